@@ -1,26 +1,86 @@
 """Where a library over two sizes is solved, what its bars are made of: every step on numbers made by hand."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from metalens.cell import Cell, Index, Lattice
+from metalens.cell.shapes import Rectangle
+from metalens.ground import config
+from metalens.pillars import Sweep
 from metalens.pillars.axes import between, solving
 
+SQUARE = Cell(0.42, 0.4, Index(1.7), Index(1.45), shape=Rectangle())
+OBLONG = replace(SQUARE, lattice=Lattice("rectangular", 1.1))  # where sizes are not exchanged
 
-def swept(x, y, samples):
+
+def swept(x, y, samples, waves=(0.7,)):
     """Settings of so few samples that their entries can be counted."""
-    return SimpleNamespace(diameters_um=x, lengths_um=y, samples=samples, tolerance=0.1)
+    return Sweep(waves, diameters_um=x, lengths_um=y, samples=samples, tolerance=0.1)
+
+
+def pillar(x, y, wave=0.7, near=0.012):
+    """(..., 4) Jones matrix in closed form: a resonance that moves with both sizes; exchanged sizes exchange x and y.
+
+    near: half-width of the resonance.
+    """
+    x, y = np.broadcast_arrays(x, y)
+
+    def one(a, b):
+        pole = 0.2 * near / (a - 0.21 - 0.3 * (b - 0.25) + 1j * near)
+        return 0.5 * np.exp(2j * np.pi * (a + 0.4 * b) / wave) + pole
+
+    def mixed(a, b):
+        return 0.1j * np.cos(9 * a - 4 * b)
+
+    return np.stack([one(x, y), mixed(x, y), mixed(y, x), one(y, x)], axis=-1)
+
+
+def bar(x, y):
+    """Of the solver: unlike for exchanged sizes where those are solved by themselves."""
+    return 0.002 + 0.01 * x + 0.003 * y
+
+
+class Solver:
+    """A journal whose pillars are solved in closed form."""
+
+    def __init__(self, near=0.012, loud=1.0):
+        self.near, self.loud, self.asked, self.ended = near, loud, {"pillars": [], "held out": []}, False
+
+    def run(self, tasks, console, label):
+        made = []
+        for task in tasks:
+            size, shape = task["size_um"], config.loads(task["cell"], Cell, where="task").shape
+            x, y, wave = size, shape.ratio * size, task["lights"][0][0]
+            self.asked[label].append((x, y, wave, task["tolerance"], task["harmonics"]))
+            t = [[v.real, v.imag] for v in pillar(x, y, wave, self.near).tolist()]
+            made.append({"t": t, "error": [self.loud * bar(x, y) * share for share in (0.5, 0.25, 1.0, 0.7)]})
+        return made
+
+    def finish(self):
+        self.ended = True
+
+    def lines(self, count, wave=0.7):
+        """Nodes of the first grid that has so many along x, from the order of what was asked for."""
+        found = [set(), set()]
+        for x, y, *_ in (one for one in self.asked["pillars"] if one[2] == wave):
+            if len(found[0] | {round(x, 12)}) > count or len(found[1] | {round(y, 12)}) > count:
+                break
+            found[0].add(round(x, 12))
+            found[1].add(round(y, 12))
+        return tuple(np.array(sorted(each)) for each in found)
 
 
 def test_entries_share_the_step_of_the_longer_range():
-    x, y = solving.entries(swept((0.1, 0.4), (0.2, 0.29), 13))  # 0.3 in 12 steps of 0.025: 0.09 holds 3 of them
-    assert x == pytest.approx(0.1 + 0.025 * np.arange(13), abs=1e-15)
-    assert y == pytest.approx([0.2, 0.225, 0.25, 0.275], abs=1e-15)
-    x, y = solving.entries(swept((0.3, 0.44), (0.1, 0.38), 5))
-    assert x == pytest.approx([0.3, 0.37, 0.44], abs=1e-15)
-    assert x[-1] <= 0.44
-    assert len(y) == 5
+    x, y = solving.entries(swept((0.1, 0.4), (0.2, 0.27), 25))  # 0.3 in 24 steps of 0.0125: 0.07 holds 5 of them
+    assert x == pytest.approx(0.1 + 0.0125 * np.arange(25), abs=1e-15)
+    assert y == pytest.approx([0.2, 0.2125, 0.225, 0.2375, 0.25, 0.2625], abs=1e-15)
+    x, y = solving.entries(swept((0.3, 0.41), (0.1, 0.32), 21))
+    assert x == pytest.approx(np.linspace(0.3, 0.41, 11), abs=1e-15)
+    assert x[-1] <= 0.41
+    assert len(y) == 21
 
 
 def test_nodes_are_added_in_the_middle_of_the_gaps_with_most_doubt():
@@ -32,88 +92,12 @@ def test_nodes_are_added_in_the_middle_of_the_gaps_with_most_doubt():
     assert edge == pytest.approx([0, 1, 1.5, 1.75, 2])  # what lies on a node counts for neither gap
 
 
-def test_first_nodes_are_chebyshev_s_and_the_search_ends_where_few_pairs_stay_above(monkeypatch):
-    """(1 - share) of the tolerance is for the interpolation; a doubt is looked at between the nodes."""
-    asked = []
-
-    def told(doubt_of):
-        def surface(lines, values, look, *, tolerance):
-            asked.append((lines, look, tolerance))
-            return SimpleNamespace(doubt=doubt_of(len(asked), *look))
-
-        return surface
-
-    gridded = []
-
-    def grid(x, y, console, label):
-        gridded.append((x, y))
-        return np.zeros((len(x), len(y), 4)), None
-
-    nodes = SimpleNamespace(grid=grid, swaps=False)
-    rows = np.arange(61 * 61).reshape(61, 61)
-    few, many = int(0.03 * 3721), int(0.03 * 3721) + 1  # 111 of 3721 pairs may stay above 0.04
-    monkeypatch.setattr(
-        solving, "surface", told(lambda turn, x, y: np.where(rows < (many if turn == 1 else few), 0.0401, 0.0399))
-    )
-    x, y = solving._lines(nodes, swept((0.1, 0.4), (0.2, 0.3), 13), None)
-    first = np.cos(np.pi * np.arange(7) / 6)
-    assert asked[0][0][0] == pytest.approx(0.25 - 0.15 * first, abs=1e-15)
-    assert asked[0][0][1] == pytest.approx(0.25 - 0.05 * first, abs=1e-15)
-    assert [v.size for v in asked[0][1]] == [61, 61]
-    assert (asked[0][1][0][0], asked[0][1][0][-1], asked[0][1][1][0], asked[0][1][1][-1]) == (0.1, 0.4, 0.2, 0.3)
-    assert asked[0][2] == 0.1
-    assert all(np.array_equal(a, b) for (a, b) in zip(gridded[0], asked[0][0], strict=True))
-    assert len(asked) == 2  # one round more: two nodes on each axis
-    assert (len(x), len(y)) == (9, 9)
-
-
-@pytest.mark.parametrize("swaps", [False, True])
-def test_each_axis_gets_nodes_where_its_own_doubt_lies(monkeypatch, swaps):
-    """A ridge at small x and a spot at large y; a resonance counts as ten tolerances; together where they exchange."""
-    seen = []
-
-    def surface(lines, values, look, *, tolerance):
-        x, y = look
-        doubt = np.full((61, 61), 0.03) + 0.02 * (x[:, None] < 0.12) + np.where((x[:, None] > 0.39) & (y > 0.28), 50, 0)
-        seen.append(lines)
-        return SimpleNamespace(doubt=doubt)
-
-    monkeypatch.setattr(solving, "surface", surface)
-    nodes = SimpleNamespace(grid=lambda x, y, console, label: (np.zeros((len(x), len(y), 4)), None), swaps=swaps)
-    monkeypatch.setattr(solving, "MOST", 9)
-    x, y = solving._lines(nodes, swept((0.1, 0.4), (0.1, 0.3), 13), None)
-    assert (len(x), len(y)) == (9, 9)
-    look = np.linspace(0.1, 0.4, 61), np.linspace(0.1, 0.3, 61)
-    doubt = np.minimum(surface(None, None, look, tolerance=0.1).doubt, 1.0)
-    own = [doubt.mean(1), doubt.mean(0)]
-    if swaps:
-        own = [own[0] + own[1]] * 2
-    for got, start, place, profile in zip((x, y), seen[0], look, own, strict=True):
-        assert got == pytest.approx(solving._more(start, place, profile), abs=1e-15)
-
-
 def test_pairs_held_out_follow_roberts_s_sequence():
     g = 1.324717957244746  # g³ = g + 1
     row, column = solving._spread((np.zeros(31), np.zeros(17)))
     n = np.arange(1, 25)
     assert row.tolist() == np.floor(np.mod(0.5 + n / g, 1) * 31).tolist()
     assert column.tolist() == np.floor(np.mod(0.5 + n / g**2, 1) * 17).tolist()
-
-
-def test_held_out_pairs_are_off_by_their_largest_element():
-    places = np.linspace(0.1, 0.4, 31), np.linspace(0.2, 0.3, 17)
-    row, column = solving._spread(places)
-    value = np.zeros((31, 17, 4), complex)
-    off = np.array([0.01, -0.03j, 0.02, 0.005])
-    exact = SimpleNamespace(
-        solve=lambda pairs, console, label: [SimpleNamespace(t=(off * (1 + k)).reshape(2, 2)) for k in range(24)]
-    )
-    doubt = np.arange(31 * 17.0).reshape(31, 17)
-    got = solving._held_out(exact, places, value, doubt, None)
-    assert got[:, 0] == pytest.approx(places[0][row])
-    assert got[:, 1] == pytest.approx(places[1][column])
-    assert got[:, 2] == pytest.approx(0.03 * (1 + np.arange(24)))
-    assert got[:, 3] == pytest.approx(doubt[row, column])
 
 
 def test_errors_of_the_solver_are_carried_as_shifts_of_the_sizes():
@@ -209,37 +193,6 @@ def test_lines_are_fitted_along_x_and_their_values_along_y(monkeypatch):
     assert [len(one[0]) for one in asked] == [3, 3, 2, 2]
 
 
-def test_a_grid_of_nodes_is_solved_pair_by_pair(monkeypatch):
-    """Of pairs that may be exchanged the larger size first; x and y change places in the matrix of the other."""
-    asked = []
-    monkeypatch.setattr(solving, "sized", lambda cell, x, y: (x, y))
-    monkeypatch.setattr(
-        solving.workers, "jones_task", lambda cell, x, wave, *, tolerance, reach: (*cell, wave, tolerance, reach)
-    )
-
-    def run(tasks, console, label):
-        asked.extend(tasks)
-        for a, b, *_ in tasks:
-            yield {"t": [[a, 0], [0, b], [a * b, 1], [2, a + b]], "error": [a, 3 * b]}
-
-    settings = swept((0.1, 0.4), (0.2, 0.3), 31)
-    for swaps in (False, True):
-        asked.clear()
-        monkeypatch.setattr(solving, "swaps", lambda cell, sweep, swaps=swaps: swaps)
-        nodes = solving._Nodes("cell", settings, 0.7, 6, SimpleNamespace(run=run))
-        t, bars = nodes.grid(np.array([0.2, 0.3]), np.array([0.2, 0.3, 0.4]), None, "")
-        assert (t.shape, bars.shape) == ((2, 3, 4), (2, 3))
-        assert t[1, 2 if not swaps else 0] == pytest.approx(
-            [0.3, 0.4j, 0.12 + 1j, 2 + 0.7j] if not swaps else [0.3, 0.2j, 0.06 + 1j, 2 + 0.5j]
-        )
-        if swaps:
-            assert asked == [(0.2, 0.2, 0.7, 0.1, 6), (0.3, 0.2, 0.7, 0.1, 6), (0.4, 0.2, 0.7, 0.1, 6),
-                             (0.3, 0.3, 0.7, 0.1, 6), (0.4, 0.3, 0.7, 0.1, 6)]  # fmt: skip
-            assert t[0, 2] == pytest.approx([2 + 0.6j, 0.08 + 1j, 0.2j, 0.4])  # both axes turned round
-        assert bars[0, 2] == pytest.approx(1.2 if not swaps else 0.6)
-        assert nodes.solves == (6 if not swaps else 5)
-
-
 def test_the_truncation_is_the_least_that_meets_its_share_at_four_probes(monkeypatch):
     from metalens import rcwa
 
@@ -249,58 +202,106 @@ def test_the_truncation_is_the_least_that_meets_its_share_at_four_probes(monkeyp
         asked.append((cell, size, wavelength, tolerance, harmonics))
         return SimpleNamespace(converged=harmonics >= 7)
 
-    monkeypatch.setattr(solving, "sized", lambda cell, x, y: (x, y))
     monkeypatch.setattr(rcwa, "jones", jones)
-    settings = swept((0.1, 0.4), (0.2, 0.3), 31)
-    settings.wavelengths_um = (0.7, 0.8)
+    settings = swept((0.1, 0.4), (0.2, 0.3), 31, (0.7, 0.8))
     for most, want in ((12, 7), (6, 6), (4, 4)):
         monkeypatch.setattr(rcwa, "most_harmonics", lambda cell, size, most=most: most)
         asked.clear()
-        assert solving._reach("cell", settings) == want
+        assert solving._reach(SQUARE, settings) == want
     monkeypatch.setattr(rcwa, "most_harmonics", lambda cell, size: 12)
     asked.clear()
-    solving._reach("cell", settings)
+    solving._reach(SQUARE, settings)
     last = [one for one in asked if one[4] == 7]
     places = [(0.1 + 0.3 * a, 0.2 + 0.1 * b) for a, b in ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))]
-    assert [one[0] for one in last] == [pytest.approx(p) for p in places for _ in (0, 1)]
+    assert [one[0].shape.ratio for one in last] == pytest.approx([p[1] / p[0] for p in places for _ in (0, 1)])
     assert [one[1] for one in last] == pytest.approx([p[0] for p in places for _ in (0, 1)])
     assert [one[2] for one in last] == [0.7, 0.8] * 4
     assert [one[3] for one in last] == pytest.approx([0.06] * 8)
     assert asked[0][4] == 5
 
 
-@pytest.mark.parametrize(("ratio", "wide"), [(0.8, 1.6), (0.1, 0.5)])
-def test_a_bar_is_the_doubt_widened_by_what_every_other_pair_shows_and_the_solver_s(monkeypatch, ratio, wide):
-    """Twice the largest error to doubt of the pairs 0, 2, 4, …, at least a half; never above 2."""
-    places = np.linspace(0.1, 0.4, 31), np.linspace(0.2, 0.3, 17)
-    doubt = np.linspace(0.01, 2.0, 31 * 17).reshape(31, 17)
-    held = np.tile([0.15, 0.25, 0.0, 0.02], (24, 1))
-    held[6, 2], held[7, 2] = 0.02 * ratio, 99.0  # the second half is left to judge
-    for name, answer in {
-        "check": lambda *_: None,
-        "Journal": lambda *_: SimpleNamespace(finish=lambda: None),
-        "entries": lambda _: places,
-        "_reach": lambda *_: 6,
-        "_Nodes": lambda *_: SimpleNamespace(grid=lambda *_: (None, None), solves=5),
-        "_lines": lambda *_: (None, None),
-        "surface": lambda *_, **__: SimpleNamespace(value=np.ones((31, 17, 4)), doubt=doubt),
-        "_held_out": lambda *_: held.copy(),
-        "_carried": lambda *_: 0.3 * doubt,
-        "AxesLibrary": lambda *given: given,
-    }.items():
-        monkeypatch.setattr(solving, name, answer)
-    settings = swept((0.1, 0.4), (0.2, 0.3), 31)
-    settings.wavelengths_um = (0.7, 0.8)
-    monkeypatch.setattr(solving.config, "dumps", lambda _: "")
-    _, _, wavelengths, x, y, t, error, found, solves, reach, _ = solving.sweep(None, settings)
-    want = np.minimum((wide + 0.3) * doubt, 2.0)
-    assert (want.max() == 2.0) == (wide > 1)
-    assert error == pytest.approx(np.stack([want, want]))
-    assert (t.shape, solves, reach, x is places[0], y is places[1]) == ((2, 31, 17, 2, 2), 10, 6, True, True)
-    assert wavelengths.tolist() == [0.7, 0.8]
+@pytest.mark.parametrize("cell", [SQUARE, OBLONG])
+def test_a_grid_of_nodes_is_solved_pair_by_pair(cell):
+    """Of pairs that may be exchanged the larger size first; x and y change places in the matrix of the other."""
+    solver, swaps = Solver(), cell is SQUARE
+    nodes = solving._Nodes(cell, swept((0.1, 0.4), (0.1, 0.4), 31), 0.7, 6, solver)
+    x, y = np.array([0.2, 0.3]), np.array([0.2, 0.3, 0.4])
+    t, bars = nodes.grid(x, y, None, "pillars")
+    assert t == pytest.approx(pillar(x[:, None], y), abs=1e-12)
+    places = (np.maximum(x[:, None], y), np.minimum(x[:, None], y)) if swaps else (x[:, None], y)
+    assert bars == pytest.approx(bar(*places))
+    asked = np.array(solver.asked["pillars"])
+    pairs = [(0.2, 0.2), (0.3, 0.2), (0.4, 0.2), (0.3, 0.3), (0.4, 0.3)]
+    pairs = pairs if swaps else [(a, b) for a in x for b in y]
+    assert asked[:, :2] == pytest.approx(np.array(pairs))
+    assert (asked[:, 2:] == [0.7, 0.1, 6]).all()
+    assert nodes.solves == len(pairs)
+    again, _ = nodes.grid(x, y[:2], None, "pillars")
+    assert np.array_equal(again, t[:, :2])
+    assert nodes.solves == len(asked) == len(pairs)  # known by now
+
+
+@pytest.mark.parametrize("cell", [SQUARE, OBLONG])
+def test_nodes_are_added_to_chebyshev_s_where_each_axis_doubts_until_few_pairs_do(cell):
+    """0.4 of the tolerance is for the interpolation, between the nodes; 3 % of the pairs may stay above; a resonance
+    counts as ten tolerances; both axes together where sizes are exchanged."""
+    y_range, swaps = ((0.1, 0.4) if cell is SQUARE else (0.12, 0.33)), cell is SQUARE
+    settings, solver = swept((0.1, 0.4), y_range, 31), Solver()
+    x, y = solving._lines(solving._Nodes(cell, settings, 0.7, 6, solver), settings, None)
+    first = np.cos(np.pi * np.arange(7) / 6)
+    low, high = y_range
+    look = np.linspace(0.1, 0.4, 61), np.linspace(low, high, 61)
+    lines = 0.25 - 0.15 * first, (low + high) / 2 - (high - low) / 2 * first
+    assert len(x) > 9
+    for count in range(7, len(x) + 1, 2):
+        if not swaps:
+            assert all(np.allclose(a, b, atol=1e-9) for a, b in zip(solver.lines(count), lines, strict=True))
+        doubt = between.surface(lines, pillar(lines[0][:, None], lines[1]), look, tolerance=0.1).doubt
+        assert ((doubt > 0.04).mean() <= 0.03) == (count == len(x))
+        if count < len(x):
+            own = [np.minimum(doubt, 1.0).mean(1), np.minimum(doubt, 1.0).mean(0)]
+            own = [own[0] + own[1]] * 2 if swaps else own
+            lines = [solving._more(*each) for each in zip(lines, look, own, strict=True)]
+    assert x == pytest.approx(lines[0], abs=1e-12)
+    assert y == pytest.approx(lines[1], abs=1e-12)
+
+
+def test_no_more_nodes_are_added_than_may_be(monkeypatch):
+    monkeypatch.setattr(solving, "MOST", 9)
+    settings = swept((0.1, 0.4), (0.12, 0.33), 31)
+    x, y = solving._lines(solving._Nodes(OBLONG, settings, 0.7, 6, Solver(0.003)), settings, None)
+    assert (len(x), len(y)) == (9, 9)
+
+
+@pytest.mark.parametrize(("near", "loud"), [(0.5, 1.0), (0.05, 300.0)])
+def test_a_bar_is_the_doubt_widened_by_what_every_other_pair_shows_and_the_solver_s(monkeypatch, near, loud):
+    """Twice the largest error to doubt of the pairs 0, 2, 4, ..., at least a half; never above 2; the second half of
+    the pairs is left to judge. Pairs that show more than the doubt, and such that show less with a poor solver."""
+    solver = Solver(near, loud)
+    monkeypatch.setattr(solving, "Journal", lambda *_: solver)
+    found = solving.sweep(OBLONG, swept((0.1, 0.4), (0.2, 0.3), 31, (0.7, 0.8)))
+    places = found.x_um, found.y_um
     row, column = solving._spread(places)
-    for index in (0, 1):
-        mine = found[24 * index : 24 * (index + 1)]
-        assert (mine[:, 0] == index).all()
-        assert mine[:, 3] == pytest.approx(held[:, 2])
-        assert mine[:, 4] == pytest.approx(want[row, column])
+    told = []
+    for index, wave in enumerate((0.7, 0.8)):
+        x, y = solver.lines(99, wave)
+        made = between.surface((x, y), pillar(x[:, None], y, wave, near), places, tolerance=0.1)
+        exact = pillar(places[0][row], places[1][column], wave, near)
+        missed = np.abs(made.value[row, column] - exact).max(axis=-1)
+        ratio = missed / made.doubt[row, column]
+        wide = max(0.5, 2 * max(ratio[::2]))
+        told.append(wide)
+        carried = solving._carried((x, y), loud * bar(x[:, None], y), places, made.value)
+        want = np.minimum(wide * made.doubt + carried, 2.0)
+        assert (want.max() == 2.0) == (loud > 1)
+        assert np.median(want) < 2.0
+        assert found.t[index].reshape(made.value.shape) == pytest.approx(made.value, abs=1e-9)
+        assert found.t_error[index] == pytest.approx(want, rel=1e-6)
+        mine = found.held_out[24 * index : 24 * (index + 1)]
+        want = [np.full(24, index), places[0][row], places[1][column], missed, want[row, column]]
+        assert mine == pytest.approx(np.stack(want, axis=1), rel=1e-6, abs=1e-9)
+    assert found.solves == sum(map(len, solver.asked.values()))
+    assert (min(told) == 0.5) == (loud > 1)
+    assert max(told) > 0.5
+    assert solver.ended
+    assert (found.harmonics, found.wavelength_um.tolist()) == (solver.asked["pillars"][0][4], [0.7, 0.8])
