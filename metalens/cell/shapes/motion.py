@@ -64,7 +64,7 @@ def _conic(part: Conic, g: Array, rates: Array) -> Array:
     small = reach < 1e-3
     safe = np.where(small, 1.0, reach)
     value = np.where(small, 1 - reach**2 / 8, 2 * jv(1, safe) / safe)
-    slope = np.where(small, -0.25 + reach**2 / 48, -2 * jv(2, safe) / safe**2)  # of the value, by s, over s
+    slope = np.where(small, -0.25, -2 * jv(2, safe) / safe**2)  # of the value, by s, over s; counts with s²
     along, across = b * (value + slope * (a * x) ** 2), a * (value + slope * (b * y) ** 2)
     turn = a * b * slope * (a - b) * (a + b) * x * y
     return np.asarray(part.sign * math.pi * (rates[0] * along + rates[1] * across + rates[2] * turn))

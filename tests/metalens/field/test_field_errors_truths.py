@@ -74,17 +74,19 @@ def test_the_transform_is_judged_by_rays_seen_from_a_width_aside(monkeypatch):
     assert found == pytest.approx(math.sqrt(np.mean(np.square(errors))), rel=1e-9)
 
 
-def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monkeypatch):
+@pytest.mark.parametrize("slopes", [False, True])  # with derivatives one point after the other
+def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monkeypatch, slopes):
     def psfs(optics, at, *, depths_um, wavelength_um, window, finest_um):
         assert finest_um == 0.82
         return (at.sum() + 10 * wavelength_um) * torch.ones(1, len(depths_um), 7, 7)
 
     monkeypatch.setattr(plan, "psfs", psfs)
-    at = torch.tensor([[1.0, 2.0], [5.0, -3.0], [0.5, 0.25]])
+    at = torch.tensor([[1.0, 2.0], [5.0, -3.0], [0.5, 0.25]], requires_grad=slopes)
     found = plan.spectral(OPTICS, at, torch.ones(2), WAVES, PLAN.window)
     middle = 10 * (0.25 * 0.82 + 0.75 * 0.88)
     assert found.shape == (3, 2, 7, 7)
-    assert found[:, 1, 4, 2].numpy() == pytest.approx([3 + middle, 2 + middle, 0.75 + middle], rel=1e-6)
+    assert found.requires_grad is slopes
+    assert found[:, 1, 4, 2].detach().numpy() == pytest.approx([3 + middle, 2 + middle, 0.75 + middle], rel=1e-6)
 
 
 def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):

@@ -10,7 +10,7 @@ import torch
 from metalens.field import Grid, forming, patches, plan, subset
 from metalens.field.patches import relative, shares
 from metalens.ground.errors import SceneError
-from metalens.psf import Nodes, Source
+from metalens.psf import Nodes, Source, spectrum
 
 draw = np.random.default_rng(21)
 BASE = torch.from_numpy(draw.random((7, 7)) + 0.3)
@@ -48,13 +48,17 @@ def test_as_few_depths_as_the_error_of_cubics_asks_for(between, nodes):
 
 
 def test_as_few_field_points_as_the_error_of_cubics_asks_for():
-    """Even nodes on an axis of 192 steps; what is tried next comes from how the error falls, so a few may be spared."""
+    """Nodes on an axis of 192 steps, even or denser at the rim, whichever err less; what is tried next comes from how
+    the error falls, so a few may be spared."""
     eps, span = 1e-3, (0.0, 300.0)
     for intervals in (8, 12, 16, 24):
         tolerance = 1.01 * cubic_error(eps, intervals)
         count, denser = plan._line(line(eps, plan.ALONG), span, tolerance)
-        assert plan._Known(line(eps, plan.ALONG)).error(plan.placed(count, denser, span).int().tolist()) <= tolerance
         assert count <= 1.5 * intervals + 2
+        known = plan._Known(line(eps, plan.ALONG))
+        tried = {d: known.error(plan.placed(count, d, span).int().tolist()) for d in plan.DENSER}
+        assert denser == min(tried, key=tried.get)
+        assert tried[denser] <= tolerance
     with pytest.raises(SceneError, match="field points along an axis leave"):
         plan._line(line(eps, plan.ALONG), span, 1e-12)
 
@@ -80,6 +84,31 @@ def test_a_spectrum_takes_the_rule_that_the_next_one_confirms(monkeypatch):
         assert loose.error == pytest.approx(error, rel=0.01)
 
 
+def test_a_spectrum_is_judged_where_it_changes_an_image_most_and_by_what_lies_beside_it(monkeypatch):
+    """Twice as much at the farther depth, and by the distance from the middle: 0.9 and 0.8 of the way to the rims.
+    Of a measured source what it leaves out adds to the error of any rule."""
+    grid, half = Grid((5, 6), 2.0, (3e3, 9e3), window=7), (24.0, 31.0)
+
+    def moment(waves):
+        return float(((waves.wavelengths_um - 0.83) / 0.05) ** 5 @ waves.weights)
+
+    def spectral(optics, at, depths, waves, window):
+        off = (at - torch.tensor([7.0, -3.0])).abs() / torch.tensor([31.0, 24.0])
+        size = (0.6 * off[:, :1] + 0.4 * off[:, 1:]) * torch.where(depths > 5e3, 2.0, 1.0)
+        return BASE + 1e-3 * moment(waves) * size[..., None, None] * CHANGE
+
+    monkeypatch.setattr(plan, "spectral", spectral)
+    um = np.linspace(0.80, 0.89, 21)
+    share = np.exp(-((um - 0.83) ** 2) / 2e-4) + 2 * (um - 0.8)
+    source = spectrum.Measured(um, share / share.sum(), beside=1e-3 * RATIO)
+    two, three = (plan._coarse(source, n) for n in (2, 3))
+    error = 1e-3 * abs(moment(two) - moment(three)) * RATIO * 2 * (0.6 * 0.9 + 0.4 * 0.8) + source.beside
+    for much, count, left in ((1.01, 2, error), (0.99, 3, source.beside)):
+        made = plan.waves_of(None, grid, source, (7.0, -3.0), list(half), much * error)
+        assert len(made.wavelengths_um) == count
+        assert made.error == pytest.approx(left, rel=5e-3)  # RATIO is that of a small change
+
+
 @pytest.mark.parametrize(
     ("samples", "middle", "folds"), [((6, 6), 0.0, True), ((6, 7), 0.0, False), ((6, 6), 0.0, False)]
 )
@@ -97,6 +126,23 @@ def test_a_field_folds_only_where_it_is_square(monkeypatch, samples, middle, fol
     assert [float(made.y_um[-1]), float(made.x_um[-1])] == pytest.approx(half)
     assert [float(made.y_um[0]), float(made.x_um[0])] == pytest.approx([-h for h in half])
     assert len(made.depths_um) == 5
+
+
+@pytest.mark.parametrize(("samples", "counts"), [((20, 40), [4, 5]), ((40, 20), [9, 5]), ((1, 90), [2, 5])])
+def test_nodes_lie_as_densely_along_y_as_a_line_along_x_asks_for(monkeypatch, samples, counts):
+    """Five along x: steps of a quarter of its length, no longer ones along y; two at least. Rays that err by more than
+    0.4 of the tolerance are seen from every place."""
+    monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
+    monkeypatch.setattr(plan, "unpolarised", lambda *_: 0.0)
+    grid, waves = Grid(samples, 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
+    for left in (0.0039, 0.0041):
+        monkeypatch.setattr(plan, "neglected", lambda *_, left=left: left)
+        made = plan.planned(None, grid, waves, (31.0, -17.0), tolerance=0.01, folds=True)
+        assert made.window.curved is (left > 0.004)
+    assert not made.folds
+    assert [len(made.y_um), len(made.x_um)] == counts
+    for nodes, middle, n in ((made.y_um, -17.0, grid.frame[0]), (made.x_um, 31.0, grid.frame[1])):
+        assert [float(nodes[0]), float(nodes[-1])] == pytest.approx([middle - (n - 1), middle + (n - 1)])
 
 
 def test_light_from_one_point_and_one_wavelength_is_drawn_evenly_and_by_weight(monkeypatch):
