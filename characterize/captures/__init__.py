@@ -6,6 +6,9 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from characterize.captures import capture as capture
+    from characterize.captures.alike import Spectra as Spectra
+    from characterize.captures.alike import above_rim as above_rim
+    from characterize.captures.alike import likeness as likeness
     from characterize.captures.capture import Capture as Capture
     from characterize.captures.electrons import Frames as Frames
     from characterize.captures.electrons import Gain as Gain
@@ -23,10 +26,13 @@ __getattr__, __dir__, __all__ = attach(
         "Frames": "electrons",
         "Gain": "electrons",
         "MIRRORED": "turns",
+        "Spectra": "alike",
         "TURNS": "turns",
+        "above_rim": "alike",
         "between": "turns",
         "capture": "",
         "clean": "electrons",
+        "likeness": "alike",
         "merge_brackets": "electrons",
         "turn": "turns",
     },

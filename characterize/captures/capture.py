@@ -15,13 +15,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import colour, stage, tiff_pages, tiff_tags
+from characterize.captures import stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
+from characterize.captures.colour import Colours
 from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
+_PLAIN = Colours()
 _LEAST_PNG = 33  # bytes of a PNG's mark and head
 
 
@@ -35,7 +37,8 @@ class Capture:
     exposure_s: (n,) nan where unknown.
     names: of every frame, for messages.
     bits: of the converter; the largest count is 2**bits - 1.
-    pixel_um, wavelength_um: nan where unknown.
+    pixel_um, wavelength_um: nan where unknown; the first is the pitch of the frames.
+    fill: width of a pixel over that pitch: a half where frames are one colour of a mosaic.
     dark, flat: (k, y, x) counts, or None.
     about: further entries of the capture's description (numbers and words).
     corrections: what was changed on the way in, in words.
@@ -53,6 +56,7 @@ class Capture:
     flat: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
     corrections: tuple[str, ...] = ()
+    fill: float = 1.0
 
     def __post_init__(self) -> None:
         n, shape = len(self.frames), self.frames.shape[1:]
@@ -97,27 +101,26 @@ def load(path: str | Path) -> Capture:
         raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
 
 
-def read_images(path: Path, channel: object = None, *, grey: bool = False) -> Array:
+def read_images(path: Path, colours: Colours = _PLAIN, *, grey: bool = False) -> Array:
     """(n, y, x) images of one file, in its own number type.
 
     Args:
-        channel: of colour images, "red", "green" or "blue"; what capture.toml says as ``channel``.
+        colours: which colour is lit, and how a raw mosaic holds it.
         grey: whether images without colours are taken beside a channel (dark, flat).
 
     Raises:
-        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, a channel without colour, or an
-            unknown one.
+        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or a channel without colour.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY:
         raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
-    read_tiff = partial(tiff_pages.read, coloured=channel is not None)
+    read_tiff = partial(tiff_pages.read, coloured=colours.channel is not None, mosaic=bool(colours.mosaic))
     readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: _read_png, HDF5: _read_hdf5}
     reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
     if reader is None:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
     images = reader(path)
-    images = colour.pick(images[None] if images.ndim == 2 else images, channel, path, grey=grey)
+    images = colours.pick(images[None] if images.ndim == 2 else images, path, grey=grey)
     if images.size == 0:
         raise CaptureError(f"{path}: images of shape {images.shape} are empty")
     _check_values(images, path)
@@ -126,14 +129,14 @@ def read_images(path: Path, channel: object = None, *, grey: bool = False) -> Ar
 
 def _load_file(path: Path) -> Capture:
     about = stage.read_beside(path)
-    channel = about.pop("channel", None)
-    images = read_images(path, channel)
+    colours = Colours.of(about, str(path))
+    images = read_images(path, colours)
     tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
     images, bits, note, _ = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
     step = about.get("step_um", math.nan)
     position = np.arange(n) * step if math.isfinite(step) else tags.position_um
-    notes = [note, *tags.notes, *colour.notes(channel)]
+    notes = [note, *tags.notes, *colours.notes()]
     return Capture(
         images,
         position if len(position) == n else np.full(n, np.nan),
@@ -141,10 +144,11 @@ def _load_file(path: Path) -> Capture:
         np.full(n, np.nan),
         tuple(f"{reading.shown(path.name)}[{i}]" for i in range(n)),
         bits,
-        pixel_um=about.pop("pixel_um", tags.pixel_um),
+        pixel_um=about.pop("pixel_um", tags.pixel_um) * colours.pitch,
         wavelength_um=about.pop("wavelength_um", math.nan),
         about=about,
         corrections=tuple(notes),
+        fill=1 / colours.pitch,
     )
 
 
@@ -155,14 +159,14 @@ def _load_folder(folder: Path) -> Capture:
     files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
-    channel = about.pop("channel", None)
+    colours = Colours.of(about, str(folder))
     said = stage.left_out(files, rows) if rows else ()
     if rows is None:
-        names, frames = _all_frames(files, folder, channel)
+        names, frames = _all_frames(files, folder, colours)
         rows = stage.Rows.unknown(names)
     else:
-        frames = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, channel)
-    stacks = {name: read_images(p, channel, grey=True) for name, p in special.items()}
+        frames = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, colours)
+    stacks = {name: read_images(p, colours, grey=True) for name, p in special.items()}
     bits = about.pop("bits", None)
     frames, depth, note, aligned = right_align(frames, bits, str(folder), beside=tuple(stacks.values()))
     extra = dict(zip(stacks, aligned, strict=True))
@@ -175,28 +179,29 @@ def _load_folder(folder: Path) -> Capture:
         rows.exposure_s,
         rows.files,
         depth,
-        pixel_um=about.pop("pixel_um", math.nan),
+        pixel_um=about.pop("pixel_um", math.nan) * colours.pitch,
         wavelength_um=about.pop("wavelength_um", math.nan),
         dark=extra.get("dark"),
         flat=extra.get("flat"),
         about=about,
-        corrections=(note, *colour.notes(channel), *said),
+        corrections=(note, *colours.notes(), *said),
+        fill=1 / colours.pitch,
     )
 
 
-def _all_frames(files: Sequence[Path], folder: Path, channel: object) -> tuple[tuple[str, ...], Array]:
+def _all_frames(files: Sequence[Path], folder: Path, colours: Colours) -> tuple[tuple[str, ...], Array]:
     if not files:
         raise CaptureError(f"{folder}: no frames; need TIFF, PNG or HDF5 images in it")
     names: list[str] = []
     stacks = []
     for path in files:
-        images = read_images(path, channel)
+        images = read_images(path, colours)
         names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
         stacks.append(images)
     return tuple(map(reading.shown, names)), _join(stacks, files)
 
 
-def _listed_frames(there: Mapping[str, Path], folder: Path, rows: stage.Rows, channel: object) -> Array:
+def _listed_frames(there: Mapping[str, Path], folder: Path, rows: stage.Rows, colours: Colours) -> Array:
     """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn."""
     stacks: dict[str, Array] = {}
     images = []
@@ -205,7 +210,7 @@ def _listed_frames(there: Mapping[str, Path], folder: Path, rows: stage.Rows, ch
         path = there.get(stage.spelt(name), folder / name)
         if not path.is_file():
             raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
-        stack = stacks[name] if name in stacks else read_images(path, channel)
+        stack = stacks[name] if name in stacks else read_images(path, colours)
         stacks[name] = stack
         page = min(met[name], len(stack) - 1) if stated is None else stated
         met[name] += 1

@@ -1,6 +1,8 @@
 """Frames that a camera wrote in colour: one channel of them, where the bench says which."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
@@ -8,38 +10,86 @@ from metalens.ground.errors import CaptureError
 CHANNELS = ("red", "green", "blue")
 
 
-def pick(images: Array, channel: object, path: Path, *, grey: bool = True) -> Array:
-    """One channel of (n, y, x, red green blue [alpha]); grey images as they are.
+@dataclass(frozen=True, slots=True)
+class Colours:
+    """Which colour is lit, and how a raw mosaic holds it.
 
-    Args:
-        grey: False where a channel can only be that of colour images.
-
-    Raises:
-        CaptureError: colour without a channel, or an unknown one; a channel of grey images where they cannot be.
+    channel: one of ``CHANNELS``, or None. mosaic: letters of the 2 x 2 pixels that repeat, row by row from the first
+    pixel of a frame (RGGB, BGGR, GRBG, GBRG); empty where every pixel holds all colours or none.
     """
-    if channel is not None and channel not in CHANNELS:
-        raise CaptureError(f"{path}: channel = {channel!r} in the capture's description; need one of {CHANNELS}")
-    if images.ndim == 3 and channel is not None and not grey:
-        raise CaptureError(
-            f"{path}: grey images, the capture's description says channel = {channel!r}; leave it out for a sensor "
-            "without colours, and save a raw Bayer mosaic as the pixels of the lit colour alone, with their pitch"
-        )
-    if images.ndim == 3:
+
+    channel: str | None = None
+    mosaic: str = ""
+
+    @classmethod
+    def of(cls, about: dict[str, Any], where: str) -> "Colours":
+        """As the capture's description says; its entries are taken out.
+
+        Raises:
+            CaptureError: an unknown channel or mosaic, a mosaic without a channel.
+        """
+        channel, mosaic = about.pop("channel", None), about.pop("mosaic", "")
+        if channel is not None and channel not in CHANNELS:
+            raise CaptureError(f"{where}: channel = {channel!r} in the capture's description; need one of {CHANNELS}")
+        letters = str(mosaic).upper()
+        if mosaic and (len(letters) != 4 or sorted(letters) != ["B", "G", "G", "R"]):
+            raise CaptureError(f'{where}: mosaic = {mosaic!r}; need the 2 x 2 pixels row by row, as "RGGB"')
+        if mosaic and channel is None:
+            raise CaptureError(
+                f'{where}: a mosaic without the colour that is lit; say channel = "green" (red, blue) too'
+            )
+        return cls(channel, letters)
+
+    @property
+    def pitch(self) -> int:
+        """Pixels from one of the channel's to the next."""
+        return 2 if self.mosaic else 1
+
+    def pick(self, images: Array, path: Path, *, grey: bool = True) -> Array:
+        """One channel of (n, y, x, red green blue [alpha]) or of a raw mosaic (n, y, x); grey images as they are.
+
+        Of two green pixels that of the upper row: their lattices lie a pixel apart.
+
+        Args:
+            grey: False where a channel can only be that of colour images.
+
+        Raises:
+            CaptureError: colour without a channel, or where a mosaic was stated; a channel of grey images where they
+                cannot be.
+        """
+        if images.ndim == 3:
+            return self._grey(images, path, grey=grey)
+        if images.ndim != 4 or images.shape[-1] not in (3, 4):
+            raise CaptureError(
+                f"{path}: images of shape {images.shape}; need grey frames (n, y, x), or colour (n, y, x, 3)"
+            )
+        if self.mosaic:
+            raise CaptureError(
+                f"{path}: colour images of shape {images.shape[1:]}, the capture's description says mosaic = "
+                f"{self.mosaic!r}: their colours were put together already; leave mosaic out, or save raw frames"
+            )
+        if self.channel is None:
+            raise CaptureError(
+                f"{path}: colour images of shape {images.shape[1:]}; grey frames straight from the sensor are best, "
+                'else say which of them is lit: channel = "green" (or "red", "blue") in capture.toml'
+            )
+        return images[..., CHANNELS.index(self.channel)]
+
+    def _grey(self, images: Array, path: Path, *, grey: bool) -> Array:
+        if self.mosaic:
+            row, column = divmod(self.mosaic.index(str(self.channel)[0].upper()), 2)
+            return images[:, row::2, column::2]
+        if self.channel is not None and not grey:
+            raise CaptureError(
+                f"{path}: grey images, the capture's description says channel = {self.channel!r}; leave it out for a "
+                'sensor without colours, and of a raw Bayer mosaic say how its pixels lie: mosaic = "RGGB"'
+            )
         return images
-    if images.ndim != 4 or images.shape[-1] not in (3, 4):
-        raise CaptureError(
-            f"{path}: images of shape {images.shape}; need grey frames (n, y, x), or colour (n, y, x, 3)"
-        )
-    if channel is None:
-        raise CaptureError(
-            f"{path}: colour images of shape {images.shape[1:]}; grey frames straight from the sensor are best, else "
-            'say which of them is lit: channel = "green" (or "red", "blue") in capture.toml'
-        )
-    return images[..., CHANNELS.index(str(channel))]
 
-
-def notes(channel: object) -> list[str]:
-    """What to say of frames that were a channel."""
-    if channel is None:
-        return []
-    return [f"channel {channel} used: where colours were interpolated, neighbouring pixels share their noise"]
+    def notes(self) -> list[str]:
+        """What to say of frames that were a channel."""
+        if self.mosaic:
+            return [f"channel {self.channel} used: one pixel in four of a mosaic {self.mosaic}, at twice the pitch"]
+        if self.channel is None:
+            return []
+        return [f"channel {self.channel} used: where colours were interpolated, neighbouring pixels share their noise"]

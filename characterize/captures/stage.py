@@ -46,7 +46,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     "glass_tilt_y_deg": _TILT,
     **dict.fromkeys(("read_noise_e", "wavelength_sigma_nm", "pixel_sigma_um", "pinhole_um", "glass_um"), _FROM_0),
 }
-_KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "window")
+_KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "window")
 _MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
 _COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_ANGLES)
 

@@ -17,18 +17,22 @@ from metalens.ground.errors import CaptureError
 DENSEST = 1040  # values' bytes for a byte of the file, at best
 _MOST_BYTES = 1 << 34  # of all frames of a file
 _LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
+_CFA = 32803  # what its values mean: a raw mosaic of colours
+_MEANING = {0: "says that white is 0 (photometric 0)", 3: "holds places in a table of colours"}
 _ELSEWHERE = {5: "LZW", 32773: "PackBits", 34925: "LZMA", 50000: "Zstandard"}  # need a package of their own
 
 
-def read(path: Path, *, coloured: bool = False) -> Array:
+def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
     """(n, y, x) images of a file, or (n, y, x, colours).
 
     Args:
         coloured: separate planes are the colours of an image; else they are images, since some writers take a stack of
             three or four for colours.
+        mosaic: whether it is known how a raw mosaic of colours lies.
 
     Raises:
-        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, pages of different size.
+        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, pages of different size;
+            values where more is less light, places in a table, a raw mosaic of which nothing is known.
     """
     import tifffile
 
@@ -36,6 +40,7 @@ def read(path: Path, *, coloured: bool = False) -> Array:
         with tifffile.TiffFile(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             _check(path, file)
+            _check_meaning(path, file, mosaic=mosaic)
             images = np.stack(_alike([page.asarray() for page in file.pages], path))
             planar = getattr(file.pages[0], "planarconfig", 1) == 2
             if planar and coloured and images.ndim == 4:
@@ -67,6 +72,22 @@ def _check(path: Path, file: Any) -> None:
             raise CaptureError(
                 f"{path}: frame {number} is compressed ({_ELSEWHERE[packed]}); save it plain or deflated, or install "
                 "imagecodecs"
+            )
+
+
+def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
+    """Refuse what values are not light, or not the same light in each pixel."""
+    for number, page in enumerate(file.pages):
+        meaning = int(getattr(page, "photometric", 1))
+        if meaning in _MEANING:
+            raise CaptureError(
+                f"{path}: frame {number} {_MEANING[meaning]}, so that its values are not light; save grey frames in "
+                "which black is 0"
+            )
+        if meaning == _CFA and not mosaic:
+            raise CaptureError(
+                f"{path}: frame {number} is a raw mosaic of colours (CFA); say which is lit and how its pixels lie: "
+                'channel = "green" and mosaic = "RGGB" in capture.toml'
             )
 
 

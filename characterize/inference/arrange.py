@@ -5,17 +5,20 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import fft, optimize
+from scipy import optimize
 
-from characterize.captures import MIRRORED, TURNS, between, turn
+from characterize.captures import MIRRORED, TURNS, Spectra, above_rim, between, likeness, turn
 from characterize.inference.leastsquares import Data
 from characterize.model import PLACE, ForwardModel, Setting, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
+_EVERY = range(8)  # orientation
 _ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
 Way = tuple[bool, int]  # reordered, orientation
 Shift = tuple[float, float]
+Both = tuple[Array, Array]
+"""Images as they are, and those of a camera on its side: the same where frames are square."""
 _TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
 _NEAR = 0.02  # of the likeness: by ten times less errors of a made lens were seen to exchange two orientations
 _TOLD = 40.0  # chi-square between orientations from which on fits may tell them apart
@@ -105,7 +108,7 @@ class _Frames:
 
     @classmethod
     def of(cls, model: ForwardModel, data: Data) -> "_Frames":
-        light = _prepare(np.where(data.usable, data.electrons, np.nan))
+        light = above_rim(np.where(data.usable, data.electrons, np.nan))
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
         return cls(model, model.rough(_ROUGH), light, noise, data.saturated.mean((1, 2)), _reversed(model))
 
@@ -124,45 +127,20 @@ class _Frames:
         places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
             part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
         )
-        turned = [_Spectra.of(turn(self.light, k), self.noise) for k in self.orientations()]
+        turned = [Spectra.of(turn(self.light, k), self.noise) for k in _EVERY]
         scores = np.nan_to_num(threads.each(lambda x: self._scores(x, turned), places), nan=-math.inf)
         stated, back = scores.max(0)
         orientation, back_first = _way(stated, back)
         place = int(np.argmax(scores[:, int(back_first), orientation]))
         return places[place], float(scores[place, int(back_first), orientation]) - _TWIN * back_first
 
-    def orientations(self) -> range:
-        """Those that keep the shape of the frames."""
-        return range(0, 8, 1 if self.light.shape[1] == self.light.shape[2] else 2)
-
-    def _scores(self, x: Array, turned: list["_Spectra"]) -> Array:
+    def _scores(self, x: Array, turned: list[Spectra]) -> Array:
         """(2, orientations) likeness at some parameters: of frames as stated, and end to end."""
-        expected = _Spectra.of(_expected(self.rough, x, self.clipped), 0 * self.noise)
+        upright, aside = _expected(self.rough, x, self.clipped)
+        first = Spectra.of(upright, 0 * self.noise)
+        expected = first, first if aside is upright else Spectra.of(aside, 0 * self.noise)
         orders = np.arange(len(self.light)), self.back
-        return np.array([[frames.alike(expected, index) for frames in turned] for index in orders])
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Spectra:
-    """Frames as :func:`_likeness` correlates them: spectra (n, u, v) of twice the side, norms (n,) freed of noise."""
-
-    spectrum: Array
-    norm: Array
-    sides: tuple[int, int]
-
-    @classmethod
-    def of(cls, frames: Array, noise: Array) -> "_Spectra":
-        """Of frames with noise of some norm, (n,)."""
-        power = (frames**2).sum((1, 2))
-        norm = np.sqrt(np.maximum(power - noise**2, 0.1 * power))
-        sides = 2 * frames.shape[1], 2 * frames.shape[2]
-        return cls(fft.rfft2(frames, sides), norm, sides)
-
-    def alike(self, expected: "_Spectra", index: Array) -> float:
-        """Mean likeness of the frames, taken in some order, to those expected."""
-        cross = fft.irfft2(self.spectrum[index] * np.conj(expected.spectrum), self.sides).max((1, 2))
-        norm = self.norm[index] * expected.norm
-        return float(np.minimum(np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0).mean())
+        return np.array([[turned[k].alike(expected[k % 2], index) for k in _EVERY] for index in orders])
 
 
 def _way(stated: Array, back: Array) -> tuple[int, bool]:
@@ -178,14 +156,14 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
     """Order and orientation of the frames, judged against the images at some parameters."""
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
-    order, reordered, seen = _order(light, expected, noise, frames.model)
+    order, reordered, seen = _order(light, expected[0], noise, frames.model)
     orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
     alike, shifts = _ways(frames, expected, orders)
     orientation, clearly = _orientation(light, expected, noise)
     if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
         reordered, clearly = _plainest(light, expected, noise, order, orientation)
     chosen = reordered, orientation if clearly else 0
-    apart = {k: _apart(k, expected, light, noise) for k in frames.orientations()}
+    apart = {k: _apart(k, expected, light, noise) for k in _EVERY}
     found = Arrangement(
         stage_zero_um=float(x[PLACE["stage_zero_um"]]),
         distance_um=float(x[PLACE["distance_um"]]),
@@ -208,22 +186,22 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
     return replace(found, others=tuple(others))
 
 
-def _ways(frames: _Frames, expected: Array, orders: dict[bool, Array]) -> tuple[dict[Way, float], dict[Way, Shift]]:
+def _ways(frames: _Frames, expected: Both, orders: dict[bool, Array]) -> tuple[dict[Way, float], dict[Way, Shift]]:
     """Mean likeness and shift (y, x) of the frames, by whether they are reordered and by orientation."""
     alike, shifts = {}, {}
-    for way in itertools.product(orders, frames.orientations()):
+    for way in itertools.product(orders, _EVERY):
         index = orders[way[0]]
-        found = _compare(turn(frames.light[index], way[1]), expected, frames.noise[index])
+        found = _compare(turn(frames.light[index], way[1]), expected[way[1] % 2], frames.noise[index])
         alike[way] = float(np.mean([score for score, _ in found]))
         y, x = np.median([shift for _, shift in found], axis=0).tolist()
         shifts[way] = y, x
     return alike, shifts
 
 
-def _apart(k: int, expected: Array, light: Array, noise: Array) -> float:
+def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
     """Chi-square between the nominal images, as bright as the light, and these turned about the chief ray."""
-    odd = expected[:, 1 - expected.shape[1] % 2 :, 1 - expected.shape[2] % 2 :]  # pixel n // 2 is its middle
-    unlike = ((turn(odd, k) - odd) ** 2).sum((1, 2)) * _brightness(light, expected, noise) ** 2
+    odd = [one[:, 1 - one.shape[1] % 2 :, 1 - one.shape[2] % 2 :] for one in expected]  # pixel n // 2 is its middle
+    unlike = ((turn(odd[0], k) - odd[k % 2]) ** 2).sum((1, 2)) * _brightness(light, expected[0], noise) ** 2
     return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
@@ -236,15 +214,21 @@ def _reversed(model: ForwardModel) -> Array:
     return back
 
 
-def _expected(model: ForwardModel, x: Array, clipped: Array) -> Array:
+def _expected(model: ForwardModel, x: Array, clipped: Array) -> Both:
     """Nominal frames without background, clipped in as large a share of their pixels as the measured ones."""
+    upright = _clipped(model, x, clipped)
+    square = model.setting.rows == model.setting.columns
+    return upright, upright if square else _clipped(model.exchanged(), x, clipped)
+
+
+def _clipped(model: ForwardModel, x: Array, clipped: Array) -> Array:
     images = model.images(_bare(x))[0]
     tops = [np.quantile(image, 1 - share) for image, share in zip(images, clipped, strict=True)]
-    return _prepare(np.minimum(images, np.array(tops)[:, None, None]))
+    return above_rim(np.minimum(images, np.array(tops)[:, None, None]))
 
 
 def _compare(light: Array, expected: Array, noise: Array) -> list[tuple[float, tuple[float, float]]]:
-    return [_likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
+    return [likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
 
 
 def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
@@ -279,23 +263,21 @@ def _brightness(light: Array, expected: Array, noise: Array) -> float:
 
 def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift that makes them most alike."""
-    _, (dy, dx) = _likeness(a, b, 0.0)
+    _, (dy, dx) = likeness(a, b, 0.0)
     return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
 
 
-def _plainest(light: Array, expected: Array, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
+def _plainest(light: Array, expected: Both, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
     """(reordered, turned): the least that explains the frames, of reordering, turning and both."""
     turned = turn(light, orientation)
     ways = {(True, False): light[order], (False, True): turned, (True, True): turned[order]}
-    scores = {way: _mean_likeness(frames, expected, noise) for way, frames in ways.items()}
+    seen = {way: expected[orientation % 2 if way[1] else 0] for way in ways}
+    scores = {way: _mean_likeness(frames, seen[way], noise) for way, frames in ways.items()}
     return next(way for way, score in scores.items() if score > max(scores.values()) - 5e-3)
 
 
-def _orientation(light: Array, expected: Array, noise: Array) -> tuple[int, bool]:
-    scores = np.full(8, -1.0)
-    for k in range(0, 8, 1 if light.shape[1] == light.shape[2] else 2):
-        scores[k] = _mean_likeness(turn(light, k), expected, noise)
-    return _plainest_turn(scores)
+def _orientation(light: Array, expected: Both, noise: Array) -> tuple[int, bool]:
+    return _plainest_turn(np.array([_mean_likeness(turn(light, k), expected[k % 2], noise) for k in _EVERY]))
 
 
 def _plainest_turn(scores: Array) -> tuple[int, bool]:
@@ -310,37 +292,6 @@ def _bare(x: Array) -> Array:
     for name in ("background_e", "background_x_e", "background_y_e"):
         out[PLACE[name]] = 0.0
     return out
-
-
-def _prepare(frames: Array) -> Array:
-    """Frames less a plane through their rim, holes filled by the frame's median."""
-    out = np.empty(frames.shape)
-    ny, nx = frames.shape[1:]
-    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
-    rim = np.ones((ny, nx), bool)
-    rim[2:-2, 2:-2] = False
-    for i, frame in enumerate(frames):
-        filled = np.where(np.isfinite(frame), frame, np.nanmedian(frame))
-        design = np.stack([np.ones(rim.sum()), x[rim], y[rim]], 1)
-        plane = np.linalg.lstsq(design, filled[rim], rcond=None)[0]
-        out[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
-    return out
-
-
-def _likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
-
-    The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
-    """
-    power = float((a**2).sum())
-    norm = math.sqrt(max(power - noise**2, 0.1 * power)) * float(np.linalg.norm(b))
-    if norm == 0:
-        return 0.0, (0.0, 0.0)
-    shape = [2 * s for s in a.shape]
-    cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
-    row, column = np.unravel_index(int(cross.argmax()), cross.shape)
-    shift = [int(i) - s if i >= s // 2 else int(i) for i, s in ((row, shape[0]), (column, shape[1]))]
-    return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
 def rearranged(values: Array, arrangement: Arrangement) -> Array:

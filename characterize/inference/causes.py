@@ -11,7 +11,17 @@ import numpy as np
 from scipy import ndimage
 
 from characterize.inference.search import Task
-from characterize.model import LIGHT, MODES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Setting, basis, prior_rad
+from characterize.model import (
+    LIGHT,
+    MODES,
+    PARAMETERS,
+    PLACE,
+    UNFITTED,
+    ForwardModel,
+    background,
+    basis,
+    prior_rad,
+)
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
@@ -75,6 +85,7 @@ def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Ite
         yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True)
     light = image - background(x, task.model.setting)
     yield Change("vibration or blur along one direction", _along_one(light))
+    yield Change("pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)", _of_mosaic(light))
     if len(image) > 2:
         yield from _of_frames(light, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
@@ -203,6 +214,12 @@ def _along_one(light: Array) -> Array:
     return np.stack([xx - yy, 2 * np.gradient(np.gradient(light, axis=1), axis=2)])
 
 
+def _of_mosaic(light: Array) -> Array:
+    """(3, n, y, x): light of every second pixel, as waves over rows, columns and both; the fourth share is the gain."""
+    y, x = ((-1.0) ** np.arange(n) for n in light.shape[1:])
+    return np.stack([light * y[:, None], light * x, light * y[:, None] * x])
+
+
 def _curvature(light: Array) -> Array:
     return np.stack([ndimage.laplace(frame, mode="nearest") for frame in light])
 
@@ -214,12 +231,3 @@ def on_pixels(model: ForwardModel, share: float) -> ForwardModel:
     part.setting = dataclasses.replace(model.setting, pixel_um=pixel_um)
     part.grid = dataclasses.replace(model.grid, pixel_um=pixel_um)
     return part
-
-
-def background(x: Array, setting: Setting) -> Array:
-    """(rows, columns) electrons of the background plane."""
-    rows, columns = setting.rows, setting.columns
-    edge_y = (np.arange(rows) - rows // 2)[:, None] / (rows / 2)
-    edge_x = (np.arange(columns) - columns // 2)[None] / (columns / 2)
-    along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
-    return np.asarray(x[PLACE["background_e"]] + along)

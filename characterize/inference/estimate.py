@@ -195,7 +195,9 @@ def _arranged_words(found: Arrangement) -> list[str]:
 
 def _as_laid(task: Task, found: Arrangement) -> Task:
     """The task with its frames laid as found, and its windows held where the light then lies."""
-    model = task.model.about(search.window_um(found, task.model.setting.pixel_um))
+    aside = found.clearly and found.orientation % 2 == 1
+    model = task.model.exchanged() if aside else task.model
+    model = model.about(search.window_um(found, model.setting.pixel_um))
     return dataclasses.replace(task, model=model, data=_rearranged(task.data, found), found=found)
 
 

@@ -20,7 +20,7 @@ from scipy import stats
 from characterize.inference import causes
 from characterize.inference.leastsquares import Solution
 from characterize.inference.search import Task
-from characterize.model import PLACE
+from characterize.model import PLACE, background
 from metalens.ground.arrays import Array
 
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
@@ -242,7 +242,7 @@ class Fitted:
 
 def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean:
     """The shift of the light at which a fainter copy of it explains most; its chance is that of the best of many."""
-    light = image - causes.background(x, task.model.setting)
+    light = image - background(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
     places = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
     places = [p for p in places if max(abs(p[0]), abs(p[1])) >= _NEAREST_PX]

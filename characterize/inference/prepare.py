@@ -61,6 +61,7 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
         capture.pixel_um,
         rows,
         columns,
+        fill=capture.fill,
     ), window
 
 
@@ -144,7 +145,9 @@ def stated(capture: Capture, lens: Lens) -> list[Known]:
     held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
     known += [Known(name, _number(capture, name), 0.0) for name in held if name in capture.about]
     if "pixel_sigma_um" in capture.about:
-        known.append(Known("pixel_percent", 0.0, 100 * _number(capture, "pixel_sigma_um") / capture.pixel_um))
+        known.append(
+            Known("pixel_percent", 0.0, 100 * _number(capture, "pixel_sigma_um") / (capture.fill * capture.pixel_um))
+        )
     return known
 
 

@@ -120,8 +120,9 @@ def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Fi
     """
     wave = capture.wavelength_um if math.isfinite(capture.wavelength_um) else design.wavelength_um
     sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.sensor_distance_um)
+    within = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
     y, x = (
-        (np.arange(n * _FINE) - (n * _FINE - 1) / 2) / _FINE - p for n, p in zip(shape, place_px[::-1], strict=True)
+        (np.arange(n)[:, None] - (n - 1) / 2 - p + within).ravel() for n, p in zip(shape, place_px[::-1], strict=True)
     )
     u = 2 * math.pi * sine / wave * capture.pixel_um * np.hypot(x[None], y[:, None])
     safe = np.maximum(u, 1e-9)

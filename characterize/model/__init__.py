@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from characterize.model.pillars import incidence_rad as incidence_rad
     from characterize.model.setting import LIGHT as LIGHT
     from characterize.model.setting import Setting as Setting
+    from characterize.model.setting import background as background
     from characterize.model.setting import light_maps as light_maps
     from characterize.model.setting import spectrum as spectrum
     from characterize.model.setting import true_depth as true_depth
@@ -41,6 +42,7 @@ __getattr__, __dir__, __all__ = attach(
         "PLACE": "parameters",
         "Setting": "setting",
         "UNFITTED": "parameters",
+        "background": "setting",
         "basis": "thinplate",
         "detector": "",
         "extra_path": "glass",

@@ -34,6 +34,7 @@ class Grid:
 
     rows, columns: pixels of the window. oversample: fine samples per pixel side.
     margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief ray.
+    fill: width of a pixel over the pitch.
     """
 
     rows: int
@@ -42,11 +43,17 @@ class Grid:
     oversample: int = 1
     margin: int = 2
     middle_um: tuple[float, float] = (0.0, 0.0)
+    fill: float = 1.0
 
     @property
     def fine_um(self) -> float:
         """Pitch of the fine samples."""
         return self.pixel_um / self.oversample
+
+    @property
+    def wide_um(self) -> float:
+        """Width of a pixel."""
+        return self.fill * self.pixel_um
 
     def axes_um(self) -> tuple[Array, Array]:
         """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows // 2, columns // 2)."""
@@ -90,7 +97,7 @@ class Grid:
         f = fft.fftfreq(count, self.fine_um)
         at = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
         place = np.arange(m * o + o // 2, (m + pixels) * o, o)[:, None] - np.arange(count)
-        parts = [fft.ifft(np.sinc(f * self.pixel_um) * at * part).real for part in gauss(f, np.zeros(1), sigma_um)]
+        parts = [fft.ifft(np.sinc(f * self.wide_um) * at * part).real for part in gauss(f, np.zeros(1), sigma_um)]
         return parts[0][place % count].astype(kind), parts[1][place % count].astype(kind)
 
 
@@ -104,19 +111,19 @@ def transfers(
     Args:
         sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over the source's. kind: of the sums.
     """
-    pixel_um = grid.pixel_um
+    wide_um = grid.wide_um
     if not sizes_um.any() and not sized:
-        blur, by_blur = grid.sums(crosstalk_px * pixel_um, kind)
-        return blur, {"crosstalk_px": by_blur.times(pixel_um)}
+        blur, by_blur = grid.sums(crosstalk_px * wide_um, kind)
+        return blur, {"crosstalk_px": by_blur.times(wide_um)}
     fy, fx = grid.frequencies()
-    smooth, by_sigma = gauss(fy, fx, crosstalk_px * pixel_um)
-    square = pixel(fy, fx, pixel_um)
+    smooth, by_sigma = gauss(fy, fx, crosstalk_px * wide_um)
+    square = pixel(fy, fx, wide_um)
     shared, image = square * smooth, [disc(fy, fx, size) for size in sizes_um]
-    some = np.maximum(sizes_um, _LEAST_DISC * pixel_um)
+    some = np.maximum(sizes_um, _LEAST_DISC * wide_um)
     seen = np.stack([disc(fy, fx, size)[1] for size in some]) * shrink[:, None, None]
     whole = np.stack([value for value, _ in image])
     slopes: dict[str, Blur] = {
-        "crosstalk_px": square * by_sigma * pixel_um * whole,
+        "crosstalk_px": square * by_sigma * wide_um * whole,
         "pinhole_um": shared * seen,
         "growth": shared * np.stack([slope for _, slope in image]) * shrink[:, None, None],
     }

@@ -17,7 +17,7 @@ from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
-from characterize.model.setting import LIGHT, Setting, light_maps, spectrum, true_depth
+from characterize.model.setting import LIGHT, Setting, background, brightness, light_maps, spectrum, true_depth
 from characterize.model.window import Operators
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -73,7 +73,8 @@ class ForwardModel:
         self.lens, self.setting = lens, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
         over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
-        self.grid = detector.Grid(setting.rows, setting.columns, setting.pixel_um, over, setting.margin)
+        s = setting
+        self.grid = detector.Grid(s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill)
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
@@ -81,8 +82,6 @@ class ForwardModel:
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
         self.stage_centre_um = float(setting.depth_um.mean())
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
-        self._edge_y = (np.arange(setting.rows) - setting.rows // 2)[:, None] / (setting.rows / 2)
-        self._edge_x = (np.arange(setting.columns) - setting.columns // 2)[None] / (setting.columns / 2)
 
     def _group(self, angle_rad: Array) -> _Group:
         setting = self.setting
@@ -120,6 +119,13 @@ class ForwardModel:
         part.grid = dataclasses.replace(self.grid, middle_um=(float(middle_um[0]), float(middle_um[1])))
         if max(abs(v) for v in middle_um) > reach:  # wants more directions
             part._kept, part.groups = {}, [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)]
+        return part
+
+    def exchanged(self) -> "ForwardModel":
+        """The same model of frames with rows and columns exchanged: those of a camera on its side."""
+        part, s = copy.copy(self), self.setting
+        part.setting = dataclasses.replace(s, rows=s.columns, columns=s.rows)
+        part.grid = dataclasses.replace(self.grid, rows=s.columns, columns=s.rows)
         return part
 
     def rough(self, tolerance: float) -> "ForwardModel":
@@ -166,30 +172,24 @@ class ForwardModel:
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
         light, slopes = self._light(x, wanted)
-        n, s, scale = len(light), self.setting, self._scale(x)
+        n, s, centre_um = len(light), self.setting, self.stage_centre_um
+        scale = brightness(x, s, centre_um=centre_um, reference_um=self.reference_um) / self.area_um2
         sampled = scale[:, None, None] * light
-        image = sampled + x[PLACE["background_e"]]
-        image = image + x[PLACE["background_x_e"]] * self._edge_x + x[PLACE["background_y_e"]] * self._edge_y
+        image = sampled + background(x, s)
         if wanted is None:
             return image, None
         out = np.zeros((len(wanted), n, s.rows, s.columns))
         plain: dict[str, Any] = {"background_e": 1.0, "log_gain": sampled}
-        plain |= {"background_x_e": self._edge_x, "background_y_e": self._edge_y}
+        plain |= dict(zip(("background_y_e", "background_x_e"), s.edges, strict=True))
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
         if "stage_zero_um" in wanted or "stage_scale" in wanted:
-            depth = true_depth(x, self.setting, self.stage_centre_um)
-            rates: dict[str, Any] = {"stage_zero_um": 1.0, "stage_scale": self.setting.depth_um - self.stage_centre_um}
+            depth = true_depth(x, s, centre_um)
+            rates: dict[str, Any] = {"stage_zero_um": 1.0, "stage_scale": s.depth_um - centre_um}
             for name, rate in rates.items():
                 if name in wanted:  # light falls as the square of the depth
                     out[list(wanted).index(name)] += (-2 * rate / depth)[:, None, None] * sampled
         return image, out
-
-    def _scale(self, x: Array) -> Array:
-        """(n,) electrons in a pixel for unit |E|² density: gain, exposure, distance of the source, pixel area."""
-        depth = true_depth(x, self.setting, self.stage_centre_um)
-        gain = np.exp(x[PLACE["log_gain"]]) * self.setting.pixel_um**2 / self.area_um2
-        return np.asarray(gain * self.setting.exposure * (self.reference_um / depth) ** 2)
 
     def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""

@@ -47,15 +47,20 @@ def helix():
     return design.make(phase, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=b.proxy())[0]
 
 
+def task_of(shots, lens):
+    """What a fit begins with."""
+    setting, window = setting_of(shots, 64)
+    model, data = ForwardModel(lens, setting, b.RESPONSE), data_of(clean(shots), window)
+    return Task(model, data, vector(), {}, arranging.arrange(model, data, scan_um=60.0))
+
+
 def laid(way, *, peak_e=6000.0):
     """How frames of a helix as made seem to lie whose camera lies some way, and how a fit takes them."""
     light = bench.irradiance(helix(), b.truth(), b.RESPONSE)
     shots = b.capture(light * (peak_e / light.max()) + bench.background(b.truth()))
     shots = dataclasses.replace(shots, frames=np.ascontiguousarray(turn(shots.frames, way)))
-    setting, window = setting_of(shots, 64)
-    model, data = ForwardModel(helix(), setting, b.RESPONSE), data_of(clean(shots), window)
-    found = arranging.arrange(model, data, scan_um=60.0)
-    whole = Task(model, data, vector(), {}, found)
+    whole = task_of(shots, helix())
+    found = whole.found
     return found, search.oriented([estimate._as_laid(whole, one) for one in (found, *found.others)]).found
 
 
@@ -65,6 +70,23 @@ def test_half_a_turn_that_images_hardly_show_is_told_by_a_fit(way, back):
     seen, taken = laid(way)
     assert (taken.orientation, taken.clearly, taken.reordered, taken.alike) == (back, back != 0, False, ())
     assert abs(seen.stage_zero_um - b.VALUES["stage_zero_um"]) < 20  # astigmatism moves the best focus by as much
+
+
+@pytest.mark.parametrize("way", [1, 5])
+def test_frames_of_a_camera_on_its_side_that_are_not_square_lie_as_if_never_turned(way):
+    """Of 12 rows and 16 columns as the lens has them; the camera wrote 16 rows and 12 columns."""
+    light = bench.irradiance(helix(), b.truth(), b.RESPONSE)
+    shots = b.capture(light * (6000.0 / light.max()) + bench.background(b.truth()))
+    wide = dataclasses.replace(shots, frames=np.ascontiguousarray(shots.frames[:, 2:14]))
+    aside = dataclasses.replace(shots, frames=np.ascontiguousarray(turn(wide.frames, way)))
+    plain, turned = (task_of(some, helix()) for some in (wide, aside))
+    assert turned.data.electrons.shape == (5, 16, 12)
+    back = next(k for k in range(8) if np.array_equal(turn(turn(wide.frames, way), k), wide.frames))
+    assert (turned.found.orientation, turned.found.clearly, plain.found.clearly) == (back, True, False)
+    laid, stays = (estimate._as_laid(task, task.found) for task in (turned, plain))
+    assert np.array_equal(laid.data.electrons, stays.data.electrons)
+    x = vector(b.VALUES)
+    assert np.array_equal(laid.model.images(x)[0], stays.model.images(x)[0])
 
 
 def test_half_a_turn_that_noise_hides_is_said():

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from characterize.captures import Spectra, above_rim, likeness
 from characterize.inference import arrange
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Data
@@ -27,7 +28,7 @@ def test_a_shifted_picture_is_alike_at_its_shift(shift):
     picture = np.zeros((11, 14))
     picture[4:8, 5:9] = RNG.uniform(1, 3, (4, 4))
     moved = np.roll(picture, shift, (0, 1))
-    score, found = arrange._likeness(1.7 * moved, picture, 0.0)
+    score, found = likeness(1.7 * moved, picture, 0.0)
     assert score == pytest.approx(1, rel=1e-9)
     assert found == shift
     assert arrange._distance(moved, picture) == pytest.approx(0, abs=1e-9)
@@ -44,8 +45,8 @@ def test_noise_is_taken_off_the_norm_and_never_more_than_nine_tenths():
     power, cross = (picture**2).sum(), (picture * other).sum()
     for noise, left in ((0.3 * power**0.5, 0.91 * power), (5 * power**0.5, 0.1 * power)):
         want = min(cross / np.sqrt(left * (other**2).sum()), 1.0)
-        assert arrange._likeness(picture, other, noise)[0] == pytest.approx(want, rel=1e-9)
-    assert arrange._likeness(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
+        assert likeness(picture, other, noise)[0] == pytest.approx(want, rel=1e-9)
+    assert likeness(picture, 0 * other, 0.0) == (0.0, (0.0, 0.0))
 
 
 def test_a_scan_sees_the_likeness_of_frames_in_their_order():
@@ -53,8 +54,8 @@ def test_a_scan_sees_the_likeness_of_frames_in_their_order():
     light, expected = RNG.normal(0, 1, (2, 3, 7, 10)) ** 3
     expected[2] = 0
     noise, back = np.array([0.3, 60.0, 1.1]), np.array([2, 1, 0])
-    plain = [arrange._likeness(light[j], expected[i], noise[j])[0] for i, j in enumerate(back)]
-    spectra = arrange._Spectra.of(light, noise), arrange._Spectra.of(expected, np.zeros(3))
+    plain = [likeness(light[j], expected[i], noise[j])[0] for i, j in enumerate(back)]
+    spectra = Spectra.of(light, noise), Spectra.of(expected, np.zeros(3))
     assert spectra[0].alike(spectra[1], back) == pytest.approx(np.mean(plain), rel=1e-9)
 
 
@@ -77,7 +78,7 @@ def test_frames_lose_the_plane_of_their_rim_and_holes_take_the_median():
     frame = 30 + 2.0 * x - 5 * y
     frame[4, 5:8] += 70.0
     frame[3, 3] = np.nan
-    got = arrange._prepare(np.stack([frame, 2 * frame]))
+    got = above_rim(np.stack([frame, 2 * frame]))
     want = np.zeros((9, 12))
     want[4, 5:8] = 70.0
     want[3, 3] = np.nanmedian(frame) - (30 + 2 * x - 5 * y)[3, 3]
@@ -94,11 +95,12 @@ def test_turned_pictures_are_turned_back(orientation):
         for k in range(8)
     }
     light = arrange.turn(expected, back[orientation])
-    found, clearly = arrange._orientation(light, expected, np.zeros(3))
+    found, clearly = arrange._orientation(light, (expected, expected), np.zeros(3))
     assert (found, clearly) == (orientation, orientation != 0)
-    if orientation % 2:
-        wide = np.pad(expected, ((0, 0), (0, 0), (2, 2)))
-        assert arrange._orientation(wide, wide, np.zeros(3)) == (0, False)
+    upright, aside = (np.pad(expected, ((0, 0), (y, y), (x, x))) for y, x in ((0, 2), (2, 0)))
+    wide = arrange.turn(aside if orientation % 2 else upright, back[orientation])
+    assert wide.shape == upright.shape
+    assert arrange._orientation(wide, (upright, aside), np.zeros(3)) == (orientation, orientation != 0)
 
 
 @pytest.mark.parametrize("way", [(True, False), (False, True), (True, True)])
@@ -109,14 +111,14 @@ def test_of_order_and_turn_the_least_is_said_that_explains_the_frames(way):
     back = next(k for k in range(8) if np.array_equal(arrange.turn(arrange.turn(expected, turned), k), expected))
     light = arrange.turn(expected, turned) if way[1] else expected
     light = light[np.argsort(order)] if way[0] else light
-    assert arrange._plainest(light, expected, np.zeros(4), order, back) == way
+    assert arrange._plainest(light, (expected, expected), np.zeros(4), order, back) == way
 
 
 def test_of_ways_that_explain_frames_alike_the_order_is_said():
     """Frames that all are one round spot: order and turn change nothing."""
     y, x = np.mgrid[-6:7, -6:7]
     expected = np.repeat(np.exp(-(x**2 + y**2) / 8.0)[None], 4, 0)
-    assert arrange._plainest(expected, expected, np.zeros(4), np.array([2, 0, 3, 1]), 5) == (True, False)
+    assert arrange._plainest(expected, (expected, expected), np.zeros(4), np.array([2, 0, 3, 1]), 5) == (True, False)
 
 
 def test_turns_by_hand():
@@ -169,7 +171,8 @@ class _Stack:
 
     def __init__(self, index=range(9)):
         self.index = np.array(index)
-        self.setting = SimpleNamespace(depth_um=100.0 * (5 + self.index), angle_rad=np.zeros((len(self.index), 2)))
+        angles = np.zeros((len(self.index), 2))
+        self.setting = SimpleNamespace(depth_um=100.0 * (5 + self.index), angle_rad=angles, rows=15, columns=17)
         self.groups = groups(range(len(self.index))).groups
 
     def only(self, index):
@@ -177,6 +180,9 @@ class _Stack:
 
     def rough(self, _):
         return self
+
+    def exchanged(self):
+        return SimpleNamespace(images=lambda x: (self.images(x)[0].swapaxes(1, 2),))
 
     def images(self, x):
         at = self.index + x[PLACE["distance_um"]] / 25 + x[PLACE["stage_zero_um"]] / 1e4

@@ -12,7 +12,8 @@ from scipy import stats
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
-from characterize.inference import arrange, causes, estimate, leastsquares, missing, verdict
+from characterize.captures import likeness as likeness_of
+from characterize.inference import causes, estimate, leastsquares, missing, verdict
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Data, Prior
 from characterize.inference.missing import Fitted, Lean
@@ -74,7 +75,7 @@ def test_spots_of_twice_the_width_are_the_lens_and_of_seven_times_another(wider,
     wide (0.28) is one of another lens, or far from the depths."""
     told = 1.1 if wider > 1 else 8.0
     seen, told = gaussian(told * wider), gaussian(told)
-    likeness, _ = arrange._likeness(3.7 * seen, told, 0.0)
+    likeness, _ = likeness_of(3.7 * seen, told, 0.0)
     assert likeness == pytest.approx(2 * wider / (1 + wider**2), abs=0.02)  # of pixels, and the rim of the picture
     found = SimpleNamespace(likeness=likeness)
     lens = SimpleNamespace(profile="hyperbolic")

@@ -42,7 +42,8 @@ def spot(width):
 def test_a_stack_end_to_end_is_worth_a_twentieth_less_than_one_as_stated(monkeypatch, turned, want):
     """Both are wholly alike; what is stated is right unless the other is clearly better."""
     stack = np.array([spot(w) for w in (1.2, 1.9, 2.7, 3.6)])
-    monkeypatch.setattr(arrange, "_expected", lambda model, x, clipped: stack)
+    aside = np.swapaxes(np.roll(stack, 1, 0), 1, 2)  # of another lens
+    monkeypatch.setattr(arrange, "_expected", lambda model, x, clipped: (stack, aside))
     seen = 5.3 * (stack[::-1] if turned else stack)
     frames = _Frames(None, None, seen, np.zeros(4), np.zeros(4), np.arange(4)[::-1])
     assert frames.scanned(vector(), np.zeros(1))[1] == pytest.approx(want, abs=1e-6)

@@ -1,0 +1,63 @@
+"""How much alike two frames are, wherever the light lies in them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from metalens.ground.arrays import Array
+
+
+def above_rim(frames: Array) -> Array:
+    """Frames less a plane through their rim, holes filled by the frame's median."""
+    out = np.empty(frames.shape)
+    ny, nx = frames.shape[1:]
+    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
+    rim = np.ones((ny, nx), bool)
+    rim[2:-2, 2:-2] = False
+    for i, frame in enumerate(frames):
+        filled = np.where(np.isfinite(frame), frame, np.nanmedian(frame))
+        design = np.stack([np.ones(rim.sum()), x[rim], y[rim]], 1)
+        plane = np.linalg.lstsq(design, filled[rim], rcond=None)[0]
+        out[i] = filled - (plane[0] + plane[1] * x + plane[2] * y)
+    return out
+
+
+def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
+    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
+
+    The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
+    """
+    power = float((a**2).sum())
+    norm = math.sqrt(max(power - noise**2, 0.1 * power)) * float(np.linalg.norm(b))
+    if norm == 0:
+        return 0.0, (0.0, 0.0)
+    shape = [2 * s for s in a.shape]
+    cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
+    row, column = np.unravel_index(int(cross.argmax()), cross.shape)
+    shift = [int(i) - s if i >= s // 2 else int(i) for i, s in ((row, shape[0]), (column, shape[1]))]
+    return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Spectra:
+    """Frames as :func:`likeness` correlates them: spectra (n, u, v) of twice the side, norms (n,) freed of noise."""
+
+    spectrum: Array
+    norm: Array
+    sides: tuple[int, int]
+
+    @classmethod
+    def of(cls, frames: Array, noise: Array) -> "Spectra":
+        """Of frames with noise of some norm, (n,)."""
+        power = (frames**2).sum((1, 2))
+        norm = np.sqrt(np.maximum(power - noise**2, 0.1 * power))
+        sides = 2 * frames.shape[1], 2 * frames.shape[2]
+        return cls(fft.rfft2(frames, sides), norm, sides)
+
+    def alike(self, expected: "Spectra", index: Array) -> float:
+        """Mean likeness of the frames, taken in some order, to those expected."""
+        cross = fft.irfft2(self.spectrum[index] * np.conj(expected.spectrum), self.sides).max((1, 2))
+        norm = self.norm[index] * expected.norm
+        return float(np.minimum(np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0).mean())
