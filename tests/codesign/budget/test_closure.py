@@ -24,7 +24,9 @@ from codesign.eye.population import Rig
 from codesign.optics import Numerics, formed, image_difference
 from metalens.ground.errors import ConfigError, LensError
 
-FRAMES = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0)
+FRAMES = ExperimentConfig(
+    subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0, people=9
+)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
 from tests.referees.seen_pupil import pupil_of
 
-SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0)
+SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, people=9)
 
 
 @pytest.fixture(scope="module")
