@@ -15,7 +15,7 @@ from codesign.optics import formed
 from metalens.ground.errors import ConfigError, SceneError
 from metalens.image import Grid, Imager, Normalisation, axial_information, imager, integrate, scene
 from metalens.lens import Lens, reach
-from metalens.psf import View, from_lens
+from metalens.psf import View, from_lens, passed_um2
 
 WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 
@@ -165,7 +165,7 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
             )
         )
     light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(len(angles), s.count)
-    share = light / passed_um2(lens) / torch.cos(torch.tensor([a for a, _ in angles]))[:, None]
+    share = light / torch.as_tensor(np.array([passed_um2(lens, angle, tuple(depths)) for angle in angles]))
     inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
     slices = intensity[0, 0].sum(1)
     return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error), slices)
@@ -296,10 +296,5 @@ def lens_basis(
     stack = from_lens(lens, view, tolerance=1e-3)
     intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
     pixels = integrate(intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1))  # odd: centred
-    light = float(torch.as_tensor(stack.energy_um2).min()) / passed_um2(lens)
+    light = float((stack.energy_um2[0] / passed_um2(lens, (0.0, 0.0), depths.tolist())).min())
     return scene.basis(pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance), min(light, 1.0)
-
-
-def passed_um2(lens: Lens) -> float:
-    """Light through the lens at unit irradiance: sum of |T|² times the cell's area."""
-    return float((lens.transmission() ** 2).sum()) * lens.diameters.pitch_um**2

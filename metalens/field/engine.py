@@ -15,6 +15,7 @@ from metalens.field.patches import relative
 from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
 from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
+from metalens.field.through import through
 from metalens.field.waves import SmoothWave, Wave, wave_of
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
@@ -106,10 +107,13 @@ def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
 
 def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
-    total = light.sum((-2, -1))
-    reduced = optics.layers.after(optics.distance_um, float(plan.waves.wavelengths_um.mean())).reduced_um
-    cosine2 = 1 / (1 + (plan.y_um[:, None] ** 2 + plan.x_um**2) / reduced**2)
-    return light / total[..., None, None], total * (cosine2**2)[..., None].to(total)
+    total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
+    slope = (
+        torch.hypot(plan.y_um[:, None], plan.x_um).numpy() / optics.layers.after(optics.distance_um, wave).reduced_um
+    )
+    rays = [optics.layers.through_middle(slope, depth, wave) for depth in plan.depths_um.tolist()]
+    cosine2 = torch.from_numpy(1 / (1 + np.stack(rays, -1) ** 2))
+    return light / total[..., None, None], total * (cosine2**2).to(total)
 
 
 def _folded(optics: Optics, plan: Plan) -> Tensor:
@@ -185,7 +189,9 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     ends = 1 / plan.depths_um[[0, -1]]
     depths = 1 / (ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64))
     true = spectral(optics, at, depths, plan.waves, plan.window).detach()
-    outside = 1 - float(true.sum((-1, -2)).mean())
+    wave = float(plan.waves.wavelengths_um[0])
+    whole = through(optics, at, depths_um=depths, wavelength_um=wave, window=plan.window)
+    outside = 1 - float((true.sum((-1, -2)) / whole).mean())
     true = true / true.sum((-1, -2), keepdim=True)
     with torch.no_grad():
         got = psfs_used(made, pixels, depths)
@@ -195,7 +201,6 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
     found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
-    wave = float(plan.waves.wavelengths_um[0])
     found["pillars"] = gathered.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
         found["stop"] = _ripples(optics, wave, few, blur_um(true[:NEGLECTED].cpu().numpy(), plan.window.step_um))

@@ -2,9 +2,10 @@
 
     I(X) = Σ_sheets Σ_points L(x) E(x, z) P(X; x, z)
 
-E: relative illumination: cos⁴ of the field angle (projected aperture and solid angle of a sample) times the light of
-the PSF's window. 1 is what an ideal lens of the same aperture sends to a sample on the axis from radiance 1; the
-irradiance in watts is that times π NA'² L with sin of the rim's angle NA' (small angles: area / distance²).
+E: relative illumination: cos⁴ of the field angle (projected aperture and solid angle of a sample; of the ray through
+the middle of the stop where there is one) times the light of the PSF's window. 1 is what an ideal lens of the same
+aperture sends to a sample on the axis from radiance 1; the irradiance in watts is that times π NA'² L with sin of the
+rim's angle NA' (small angles: area / distance²).
 The near sheet hides the far one as in :mod:`metalens.image.scene`; where one sheet is seen, the sum is as above, and
 frames whose far sheet covers all take that sum alone, at less than half the cost.
 """
@@ -39,7 +40,8 @@ class Imager:
         the field that are left out, all but a scalar where that is within the tolerance), edge (light that the rim
         bends out of the window, and that the transform folds back), pillars (taken together a few micrometres at a
         time; 0 of a smooth phase), stop (of its shadow, where there is one).
-        Beside them ``outside``: light that windows leave out.
+        Beside them ``outside``: of the light that goes through the lens (:mod:`metalens.field.through`), what
+        windows leave out.
     stray: light of other diffraction orders, None where the lens tells nothing of them.
     """
 

@@ -187,9 +187,8 @@ def _one(
     light = light if factor is None else light * factor.to(torch.complex64)
     total: float | Tensor = pupil.given * grid.size**2 / (1 - grid.beyond)
     if optics.layers.stop is not None:
-        about = tuple(tangents.tolist()), found, tuple(depths_um.tolist())
-        light = light * through_stop(optics.layers, *about, wavelength_um)
-        total = total * _taken(optics, depths_um, wavelength_um).to(found.passed.device, torch.float32)
+        shade, taken = stopped(optics, tangents, found, depths_um, wavelength_um)
+        light, total = light * shade, total * taken
     mixed = None
     if grid.components:
         fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
@@ -201,11 +200,15 @@ def _one(
     return torch.cat([_shown(_fluxes(part, mixed, aside, grid.size), ends, moves) for part in parts]) / total
 
 
-def _taken(optics: Optics, depths_um: Tensor, wavelength_um: float) -> Tensor:
-    """(depths, 1, 1) light through the stop over that on the whole lens, of sources on the axis."""
-    radius = optics.wave.radius_um
-    each = [(optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2 for depth in depths_um.tolist()]
-    return torch.tensor(each)[:, None, None]
+def stopped(
+    optics: Optics, tangents: Tensor, found: Rays, depths_um: Tensor, wavelength_um: float
+) -> tuple[Tensor, Tensor]:
+    """Of each source, (depths, nodes, nodes) amplitude behind the stop over that without, and (depths, 1, 1) light on
+    the stop over that on the whole lens, of sources on the axis."""
+    depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
+    shade = through_stop(optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um)
+    each = [(optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2 for depth in depths]
+    return shade, torch.tensor(each, device=shade.device)[:, None, None]
 
 
 def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:

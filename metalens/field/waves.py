@@ -128,6 +128,10 @@ class PillarWave:
         :meth:`factor` asks for them."""
         return self._among(self._pillars(wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0)[0])
 
+    def transmittance(self, wavelength_um: float, angle_rad: float) -> float:
+        """Mean |t|² of the pillars."""
+        return float((self.answer(wavelength_um, angle_rad).abs() ** 2).sum() / (self.diameter_um > 0).sum())
+
     def _among(self, t: Tensor) -> Tensor:
         """With the factor of unlike neighbours where the lens holds their rows."""
         if self.lens.neighbours is None:
@@ -150,6 +154,10 @@ class PillarWave:
         """(complex t, carrier, 1 where a pillar stands) of every pillar, in single precision."""
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
+        if compiled.values(d):
+            phases, levels = torch.empty(2, *d.shape)
+            answers.put_all(proxy, d.detach().numpy(), (wavelength_um, tilt), phases.numpy(), levels.numpy())
+            return torch.polar(levels, phases), self._ideal, open_
         inside = torch.where(d > 0, d, torch.full_like(d, proxy.domain_um[0]))
         phase: Any = proxy.phase_rad(inside, wavelength_um, tilt)
         level: Any = proxy.transmission(inside, wavelength_um, tilt)

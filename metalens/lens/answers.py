@@ -33,10 +33,16 @@ def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> Non
         turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
         phase[:], level[:] = (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(at[0], at[1])
         return
-    d, loop = np.asarray(lens.diameters.diameter_um), _fill
-    numbers = polynomials(lens.proxy, d, at)
-    turned = lens.diameters.angle_rad
-    turn = np.zeros((len(d), 0)) if turned is None else np.asarray(lens.geometric_rad(slice(None)))
+    turned = None if lens.diameters.angle_rad is None else np.asarray(lens.geometric_rad(slice(None)))
+    put_all(lens.proxy, np.asarray(lens.diameters.diameter_um), at, phase, level, turned)
+
+
+def put_all(
+    proxy: Proxy, d: Array, at: tuple[float, float], phase: Array, level: Array, turned: Array | None = None
+) -> None:
+    """As :func:`fill`, of (y, x) diameters in um; turned: (y, x) phase in rad that is added."""
+    loop, numbers = _fill, polynomials(proxy, d, at)
+    turn = np.zeros((len(d), 0)) if turned is None else turned
     split(len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b]))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from metalens.cell import Film, Index, Material, index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, PropagationError
+from metalens.lens import media
 from metalens.lens.media import Media
 from metalens.lens.stop import Stop, crossing, left_out, lit_um, passed, shadow
 
@@ -84,6 +85,21 @@ class Layers:
         if thick + left == 0:
             return None
         return _media(tuple(found), "air", thick + left, wavelength_um, "stop to lens")
+
+    def through_middle(self, slope: Array, depth_um: float, wavelength_um: float) -> Array:
+        """Slopes in air of the rays through the middle of the stop from sources at this depth, whose rays to the middle
+        of the lens have these slopes; the same without a stop, and of collimated light."""
+        if self.stop is None or self.stop.distance_um == 0 or math.isinf(depth_um):
+            return slope
+        before, between = self._around_stop(depth_um, wavelength_um)
+        if before is None or between is None:
+            return slope
+        inner = dict(between.layers)
+        outer = [(n, t - inner.get(n, 0.0)) for n, t in before.layers]
+        outer = [(n, t) for n, t in outer if t > 1e-9 * depth_um]
+        far = slope / np.sqrt(1 + slope**2)
+        p = media.direction(Media(*zip(*outer, strict=True)), media.reach(before, far))
+        return np.asarray(p / np.sqrt(1 - p * p))
 
     def lit(
         self,

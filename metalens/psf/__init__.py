@@ -17,14 +17,15 @@ if TYPE_CHECKING:
     from metalens.psf.budget import Budget as Budget
     from metalens.psf.budget import LeftOut as LeftOut
     from metalens.psf.budget import Polarisation as Polarisation
+    from metalens.psf.budget import aperture as aperture
     from metalens.psf.budget import scalar_error as scalar_error
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
     from metalens.psf.metrics import blur_um as blur_um
     from metalens.psf.of_lens import View as View
-    from metalens.psf.of_lens import aperture as aperture
     from metalens.psf.of_lens import from_lens as from_lens
+    from metalens.psf.of_lens import passed_um2 as passed_um2
     from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
     from metalens.psf.record import PsfStack as PsfStack
@@ -56,7 +57,7 @@ __getattr__, __dir__, __all__ = attach(
         "SourceShape": "record",
         "View": "of_lens",
         "among": "",
-        "aperture": "of_lens",
+        "aperture": "budget",
         "beyond_faces": "vector",
         "blur_um": "metrics",
         "export": "",
@@ -66,6 +67,7 @@ __getattr__, __dir__, __all__ = attach(
         "load": "record",
         "of_flux": "vector",
         "on_pixels": "pixels",
+        "passed_um2": "of_lens",
         "plots": "",
         "psf_stack": "stack",
         "save": "record",

@@ -15,13 +15,14 @@ import numpy as np
 from scipy.special import jv
 
 from metalens.ground.arrays import Array
-from metalens.lens import CURVED, Neighbours
+from metalens.lens import CURVED, Lens, Neighbours, media
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
 # pillars among unlike neighbours, solved rows of 12 and 8 of the default cell: amplitude 0.986, -0.066 rad at sine
 # 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
 ANGLE = 2.5  # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst pillar off resonance
+RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
@@ -151,6 +152,29 @@ def with_model(
 def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
     """Of one scalar: of a perfect lens in one medium, and of films as measured on the light."""
     return _together(scalar_error(aperture, uneven), budget.polarisation)
+
+
+def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
+    """Half the spread in sin θ of the rays from the lens to the chief ray's place on the sensor."""
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
+    centre = float(media.reach(after, sine))
+    edges = centre + np.array([-1.0, 1.0]) * (lens.diameters.radius_um + lens.diameters.pitch_um / 2)
+    p = np.sign(edges) * media.direction(after, np.abs(edges))
+    return float((p[1] - p[0]) / 2 / after.order[-1])
+
+
+def uneven(lens: Lens, angle_rad: tuple[float, float]) -> float:
+    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the chief ray's place on the sensor."""
+    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    centre = float(media.reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))))
+    node, share = np.polynomial.legendre.leggauss(RINGS)
+    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt((node + 1) / 2)[:, None]
+    turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
+    p = media.direction(after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn)))
+    weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)
+    mean = share @ weight.mean(1) / 2
+    return float(np.sqrt(share @ ((weight - mean) ** 2).mean(1) / 2) / mean)
 
 
 def scalar_error(aperture: float, uneven: float = 0.0) -> float:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,18 @@ from metalens.propagate import paths
 from metalens.psf import among
 from metalens.psf import spectrum as spectra
 from metalens.psf.among import Jones
-from metalens.psf.budget import Budget, LeftOut, Polarisation, scalar_error, with_model, worst
+from metalens.psf.budget import (
+    RINGS,
+    SPOKES,
+    Budget,
+    LeftOut,
+    Polarisation,
+    aperture,
+    scalar_error,
+    uneven,
+    with_model,
+    worst,
+)
 from metalens.psf.extended import Extent, reach
 from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Measured, Nodes, Source
@@ -28,7 +40,6 @@ ROWS, NEARBY = 64, 1e-4  # rows of pillars whose delays are taken, and how far a
 TRIES = 3  # at a spectrum: the light of one tells the paths for the next
 PILOT, PILOT_ERROR = 5, 1e-3  # wavelengths, and their tolerance, by which the light of a whole spectrum is foreseen
 SPARE = 0.7  # of the tolerance that is asked for by that light, so that one try does
-RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
@@ -285,29 +296,6 @@ def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation,
     return polarisation
 
 
-def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Half the spread in sin θ of the rays from the lens to the chief ray's place on the sensor."""
-    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
-    centre = float(media.reach(after, sine))
-    edges = centre + np.array([-1.0, 1.0]) * (lens.diameters.radius_um + lens.diameters.pitch_um / 2)
-    p = np.sign(edges) * media.direction(after, np.abs(edges))
-    return float((p[1] - p[0]) / 2 / after.order[-1])
-
-
-def uneven(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the chief ray's place on the sensor."""
-    after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    centre = float(media.reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))))
-    node, share = np.polynomial.legendre.leggauss(RINGS)
-    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt((node + 1) / 2)[:, None]
-    turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
-    p = media.direction(after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn)))
-    weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)
-    mean = share @ weight.mean(1) / 2
-    return float(np.sqrt(share @ ((weight - mean) ** 2).mean(1) / 2) / mean)
-
-
 def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
     """Angle in rad at which the pillars are asked for light from a direction: 0 where their library has no angles."""
     return float(np.arctan(np.hypot(*np.tan(angle_rad)))) if lens.proxy.max_angle_rad > 0 else 0.0
@@ -329,11 +317,19 @@ def _all_maps(
     return (phase, level), among.jones(phase, level, lens.neighbours, lens.diameters.pitch_um)
 
 
-def pillar_maps(lens: Lens, wavelength_um: float, angle_rad: tuple[float, float]) -> tuple[Array, Array]:
-    """(phase wrapped to ±π, transmission) of every pillar for light from a direction; 0 where there is no pillar."""
-    phase, level = (np.empty(lens.diameters.diameter_um.shape) for _ in range(2))
-    answers.fill(lens, (wavelength_um, incidence(lens, angle_rad)), phase, level)
-    return phase, level
+def passed_um2(lens: Lens, angle_rad: tuple[float, float], depths_um: Sequence[float]) -> Array:
+    """(depths,) light that leaves the pillars, and the faces behind them, for unit irradiance from this direction.
+
+    Σ |T S|² a at the design wavelength: S the shadow of a stop, a the area of a site.
+    """
+    nodes = Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
+    d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
+    level = _all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0].numpy()
+    places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
+    shades = (lens.layers.shadow(tangents, z, lens.wavelength_um, places, width) for z in depths_um)
+    order = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).order
+    faces = media.passed_at(order, 1 - 1 / (1 + tangents[0] ** 2 + tangents[1] ** 2))
+    return np.asarray(faces * d.site_um2 * np.array([(np.abs(level * shade) ** 2).sum() for shade in shades]))
 
 
 def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:

@@ -188,15 +188,16 @@ def test_polychromatic_psf_converges_with_the_nodes():
 
 def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.cell import Cell
-    from metalens.lens import DiameterMap, Lens
+    from metalens.lens import DiameterMap, Lens, answers
     from metalens.pillars import Proxy
-    from metalens.psf.of_lens import pillar_maps
+    from metalens.psf.of_lens import incidence
 
     angled = np.array([[[1.3, 4.0]], [[0.4, 0.0]]]), np.array([[[0.6, 0.3]], [[-0.05, 0.0]]])  # of sin² of the angle
     proxy = Proxy(*angled, (0.1, 0.3), (0.9, 0.98), 0.0, 0.0, max_angle_rad=0.5)
     sizes = np.array([[0.1, 0.0], [0.3, 0.22]])
     lens = Lens(DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map")
-    phase, level = pillar_maps(lens, 0.94, (0.17, -0.31))
+    phase, level = np.empty((2, 2)), np.empty((2, 2))
+    answers.fill(lens, (0.94, incidence(lens, (0.17, -0.31))), phase, level)
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
     tilt = np.arccos(1 / np.linalg.norm(direction))
     share = 2 * (np.sin(tilt) / np.sin(0.5)) ** 2 - 1
@@ -207,7 +208,9 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     upright = Proxy(
         angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
     )  # a library of normal incidence alone
-    assert pillar_maps(dataclasses.replace(lens, proxy=upright), 0.94, (0.17, -0.31))[1] == pytest.approx(3 * sizes)
+    flat = dataclasses.replace(lens, proxy=upright)
+    answers.fill(flat, (0.94, incidence(flat, (0.17, -0.31))), phase, level)
+    assert level == pytest.approx(3 * sizes)
 
 
 def test_metrics_of_an_oblong_spot_off_the_middle():
