@@ -4,6 +4,7 @@ YAML files are pages of refractiveindex.info (:mod:`metalens.cell.database`).
 Time factor exp(-iwt): an absorbing material has k > 0. Nothing is extrapolated.
 """
 
+import bisect
 import csv
 import importlib.resources
 import math
@@ -343,7 +344,7 @@ def _from_sellmeier(record: Material, wavelength_um: float) -> tuple[complex, co
 
 def _from_table(record: Material, wavelength_um: float) -> tuple[complex, complex]:
     x, n, k = record.table
-    i = int(np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2))
+    i = min(max(bisect.bisect_right(x, wavelength_um) - 1, 0), len(x) - 2)
     rate = complex(n[i + 1] - n[i], k[i + 1] - k[i]) / (x[i + 1] - x[i])
     share = (wavelength_um - x[i]) / (x[i + 1] - x[i])
     return complex(n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]), rate

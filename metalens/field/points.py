@@ -295,14 +295,16 @@ def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 
 @functools.lru_cache(maxsize=64)
 def _to_samples(grid: Sampling, window: Window, shift_um: float, device: torch.device) -> Samples:
-    """From the points of the padded transform to the samples along an axis: sinc² up to its second zero."""
-    harmonic = np.arange(1, grid.harmonics + 1)
+    """From the points of the padded transform to the samples along an axis: sinc² up to its second zero.
+
+    Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics to harmonics, by a transform.
+    """
+    harmonic = np.arange(grid.harmonics + 1)
     box = np.sinc(harmonic / grid.period_um * window.step_um) ** 2
     place = (np.arange(window.samples) - (window.samples - 1) / 2) * window.step_um - shift_um
-    turns = (place[:, None] / grid.period_um + np.arange(grid.size) / grid.size) % 1
-    angle = 2 * np.pi * turns[..., None] * harmonic
-    scale = window.step_um / grid.period_um
-    light = scale * (1 + 2 * np.cos(angle) @ box)
-    slope = scale * -2 * np.sin(angle) @ (box * harmonic * 2 * np.pi / grid.period_um)
+    wave = box * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
+    scale = window.step_um / grid.period_um * grid.size
+    light = scale * np.fft.irfft(wave, grid.size)
+    slope = scale * np.fft.irfft(wave * (2j * np.pi / grid.period_um * harmonic), grid.size)
     found = [torch.from_numpy(a.astype(np.float32)).to(device) for a in (light, slope, place)]
     return Samples(found[0], found[1], found[2])
