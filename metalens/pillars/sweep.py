@@ -110,7 +110,7 @@ def _misses(row: Array, sweep: Sweep) -> Array:
 
 def _evaluate(curve: Curve, diameters: Array) -> Array:
     value, error = curve(diameters)
-    return np.stack([value[:, 0], value[:, 1], error + 0j])
+    return np.stack([value[:, 0], value[:, 1], error])
 
 
 def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> Array:

@@ -267,3 +267,18 @@ def test_of_places_and_depths_the_worst_shadow_of_a_stop_counts():
         got = engine._ripples(optics, 0.8, (places, depths), blurs)
         assert got == pytest.approx(max(told.values()), rel=1e-9)
         assert max(told, key=told.get) == ((-3.0, 400.0) if blurs[2, 0] == 9.0 else (-3.0, 2100.0))
+
+
+def test_the_texture_that_kernels_are_judged_by_fills_all_depths_with_two_sheets():
+    """Each sheet over a range of 1/z of its own, together 0.2 to 0.95 of it; light of mean 1 and contrast 0.3."""
+    frames = engine.trial(Grid((57, 44), 2.0, (3e3, 9e3), window=7))
+    cover, depth = frames.coverage[0], frames.depth_um[0]
+    assert cover.sum(0).numpy() == pytest.approx(np.ones(cover.shape[1:]), abs=1e-6)
+    assert 0.2 < float(cover[0].mean()) < 0.8
+    share = (1 / depth.double() - 1 / 3e3) / (1 / 9e3 - 1 / 3e3)
+    ends = [(float(one.min()), float(one.max())) for one in share]
+    assert ends[0] == pytest.approx((0.0, 0.4), abs=1e-5)
+    assert ends[1] == pytest.approx((0.25, 0.95), abs=1e-5)
+    light = (frames.radiance[0] / cover)[cover > 1e-5]  # of both sheets, but where one is all there is
+    assert float(light.mean()) == pytest.approx(1.0, abs=0.02)
+    assert float(light.std()) == pytest.approx(0.3, abs=0.02)  # less what is cut off at 0

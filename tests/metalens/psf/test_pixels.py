@@ -1,5 +1,7 @@
 """Pixels that are added in squares: light of the fine ones, wherever the grid is moved."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -59,3 +61,8 @@ def test_a_pitch_that_is_trained_keeps_its_derivative():
     want = (float(weighed(1.7 + step)) - float(weighed(1.7 - step))) / (2 * step)
     assert float(pitch.grad) == pytest.approx(want, rel=1e-6)
     assert on_pixels(stack, pitch_um=pitch, count=9).step_um == pytest.approx(1.7)
+
+
+def test_an_error_within_the_tolerance_has_converged_the_end_included():
+    for error, met in ((0.99e-4, True), (1e-4, True), (1.01e-4, False)):
+        assert replace(made(), error=error).converged is met

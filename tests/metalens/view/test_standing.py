@@ -70,3 +70,16 @@ def test_turned_rectangles_are_drawn_turned_and_coloured_by_their_turn(tmp_path)
         column, row = int(x > 0), int(y > 0)
         assert np.degrees(angle[row, column]) == pytest.approx(outline.notes["turn / deg"], abs=1e-4)
     assert len({o.layer for o in panel.outlines}) == 4
+
+
+def test_of_a_lens_too_large_for_a_page_the_square_about_its_middle_is_drawn(monkeypatch):
+    """40 sites of 0.3 um by 0.3 um: those within 0.95 um of the axis along x and along y; an oblong lens."""
+    size = np.full((31, 18), 0.15, np.float32)
+    lens = Lens(DiameterMap(size, 0.3), Cell(0.3, 0.7, Index(3.6)), PROXY, **ABOUT)
+    monkeypatch.setattr(standing, "MOST_DRAWN", 40)
+    places = np.concatenate([o.places for o in standing.drawn(lens).outlines])
+    x, y = np.meshgrid(lens.diameters.x_um, lens.diameters.y_um)
+    inside = (np.abs(x) <= 0.949) & (np.abs(y) <= 0.949)
+    want = np.rint(1e3 * np.stack([x[inside], y[inside]], axis=-1)).astype(int)
+    assert sorted(map(tuple, places.tolist())) == sorted(map(tuple, want.tolist()))
+    assert len(want) == 7 * 6

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from metalens import lens, psf
+from metalens import library as libraries
 from metalens.cell import Cell, Index
 from metalens.commands import view
 from metalens.design import make
 from metalens.ground import store
 from metalens.ground.errors import OutputError, StoreError
+from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
 from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, artefacts, page
@@ -63,6 +65,28 @@ def test_every_pillar_is_in_the_page(folder):
     picked = tuple(np.argwhere(index > 0)[37])
     turns = design.phase_rad()[picked] / (2 * np.pi)
     assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(turns, rel=1e-5)
+
+
+def test_bands_of_a_library_are_its_bars_and_what_they_turn_the_phase_by(tmp_path):
+    """The largest turn of t by a circle of the bar's radius around it; a quarter where the bar holds 0."""
+    d = np.linspace(0.08, 0.21, 20)
+    t = (np.linspace(0.9, 0.3, 20) * np.exp(55j * d))[None, None, None]
+    bar = np.linspace(0.02, 0.28, 20)[None, None, None] * np.ones(t.shape)
+    bar[..., 7] = 0.95
+    parts = (np.zeros(1), np.array([0.85]), d, t, 0.4 * t, bar, np.ones(t.shape), np.array([[0, 0, 0.85, 0.12, 3e-3]]))
+    made = PillarLibrary(Cell(0.30, pillar=Index(3.6)), Sweep(), ("x",), *parts, "modal", 20)
+    libraries.save(tmp_path / "l.h5", made)
+    size, phase, error = artefacts.library_panels(tmp_path / "l.h5")
+    assert size.x == pytest.approx(1e3 * d)
+    assert size.lines["|r|"] == pytest.approx(0.4 * size.lines["|t|"])
+    assert size.errors["|t|"] == pytest.approx(bar)
+    assert error.lines["error bar"] == pytest.approx(bar)
+    assert np.ravel(size.bands) == pytest.approx([117.0, 123.0])
+    assert phase.lines["phase"] == pytest.approx(np.unwrap(np.angle(t)) / (2 * np.pi))
+    circle = np.exp(1j * np.linspace(0, 2 * np.pi, 3001))
+    turned = np.abs(np.angle(1 + bar[..., None] / np.abs(t)[..., None] * circle)).max(-1) / (2 * np.pi)
+    turned[..., 7] = 0.25
+    assert phase.errors["phase"] == pytest.approx(turned, rel=1e-5)
 
 
 def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(folder, monkeypatch):
