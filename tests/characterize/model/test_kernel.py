@@ -26,22 +26,24 @@ from metalens.ground.errors import FitError
 from metalens.ground.paths import source_path
 
 K = 2 * math.pi / 0.85
-CASES = {  # nominal distance, actual over nominal, lens radius, half window, tangents; um
+CASES = {  # nominal distance, actual over nominal, lens radius or half sides (x, y), half window, tangents; um
     "millimetre": (2000.0, 1.003, 500.0, 60.0, (0.0, 0.0)),
     "oblique": (2000.0, 1.0, 500.0, 60.0, (0.3, 0.2)),
     "as wide as far": (20.0, 1.0, 10.0, 10.0, (0.0, 0.0)),
     "wide and oblique": (20.0, 1.1, 8.0, 10.0, (0.3, -0.1)),
     "twice as wide": (20.0, 0.9, 8.0, 20.0, (0.0, 0.0)),
     "four times as wide": (10.3, 1.0, 4.5, 21.3, (0.0, 0.0)),
+    "of a narrow lens": (20.0, 1.0, (0.7, 12.0), 30.0, (0.0, 0.0)),
+    "of a low lens": (20.0, 1.0, (12.0, 0.7), 30.0, (0.0, 0.0)),
 }
-MOST = (14, 16, 24, 26, 46, 66)  # nodes across the window; its own path bends by 13, 13, 37, 34, 164 and 326 rad
+MOST = (14, 16, 24, 26, 46, 66, 84, 84)  # nodes across the window; its own path bends by 13 to 326 rad
 
 
 def case(name):
     """(kernel, half window)."""
     distance, share, radius, half, (tx, ty) = CASES[name]
-    edge = np.linspace(-radius, radius, 41)
-    x, y = np.meshgrid(edge - distance * tx, edge - distance * ty)
+    edge, (wide, high) = np.linspace(-1, 1, 41), np.broadcast_to(radius, 2)
+    x, y = np.meshgrid(wide * edge - distance * tx, high * edge - distance * ty)
     p, q = x / np.sqrt(x**2 + y**2 + distance**2), y / np.sqrt(x**2 + y**2 + distance**2)
     spans = (float(p.min()), float(p.max())), (float(q.min()), float(q.max()))
     return Kernel(K, *spans, distance, distance * share, (tx, ty)), half
