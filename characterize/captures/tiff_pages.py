@@ -42,7 +42,7 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
             _check(path, file)
             _check_meaning(path, file, mosaic=mosaic)
             images = np.stack(_alike([page.asarray() for page in file.pages], path))
-            planar = getattr(file.pages[0], "planarconfig", 1) == 2
+            planar = file.pages.first.planarconfig == 2
             if planar and coloured and images.ndim == 4:
                 return np.moveaxis(images, 1, -1)
             return np.asarray(images.reshape(-1, *images.shape[-2:]) if planar else images)

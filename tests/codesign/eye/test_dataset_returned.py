@@ -16,11 +16,15 @@ class Looking:
     gaze_rad: torch.Tensor
 
 
-@pytest.mark.parametrize("tolerance_px", [0.1, 0.02])
-def test_centroids_come_within_a_third_of_the_tolerance(monkeypatch, tolerance_px):
+FAR = [[12.0, -7.0], [3.0, 20.0], [-16.0, 9.0]]
+BESIDE = [[0.025, 0.025]]  # 0.035 px in all
+
+
+@pytest.mark.parametrize(("goal", "tolerance_px"), [(FAR, 0.1), (FAR, 0.02), (BESIDE, 0.1)])
+def test_centroids_come_within_a_third_of_the_tolerance(monkeypatch, goal, tolerance_px):
     """150 px a radian, bent by 60 px a radian²: a step from 25 px leaves about a pixel, the next a thousandth."""
-    goal = torch.tensor([[12.0, -7.0], [3.0, 20.0], [-16.0, 9.0]], dtype=torch.float64)
-    seen = torch.ones(3, dtype=torch.float64)
+    goal = torch.tensor(goal, dtype=torch.float64)
+    seen = torch.ones(len(goal), dtype=torch.float64)
 
     def centroids(states, gaze, rig, camera):
         x, y = gaze.unbind(1)
@@ -29,7 +33,7 @@ def test_centroids_come_within_a_third_of_the_tolerance(monkeypatch, tolerance_p
     monkeypatch.setattr(dataset, "_centroids", centroids)
     labels = SimpleNamespace(centroid_px=goal, visible=seen)
     monkeypatch.setattr(dataset, "render", lambda *_, **__: SimpleNamespace(labels=labels))
-    start = Looking(torch.zeros(3, 2, dtype=torch.float64))
+    start = Looking(torch.zeros(len(goal), 2, dtype=torch.float64))
     found, distance, good = dataset._returned(start, start, rig=None, camera=None, tolerance_px=tolerance_px)
     assert float(distance.max()) < 0.3 * tolerance_px
     assert good.all()

@@ -457,3 +457,13 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(made,
     assert ((drawn + stays) ^ die).is_empty()
     assert area == sum(p.area2() for p in drawn.each())  # nothing is drawn (and exposed) twice
     assert drc.check(plan, PROCESS.rules).pillars > (made.diameters.diameter_um > 0).sum()
+
+
+def test_sizes_are_rounded_by_no_more_than_is_told():
+    """Of 961 sizes some lie half a step of 2 nm off the drawn ones, or nearly so; none farther."""
+    size = np.random.default_rng(8).uniform(0.12, 0.26, (31, 31))
+    made = dataclasses.replace(lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4))
+    found = build.prepare(made, PROCESS)
+    drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[found.cells.classes]
+    off = np.abs(drawn - 1e3 * size).max()
+    assert 0.95 * found.cells.rounding_nm < off <= found.cells.rounding_nm * (1 + 1e-9)
