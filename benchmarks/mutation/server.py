@@ -125,19 +125,37 @@ class _Loop:
     def _outcome(
         self, items: list[pytest.Item], functions: list[FunctionType], change: tuple[str, str], limit_s: float
     ) -> tuple[str, float] | None:
-        def mutated() -> int:
-            self.first = True
-            if not patched(functions, *change):
-                return UNPATCHED
+        """A test that the plain source fails as well has told nothing: what it would have stopped has survived."""
+        with tempfile.TemporaryDirectory(prefix="failed-") as folder:
+            told = Path(folder) / "test"
+
+            def mutated() -> int:
+                self.first = True
+                if not patched(functions, *change):
+                    return UNPATCHED
+                self._run(items)
+                told.write_text("".join(self.failed), encoding="utf-8")
+                return int(bool(self.failed))
+
+            status, spent = _forked(mutated, limit_s)
+            if os.WIFSIGNALED(status):
+                slow = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL)
+                return "time" if slow else "failed", spent
+            code = os.WEXITSTATUS(status)
+            if code == UNPATCHED:
+                return None
+            name = told.read_text(encoding="utf-8") if told.exists() else ""
+        telling = [item for item in items if item.nodeid == name]
+        return "failed" if code and telling and self._passes(telling, limit_s) else "passed", spent
+
+    def _passes(self, items: list[pytest.Item], limit_s: float) -> bool:
+        """Whether the source as it is passes tests."""
+
+        def plain() -> int:
             self._run(items)
             return int(bool(self.failed))
 
-        status, spent = _forked(mutated, limit_s)
-        if os.WIFSIGNALED(status):
-            slow = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL)
-            return "time" if slow else "failed", spent
-        code = os.WEXITSTATUS(status)
-        return None if code == UNPATCHED else ("failed" if code else "passed", spent)
+        return _forked(plain, limit_s)[0] == 0
 
     def _run(self, items: list[pytest.Item]) -> None:
         for item, following in zip(items, [*items[1:], None], strict=True):
