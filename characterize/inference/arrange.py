@@ -14,7 +14,6 @@ from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 _EVERY = range(8)  # orientation
-_ROUGH = 0.02  # of the field while scanning: 4e-4 of the likeness
 Way = tuple[bool, int]  # reordered, orientation
 Shift = tuple[float, float]
 Both = tuple[Array, Array]
@@ -110,7 +109,7 @@ class _Frames:
     def of(cls, model: ForwardModel, data: Data) -> "_Frames":
         light = above_rim(np.where(data.usable, data.electrons, np.nan))
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
-        return cls(model, model.rough(_ROUGH), light, noise, data.saturated.mean((1, 2)), _reversed(model))
+        return cls(model, model.quick(), light, noise, data.saturated.mean((1, 2)), _reversed(model))
 
     def some(self, index: Array) -> "_Frames":
         """Some of the frames."""

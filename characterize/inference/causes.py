@@ -30,6 +30,7 @@ from metalens.made import Bends, maps, named
 _STITCH_UM = 0.05
 _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
+_ENOUGH = 4e-3
 _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
@@ -73,8 +74,13 @@ class Change:
     of_mask: bool = False
 
 
-def changes(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
-    """Every cause that is not among the fitted parameters."""
+def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
+    """Every cause that is not among the fitted parameters; ``slopes``: of these.
+
+    From differences of images that leave ``_ENOUGH`` of a field out: what causes are taken for moves by a percent.
+    """
+    task = dataclasses.replace(task, model=task.model.rough(max(task.model.cut, _ENOUGH)))
+    image = task.model.images(x)[0]
     yield from _of_model(task, x, image)
     if "sidewall_deg" not in task.names or task.model.lens.cell.sidewall_rad == 0:
         leaning = task.model.with_walls(math.radians(_WALL_DEG)).images(x)[0] - image

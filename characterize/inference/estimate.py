@@ -274,7 +274,8 @@ def _nominal(task: Task, fitted: dict[str, float]) -> Array:
 
 def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
     known = verdict.process_verdict(task.names, found.low, found.high, _told(task, found), unstated)
-    return _psf_verdict(verdict.predicted_error(task, found), unseen, len(task.model.groups)), known
+    errors = verdict.predicted_error(task, found), verdict.predicted_aside(task, found)
+    return _psf_verdict(*errors, unseen, len(task.model.groups)), known
 
 
 def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:
@@ -302,10 +303,12 @@ def _told(task: Task, found: Posterior) -> Array:
     return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
 
 
-def _psf_verdict(known: tuple[float, float], unseen: float, angles: int) -> str:
+def _psf_verdict(known: tuple[float, float], aside: tuple[float, float] | None, unseen: float, angles: int) -> str:
     captured, between = known
     tested = "" if np.isnan(unseen) else f"; frames left out agree within {unseen:.2f} times their noise"
     at = "at one angle" if angles == 1 else f"at the {angles} captured angles"
+    if aside is not None:
+        at += f" ({aside[0]:.1%} between these, {aside[1]:.1%} half a step beyond)"
     return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
 
 

@@ -101,12 +101,11 @@ class Unstated:
 
 
 def look(task: Task, mode: Solution) -> Looked:
-    """Look for every cause that is not fitted."""
-    model, x = task.model, task.all_of(mode.value)
-    image, slopes = model.images(x, task.names)
+    """Look for every cause that is not fitted, by the image and the slopes that a fit ended with."""
+    x, image, slopes = task.all_of(mode.value), mode.image, mode.slopes
     root = np.where(task.data.usable & ~task.data.saturated, 1 / np.sqrt(task.data.variance(image)), 0.0)
     rest = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
-    fitted = (np.asarray(slopes) * root).reshape(len(task.names), -1)
+    fitted = (slopes * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
     pull = (mode.value - task.prior.mean) * task.prior.sigma**-2.0
@@ -115,7 +114,7 @@ def look(task: Task, mode: Solution) -> Looked:
     found, unstated = [], {}
     roughly: set[str] = set()
     of_mask: set[str] = set()
-    for one in causes.changes(task, x, image, dict(zip(task.names, np.asarray(slopes), strict=True))):
+    for one in causes.changes(task, x, dict(zip(task.names, slopes, strict=True))):
         change = (one.images * root).reshape(len(one.images), -1)
         if np.any(one.sigma):
             unstated[one.cause] = np.reshape(one.sigma, (-1, 1)) * change

@@ -304,19 +304,10 @@ def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
-    pixel = model.setting.pixel_um
-    place = window_um(found, pixel)
+    place = window_um(found, model.setting.pixel_um)
     level = float(np.median(data.electrons[data.usable]))
-    base = with_values(
-        task.start,
-        {
-            "stage_zero_um": found.stage_zero_um,
-            "distance_um": found.distance_um,
-            "decentre_x_um": place[0],
-            "decentre_y_um": place[1],
-            "background_e": level,
-        },
-    )
+    lies = {"stage_zero_um": found.stage_zero_um, "distance_um": found.distance_um, "background_e": level}
+    base = with_values(task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]})
     out = []
     for bias in biases_nm:
         x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias})

@@ -15,7 +15,7 @@ from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.missing import Unstated
 from characterize.inference.posterior import Valley
 from characterize.inference.search import WAVES_RAD, Task
-from characterize.model import PARAMETERS, PLACE, ForwardModel
+from characterize.model import PARAMETERS, PLACE, ForwardModel, thinplate
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -192,16 +192,55 @@ def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array
 
 def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
     """Expected NRMSE of the as-built images: at the captured depths, and half-way between them."""
-    model = task.model.quick()  # differences of images, to a few percent
-    rng = np.random.default_rng(0)
+    model, values = task.model.quick(), _shown(task, found)  # differences of images, to a few percent
+    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
+
+
+def predicted_aside(task: Task, found: Posterior) -> tuple[float, float] | None:
+    """As :func:`predicted_error` at the captured depths: half-way between neighbouring field angles, and half a step
+    beyond the outermost; None of frames at one angle."""
+    angles = aside(task.model.setting.angle_rad)
+    if angles is None:
+        return None
+    values = _shown(task, found)
+    models = [_at_angle(task.model, angle).quick() for angle in angles]
+    between_them, beyond = (_spread(task, model, found.best.value, values) for model in models)
+    return between_them, beyond
+
+
+def aside(angle_rad: Array) -> tuple[Array, Array] | None:
+    """(x, y) half-way between the two neighbours that lie farthest apart among field angles (n, 2), and as far beyond
+    the outermost as half of its step from its neighbour; None where all are one."""
+    angles = np.unique(angle_rad, axis=0)
+    if len(angles) < 2:
+        return None
+    apart = np.hypot(*(angles[:, None] - angles).T)
+    np.fill_diagonal(apart, np.inf)
+    nearest = angles[apart.argmin(1)]
+    wide, outer = int(apart.min(1).argmax()), int(np.hypot(*(angles - angles.mean(0)).T).argmax())
+    return (angles[wide] + nearest[wide]) / 2, angles[outer] + (angles[outer] - nearest[outer]) / 2
+
+
+def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
+    """The model of all its depths at one field angle."""
+    s = model.setting
+    there = dataclasses.replace(s, angle_rad=np.broadcast_to(angle_rad, s.angle_rad.shape))
+    return (
+        ForwardModel(model.lens, there, model.response)
+        .about(model.grid.middle_um)
+        .with_residual(model.modes, thinplate.basis)
+    )
+
+
+def _shown(task: Task, found: Posterior) -> Array:
+    """(draws, p) of the posterior, within the bounds."""
     if len(found.draws):
         values = found.draws[:_SHOWN]
     else:
         size, vectors = np.linalg.eigh(found.covariance)
-        normal = rng.standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
+        normal = np.random.default_rng(0).standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
         values = found.best.value + normal @ vectors.T
-    values = np.clip(values, task.prior.low, task.prior.high)
-    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
+    return np.clip(values, task.prior.low, task.prior.high)
 
 
 def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> float:

@@ -174,7 +174,8 @@ def valleys(task: Task, modes: Sequence[Solution], name: str) -> list[Solution]:
     for _ in range(_AGAIN):
         best, few = kept[0], few_frames(task.model.setting)
         part, step = (task.problem(few), task.data.planes(few)), _WIDEST * _wide(task, best, i)
-        here = dataclasses.replace(best, merit=_misfit(task, part, best.value), slopes=best.slopes[:, few])
+        here = dataclasses.replace(best, merit=_misfit(task, part, best.value))
+        here = dataclasses.replace(here, image=best.image[few], slopes=best.slopes[:, few])
         side = functools.partial(_side, task, part, here, i, step=step, settings=_FAR)
         sides = threads.each(side, _ends(task, best, i))
         seen = Walk.of(task, [*sides[0], *sides[1], here], i)
@@ -250,12 +251,17 @@ def _side(
 
 
 def _stop(task: Task, part: Part, here: Solution, i: int, goal: float, settings: Settings) -> Solution:
-    """The others fitted with one parameter at ``goal``, from where they are or where the parabola sends them."""
+    """The others fitted with one parameter at ``goal``, from where they are or where the parabola sends them.
+
+    From there, unless they are thought to do better where they are; then from where they really do.
+    """
     known = _holding(task.prior, i, goal)
-    along = here.covariance[:, i] / here.covariance[i, i]
-    begins = here.value, here.value + along * (goal - here.value[i])
-    begin = min((np.clip(x, known.low, known.high) for x in begins), key=lambda x: _misfit(task, part, x))
-    return _fitted(task, part, begin, known, settings)
+    way = here.covariance[:, i] / here.covariance[i, i] * (goal - here.value[i])
+    alone, along = (np.clip(x, known.low, known.high) for x in (here.value, here.value + way))
+    straight = here.image + np.tensordot(alone - here.value, here.slopes, 1)
+    least = _misfit(task, part, along)
+    far = least > _measured(task, part[1], alone, straight) and _misfit(task, part, alone) < least
+    return _fitted(task, part, alone if far else along, known, settings)
 
 
 def _amid(task: Task, part: Part, ends: tuple[Solution, Solution], i: int, goal: float, settings: Settings) -> Solution:

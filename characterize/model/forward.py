@@ -17,8 +17,9 @@ from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
-from characterize.model.setting import LIGHT, Setting, background, brightness, light_maps, spectrum, true_depth
+from characterize.model.setting import LIGHT, Setting, background, brightness, dimming, light_maps, spectrum, true_depth
 from characterize.model.window import Operators
+from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path
@@ -70,10 +71,9 @@ class ForwardModel:
                 f"the lens has layers ({len(lens.layers.films)} films, cover {lens.layers.filling}, {lens.layers.stop})"
                 ", the model of the fit has air alone: fit a lens that has no layers; its distance is then that in air"
             )
-        self.lens, self.setting = lens, setting
+        self.lens, self.setting, s = lens, setting, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
         over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
-        s = setting
         self.grid = detector.Grid(s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill)
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
@@ -172,23 +172,20 @@ class ForwardModel:
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
         light, slopes = self._light(x, wanted)
-        n, s, centre_um = len(light), self.setting, self.stage_centre_um
+        s, centre_um = self.setting, self.stage_centre_um
         scale = brightness(x, s, centre_um=centre_um, reference_um=self.reference_um) / self.area_um2
         sampled = scale[:, None, None] * light
         image = sampled + background(x, s)
         if wanted is None:
             return image, None
-        out = np.zeros((len(wanted), n, s.rows, s.columns))
+        out = np.zeros((len(wanted), *light.shape))
         plain: dict[str, Any] = {"background_e": 1.0, "log_gain": sampled}
         plain |= dict(zip(("background_y_e", "background_x_e"), s.edges, strict=True))
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
-        if "stage_zero_um" in wanted or "stage_scale" in wanted:
-            depth = true_depth(x, s, centre_um)
-            rates: dict[str, Any] = {"stage_zero_um": 1.0, "stage_scale": s.depth_um - centre_um}
-            for name, rate in rates.items():
-                if name in wanted:  # light falls as the square of the depth
-                    out[list(wanted).index(name)] += (-2 * rate / depth)[:, None, None] * sampled
+        for name, rate in dimming(x, s, centre_um).items():
+            if name in wanted:
+                out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return image, out
 
     def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
@@ -217,10 +214,12 @@ class ForwardModel:
     ) -> tuple[Array, dict[str, Array]]:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
-        phase, kind = self._phase(x, group), group.reduced.kind
-        phasor = np.exp(1j * phase).astype(kind) if np.iscomplexobj(phase) else turns(phase, kind)
-        lens = self._pupil(x, group, bool(names))
-        operators, lit = self._operators(x, group), lens[0] * phasor
+        operators, phasor, lens = threads.beside(
+            lambda: self._operators(x, group),
+            lambda: turns(self._phase(x, group), group.reduced.kind),
+            lambda: self._pupil(x, group, bool(names)),
+        )
+        lit = lens[0] * phasor
         coarse = operators.coarse(lit, self.cut)
         field = operators.envelope(coarse)
         intensity = field.real**2 + field.imag**2

@@ -127,7 +127,9 @@ class Kernel:
 
 
 def turns(phase: Array, kind: Any = np.complex64) -> Array:
-    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double."""
+    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex one makes light fade."""
+    if np.iscomplexobj(phase):
+        return np.exp(1j * phase).astype(kind)
     out = np.empty(np.shape(phase), kind)
     whole = phase * (1 / (2 * np.pi))
     small = (whole - np.rint(whole)).astype(out.real.dtype) * out.real.dtype.type(2 * np.pi)

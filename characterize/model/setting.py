@@ -57,6 +57,12 @@ def brightness(x: Array, setting: Setting, *, centre_um: float, reference_um: fl
     return np.asarray(gain * setting.exposure * (reference_um / depth) ** 2)
 
 
+def dimming(x: Array, setting: Setting, centre_um: float) -> dict[str, Array]:
+    """(n,) relative changes of :func:`brightness` by the stage: light falls as the square of the depth."""
+    rate = -2 / true_depth(x, setting, centre_um)
+    return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
+
+
 def background(x: Array, setting: Setting) -> Array:
     """(rows, columns) electrons of the background plane."""
     edge_y, edge_x = setting.edges

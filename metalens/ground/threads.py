@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -55,6 +55,18 @@ def split(count: int, work: Callable[[int, int], object]) -> None:
     if stop is not None and stop.is_set():
         raise Stopped
     _shared(count, min(threads(), count), work)
+
+
+def beside(*works: Callable[[], Any]) -> list[Any]:
+    """Results of several calls, side by side where there are threads; see :func:`split`."""
+    out = dict[int, Any]()
+
+    def some(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            out[i] = works[i]()
+
+    split(len(works), some)
+    return [out[i] for i in range(len(works))]
 
 
 def apart(count: int, work: Callable[[int, int], object]) -> None:

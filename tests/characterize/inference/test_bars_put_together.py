@@ -141,11 +141,12 @@ def test_without_a_known_gain_nothing_is_said_of_the_residuals_and_electrons_are
 
 def test_the_psf_s_verdict_has_both_errors_and_frames_left_out_where_there_are_enough():
     short = "the PSF is known to 1.2% at the captured depths and 4.6% between them, at one angle"
-    assert estimate._psf_verdict((0.0123, 0.0456), math.nan, 1) == short
+    assert estimate._psf_verdict((0.0123, 0.0456), None, math.nan, 1) == short
     several = "the PSF is known to 1.2% at the captured depths and 4.6% between them, at the 3 captured angles"
-    assert estimate._psf_verdict((0.0123, 0.0456), math.nan, 3) == several
+    several += " (2.3% between these, 6.8% half a step beyond)"
+    assert estimate._psf_verdict((0.0123, 0.0456), (0.0234, 0.0678), math.nan, 3) == several
     longer = short + "; frames left out agree within 1.31 times their noise"
-    assert estimate._psf_verdict((0.0123, 0.0456), 1.31, 1) == longer
+    assert estimate._psf_verdict((0.0123, 0.0456), None, 1.31, 1) == longer
 
 
 def test_the_lens_as_designed_is_seen_through_the_bench_that_was_fitted():

@@ -11,7 +11,7 @@ from scipy import stats
 from characterize.inference import missing
 from characterize.inference.causes import Change
 from characterize.inference.missing import Fitted, Lean
-from characterize.model import vector
+from characterize.model import Setting, vector
 
 RNG = np.random.default_rng(77)
 SHAPE = (3, 4, 5)
@@ -115,7 +115,9 @@ def looked(monkeypatch, changes):
         model=SimpleNamespace(images=lambda x, names: (image, ALONG)), data=data, all_of=lambda value: value,
         prior=SimpleNamespace(sigma=np.array([0.3, 2.1]), mean=np.zeros(2)), names=("one", "two"),
     )  # fmt: skip
-    mode = SimpleNamespace(value=np.zeros(2), residual_sigma=RNG.normal(size=SHAPE), chi2_per_dof=1.0)
+    mode = SimpleNamespace(
+        value=np.zeros(2), residual_sigma=RNG.normal(size=SHAPE), chi2_per_dof=1.0, image=image, slopes=ALONG
+    )
     monkeypatch.setattr(missing.causes, "changes", lambda *_: changes)
     monkeypatch.setattr(missing, "_ghost", lambda *_: Lean("a ghost", 4.0, 1, 0.03))
     return missing.look(task, mode), 1 / np.sqrt(2.5 * image + 9.0)
@@ -164,7 +166,7 @@ def test_light_is_moved_by_whole_pixels(shift):
 def ghost(rows, columns, shift, amount=1.0, taken=False, dark=0.0):
     """(the lean, chi-square of the copy by itself) where the residuals are a copy of the light with that of 20."""
     x = vector({"background_e": 41.0, "background_x_e": 13.0, "background_y_e": -7.0})
-    setting = SimpleNamespace(rows=rows, columns=columns)
+    setting = Setting(np.ones(2), np.zeros((2, 2)), np.ones(2), 1.5, rows, columns)
     light, root = RNG.uniform(size=(2, rows, columns)) ** 6 * 900, RNG.uniform(0.1, 0.3, (2, rows, columns))
     plane = 41 + 13 * (np.arange(columns) - columns // 2) / (columns / 2)
     plane = plane - 7 * (np.arange(rows) - rows // 2)[:, None] / (rows / 2)

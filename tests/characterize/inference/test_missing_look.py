@@ -22,7 +22,9 @@ def looked(monkeypatch, chi2_per_dof, patched=False):
     model = SimpleNamespace(images=lambda x, names: (IMAGE, SLOPES))
     prior = SimpleNamespace(sigma=np.array([0.3, 2.1]), mean=np.array([-0.4, 1.3]))
     task = SimpleNamespace(model=model, data=data, prior=prior, names=("one", "two"), all_of=lambda value: value)
-    mode = SimpleNamespace(value=np.array([0.2, -3.0]), residual_sigma=RESIDUAL, chi2_per_dof=chi2_per_dof)
+    mode = SimpleNamespace(
+        value=np.array([0.2, -3.0]), residual_sigma=RESIDUAL, chi2_per_dof=chi2_per_dof, image=IMAGE, slopes=SLOPES
+    )
     monkeypatch.setattr(missing.causes, "changes", lambda *_: ())
     monkeypatch.setattr(missing, "_ghost", lambda *_: missing.Lean("ghost", 0.0, 0, 1.0))
     monkeypatch.setattr(missing, "_patch", lambda *_: missing.Lean("patch", 4.0, int(patched), 0.03))

@@ -302,13 +302,24 @@ def _begun(monkeypatch):
     return told
 
 
-@pytest.mark.parametrize("best", ["parabola", "here"])
-def test_a_stop_begins_where_the_parabola_or_the_place_itself_misses_less(monkeypatch, best):
-    """From (2, 1, 0.4) to 1.8 of the second: by C_i / C_ii, (0.2, 0.49, -0.3) / 0.49 times 0.8; within the bounds."""
+@pytest.mark.parametrize(("best", "thought"), [("parabola", 7.2), ("parabola", -0.1), ("here", 0.1), ("lost", 7.2)])
+def test_a_stop_begins_where_the_parabola_or_the_place_itself_misses_less(monkeypatch, best, thought):
+    """From (2, 1, 0.4) to 1.8 of the second: by C_i / C_ii, (0.2, 0.49, -0.3) / 0.49 times 0.8; within the bounds.
+
+    The place itself is thought to have the straight image 5.3 + 0.8 times 1.7, and asked only where that is better.
+    """
     told, about, part = _begun(monkeypatch), SimpleNamespace(prior=prior(high=8.0)), (None, None)
-    want = np.array([2 + 0.8 * 0.2 / 0.49, 1.8, 0.4 - 0.8 * 0.3 / 0.49]) if best == "parabola" else (2.0, 1.8, 0.4)
-    monkeypatch.setattr(walk, "_misfit", lambda task, part, x: float(np.abs(x - want).sum()))
-    walk._stop(about, part, mode(1.0), 1, 1.8, None)
+    along, alone = np.array([2 + 0.8 * 0.2 / 0.49, 1.8, 0.4 - 0.8 * 0.3 / 0.49]), np.array([2.0, 1.8, 0.4])
+    want, lower = (alone if best == "here" else along), (along if best == "parabola" else alone)
+    asked = []
+    monkeypatch.setattr(walk, "_misfit", lambda task, part, x: asked.append(x) or float(np.abs(x - lower).sum()))
+    monkeypatch.setattr(
+        walk, "_measured", lambda task, data, x, image: thought if image == [5.3 + 0.8 * 1.7] else math.nan
+    )
+    here = mode(1.0, slopes=np.array([[9.0], [1.7], [9.0]]))
+    here.image = np.array([5.3])
+    walk._stop(about, part, here, 1, 1.8, None)
+    assert len(asked) == (1 if thought == 7.2 else 2)
     ((begin, known, slopes),) = told
     assert begin == pytest.approx(want, rel=1e-12)
     assert slopes is None
@@ -333,7 +344,7 @@ def test_valleys_are_sought_on_few_frames_from_the_lowest_places_and_again_from_
     """The three lowest places of the walk but the best's own; a fit that is lower by more than 1 begins it anew."""
     asked, followed = [], []
     heights = {-6.0: 6.0, -5.0: 30.0, -3.0: 4.0, -2.0: 50.0, 3.0: 12.0, 4.0: 7.0, 5.0: 15.0, 6.0: 5.0}
-    free = {"information": np.eye(3), "slopes": np.arange(15.0).reshape(3, 5)}
+    free = {"information": np.eye(3), "slopes": np.arange(15.0).reshape(3, 5), "image": np.arange(5.0)}
 
     def side(task, part, here, i, end, *, step, settings):
         asked.append((part, here.value[i], here.merit, here.slopes.tolist(), end, step))

@@ -84,7 +84,9 @@ def test_causes_are_scored_over_the_scatter_that_is_there(monkeypatch, chi2, spr
         model=model, all_of=lambda x: x, data=data, names=("bias_nm",),
         prior=SimpleNamespace(sigma=np.array([prior]), mean=np.array([0.7])),
     )  # fmt: skip
-    mode = SimpleNamespace(value=np.array([0.3]), residual_sigma=off, chi2_per_dof=chi2)
+    mode = SimpleNamespace(
+        value=np.array([0.3]), residual_sigma=off, chi2_per_dof=chi2, image=image, slopes=slope[None]
+    )
     monkeypatch.setattr(causes, "changes", lambda *_: [causes.Change("made", change[None])])
     for name in ("_ghost", "_patch"):
         monkeypatch.setattr(missing, name, lambda *_: Lean("none", 0.0, 0, 1.0))
@@ -124,9 +126,7 @@ def test_the_noise_of_a_frame_is_that_of_its_usable_pixels():
     data.usable[0, 2:4, 1:3] = False
     data.saturated[1, 0, :3] = True
     groups = [SimpleNamespace(index=np.array([0, 1]))]
-    model = SimpleNamespace(
-        rough=lambda cut: None, groups=groups, setting=SimpleNamespace(depth_um=np.array([1.0, 2.0]))
-    )
+    model = SimpleNamespace(quick=lambda: None, groups=groups, setting=SimpleNamespace(depth_um=np.array([1.0, 2.0])))
     found = arrange._Frames.of(model, data)
     variance = (data.variance_e2 + light / 1.6) * data.usable
     assert found.noise == pytest.approx([math.sqrt(v.sum()) for v in variance], rel=1e-12)
