@@ -7,12 +7,13 @@ are the same directions share it: what was computed last is kept.
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.lens import Layers, Media, media
+from metalens.lens import Layers, Media, media, smooth
 
 VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
 KEPT = 4  # field points whose rays are kept: a few MB each
@@ -129,7 +130,7 @@ def _source_paths(
     layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float | None
 ) -> Paths:
     """As :func:`source_paths`; without films in front no wavelength is needed."""
-    given = layers, tangents, (seen.x_um, seen.y_um)
+    given = layers, tangents, seen
     if len(depths_um) <= VERGENCES:
         few = _each(*given, depths_um, wavelength_um)
         return Paths(few, torch.eye(len(depths_um), dtype=few.dtype, device=few.device))
@@ -147,12 +148,12 @@ def _source_paths(
 def _each(
     layers: Layers,
     tangents: tuple[float, float],
-    at_um: tuple[Tensor, Tensor],
+    seen: Rays,
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
 ) -> Tensor:
-    """(depths, *shape) paths in um, one depth after the other."""
-    x, y = at_um
+    """(depths, *shape) paths in um, one depth after the other; beyond the rim, behind films, those of places at it."""
+    x, y = seen.x_um, seen.y_um
     slope = math.hypot(*tangents)
     p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
     out = []
@@ -168,9 +169,13 @@ def _each(
             chief = math.sqrt(depth**2 + sx**2 + sy**2)
             out.append(before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief))
         else:
-            away = torch.hypot(x - sx, y - sy)
-            out.append(
-                media.chord(before, away)
-                - media.chord(before, torch.tensor(math.hypot(sx, sy), dtype=p.dtype, device=x.device))
-            )
+            chief = float(media.chord(before, np.float64(math.hypot(sx, sy))))
+            away2 = (x - sx) ** 2 + (y - sy) ** 2
+            away2 = away2.clamp(max=float((away2 * (seen.whole > 0)).max()))
+            out.append(smooth.over(functools.partial(_chord, before), away2) - chief)
     return torch.stack(out)
+
+
+def _chord(before: Media, away2: Any) -> Any:
+    """:func:`metalens.lens.media.chord` of the squared reach; NumPy or torch."""
+    return media.chord(before, away2**0.5)

@@ -17,7 +17,7 @@ from torch import Tensor
 from metalens.design import Focus
 from metalens.field import compiled
 from metalens.ground.errors import SceneError
-from metalens.lens import Lens, Media, answers, media
+from metalens.lens import Lens, Media, answers, media, smooth
 from metalens.psf import among
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
@@ -203,7 +203,7 @@ def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
 def _longer(between: Media, r2: Tensor) -> Tensor:
     """Optical path of the ray of squared reach r² less that along the normal, um."""
     if len(between.layers) > 1:
-        extra: Tensor = media.longer(between.layers, 0.0, 0.0, r2)[1]
+        extra: Tensor = smooth.over(lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2)
         return extra
     n, d = between.layers[0]
     return n * r2 / (torch.sqrt(r2 + d * d) + d)

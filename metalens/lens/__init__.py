@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from metalens.lens import media as media
     from metalens.lens import picture as picture
     from metalens.lens import reach as reach
+    from metalens.lens import smooth as smooth
     from metalens.lens.diameters import DiameterMap as DiameterMap
     from metalens.lens.layers import Layers as Layers
     from metalens.lens.layers import check_gaps as check_gaps
@@ -54,6 +55,7 @@ __getattr__, __dir__, __all__ = attach(
         "reach": "",
         "saddle": "waves",
         "save": "record",
+        "smooth": "",
         "streamed": "record",
     },
 )

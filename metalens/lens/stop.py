@@ -23,16 +23,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import chebyshev, polynomial
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
-from metalens.lens import media
+from metalens.lens import media, smooth
 from metalens.lens.edge import behind
 from metalens.lens.media import Media
 
 BENT, INNER = 0.005, 0.055  # of PSFs of 60 lenses against plane waves through the glass
-DEGREE = 8  # of f over the squared way from source to pillars: to rounding up to 45 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +79,12 @@ def crossing(
 
 def _share(before: Media, between: Media, away2: Any) -> Any:
     """f of the heading, of the squared lateral way from source to pillars."""
-    low, high = float(away2.min()), float(away2.max())
-    middle, reach = (low + high) / 2, max((high - low) / 2, 1e-9 * high, 1e-12)
 
     def exact(u: Any) -> Any:
-        w = media.square(before.layers, middle + reach * u)
+        w = media.square(before.layers, u)
         return media.bend(between.layers, w) / media.bend(before.layers, w)
 
-    powers = chebyshev.cheb2poly(chebyshev.chebinterpolate(exact, DEGREE))
-    return polynomial.polyval((away2 - middle) / reach, powers)
+    return smooth.over(exact, away2)
 
 
 def passed(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
