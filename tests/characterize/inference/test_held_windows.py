@@ -55,9 +55,9 @@ def test_a_fit_whose_windows_were_held_off_its_decentre_is_put_there_and_finds_n
 
 
 def test_a_search_holds_its_windows_before_its_long_fits_and_takes_short_ones_by_the_quick_model(monkeypatch):
-    """Short fits of four steps know the place to a third of a pixel: every long fit begins with windows held there, by
-    all terms of the model; none begins where frames were seen to lie, 0.7 and 0.8 pixels off. (Long fits first and
-    windows after them took a sixth more time, and a Jacobian by all terms for each short step.)"""
+    """Short fits of four steps know the place to a third of a pixel: all terms of the model are asked with windows held
+    there only, never where frames were seen to lie, 0.7 and 0.8 pixels off. (Long fits first and windows after them
+    took a sixth more time.)"""
     order, long, problem = [], search._long, search.residual.problem
 
     def followed(task, value, *more):
@@ -71,10 +71,19 @@ def test_a_search_holds_its_windows_before_its_long_fits_and_takes_short_ones_by
     monkeypatch.setattr(search, "_long", followed)
     monkeypatch.setattr(search.residual, "problem", asked)
     there, _ = search.search(task())
-    first = [one[0] for one in order].index("long")
-    assert {cut for _, _, _, cut in order[:first]} == {there.model.quick().cut}
-    assert order[first][3] == there.model.cut == 0.0
-    for kind, x, y, _ in order:
-        if kind == "long":
-            assert (x, y) == pytest.approx(PLACE_UM, abs=0.5)
-    assert there.model.grid.middle_um == order[first][1:3]
+    whole = [k for k, one in enumerate(order) if one[3] == 0.0]
+    assert {cut for *_, cut in order[: whole[0]]} == {there.model.quick().cut}
+    assert {one[0] for one in order} == {"asked", "long"}
+    for k in whole:
+        assert order[k][1:3] == pytest.approx(PLACE_UM, abs=0.5)
+    assert there.model.grid.middle_um == order[whole[0]][1:3]
+
+
+def test_most_of_the_way_to_the_best_is_gone_by_the_quick_model():
+    """From several sigma off to within one of the lowest place, which the whole model has to find alone."""
+    begun = task()
+    begun = dataclasses.replace(begun, model=begun.model.about(PLACE_UM))
+    best = search.refine(begun, search.starts(begun, biases_nm=(0.0,))[0][[search.PLACE[n] for n in begun.names]])
+    off = np.array([1.0, -2.0, 1.5, 3.0, -1.0, 2.0, 1.0][: len(best.value)]) * np.sqrt(np.diag(best.covariance))
+    near = search._nearer(begun, best.value + off)
+    assert search._apart(best.value + off, best) > 3.0 > 1.0 > search._apart(near.value, best)

@@ -57,6 +57,18 @@ def test_every_part_is_done_once_by_torchs_threads():
     assert seen.tolist() == [1] * 11
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_calls_side_by_side_give_their_results_in_order(count):
+    """Where there are threads, two calls wait for each other: one after the other they would not end."""
+    before, gate = torch.get_num_threads(), threading.Barrier(2 if count > 1 else 1, timeout=20)
+    torch.set_num_threads(count)
+    try:
+        made = threads.beside(lambda: (gate.wait(), 7)[1], lambda: (gate.wait(), "wide")[1])
+    finally:
+        torch.set_num_threads(before)
+    assert made == [7, "wide"]
+
+
 def test_parts_that_stay_apart_have_one_thread_of_torch_each_and_give_them_back():
     before = torch.get_num_threads()
     torch.set_num_threads(3)
