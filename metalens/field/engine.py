@@ -17,7 +17,6 @@ from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
 from metalens.field.through import through
 from metalens.field.waves import SmoothWave, Wave, wave_of
-from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
@@ -191,7 +190,7 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     true = spectral(optics, at, depths, plan.waves, plan.window).detach()
     wave = float(plan.waves.wavelengths_um[0])
     whole = through(optics, at, depths_um=depths, wavelength_um=wave, window=plan.window)
-    outside = 1 - float((true.sum((-1, -2)) / whole).mean())
+    held = true.sum((-1, -2)) / whole
     true = true / true.sum((-1, -2), keepdim=True)
     with torch.no_grad():
         got = psfs_used(made, pixels, depths)
@@ -203,17 +202,23 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
     found["pillars"] = gathered.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
-        found["stop"] = _ripples(optics, wave, few, blur_um(true[:NEGLECTED].cpu().numpy(), plan.window.step_um))
-    return {**found, "edge": edge, "outside": outside}
+        shown = true[:NEGLECTED], held[:NEGLECTED]
+        found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um)
+    return {**found, "edge": edge, "outside": 1 - float(held.mean())}
 
 
-def _ripples(optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], blur_um: Array) -> float:
-    """Error of the stop's shadow, the worst of some places and depths, of blurs (place, depth)."""
+def _ripples(
+    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: tuple[Tensor, Tensor], step_um: float
+) -> float:
+    """Error of the stop's shadow, the worst of some places and depths; light: their PSFs, and the share of it that
+    these hold."""
     places, depths_um = seen
+    held = light[1].cpu().numpy().clip(1e-6, 1)
+    blurs_um = blur_um(light[0].cpu().numpy(), step_um, held)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     found = []
-    for place, row in zip((places / reduced).tolist(), blur_um / reduced, strict=True):
+    for place, row, parts in zip((places / reduced).tolist(), blurs_um / reduced, held, strict=True):
         rads = row / math.hypot(1, *place)
-        each = zip(depths_um.tolist(), rads.tolist(), strict=True)
-        found += [optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad) for z, rad in each]
+        each = zip(depths_um.tolist(), rads.tolist(), parts.tolist(), strict=True)
+        found += [optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, *rest) for z, *rest in each]
     return max(found)

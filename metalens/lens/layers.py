@@ -140,15 +140,22 @@ class Layers:
         return shadow(self.stop, around, tangents, wavelength_um, at_um, width_um)
 
     def shadow_error(
-        self, tangents: tuple[float, float], depth_um: float, wavelength_um: float, blur_rad: float = 0.0
+        self,
+        tangents: tuple[float, float],
+        depth_um: float,
+        wavelength_um: float,
+        blur_rad: float = 0.0,
+        held: float = 1.0,
     ) -> float:
         """Relative L2 error of a PSF by what :meth:`shadow` leaves out; 0 without a stop.
 
-        blur_rad: radius of the PSF over its distance from the lens.
+        blur_rad: radius of the PSF over its distance from the lens. held: share of its light in the window that is
+            looked at. Waves that gather about the middle of a blur fall as 1 / √r, so that their share of the light
+            grows as held^-½, and the error as held^-¼.
         """
         if self.stop is None:
             return 0.0
-        zones = self.stop.radius_um * blur_rad / wavelength_um
+        zones = self.stop.radius_um * blur_rad / wavelength_um / held**0.25
         return left_out(self.stop, self._around_stop(depth_um, wavelength_um), tangents, wavelength_um, zones)
 
     def footprint_um(self, depth_um: float, wavelength_um: float) -> float:

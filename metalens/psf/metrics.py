@@ -55,17 +55,24 @@ def _within(light: Array, distance_um: Array, radii_um: Array, step_um: float) -
     return np.asarray(sums[0][whole] + edge)
 
 
-def blur_um(light: Array, step_um: float) -> Array:
+def blur_um(light: Array, step_um: float, held: Array | float = 1.0) -> Array:
     """(…,) radius of the even disc whose light lies as far apart as that of (…, y, x): by quarters along x and y.
 
     The middle half of a disc of radius b lies within 0.404 b of its middle along an axis.
+
+    Args:
+        held: (…,) share of the whole light that (…, y, x) is. What lies outside counts on either side; the disc is at
+            most one as bright as the window on the mean, √(area / π held), and that where less than half is held.
     """
-    found = []
+    held, found = np.clip(held, 1e-6, 1.0), []
     for axis in (-1, -2):
         total = np.cumsum(light.sum(axis), -1)
-        quarters = [(total < part * total[..., -1:]).sum(-1) for part in (0.25, 0.75)]
+        parts = [np.clip(0.5 + side / held, 0, 1)[..., None] for side in (-0.25, 0.25)]
+        quarters = [(total < part * total[..., -1:]).sum(-1) for part in parts]
         found.append((quarters[1] - quarters[0] + 1) / 2 * step_um)
-    return np.asarray(np.hypot(*found) / (0.404 * math.sqrt(2)))
+    even = step_um * np.sqrt(light.shape[-1] * light.shape[-2] / (math.pi * held))
+    apart = np.hypot(*found) / (0.404 * math.sqrt(2))
+    return np.asarray(np.where(held < 0.5, even, np.minimum(apart, even)))
 
 
 def centroid(stack: PsfStack) -> tuple[Array, Array]:

@@ -108,7 +108,7 @@ def psf_stack(
     worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
     stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
     power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
-    stack = _budgeted(stack, worst, power * cases[0].area_um2, _ripples(stack, cases, layers))
+    stack = _budgeted(stack, worst, power * cases[0].area_um2, cases, layers)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
@@ -163,27 +163,32 @@ def _among(
     return maps, dataclasses.replace(wanted, fields=among.jones(*maps, neighbours, pitch_um))
 
 
-def _ripples(stack: PsfStack, cases: list[Case], layers: Layers | None) -> float:
-    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan without one."""
+def _ripples(stack: PsfStack, share: Array, cases: list[Case], layers: Layers | None) -> float:
+    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan without one.
+
+    share: (…, [angle,] depth) of the light that the windows hold.
+    """
     if layers is None or layers.stop is None:
         return math.nan
     light = stack.intensity.detach().cpu().numpy().reshape(-1, len(cases), *stack.intensity.shape[-3:])
-    blurs_um, found = blur_um(light, stack.step_um).max(0), []
-    for case, row in zip(cases, blurs_um, strict=True):
+    held = share.clip(1e-6, 1).reshape(light.shape[:-2])
+    blurs_um, found = blur_um(light, stack.step_um, held), []
+    for case, row, shares in zip(cases, blurs_um.max(0), held.min(0), strict=True):
         rads = row / propagate.chief_path(case)
         found += [
-            layers.shadow_error(case.tangents, z, w, rad)
-            for z, rad in zip(stack.depths_um.tolist(), rads.tolist(), strict=True)
+            layers.shadow_error(case.tangents, z, w, rad, part)
+            for z, rad, part in zip(stack.depths_um.tolist(), rads.tolist(), shares.tolist(), strict=True)
             for w in stack.wavelengths_um.tolist()
         ]
     return max(found)
 
 
-def _budgeted(stack: PsfStack, worst: Result, whole: torch.Tensor, stop: float) -> PsfStack:
-    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²; stop:
-    error of its shadow."""
-    share = (stack.energy_um2.detach().cpu().double() / whole).min()
-    outside = max(0.0, 1 - float(share))
+def _budgeted(
+    stack: PsfStack, worst: Result, whole: torch.Tensor, cases: list[Case], layers: Layers | None
+) -> PsfStack:
+    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
+    share = (stack.energy_um2.detach().cpu().double() / whole).numpy()
+    outside, stop = max(0.0, 1 - float(share.min())), _ripples(stack, share, cases, layers)
     parts = {"sampling": worst.sampling, "source": worst.source, "polarisation": worst.rays, "stop": stop}
     return dataclasses.replace(stack, budget=Budget(worst.error, outside=outside, **parts))
 

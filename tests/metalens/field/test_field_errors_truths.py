@@ -250,21 +250,22 @@ def test_a_near_sheet_hides_what_it_covers_of_a_far_one():
     assert float(_over(light, whole)) == pytest.approx(0.2 * 1.4, rel=1e-6)  # nothing of the far one
 
 
-def test_of_places_and_depths_the_worst_shadow_of_a_stop_counts():
-    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray, and R b cos / (λ d) zones of a blur b; the
-    sensor lies as far as 240 um of air."""
+def test_of_places_and_depths_the_worst_shadow_of_a_stop_counts(monkeypatch):
+    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray, and R b cos / (λ d) zones of a blur b, over
+    held^¼ of windows that hold a share of the light; the sensor lies as far as 240 um of air."""
     layers = Layers(stop=Stop(31.0, 70.0), behind=(Film(Index(1.5), 90.0),))
     optics = SimpleNamespace(distance_um=270.0, layers=layers)
     places = torch.tensor([[20.0, -31.0], [60.0, 95.0], [-3.0, 8.0]]).double()
     depths = torch.tensor([400.0, 2100.0]).double()
-    told = {}
+    told, light, held = {}, torch.rand(3, 2, 5, 5), np.array([[0.9, 0.7], [0.2, 0.6], [0.8, 0.5]])
     for blurs in (np.array([[2.0, 1.0], [5.0, 0.3], [9.0, 2.5]]), np.array([[2.0, 1.0], [5.0, 0.3], [2.0, 17.0]])):
-        for (x, y), row in zip(places.tolist(), blurs, strict=True):
+        monkeypatch.setattr(engine, "blur_um", lambda *given, blurs=blurs: blurs)
+        for (x, y), row, parts in zip(places.tolist(), blurs, held, strict=True):
             cosine = 240 / math.hypot(x, y, 240)
-            for z, blur in zip((400.0, 2100.0), row, strict=True):
+            for z, blur, part in zip((400.0, 2100.0), row, parts, strict=True):
                 number = 31.0**2 * cosine**3 / (0.8 * 70 * (z - 70) / z)
-                told[x, z] = (0.005 + 0.055 * 31.0 * blur / 240 * cosine / 0.8) / number
-        got = engine._ripples(optics, 0.8, (places, depths), blurs)
+                told[x, z] = (0.005 + 0.055 * 31.0 * blur / 240 * cosine / 0.8 / part**0.25) / number
+        got = engine._ripples(optics, 0.8, (places, depths), (light, torch.from_numpy(held)), 1.3)
         assert got == pytest.approx(max(told.values()), rel=1e-9)
         assert max(told, key=told.get) == ((-3.0, 400.0) if blurs[2, 0] == 9.0 else (-3.0, 2100.0))
 

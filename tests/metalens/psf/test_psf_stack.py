@@ -142,6 +142,14 @@ def test_blur_of_even_discs_is_their_radius():
     np.testing.assert_allclose(
         psf_metrics.blur_um(np.stack([near, wide]).astype(float), 0.5), [37.0, 19.0], atol=0.5 / 0.404
     )
+    middle = near[80:121, 70:131].astype(float)  # lit all over, 20.5 by 30.5 um of it
+    held = 20.5 * 30.5 / (np.pi * 37.0**2)
+    assert psf_metrics.blur_um(middle, 0.5, held) == pytest.approx(37.0, rel=1e-12)
+    most = wide[20:, 60:].astype(float)  # a tenth of the light beside it, half on either side
+    ends = np.quantile(np.repeat(place[60:], most.sum(0).astype(int)), [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9])
+    down = np.quantile(np.repeat(place[20:], most.sum(1).astype(int)), [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9])
+    want = np.hypot(np.ptp(ends), np.ptp(down)) / 2 / 0.404 / np.sqrt(2)
+    assert psf_metrics.blur_um(most, 0.5, 0.9) == pytest.approx(want, abs=0.5 / 0.404)
 
 
 def test_metrics_of_gaussians_are_closed_forms():
