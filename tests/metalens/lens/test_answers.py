@@ -72,6 +72,16 @@ def test_what_a_proxy_does_not_know_is_refused_by_name():
         answers.fill(replace(made, diameters=replace(made.diameters, diameter_um=thin)), (WAVE, TILT), *out)
 
 
+def test_sites_without_a_pillar_ask_nothing_of_the_proxy_and_the_thickest_does():
+    sizes = np.zeros((3, 4))
+    whole = answers.polynomials(PROXY, np.full((3, 4), 0.2), (WAVE, TILT))
+    for one, other in zip(answers.polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True):
+        assert np.array_equal(one, other)
+    sizes[2, 1] = 0.315
+    with pytest.raises(DomainError, match=r"0\.315"):
+        answers.polynomials(PROXY, sizes, (WAVE, TILT))
+
+
 def test_a_transmission_that_rounding_takes_above_1_is_1():
     bright = Proxy(np.array([[1.0, 2.0]]), np.array([[1 - 1e-9, 0.9e-9]]), (0.09, 0.31), (0.8, 0.93), 0.0, 0.0)
     made = lens(proxy=bright)
