@@ -209,6 +209,17 @@ def test_a_wall_in_steps_that_is_all_but_upright_is_the_upright_wall():
     assert np.abs(one.e - other.e).max() < 1e-4
 
 
+@pytest.mark.parametrize("tilt", [0.12, -0.08])
+def test_a_leaning_wall_is_wide_at_its_foot_in_twelve_steps(tilt):
+    """Width at half height, less twice the height above it times the tangent: each step that of its middle."""
+    cell, x = dataclasses.replace(ROUND, sidewall_rad=tilt), np.linspace(-0.17, 0.17, 341)
+    z = (np.arange(12) + 0.3) / 12 * 0.45
+    got = near_field(cell, SIZE, Light(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1)
+    wide = (got.index[:, 0].real > 1.7).sum(1) * 0.001
+    want = SIZE - 2 * ((np.arange(12) + 0.5) / 12 * 0.45 - 0.225) * math.tan(tilt)
+    assert wide == pytest.approx(want, abs=0.0021)
+
+
 def test_the_error_bar_holds_against_more_orders():
     """At seven orders 2.5 times the farthest of four truncations; at five, 7.8 times, as for t."""
     grid = {"x_um": _middles(9, 0.36), "y_um": [0.02], "z_um": np.linspace(-0.1, 0.6, 15)}
