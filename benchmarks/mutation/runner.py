@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.mutation.server import QUIET
+from benchmarks.mutation.server import QUIET, may_have_children
 
 LIBRARIES = (
     "numpy",
@@ -86,6 +86,7 @@ class Bench:
 
     def _child(self, tests: list[str], limit_s: int, fresh: bool) -> None:
         os.setpgid(0, 0)
+        may_have_children()
         resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s + 5))
         signal.alarm(8 * limit_s)
         null = os.open(os.environ.get("MUTANT_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND)

@@ -59,7 +59,13 @@ class Server:
         os.waitpid(self._child, 0)
 
 
+def may_have_children() -> None:
+    """Of a fork of a pool's worker: tests that start processes of their own fail where they are not allowed to."""
+    multiprocessing.current_process().daemon = False
+
+
 def _serve(tree: Path, pipe: Connection, tests: Sequence[str]) -> None:
+    may_have_children()
     os.chdir(tree)
     null = os.open(os.environ.get("MUTANT_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(null, 1)

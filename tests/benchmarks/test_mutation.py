@@ -1,11 +1,12 @@
 """The runner of mutants on a module of its own: what changes, what runs a line, what takes its place in memory."""
 
 import importlib.util
+import multiprocessing
 
 import pytest
 
 from benchmarks.mutation import __main__ as main
-from benchmarks.mutation import reach, rules, server
+from benchmarks.mutation import reach, rules, runner, server
 from benchmarks.mutation.graph import Graph
 from benchmarks.mutation.reach import Reach
 
@@ -138,6 +139,26 @@ def test_a_watched_test_tells_its_lines(tree):
     other = MODULE.replace("abs(x)", "(x)")
     assert answer.outcome(path, other, ["test_it.py::test_a"], 60.0)[0] == "passed"
     answer.close()
+
+
+def _asked(tree):
+    """In a worker of a pool, which may have no children of its own."""
+    answer = server.Server(tree, ["test_it.py"])
+    other = MODULE.replace("abs(x)", "(x)")
+    told = answer.outcome("metalens/numbers_of.py", other, ["test_it.py"], 60.0)[0]
+    answer.close()
+    return told, runner.Bench(tree).outcome("metalens/numbers_of.py", other, ["test_it.py"], 20.0, fresh=False)[0]
+
+
+def test_tests_that_start_processes_pass_in_workers_too(tree):
+    (tree / "test_it.py").write_text(
+        "import multiprocessing, sys\nsys.path.insert(0, 'metalens')\nimport numbers_of\n"
+        "def test_a():\n    numbers_of.Box().width(3)\n"
+        "    child = multiprocessing.get_context('spawn').Process(target=print)\n    child.start()\n    child.join()\n"
+        "    assert child.exitcode == 0\n"
+    )
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        assert pool.apply(_asked, (tree,)) == ("passed", "passed")
 
 
 def test_a_reason_is_for_one_line(tmp_path, monkeypatch):
