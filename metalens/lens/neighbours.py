@@ -82,7 +82,14 @@ class Neighbours:
         Args:
             sine: (…) by which the slope turns light of the rows' wavelength. aside: sin² 2α of its azimuth α.
         """
-        straight, diagonal = self.coefficients[:, field]
+        return self._factor(self.coefficients[:, field], sine, aside)
+
+    def of_both(self, sine: Any, aside: Any) -> Any:
+        """(…) mean of :meth:`of_field` over both fields."""
+        return self._factor(self.coefficients.mean(1), sine, aside)
+
+    def _factor(self, coefficients: Array, sine: Any, aside: Any) -> Any:
+        straight, diagonal = coefficients
         (a, b), (a2, b2) = straight.tolist(), (diagonal - straight).tolist()
         s, turned = (abs(sine).clip(max=most) for most in self.steepest)
         return 1 + s * (a + b * s) + aside * (turned * (a2 + b2 * turned))

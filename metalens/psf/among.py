@@ -49,12 +49,14 @@ def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 def _around(pairs: Tensor, *, along: int) -> Tensor:
     """Sum of the pairs around each pillar; there is one more pillar than pairs on the axis ``along``."""
-    shape, parts = pairs.shape, torch.view_as_real(pairs).movedim(-1, -3).reshape(-1, 1, *pairs.shape[-2:])
-    whole, between = 2 * REACH + 1, 2 * REACH
-    kernel = (whole, between) if along == -1 else (between, whole)
-    total = torch.nn.functional.avg_pool2d(parts, kernel, stride=1, padding=REACH, divisor_override=1)
-    total = total.reshape(*shape[:-2], 2, *total.shape[-2:]).movedim(-3, -1).contiguous()
-    return torch.view_as_complex(total)
+    for axis in (-1, -2):
+        wide = 2 * REACH + (axis != along)
+        padded = torch.nn.functional.pad(pairs, (REACH, REACH) if axis == -1 else (0, 0, REACH, REACH))
+        count = padded.shape[axis] - wide + 1
+        pairs = padded.narrow(axis, 0, count)
+        for k in range(1, wide):
+            pairs = pairs + padded.narrow(axis, k, count)
+    return pairs
 
 
 def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
@@ -62,8 +64,7 @@ def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
     parts = []
     for inner, some in _shares(light):
         s, aside, _ = _turned(*slopes(some, pitch_um), neighbours)
-        both = [neighbours.of_field(field, s, aside) for field in (0, 1)]
-        parts.append(((both[0] + both[1]) / 2)[..., inner, :])
+        parts.append(neighbours.of_both(s, aside)[..., inner, :])
     return torch.cat(parts, -2)
 
 
