@@ -284,6 +284,8 @@ def save(path: str | Path, result: AsBuilt) -> None:
         arrays["residual_modes"] = result.residual_modes
     arrays |= {f"curves/{name}": curve for name, curve in result.curves.items()}
     arrays |= {"response/coefficients": result.response.coefficients}
+    if result.response.edges is not None:
+        arrays["response/edges"] = result.response.edges
     if result.response.solved is not None:
         solved = result.response.solved
         arrays |= {"response/diameter_um": solved.diameter_um, "response/powers": solved.powers}
@@ -340,7 +342,12 @@ def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
         wave = float(arrays["response/wavelength_um"])
         solved = Solved(wave, arrays["response/diameter_um"], arrays["response/powers"])
     return Sensitivity(
-        arrays["response/coefficients"], about["response_center_um"], about["response_error"], *ends, solved
+        arrays["response/coefficients"],
+        about["response_center_um"],
+        about["response_error"],
+        *ends,
+        solved,
+        arrays.get("response/edges"),
     )
 
 

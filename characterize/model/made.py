@@ -12,7 +12,7 @@ from characterize.model.pillars import incidence_rad
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Bends, Sensitivity, Widens, causes, transmission
+from metalens.made import Bends, Sensitivity, Widens, biased, causes, transmission
 
 _TABLE = 1 << 16
 _NODES = max(causes.polynomials(kind).shape[-1] for kind in (Widens, Bends))
@@ -49,6 +49,7 @@ def pillars(
     t = transmission(lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad)
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]
+    t = t * biased(response, np.nan_to_num(grown, nan=low), bias + noise_um)
     if made.bends():
         t *= np.exp(1j * _on_pillars(d, made.phase_rad))
     if modes is not None and len(modes):

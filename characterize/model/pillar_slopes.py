@@ -10,9 +10,9 @@ from characterize.model import kept, solving
 from metalens import modal, rcwa
 from metalens.cell import Cell, index
 from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, MaterialError
+from metalens.ground.errors import CellError, FitError, MaterialError
 from metalens.lens import Lens
-from metalens.made import Answers, Cause, Sensitivity, Solved, of_kind, sensitivity
+from metalens.made import Answers, Cause, Sensitivity, Solved, lacking, of_kind, sensitivity
 
 _NODES, _MOST = 25, 14
 _SOURCES = (
@@ -29,17 +29,28 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
     3e-3. No slope is taken for a curve, and past the proxy's domain, where pillars begin to resonate, nothing is
     extrapolated.
 
-    Other cells: exact derivatives at 25 Chebyshev diameters (RCWA for films or tilted walls), as the
+    Other round ones: exact derivatives at 25 Chebyshev diameters (RCWA for films or tilted walls), as the
     polynomial of least degree whose error on diameters that it was not made from meets ``tolerance``, relative to
     the largest change of the slope across the lens; the best one below degree 15 where none does. The error reached
-    is in ``error``. Cells that no solver takes get the effective-index slopes of :func:`metalens.made.sensitivity`.
+    is in ``error``. Cells that no solver takes get the effective-index slopes of :func:`metalens.made.sensitivity`, and
+    pillars that are not round on a square lattice, those of their own shape that it has.
 
     What was solved once is kept in the user's cache folder (:mod:`characterize.model.kept`).
 
     Args:
         wanted: names of causes whose slope no solver knows in closed form (the sidewall) and that are wanted all the
             same: by differences of the RCWA solver (half a degree of wall: 0.1 deg² of curvature); zero without.
+
+    Raises:
+        FitError: a cause is wanted that pillars of this shape cannot have. CellError, MaterialError: pillars that are
+            not round, and that no solver takes.
     """
+    for name in lacking(lens.cell):
+        if name in wanted:
+            raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
+    if not lens.cell.round:
+        about = _about(lens, tolerance, ["own shape"])
+        return _unpacked(kept.kept("pillars", about, _SOURCES, lambda: _packed(sensitivity(lens))))
     try:
         about = _about(lens, tolerance, [row.name for row in _unknown() if row.name in wanted])
         return _unpacked(kept.kept("pillars", about, _SOURCES, lambda: _packed(_solve(lens, tolerance, wanted))))
@@ -65,6 +76,8 @@ def _packed(found: Sensitivity) -> dict[str, Array]:
     if found.solved is not None:
         table = found.solved
         out |= {"wavelength": np.array(table.wavelength_um), "diameter": table.diameter_um, "powers": table.powers}
+    if found.edges is not None:
+        out["edges"] = found.edges
     return out
 
 
@@ -74,7 +87,7 @@ def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
     if "powers" in arrays:
         table = Solved(float(arrays["wavelength"]), arrays["diameter"], arrays["powers"])
     center, error, low, high = arrays["numbers"].tolist()
-    return Sensitivity(arrays["coefficients"], center, error, low, high, table)
+    return Sensitivity(arrays["coefficients"], center, error, low, high, table, arrays.get("edges"))
 
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
@@ -120,8 +133,10 @@ def _exact(
             return complex(slope[row.name])
         if row.acts.exact:
             return complex(getattr(found, row.acts.exact) / found.t)
-        step = row.acts.step
-        ends = (row.acts.changed(cell, sign * step, wavelength_um) for sign in (1, -1))
+        if row.acts.changed is None:
+            return 0.0
+        step, changed = row.acts.step, row.acts.changed
+        ends = (changed(cell, sign * step, wavelength_um) for sign in (1, -1))
         up, down = (rcwa.derivatives(end, diameter_um, wavelength_um).t for end in ends)
         return complex(np.log(up / down) / (2 * step))
 

@@ -4,6 +4,7 @@ t(D + b; height, index, sidewall, wavelength) for all small changes lies close t
 summing the lens once for each u_k makes every change of process act on coarse nodes (see :mod:`reduced`).
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE, state
+from metalens.cell import Cell
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Sensitivity, answer, designed, of_kind, transmission
+from metalens.made import Answers, Sensitivity, answer, biased, designed, lacking, of_kind, transmission
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
@@ -44,6 +46,12 @@ class Range:
     answers: tuple[float, ...] = tuple(_ROOM * max(-row.low, row.high) * row.unit for row in _ROWS)
     wavelength_um: float = 0.006
 
+    def within(self, cell: Cell) -> "Range":
+        """Without what pillars of this cell cannot have."""
+        none = lacking(cell)
+        kept = (0.0 if row.name in none else amount for row, amount in zip(_ROWS, self.answers, strict=True))
+        return dataclasses.replace(self, answers=tuple(kept))
+
 
 class Pillars:
     """Transmission of pillars under change, exact and in its low-rank basis.
@@ -61,7 +69,7 @@ class Pillars:
         tolerance: float = 3e-5,
         angle_rad: float = 0.0,
     ) -> None:
-        span = span or Range()
+        span = (span or Range()).within(lens.cell)
         self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
         built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
@@ -78,7 +86,9 @@ class Pillars:
         self.nodes_um = unit * self.span.bias_um
         share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
         self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
-        self._answer = answer(self.lens.proxy, self.response, self.diameter_um + self.nodes_um[:, None])
+        nodes = self.nodes_um[:, None]
+        self._answer = answer(self.lens.proxy, self.response, self.diameter_um + nodes)
+        self._biased = biased(self.response, self.diameter_um + nodes, nodes)
         self._designed: dict[float, Array] = {}
         self._colours = self._through_colours()
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
@@ -90,7 +100,8 @@ class Pillars:
         """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
-        return transmission(self.lens.proxy, self.response, d, wave, np.array(change.answers), angle_rad=self.angle_rad)
+        amounts = np.array(change.answers)
+        return transmission(self.lens.proxy, self.response, d, wave, amounts, bias_um=bias_um, angle_rad=self.angle_rad)
 
     def coefficients(self, change: Change, lean_um: float = 0.0) -> Array:
         """(b, r) coefficients of t in the basis, as Chebyshev series of the bias.
@@ -119,7 +130,7 @@ class Pillars:
             if len(self._designed) >= 8:
                 self._designed.pop(next(iter(self._designed)))
             self._designed[wave] = self._designed_at(wave, change.wavelength_um / self.span.wavelength_um)
-        return np.asarray(self._designed[wave] * self._answer.factor(np.array(change.answers)))
+        return np.asarray(self._designed[wave] * self._answer.factor(np.array(change.answers)) * self._biased)
 
     def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
         """(b, grid) t as designed at the bias nodes; between wavelengths that are known where ``share`` of the span is
@@ -163,7 +174,7 @@ class Pillars:
     def _training(self) -> list[Change]:
         s, waves = self.span, self._waves()
         single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
-        both = [Change(tuple(sign * one[:-1]), sign * one[-1]) for one in single for sign in (1, -1)]
+        both = [Change(tuple(sign * one[:-1]), sign * one[-1]) for one in single if one.any() for sign in (1, -1)]
         return [Change(), *both, *(_draw(np.random.default_rng(i), s, waves) for i in range(6))]
 
     def _waves(self) -> bool:
@@ -191,8 +202,11 @@ def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
 
 
 def _draw(random: np.random.Generator, span: Range, waves: bool) -> Change:
-    *some, wave = random.uniform(-0.7, 0.7, len(span.answers) + 1)
-    return Change(tuple(np.array(some) * span.answers), float(wave) * span.wavelength_um * waves)
+    known = np.flatnonzero(span.answers)
+    *some, wave = random.uniform(-0.7, 0.7, len(known) + 1)
+    amounts = np.zeros(len(span.answers))
+    amounts[known] = np.array(some) * np.array(span.answers)[known]
+    return Change(tuple(amounts.tolist()), float(wave) * span.wavelength_um * waves)
 
 
 def _cubic(values: Array, place: Array) -> Array:

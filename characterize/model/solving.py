@@ -51,7 +51,9 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / _FINE_UM) + 1)
     changes = _changes()
     cells = [
-        row.acts.changed(cell, amount, wavelength_um) if isinstance(row.acts, Answers) and amount else cell
+        row.acts.changed(cell, amount, wavelength_um)
+        if isinstance(row.acts, Answers) and row.acts.changed and amount
+        else cell
         for _, row, amounts in changes
         for amount in amounts
     ]

@@ -165,7 +165,10 @@ def present_bias(path: Path | None) -> Bias:
 
 
 def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -> Array:
-    """Made diameters whose phase in the process as it is equals the designed one, up to a piston."""
+    """Made diameters whose phase in the process as it is equals the designed one, up to a piston.
+
+    Of pillars that lose their form as their edges move: by the phase of the designed ones with all edges moved so far.
+    """
     low, high = design.proxy.domain_um
     fine = np.linspace(low, min(high, 0.999 * design.diameters.pitch_um), 4001)
     wave = design.wavelength_um
@@ -176,7 +179,12 @@ def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -
     inside = (fine >= designed[0]) & (fine <= designed[-1])
     piston = float((now - meant)[inside].mean())
     goal = np.interp(designed, fine, meant) + piston
-    return np.asarray(np.interp(goal, np.maximum.accumulate(now), fine))
+
+    def made(size: float) -> Array:
+        rate = response.by_edges((fine + size) / 2)
+        return np.maximum.accumulate(now if rate is None else now + (fine - size) * rate.imag)
+
+    return np.array([np.interp(g, made(size), fine) for size, g in zip(designed.tolist(), goal.tolist(), strict=True)])
 
 
 def _evened(design: Lens, x: Array) -> Lens:

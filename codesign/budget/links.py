@@ -27,7 +27,7 @@ from metalens.design import neighbours as supercell
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, LensError
 from metalens.lens import Neighbours
-from metalens.made import State, draws, sensitivity, transmission
+from metalens.made import State, biased, draws, sensitivity, transmission
 from metalens.pillars import PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again
@@ -183,6 +183,7 @@ def process(about: Bench) -> Iterator[Entry]:
     """Draws of the process; what a fit of the built lens would take out again."""
     if about.given.mask is None:
         return
+    about.given.mask.spread.check(about.lens.cell)
     made = [Made(draw.state()) for draw in draws(about.given.mask.spread, about.given.draws, seed=5)]
     yield drawn(about, "process spread", made, f"{len(made)} draws of the process, lens not measured")
 
@@ -206,7 +207,12 @@ def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
     for made in lenses:
         answers = made.state.answers()
         table = transmission(about.lens.proxy, response, aperture.diameter_um, about.lens.wavelength_um, answers)
-        phase, level = aperture.maps(table, bias_um=made.state.bias_um(u, v))
+        bias = made.state.bias_um(u, v)
+        phase, level = aperture.maps(table, bias_um=bias)
+        moved = biased(response, np.where(built, d.diameter_um, aperture.diameter_um[0]) + bias, bias)
+        if not isinstance(moved, float):
+            phase = phase + torch.from_numpy((np.angle(moved) * built).astype(np.float32))
+            level = level * torch.from_numpy(abs(moved).astype(np.float32))
         if made.state.bends():
             phase = phase + torch.from_numpy(made.state.phase_rad(u, v).astype(np.float32) * built)
         turn = phase[torch.from_numpy(built)].numpy() - base

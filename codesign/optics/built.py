@@ -145,8 +145,9 @@ class MadeLens:
         count = int((float(self._diameter_um.max()) + reach - low) / TABLE_STEP_UM) + 2
         grid = low + TABLE_STEP_UM * np.arange(count)
         t = transmission(self.design.proxy, self.response, grid, self.design.wavelength_um, known.answers())
+        edges = self.response.by_edges(grid)
         u, v = d.x_um / self._rim_um, d.y_um / self._rim_um
-        table = t.astype(np.complex64), low, TABLE_STEP_UM
+        table = t.astype(np.complex64), np.empty(0, complex) if edges is None else edges, low, TABLE_STEP_UM
         return np.asarray(_gather(self._diameter_um, self._carrier, *table, u, v, bias, self._block))
 
     def _on_nodes(self, cells: Array, nodes_x: Array, nodes_y: Array) -> Array:
@@ -202,8 +203,11 @@ def _filled(cells: Array) -> Array:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _gather(diameter, carrier, table, low, step, u, v, bias, block):  # type: ignore[no-untyped-def]
-    """Mean of table[(D + sum_mn bias_mn u^m v^n - low) / step] * carrier over blocks of pillars; 0 for empty blocks."""
+def _gather(diameter, carrier, table, edges, low, step, u, v, bias, block):  # type: ignore[no-untyped-def]
+    """Mean of table[(D + b - low) / step] * carrier over blocks, b = sum_mn bias_mn u^m v^n; 0 for empty blocks.
+
+    edges: on the same grid, of pillars that lose their form as they grow: times exp(b edges(D + b/2)); else empty.
+    """
     rows, columns = diameter.shape
     terms = len(bias)
     along = np.zeros(terms)
@@ -220,6 +224,9 @@ def _gather(diameter, carrier, table, low, step, u, v, bias, block):  # type: ig
                 b = along[terms - 1]
                 for m in range(terms - 2, -1, -1):
                     b = b * u[j] + along[m]
-                total[i // block, j // block] += table[int((d + b - low) / step + 0.5)] * carrier[i, j]
+                value = table[int((d + b - low) / step + 0.5)] * carrier[i, j]
+                if edges.size > 0:
+                    value = value * np.exp(b * edges[int((d + b / 2 - low) / step + 0.5)])
+                total[i // block, j // block] += value
                 count[i // block, j // block] += 1
     return np.where(count > 0, total / np.maximum(count, 1), 0)

@@ -46,6 +46,7 @@ class LensErrors(_Entries):  # type: ignore[misc]
     rows one after the other; empty for none.
     bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of the bias from axis to rim,
     along an axis and in all directions. index: of the pillars. sidewall_deg: lean of their walls.
+    width_nm, length_nm: of all pillars along x and y alone. turn_deg: refused, since round pillars have none.
     """
 
     correlation: tuple[float, ...] = ()
@@ -53,6 +54,8 @@ class LensErrors(_Entries):  # type: ignore[misc]
     def __post_init__(self) -> None:
         if min(self.deviations) < 0:
             raise ConfigError(f"spread {self.deviations}: need standard deviations of 0 or more")
+        if self.turn_deg:
+            raise ConfigError("spread.turn_deg: pillars are drawn as round ones, which no turn changes; need 0")
         if self.correlation:
             self._check()
 
@@ -74,11 +77,12 @@ class LensErrors(_Entries):  # type: ignore[misc]
         """The errors of one lens; None where nothing varies."""
         if not any(self.deviations):
             return None
-        values, vectors = np.linalg.eigh(self.covariance)
+        held = [n for n, name in enumerate(ENTRIES) if name not in DRAWN or DRAWN[name].sigma or self.deviations[n]]
+        values, vectors = np.linalg.eigh(self.covariance[np.ix_(held, held)])
         root = vectors * np.sqrt(values.clip(0))
-        normal = torch.randn(len(ENTRIES), generator=generator, dtype=torch.float64).numpy()
+        normal = torch.randn(len(held), generator=generator, dtype=torch.float64).numpy()
         turn = 2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
-        return LensError(dict(zip(ENTRIES, (root @ normal).tolist(), strict=True)), turn)
+        return LensError({ENTRIES[n]: amount for n, amount in zip(held, (root @ normal).tolist(), strict=True)}, turn)
 
     def _check(self) -> None:
         size = math.isqrt(len(self.correlation))

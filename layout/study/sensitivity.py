@@ -9,28 +9,38 @@ from metalens.cell import Cell
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, of_kind
+from metalens.made import Answers, of_kind, own_rates
 
 Solver = Callable[[Cell, Array, float, bool], Array]
 _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
-_UPRIGHT, _TILTED = (6, 8), (5, 6)  # harmonics of the coarser and the finer truncation
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivities:
     """Logarithmic derivatives of t: the real part changes |t|, the imaginary part is a phase in rad.
 
-    diameter_um: (n,) rising. rates: (answering causes, n) complex, by the base unit of each (um, rad, 1).
+    diameter_um: (n,) rising. rates: (answering causes, n) complex, by the base unit of each (um, rad, 1); rows that are
+        not there are 0.
     error: largest relative change (rms over the diameters) of one of them from a coarser truncation.
+    edges: (n,) by a bias of all edges less that by the size, per um; None where that is nothing.
     """
 
     diameter_um: Array
     rates: Array
     error: float
+    edges: Array | None = None
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t; beyond the ends the end value holds."""
-        return np.stack([np.interp(diameter_um, self.diameter_um, row) for row in self.rates])
+        values = [np.interp(diameter_um, self.diameter_um, row) for row in self.rates]
+        missing = len(_answering()) - len(values)
+        return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+
+    def by_edges(self, diameter_um: Array) -> Array | None:
+        """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""
+        if self.edges is None or not self.edges.any():
+            return None
+        return np.asarray(np.interp(diameter_um, self.diameter_um, self.edges))
 
 
 def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) -> Sensitivities:
@@ -56,29 +66,8 @@ def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) 
 
 def _exact(lens: Lens, diameter_um: Array) -> Sensitivities:
     """From the derivatives of the Jones matrices."""
-    reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
-    tasks = [(float(d), harmonics) for harmonics in reach for d in diameter_um]
-    some = list(executor.gather(_derived, (lens.cell, lens.wavelength_um, _seen(lens)), tasks))
-    coarse, fine = np.array(some).reshape(len(reach), len(diameter_um), -1).transpose(0, 2, 1)
-    off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
-    return Sensitivities(diameter_um, fine, float(off.max()))
-
-
-def _seen(lens: Lens) -> Array:
-    """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of."""
-    one = lens.one_light and lens.proxy.max_angle_rad == 0
-    return np.diag([1.0, 0.0] if one else [0.5, 0.5])
-
-
-def _derived(about: tuple[Cell, float, Array], task: tuple[float, int]) -> list[complex]:
-    """Derivatives of ln t by every answering cause."""
-    from metalens.rcwa.rates import jones_derivatives
-
-    (cell, wavelength_um, weight), (diameter_um, harmonics) = about, task
-    numbers = [acts.number for acts in _answering()]
-    found = jones_derivatives(cell, diameter_um, wavelength_um, harmonics=harmonics, by=numbers)
-    t = (weight * found.jones.t).sum()
-    return [complex((weight * found.by[name].t).sum() / t) for name in numbers]
+    found = own_rates(lens, diameter_um)
+    return Sensitivities(diameter_um, found.rates, found.error, found.edges)
 
 
 def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
@@ -87,6 +76,9 @@ def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
     solved = iter(executor.gather(_solved, (solver, lens.wavelength_um), tasks))
     found, worst = [], 0.0
     for acts in _answering():
+        if acts.changed is None:
+            found.append(np.zeros(len(diameters), complex))
+            continue
         rates = []
         for _ in (False, True):  # coarser, finer
             less, more = next(solved), next(solved)
@@ -104,6 +96,8 @@ def _answering() -> list[Answers]:
 def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
     """Solves of one cause after the other: the coarser and the finer, each below and above."""
     for acts in _answering():
+        if acts.changed is None:
+            continue
         ends = [acts.changed(lens.cell, sign * acts.step, lens.wavelength_um) for sign in (-1, 1)]
         some = _some(lens, acts, diameter_um)
         yield from ((end, some, finer) for finer in (False, True) for end in ends)
@@ -111,7 +105,7 @@ def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
 
 def _some(lens: Lens, acts: Answers, diameter_um: Array) -> Array:
     """Diameters that a cause is solved at: every other one where walls tilt."""
-    tilted = acts.changed(lens.cell, acts.step, lens.wavelength_um).sidewall_rad
+    tilted = acts.changed and acts.changed(lens.cell, acts.step, lens.wavelength_um).sidewall_rad
     return np.asarray(diameter_um[:: 2 if tilted else 1])
 
 

@@ -39,7 +39,8 @@ class Pillars:
     def curve(self, diameter_um: Array, bias_um: Array, state: State) -> Array:
         """(bias, diameters) complex t for local biases and one made lens."""
         d = diameter_um + np.reshape(bias_um, (-1, 1))
-        return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers())
+        bias = np.reshape(bias_um, (-1, 1))
+        return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

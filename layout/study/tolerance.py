@@ -13,7 +13,7 @@ from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.lens import Lens, reach
-from metalens.made import DRAWN, Draw, State, spread
+from metalens.made import Draw, State, spread
 
 STEPS = 50  # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16 to 26 mm
 _BATCH = 25
@@ -98,17 +98,18 @@ def analyse(
     Accuracy: see ``error`` of the report (measured); bands of percentiles carry the sampling error of ``draws``.
 
     Raises:
-        ProcessError: fewer than 10 draws.
+        ProcessError: fewer than 10 draws, or a spread that pillars of this shape cannot have.
     """
     if draws < 10:
         raise ProcessError(f"draws = {draws}: need 10 or more for confidence bands")
+    process.spread.check(lens.cell)
     sens = sensitivities(lens) if sens is None else sens
     near, far = reach.depth_range_um(lens)
     depths_um, step_um = depths_um or (near, (near + far) / 2, far), (far - near) / STEPS
     every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))])
     focus = prepare(lens, window(lens, depths_um=every))
     model = reduce(lens, sens, focus, process.spread, seed=seed)
-    single = [Draw({name: sign * s}) for name, s in process.spread.values().items() for sign in (-1, 1)]
+    single = [Draw({name: sign * s}) for name, s in process.spread.stated.items() for sign in (-1, 1)]
     everything = [Draw({}), *single, *spread.draws(process.spread, draws, seed=seed + 1)]
     outcome = _outcome(model, [draw.state() for draw in everything], step_um)
     nominal, alone, many = (
@@ -116,7 +117,7 @@ def analyse(
     )
     effects = tuple(
         _effect(model, tuple(single[2 * n : 2 * n + 2]), _part(alone, slice(2 * n, 2 * n + 2)), nominal)
-        for n in range(len(DRAWN))
+        for n in range(len(single) // 2)
     )
     error = missed(model, everything)
     return ToleranceReport(

@@ -17,15 +17,19 @@ if TYPE_CHECKING:
     from metalens.made.causes import Drawn as Drawn
     from metalens.made.causes import Guide as Guide
     from metalens.made.causes import Widens as Widens
+    from metalens.made.causes import lacking as lacking
     from metalens.made.causes import maps as maps
     from metalens.made.causes import named as named
     from metalens.made.causes import of_kind as of_kind
+    from metalens.made.own import OwnRates as OwnRates
+    from metalens.made.own import own_rates as own_rates
     from metalens.made.printed import Printed as Printed
     from metalens.made.printed import of_process as of_process
     from metalens.made.printed import with_table as with_table
     from metalens.made.response import Sensitivity as Sensitivity
     from metalens.made.response import Slopes as Slopes
     from metalens.made.response import answer as answer
+    from metalens.made.response import biased as biased
     from metalens.made.response import designed as designed
     from metalens.made.response import guide as guide
     from metalens.made.response import sensitivity as sensitivity
@@ -49,6 +53,7 @@ __getattr__, __dir__, __all__ = attach(
         "Draw": "spread",
         "Drawn": "causes",
         "Guide": "causes",
+        "OwnRates": "own",
         "Printed": "printed",
         "STEEPEST": "bias",
         "Sensitivity": "response",
@@ -58,14 +63,17 @@ __getattr__, __dir__, __all__ = attach(
         "State": "state",
         "Widens": "causes",
         "answer": "response",
+        "biased": "response",
         "causes": "",
         "designed": "response",
         "draws": "spread",
         "guide": "response",
+        "lacking": "causes",
         "maps": "causes",
         "named": "causes",
         "of_kind": "causes",
         "of_process": "printed",
+        "own_rates": "own",
         "read_csv": "bias",
         "sensitivity": "response",
         "spread": "",

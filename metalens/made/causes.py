@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from metalens.cell import Cell, Index, index
+from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.ground.arrays import Array
 
 Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
@@ -54,15 +55,17 @@ class Answers:
     """Derivative of ln t of every pillar alike, by ``unit`` of the row.
 
     quick: from the effective index, (n,) complex for the diameters of a guide. changed: the cell with so much more of
-    the cause. step: of differences through a solver. exact: where :class:`metalens.modal.Gradient` has dt/d(cause).
-    number: of the cell, as :func:`metalens.rcwa.jones_derivatives` names it, for a pillar without layers.
+    the cause; None where a pillar of the same size has no more of it. step: of differences through a solver. exact:
+    where :class:`metalens.modal.Gradient` has dt/d(cause).
+    numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives` names them, by cell and size of
+    the pillar; {} where such a pillar cannot have the cause. None: by differences, step by step.
     """
 
     quick: Callable[[Guide], Array]
-    changed: Callable[[Cell, float, float], Cell]
+    changed: Callable[[Cell, float, float], Cell] | None
     step: float
     exact: Literal["height_um", "n", ""] = ""
-    number: str = ""
+    numbers: Callable[[Cell, float], dict[str, float]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +128,41 @@ def _by_sidewall(g: Guide) -> Array:
     return 1j * g.k * g.curvature * g.sidewall_rad * g.height_um**3 / 3
 
 
+def _by_side(g: Guide) -> Array:
+    """A round pillar that is wider along one axis: the mean over both polarisations is half of the diameter's."""
+    return 0.5j * g.k * g.height_um * g.slope
+
+
+def _by_turn(g: Guide) -> Array:
+    """A round pillar is the same at any turn."""
+    return np.zeros_like(g.effective, complex)
+
+
+def _number(name: str) -> Callable[[Cell, float], dict[str, float]]:
+    """A number that every cell has."""
+    return lambda cell, size_um: {name: 1.0}
+
+
+def _width(cell: Cell, size_um: float) -> dict[str, float]:
+    """Along the shape's own x at the length that it has, where it has two sides: L = ratio times the size."""
+    ratio = _ratio(cell)
+    return {"size_um": 1.0, "shape.ratio": -ratio / size_um} if ratio else {}
+
+
+def _length(cell: Cell, size_um: float) -> dict[str, float]:
+    """Along the shape's own y at the width that it has."""
+    return {"shape.ratio": 1 / size_um} if _ratio(cell) else {}
+
+
+def _turn(cell: Cell, size_um: float) -> dict[str, float]:
+    return {"shape.angle_rad": 1.0} if hasattr(cell.shape, "angle_rad") else {}
+
+
+def _ratio(cell: Cell) -> float:
+    """Of the second side of a rectangle or an ellipse to its size; 0 for other shapes."""
+    return float(cell.shape.ratio) if isinstance(cell.shape, Rectangle | Ellipse) else 0.0
+
+
 def _taller(cell: Cell, amount: float, wavelength_um: float) -> Cell:
     return dataclasses.replace(cell, height_um=cell.height_um + amount)
 
@@ -147,6 +185,11 @@ def _bends(name: str, norm: float, terms: Terms) -> Cause:
     """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
     rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
     return Cause(f"{name}_rad", f"Zernike {name} of the wave front, rms", 0.05, 1.0, -6.0, 6.0, Bends(rad))
+
+
+def _side(name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]) -> Cause:
+    acts = Answers(_by_side, None, 2e-3, numbers=numbers)
+    return Cause(name, meaning, 1.0, 2.0, -12.0, 12.0, acts, 1e-3, free=False, drawn=Drawn(name, 0.0))
 
 
 DEG = math.pi / 180
@@ -172,16 +215,22 @@ CAUSES: tuple[Cause, ...] = (
     _widens("bias_o_nm", "oblique saddle of the diameter bias, 2xy over R²", 10.0, 15.0, ((2, 1, 1),), free=False),
     Cause(
         "height_nm", "pillar height minus design", 5.0, 10.0, -28.0, 28.0,
-        Answers(_by_height, _taller, 0.01, "height_um", "height_um"), 1e-3, drawn=Drawn("height_nm", 7.0),
+        Answers(_by_height, _taller, 0.01, "height_um", _number("height_um")), 1e-3, drawn=Drawn("height_nm", 7.0),
     ),
     Cause(
         "index", "refractive index of the pillars minus design", 0.02, 0.02, -0.075, 0.075,
-        Answers(_by_index, _denser, 0.02, "n", "pillar.n"), free=False, drawn=Drawn("index", 0.02),
+        Answers(_by_index, _denser, 0.02, "n", _number("pillar.n")), free=False, drawn=Drawn("index", 0.02),
     ),
     Cause(
         "sidewall_deg", "sidewall angle minus design", 0.3, 0.5, -1.6, 1.6,
-        Answers(_by_sidewall, _leaning, DEG / 2, number="sidewall_rad"), DEG, free=False,
+        Answers(_by_sidewall, _leaning, DEG / 2, numbers=_number("sidewall_rad")), DEG, free=False,
         drawn=Drawn("sidewall_deg", 0.5), plausible=2.0,
+    ),
+    _side("width_nm", "side of a rectangle or ellipse along its x, minus design and bias", _width),
+    _side("length_nm", "side of a rectangle or ellipse along its y, minus design and bias", _length),
+    Cause(
+        "turn_deg", "turn of every pillar in the plane, from +x to +y, minus design", 0.2, 0.3, -3.0, 3.0,
+        Answers(_by_turn, None, DEG / 2, numbers=_turn), DEG, free=False, drawn=Drawn("turn_deg", 0.0),
     ),
     _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _bends("oblique_astigmatism", 6, ((2, 1, 1),)),
@@ -201,6 +250,13 @@ def of_kind(kind: type[Widens] | type[Answers] | type[Bends]) -> Iterator[tuple[
 def named(kind: type[Widens] | type[Answers] | type[Bends]) -> tuple[str, ...]:
     """Names of the causes that act in one way, in order."""
     return tuple(row.name for _, row in of_kind(kind))
+
+
+def lacking(cell: Cell) -> tuple[str, ...]:
+    """Names of the causes that pillars of this shape cannot have: a round one has no length, and no turn."""
+    size = cell.pitch_um / 2
+    rows = [row for _, row in of_kind(Answers) if isinstance(row.acts, Answers) and row.acts.numbers]
+    return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]
 
 
 def polynomials(kind: type[Widens] | type[Bends]) -> Array:

@@ -5,15 +5,18 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.polynomial import polynomial
+from numpy.polynomial import chebyshev, polynomial
 
 from metalens.cell import Cell, Index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
 from metalens.made.causes import Answers, Guide, of_kind
+from metalens.made.own import own_rates
 from metalens.made.solved import Solved
 from metalens.pillars import Proxy
+
+_NODES, _DEGREE = 9, 5  # sizes that own shapes are solved at, and of the polynomials through them
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -25,6 +28,8 @@ class Sensitivity:
     error: of the slopes, relative to their change across the lens; nan where not known.
     low_um, high_um: diameters that the polynomials were made for; beyond them they go on along their tangents.
     solved: t itself under large changes, where a solver was asked; it stands for the proxy then.
+    edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size, per um: a proxy knows pillars
+        that keep their form as they grow, which a biased rectangle does not; None for those that do.
     """
 
     coefficients: Array
@@ -33,17 +38,26 @@ class Sensitivity:
     low_um: float = -math.inf
     high_um: float = math.inf
     solved: Solved | None = None
+    edges: Array | None = None
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t."""
-        inside = np.clip(diameter_um, self.low_um, self.high_um)
-        offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
-        values = [polynomial.polyval(offset, row) for row in self.coefficients]
-        if beyond.any():
-            slopes = [polynomial.polyval(offset, polynomial.polyder(row)) for row in self.coefficients]
-            values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
+        values = self._series(self.coefficients, diameter_um)
         missing = len(list(of_kind(Answers))) - len(values)
         return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+
+    def by_edges(self, diameter_um: Array) -> Array | None:
+        """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""
+        return None if self.edges is None else self._series(self.edges, diameter_um)[0]
+
+    def _series(self, coefficients: Array, diameter_um: Array) -> list[Array]:
+        inside = np.clip(diameter_um, self.low_um, self.high_um)
+        offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
+        values = [polynomial.polyval(offset, row) for row in coefficients]
+        if beyond.any():
+            slopes = [polynomial.polyval(offset, polynomial.polyder(row)) for row in coefficients]
+            values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
+        return values
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,13 +100,23 @@ class Slopes(Protocol):
         """(answering causes, *shape) derivatives of ln t by the base unit of each."""
         ...
 
+    def by_edges(self, diameter_um: Array) -> Array | None:
+        """(*shape) per um, beyond what the size says; None for nothing."""
+        ...
+
 
 def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
-    """Derivatives from the effective index of the pillars that the proxy's phase implies.
+    """Derivatives from the effective index of the pillars that the proxy's phase implies; of pillars that are not
+    round on a square lattice those of their own shape, by exact derivatives of a solver (seconds a lens).
 
     Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by index; interference between
-    foot and top is left out. The cell solvers say it better, at seconds a lens.
+    foot and top is left out. The cell solvers say it better, at seconds a lens. Of others: ``error`` of the result.
+
+    Raises:
+        CellError, MaterialError, LensError: pillars that are not round and that the solver does not take.
     """
+    if not lens.cell.round:
+        return _of_its_own(lens)
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = max(float(d.min()), lens.proxy.domain_um[0]), min(float(d.max()), lens.proxy.domain_um[1])
     seen = guide(lens.cell, lens.proxy, lens.wavelength_um, np.linspace(low, high, 61), degree=degree)
@@ -103,6 +127,23 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
         if isinstance(row.acts, Answers)
     ]
     return Sensitivity(np.array(rows), center, 0.5, low, high)
+
+
+def _of_its_own(lens: Lens) -> Sensitivity:
+    """From :func:`metalens.made.own.own_rates` at Chebyshev sizes, as polynomials of degree 5."""
+    low, high = lens.proxy.domain_um
+    unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    found = own_rates(lens, (low + high) / 2 + (high - low) / 2 * unit)
+    rows = np.vstack([found.rates, found.edges])
+    series = chebyshev.chebfit(unit, rows.T, _DEGREE)
+    off = np.linalg.norm(chebyshev.chebval(unit, series) - rows, axis=1) / np.maximum(
+        np.linalg.norm(rows, axis=1), 1e-9
+    )
+    known = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
+    scale = (2 / (high - low)) ** np.arange(_DEGREE + 1)
+    made = np.array([np.pad(c, (0, _DEGREE + 1 - len(c))) for c in map(chebyshev.cheb2poly, series.T)]) * scale
+    error = found.error + float((off * known).max())
+    return Sensitivity(made[:-1], (low + high) / 2, error, low, high, None, made[-1:] if known[-1] else None)
 
 
 def guide(cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array, *, degree: int = 5) -> Guide:
@@ -162,6 +203,15 @@ def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
     return Answer(slopes, series, designed(proxy, inside, solved.wavelength_um))
 
 
+def biased(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
+    """t of pillars whose edges have moved by a bias to sizes ``d_um``, over that of pillars designed so.
+
+    Of second order: the derivative is taken half-way. 1 for shapes that keep their form.
+    """
+    rate = response.by_edges(np.asarray(d_um - np.asarray(bias_um) / 2))
+    return 1.0 if rate is None else np.exp(bias_um * rate)
+
+
 def transmission(
     proxy: Proxy,
     response: Slopes,
@@ -169,12 +219,14 @@ def transmission(
     wavelength_um: float,
     answers: Array,
     *,
+    bias_um: Array | float = 0.0,
     angle_rad: float = 0.0,
 ) -> Array:
     """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc), or as the solver has it.
 
     Args:
-        answers: (answering causes,) amounts in base units: :meth:`State.answers`.
+        answers: (answering causes,) amounts in base units: :meth:`State.answers`. bias_um: what of the diameters is
+            bias, of all edges alike, and no size of the design (:func:`biased`).
     """
-    changed = answer(proxy, response, d_um).factor(answers)
+    changed = answer(proxy, response, d_um).factor(answers) * biased(response, d_um, bias_um)
     return np.asarray(designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed)

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from metalens.cell import Cell
 from metalens.ground.errors import ProcessError
-from metalens.made.causes import CAUSES, Drawn
+from metalens.made.causes import CAUSES, Drawn, lacking
 from metalens.made.state import State
 
 DRAWN: dict[str, Drawn] = {row.drawn.name: row.drawn for row in CAUSES if row.drawn}  # by entry, in the table's order
@@ -23,6 +24,7 @@ class Spread(_Entries):  # type: ignore[misc]
 
     bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the other, in a random direction.
     bow_nm: bias from centre to edge. height_nm, index, sidewall_deg: of the whole lens.
+    width_nm, length_nm, turn_deg: of the sides of all rectangles or ellipses and of their turn; none unless stated.
     """
 
     def __post_init__(self) -> None:
@@ -33,6 +35,22 @@ class Spread(_Entries):  # type: ignore[misc]
     def values(self) -> dict[str, float]:
         """Standard deviations by entry."""
         return {name: float(getattr(self, name)) for name in DRAWN}
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """The same without entries that no process has unless it says so."""
+        return {name: value for name, value in self.values().items() if value or DRAWN[name].sigma}
+
+    def check(self, cell: Cell) -> None:
+        """Refuse what pillars of this cell cannot have.
+
+        Raises:
+            ProcessError: naming the entry.
+        """
+        apart = {row.drawn.name: row.name for row in CAUSES if row.drawn}
+        for name, value in self.stated.items():
+            if value and apart[name] in lacking(cell):
+                raise ProcessError(f"spread.{name} = {value:g}: {cell.described} has none; need 0")
 
     @classmethod
     def only(cls, **values: float) -> "Spread":
@@ -64,9 +82,9 @@ class Draw:
 
 def draws(spread: Spread, count: int, *, seed: int) -> list[Draw]:
     """``count`` lenses of a process: normal amounts, gradients in any direction."""
-    random = np.random.default_rng(seed)
-    sigma = np.array(list(spread.values().values()))
+    random, stated = np.random.default_rng(seed), spread.stated
+    sigma = np.array(list(stated.values()))
     normal, turns = random.standard_normal((count, len(sigma))) * sigma, random.uniform(0, 2 * np.pi, count)
     return [
-        Draw(dict(zip(DRAWN, row.tolist(), strict=True)), float(turn)) for row, turn in zip(normal, turns, strict=True)
+        Draw(dict(zip(stated, row.tolist(), strict=True)), float(turn)) for row, turn in zip(normal, turns, strict=True)
     ]

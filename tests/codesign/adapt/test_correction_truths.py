@@ -11,6 +11,8 @@ from metalens.lens import DiameterMap
 
 RNG = np.random.default_rng(29)
 
+FORM_KEPT = SimpleNamespace(by_edges=lambda diameter_um: None)
+
 
 def test_an_overlap_is_the_strehl_ratio_with_the_best_piston():
     """exp(-V) to second order for a phase of variance V; 1 for a wave times any number."""
@@ -51,10 +53,10 @@ def process(monkeypatch):
 
 def test_made_diameters_are_wanted_that_give_the_designed_phases_up_to_a_piston(process):
     """All shifted alike: the shift is a piston, so nothing is wanted to change; the table is the present bias."""
-    wanted = correction._wanted_um(process, np.array([0.12, 0.19, 0.26]), 1, None)
+    wanted = correction._wanted_um(process, np.array([0.12, 0.19, 0.26]), 1, FORM_KEPT)
     assert wanted == pytest.approx([0.12, 0.19, 0.26], abs=1e-6)
     old = SimpleNamespace(drawn_nm=lambda made: np.asarray(made) - 11.0)
-    table = correction.table(process, 1, response=None, old=old, range_um=(0.12, 0.26), knots=5)
+    table = correction.table(process, 1, response=FORM_KEPT, old=old, range_um=(0.12, 0.26), knots=5)
     assert table.designed_um == pytest.approx(np.linspace(0.12, 0.26, 5))
     assert table.bias_nm == pytest.approx(np.full(5, 15.0), abs=1e-3)  # 11 of the old table and 4 of the fit
     assert table.drawn_nm == pytest.approx(np.linspace(120, 260, 5) - 15.0, abs=1e-3)

@@ -33,7 +33,7 @@ def test_cells_hold_the_mean_of_their_pillars_with_the_bias_where_each_stands():
     bias = np.array([[0.01, -0.002, 0.0], [0.004, 0.003, 0.0], [0.005, 0.0, 0.0]])
     low, step = 0.05, 1e-3
     table = np.exp(1j * np.arange(400) / 50).astype(np.complex64)
-    got = GATHER(diameter, carrier, table, low, step, u, v, bias, 3)
+    got = GATHER(diameter, carrier, table, np.empty(0, complex), low, step, u, v, bias, 3)
     assert got.shape == (2, 3)
     for row, column in np.ndindex(2, 3):
         terms = []
@@ -45,7 +45,10 @@ def test_cells_hold_the_mean_of_their_pillars_with_the_bias_where_each_stands():
         want = np.mean(terms) if terms else 0.0
         assert got[row, column] == pytest.approx(want, abs=1e-6)
     assert got[1, 1] == 0
-    assert GATHER(diameter[:, :6], carrier[:, :6], table, low, step, u[:6], v, bias, 3).shape == (2, 2)
+    assert GATHER(diameter[:, :6], carrier[:, :6], table, np.empty(0, complex), low, step, u[:6], v, bias, 3).shape == (
+        2,
+        2,
+    )
 
 
 def test_empty_cells_take_the_nearest_filled_one():

@@ -71,7 +71,7 @@ def test_errors_are_correlated_as_they_are_said_to_be():
     assert np.count_nonzero(found) == 9 + 2
     generator = torch.Generator().manual_seed(5)
     drawn = [errors.draw(generator) for _ in range(3000)]
-    values = np.array([[one.amounts[name] for name in lens_errors.ENTRIES] for one in drawn])
+    values = np.array([[one.amounts.get(name, 0.0) for name in lens_errors.ENTRIES] for one in drawn])
     scale = np.sqrt(np.maximum(np.diag(found), 1e-30))
     assert np.abs((np.cov(values.T) - found) / np.outer(scale, scale)).max() < 0.11  # four sigma of √(2 / 3000)
     turn = np.array([one.turn_rad for one in drawn])

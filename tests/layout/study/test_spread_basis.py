@@ -27,9 +27,9 @@ def overlaps(lens, spread, seed):
         a = draw.amounts
         bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * r * np.cos(phi - draw.turn_rad) + a["bow_nm"] * (r**2 - 0.5)
         d = size * 5e-5 + bias_nm * 1e-3
-        height, index, wall = SENS.at(d)
+        height, index, wall = SENS.at(d)[:3]
         change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
-        curves.append(transmission(PROXY, SENS, d, 0.85, np.zeros(3)) * np.exp(change))
+        curves.append(transmission(PROXY, SENS, d, 0.85, np.zeros(6)) * np.exp(change))
     return (np.array(curves) * count) @ np.conj(curves).T
 
 
@@ -144,7 +144,7 @@ def test_curves_of_a_basis_are_of_places_anywhere_in_the_lens(monkeypatch):
         places.append((float(u), float(v)))
         return np.zeros(1)
 
-    made = SimpleNamespace(bias_um=bias_um, answers=lambda: np.zeros(3))
+    made = SimpleNamespace(bias_um=bias_um, answers=lambda: np.zeros(6))
     one = SimpleNamespace(state=lambda: made)
     monkeypatch.setattr(spread_model, "draws", lambda spread, count, *, seed: [one] * count)
     lens = hyperbolic()

@@ -22,7 +22,7 @@ from metalens.cell.shapes import Circle, Cross, Rectangle, Square
 from metalens.ground.errors import ProcessError
 from metalens.ground.report import Figure, Table
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import DRAWN, Spread, draws, transmission
+from metalens.made import Spread, draws, transmission
 from metalens.pillars.proxy import Proxy
 from tests.referees import plain_sum
 
@@ -69,9 +69,9 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
         along = x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
         bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (x**2 + y**2 - 0.5)
         made = np.where(d > 0, d + bias_nm * 1e-3, 0.2)
-        height, index, wall = SENS.at(made)
+        height, index, wall = SENS.at(made)[:3]
         change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
-        t = transmission(PROXY, SENS, made, 0.85, np.zeros(3)) * np.exp(change)
+        t = transmission(PROXY, SENS, made, 0.85, np.zeros(6)) * np.exp(change)
         exact = plain_sum.field(lens, np.where(d > 0, t, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
     assert missed(model, lenses) < 2e-3
@@ -88,7 +88,7 @@ def test_no_spread_leaves_the_lens_as_it_is():
 
 def test_effects_and_bands_of_a_lens():
     report = tolerance.analyse(hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3)
-    assert [effect.cause for effect in report.effects] == list(DRAWN)
+    assert [effect.cause for effect in report.effects] == list(Spread().stated)
     again = tolerance.analyse(hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3)
     assert (report.draws.strehl == again.draws.strehl).all()
     low, middle, high = report.band("information")
@@ -96,7 +96,7 @@ def test_effects_and_bands_of_a_lens():
     assert (low < middle).all()
     assert (middle < high).all()
     # a phase spread s costs exp(-s^2) of the peak; height changes phase and, by its real part, the level
-    height = report.effects[list(DRAWN).index("height_nm")]
+    height = report.effects[list(Spread().stated).index("height_nm")]
     assert height.strehl == pytest.approx(1 - np.exp(-(height.phase_rad**2) - 2 * 1.0 * 0.007), abs=0.004)
     assert report.error < 2e-3
     assert 0.4 < report.nominal.efficiency[0] < 1
@@ -128,7 +128,7 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
 
 def test_beyond_the_domain_the_phase_goes_on_straight():
     d = np.array([0.3, 0.31, 0.32])
-    phase = np.unwrap(np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(3))))
+    phase = np.unwrap(np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(6))))
     assert np.diff(phase) == pytest.approx(0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9)
 
 
@@ -211,7 +211,7 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
     assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
     tables = [item for section in made for item in section.items if isinstance(item, Table)]
-    assert [row[0] for row in tables[1].rows] == list(DRAWN)
+    assert [row[0] for row in tables[1].rows] == list(Spread().stated)
     assert all(
         np.isfinite(value) for table in tables for row in table.rows for value in row if isinstance(value, float)
     )

@@ -56,8 +56,10 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
 
 
 def test_answers_travel_in_micrometres_radians_and_one():
-    made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9})
-    assert made.answers() == pytest.approx([-7e-3, 0.013, math.radians(0.9)], rel=1e-12)
+    sides = {"width_nm": 5.0, "length_nm": -3.0, "turn_deg": 0.4}
+    made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9, **sides})
+    want = [-7e-3, 0.013, math.radians(0.9), 5e-3, -3e-3, math.radians(0.4)]
+    assert made.answers() == pytest.approx(want, rel=1e-12)
     assert not State.of().amounts.any()
     assert len(State.of().amounts) == len(CAUSES)
 
@@ -88,11 +90,16 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
 
     by_wall = (phase(wall + 1e-4) - phase(wall - 1e-4)) / 2e-4
     assert rows["sidewall_deg"] == pytest.approx(1j * by_wall, rel=1e-4)
+    by_diameter = 1j * k * h * guide.slope  # of one side, the mean of both polarisations: half of it
+    assert rows["width_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
+    assert rows["length_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
+    assert not rows["turn_deg"].any()
 
 
 def test_changed_cells_have_so_much_more_of_the_cause():
     cell = Cell(0.4, 0.6, Index(3.1, 0.02), sidewall_rad=0.03)
-    rows = {row.name: row.acts.changed(cell, 0.011, 0.85) for _, row in causes.of_kind(Answers)}
+    rows = {row.name: row.acts.changed(cell, 0.011, 0.85) for _, row in causes.of_kind(Answers) if row.acts.changed}
+    assert len(rows) == 3
     assert rows["height_nm"].height_um == pytest.approx(0.611)
     assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx((3.111, 0.02))
     assert rows["sidewall_deg"].sidewall_rad == pytest.approx(0.041)
@@ -108,7 +115,8 @@ def test_a_drawn_gradient_points_in_its_own_direction():
 
 def test_lenses_are_drawn_with_the_stated_sigma_and_in_all_directions():
     sigma = {"bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 0.0, "height_nm": 7.0, "index": 0.013, "sidewall_deg": 0.4}
-    assert set(sigma) == set(DRAWN)
+    sides = {"width_nm", "length_nm", "turn_deg"}
+    assert set(sigma) == set(DRAWN) - sides
     lenses = draws(Spread(**sigma), 4000, seed=3)
     for name, want in sigma.items():
         values = np.array([lens.amounts[name] for lens in lenses])
@@ -120,7 +128,11 @@ def test_lenses_are_drawn_with_the_stated_sigma_and_in_all_directions():
     usual = Spread().values()
     assert usual == {
         "bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 2.0, "height_nm": 7.0, "index": 0.02, "sidewall_deg": 0.5,
-    }  # fmt: skip
+    } | dict.fromkeys(sides, 0.0)  # fmt: skip
+    assert Spread(width_nm=2.0).stated == {n: v for n, v in usual.items() if n not in sides} | {"width_nm": 2.0}
+    some = draws(Spread(length_nm=2.5), 4000, seed=5)
+    assert np.std([lens.amounts["length_nm"] for lens in some]) == pytest.approx(2.5, rel=0.05)
+    assert "width_nm" not in some[0].amounts
 
 
 def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_for():
@@ -128,12 +140,14 @@ def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_f
     made = Sensitivity(rows, 0.2, low_um=0.1, high_um=0.35)
     for d in (0.14, 0.31):
         o = d - 0.2
-        assert made.at(np.array([d]))[:, 0] == pytest.approx([*(r[0] + r[1] * o + r[2] * o * o for r in rows), 0])
+        assert made.at(np.array([d]))[:, 0] == pytest.approx(
+            [*(r[0] + r[1] * o + r[2] * o * o for r in rows), *[0] * 4]
+        )
     for d, edge in ((0.05, 0.1), (0.5, 0.35)):
         o = edge - 0.2
         want = [r[0] + r[1] * o + r[2] * o * o + (d - edge) * (r[1] + 2 * r[2] * o) for r in rows]
-        assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx([*want, 0])  # the third cause is not there
-        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], 0])
+        assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx([*want, *[0] * 4])  # the other causes are not there
+        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], *[0] * 4])
 
 
 def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_series():
@@ -186,7 +200,7 @@ def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
     assert np.abs(got[3:]) == pytest.approx([0, 1], abs=1e-12)  # held within 0 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
-    changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0]), angle_rad=0.1)
+    changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0, *[0] * 3]), angle_rad=0.1)
     assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
 
 
@@ -199,13 +213,13 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     solved = Solved(0.85, at, powers)
     slopes = Sensitivity(np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved)
     made = response.answer(Line(), slopes, np.array([0.18, 0.24]))
-    amounts = np.array([0.5, 0.02, -0.3])
+    amounts = np.array([0.5, 0.02, -0.3, 0.0, 0.0, 0.0])
     want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
     proxy = response.designed(Line(), at[1:3], 0.85)
     assert made.factor(amounts) * proxy == pytest.approx(want * np.exp(0.15j - 0.03), rel=1e-9)
     beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
     ends = response.designed(Line(), at[[0, 3]], 0.85)
-    assert beyond.factor(np.zeros(3)) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
+    assert beyond.factor(np.zeros(6)) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
