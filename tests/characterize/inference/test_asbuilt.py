@@ -20,6 +20,8 @@ from characterize.model.forward import ForwardModel, Setting
 from characterize.model.parameters import NAMES, PARAMETERS, PLACE, Known, vector
 from characterize.model.pillars import Pillars
 from metalens import psf
+from metalens.cell import Cell
+from metalens.cell.shapes import Rectangle
 from metalens.ground.errors import CaptureError, ConfigError, FitError
 from metalens.made import Solved, sensitivity
 from metalens.psf.of_lens import View
@@ -77,9 +79,16 @@ def test_low_rank_pillars_know_their_error():
     assert pillars.error < 1e-3
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "bandwidth_nm"])
+SIDES = ("width_nm", "length_nm", "turn_deg")  # of rectangles, below: round pillars have none
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES)])
 def test_derivatives_match_finite_differences(model, name):
     x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0} | GLASS)
+    slopes_are_differences(model, name, x)
+
+
+def slopes_are_differences(model, name, x):
     # images are in single precision: of a wall, that acts little, its rounding would be 2 % of so small a difference
     h = (0.3 if name == "sidewall_deg" else 0.1) * PARAMETERS[PLACE[name]].scale
     up, down = x.copy(), x.copy()
@@ -88,6 +97,21 @@ def test_derivatives_match_finite_differences(model, name):
     want = (model.images(up)[0] - model.images(down)[0]) / (2 * h)
     slope = model.images(x, [name])[1][0]
     assert np.abs(slope - want).max() < 2e-2 * np.abs(want).max()  # operators of derivatives are cut at 3e-3 of all
+
+
+@pytest.fixture(scope="module")
+def of_rectangles():
+    """Slopes by sides and turn, and by edges beyond the size, as of some rectangle."""
+    lens = dataclasses.replace(b.lens(), cell=Cell(0.4, shape=Rectangle(0.7)))
+    rows = np.vstack([b.RESPONSE.coefficients, [[0.1 + 12j, 70j], [0.2 + 7j, 30j], [-0.5 + 0.8j, 4j]]])
+    response = dataclasses.replace(b.RESPONSE, coefficients=rows, edges=np.array([[0.1 + 6j, 40j]]))
+    return ForwardModel(lens, SETTING, response)
+
+
+@pytest.mark.parametrize("name", [*SIDES, "bias_nm", "bias_x_nm"])
+def test_derivatives_by_sides_edges_and_turn_match_finite_differences(of_rectangles, name):
+    x = vector(b.VALUES | {"log_gain": 10.0, "width_nm": 3.0, "length_nm": -2.0, "turn_deg": 0.7})
+    slopes_are_differences(of_rectangles, name, x)
 
 
 def test_a_point_source_has_a_slope_by_its_size(model):
@@ -287,7 +311,7 @@ def test_what_is_stated_is_not_reckoned_with():
 def test_effective_index_slopes_scale_as_a_waveguide():
     found = sensitivity(b.lens())
     d = np.array([0.12, 0.17, 0.22])
-    height, index, wall = found.at(d)
+    height, index, wall = found.at(d)[:3]
     k = 2 * np.pi / 0.85
     phase = b.lens().proxy.phase_rad(d, 0.85)
     assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)  # phase = k n_eff h
