@@ -341,14 +341,8 @@ def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
     if "response/powers" in arrays:
         wave = float(arrays["response/wavelength_um"])
         solved = Solved(wave, arrays["response/diameter_um"], arrays["response/powers"])
-    return Sensitivity(
-        arrays["response/coefficients"],
-        about["response_center_um"],
-        about["response_error"],
-        *ends,
-        solved,
-        arrays.get("response/edges"),
-    )
+    more = about["response_center_um"], about["response_error"], *ends, solved, arrays.get("response/edges")
+    return Sensitivity(arrays["response/coefficients"], *more)
 
 
 def _text(array: Array) -> list[str]:
