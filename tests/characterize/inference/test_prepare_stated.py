@@ -8,7 +8,7 @@ from characterize.inference.prepare import stated
 
 
 def said(**about):
-    capture = SimpleNamespace(wavelength_um=0.8523, pixel_um=0.75, about=about)
+    capture = SimpleNamespace(wavelength_um=0.8523, fill=1.0, pixel_um=0.75, about=about)
     return {one.name: (one.value, one.sigma) for one in stated(capture, SimpleNamespace(wavelength_um=0.85))}
 
 
