@@ -1,7 +1,7 @@
 """The virtual experiment of the paper's Sec. 5: best focus, mid-range, asphere, jointly trained lens of one network.
 
     python -m benchmarks.experiment train NAME --seed 0 --work DIR  # NAME: of LENSES; resumes
-    python -m benchmarks.experiment run --work DIR                  # of the runs there are, kept in benchmarks/results
+    python -m benchmarks.experiment run --work DIR                  # of the runs there, beside the kept ones of others
 
 Trained and judged on the true image: a field of ±25 degrees in light of 30 nm. Gaze is calibrated on stimuli drawn at
 random, or with ``--points spread`` on as many spread over the field. Networks of another seed have other weights,
@@ -125,7 +125,7 @@ def main() -> None:
         return
     folders = sorted(f.parent for f in given.work.glob("*-*/result.json"))
     kept = json.loads(RESULT.read_text("utf-8")) if RESULT.is_file() else {}
-    kept[given.points] = _shown(given.work, given.points, folders)
+    kept[given.points] = kept.get(given.points, {}) | _shown(given.work, given.points, folders)
     store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
 
 
