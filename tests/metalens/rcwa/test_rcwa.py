@@ -351,17 +351,6 @@ def test_bad_numbers_are_refused_by_name(change, message):
         rcwa.solve(CELL, **numbers)
 
 
-def test_tilted_walls_that_meet_or_close_are_refused():
-    """Wider by height times tangent at the foot, or at the top where the wall leans out; thinner at the other end."""
-    slant = CELL.height_um * math.tan(0.1)
-    for tilt, wide, narrow in ((0.1, "foot", "top"), (-0.1, "top", "foot")):
-        leaning = replace(CELL, sidewall_rad=tilt)
-        with pytest.raises(CellError, match=f"overlap, {0.38 + slant:.6g} um wide at the {wide}"):
-            rcwa.solve(leaning, 0.38, WAVELENGTH)
-        with pytest.raises(CellError, match=f"closes the pillar below its {narrow}; need at least {slant:.6g} um"):
-            rcwa.solve(leaning, 0.05, WAVELENGTH)
-
-
 def test_light_that_cannot_come_from_the_substrate_is_refused():
     with pytest.raises(CellError, match="cannot come"):
         rcwa.solve(replace(CELL, substrate=Index(0.5)), 0.2, WAVELENGTH, angle_rad=0.6, polarization="s")
