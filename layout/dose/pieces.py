@@ -10,21 +10,24 @@ import numpy as np
 
 from layout.dose.exposure import CLEARS, PointExposure
 from layout.dose.rects import CORNER, pairs_near, sums_of_boxes
+from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
 MOST_PIECES = 500_000
 _SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
 _SHORTEST = 64  # pieces along the range, at most
-_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece, the first that takes few: others' doses differ beside it
+_LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece, the first that the limits allow
 _FEW_PIECES = 100_000
+_EVEN = 1.0  # ranges: where longer pieces meet, doses change so far into a shape that edges are 1 to 2 % off
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pieces:
-    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these sides the box has of its shape.
+    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these sides the box has of its
+    shape, in part at least.
 
     of: (n,) the box it was cut from.
     """
@@ -68,7 +71,7 @@ def cut(
     usual, corners = _ranges(around, change)
     sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
     for ranges in _LONGEST:
-        most = MOST_PIECES if ranges == _LONGEST[-1] else min(_FEW_PIECES, MOST_PIECES)
+        most = MOST_PIECES if ranges >= _EVEN else min(_FEW_PIECES, MOST_PIECES)
         if np.ceil(sides / (ranges * usual)).prod(1).sum() > most:
             continue
         caps = _Caps(shortest, ranges * usual, [(_FEW * width, ranges * width) for width in corners], change)
@@ -111,12 +114,14 @@ def _halved(
 ) -> _Pieces | None:
     """Boxes halved until they keep the limits; None where that takes more than ``most``."""
     every = np.asarray(boxes) * step_um
-    pairs = pairs_near(every, np.zeros(len(every)), around)
+    pairs, whole = pairs_near(every, np.zeros(len(every)), around), np.asarray(boxes, np.int64)
+    first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
     done: list[_Pieces] = []
     open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
     while len(open_.box):
         if len(open_.box) + sum(len(p.box) for p in done) > most:
             return None
+        _uncover(open_.box, open_.of, whole, first, pairs[1], open_.outer)
         longest = _longest(open_, lattices, every, step_um, around, caps)
         change = _change(open_, every, pairs, step_um, around) / caps.change
         side = open_.box[:, 2:] - open_.box[:, :2]
@@ -125,6 +130,29 @@ def _halved(
         done.append(open_.some(np.asarray(~split.any(1))))
         open_ = _joined([open_.some(across[:, 0]).halved(0), open_.some(across[:, 1] & ~across[:, 0]).halved(1)])
     return _joined(done)
+
+
+@compiled
+def _uncover(box: Array, of: Array, whole: Array, first: Array, near: Array, outer: Array) -> None:
+    """Take sides that other boxes cover from end to end out of ``outer``: no edge is there.
+
+    near: numbers of the boxes around each of ``whole``, from ``first`` on.
+    """
+    for n in range(box.shape[0]):
+        beside = near[first[of[n]] : first[of[n] + 1]]
+        for side in range(4):  # left, bottom, right, top
+            if not outer[n, side]:
+                continue
+            across, along, at = side % 2, 1 - side % 2, box[n, side]
+            low, reached = box[n, along], box[n, along] - 1
+            while reached < low < box[n, along + 2]:
+                reached = low
+                for m in beside:
+                    b = whole[m]
+                    over = b[across] < at <= b[across + 2] if side < 2 else b[across] <= at < b[across + 2]
+                    if over and b[along] <= low:
+                        low = max(low, b[along + 2])
+            outer[n, side] = low < box[n, along + 2]
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
