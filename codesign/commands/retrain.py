@@ -95,15 +95,15 @@ def _recipe(options: Options, source: Source) -> Recipe:
 
 def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
     """Note the recipe, or refuse to resume another."""
-    text, folder = config.dumps(recipe), draft.path
+    folder = draft.path
     if resume:
         if not (folder / RECIPE).is_file():
             raise TrainingError(f"{draft.target}: no retraining to resume ({RECIPE} missing); start without --resume")
-        changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), text)
+        changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), recipe)
         if changed:
             raise TrainingError(f"{folder} belongs to other settings; start anew or undo the change:\n{changed}")
         return
-    store.write_text(folder / RECIPE, text)
+    store.write_text(folder / RECIPE, config.dumps(recipe))
 
 
 def _train(options: Options, folder: Path, given: tuple[Recipe, Source, Lenses], name: str) -> Trainer:

@@ -1,6 +1,7 @@
 """Training state on disk: every tensor bit for bit (safetensors), the rest as JSON, written whole or not at all."""
 
 import json
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +76,29 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
     return merged
 
 
-def difference(old: str, new: str) -> str:
-    """What changed between two settings in TOML, one ``key: old -> new`` a line; '' for none."""
-    before, after = (_flat(text) for text in (old, new))
+def difference(old: str, settings: object) -> str:
+    """What changed from settings in TOML to these, one ``key: old -> new`` a line; '' for none.
+
+    A setting that the old ones do not know stands at its default there: one whose default is not what was done before
+    needs another :data:`VERSION`.
+    """
+    before, after, plain = _flat(old), _flat(config.dumps(settings)), _flat(config.dumps(_plain(settings)))
+    before = {key: value for key, value in plain.items() if key in after} | before
     keys = sorted(before.keys() | after.keys())
     changed = [k for k in keys if before.get(k) != after.get(k)]
     return "\n".join(f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed)
+
+
+def _plain(settings: Any) -> Any:
+    """Settings of the same kind, all that have a default at it."""
+    held: dict[str, Any] = {}
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value):
+            held[field.name] = _plain(value)
+        elif field.default is MISSING and field.default_factory is MISSING:
+            held[field.name] = value
+    return type(settings)(**held)
 
 
 def _about(metadata: dict[str, str]) -> dict[str, Any]:
@@ -98,7 +116,7 @@ def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
             f"{path} holds {found[0]!r} version {found[1]}, need 'checkpoint' version {VERSION}; train again, or go on "
             "with the release that wrote it"
         )
-    changed = difference(metadata["settings"], config.dumps(settings))
+    changed = difference(metadata["settings"], settings)
     if changed:
         raise TrainingError(f"{path} belongs to other settings; start a new run or undo the change:\n{changed}")
 

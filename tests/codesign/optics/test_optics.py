@@ -157,7 +157,8 @@ def test_lens_errors_have_the_covariance_that_was_asked_for():
     spread = LensErrors(2.0, 0.1, 0.0, 4.0, 8.0, gradient_nm=3.0, correlation=tuple(correlation.ravel()))
     assert lens_errors.ENTRIES[:5] == ("focus_um", "tilt_waves", "astigmatism_waves", "bias_nm", "height_nm")
     generator = torch.Generator().manual_seed(0)
-    drawn = np.array([list(spread.draw(generator).amounts.values()) for _ in range(4000)])
+    errors = [spread.draw(generator).amounts for _ in range(4000)]
+    drawn = np.array([[one.get(name, 0.0) for name in lens_errors.ENTRIES] for one in errors])
     scale = np.outer(spread.deviations, spread.deviations) + 1e-12
     assert np.abs((np.cov(drawn.T) - spread.covariance) / np.sqrt(np.outer(*[np.diag(scale)] * 2))).max() < 0.06
     assert LensErrors().draw(generator) is None

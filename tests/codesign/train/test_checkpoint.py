@@ -67,6 +67,32 @@ def test_changed_settings_are_refused_with_the_difference(tmp_path):
         checkpoint.load(tmp_path / "c", settings=replace(Settings(), rate=0.2))
 
 
+@dataclass(frozen=True)
+class Inner:
+    turn: float = 0.0
+
+
+@dataclass(frozen=True)
+class Later(Settings):
+    width: float = 0.0
+    inner: Inner = Inner()
+
+
+def test_settings_that_an_older_run_did_not_know_stand_at_their_defaults(tmp_path):
+    """A run goes on where a later release added settings, and is refused where these are used."""
+    checkpoint.save(tmp_path / "c", {"a": 1}, settings=Settings(rate=0.3))
+    assert checkpoint.load(tmp_path / "c", settings=Later(rate=0.3)) == {"a": 1}
+    for used, told in (
+        (Later(rate=0.3, width=0.7), "width: 0.0 -> 0.7"),
+        (Later(rate=0.3, inner=Inner(2.0)), "inner.turn: 0.0 -> 2.0"),
+    ):
+        with pytest.raises(TrainingError, match=told):
+            checkpoint.load(tmp_path / "c", settings=used)
+    checkpoint.save(tmp_path / "l", {"a": 1}, settings=Later())
+    with pytest.raises(TrainingError, match=r"width: 0\.0 -> absent"):
+        checkpoint.load(tmp_path / "l", settings=Settings())
+
+
 @pytest.mark.parametrize("keep", [0, 5, 60, 200])
 def test_truncated_checkpoint_is_refused(tmp_path, keep):
     path = tmp_path / "c"

@@ -11,7 +11,7 @@ from layout.study import focus, stitching, tolerance
 from layout.study.focus import Window, peak
 from layout.study.spread_model import reduce
 from layout.study.tolerance import Outcome
-from metalens.made import Draw, Spread, draws, transmission
+from metalens.made import Answers, Draw, Spread, draws, named, transmission
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 from tests.referees import plain_sum
 
@@ -55,7 +55,9 @@ def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(model):
     found = tolerance._effect(model, (Draw({"bias_nm": -31.0}), Draw({"bias_nm": 31.0})), alone, nominal)
     assert (found.cause, found.deviation) == ("bias_nm", 31.0)
     every = hyperbolic(61, 60.0, 500.0).diameters.diameter_um
-    before, *after = (transmission(PROXY, SENS, every[every > 0] + b, 0.85, np.zeros(3)) for b in (0, -0.031, 0.031))
+    before, *after = (
+        transmission(PROXY, SENS, every[every > 0] + b, 0.85, np.zeros(len(named(Answers)))) for b in (0, -0.031, 0.031)
+    )
     turned = [np.angle(t / before * np.exp(-1j * np.angle((t / before).sum()))) for t in after]
     phases = [float(np.sqrt((turn**2).mean())) for turn in turned]
     levels = [float(np.sqrt(((np.abs(t) - np.abs(before)) ** 2).mean())) for t in after]
