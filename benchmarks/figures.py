@@ -16,7 +16,7 @@ SENTENCES = (  # of the README's text, beside its table
     "{characterize_study; peak 8000 e & Cramér-Rao; error; 3} times the\nCramér-Rao bound",
     "the fit of a 1 mm lens in 8 s ({characterize; fit & rms; seconds; 2} s)",
     "as fast as the angular spectrum ({psf; 1 mm free-form & windowed 1e-4; (\\d+)x textbook; 3} times)",
-    "as wide as a sensor a hundred times\n({psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2})",
+    "as wide as a sensor a hundred times ({psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2})",
 )
 REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
 
