@@ -7,7 +7,6 @@ import dataclasses
 import math
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,20 +87,12 @@ def mask_study():
 def budget():
     """The entry of draws of the process: the phase that the lean alone gives."""
     import made_lens as m
+    from process_entry import process_entry
 
-    from codesign.budget import links
-    from codesign.budget.entry import Entry
-    from codesign.budget.prepared import Given
-    from codesign.optics import Aperture
-    from metalens.made import Printed, Spread
+    from metalens.made import Spread
 
     lens = m.small()
-    about = SimpleNamespace(
-        aperture=Aperture(lens), lens=lens, given=Given(mask=Printed(spread=Spread.only(lean_nm=4.0)), draws=60),
-        device=SimpleNamespace(image=lambda **moved: None),
-        entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
-    )  # fmt: skip
-    (entry,) = links.process(about)
+    entry = process_entry(lens, Spread.only(lean_nm=4.0), draws=60)
     built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     slope = lens.proxy.dphase_ddiameter(built, 0.85)
     want = 4e-3 * math.sqrt((slope**2).mean() / 8)

@@ -14,9 +14,8 @@ from numpy.polynomial import chebyshev
 from characterize.model import made, pillar_slopes, state, vector
 from codesign.adapt import correction
 from codesign.budget import links
-from codesign.budget.entry import Entry
 from codesign.budget.prepared import Given
-from codesign.optics import Aperture, LensErrors, MadeLens, OpticsConfig
+from codesign.optics import LensErrors, MadeLens, OpticsConfig
 from codesign.optics.lens_errors import LensError, variance_rad2
 from layout.process import Process
 from layout.study import tolerance
@@ -27,6 +26,7 @@ from metalens.lens import DiameterMap, Lens
 from metalens.made import Bias, Printed, Spread, State, lacking, sensitivity
 from metalens.pillars import Proxy
 from metalens.rcwa import jones
+from tests.codesign.process_entry import process_entry
 
 WAVE, RATIO, HARMONICS = 0.633, 0.62, 8
 CELL = Cell(0.32, height_um=0.55, pillar=Index(2.38), substrate=Index(1.46), shape=Rectangle(RATIO))
@@ -119,12 +119,7 @@ def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
 
 
 def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens):
-    about = SimpleNamespace(
-        aperture=Aperture(lens), lens=lens, given=Given(mask=Printed(spread=Spread.only(length_nm=5.0)), draws=60),
-        device=SimpleNamespace(image=lambda **moved: None),
-        entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
-    )  # fmt: skip
-    (entry,) = links.process(about)
+    entry = process_entry(lens, Spread.only(length_nm=5.0), draws=60)
     there = lens.diameters.diameter_um > 0
     up, down = (anew(lens, length=step)[there] for step in (2e-3, -2e-3))
     rate = np.angle(up / down) / 4e-3

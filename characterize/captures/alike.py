@@ -1,6 +1,5 @@
 """How much alike two frames are, wherever the light lies in them."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,13 +23,18 @@ def above_rim(frames: Array) -> Array:
     return out
 
 
+def _norm(frames: Array, noise: Array | float) -> Array:
+    """Of frames (..., y, x), freed of that of their noise (...)."""
+    power = (frames**2).sum((-2, -1))
+    return np.asarray(np.sqrt(np.maximum(power - noise**2, 0.1 * power)))
+
+
 def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
     """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
 
     The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
     """
-    power = float((a**2).sum())
-    norm = math.sqrt(max(power - noise**2, 0.1 * power)) * float(np.linalg.norm(b))
+    norm = float(_norm(a, noise)) * float(np.linalg.norm(b))
     if norm == 0:
         return 0.0, (0.0, 0.0)
     shape = [2 * s for s in a.shape]
@@ -51,10 +55,8 @@ class Spectra:
     @classmethod
     def of(cls, frames: Array, noise: Array) -> "Spectra":
         """Of frames with noise of some norm, (n,)."""
-        power = (frames**2).sum((1, 2))
-        norm = np.sqrt(np.maximum(power - noise**2, 0.1 * power))
         sides = 2 * frames.shape[1], 2 * frames.shape[2]
-        return cls(fft.rfft2(frames, sides), norm, sides)
+        return cls(fft.rfft2(frames, sides), _norm(frames, noise), sides)
 
     def alike(self, expected: "Spectra", index: Array) -> float:
         """Mean likeness of the frames, taken in some order, to those expected."""

@@ -9,7 +9,7 @@ from metalens.cell import Cell
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, of_kind, own_rates
+from metalens.made import Answers, of_kind, own_rates, with_missing
 
 Solver = Callable[[Cell, Array, float, bool], Array]
 _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
@@ -32,9 +32,7 @@ class Sensitivities:
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t; beyond the ends the end value holds."""
-        values = [np.interp(diameter_um, self.diameter_um, row) for row in self.rates]
-        missing = len(_answering()) - len(values)
-        return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+        return with_missing([np.interp(diameter_um, self.diameter_um, row) for row in self.rates])
 
     def by_edges(self, diameter_um: Array) -> Array | None:
         """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""

@@ -38,8 +38,8 @@ class Pillars:
 
     def curve(self, diameter_um: Array, bias_um: Array, state: State) -> Array:
         """(bias, diameters) complex t for local biases and one made lens."""
-        d = diameter_um + np.reshape(bias_um, (-1, 1))
         bias = np.reshape(bias_um, (-1, 1))
+        d = diameter_um + bias
         return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias)
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from metalens.made.causes import maps as maps
     from metalens.made.causes import named as named
     from metalens.made.causes import of_kind as of_kind
+    from metalens.made.causes import with_missing as with_missing
     from metalens.made.own import OwnRates as OwnRates
     from metalens.made.own import own_rates as own_rates
     from metalens.made.printed import Printed as Printed
@@ -78,6 +79,7 @@ __getattr__, __dir__, __all__ = attach(
         "sensitivity": "response",
         "spread": "",
         "transmission": "response",
+        "with_missing": "causes",
         "with_table": "printed",
     },
 )

@@ -11,7 +11,7 @@ a new row. Three kinds of derivative hold all of them:
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -250,6 +250,11 @@ def of_kind(kind: type[Widens] | type[Answers] | type[Bends]) -> Iterator[tuple[
 def named(kind: type[Widens] | type[Answers] | type[Bends]) -> tuple[str, ...]:
     """Names of the causes that act in one way, in order."""
     return tuple(row.name for _, row in of_kind(kind))
+
+
+def with_missing(rows: Sequence[Array]) -> Array:
+    """(answering causes, *shape) of the first rows of the table: those that are not there are 0."""
+    return np.stack([*rows, *[np.zeros_like(rows[0])] * (len(named(Answers)) - len(rows))])
 
 
 def lacking(cell: Cell) -> tuple[str, ...]:

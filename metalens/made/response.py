@@ -11,7 +11,7 @@ from metalens.cell import Cell, Index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
-from metalens.made.causes import Answers, Guide, of_kind
+from metalens.made.causes import Answers, Guide, of_kind, with_missing
 from metalens.made.own import own_rates
 from metalens.made.solved import Solved
 from metalens.pillars import Proxy
@@ -42,9 +42,7 @@ class Sensitivity:
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t."""
-        values = self._series(self.coefficients, diameter_um)
-        missing = len(list(of_kind(Answers))) - len(values)
-        return np.stack([*values, *[np.zeros_like(values[0])] * missing])
+        return with_missing(self._series(self.coefficients, diameter_um))
 
     def by_edges(self, diameter_um: Array) -> Array | None:
         """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""

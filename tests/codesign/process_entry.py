@@ -1,0 +1,20 @@
+"""The budget's entry of what a process draws, of any lens: nothing of its bench but the aperture is asked."""
+
+from types import SimpleNamespace
+
+from codesign.budget import links
+from codesign.budget.entry import Entry
+from codesign.budget.prepared import Given
+from codesign.optics import Aperture
+from metalens.made import Printed
+
+
+def process_entry(lens, spread, draws):
+    """The one entry of a mask of this spread."""
+    about = SimpleNamespace(
+        aperture=Aperture(lens), lens=lens, given=Given(mask=Printed(spread=spread), draws=draws),
+        device=SimpleNamespace(image=lambda **moved: None),
+        entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
+    )  # fmt: skip
+    (entry,) = links.process(about)
+    return entry
