@@ -68,7 +68,7 @@ def finished(run: Run) -> list[End]:
         trainer = _tuned(run, best.architecture, i)
         net, architecture = trainer.model.net, best.architecture
         recalibrate(net, architecture, assess.parts(measured))
-        row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": run.counted(architecture) / 1e6}
+        row: dict[str, Any] = {"budget_mmacs": budget, "mmacs": run.macs(architecture) / 1e6}
         row["effective_pitch_um"] = float(run.trainer.model.pitch_um.detach()) / architecture.resolution
         reach = widths(assess.predict(net, architecture, apart, settings.inner), apart)
         plain = assess.predict(net, architecture, tests[""], settings.inner)

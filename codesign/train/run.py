@@ -131,17 +131,19 @@ class Run:
         return self.settings.scenes.pixels * self.settings.optics.sample_um
 
     def macs(self, architecture: Architecture) -> float:
-        """Multiply-accumulates of an architecture at the pitch that was found."""
-        pitch = self.trainer.model.pitch_um.detach()
-        cost.input_size(self.window_um, float(pitch), architecture.resolution)
-        return float(network_macs(self.trainer.model.net, architecture, self.window_um, pitch))
+        """Multiply-accumulates that run for a frame of whole pixels at the pitch that was found.
 
-    def counted(self, architecture: Architecture) -> int:
-        """Multiply-accumulates that run for a frame of whole pixels; :meth:`macs` goes smoothly with the pitch."""
-        settings, pitch = self.settings, float(self.trainer.model.pitch_um.detach())
-        pixels = pixel_count(settings.scenes.pixels, settings.optics.sample_um, pitch)
+        Training counts smoothly with the pitch (:func:`network_macs`), up to a row of pixels less.
+        """
+        pitch = float(self.trainer.model.pitch_um.detach())
+        cost.input_size(self.window_um, pitch, architecture.resolution)
+        return self.counted(architecture, pitch)
+
+    def counted(self, architecture: Architecture, pitch_um: float) -> float:
+        """Multiply-accumulates of an architecture for the whole pixels of any pitch."""
+        pixels = pixel_count(self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um)
         sizes = np.array([round(pixels * architecture.resolution)])
-        return int(self.trainer.model.net.counts(architecture, sizes)[0])
+        return float(self.trainer.model.net.counts(architecture, sizes)[0])
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
@@ -195,6 +197,8 @@ def _pool(scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed
 def _affordable(run: Run, *, moves: bool) -> float:
     """The finest pitch that leaves the smallest network within every budget; 0 where the samples' own does.
 
+    By both counts: that which training goes by and that of whole pixels, which the search goes by.
+
     Raises:
         TrainingError: it is coarser than the pitch that the run begins with.
     """
@@ -202,14 +206,15 @@ def _affordable(run: Run, *, moves: bool) -> float:
     least, budget = smallest(settings.space), min(settings.run.budgets_mmacs) * 1e6
 
     def count(pitch_um: float) -> float:
-        return float(network_macs(net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64)))
+        smooth = network_macs(net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64))
+        return max(float(smooth), run.counted(least, pitch_um))
 
     begins, coarsest = settings.run.pitch_um, cost.coarsest_um(run.window_um, settings.space.resolution[0])
     if count(begins) > budget:
         coarser = _finest(count, budget, begins, coarsest)
         way = "" if coarser is None else f", or begin with run.pitch_um = {math.ceil(coarser * 100) / 100:g} or more"
         raise TrainingError(
-            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.1f} MMACs at "
+            f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.2f} MMACs at "
             f"run.pitch_um = {begins:g}: raise run.budgets_mmacs{way}"
         )
     finest = min(settings.optics.sample_um, begins)

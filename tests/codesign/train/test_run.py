@@ -186,7 +186,8 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
     going.trainer.optimisers.clear()
     going.trainer._apply({"pitch": 0.1}, finite=True)
     assert going.trainer.pitch_held_um == made.finest_um
-    assert going.macs(smallest(settings.space)) == pytest.approx(1.5e6, rel=1e-3)
+    least = smallest(settings.space)
+    assert going.macs(least) <= 1.5e6 < going.counted(least, 0.98 * made.finest_um)  # two rows of pixels more
     assert "beyond the budget of 1.5 MMACs" in command_codesign._of_pitch(going, made.finest_um)
 
 
@@ -199,8 +200,17 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     pixels = math.ceil(settings.scenes.pixels * settings.optics.sample_um / pitch)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, pixels, pixels), chosen)
-    assert going.counted(chosen) == counter.get_total_flops() // 2
-    assert going.macs(chosen) != pytest.approx(going.counted(chosen), rel=1e-4)
+    assert going.macs(chosen) == counter.get_total_flops() // 2
+
+
+@pytest.mark.parametrize("pitch_um", [18.3, 19.7, 21.1])
+def test_no_network_that_is_found_takes_more_than_its_budget(settings, tmp_path, pitch_um):
+    """Pixels that do not divide the image: 47.2, 43.9 and 40.9 of them; a budget that whole resolution is beyond."""
+    budgets = replace(settings.run, budgets_mmacs=(1.7, 2.3), pitch_um=pitch_um)
+    still = replace(settings.inner, pitch=replace(settings.inner.pitch, rate=0.0), steps=1)
+    rows = _end(run.start(replace(settings, run=budgets, inner=still)), tmp_path / "run")
+    for row in rows:
+        assert 0.9 * row["budget_mmacs"] < row["mmacs"] <= row["budget_mmacs"]
 
 
 def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
