@@ -66,6 +66,8 @@ def _work(
     """Train, search and write into the folder; a row a network, and what images they were trained on."""
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
+    if settings.run.pitch_um < settings.optics.sample_um:
+        console.say(_of_samples(settings))
     place(going.trainer, device)
     parallel.wait()
     journal = Journal(folder) if options.events else None
@@ -93,6 +95,13 @@ def _work(
     if options.export:
         _export(folder, going, ends)
     return [end.row for end in ends], said
+
+
+def _of_samples(settings: RunConfig) -> str:
+    return (
+        f"run.pitch_um = {settings.run.pitch_um:g} is finer than the samples of the image, optics.sample_um = "
+        f"{settings.optics.sample_um:g}: such pixels cost more and show nothing new"
+    )
 
 
 def _of_pitch(going: Run, limit_um: float) -> str:

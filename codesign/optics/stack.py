@@ -35,6 +35,8 @@ from metalens.image import (
     view,
 )
 
+MOST_VALUES = 5e8  # of the transforms of a stack of PSFs: 4 GB
+
 
 @dataclass(frozen=True, slots=True)
 class OpticsConfig:
@@ -110,13 +112,11 @@ class OpticsConfig:
             raise ConfigError(f"filter_nm = {self.filter_nm} before a source of one wavelength: give fwhm_nm too")
         if self.window_samples < 3 or self.window_samples % 2 == 0:
             raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
-
-    @property
-    def fine(self) -> int:
-        """Samples of the intensity to one of ``sample_um``: at most lambda / (4 NA) apart, an odd number."""
-        pupil = Pupil(self.aperture_mm * 500, self.sensor_distance_mm * 1e3, self.wavelength_nm * 1e-3)
-        need = math.ceil(self.sample_um / (pupil.field_step_um / 2))
-        return need + 1 - need % 2
+        values = self.depth_count * (self.pupil.nodes + self.pupil.period_um / (2 * self.sample_um)) ** 2
+        if values > MOST_VALUES:
+            names = ("aperture_mm", "sensor_distance_mm", "wavelength_nm", "sample_um", "window_samples", "depth_count")
+            given = ", ".join(f"{name} = {getattr(self, name):g}" for name in names)
+            raise ConfigError(f"{given}: PSFs of {values:.1e} values, need {MOST_VALUES:.0e} or less; check the units")
 
     @property
     def start(self) -> Start:

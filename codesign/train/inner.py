@@ -60,7 +60,7 @@ class InnerConfig:
     point_weight: float = 0.2
     optics_weight: float = 0.05
     budget_weight: float = 1.0
-    energy: float = 0.4
+    energy: float = field(default=0.4, metadata={"most": 1.0})
     budget_mmacs: float = 0.0
     slip_scale_mm: tuple[float, float, float] = (1.4, 1.2, 2.3)
     refresh: int = 50

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.ground.errors import PropagationError
+from metalens.ground.errors import MaterialError, PropagationError
 
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
@@ -76,8 +76,14 @@ def weight(source: Source) -> tuple[Array, Array]:
     from metalens.cell import materials
 
     step_nm = min(0.25, source.fwhm_nm / 40)
-    for end_nm in (-2.5 * source.fwhm_nm, 2.5 * source.fwhm_nm):  # before an absurd width takes memory
-        materials.index("Si", (source.peak_nm + end_nm) * 1e-3)
+    for end_nm in (source.peak_nm - 2.5 * source.fwhm_nm, source.peak_nm + 2.5 * source.fwhm_nm):
+        try:  # before an absurd width takes memory
+            materials.index("Si", end_nm * 1e-3)
+        except MaterialError as error:
+            raise MaterialError(
+                f"a source at {source.peak_nm:g} nm with fwhm_nm = {source.fwhm_nm:g} reaches to {end_nm:g} nm, where "
+                f"the sensor's silicon is not known; {error}"
+            ) from None
     count = round(2.5 * source.fwhm_nm / step_nm)
     away = np.arange(-count, count + 1) * step_nm / source.fwhm_nm
     um = (source.peak_nm + away * source.fwhm_nm) * 1e-3

@@ -18,6 +18,7 @@ from codesign.commands import codesign as command_codesign
 from codesign.network.architecture import smallest
 from codesign.train import run
 from codesign.train.finish import finish, finished
+from metalens import cli
 from metalens.ground.errors import ConfigError, TrainingError
 
 TINY = """
@@ -150,6 +151,10 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
         ("[scenes]\npool = 3", "need a pool of a batch or more"),
         ("[run]\nfrozen = ['lens']", "frozen"),
         ("network = 'resnet'", "network"),
+        ("[optics]\nwavelength_nm = 0.94", r"wavelength_nm = 0.94, .* check the units"),
+        ("[optics]\nsensor_distance_mm = 2000.0", r"sensor_distance_mm = 2000, .* check the units"),
+        ("[optics]\ndepth_count = 1000000", r"depth_count = 1e\+06: PSFs of .* check the units"),
+        ("[inner]\nenergy = 1.5", "inner.energy is 1.5, need at most 1"),
         ("[optics.spread]\nfocus_um = -1.0", "standard deviations of 0 or more"),
         ("[optics.spread]\ncorrelation = [1.0, 0.2]", "correlation has 2 entries, need k x k"),
     ],
@@ -201,6 +206,15 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, pixels, pixels), chosen)
     assert going.macs(chosen) == counter.get_total_flops() // 2
+
+
+@pytest.mark.parametrize(("pitch_um", "said"), [(17.0, 1), (18.0, 0)])
+def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys, pitch_um, said):
+    text = TINY.replace("budgets_mmacs = [2.0]", f"budgets_mmacs = [2.0]\npitch_um = {pitch_um}")
+    (tmp_path / "run.toml").write_text(text)
+    assert cli.main(["codesign", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]) == 0
+    words = f"run.pitch_um = {pitch_um:g} is finer than the samples of the image, optics.sample_um = 18"
+    assert capsys.readouterr().out.count(words) == said
 
 
 @pytest.mark.parametrize("pitch_um", [18.3, 19.7, 21.1])
