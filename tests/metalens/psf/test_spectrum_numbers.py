@@ -198,7 +198,7 @@ def test_the_narrowest_line_is_one_wavelength_to_a_lens_of_a_millimetre():
     assert found.error == pytest.approx(turn**2 / (4 * math.log(2)), rel=0.02)
 
 
-@pytest.mark.parametrize(("fwhm_nm", "word"), [(250.0, "850 nm with fwhm_nm = 250 reaches to 225 nm, .* Si at 0.225 um"), (1e9, "wavelength")])
+@pytest.mark.parametrize(("fwhm_nm", "word"), [(250.0, "fwhm_nm = 250 reaches to 225 nm"), (1e9, "wavelength")])
 def test_a_line_beyond_the_data_of_silicon_is_refused(fwhm_nm, word):
     with pytest.raises(MaterialError, match=word):
         spectrum.weight(spectrum.Source(850.0, fwhm_nm))
