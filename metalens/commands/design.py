@@ -33,7 +33,7 @@ from metalens.ground import config, reading, store, transaction
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.ground.store import write_bytes
-from metalens.lens import Layers, check_gaps
+from metalens.lens import Layers, Lens, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
 
@@ -139,8 +139,9 @@ def run(options: Options) -> int:
         raise ConfigError("along_y: one phase for x and one for y need a library over two sizes (lengths_um); give it")
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
-    head, layers = _head(made.wanted, target, made.quality) + made.held, made.wanted.layers
+    head, layers = _head(made.wanted, target, made.quality) + words.held(made.lens), made.wanted.layers
     values = words.values(made.quality, made.check, made.unlike) | several.numbers(made.beside)
+    values |= words.curve(made.lens.proxy)
     text = words.text(head, layers, made.quality, made.check, made.unlike, several=bool(made.beside))
     text += several.lines(made.beside, layers)
     if made.conversion is not None:
@@ -244,14 +245,13 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(wanted, quality, check, judged, conversion, found, words.held(made), beside)
+    return Outcome(wanted, quality, check, judged, conversion, found, made, beside)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; judged: of a free form; conversion: of
-    circular light; unlike: what neighbours leave of the efficiency; held: which light it is for, where that matters;
-    beside: of the other wavelengths."""
+    circular light; unlike: what neighbours leave of the efficiency; beside: of the other wavelengths."""
 
     wanted: Design
     quality: Quality
@@ -259,7 +259,7 @@ class Outcome:
     judged: "_Judged | None"
     conversion: Conversion | None
     unlike: design.Unlike | None
-    held: str
+    lens: Lens
     beside: tuple[several.Judged, ...]
 
 

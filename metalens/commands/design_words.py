@@ -9,6 +9,7 @@ from metalens.design import Conversion, Focus, FocusCheck, PhaseOf, Quality, Unl
 from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens
+from metalens.pillars import Proxy
 
 
 def meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
@@ -122,11 +123,25 @@ def _films(layers: Layers) -> list[str]:
     return found
 
 
+def curve(proxy: Proxy) -> dict[str, object]:
+    """How far the curve that stands for the pillars is from the solved ones, at the most."""
+    return {
+        "proxy_phase_error_rad": proxy.max_phase_error_rad,
+        "proxy_transmission_error": proxy.max_transmission_error,
+    }
+
+
 def held(made: Lens) -> str:
-    """Which light a lens is for, in words: a line, where its pillars of one size answer x and y apart."""
+    """What is known of its pillars, in words: how close to solved ones; and for which light, where pillars of one size
+    answer x and y apart."""
+    phase, level = made.proxy.max_phase_error_rad, made.proxy.max_transmission_error
+    known = (
+        f"\n  what follows takes pillars by a curve, within {phase:.1e} rad and {level:.1e} of |T| of those solved for "
+        "the library"
+    )
     if not made.one_light:
-        return ""
-    return (
+        return known
+    return known + (
         f"\n  all of it for {made.one_light}: {made.cell.described} answers x and y apart, and the library\n"
         "  holds no more (of rectangles and ellipses lengths_um in [sweep] makes one for both)"
     )

@@ -65,7 +65,7 @@ def run(options: Options) -> int:
         if wanted.sweep.light == "circular":
             made = converted.with_turns(made)
         fitted, refusal = _fit(made, wanted.proxy)
-        notes = fitted.notes if fitted else (refusal,)
+        notes = (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
         about = store.Provenance(config.dumps(wanted), inputs)
         made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
         library.save(draft.path, made)
@@ -106,10 +106,15 @@ def _failures(
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
     elif fitted.turns < 1 and not accept_partial_turn:
-        failures.append(
-            f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: take a smaller pitch, taller pillars or "
-            "a material of higher index (metalens study compares cells)"
-        )
+        cure = "take a smaller pitch, taller pillars or a material of higher index (metalens study compares cells)"
+        if fitted.smooth_turns >= 1:
+            cure = (
+                f"the pillars cover {fitted.smooth_turns:.2f}, but it cannot follow them so far within its tolerances: "
+                "sweep with more samples, or loosen phase_tolerance_rad and transmission_tolerance"
+            )
+        failures.append(f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: {cure}")
+    if fitted is not None and fitted.shortfall:
+        failures.append(fitted.shortfall)
     return failures
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import DomainError
 from metalens.pillars import circular
-from metalens.pillars.fit import Data, ProxyFit, Wanted, fit_terms
+from metalens.pillars.fit import Data, ProxyFit, Wanted, fit_terms, missed, shortfall
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary
 
@@ -57,7 +57,7 @@ def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
     kept = Data(phase[None], np.abs(t[:, run])[None], d[run], library.wavelength_um, library.angle_rad)
     proxy = _widest(kept, middle - run.start, wanted)
     notes = (f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",)
-    return ProxyFit(proxy, notes, (), math.nan, 0.0)
+    return ProxyFit(proxy, notes, (), math.nan, 0.0, shortfall(proxy, wanted), math.nan)
 
 
 def with_turns(library: PillarLibrary) -> PillarLibrary:
@@ -84,9 +84,7 @@ def _widest(data: Data, middle: int, wanted: Wanted) -> Proxy:
         some = Data(data.phase[..., part], data.level[..., part], data.diameter[part], data.wavelength, data.angle)
         count = len(some.diameter)
         proxy = fit_terms(some, 1, min(max(2, wanted.coefficients // 2), count // 3))
-        met = proxy.max_phase_error_rad <= wanted.phase_tolerance_rad
-        met &= proxy.max_transmission_error <= wanted.transmission_tolerance
-        if met or count <= LEAST_ENTRIES:
+        if missed(proxy, wanted) <= 1 or count <= LEAST_ENTRIES:
             return proxy
         nearer = max(LEAST_ENTRIES // 2, int(0.9 * reach))
         if nearer >= reach:

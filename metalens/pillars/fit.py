@@ -18,6 +18,7 @@ TURN = 2 * math.pi
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
+TURNS_BACK = "the phase of the proxy turns back, which the library's does not: sweep with more samples"
 MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 
 
@@ -58,6 +59,8 @@ class ProxyFit:
     notes: where its domain was cut, and why. table: error against the number of coefficients on that domain.
     turns: covered by the domain, the least over wavelengths and angles.
     polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their mean.
+    shortfall: by how much the proxy misses the tolerances that were wanted, for a person; empty where it meets them.
+    smooth_turns: covered by the diameters without resonance, as far as the proxy or not.
     """
 
     proxy: Proxy
@@ -65,6 +68,8 @@ class ProxyFit:
     table: tuple[Trial, ...]
     turns: float
     polarization_spread: float
+    shortfall: str
+    smooth_turns: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,7 +88,8 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
 
     Every other diameter is fitted (least largest deviation, by Lawson's weights), all are judged: half of them
     the fit never saw. The phase is monotone, as the library's is. Phase and |T| have their own polynomials in
-    diameter^power; |T| is scaled until its certified bound lies below 1.
+    diameter^power; |T| is scaled until its certified bound lies below 1. Where so few entries allow only a
+    domain that misses the tolerances, ``shortfall`` says so.
 
     Raises:
         DomainError: no stretch of diameters without resonance holds enough entries.
@@ -96,15 +102,31 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         within_um=wanted.within_um,
     )
     data = Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
-    terms = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
-    kept, proxy = _longest(data, wanted, terms)
-    while terms < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
-        terms += 2
-        kept, proxy = _longest(data, wanted, terms)
+    kept, proxy, terms = _followed(data, wanted)
     counts = range(4, max(18, 2 * terms + 5), 2)
     trials = (_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
     table = tuple(trial for trial in trials if trial is not None)
-    return ProxyFit(proxy, _notes(smooth, data, kept, terms), table, _turns(kept), smooth.polarization_spread)
+    notes = _notes(smooth, data, kept, terms)
+    short = TURNS_BACK if math.isinf(_cost(proxy, wanted)) else shortfall(proxy, wanted)
+    return ProxyFit(proxy, notes, table, _turns(kept), smooth.polarization_spread, short, _turns(data))
+
+
+def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
+    """The domain that a proxy follows, and its number of coefficients: those wanted; more where a full turn takes them;
+    fewer where so few entries let those wanted swing between them."""
+    terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
+    kept, proxy = _longest(data, wanted, terms)
+    while more < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
+        more += 2
+        with contextlib.suppress(DomainError):  # more coefficients than so few entries bear: those before stand
+            longer, better = _longest(data, wanted, more)
+            if _cost(better, wanted) <= 1 and len(longer.diameter) > len(kept.diameter):
+                kept, proxy, terms = longer, better, more
+    for fewer in range(terms - 1, 1, -1) if _cost(proxy, wanted) > 1 else ():
+        other = _best(kept, wanted, fewer)
+        if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
+            proxy, terms = other, fewer
+    return kept, proxy, terms
 
 
 def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
@@ -135,15 +157,31 @@ def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
     while bad - good > 1:
         middle = (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
         trial = _best(_head(data, middle), wanted, terms)
-        if trial is not None and _meets(trial, wanted):
+        if trial is not None and _cost(trial, wanted) <= 1:
             good, best = middle, trial
         else:
             bad = middle
     return _head(data, good), best
 
 
-def _meets(proxy: Proxy, wanted: Wanted) -> bool:
-    return _cost(proxy, wanted) <= 1
+def shortfall(proxy: Proxy, wanted: Wanted) -> str:
+    """By how much a proxy misses its tolerances, for a person; empty where it meets them."""
+    if missed(proxy, wanted) <= 1:
+        return ""
+    return (
+        f"the proxy follows the phase within {proxy.max_phase_error_rad:.1e} rad and |T| within "
+        f"{proxy.max_transmission_error:.1e}, where {wanted.phase_tolerance_rad:g} and "
+        f"{wanted.transmission_tolerance:g} are wanted: sweep with more samples, or loosen phase_tolerance_rad and "
+        "transmission_tolerance"
+    )
+
+
+def missed(proxy: Proxy, wanted: Wanted) -> float:
+    """The larger error in units of its tolerance."""
+    return max(
+        proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
+        proxy.max_transmission_error / wanted.transmission_tolerance,
+    )
 
 
 def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
@@ -157,14 +195,10 @@ def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
 
 
 def _cost(proxy: Proxy, wanted: Wanted) -> float:
-    """The larger error in units of its tolerance; infinite where the phase turns back (the library's does not)."""
+    """As :func:`missed`; infinite where the phase turns back (the library's does not)."""
     middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
-    if not all(proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}):
-        return math.inf
-    return max(
-        proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
-        proxy.max_transmission_error / wanted.transmission_tolerance,
-    )
+    monotone = all(proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad})
+    return missed(proxy, wanted) if monotone else math.inf
 
 
 def fit_terms(data: Data, power: int, terms: int) -> Proxy:

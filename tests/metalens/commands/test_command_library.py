@@ -78,6 +78,14 @@ def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
     assert (tmp_path / "library.h5").exists()  # the result is there to look at
 
 
+def test_a_proxy_that_misses_its_tolerances_fails_its_check(cell, tmp_path, capsys):
+    assert cell(QUICK + "[proxy]\nphase_tolerance_rad = 1e-15\n") == 1
+    told = capsys.readouterr().out
+    assert "a lens needs 1: the pillars cover 1." in told  # more samples, not another cell
+    assert "where 1e-15 and 0.001 are wanted" in told
+    assert any("where 1e-15 and" in note for note in library.load(tmp_path / "library.h5").notes)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

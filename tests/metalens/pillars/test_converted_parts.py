@@ -25,15 +25,15 @@ def test_the_run_shrinks_about_the_best_size_until_the_fit_meets_its_tolerance()
     """A straight phase up to 0.16 um and a step of a radian there: runs about 0.14 that reach it are not met."""
     phase = 30 * (SIZES - 0.1) + (SIZES > 0.1605)
     data = Data(phase[None, None], np.ones((1, 1, 101)), SIZES, np.array([0.85]), np.zeros(1))
-    wanted = SimpleNamespace(coefficients=4, phase_tolerance_rad=1e-3, transmission_tolerance=1e-2)
+    wanted = Wanted(coefficients=4, phase_tolerance_rad=1e-3, transmission_tolerance=1e-2)
     proxy = converted._widest(data, 40, wanted)
     low, high = proxy.domain_um
     assert high <= 0.1605
     assert (low + high) / 2 == pytest.approx(0.14, abs=1e-9)
     assert high - 0.14 > 0.9 * 0.02 - 2e-3  # a tenth less at a time
     assert proxy.max_phase_error_rad < 1e-3
-    never = SimpleNamespace(coefficients=4, phase_tolerance_rad=-1.0, transmission_tolerance=1e-2)
-    low, high = converted._widest(data, 40, never).domain_um
+    rough = Data(phase + 0.1 * (-1.0) ** np.arange(101)[None, None], data.level, SIZES, data.wavelength, data.angle)
+    low, high = converted._widest(rough, 40, wanted).domain_um
     assert round((high - low) / 1e-3) + 1 in (12, 13)  # the least that is fitted
 
 
