@@ -32,17 +32,15 @@ def surrogate(
         gradient: (rows, columns, depths, h, w) of the loss with respect to :func:`node_light`.
         draws: pairs of a field point and a wavelength, drawn with replacement.
     """
-    share = torch.as_tensor(plan.waves.weights)
-    total = float(share.sum())
     points = torch.randint(len(plan.y_um) * len(plan.x_um), (draws,), generator=generator)
-    waves = torch.multinomial(share / total, draws, replacement=True, generator=generator)
+    waves = torch.multinomial(torch.as_tensor(plan.waves.weights), draws, replacement=True, generator=generator)
     return torch.stack(
         [term(optics, plan, gradient, int(p), int(w)) for p, w in zip(points, waves, strict=True)]
     ).mean()
 
 
 def term(optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int) -> Tensor:
-    """What one draw adds: number of points · Σ weights · <G_point, light_point,wave>."""
+    """What one draw adds: number of points · <G_point, light_point,wave>."""
     places = _places(plan)
     light = psfs(
         optics,
@@ -52,7 +50,7 @@ def term(optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int) ->
         window=plan.window,
         finest_um=float(plan.waves.wavelengths_um.min()),
     )[0]
-    return len(places) * float(plan.waves.weights.sum()) * (gradient.flatten(0, 1)[point] * light).sum()
+    return len(places) * (gradient.flatten(0, 1)[point] * light).sum()
 
 
 def _places(plan: Plan) -> Tensor:

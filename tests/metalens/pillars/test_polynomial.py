@@ -1,5 +1,7 @@
 """Chunked polynomials against numpy's own, their slopes against the complex step, their bounds against samples."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -113,11 +115,11 @@ def test_tensors_stay_on_their_device():
         polynomial_torch.value(p, 2 * d.detach())
 
 
-@pytest.mark.parametrize("size", [5, 200_000])
-def test_backward_in_one_pass_is_the_slope_times_the_weight(size):
+@pytest.mark.parametrize("shape", [(5,), (200_000,), (3, 40)])
+def test_backward_in_one_pass_is_the_slope_times_the_weight(shape):
     p = polynomial.curve(np.array([0.3, 1.0, -0.2, 0.1]), (0.06, 0.2), 2)
-    d = np.linspace(0.06, 0.2, size)
-    weight = np.linspace(-1, 2, size)
+    d = np.linspace(0.06, 0.2, math.prod(shape)).reshape(shape)
+    weight = np.linspace(-1, 2, d.size).reshape(shape)
     want = polynomial.slope(p, d)
     assert np.array_equal(polynomial.pulled_back(p, d, weight), want * weight)
     assert np.array_equal(polynomial.pulled_back(p, d, np.broadcast_to(np.array(2.0), d.shape)), 2 * want)
