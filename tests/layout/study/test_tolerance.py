@@ -114,6 +114,8 @@ def test_the_effect_of_a_bias_on_the_phase_is_the_slope_of_the_proxy():
 def test_axial_information_is_equation_11_of_the_direct_psf():
     lens = hyperbolic()
     report = tolerance.analyse(lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10)
+    near = 1 / (1 / 1500 + 3.5 * 0.85 / lens.diameters.radius_um**2)  # the rim 1.75 waves out; beyond: ten times as far
+    assert report.step_um == pytest.approx(9 * near / 50, rel=0.02)  # both ends rounded to two digits
     where = dataclasses.replace(report.window, depths_um=np.array([1200.0, 1200.0 + report.step_um]))
     t = lens.transmission() * np.exp(1j * lens.phase_rad())
     few = dataclasses.replace(where, x_um=where.x_um[::2], y_um=where.y_um[::2])

@@ -1,0 +1,93 @@
+"""Pillars by their own shape: derivatives of ln t against differences of the same truncation, and their error bar."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from metalens.cell import Cell, Index, Layer
+from metalens.cell.shapes import Circle, Ellipse, Rectangle
+from metalens.lens import DiameterMap, Lens
+from metalens.made import Answers, named, own, own_rates
+from metalens.pillars import Proxy
+from metalens.rcwa import jones, pattern
+
+WAVE, SIZE, RATIO, ANGLE = 0.85, 0.23, 0.62, 0.2
+CELL = Cell(0.4, 0.57, Index(2.6), Index(1.45), Index(1.1), Index(1.05), shape=Rectangle(RATIO, ANGLE))
+ROWS = named(Answers)
+
+
+def lens(cell=CELL, *, hand="", tilted_light=False):
+    phase, level, most = np.array([[4.6, 4.2, 0.5]]), np.array([[0.83, 0.02]]), 0.2 if tilted_light else 0.0
+    phase, level = (table[None] if tilted_light else table for table in (phase, level))
+    proxy = Proxy(phase, level, (0.1, 0.3), (0.85, 0.85), 0.0, 0.0, max_angle_rad=most)
+    sizes = np.full((3, 4), 0.2)
+    turns = {"angle_rad": np.full((3, 4), 0.3)} if hand else {}
+    return Lens(DiameterMap(sizes, 0.4, **turns), cell, proxy, WAVE, 150.0, 1500.0, "map", hand=hand)
+
+
+@pytest.fixture
+def few_orders(monkeypatch):
+    """Three orders, and one field of normals for all: any has the same limit, and the usual one moves with its rim."""
+    own_tables, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
+    monkeypatch.setattr(pattern, "normal_tables", lambda outlines, cell, reach: own_tables(fixed, cell, reach))
+    monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
+
+
+def changed(name, x):
+    """(cell, size) with so much more of one cause, in um, rad or 1."""
+    if name == "height_nm":
+        return dataclasses.replace(CELL, height_um=CELL.height_um + x), SIZE
+    if name == "index":
+        return dataclasses.replace(CELL, pillar=Index(2.6 + x)), SIZE
+    if name == "turn_deg":
+        return dataclasses.replace(CELL, shape=Rectangle(RATIO, ANGLE + x)), SIZE
+    width, length = SIZE + (name == "width_nm") * x, RATIO * SIZE + (name == "length_nm") * x
+    return dataclasses.replace(CELL, shape=Rectangle(length / width, ANGLE)), width
+
+
+SEEN = {  # of the Jones matrix: light along x, the mean of both, right-handed light that leaves left-handed
+    "along x": ({}, lambda j: j[0, 0]),
+    "of any kind": ({"tilted_light": True}, lambda j: (j[0, 0] + j[1, 1]) / 2),
+    "right": ({"hand": "right"}, lambda j: (j[0, 0] - j[1, 1] + 1j * (j[0, 1] + j[1, 0])) / 2),
+    "left": ({"hand": "left"}, lambda j: (j[0, 0] - j[1, 1] - 1j * (j[0, 1] + j[1, 0])) / 2),
+}
+
+
+@pytest.mark.parametrize("light", SEEN)
+def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(light, few_orders):
+    """Central differences over 0.1 nm, mrad, 1e-4: their order leaves 1e-6."""
+    about, seen = SEEN[light]
+    found = own_rates(lens(**about), np.array([0.17, SIZE]))
+
+    def slope(at):
+        more, less = (np.log(seen(jones(*at(x), WAVE, harmonics=3).t)) for x in (1e-4, -1e-4))
+        return (more - less) / 2e-4
+
+    for name in ("height_nm", "index", "turn_deg", "width_nm", "length_nm"):
+        want = slope(lambda x, name=name: changed(name, x))
+        assert found.rates[ROWS.index(name), 1] == pytest.approx(want, rel=1e-4), name
+    grown = slope(lambda x: (dataclasses.replace(CELL, layers=(Layer(CELL.height_um, x),)), SIZE))
+    wider = slope(lambda x: (CELL, SIZE + x))
+    assert found.edges[1] == pytest.approx(grown - wider, rel=1e-4)
+    assert abs(found.edges[1]) > 0.1 * abs(wider)
+
+
+@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (0.004, 7)])
+def test_the_error_is_the_largest_change_from_the_coarser_truncation(angle, rows, monkeypatch, few_orders):
+    """Of every row that is there, however little it does: a turn that a mirror of the cell forbids is rounding."""
+    straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
+    sizes = np.array([0.17, SIZE, 0.26])
+    fine = own_rates(straight, sizes)
+    monkeypatch.setattr(own, "_UPRIGHT", (1, 2))
+    coarse = own_rates(straight, sizes)
+    pairs = zip(*(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True)
+    moved = [np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in pairs if np.abs(a).max() > 1e-4]
+    assert len(moved) == rows
+    assert fine.error == pytest.approx(max(moved), rel=1e-9)
+
+
+def test_round_pillars_keep_their_form_as_their_edges_move(few_orders):
+    found = own_rates(lens(dataclasses.replace(CELL, shape=Circle())), np.array([SIZE]))
+    assert not found.edges.any()
+    assert not found.rates[[ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]].any()
