@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign.network import blur, cost, supernet
-from codesign.network.architecture import Block, smallest
+from codesign.network.architecture import Block, divisible, smallest
 from codesign.network.cost import MASK_CHANNELS, POINT_FEATURES, SLIP_CHANNELS, SLIP_GRID, lateral_strides
 from metalens.ground.errors import TrainingError
 
@@ -284,3 +284,10 @@ def test_recalibration_forgets_what_was_measured_before():
     assert not net.training
     with pytest.raises(TrainingError, match="found none"):
         supernet.recalibrate(net, None, iter([]))
+
+
+@pytest.mark.parametrize(
+    ("channels", "found"), [(3, 8), (12, 16), (11, 16), (17, 16), (19, 24), (83.9, 80), (84, 88), (85, 88), (92, 96)]
+)
+def test_channels_go_to_the_nearest_multiple_of_eight_or_up_where_a_tenth_would_be_lost(channels, found):
+    assert divisible(channels) == found

@@ -93,7 +93,7 @@ def test_no_single_step_of_a_vertex_makes_an_outline_better(diameter, vertices):
             assert polygon._cost(moved[..., None], diameter)[0] >= here - 1e-12
 
 
-@pytest.mark.parametrize("diameter", [21.0, 38.4, *np.arange(47.0, 260.0, 11.3).tolist()])
+@pytest.mark.parametrize("diameter", [4.9, 21.0, 38.4, *np.arange(47.0, 260.0, 11.3).tolist()])
 def test_octagon_is_the_cheapest_of_all_near_the_regular_one(diameter):
     """Half width a within 4 %, cut corner c = a - b; area from the outline. Regular: 8 (√2 - 1) a², c = (2 - √2) a."""
     goal = math.pi * diameter**2 / 4

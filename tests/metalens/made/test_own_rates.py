@@ -8,7 +8,7 @@ import pytest
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Ellipse, Rectangle
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Answers, named, own, own_rates
+from metalens.made import Answers, causes, named, own, own_rates
 from metalens.pillars import Proxy
 from metalens.rcwa import jones, pattern
 
@@ -73,9 +73,9 @@ def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(light
     assert abs(found.edges[1]) > 0.1 * abs(wider)
 
 
-@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (0.004, 7)])
+@pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (1e-5, 6), (0.004, 7)])
 def test_the_error_is_the_largest_change_from_the_coarser_truncation(angle, rows, monkeypatch, few_orders):
-    """Of every row that is there, however little it does: a turn that a mirror of the cell forbids is rounding."""
+    """Of every row that is there, however little it does: a turn that a mirror of the cell all but forbids is not."""
     straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
     sizes = np.array([0.17, SIZE, 0.26])
     fine = own_rates(straight, sizes)
@@ -85,6 +85,21 @@ def test_the_error_is_the_largest_change_from_the_coarser_truncation(angle, rows
     moved = [np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in pairs if np.abs(a).max() > 1e-4]
     assert len(moved) == rows
     assert fine.error == pytest.approx(max(moved), rel=1e-9)
+
+
+def test_a_cause_of_which_no_number_tells_goes_by_differences(few_orders, monkeypatch):
+    """Over 10 nm and 0.02 of index: their second order leaves 2 %."""
+    about, sizes = SEEN["left"][0], np.array([SIZE])
+    exact = own_rates(lens(**about), sizes)
+    untold = tuple(
+        dataclasses.replace(row, acts=dataclasses.replace(row.acts, numbers=None))
+        if isinstance(row.acts, Answers) else row for row in causes.CAUSES
+    )  # fmt: skip
+    monkeypatch.setattr(causes, "CAUSES", untold)
+    found = own_rates(lens(**about), sizes)
+    for name in ("height_nm", "index"):
+        assert found.rates[ROWS.index(name)] == pytest.approx(exact.rates[ROWS.index(name)], rel=0.02), name
+    assert not found.rates[[ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]].any()
 
 
 def test_round_pillars_keep_their_form_as_their_edges_move(few_orders):
