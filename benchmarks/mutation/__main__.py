@@ -247,13 +247,15 @@ def _say(done: int, total: int, row: dict[str, object]) -> None:
 
 
 def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) -> int:
-    """The result as JSON and as a table; with --again the judged ones replace their old lines, and open ones of source
-    that is no longer there go."""
+    """The result as JSON and as a table; with --again the judged ones replace their old lines, open ones of source
+    that is no longer there go, and what was said of the draw stays."""
+    drawn = ""
     if asked.again:
         kept = json.loads(asked.result.read_text(encoding="utf-8"))
         judged = {_identity(row): row for row in rows}
         stay = [r for r in kept["mutants"] if _identity(r) in judged or r["outcome"] != "survived" or _reason(r)]
         rows, words = [judged.get(_identity(row), row) for row in stay], kept["command"]
+        drawn = kept.get("drawn") or table.summary(kept["mutants"])
     else:
         words = f"python -m benchmarks.mutation {words}".strip()
     for row in rows:
@@ -261,8 +263,9 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
         reason = _reason(row)
         if reason and row["outcome"] != "killed":
             row["reason"] = reason
-    asked.result.write_text(json.dumps({"command": words, "mutants": rows}, indent=1) + "\n", encoding="utf-8")
-    asked.result.with_suffix(".md").write_text(table.markdown(rows, words), encoding="utf-8")
+    about = {"command": words} | ({"drawn": drawn} if drawn else {})
+    asked.result.write_text(json.dumps(about | {"mutants": rows}, indent=1) + "\n", encoding="utf-8")
+    asked.result.with_suffix(".md").write_text(table.markdown(rows, words, drawn), encoding="utf-8")
     print(table.summary(rows))
     return int(any(row["outcome"] in ("survived", "no test") and "reason" not in row for row in rows))
 

@@ -6,9 +6,17 @@ Row = dict[str, object]
 LEFT = ("survived", "no test")
 
 
-def markdown(rows: list[Row], command: str) -> str:
-    """A page for readers of the repository."""
-    out = ["# One-line mutants of the numeric code", "", f"Made by `{command}`.", "", summary(rows), ""]
+def markdown(rows: list[Row], command: str, drawn: str = "") -> str:
+    """A page for readers of the repository. drawn: the summary before the survivors were judged once more."""
+    out = ["# One-line mutants of the numeric code", "", f"Made by `{command}`.", ""]
+    if drawn:
+        out += [
+            f"As drawn: {drawn}",
+            "",
+            "Survivors have tests since, or went with their source; judged once more:",
+            "",
+        ]
+    out += [summary(rows), ""]
     for head, key in (
         ("folder", lambda r: "/".join(str(r["path"]).split("/")[:2])),
         ("rule", lambda r: str(r["rule"])),

@@ -1,5 +1,6 @@
 """The runner of mutants on a module of its own: what changes, what runs a line, what takes its place in memory."""
 
+import argparse
 import importlib.util
 import multiprocessing
 
@@ -171,6 +172,28 @@ def test_a_reason_is_for_one_line(tmp_path, monkeypatch):
     assert main._reason(row) == main._reason(row | {"line": 9}) == "a scale"
     assert not any(main._reason(row | other) for other in ({"text": "y = 2.0"}, {"became": "(1.0)"}, {"path": "b.py"}))
     main._reasons.cache_clear()
+
+
+def test_what_was_drawn_is_told_beside_what_was_judged_once_more(tmp_path):
+    """Of three one is killed; then a second one, and the source of the third is gone. Once more: the draw stays."""
+    rows = [
+        {"path": "layout/a.py", "text": f"x = {k}", "was": "1", "became": "(2)", "rule": "constant", "bar": k > 0}
+        | {"outcome": "killed" if k == 0 else "survived"}
+        for k in range(3)
+    ]
+    result = tmp_path / "mutants.json"
+    asked = argparse.Namespace(again=False, result=result)
+    assert main._keep(rows, asked, "--count 3") == 1
+    assert "As drawn" not in result.with_suffix(".md").read_text()
+    asked.again = True
+    for again in ([rows[1] | {"outcome": "killed"}], []):
+        assert main._keep(again, asked, "--again") == 0
+        page = result.with_suffix(".md").read_text()
+        assert "Made by `python -m benchmarks.mutation --count 3`." in page
+        first, then = (line for line in page.splitlines() if "of" in line and "killed (" in line)
+        assert first.startswith("As drawn: all: 1 of 3 killed (33.3%), 0 more are equivalent; on lines that make an")
+        assert first.endswith("0 of 2 killed (0.0%), 0 more are equivalent.")
+        assert then.startswith("all: 2 of 2 killed")
 
 
 def test_test_files_of_closed_forms_are_asked_first(tree):
