@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from codesign.commands.options.optics import Options
-from codesign.evaluate import ReaderConfig, Scenes, Setting, judged, reader
+from codesign.evaluate import FieldSetting, ReaderConfig, Scenes, Setting, field_page, judged, reader
 from codesign.evaluate import optics as evaluate_optics
 from codesign.evaluate import plots as evaluate_plots
 from codesign.evaluate import tables as evaluate_tables
@@ -21,7 +21,7 @@ from metalens.design.free_form import Fisher, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
-from metalens.ground.report import Figure, Section, write
+from metalens.ground.report import Figure, Section, Table, write
 from metalens.lens import Lens
 
 
@@ -29,11 +29,12 @@ from metalens.lens import Lens
 class Settings:
     """The content of OPTICS.toml; every key may be left out.
 
-    axial: how the axial information is measured. scenes: what the scene table is made of.
-    reader: what the reference reader sees, with ``--reader``.
+    axial: how the axial information is measured. over_field: what the designer's page shows. scenes: what the scene
+    table is made of. reader: what the reference reader sees, with ``--reader``.
     """
 
     axial: Setting = field(default_factory=Setting)
+    over_field: FieldSetting = field(default_factory=FieldSetting)
     scenes: Scenes = field(default_factory=Scenes)
     reader: ReaderConfig = field(default_factory=ReaderConfig)
 
@@ -50,7 +51,7 @@ def run(options: Options) -> int:
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)
-    options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, three pictures, report.html")
+    options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, five pictures, report.html")
     return 0
 
 
@@ -66,9 +67,13 @@ def _measure(
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
     pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
     axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
+    pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="field")
+    seen = {name: settings.over_field.of(lens, made[0], measured.angles_deg) for name, lens in pairs}
     scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
-    tables = evaluate_tables.tables(axial, scenes, measured)
+    tables = [*evaluate_tables.tables(axial, scenes, measured), *field_page.tables(seen)]
     values = evaluate_tables.values(axial, scenes, measured)
+    for name, one in seen.items():
+        values["lenses"][name]["field"] = field_page.values(one)
     if options.reader:
         told = judged(dict(zip(names, made, strict=True)), settings.reader)
         found = dict(options.console.track(told, total=len(made), label="reader"))
@@ -82,16 +87,21 @@ def _measure(
         "axial": evaluate_plots.information(axial, measured),
         "slices": evaluate_plots.slices(axial, measured),
         "scenes": evaluate_plots.scenes(scenes),
+        "field": field_page.picture(seen),
+        "mtf": field_page.mtf_picture(seen),
     }
+    _write(folder, pictures, tables)
+    return values, text
+
+
+def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:
+    """The pictures, and the page of pictures and tables."""
+    captions = evaluate_plots.CAPTIONS | field_page.CAPTIONS
     for name, image in pictures.items():
         store.write_bytes(folder / f"{name}.png", image)
-    items = [Figure(image, evaluate_plots.CAPTIONS[name], wide=True) for name, image in pictures.items()]
-    write(
-        folder / "report.html",
-        "What the lenses tell",
-        [Section("Pictures", items=items), Section("Tables", items=tables)],
-    )
-    return values, text
+    items = [Figure(image, captions[name], wide=True) for name, image in pictures.items()]
+    sections = [Section("Pictures", items=items), Section("Tables", items=tables)]
+    write(folder / "report.html", "What the lenses tell", sections)
 
 
 def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:

@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from codesign.evaluate import experiment_plots as experiment_plots
+    from codesign.evaluate import field_page as field_page
     from codesign.evaluate import gaze_experiment as gaze_experiment
     from codesign.evaluate import imaged as imaged
     from codesign.evaluate import optics as optics
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from codesign.evaluate import plots as plots
     from codesign.evaluate import reader as reader
     from codesign.evaluate import tables as tables
+    from codesign.evaluate.field_page import FieldSetting as FieldSetting
     from codesign.evaluate.gaze_experiment import AXIAL as AXIAL
     from codesign.evaluate.gaze_experiment import LATERAL as LATERAL
     from codesign.evaluate.gaze_experiment import Result as Result
@@ -41,7 +43,9 @@ __getattr__, __dir__, __all__ = attach(
         "Scenes": "optics",
         "Setting": "optics",
         "experiment": "gaze_experiment",
+        "FieldSetting": "field_page",
         "experiment_plots": "",
+        "field_page": "",
         "gaze_experiment": "",
         "judged": "reader",
         "imaged": "",

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from metalens.psf.extended import Extent as Extent
     from metalens.psf.metrics import blur_um as blur_um
     from metalens.psf.of_lens import View as View
+    from metalens.psf.of_lens import all_maps as all_maps
     from metalens.psf.of_lens import from_lens as from_lens
+    from metalens.psf.of_lens import incidence as incidence
     from metalens.psf.of_lens import passed_um2 as passed_um2
     from metalens.psf.of_lens import unpolarised as unpolarised
     from metalens.psf.pixels import on_pixels as on_pixels
@@ -56,6 +58,7 @@ __getattr__, __dir__, __all__ = attach(
         "Source": "spectrum",
         "SourceShape": "record",
         "View": "of_lens",
+        "all_maps": "of_lens",
         "among": "",
         "aperture": "budget",
         "beyond_faces": "vector",
@@ -63,6 +66,7 @@ __getattr__, __dir__, __all__ = attach(
         "export": "",
         "far_field": "directions",
         "from_lens": "of_lens",
+        "incidence": "of_lens",
         "unpolarised": "of_lens",
         "load": "record",
         "of_flux": "vector",

@@ -215,7 +215,7 @@ def _of_nodes(
         counted = _counted(lens, angle, polarisation, tolerance)
         alike = incidence(lens, angle), counted == "scalar"
         if seen != alike:  # without angles in the library all directions share the maps
-            (phase, level), fields = _all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
+            (phase, level), fields = all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
             seen = alike
         parts.append(
             psf_stack(
@@ -301,7 +301,7 @@ def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
     return float(np.arctan(np.hypot(*np.tan(angle_rad)))) if lens.proxy.max_angle_rad > 0 else 0.0
 
 
-def _all_maps(
+def all_maps(
     lens: Lens, nodes: Nodes, angle_rad: tuple[float, float], dtype: torch.dtype, *, scalar: bool
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], Jones | None]:
     """(wavelength, y, x) phase and transmission of every pillar for light from a direction, with the mean factor of
@@ -324,7 +324,7 @@ def passed_um2(lens: Lens, angle_rad: tuple[float, float], depths_um: Sequence[f
     """
     nodes = Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
-    level = _all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0].numpy()
+    level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0].numpy()
     places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
     shades = (lens.layers.shadow(tangents, z, lens.wavelength_um, places, width) for z in depths_um)
     order = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).order

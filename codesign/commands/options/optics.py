@@ -16,8 +16,8 @@ class Options(Common):
 
     Attributes:
         lenses: lens files; the first is what the others are compared with.
-        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png and report.html.
-        config: OPTICS.toml with the tables [axial], [scenes] and [reader]; without it the defaults.
+        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png, field.png, mtf.png, report.html.
+        config: OPTICS.toml with the tables [axial], [over_field], [scenes] and [reader]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.
         baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
             and at the aperture of the first lens; tuned on axis for the finest binning.

@@ -19,6 +19,9 @@ count = 3
 angles_deg = [0.0, 5.0]
 binnings = [1, 2]
 window_um = 60.0
+[over_field]
+angles_deg = [-6.0, 0.0, 11.0]
+frequencies_per_mm = [60.0, 120.0]
 [scenes]
 count = 3
 pixels = 64
@@ -63,7 +66,13 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     assert set(read) == {"a", "b"}
     assert all(0 <= one["covered"] <= 1 and one["axial_low_mm"] < one["axial_mm"] for one in read.values())
     assert "90 % interval" in (tmp_path / "out" / "tables.txt").read_text()
-    for name in ("axial.png", "slices.png", "scenes.png", "report.html"):
+    field = values["lenses"]["b"]["field"]
+    assert field["angles_deg"] == [-6.0, 0.0, 11.0]
+    assert field["chief_um"][2][0] == pytest.approx(600.0 * math.tan(math.radians(11.0)), abs=0.01)
+    assert np.shape(field["mtf"]) == (3, 2, 2)
+    assert "T at 60 / mm" in shown
+    assert "distortion / %" in shown
+    for name in ("axial.png", "slices.png", "scenes.png", "field.png", "mtf.png", "report.html"):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 
 

@@ -140,7 +140,7 @@ def test_sums_get_what_the_spectrum_s_error_leaves_of_the_tolerance(monkeypatch,
     made.diameters.grid = SimpleNamespace(_asdict=dict)
     made.neighbours = None
     monkeypatch.setattr(of_lens, "psf_stack", summed)
-    monkeypatch.setattr(of_lens, "_all_maps", lambda lens, nodes, angle, dtype, scalar: ((str(dtype), None), None))
+    monkeypatch.setattr(of_lens, "all_maps", lambda lens, nodes, angle, dtype, scalar: ((str(dtype), None), None))
     monkeypatch.setattr(of_lens, "_budget", lambda *_: Budget(2e-4))
     view = of_lens.View((2e3, 5e3), ((0.0, 0.1), (0.2, 0.0)))
     found = of_lens.from_lens(made, view, tolerance=tolerance, spectrum=nodes)

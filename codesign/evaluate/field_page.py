@@ -1,0 +1,144 @@
+"""Lenses as an optical designer looks at them: distortion, field curvature, light and MTF over the field angle."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from metalens.aberrations import OverField, frequencies_per_mm, over_field
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError
+from metalens.ground.report import Table, canvas, png
+from metalens.lens import Lens
+
+CAPTIONS = {
+    "field": "Over the field angle: distortion; focus behind (+) or before the sensor, of close rays (lines) and of "
+    "the whole aperture (points), tangential (line drawn through, circles) and sagittal (dashed, squares); relative "
+    "illumination and, dotted, vignetting.",
+    "mtf": "Modulation transfer over the field angle, of all light through the lens, a frequency each: tangential "
+    "drawn through, sagittal dashed.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSetting:
+    """How lenses are looked at over the field.
+
+    angles_deg: field angles along x, of either sign; left out, those of [axial].
+    frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of 2 NA / wavelength of the first lens.
+    depth_mm: of the sources, inf for collimated light; left out, the focus that each lens was made for.
+    """
+
+    angles_deg: tuple[float, ...] | None = field(default=None, metadata={"signed": True})
+    frequencies_per_mm: tuple[float, ...] | None = None
+    depth_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        angles, frequencies = self.angles_deg, self.frequencies_per_mm
+        if angles is not None and not (angles and max(map(abs, angles)) < 85):
+            raise ConfigError(f"angles_deg = {angles}: need one field angle or more, between -85 and 85")
+        if frequencies is not None and not (frequencies and min(frequencies) > 0):
+            raise ConfigError(f"frequencies_per_mm = {frequencies}: need one or more, all above 0")
+        if self.depth_mm is not None and not self.depth_mm > 0:
+            raise ConfigError(f"depth_mm = {self.depth_mm}: need a depth above 0, or inf")
+
+    def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
+        """A lens over the field, with what was left out from the first one and from other angles."""
+        return over_field(
+            lens,
+            self.angles_deg or angles_deg,
+            depth_um=None if self.depth_mm is None else 1e3 * self.depth_mm,
+            frequencies=self.frequencies_per_mm or frequencies_per_mm(first),
+        )
+
+
+def values(found: OverField) -> dict[str, Any]:
+    """Every number of one lens, ready for JSON: None where there is none."""
+    arrays = {name: _plain(np.asarray(getattr(found, name))) for name in found.__slots__ if name != "left_out"}
+    return arrays | {"left_out": list(found.left_out)}
+
+
+def _plain(array: Array) -> Any:
+    if array.ndim:
+        return [_plain(part) for part in array]
+    return float(array) if math.isfinite(array) else None
+
+
+def tables(seen: Mapping[str, OverField]) -> list[Table]:
+    """Rays and light over the field angle, and the MTF."""
+    head = (
+        "lens", "angle / °", "chief ray x / µm", "distortion / %", "close rays T / µm", "S / µm",
+        "sharpest line T / µm", "S / µm", "vignetting / %", "illumination",
+    )  # fmt: skip
+    rows, curves = [], []
+    for name, one in seen.items():
+        for k, angle in enumerate(one.angles_deg):
+            label = name if k == 0 else ""
+            focus = [_told(v, 1) for v in (*one.close_um[k], *one.sharpest_um[k])]
+            bent, lost = (_told(100 * v[k], 2) for v in (one.distortion, one.vignetting))
+            chief, light = _told(one.chief_um[k, 0], 2), _told(one.illumination[k], 3)
+            rows.append((label, f"{angle:g}", chief, bent, *focus, lost, light))
+            mtf = [_told(v, 3) for pair in one.mtf[k].T for v in pair]
+            curves.append((label, f"{angle:g}", *mtf))
+    frequencies = next(iter(seen.values())).frequencies_per_mm
+    over = [f"{part} at {f:g} / mm" for f in frequencies for part in "TS"]
+    return [
+        Table(head, rows, _caption(seen)),
+        Table(("lens", "angle / °", *over), curves, "Modulation transfer over the field, of all light through the lens "
+              "(T tangential: along x, S sagittal: along y)."),
+    ]  # fmt: skip
+
+
+def _caption(seen: Mapping[str, OverField]) -> str:
+    depths = {f"{1e-3 * one.depth_um:.4g} mm" if math.isfinite(one.depth_um) else "infinity" for one in seen.values()}
+    why = "".join(f"\n{name}: {line}." for name, one in seen.items() for line in one.left_out)
+    return (
+        f"Over the field along x, sources at {', '.join(sorted(depths))}, design wavelength. Foci behind (+) or before "
+        f"the sensor, T tangential and S sagittal; illumination relative to 0°.{why}"
+    )
+
+
+def _told(value: float, digits: int) -> str:
+    if not math.isfinite(value):
+        return "–"
+    shown = f"{value:.{digits}f}"
+    return shown.removeprefix("-") if float(shown) == 0 else shown
+
+
+def picture(seen: Mapping[str, OverField]) -> bytes:
+    """Distortion, foci and light over the field angle."""
+    figure, panels = canvas(1, 3, size=(10.5, 3.4))
+    for number, (name, one) in enumerate(seen.items()):
+        order, colour = np.argsort(one.angles_deg), f"C{number % 6}"
+        angle = one.angles_deg[order]
+        panels[0].plot(angle, 100 * one.distortion[order], ".-", color=colour, label=name)
+        for axis, style, mark in ((0, "-", "o"), (1, "--", "s")):
+            panels[1].plot(angle, one.close_um[order, axis], style, color=colour)
+            panels[1].plot(angle, one.sharpest_um[order, axis], mark, color=colour, markersize=3, fillstyle="none")
+        panels[2].plot(angle, one.illumination[order], ".-", color=colour)
+        panels[2].plot(angle, one.vignetting[order], ":", color=colour)
+    panels[0].set(title="distortion", ylabel="distortion / %")
+    panels[1].set(title="field curvature", ylabel="focus from the sensor / µm")
+    panels[2].set(title="illumination and vignetting", ylabel="share", ylim=(-0.03, None))
+    panels[0].legend(fontsize=7)
+    for panel in panels:
+        panel.set_xlabel("field angle / °")
+    return png(figure)
+
+
+def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
+    """MTF over the field angle, a panel for each frequency."""
+    frequencies = next(iter(seen.values())).frequencies_per_mm
+    figure, panels = canvas(1, len(frequencies), size=(1 + 3.2 * len(frequencies), 3.2), squeeze=False, sharey=True)
+    for number, (name, one) in enumerate(seen.items()):
+        order, colour = np.argsort(one.angles_deg), f"C{number % 6}"
+        for k, panel in enumerate(panels[0]):
+            panel.plot(one.angles_deg[order], one.mtf[order, 0, k], ".-", color=colour, label=name)
+            panel.plot(one.angles_deg[order], one.mtf[order, 1, k], ".--", color=colour)
+    for panel, frequency in zip(panels[0], frequencies, strict=True):
+        panel.set(title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1))
+    panels[0, 0].set_ylabel("modulation")
+    panels[0, 0].legend(fontsize=7)
+    return png(figure)
