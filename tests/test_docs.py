@@ -35,6 +35,7 @@ def _records():
     from characterize.bench.protocol import Protocol
     from characterize.pupil.record import PupilSpec
     from codesign.budget.plan import PlanConfig
+    from codesign.commands.evaluate_optics import Settings as Optics
     from layout.arrange import Arrangement
     from layout.process.process import Process
 
@@ -49,6 +50,7 @@ def _records():
         "PLAN.toml": PlanConfig,
         "CHAIN.toml": ChainFiles,
         "ARRANGEMENT.toml": Arrangement,
+        "OPTICS.toml": Optics,
     }
 
 
