@@ -95,7 +95,7 @@ def _lost(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
 
 def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Array:
     """(2,) where the source of a field angle lies from the axis, in um; the tangents of collimated light."""
-    tangents = np.tan(np.asarray(angle_rad, float))
+    tangents: Array = np.tan(np.asarray(angle_rad, float))
     slope = float(np.hypot(*tangents))
     if math.isinf(depth_um) or slope == 0:
         return tangents
