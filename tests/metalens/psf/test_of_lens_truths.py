@@ -9,6 +9,7 @@ import pytest
 
 from metalens.ground.store import Provenance
 from metalens.lens import Layers
+from metalens.pillars import Proxy
 from metalens.psf import of_lens
 from metalens.psf.budget import Budget
 from metalens.psf.record import PsfStack
@@ -17,13 +18,21 @@ from metalens.psf.spectrum import Nodes
 RNG = np.random.default_rng(3)
 
 
+def proxy(knows_angles):
+    """|T| = 0.8 everywhere, 4e-3 rad and 6e-3 off."""
+    phase, level = np.array([[1.0, 2.0]]), np.array([[0.8]])
+    if knows_angles:
+        phase, level = phase[None], level[None]
+    return Proxy(phase, level, (0.1, 0.3), (0.84, 0.86), 4e-3, 6e-3, 1, knows_angles)
+
+
 def lens(knows_angles=0.0):
     return SimpleNamespace(
         layers=Layers(),
         sensor_distance_um=700.0,
         wavelength_um=0.85,
         diameters=SimpleNamespace(radius_um=200.0, pitch_um=0.4, pillars=700_000, site_um2=0.16),
-        proxy=SimpleNamespace(max_angle_rad=knows_angles),
+        proxy=proxy(knows_angles),
         hand="",
         pairs=None,
         one_light="",
@@ -115,6 +124,7 @@ def test_a_direction_s_budget_has_its_own_cone_and_incidence(monkeypatch):
     assert (asked["polarisation"], asked["has_angles"], asked["left_out"]) == ("vector", False, "rough")
     assert asked["ghost"] == lens().layers.ghost(0.85)
     assert asked["lit"] == pytest.approx(700_000 * 0.16 / 0.85**2, rel=1e-12)
+    assert asked["proxy"] == pytest.approx(8.5e-3, rel=1e-12)  # 4e-3 and 6e-3 / 0.8
 
 
 @pytest.mark.parametrize(
