@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.model import LIGHT, PLACE, Known, extra_path, incidence_rad, light_maps, made, spectrum, vector
+from characterize.model import LIGHT, PLACE, Known, Spectrum, extra_path, incidence_rad, light_maps, made, vector
 from metalens import psf
 from metalens.ground import executor
 from metalens.ground.arrays import Array
@@ -20,6 +20,7 @@ from metalens.lens import Lens
 from metalens.made import Sensitivity
 
 FINE = 9
+_SPECTRUM = 1e-5  # of a mean over it: a fiftieth of what the fit allows itself
 _MARGIN = 4  # pixels about the window that blur may reach in from
 _TOGETHER = 1_000_000  # fine samples of the frames that are computed together, by one worker
 
@@ -123,7 +124,8 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
     if depth.min() <= 0:
         raise FitError(f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens")
     tasks = []
-    for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
+    line = Spectrum.of(lens, depth, angles, tolerance=_SPECTRUM)
+    for offset_nm, weight in line.colours(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
         tasks += [

@@ -80,12 +80,12 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     check_enough(data, search.names_of(known, options.free))
     model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
     start = vector({name: k.value for name, k in known.items()})
-    scan = options.scan_um if options.scan_um is not None else 0.12 * float(np.median(setting.depth_um))
-    found = arrange(model, data, scan_um=scan, start=start, reach_um=_reach_um(known, lens))
+    scan_um = 0.12 * float(np.median(setting.depth_um)) if options.scan_um is None else options.scan_um
+    found = arrange(model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens))
     _check_likeness(found, lens)
     whole = Task(model, data, start, known, found, options.free, unfitted)
     task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
-    cautions = [*frames.corrections, *_arranged_words(task.found or found)]
+    cautions = [*frames.corrections, *_arranged_words(task.found or found), *verdict.colours(lens, known)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     unbiased = search.starts(task, biases_nm=(0.0,))[0]

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -15,13 +16,15 @@ from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.missing import Unstated
 from characterize.inference.posterior import Valley
 from characterize.inference.search import WAVES_RAD, Task
-from characterize.model import PARAMETERS, PLACE, ForwardModel, thinplate
+from characterize.model import PARAMETERS, PLACE, ForwardModel, Known, thinplate
 from metalens.ground import threads
 from metalens.ground.arrays import Array
+from metalens.lens import Lens
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
+_ONE_COLOUR_NM = 2.0  # over which pillars turn by 0.02 rad, those of a library at one wavelength too
 _STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a thousand frames of noise reach 4
 
 
@@ -103,6 +106,20 @@ def at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[
         (n, v)
         for n, v, out, low, high in ends
         if (v >= high and out > _BEYOND) or (v <= low and out < -_BEYOND and n not in blurs)
+    ]
+
+
+def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
+    """Whether pillars were solved for the colours of a stated spectrum, in words; beyond, ``designed`` holds them."""
+    bandwidth_nm = known["bandwidth_nm"].value if "bandwidth_nm" in known else 0.0
+    low, high = (edge * 1e3 for edge in lens.proxy.wavelengths_um)
+    first, last = (lens.wavelength_um * 1e3 + reach * bandwidth_nm for reach in (-2, 2))
+    room = max(high - low, _ONE_COLOUR_NM)
+    if low - room <= first and last <= high + room:
+        return []
+    return [
+        f"the light reaches from {first:.0f} to {last:.0f} nm, the pillars are known from {low:.0f} to {high:.0f} nm: "
+        f"beyond {low - room:.0f} and {high + room:.0f} nm they are taken to be the same; sweep the library over it"
     ]
 
 

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from characterize.model.pillars import incidence_rad as incidence_rad
     from characterize.model.setting import LIGHT as LIGHT
     from characterize.model.setting import Setting as Setting
+    from characterize.model.setting import Spectrum as Spectrum
     from characterize.model.setting import background as background
     from characterize.model.setting import light_maps as light_maps
-    from characterize.model.setting import spectrum as spectrum
     from characterize.model.setting import true_depth as true_depth
     from characterize.model.thinplate import MODES as MODES
     from characterize.model.thinplate import basis as basis
@@ -41,6 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "PARAMETERS": "parameters",
         "PLACE": "parameters",
         "Setting": "setting",
+        "Spectrum": "setting",
         "UNFITTED": "parameters",
         "background": "setting",
         "basis": "thinplate",
@@ -52,7 +53,6 @@ __getattr__, __dir__, __all__ = attach(
         "oversampling": "detector",
         "prior_rad": "thinplate",
         "slopes": "pillar_slopes",
-        "spectrum": "setting",
         "state": "parameters",
         "thinplate": "",
         "true_depth": "setting",

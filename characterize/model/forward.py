@@ -17,7 +17,7 @@ from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
-from characterize.model.setting import LIGHT, Setting, background, brightness, dimming, light_maps, spectrum, true_depth
+from characterize.model.setting import LIGHT, Setting, Spectrum, background, brightness, dimming, light_maps, true_depth
 from characterize.model.window import Operators
 from metalens.ground import threads
 from metalens.ground.arrays import Array
@@ -31,9 +31,10 @@ GEOMETRY = (
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
 WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
+Light = tuple[Array, dict[str, Array]]  # and its derivatives by name
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
-_WAVE_STEP_NM = 0.01
+_WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
 _NEAR_UM = 5.0  # off the chief ray, within which windows need no more directions than those of the middle
 _FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
 
@@ -81,6 +82,7 @@ class ForwardModel:
         self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
         self.stage_centre_um = float(setting.depth_um.mean())
+        self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
 
     def _group(self, angle_rad: Array) -> _Group:
@@ -188,13 +190,13 @@ class ForwardModel:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return image, out
 
-    def _light(self, x: Array, wanted: Sequence[str] | None) -> tuple[Array, dict[str, Array]]:
+    def _light(self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None) -> Light:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
-        s, wanted = self.setting, list(wanted or ())
+        s, wanted, wide_nm = self.setting, list(wanted or ()), float(x[PLACE["bandwidth_nm"]])
         names = list(dict.fromkeys("stage_zero_um" if name == "stage_scale" else name for name in wanted))
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
-        for offset_nm, weight in spectrum(x[PLACE["bandwidth_nm"]]):
+        for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
             for group in self.groups:
                 part, more = self._group_light(x, group, offset_nm, names)
                 light[group.index] += weight * part
@@ -202,16 +204,13 @@ class ForwardModel:
                     if name in more:
                         slopes[name][group.index] += weight * more[name]
         if "bandwidth_nm" in names:
-            up = x.copy()
-            up[PLACE["bandwidth_nm"]] += 0.02
-            slopes["bandwidth_nm"] = (self._light(up, None)[0] - light) / 0.02
+            up = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
+            slopes["bandwidth_nm"] = (self._light(up, None, wide_nm)[0] - light) / _WIDER_NM
         if "stage_scale" in wanted:  # of one frame as its stage zero's, by how far it is from the middle
             slopes["stage_scale"] = slopes["stage_zero_um"] * (s.depth_um - self.stage_centre_um)[:, None, None]
         return light, slopes
 
-    def _group_light(
-        self, x: Array, group: _Group, offset_nm: float, names: list[str]
-    ) -> tuple[Array, dict[str, Array]]:
+    def _group_light(self, x: Array, group: _Group, offset_nm: float, names: list[str]) -> Light:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, lens = threads.beside(

@@ -1,5 +1,6 @@
 """Which frames are predicted: depths, angles, exposures, window; where the source truly stood, and its spectrum."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -8,6 +9,10 @@ import numpy as np
 from characterize.model.parameters import PLACE
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
+from metalens.lens import Lens
+
+LEAST_NM = 0.02  # of a spectrum that colours are chosen for: none has no slope by its width
+_RIM, _TURN_STEP, _MOST_COLOURS = 48, 0.05, 64
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,9 +83,72 @@ def light_maps(u: Array, v: Array) -> Array:
     return np.stack([u, v, u * u + v * v - 0.5])
 
 
-def spectrum(bandwidth_nm: float) -> list[tuple[float, float]]:
-    """(offset in nm, weight) of a Gaussian line by 5-point Gauss-Hermite quadrature; one line for no width."""
-    if bandwidth_nm <= 0:
-        return [(0.0, 1.0)]
-    place, weight = np.polynomial.hermite_e.hermegauss(5)
-    return [(float(p) * bandwidth_nm, float(w)) for p, w in zip(place, weight / weight.sum(), strict=True)]
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """A Gaussian line as the fewest colours that stand for it to a lens.
+
+    Intensities turn with the wavelength as the paths through the lens differ: by up to t = 2 pi path sigma over
+    wavelength² in a standard deviation sigma of the line, and no faster.
+
+    path_um: largest difference in optical path between two parts of the lens. wavelength_um: of the design.
+    tolerance: of the mean of exp(i s) over the line, exp(-s²/2), for every s up to t.
+    """
+
+    path_um: float
+    wavelength_um: float
+    tolerance: float
+
+    @classmethod
+    def of(cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float) -> "Spectrum":
+        """Paths from axis and rim to sources and chief ray's places through air; a wavelength more for the pillars.
+
+        Args:
+            depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
+        """
+        turn = np.linspace(0, 2 * math.pi, _RIM, endpoint=False)
+        x, y = (np.append(lens.diameters.radius_um * part, 0.0) for part in (np.cos(turn), np.sin(turn)))
+        z, d, (tx, ty) = depth_um[:, None], lens.sensor_distance_um, np.tan(angle_rad.T)[..., None]
+        paths = np.sqrt((x + z * tx) ** 2 + (y + z * ty) ** 2 + z**2)
+        paths = paths + np.sqrt((x - d * tx) ** 2 + (y - d * ty) ** 2 + d**2)
+        return cls(float(np.ptp(paths, axis=1).max()) + lens.wavelength_um, lens.wavelength_um, tolerance)
+
+    def colours(self, bandwidth_nm: float, like_nm: float | None = None) -> list[tuple[float, float]]:
+        """(offset in nm, weight) of a line of this standard deviation; one for no width.
+
+        Gauss-Hermite nodes, or even ones of Gaussian weight, of which fewer do where t is above 2.
+
+        Args:
+            like_nm: another width, by which they are chosen: for differences.
+
+        Raises:
+            FitError: more than 64 colours would be needed.
+        """
+        if bandwidth_nm <= 0:
+            return [(0.0, 1.0)]
+        wide_nm = max(bandwidth_nm if like_nm is None else like_nm, LEAST_NM)
+        turn = 2 * math.pi * self.path_um * wide_nm * 1e-3 / self.wavelength_um**2
+        place, weight = _colours(math.ceil(turn / _TURN_STEP) * _TURN_STEP, self.tolerance)
+        return list(zip((bandwidth_nm * place).tolist(), weight.tolist(), strict=True))
+
+
+@functools.lru_cache(maxsize=64)
+def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
+    """(n,) places in standard deviations and weights of sum 1."""
+    s = np.linspace(0, turn, 129)
+    for count in range(2, _MOST_COLOURS + 1):
+        for place, weight in (np.polynomial.hermite_e.hermegauss(count), _even(count, turn)):
+            weight = weight / weight.sum()
+            if np.abs(weight @ np.cos(place[:, None] * s) - np.exp(-(s**2) / 2)).max() <= tolerance:
+                return place, weight
+    raise FitError(
+        f"a spectrum so wide that light turns by {turn:.0f} rad against itself in one standard deviation needs more "
+        f"than {_MOST_COLOURS} colours; put a narrower filter before the lens"
+    )
+
+
+def _even(count: int, turn: float) -> tuple[Array, Array]:
+    """What is cut off at the ends, exp(-r²/2), and what the steps h leave of the fastest turn, which is of size
+    exp(-(2 pi / h - t)² / 2), are alike where the reach r is 2 pi / h - t."""
+    step = (math.hypot(turn, math.sqrt(4 * math.pi * (count - 1))) - turn) / (count - 1)
+    place = step * (np.arange(count) - (count - 1) / 2)
+    return place, np.exp(-(place**2) / 2)

@@ -9,13 +9,13 @@ from numpy.polynomial import chebyshev, polynomial
 
 from metalens.cell import Cell, Index
 from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens
 from metalens.made.causes import Answers, Guide, of_kind, with_missing
 from metalens.made.own import own_rates
 from metalens.made.solved import Solved
 from metalens.pillars import Proxy
 
+_END = 64  # steps in the wavelengths of a proxy, of which the last one gives the tangent at its end
 _NODES, _DEGREE = 9, 5  # sizes that own shapes are solved at, and of the polynomials through them
 
 
@@ -170,20 +170,29 @@ def guide(cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array, *,
 def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0) -> Array:
     """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at an angle of incidence.
 
-    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (held within 0 to 1).
-
-    Raises:
-        FitError: a wavelength where the proxy says nothing.
+    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 0 to 1): by
+    diameter, and by wavelength as far again as the proxy reaches, then held; of one wavelength they hold at all.
     """
     low, high = proxy.wavelengths_um
-    if high > low and not low <= wavelength_um <= high:
-        raise FitError(f"wavelength {wavelength_um:.4f} um outside the proxy's {low:.4f} to {high:.4f} um")
-    at = low if high == low else wavelength_um, angle_rad
+    inside = min(max(wavelength_um, low), high)
+    phase, level = _levels(proxy, d_um, low if high == low else inside, angle_rad)
+    away = min(max(wavelength_um - inside, low - high), high - low)
+    if away:
+        step = math.copysign((high - low) / _END, away)
+        before = _levels(proxy, d_um, inside - step, angle_rad)
+        phase = phase + (phase - before[0]) * (away / step)
+        level = level + (level - before[1]) * (away / step)
+    return np.asarray(np.clip(level, 0, 1) * np.exp(1j * phase))
+
+
+def _levels(proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float) -> tuple[Array, Array]:
+    """Phase and |T| at a wavelength that the proxy knows, along their tangents beyond its diameters."""
+    at = wavelength_um, angle_rad
     inside = np.clip(d_um, *proxy.domain_um)
     beyond = d_um - inside
     phase = proxy.phase_rad(inside, *at) + beyond * proxy.dphase_ddiameter(inside, *at)
     level = proxy.transmission(inside, *at) + beyond * proxy.dtransmission_ddiameter(inside, *at)
-    return np.asarray(np.clip(level, 0, 1) * np.exp(1j * phase))
+    return np.asarray(phase), np.asarray(level)
 
 
 def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
