@@ -157,8 +157,8 @@ def _brightness(lens: Lens, angle_deg: float, depth_um: float, chief: ChiefRay) 
     Irradiance on the lens by an element of the plane (by its tangents at infinity), cos⁴ or 1 / spread of the media
     before, over the area of the element's image; of an arbitrary unit.
     """
-    steep = abs(math.tan(math.radians(angle_deg)))
-    slope = float(lens.layers.through_middle(np.array([steep]), depth_um, lens.wavelength_um)[0])
+    tangents = np.array([math.tan(math.radians(angle_deg)), 0.0])
+    slope = float(np.hypot(*lens.layers.through_middle(tangents, depth_um, lens.wavelength_um)))
     p = slope / math.hypot(1, slope)
     if math.isinf(depth_um):
         falls = (1 - p * p) ** 2

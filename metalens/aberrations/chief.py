@@ -120,13 +120,11 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
         axes = lens.diameters.x_um, lens.diameters.y_um
         return np.array([a @ w / w.sum() for a, w in zip(axes, weights, strict=True)])
     if between is None:
-        return np.zeros(2)
+        return np.array(stop.centre_um)
     p = _arriving(lens, np.zeros(2), source, depth_um)
-    sine = float(np.hypot(*p))
-    slope = np.array([sine / math.sqrt(1 - sine * sine)])
-    tilt = float(lens.layers.through_middle(slope, depth_um, lens.wavelength_um)[0])
-    p = p * (tilt / math.hypot(1, tilt) / sine) if sine else p
-    return np.asarray(media.bend(between.layers, float(p @ p)) * p)
+    slopes = lens.layers.through_middle(p / math.sqrt(1 - float(p @ p)), depth_um, lens.wavelength_um)
+    p = slopes / math.sqrt(1 + float(slopes @ slopes))
+    return np.asarray(stop.centre_um + media.bend(between.layers, float(p @ p)) * p)
 
 
 def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:

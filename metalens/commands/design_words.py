@@ -119,6 +119,7 @@ def _films(layers: Layers) -> list[str]:
     if layers.stop is not None:
         found.append(
             f"  aperture stop of {2 * layers.stop.radius_um:g} um, {layers.stop.distance_um:g} um before the pillars"
+            + ("" if layers.stop.centred else f", its middle at {layers.stop.centre_um} um")
         )
     return found
 

@@ -1,7 +1,7 @@
 """A phase profile made of pillars: every site takes the diameter whose proxy phase is the wanted one."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -241,6 +241,15 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
 
 
 def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
+    """The largest of light from four sides, by turns of a stop beside the axis; of one where all are alike."""
+    stop, found = focus.layers.stop, []
+    for _ in range(4 if stop is not None and not stop.centred else 1):
+        found.append(_from_the_side(replace(focus, layers=replace(focus.layers, stop=stop)), radius_um, angle_rad))
+        stop = stop and replace(stop, centre_um=(-stop.centre_um[1], stop.centre_um[0]))
+    return max(found)
+
+
+def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
     unit = np.linspace(-1, 1, 61)
     x, y = (g[np.hypot(*np.meshgrid(unit, unit)) <= 1] * radius_um for g in np.meshgrid(unit, unit))
     tangent = math.tan(angle_rad)

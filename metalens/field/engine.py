@@ -74,6 +74,7 @@ def imager(
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
     round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
+    round_ = round_ and (layers.stop is None or layers.stop.centred)
     plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, plan)
     whole = patched(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
@@ -107,11 +108,10 @@ def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
 def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
-    slope = (
-        torch.hypot(plan.y_um[:, None], plan.x_um).numpy() / optics.layers.after(optics.distance_um, wave).reduced_um
-    )
-    rays = [optics.layers.through_middle(slope, depth, wave) for depth in plan.depths_um.tolist()]
-    cosine2 = torch.from_numpy(1 / (1 + np.stack(rays, -1) ** 2))
+    places = torch.stack(torch.broadcast_tensors(plan.x_um, plan.y_um[:, None]), -1).numpy()
+    tangents = places / optics.layers.after(optics.distance_um, wave).reduced_um
+    rays = [optics.layers.through_middle(tangents, depth, wave) for depth in plan.depths_um.tolist()]
+    cosine2 = torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)))
     return light / total[..., None, None], total * (cosine2**2).to(total)
 
 

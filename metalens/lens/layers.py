@@ -86,20 +86,22 @@ class Layers:
             return None
         return _media(tuple(found), "air", thick + left, wavelength_um, "stop to lens")
 
-    def through_middle(self, slope: Array, depth_um: float, wavelength_um: float) -> Array:
-        """Slopes in air of the rays through the middle of the stop from sources at this depth, whose rays to the middle
-        of the lens have these slopes; the same without a stop, and of collimated light."""
-        if self.stop is None or self.stop.distance_um == 0 or math.isinf(depth_um):
-            return slope
+    def through_middle(self, tangents: Array, depth_um: float, wavelength_um: float) -> Array:
+        """(…, 2) slopes in air of the rays through the middle of the stop from sources at this depth, whose rays to the
+        middle of the lens have these slopes; the same without a stop, and of collimated light."""
+        if self.stop is None or math.isinf(depth_um):
+            return tangents
         before, between = self._around_stop(depth_um, wavelength_um)
-        if before is None or between is None:
-            return slope
-        inner = dict(between.layers)
+        if before is None or (between is None and self.stop.centred):
+            return tangents
+        inner = {} if between is None else dict(between.layers)
         outer = [(n, t - inner.get(n, 0.0)) for n, t in before.layers]
         outer = [(n, t) for n, t in outer if t > 1e-9 * depth_um]
-        far = slope / np.sqrt(1 + slope**2)
-        p = media.direction(Media(*zip(*outer, strict=True)), media.reach(before, far))
-        return np.asarray(p / np.sqrt(1 - p * p))
+        sine2 = (tangents**2).sum(-1, keepdims=True)
+        come = tangents / np.sqrt(1 + sine2)
+        away = media.bend(before.layers, sine2 / (1 + sine2)) * come + np.array(self.stop.centre_um)
+        w = media.square(outer, (away**2).sum(-1, keepdims=True))
+        return np.asarray(away / media.bend(outer, w) / np.sqrt(1 - w))
 
     def lit(
         self,

@@ -40,7 +40,7 @@ def _phase(figure: Any, axes: Any, lens: Lens) -> None:
     edge = d.x_um[0], d.x_um[-1], d.y_um[-1], d.y_um[0]
     axes.imshow(colour, extent=edge, interpolation="nearest")
     if stop := lens.layers.stop:
-        hole = Circle((0, 0), stop.radius_um, fill=False, color="k", linestyle="--")
+        hole = Circle(stop.centre_um, stop.radius_um, fill=False, color="k", linestyle="--")
         axes.add_patch(hole)
         axes.legend([hole], [f"aperture stop, {stop.distance_um:g} µm before"], loc="upper right")
     scale = ScalarMappable(Normalize(0, 2 * np.pi), "twilight")

@@ -19,7 +19,7 @@ within the Fresnel zone: mean of its sagitta y² / 2R, <y²> = i λ L' / 2π, L'
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,17 +35,18 @@ BENT, INNER = 0.005, 0.055  # of PSFs of 60 lenses against plane waves through t
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A round hole about the axis.
+    """A round hole, about the axis or beside it.
 
     radius_um: of the hole. distance_um: from its plane to that of the pillars, through the films in front of them that
-    lie there, the last one at the pillars, and air where they are thinner.
+    lie there, the last one at the pillars, and air where they are thinner. centre_um: (x, y) of its middle.
 
     Raises:
-        ConfigError: a radius that is not above 0, a distance below 0.
+        ConfigError: a radius that is not above 0, a distance below 0, a centre that is not finite.
     """
 
     radius_um: float
     distance_um: float = 0.0
+    centre_um: tuple[float, float] = field(default=(0.0, 0.0), metadata={"signed": True})
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.radius_um) and self.radius_um > 0 and 0 <= self.distance_um < math.inf):
@@ -53,6 +54,13 @@ class Stop:
                 f"stop: radius_um = {self.radius_um}, distance_um = {self.distance_um}; need a radius above 0 and a "
                 "distance of 0 or more"
             )
+        if not all(map(math.isfinite, self.centre_um)):
+            raise ConfigError(f"stop: centre_um = {self.centre_um}; need a finite x and y")
+
+    @property
+    def centred(self) -> bool:
+        """Whether it lies about the axis."""
+        return not any(self.centre_um)
 
 
 def crossing(
@@ -90,7 +98,8 @@ def _share(before: Media, between: Media, away2: Any) -> Any:
 def passed(stop: Stop, at_um: tuple[Any, Any], width_um: Any) -> Any:
     """Share of light that passes where rays cross the stop at (x, y): 1 inside, 0 outside, over the edge as much of a
     patch of ``width_um`` as lies inside; numpy or torch."""
-    radius = (at_um[0] * at_um[0] + at_um[1] * at_um[1]) ** 0.5
+    x, y = (at - middle for at, middle in zip(at_um, stop.centre_um, strict=True))
+    radius = (x * x + y * y) ** 0.5
     share = (stop.radius_um - radius) / width_um + 0.5
     return share.clip(0, 1) if isinstance(share, np.ndarray) else share.clamp(0, 1)
 
@@ -116,7 +125,7 @@ def shadow(
     slope = math.hypot(*tangents)
     ray = (tangents[0] / slope, tangents[1] / slope) if slope else (1.0, 0.0)
     lengths = fresnel_um(media_um[0], media_um[1], tangents)
-    x, y = np.broadcast_arrays(x, y)
+    x, y = np.broadcast_arrays(x - stop.centre_um[0], y - stop.centre_um[1])
     return behind((x, y), width_um, ray, lengths, stop.radius_um, wavelength_um)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 class Lens:
     """φ = -k (√(ρ² + d²) + √(ρ² + z²)), ρ from the vertex; z inf for a lens made for collimated light.
 
-    front, behind: (index, thickness) in the order of the light, air or cover left out. stop: (radius, distance).
+    front, behind: (index, thickness) in the order of the light, air or cover left out.
+    stop: (radius, distance, centre).
     """
 
     sensor_um: float
@@ -18,7 +19,7 @@ class Lens:
     vertex: tuple[float, float] = (0.0, 0.0)
     front: tuple[tuple[float, float], ...] = ()
     behind: tuple[tuple[float, float], ...] = ()
-    stop: tuple[float, float] | None = None
+    stop: tuple[float, float, tuple[float, float]] | None = None
 
     def slope(self, x):
         """(2,) grad φ / k."""
@@ -60,7 +61,7 @@ class Lens:
         """(2,) where the ray through the middle of the stop meets the pillars, by repeated correction."""
         x = np.zeros(2)
         for _ in range(60 if self.stop else 0):
-            x = x - self.crossing(x, angle_deg, depth_um)
+            x = x - self.crossing(x, angle_deg, depth_um) + self.stop[2]
         return x
 
     def lands(self, x, angle_deg, depth_um, sensor_um=None):

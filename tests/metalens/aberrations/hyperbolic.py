@@ -16,11 +16,14 @@ CASES = {
     "plain": (ray_trace.Lens(310.0, math.inf), math.inf),
     "off-centre": (ray_trace.Lens(310.0, 1900.0, vertex=(13.0, -7.0)), 1900.0),
     "glass": (ray_trace.Lens(310.0, math.inf, behind=((1.51, 90.0), (1.38, 30.0))), math.inf),
-    "stop": (ray_trace.Lens(310.0, math.inf, front=((1.45, 130.0),), stop=(35.0, 130.0)), math.inf),
+    "stop": (ray_trace.Lens(310.0, math.inf, front=((1.45, 130.0),), stop=(35.0, 130.0, (0.0, 0.0))), math.inf),
     "all": (
-        ray_trace.Lens(310.0, 1900.0, (9.0, 4.0), ((1.62, 20.0), (1.45, 90.0)), ((1.51, 90.0),), (37.0, 120.0)),
+        ray_trace.Lens(
+            310.0, 1900.0, (9.0, 4.0), ((1.62, 20.0), (1.45, 90.0)), ((1.51, 90.0),), (37.0, 120.0, (0.0, 0.0))
+        ),
         1300.0,
     ),
+    "beside": (ray_trace.Lens(310.0, 1900.0, front=((1.45, 110.0),), stop=(29.0, 125.0, (17.0, -6.0))), 1500.0),
 }
 
 

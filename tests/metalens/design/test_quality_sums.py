@@ -44,3 +44,15 @@ def test_thirty_places_of_the_lens_are_light_enough_for_a_wave_front():
     few, enough = (Focus(0.79, 1700.0, math.inf, Layers(stop=Stop(r, 100.0))) for r in (61.6, 62.3))
     assert of_phase._wavefront_variance(few, 600.0, 0.0) == math.inf
     assert of_phase._wavefront_variance(enough, 600.0, math.atan(0.1)) < 1e-3
+
+
+def test_the_field_behind_a_hole_beside_the_axis_is_that_of_its_worst_side():
+    """Turned by quarters it is the same; light from the side that moves off the vertex has more coma than of the
+    middle of either."""
+    sides = [(90.0, 30.0), (-30.0, 90.0), (-90.0, -30.0), (30.0, -90.0)]
+    holes = [Focus(0.79, 1700.0, 23e3, Layers(stop=Stop(160.0, 300.0, side))) for side in sides]
+    found = [of_phase._wavefront_variance(focus, 600.0, 0.15) for focus in holes]
+    one_side = [of_phase._from_the_side(focus, 600.0, 0.15) for focus in holes]
+    assert found == pytest.approx([max(found)] * 4, rel=1e-9)
+    assert max(one_side) == pytest.approx(found[0], rel=1e-9)
+    assert max(one_side) > 1.5 * min(one_side)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from metalens.field import Grid, forming, patches, plan, subset
+from metalens.design import Focus
+from metalens.field import Grid, SmoothWave, engine, forming, patches, plan, subset
 from metalens.field.patches import relative, shares
 from metalens.ground.errors import SceneError
+from metalens.lens import Layers, Stop
 from metalens.psf import Nodes, Source, spectrum
 
 draw = np.random.default_rng(21)
@@ -207,3 +209,19 @@ def test_patches_off_the_corner_give_the_psfs_of_their_own_pixels():
         wy, wx = through(y.tolist(), rows, row), through(x.tolist(), columns, column)
         want = np.einsum("a,b,c,abcyx->yx", wy, wx, [0.3, 0.7], stack.numpy())
         assert np.abs(psf.numpy() - want).max() < 2e-5 * np.abs(want).max()  # float32, and vectors cut at 1e-7
+
+
+@pytest.mark.parametrize(("middle", "folds"), [((0.0, 0.0), True), ((5.0, 0.0), False), ((0.0, -2.0), False)])
+def test_a_lens_behind_a_hole_beside_the_axis_is_not_round(monkeypatch, middle, folds):
+    seen = []
+
+    def planned(*given, **about):
+        seen.append(about["folds"])
+        raise SceneError("asked")
+
+    monkeypatch.setattr(engine, "planned", planned)
+    layers = Layers(stop=Stop(30.0, 100.0, middle))
+    wave = SmoothWave(Focus(0.85, 500.0, 6000.0, layers), 60.0)
+    with pytest.raises(SceneError, match="asked"):
+        engine.imager(wave, Grid((9, 9), 3.0, (3e3, 9e3), 0, 9), layers=layers, tolerance=0.1)
+    assert seen == [folds]

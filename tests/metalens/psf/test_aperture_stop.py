@@ -29,7 +29,13 @@ LAYERS = Layers(front=(Film(Index(GLASS), THICK),), stop=Stop(STOP, THICK))
 WINDOW = {"window_um": 41.0, "samples": 41}
 
 
-def _on_the_pillars(angle: tuple[float, float], depth_um: float, stop_um: float, thick_um: float) -> np.ndarray:
+def _on_the_pillars(
+    angle: tuple[float, float],
+    depth_um: float,
+    stop_um: float,
+    thick_um: float,
+    middle: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
     """(y, x) field before the pillars: the source's wave through the hole, its plane waves through glass."""
     fine, count = PITCH / 2, 1280
     place = (np.arange(count) - count // 2) * fine + PITCH / 2  # every second one is a pillar
@@ -47,7 +53,7 @@ def _on_the_pillars(angle: tuple[float, float], depth_um: float, stop_um: float,
         way = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + gap**2)
         wave = np.exp(1j * K * way) / way
         even = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (gap + thick_um / GLASS) ** 2)
-    wave = wave * np.clip((stop_um - np.hypot(x, y)) / fine + 0.5, 0, 1)
+    wave = wave * np.clip((stop_um - np.hypot(x - middle[0], y - middle[1])) / fine + 0.5, 0, 1)
     f = np.fft.fftfreq(count, fine)
     along = np.sqrt((GLASS / WAVE) ** 2 - f**2 - f[:, None] ** 2 + 0j)
     behind = np.fft.ifft2(np.fft.fft2(wave) * np.exp(2j * np.pi * along * thick_um))
@@ -70,11 +76,12 @@ def _summed(
 def _lit(
     angle: tuple[float, float],
     depth_um: float,
-    hole_um: tuple[float, float],
+    hole_um: tuple[float, float] | tuple[float, float, tuple[float, float]],
     level: np.ndarray,
     window: tuple[float, float],
 ) -> np.ndarray:
-    """The same as it is, on the window of the chief ray of an angle; hole_um: radius, and before the pillars."""
+    """The same as it is, on the window of the chief ray of an angle; hole_um: radius, how far before the pillars,
+    and middle."""
     light = (_on_the_pillars(angle, depth_um, *hole_um) * level * np.exp(1j * PHASE))[level > 0]
     x, y = X[level > 0], Y[level > 0]
     across, down = np.arange(41)[::2] - 20.0, np.arange(41)[::4] - 20.0
@@ -123,6 +130,43 @@ def test_psf_behind_a_stop_is_that_of_waves_through_its_glass_within_the_error_i
     assert said / 8 < _apart(seen, want) < said + 1e-4  # of the sums
     on_pillars = replace(layers, stop=Stop(stop_um))  # the same hole there: other light where there is an angle
     assert _apart(_seen(angle, depth_um, on_pillars, level)[0], want) > 3 * said or angle == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("angle", "depth_um", "stop_um", "thick_um", "middle"),
+    [((0.0, 0.0), math.inf, 27.0, 80.0, (13.0, -8.0)), ((0.12, -0.07), math.inf, 24.0, 80.0, (-17.0, 5.0)),
+     ((0.12, -0.07), 3000.0, 24.0, 80.0, (19.0, 11.0)), ((-0.05, 0.21), 700.0, 22.0, 110.0, (9.0, -14.0)),
+     ((0.02, 0.03), 480.0, 18.0, 45.0, (-21.0, -12.0)), ((0.209, 0.0), 1300.0, 19.0, 60.0, (12.0, 16.0)),
+     ((-0.28, -0.15), 2100.0, 26.0, 57.0, (11.0, 3.0)), ((0.0, 0.0), 900.0, 21.0, 95.0, (0.0, 23.0))],
+)  # fmt: skip
+def test_a_hole_beside_the_axis_lights_its_own_part_of_the_lens(
+    angle: tuple[float, float], depth_um: float, stop_um: float, thick_um: float, middle: tuple[float, float]
+) -> None:
+    """As above, of a stop whose middle lies up to its own radius from the axis; on the axis it would be far off."""
+    layers = Layers(front=(Film(Index(GLASS), thick_um),), stop=Stop(stop_um, thick_um, middle))
+    want = _lit(angle, depth_um, (stop_um, thick_um, middle), LEVEL, angle)
+    want /= want.sum()
+    seen, said = _seen(angle, depth_um, layers)
+    assert said / 8 < _apart(seen, want) < said + 1e-4  # of the sums
+    centred = replace(layers, stop=Stop(stop_um, thick_um))
+    assert _apart(_seen(angle, depth_um, centred)[0], want) > 10 * said
+
+
+def test_the_ray_through_the_middle_of_a_hole_beside_the_axis() -> None:
+    """Forwards, from the source through the hole's middle in air; the same slopes of collimated light."""
+    layers = Layers(stop=Stop(20.0, 150.0, (31.0, -12.0)))
+    tangents, depth = np.array([[0.2, -0.1], [0.0, 0.0]]), 900.0
+    want = (tangents * depth + np.array([31.0, -12.0])) / (depth - 150.0)
+    np.testing.assert_allclose(layers.through_middle(tangents, depth, WAVE), want, rtol=1e-12)
+    np.testing.assert_array_equal(layers.through_middle(tangents, math.inf, WAVE), tangents)
+    on_pillars = replace(layers, stop=Stop(20.0, 0.0, (31.0, -12.0))).through_middle(tangents, depth, WAVE)
+    np.testing.assert_allclose(on_pillars, tangents + np.array([31.0, -12.0]) / depth, rtol=1e-12)
+
+
+@pytest.mark.parametrize("middle", [(math.nan, 0.0), (0.0, math.inf)])
+def test_a_hole_nowhere_is_refused(middle: tuple[float, float]) -> None:
+    with pytest.raises(ConfigError, match="centre_um"):
+        Stop(20.0, 150.0, middle)
 
 
 # windows that hold 0.1 to 0.2 of the light: by the blur that is seen in them they said 0.3 to 1.1 of the true error
@@ -224,9 +268,10 @@ def test_shadow_near_the_pillars_is_a_hole_there_and_far_waves_are_shared_out() 
     )
 
 
-def test_image_engine_and_every_pillar_see_the_same_stop() -> None:
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (-37.0, 11.0)])
+def test_image_engine_and_every_pillar_see_the_same_stop(middle: tuple[float, float]) -> None:
     """PSFs by rays of a smooth wave against sums over pillars; 1.6e-2 is what both differ by without a stop as well."""
-    layers = Layers(front=(Film(Index(GLASS), 160.0),), stop=Stop(70.0, 160.0))
+    layers = Layers(front=(Film(Index(GLASS), 160.0),), stop=Stop(70.0, 160.0, middle))
     radius, pitch, step, fine = 130.0, 0.45, 3.0, 7
     place = (np.arange(579) - 289) * pitch
     x, y = np.meshgrid(place, place)
