@@ -3,28 +3,15 @@ light on the nodes of a pupil, and pillars gathered over cells."""
 
 import numba
 import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd import forward_ad
 
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
+from metalens.image.scene import plain as plain
+from metalens.image.scene import values as values
 from metalens.lens import answers
 from metalens.propagate import turns32
 
 PART, put = answers.PART, answers.answers  # compiled loops know names of their own module
-
-
-def plain(a: Tensor) -> bool:
-    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
-    return a.dtype in (torch.float32, torch.complex64) and values(a)
-
-
-def values(a: Tensor) -> bool:
-    """Whether it lies in main memory and carries no derivatives, backward or forward."""
-    if a.device.type != "cpu" or a.requires_grad:
-        return False
-    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)

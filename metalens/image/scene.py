@@ -233,7 +233,7 @@ def _sources(frames: Frames, optics: UniformImager) -> Tensor:
     """(rank, frames, 2 kinds, 2 sheets, y, x) light and coverage weighted for every kernel, ready to transform."""
     psf, given = optics.psf, (frames.radiance, frames.coverage, frames.depth_um)
     single = psf.weights.shape[:2] == (1, 1)
-    if single and all(_plain(a) for a in (*given, psf.weights)):
+    if single and all(plain(a) for a in (*given, psf.weights)):
         from metalens.image.sources import weighted
 
         ends = float(psf.depths_um[0]), float(psf.depths_um[-1])
@@ -245,12 +245,16 @@ def _sources(frames: Frames, optics: UniformImager) -> Tensor:
     return _padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
 
 
-def _plain(a: Tensor) -> bool:
+def plain(a: Tensor) -> bool:
     """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
-    if a.dtype != torch.float32 or a.device.type != "cpu" or a.requires_grad:
+    return a.dtype in (torch.float32, torch.complex64) and values(a)
+
+
+def values(a: Tensor) -> bool:
+    """Whether it lies in main memory and carries no derivatives, backward or forward."""
+    if a.device.type != "cpu" or a.requires_grad:
         return False
-    tangent = forward_ad.unpack_dual(a).tangent  # type: ignore[no-untyped-call]
-    return tangent is None
+    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 def with_kernels(optics: UniformImager, kernels: Tensor) -> UniformImager:

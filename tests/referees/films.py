@@ -9,6 +9,11 @@ import itertools
 import numpy as np
 
 
+def rise(u):
+    """From 0 to 1 over u of 0 to 1, with two derivatives that are 0 at either end."""
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
 class Stack:
     """films: (index, thickness) from pillars to sensor, the first fills the gap; lattice of ``count`` points.
 
@@ -43,7 +48,7 @@ class Stack:
             return 1.0
         beside = sum(t * np.sqrt(p2 / (n * n - p2)) for n, t in self.films)
         u = np.clip((beside - self.near) / (self.count * self.step - 2 * self.near), 0, 1)
-        return 1 - u**3 * (10 - 15 * u + 6 * u**2)
+        return 1 - rise(u)
 
     def fields(self, light, at=(0.0, 0.0)):
         """(2, y, x) fields of s and p light on the lattice about ``at``; light: (rows, columns) of the pillars."""
@@ -91,7 +96,7 @@ def source_phase(films, depth, beside, radii, wavelength, count=60000):
     k, end = 2 * np.pi / wavelength, 0.75
     p = (np.arange(count) + 0.5) / count * end
     fade = np.clip((end - p) / (0.35 * end), 0, 1)
-    fade = fade**3 * (10 - 15 * fade + 6 * fade**2)
+    fade = rise(fade)
     gap = depth - sum(t for _, t in films[1:])
     path = gap * (np.sqrt(films[0][0] ** 2 - p**2) - films[0][0])
     path = path + sum(t * (np.sqrt(n * n - p**2) - n) for n, t in films[1:])

@@ -7,6 +7,8 @@ scene's sample and that of a sensor's. One full transform a point: for images of
 
 import numpy as np
 
+from .films import rise
+
 
 def _rotated(e, start, end):
     """e as the rotation of unit vectors start to end takes it: e cos + u x e + u (u·e)/(1 + cos) (Rodrigues)."""
@@ -46,7 +48,7 @@ class Referee:
         beside = np.hypot(self.distance * p / s - place[0], self.distance * q / s - place[1])
         near = self.radius + self.looked_at
         u = np.clip((beside - near) / (self.count * self.fine - 2 * near), 0, 1)
-        return 1 - u**3 * (10 - 15 * u + 6 * u**2)
+        return 1 - rise(u)
 
     def intensity(self, place, depth, wavelength):
         """|U|² on the fine lattice about `place` (x, y on the sensor) for a source seen in the direction of `place`."""

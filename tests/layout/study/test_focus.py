@@ -10,7 +10,7 @@ from layout.study import focus
 from layout.study.focus import Window
 from metalens.cell import Cell, Film, Index
 from metalens.ground.errors import PropagationError
-from metalens.lens import DiameterMap, Layers, Lens
+from metalens.lens import DiameterMap, Layers, Lens, Stop
 from metalens.pillars.proxy import Proxy
 from tests.referees import films, plain_sum
 
@@ -141,3 +141,10 @@ def test_the_peak_between_samples_of_an_airy_spot_is_found(x0, y0):
     axis = np.arange(-20, 21) * 0.5
     spot = np.sinc(axis - x0 / 2) ** 2 * np.sinc(axis[:, None] - y0 / 2) ** 2
     assert focus.peak(spot) == pytest.approx(1, abs=1.5e-3)  # cut at 10 widths: tails of 1e-3
+
+
+def test_a_lens_behind_a_stop_is_refused_by_what_it_would_need():
+    lens = random_lens()
+    behind = dataclasses.replace(lens, layers=Layers(stop=Stop(31.0, 40.0)))
+    with pytest.raises(PropagationError, match=r"behind a stop of 62 um is not studied.*lights others at each"):
+        focus.prepare(behind, window_of(behind, [900.0]))
