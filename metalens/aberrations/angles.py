@@ -193,7 +193,8 @@ def _sharpest(lens: Lens, light: Waves, angle_rad: float, close_um: Array) -> Ar
     sensor, flat = lens.sensor_distance_um, lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     aperture = max(min(light.aperture), 1e-6)
     deep = lens.wavelength_um * flat.index[0] / aperture**2
-    known = [*(sensor + close_um[np.isfinite(close_um)]), sensor, sensor * math.cos(angle_rad) ** 3]
+    close = sensor + close_um[np.abs(close_um) < sensor]
+    known = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
     films = sum(flat.thickness_um[1:])
     low, high = max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films)), max(known) + BEYOND * deep
     count = min(max(math.ceil((high - low) / deep * STEPS), 8), MOST_STEPS)

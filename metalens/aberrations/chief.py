@@ -31,6 +31,8 @@ SPARSE = 0.3  # of the sites about the ray: with fewer pillars it has missed the
 ROUGH = 0.6  # rad rms of the phase about its polynomial, beyond which there is no wave front; 1.81 is that of any phase
 POWERS = [(i, j) for i in range(5) for j in range(5 - i)]
 TURNS = 4  # of the polynomial, each taken off the phase before the next
+FAR = 5  # of the width of what is looked at: how far apart slopes are compared
+PARALLEL = 1e-16  # squared change of where rays meet over the distance, below which they are parallel to rounding
 STEP = 1e-4  # of differences, in tangents or depths
 
 
@@ -71,7 +73,7 @@ def chief_ray(lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um:
     """
     source = source_at(lens, angle_rad, depth_um)
     at = middle_um(lens, source, depth_um)
-    slope, curved, doubt = _wave_front(lens, at, angle_rad, depth_um)
+    slope, curved, doubt = _wave_front(lens, at, angle_rad)
     p = _arriving(lens, at, source, depth_um) + slope
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     w = float(p @ p)
@@ -79,7 +81,10 @@ def chief_ray(lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um:
         raise PropagationError(_lost(lens, angle_rad, f"leaves with n sin θ = {math.sqrt(w):.3f}, beyond the media"))
     q = curved + _change(lambda x: _arriving(lens, x, source, depth_um), at, 1.0)
     focus = _foci(after, p, q)
-    error = np.sqrt(sum((_foci(after, p, q + change) - focus) ** 2 for change in doubt))
+    real = np.isfinite(focus)
+    error = np.where(
+        real, np.sqrt(sum((_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2 for d in doubt)), np.inf
+    )
     step = STEP if math.isinf(depth_um) else STEP * depth_um
     moved = _change(lambda s: _arriving(lens, at, s, depth_um), source, step)
     walks = _change(lambda s: middle_um(lens, s, depth_um), source, step)
@@ -145,16 +150,16 @@ def _foci(after: Media, p: Array, q: Array) -> Array:
     per_um = np.eye(2) / (cover**2 - w) ** 0.5 + np.outer(p, p) / (cover**2 - w) ** 1.5
     rest, change = np.eye(2) + _bent(after, p) @ q, per_um @ q
     power = (change**2).sum(1)
-    more = np.divide(-(rest * change).sum(1), power, out=np.full(2, np.inf), where=power > 0)
+    more = np.divide(
+        -(rest * change).sum(1), power, out=np.full(2, np.inf), where=power > PARALLEL / sum(after.thickness_um) ** 2
+    )
     return np.asarray(sum(after.thickness_um) + more)
 
 
-def _wave_front(
-    lens: Lens, at: Array, angle_rad: tuple[float, float], depth_um: float
-) -> tuple[Array, Array, list[Array]]:
+def _wave_front(lens: Lens, at: Array, angle_rad: tuple[float, float]) -> tuple[Array, Array, list[Array]]:
     """Slope (2,) and curvature (2, 2) of the pillars' phase over k about a place, and changes of the curvature whose
     squares add up to its variance."""
-    focal = 1 / (1 / lens.reduced_um + 1 / min(depth_um, lens.source_distance_um))
+    focal = 1 / (1 / lens.reduced_um + 1 / lens.source_distance_um)
     k, site = 2 * math.pi / lens.wavelength_um, lens.diameters.site_um2
     radius = max(ZONES * math.sqrt(lens.wavelength_um * focal), math.sqrt(2 * LEAST * site / math.pi))
     x, y, phase, near = _about(lens, at, radius, incidence(lens, angle_rad))
@@ -164,20 +169,17 @@ def _wave_front(
             _lost(lens, angle_rad, f"comes to the pillars' plane at ({at[0]:.1f}, {at[1]:.1f}) um, where the lens has "
             f"{np.count_nonzero(near)} pillars; need {max(wanted, LEAST):.0f} about it")
         )  # fmt: skip
-    flat = phase + k / (2 * focal) * (x * x + y[:, None] ** 2)
-    turn, hop = np.where(near, np.exp(1j * flat), 0.0), 2 if lens.diameters.lattice.centred else 1
-    hops = [np.angle((turn[:, hop:] * turn[:, :-hop].conj()).sum()), np.angle((turn[hop:] * turn[:-hop].conj()).sum())]
-    steps = lens.diameters.steps_um
-    first = [hops[0] / (hop * steps[0]) * radius, hops[1] / (hop * steps[1]) * radius]
+    turn = np.where(near, np.exp(1j * phase), 0.0)
+    first = _guessed(turn, (x[0] + x[-1], y[0] + y[-1]), lens.diameters.steps_um, lens.diameters.lattice.centred)
     terms = np.stack([(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1)[near]
-    series, scatter = _fitted(terms, turn[near], first)
+    series, scatter = _fitted(terms, turn[near], {(i, j): c * radius ** (i + j) for (i, j), c in first.items()})
     if scatter > ROUGH:
         raise PropagationError(_lost(lens, angle_rad, f"meets no wave front: phases scatter by {scatter:.2f} rad rms"))
     named = dict(zip(POWERS, series / k, strict=True))
     slope = np.array([named[1, 0], named[0, 1]]) / radius
     inverse = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
     doubt = [_curvature(dict(zip(POWERS, column, strict=True)), radius) for column in inverse.T]
-    return slope, _curvature(named, radius) - np.eye(2) / focal, doubt
+    return slope, _curvature(named, radius), doubt
 
 
 def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
@@ -197,10 +199,32 @@ def _about(lens: Lens, at: Array, radius: float, tilt_rad: float) -> tuple[Array
     return x, y, lens.rows_phase_rad(down, lens.wavelength_um, tilt_rad)[:, across], near
 
 
-def _fitted(terms: Array, turn: Array, first: list[float]) -> tuple[Array, float]:
-    """(terms,) polynomial of the phase of (pillars,) unit numbers, and the rms of what it leaves, rad."""
-    series = np.zeros(len(POWERS))
-    series[POWERS.index((1, 0))], series[POWERS.index((0, 1))] = first
+def _guessed(
+    turn: Array, twice_um: tuple[float, float], steps: tuple[float, float], centred: bool
+) -> dict[tuple[int, int], float]:
+    """Slopes and halves of curvatures, by power of x and y, of the phase of (y, x) unit numbers: of neighbours, and of
+    how that differs some pillars on. twice_um: twice the middle (x, y) of the map from where the slopes are wanted."""
+    hop, found = 2 if centred else 1, {}
+    beside, below = turn[:, hop:] * turn[:, :-hop].conj(), turn[hop:] * turn[:-hop].conj()
+    far = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
+    across = beside[:, far[0] :] * beside[:, : -far[0]].conj()
+    down = below[far[1] :] * below[: -far[1]].conj()
+    mixed = beside[far[1] :] * beside[: -far[1]].conj()
+    bent = [
+        np.angle(across.sum()) / (hop * far[0] * steps[0] ** 2),
+        np.angle(down.sum()) / (hop * far[1] * steps[1] ** 2),
+    ]
+    twist = np.angle(mixed.sum()) / (hop * far[1] * steps[0] * steps[1])
+    found = {(2, 0): bent[0] / 2, (1, 1): twist, (0, 2): bent[1] / 2}
+    found[1, 0] = np.angle(beside.sum()) / (hop * steps[0]) - bent[0] * twice_um[0] / 2 - twist * twice_um[1] / 2
+    found[0, 1] = np.angle(below.sum()) / (hop * steps[1]) - bent[1] * twice_um[1] / 2 - twist * twice_um[0] / 2
+    return found
+
+
+def _fitted(terms: Array, turn: Array, first: dict[tuple[int, int], float]) -> tuple[Array, float]:
+    """(terms,) polynomial of the phase of (pillars,) unit numbers from a guess of some of its terms, and the rms of
+    what it leaves, rad."""
+    series = np.array([first.get(power, 0.0) for power in POWERS])
     solve = np.linalg.pinv(terms)
     for _ in range(TURNS):
         left = turn * np.exp(-1j * (terms @ series))

@@ -69,6 +69,26 @@ def test_scattered_phases_are_within_their_error():
     assert chief_ray(rough).focus_error_um.min() > 20 * chief_ray(even).focus_error_um.max()
 
 
+@pytest.mark.parametrize("depth", [97.0, 240.0])
+def test_sources_far_from_the_one_of_the_design_have_their_own_foci(depth):
+    """1/f = 1/z + 1/s on the axis: nearer than f it is behind the lens, a virtual one."""
+    found = chief_ray(made("plain"), (0.0, 0.0), depth)
+    assert found.focus_um == pytest.approx(1 / (1 / 310.0 - 1 / depth), rel=3e-4)
+
+
+def test_a_plate_without_a_lens_has_its_foci_at_infinity_and_a_tilt_bends_its_ray():
+    lens = made("plain")
+    place = lens.diameters.x_um
+    for slope in (0.0, 0.13):
+        turns = np.mod(slope * place / WAVE, 1.0) + np.zeros((len(place), 1))
+        even = np.where(lens.diameters.diameter_um > 0, 0.2 + 0.12 * 2 * turns / 3, 0.0)
+        flat = type(lens)(type(lens.diameters)(even, PITCH), lens.cell, lens.proxy, WAVE, 310.0, math.inf, "map")
+        found = chief_ray(flat, (0.1, 0.0))
+        sine = math.sin(0.1) + slope
+        assert found.meets_um[0] == pytest.approx(310.0 * math.tan(math.asin(sine)), rel=1e-5)
+        assert np.abs(found.focus_um).min() > 1e8
+
+
 def test_a_vortex_has_no_wave_front():
     with pytest.raises(PropagationError, match=r"chief ray of \(3, 0\) degrees.*no wave front.*rad rms"):
         chief_ray(made("plain", turns=1), (math.radians(3.0), 0.0))
