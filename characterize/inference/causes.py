@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -31,6 +32,8 @@ _STITCH_UM = 0.05
 _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
 _ENOUGH = 4e-3
+_CAMERA_DEG, _DENSE = 0.5, 3  # samples a pixel's side between which turned frames are interpolated
+_ROUND = 1e-4  # of the peak: round light does not turn, what is left is of the interpolation
 _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
@@ -96,6 +99,10 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         yield from _of_frames(light, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
+    turned = np.subtract(*(turned_frames(task.model, x, angle) for angle in (_CAMERA_DEG, 0.0)))[None]
+    if np.abs(turned).max() > _ROUND * light.max():
+        sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
+        yield Change("a camera that is turned", turned, _CAMERA_DEG, "{:.3g} deg against the lens", sigma)
     held = tuple(name for name in LIGHT if name not in task.names)
     if held:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
@@ -236,4 +243,30 @@ def on_pixels(model: ForwardModel, share: float) -> ForwardModel:
     pixel_um = model.setting.pixel_um * share
     part.setting = dataclasses.replace(model.setting, pixel_um=pixel_um)
     part.grid = dataclasses.replace(model.grid, pixel_um=pixel_um)
+    return part
+
+
+def turned_frames(model: ForwardModel, x: Array, turn_deg: float) -> Array:
+    """(n, y, x) light of a camera turned from +x to +y about its window's middle, less the background.
+
+    Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order; pixels themselves stay upright.
+    """
+    s, dense = model.setting, _sampled(model, _DENSE)
+    close = dense.images(x)[0] - background(x, dense.setting)
+    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    across, down = np.meshgrid(np.arange(s.columns) - s.columns // 2, np.arange(s.rows) - s.rows // 2)
+    middle = np.array([n // 2 for n in close.shape[1:]])[:, None, None]
+    places = middle + _DENSE * np.stack([sine * across + cosine * down, cosine * across - sine * down])
+    return np.stack([ndimage.map_coordinates(frame, places, order=5, mode="nearest") for frame in close])
+
+
+def _sampled(model: ForwardModel, dense: int) -> ForwardModel:
+    """The model of frames whose pixels lie ``dense`` times as close and stay as wide."""
+    part = copy.copy(model)
+    s, over = model.setting, math.ceil(model.grid.oversample / dense)
+    rows, columns, margin = dense * s.rows, dense * s.columns, dense * s.margin
+    now: dict[str, Any] = {"rows": rows, "columns": columns, "margin": margin}
+    now |= {"pixel_um": s.pixel_um / dense, "fill": dense * s.fill}
+    part.setting = dataclasses.replace(s, **now)
+    part.grid = dataclasses.replace(model.grid, **now, oversample=over)
     return part

@@ -29,6 +29,9 @@ class Sensor:
     pixel_um: float = 3.0
     rows: int = 5
     columns: int = 7
+    margin: int = 4
+    fill: float = 1.0
+    oversample: int = 2
     edges = Setting.edges
 
 
@@ -48,7 +51,10 @@ class Model:
         light = LIGHT + np.tensordot(x, SLOPES, 1) + self.wall_rad * LEANING
         light = light + np.tensordot(np.array(self.moved), MOVED[: len(self.moved)], 1)
         slopes = [MOVED[int(n[9:])] if n.startswith("residual_") else SLOPES[PLACE[n]] for n in names]
-        return light * (1 + 5 * (self.setting.pixel_um / 3 - 1)) * self.grid.pixel_um / self.setting.pixel_um, slopes
+        close = self.setting.rows // SHAPE[1]  # samples a pixel's side, all alike
+        pitch_um = self.setting.pixel_um * close
+        light = light * (1 + 5 * (pitch_um / 3 - 1)) * self.grid.pixel_um / self.setting.pixel_um
+        return light.repeat(close, 1).repeat(close, 2), slopes
 
     def rough(self, cut):
         return self
