@@ -1,12 +1,13 @@
 """A written mask is read back and compared with its plan, site by site and vertex by vertex."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from layout.files.content import QUARTERS, CellContent, MaskContent
+from layout.files.content import QUARTERS, CellContent, MaskContent, Placed
 from layout.files.digest import Digest, Sums
-from layout.mask import Lattice, MaskPlan, PillarClass
+from layout.mask import Lattice, MaskPlan, PillarClass, symmetry
 from metalens.ground.arrays import Array
 
 _CHUNK = 1 << 20
@@ -91,6 +92,9 @@ def _compare_top(plan: MaskPlan, top: CellContent) -> list[str]:
 
 
 def _compare_lattice(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> tuple[int, list[str]]:
+    content, wrong_pieces = _with_places(plan, lattice, content)
+    if wrong_pieces:
+        return 0, wrong_pieces
     number = {made.name: k for k, made in enumerate(plan.classes, 1)}
     read = np.zeros((lattice.rows, lattice.columns), np.uint8 if len(plan.classes) <= 255 else np.uint16)
     count = 0
@@ -109,6 +113,37 @@ def _compare_lattice(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> 
             read[row, column] = lookup[placed.child[part]]
         count += len(placed.child)
     return count, _differences(lattice, read, count)
+
+
+def _with_places(plan: MaskPlan, lattice: Lattice, content: MaskContent) -> tuple[MaskContent, list[str]]:
+    """``content`` with all places in the pieces of a folded lattice of which only sums were kept, where these agree."""
+    summed = {name for name in content.cells[lattice.name].placed.children if content.cells[name].sums is not None}
+    if not summed:
+        return content, []
+    made = symmetry.pieces(lattice) if symmetry.is_square_symmetric(lattice) else []
+    pieces = {piece.lattice.name: piece.lattice for piece in made}
+    strange = sorted(summed - pieces.keys())
+    if strange:
+        return content, [f"{lattice.name} places {', '.join(strange[:5])}, which are no pieces of the plan"]
+    cells, wrong = dict(content.cells), []
+    for name in sorted(summed):
+        cell, piece = cells[name], pieces[name]
+        if cell.sums is not None:
+            wrong += _compare_sums(plan, piece, cell.placed.children, cell.sums)[1]
+        cells[name] = dataclasses.replace(cell, placed=_places(plan, piece), sums=None)
+    return dataclasses.replace(content, cells=cells), wrong
+
+
+def _places(plan: MaskPlan, lattice: Lattice) -> Placed:
+    """All pillars of a lattice in memory as a reader gives them."""
+    classes = lattice.whole()
+    row, column = np.nonzero(classes)
+    x, y = lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.down
+    number = classes[row, column]
+    used = np.flatnonzero(np.bincount(number))
+    child = np.searchsorted(used, number).astype(np.int32)
+    names = tuple(plan.classes[k - 1].name for k in used)
+    return Placed(names, child, x.astype(np.int32), y.astype(np.int32), np.zeros(len(child), np.uint8))
 
 
 def _compare_sums(plan: MaskPlan, lattice: Lattice, children: tuple[str, ...], read: Sums) -> tuple[int, list[str]]:

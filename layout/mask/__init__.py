@@ -7,6 +7,7 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from layout.mask import build as build
     from layout.mask import fields as fields
+    from layout.mask import symmetry as symmetry
     from layout.mask import tone as tone
     from layout.mask.field_figure import with_fields as with_fields
     from layout.mask.fields import FieldPlan as FieldPlan
@@ -29,6 +30,7 @@ __getattr__, __dir__, __all__ = attach(
         "UNDRAWN": "plan",
         "build": "",
         "fields": "",
+        "symmetry": "",
         "tone": "",
         "with_fields": "field_figure",
     },

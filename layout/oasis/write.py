@@ -16,10 +16,9 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
-from layout.mask import Lattice, MaskPlan, PillarClass
+from layout.mask import Lattice, MaskPlan, PillarClass, symmetry
 from layout.oasis import bytes as oasis
 from layout.oasis import tiles
-from layout.oasis.symmetry import Piece, is_square_symmetric, pieces
 from layout.process import names
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -106,8 +105,12 @@ def _square_symmetric(made: PillarClass) -> bool:
     )
 
 
-def _piece_list(lattice: Lattice, fold: bool) -> list[Piece]:
-    return pieces(lattice) if fold and is_square_symmetric(lattice) else [Piece(lattice, ((0, False),))]
+def _piece_list(lattice: Lattice, fold: bool) -> list[symmetry.Piece]:
+    return (
+        symmetry.pieces(lattice)
+        if fold and symmetry.is_square_symmetric(lattice)
+        else [symmetry.Piece(lattice, ((0, False),))]
+    )
 
 
 def layer_name(layer: tuple[int, int], name: str) -> bytes:
@@ -118,7 +121,7 @@ def layer_name(layer: tuple[int, int], name: str) -> bytes:
 
 
 def _cells(
-    plan: MaskPlan, placed: list[list[Piece]], number: dict[str, int], settings: _Settings, counts: Array
+    plan: MaskPlan, placed: list[list[symmetry.Piece]], number: dict[str, int], settings: _Settings, counts: Array
 ) -> Iterator[bytes]:
     """All cells, those of the pillar classes that occur last; ``counts`` adds up the sites of each class."""
     for figure in plan.figures:

@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 import layout
 from layout.gdsii import write as gdsii_write
+from layout.mask import symmetry
 from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
 from layout.oasis import bytes as oasis_bytes
 from layout.oasis import write as oasis_write
@@ -111,13 +112,39 @@ def test_a_symmetric_lens_is_stored_as_an_eighth_and_klayout_sees_it_whole(make_
     assert klayout_sites(path, plan)[0] == planned_sites(plan)
 
 
+@pytest.mark.parametrize("size", [40, 41])
+def test_an_eighth_too_large_to_keep_is_compared_by_its_sums(make_plan, tmp_path, size):
+    axis = np.arange(size) - (size - 1) / 2
+    half = (size - 1) * 200
+
+    def planned(classes):
+        plan = make_plan(classes)
+        return plan.replace(lattices=(dataclasses.replace(plan.lattices[0], x0=-half, y0=half),))
+
+    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(np.uint8)
+    path = write(planned(classes), tmp_path / "m.oas", {})
+    content = layout.read_oasis(path, keep=30)
+    assert content.cells["LENS_8"].sums is not None  # about 170 pillars
+    outcome = layout.compare(planned(classes), content)
+    assert (outcome.differences, outcome.pillars) == ((), size**2)
+    other = classes.copy()
+    for turn in range(4):  # two sites and their six images: still symmetric
+        for a in (np.rot90(other, turn), np.rot90(other, turn).T):
+            a[3, 9] = 1 + a[3, 9] % 5
+    wrong = layout.compare(planned(other), content).differences
+    assert any("LENS_8: class" in text for text in wrong), wrong
+    moved = dataclasses.replace(content.cells["LENS"].placed, turn=content.cells["LENS"].placed.turn * 0)
+    cells = content.cells | {"LENS": dataclasses.replace(content.cells["LENS"], placed=moved)}
+    assert not layout.compare(planned(classes), dataclasses.replace(content, cells=cells)).ok
+
+
 def test_one_broken_symmetry_is_not_folded(make_plan):
     classes = np.ones((8, 8), np.uint8)
     plan = make_plan(classes)
     lattice = dataclasses.replace(plan.lattices[0], x0=-1400, y0=1400)
-    assert oasis_write.is_square_symmetric(lattice)
+    assert symmetry.is_square_symmetric(lattice)
     classes[1, 6] = 2
-    assert not oasis_write.is_square_symmetric(lattice)
+    assert not symmetry.is_square_symmetric(lattice)
 
 
 @pytest.mark.parametrize(("suffix", "options"), FORMS)

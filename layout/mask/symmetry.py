@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.mask import Lattice
+from layout.mask.plan import Lattice
 from metalens.ground.arrays import Array
 
 ALL_EIGHT = tuple((quarter, flip) for flip in (False, True) for quarter in range(4))

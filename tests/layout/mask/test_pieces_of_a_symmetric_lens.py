@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.mask import Lattice
-from layout.oasis import symmetry
+from layout.mask import Lattice, symmetry
 
 
 def lens(count, *, x0=None):
