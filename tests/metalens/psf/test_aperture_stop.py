@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,13 +10,13 @@ import torch
 from scipy.special import fresnel
 
 from metalens import propagate
-from metalens.cell import Film, Index
+from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
 from metalens.field import Optics, SmoothWave, Window
 from metalens.field.points import psfs
 from metalens.ground.errors import ConfigError, PropagationError
-from metalens.lens import Layers, Stop, media
-from metalens.psf import Extent, blur_um, psf_stack
+from metalens.lens import DiameterMap, Layers, Lens, Pairs, Stop, media
+from metalens.psf import Extent, View, blur_um, from_lens, psf_stack
 
 WAVE, GLASS, SENSOR = 0.85, 1.45, 400.0
 K = 2 * math.pi / WAVE
@@ -79,10 +80,11 @@ def _lit(
     hole_um: tuple[float, float] | tuple[float, float, tuple[float, float]],
     level: np.ndarray,
     window: tuple[float, float],
+    phase: np.ndarray = PHASE,
 ) -> np.ndarray:
     """The same as it is, on the window of the chief ray of an angle; hole_um: radius, how far before the pillars,
     and middle."""
-    light = (_on_the_pillars(angle, depth_um, *hole_um) * level * np.exp(1j * PHASE))[level > 0]
+    light = (_on_the_pillars(angle, depth_um, *hole_um) * level * np.exp(1j * phase))[level > 0]
     x, y = X[level > 0], Y[level > 0]
     across, down = np.arange(41)[::2] - 20.0, np.arange(41)[::4] - 20.0
     out = np.empty((11, 21))
@@ -150,6 +152,31 @@ def test_a_hole_beside_the_axis_lights_its_own_part_of_the_lens(
     assert said / 8 < _apart(seen, want) < said + 1e-4  # of the sums
     centred = replace(layers, stop=Stop(stop_um, thick_um))
     assert _apart(_seen(angle, depth_um, centred)[0], want) > 10 * said
+
+
+@pytest.mark.parametrize("light", ["x", "y"])
+def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(light: Literal["x", "y"]) -> None:
+    """Size along x turns light along x, size along y that along y, in 48 steps: one focuses, the other beside it."""
+    steps, shift = 48, (9.0, -5.0)
+    beside = -K * (np.sqrt((X - shift[0]) ** 2 + (Y - shift[1]) ** 2 + SENSOR**2) - SENSOR)
+    sizes = [np.rint(np.mod(phase / (2 * np.pi), 1.0) * steps).astype(int) % steps for phase in (PHASE, beside)]
+    axis, turn = 0.1 + 0.005 * np.arange(steps), np.exp(2j * np.pi * np.arange(steps) / steps)
+    table = np.stack([turn[:, None] + 0 * turn, 0.8 * turn + 0 * turn[:, None]], -1)[None]
+    there = np.hypot(X, Y) <= 57.0
+    place = DiameterMap(np.where(there, axis[sizes[0]], 0.0), PITCH, length_um=np.where(there, axis[sizes[1]], 0.0))
+    pairs = Pairs(np.array([WAVE]), axis, axis, table, (SENSOR, math.inf))
+    hole = (24.0, 90.0, (7.0, -11.0))
+    layers = Layers(front=(Film(Index(GLASS), hole[1]),), stop=Stop(*hole))
+    lens = Lens(place, Cell(PITCH), pairs.proxy, WAVE, SENSOR, math.inf, "two", layers=layers, pairs=pairs)
+    angle, depth = (0.11, -0.06), 1400.0
+    found = from_lens(lens.seen(light), View((depth,), (angle,), 41.0, 41), tolerance=1e-4)
+    wanted = 2 * np.pi / steps * sizes["xy".index(light)]
+    want = _lit(angle, depth, hole, there.astype(float), angle, wanted)
+    got = found.intensity[0, 0, ::4, ::2]
+    assert found.budget is not None
+    assert _apart(got / got.sum(), want / want.sum()) < found.budget.stop + 1e-4
+    other = _lit(angle, depth, hole, there.astype(float), angle, 2 * np.pi / steps * sizes["yx".index(light)])
+    assert _apart(got / got.sum(), other / other.sum()) > 0.5
 
 
 def test_the_ray_through_the_middle_of_a_hole_beside_the_axis() -> None:
