@@ -87,12 +87,16 @@ def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
         out[:, y, :start] = 0
         out[:, y, stop:] = 0
         for d in range(depths):
-            for x in range(start, stop):
-                line[x] = turns[y, x]
-            for v in range(few):
-                share = mix[d, v]
+            if few == 5:  # of many depths: one pass
+                m0, m1, m2, m3, m4 = mix[d, 0], mix[d, 1], mix[d, 2], mix[d, 3], mix[d, 4]
                 for x in range(start, stop):
-                    line[x] += share * paths[v, y, x]
+                    part = m0 * paths[0, y, x] + m1 * paths[1, y, x] + m2 * paths[2, y, x]
+                    line[x] = turns[y, x] + part + m3 * paths[3, y, x] + m4 * paths[4, y, x]
+            else:
+                line[start:stop] = turns[y, start:stop]
+                for v in range(few):
+                    for x in range(start, stop):
+                        line[x] += mix[d, v] * paths[v, y, x]
             for x in range(start, stop):
                 c, s = turns32(line[x] - np.rint(line[x]))
                 out[d, y, x, 0], out[d, y, x, 1] = weight[y, x] * c, weight[y, x] * s

@@ -108,7 +108,7 @@ def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
 def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
-    y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
+    y, x = torch.meshgrid(plan.y_um.to(plan.x_um), plan.x_um, indexing="ij")
     places = torch.stack([x, y], -1).numpy()
     tangents = places / optics.layers.after(optics.distance_um, wave).reduced_um
     rays = [optics.layers.through_middle(tangents, depth, wave) for depth in plan.depths_um.tolist()]

@@ -82,11 +82,10 @@ class Pupil:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
-    """Along one axis: (samples, points) light of the points of a transform on each sample, and its derivative by the
-    sample's place in um; place_um: (samples,) from where the rays are seen."""
+    """Along one axis: (2 samples, points) light of the points of a transform on each sample, and below it the
+    derivative of that by the sample's place in um; place_um: (samples,) from where the rays are seen."""
 
-    light: Tensor
-    slope: Tensor
+    both: Tensor
     place_um: Tensor
 
 
@@ -244,10 +243,11 @@ def _fluxes(light: Tensor, mixed: Mixed | None, aside: tuple[Tensor, ...], size:
 def _on_samples(power: Tensor, ends: tuple[Samples, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """(…, h, w) light on the samples, and its derivatives by their places along x and y."""
     along_x, along_y = ends
-    rows = torch.cat([along_y.light, along_y.slope]) @ power
-    count = len(along_y.light)
-    plain, down = rows[..., :count, :], rows[..., count:, :]
-    return plain @ along_x.light.mT, plain @ along_x.slope.mT, down @ along_x.light.mT
+    height, width = len(along_y.place_um), len(along_x.place_um)
+    rows = along_y.both @ power
+    plain, down = rows[..., :height, :], rows[..., height:, :]
+    shown = plain @ along_x.both.mT
+    return shown[..., :width], shown[..., width:], down @ along_x.both[:width].mT
 
 
 def _around(ends: tuple[Samples, ...]) -> Tensor:
@@ -306,5 +306,5 @@ def _to_samples(grid: Sampling, window: Window, shift_um: float, device: torch.d
     scale = window.step_um / grid.period_um * grid.size
     light = scale * np.fft.irfft(wave, grid.size)
     slope = scale * np.fft.irfft(wave * (2j * np.pi / grid.period_um * harmonic), grid.size)
-    found = [torch.from_numpy(a.astype(np.float32)).to(device) for a in (light, slope, place)]
-    return Samples(found[0], found[1], found[2])
+    found = [torch.from_numpy(a.astype(np.float32)).to(device) for a in (np.concatenate([light, slope]), place)]
+    return Samples(found[0], found[1])
