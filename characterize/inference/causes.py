@@ -95,6 +95,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     light = image - background(x, task.model.setting)
     yield Change("vibration or blur along one direction", _along_one(light))
     yield Change("pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)", _of_mosaic(light))
+    yield Change("counts that are not in proportion to the light (a gamma)", _of_gamma(light))
     if len(image) > 2:
         yield from _of_frames(light, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
@@ -225,6 +226,12 @@ def _along_one(light: Array) -> Array:
     """
     xx, yy = (ndimage.correlate1d(light, [1.0, -2.0, 1.0], axis, mode="nearest") for axis in (2, 1))
     return np.stack([xx - yy, 2 * np.gradient(np.gradient(light, axis=1), axis=2)])
+
+
+def _of_gamma(light: Array) -> Array:
+    """(1, n, y, x): I^(1 + e) of light I over its peak is I + e I ln I."""
+    share = np.maximum(light / light.max(), 1e-6)
+    return np.asarray((share * np.log(share))[None])
 
 
 def _of_mosaic(light: Array) -> Array:

@@ -82,7 +82,10 @@ def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str
         )
     wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
     if wave > WAVES_RAD:
-        words.append(f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens")
+        words.append(
+            f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens, or counts "
+            "that are not in proportion to the light (a gamma, as pictures of 8 bits have)"
+        )
     return words
 
 

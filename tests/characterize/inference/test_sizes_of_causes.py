@@ -152,3 +152,10 @@ def test_what_is_fitted_or_stated_exactly_is_no_cause():
     assert "uneven illumination" not in every
     none, _ = found(known={"glass_um": Known("glass_um", 0.0)})
     assert not [cause for cause in none if "of glass about" in cause]
+
+
+def test_counts_of_a_gamma_differ_from_the_light_as_their_logarithm():
+    """Light from 2 to 100 % of its peak to powers 1.0001 and 0.9999: their difference."""
+    light = RNG.uniform(0.02, 1.0, SHAPE) * 730.0
+    share = light / light.max()
+    assert causes._of_gamma(light)[0] == pytest.approx((share**1.0001 - share**0.9999) / 2e-4, abs=1e-6)
