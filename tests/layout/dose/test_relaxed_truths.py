@@ -40,6 +40,13 @@ def test_neighbours_without_the_site_itself_converge_as_well():
     assert got.ravel() == pytest.approx(want, rel=1e-6)
 
 
+def test_the_slowest_that_the_bound_allows_still_comes_within_1e_8():
+    """All give to all alike, three times the mean: of the error 3 / 5 stay each time. B = 3 drive / (1 + 3)."""
+    drive = DRIVE.reshape(SHAPE)
+    got = correct._relaxed(lambda m: np.full(SHAPE, 3 * m.mean()), np.ones(SHAPE), drive)
+    assert got == pytest.approx(np.full(SHAPE, 0.75 * drive.mean()), rel=1.1e-8)
+
+
 def test_pieces_of_marks_ask_for_their_own_dose_in_the_mean_of_their_edges():
     """Two pieces of goal 1 and 0.8 and own exposure 0.9 and 0.4, with two and one edges on nodes of the grid."""
     own, goal, area = np.array([0.9, 0.4]), np.array([1.0, 0.8]), np.array([1.3, 0.6])

@@ -136,7 +136,7 @@ def test_the_error_is_relative_to_what_the_edge_should_get(monkeypatch):
     assert got > 0.3
 
 
-def test_sampled_pillars_spread_over_rows_and_columns():
+def test_sampled_pillars_spread_over_rows_and_columns(monkeypatch):
     """Of 4 n rows n pillars each, and of those n evenly; few pillars between the sampled rows are found too."""
     rows, columns = sampled._some(lens(), 3)
     every = []
@@ -146,10 +146,11 @@ def test_sampled_pillars_spread_over_rows_and_columns():
     want = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, 3).astype(int))]
     assert list(zip(rows, columns, strict=True)) == want
     few = np.zeros((40, 7), np.uint8)
-    few[3, 2], few[3, 5] = 1, 2  # of rows 0, 3.5, …: 0, 5, 11 and so on for 2 samples
+    few[8, 2], few[8, 5] = 1, 2  # of rows 0, 5.6, …: 0, 5, 11 and so on for 2 samples
+    monkeypatch.setattr(bodies, "_BLOCK_SITES", 35)  # five rows: the second block
     hidden = Body(40, 7, PITCH, 0.0, 0.0, lambda first, end: few[first:end])
     rows, columns = sampled._some(hidden, 2)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(3, 2), (3, 5)]
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(8, 2), (8, 5)]
 
 
 def test_gaussians_are_sorted_by_reach_and_widened_by_the_pillars():
@@ -193,7 +194,18 @@ def test_the_table_takes_from_each_pillar_what_the_far_field_counts_for_it():
     assert bodies.count([lens(), lens()], 4).tolist() == [0, *(2 * np.bincount(SITES.ravel())[1:]).tolist()]
 
 
+def test_neighbours_of_a_site_stand_on_every_side():
+    straight, slant = (Body(3, 4, 0.43, 0.0, 0.0, lens().source, 0.37, centred) for centred in (False, True))
+    cross = {(0.43, 0), (-0.43, 0), (0, 0.37), (0, -0.37)}
+    assert set(map(tuple, straight.steps_um.tolist())) == cross
+    corners = {(x, y) for x in (0.43, -0.43) for y in (0.37, -0.37)}
+    assert set(map(tuple, slant.steps_um.tolist())) == {(2 * x, 2 * y) for x, y in cross} | corners
+    assert (straight.apart_um, slant.apart_um) == (0.37, pytest.approx(math.hypot(0.43, 0.37)))
+
+
 def test_boxes_and_areas_of_what_is_exposed():
+    none = bodies.Rects.none()
+    assert (none.box_um.shape, none.group.shape, none.goal.shape) == ((0, 4), (0,), (0,))
     assert lens().box_um == pytest.approx((4.0, 7.7 - 18 * PITCH, 4.0 + 22 * PITCH, 7.7))
     assert lens().columns_um == pytest.approx(4.0 + PITCH * np.arange(23))
     assert lens().rows_um(3, 4) == pytest.approx(7.7 - PITCH * np.arange(3, 7))
