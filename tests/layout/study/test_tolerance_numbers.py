@@ -1,10 +1,13 @@
 """Spreads over the pillars of a lens whose proxy is a straight line or a parabola: every mean by hand."""
 
+import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from layout.process.process import Process
 from layout.study import spread_model, tolerance, tolerant
 from layout.study.sensitivity import Sensitivities
 from metalens.cell.record import Cell
@@ -52,6 +55,31 @@ def test_a_round_of_the_choice_never_raises_the_weighted_variance():
     assert variance == pytest.approx((abs(stock.rate[best] - common) ** 2 * weight).sum(), rel=1e-9)
     nearest = np.where(allowed, abs(stock.rate - common), np.inf).min(1)
     assert abs(stock.rate[best] - common)[weight > 0] == pytest.approx(nearest[weight > 0])
+
+
+@pytest.mark.parametrize("loss", [0.002, 0.006])
+def test_the_choice_is_the_best_of_all_printable_ones_that_keep_phase_and_light(loss):
+    """Every choice of 2 nm steps within 0.18 rad and ``loss`` of |T| for four diameters, tried one by one."""
+    sizes = np.array([[0.12, 0.0, 0.201], [0.266, 0.12, 0.3], [0.201, 0.201, 0.12]])
+    lens = dataclasses.replace(LENS, diameters=DiameterMap(sizes, 0.4))
+    kinds, count = np.unique(sizes[sizes > 0], return_counts=True)
+    printable = np.arange(100, 301, 2) * 1e-3
+    (phase, level, rate), (wanted, light, _) = at(printable), at(kinds)
+    away = abs(np.angle(np.exp(1j * (phase - wanted[:, None]))))
+    assert (abs(away - 0.18) > 2 * np.pi / 2048).all()  # phases are told apart by 3 mrad
+    allowed = [np.flatnonzero((a <= 0.18) & (level >= t - loss)) for a, t in zip(away, light, strict=True)]
+    tried = np.array(list(itertools.product(*allowed)))
+    share = count / count.sum()
+    spread = np.sqrt((abs(rate[tried] - (rate[tried] * share).sum(1, keepdims=True)) ** 2 * share).sum(1))
+    best = printable[tried[spread.argmin()]]
+    assert len(tried) > 10
+    made = tolerant.choose(lens, Process(), tolerance_rad=0.18, loss=loss)
+    want = np.where(sizes > 0, best[np.searchsorted(kinds, sizes).clip(0, 3)], 0)
+    assert made.lens.diameters.diameter_um == pytest.approx(want)
+    assert made.after == pytest.approx(spread.min(), rel=1e-5)
+    assert made.moved == pytest.approx((abs(best - kinds) > 1e-6) @ share)
+    assert made.transmission_before == pytest.approx(light @ share, rel=1e-6)
+    assert made.transmission == pytest.approx(level[tried[spread.argmin()]] @ share, rel=1e-6)
 
 
 def test_a_bias_changes_phase_and_light_by_the_slopes_of_the_proxy():
