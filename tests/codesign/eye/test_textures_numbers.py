@@ -147,3 +147,19 @@ def test_a_vessel_goes_on_by_two_pixels_a_step():
     wide = np.zeros((80, 90), np.uint8)
     textures._vessel(wide, Straight(), np.array([5.0, 40.0]), 0.0, width=0.8, length=30, depth=0)
     assert wide[40, 30] > 255 * 0.85
+
+
+def test_vessels_begin_at_both_sides_and_head_inwards(monkeypatch):
+    """Within some half radians of straight in: of 200 pictures' vessels the mean cosine is exp(-1/8) = 0.88."""
+    begun = []
+    monkeypatch.setattr(textures, "_vessel", lambda canvas, rng, at, heading, **about: begun.append((*at, heading)))
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        textures._veins(rng)
+    x, y, heading = np.array(begun).T
+    assert set(x.tolist()) == {0.0, float(textures.SIZE)}
+    assert 0 <= y.min() < 0.01 * textures.SIZE < 0.99 * textures.SIZE < y.max() <= textures.SIZE
+    inwards = np.where(x == 0, np.cos(heading), -np.cos(heading))
+    assert len(x) > 1000
+    for side in (x == 0, x > 0):
+        assert inwards[side].mean() == pytest.approx(np.exp(-1 / 8), abs=0.03)  # of 800, each within 0.15 rms: 0.005

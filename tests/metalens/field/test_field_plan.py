@@ -65,6 +65,32 @@ def test_as_few_field_points_as_the_error_of_cubics_asks_for():
         plan._line(line(eps, plan.ALONG), span, 1e-12)
 
 
+@pytest.mark.parametrize("sizes", [(1.0, 0.4), (0.3, 1.0)])
+def test_the_error_of_a_line_is_that_of_its_worst_depth(sizes):
+    nodes = list(range(0, plan.FINE + 1, 12))
+    both = plan._Known(lambda places: torch.cat([line(1e-3 * size, plan.FINE)(places) for size in sizes], 1))
+    assert both.error(nodes) == pytest.approx(plan._Known(line(1e-3, plan.FINE)).error(nodes), rel=1e-9)
+
+
+def test_a_field_off_the_axis_is_tried_where_it_lies(monkeypatch):
+    """No place farther from its middle than its rims, and both rims of its line; of 31 and 9 um about (70, -40)."""
+    seen = []
+
+    def spectral(optics, at, depths, waves, window):
+        seen.append(at.reshape(-1, 2))
+        return BASE.expand(len(at), len(depths), 7, 7)
+
+    monkeypatch.setattr(plan, "spectral", spectral)
+    monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
+    monkeypatch.setattr(plan, "unpolarised", lambda *_: 0.0)
+    grid, waves = Grid((10, 32), 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
+    plan.planned(None, grid, waves, (70.0, -40.0), tolerance=0.01, folds=False)
+    off = torch.cat(seen) - torch.tensor([70.0, -40.0])
+    half = torch.tensor(grid.half_um[::-1])
+    assert bool((off.abs() <= half + 1e-9).all())
+    assert [float(off[:, 0].min()), float(off[:, 0].max())] == pytest.approx([-float(half[0]), float(half[0])])
+
+
 def test_a_spectrum_takes_the_rule_that_the_next_one_confirms(monkeypatch):
     """A fifth power of the wavelength: three nodes of Gauss are exact, two are not; so three are taken, of error 0."""
 

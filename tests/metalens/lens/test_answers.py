@@ -12,6 +12,7 @@ from metalens.cell.shapes.straight import Rectangle
 from metalens.field import compiled
 from metalens.ground.errors import DomainError
 from metalens.lens import DiameterMap, Lens, answers
+from metalens.lens.pairs import Pairs
 from metalens.pillars import Proxy
 
 DRAW = np.random.default_rng(17)
@@ -59,6 +60,22 @@ def test_turned_pillars_add_twice_their_turn():
     answers.fill(made, (WAVE, TILT), phase, level)
     want = np.where(sizes > 0, np.exp(1j * (series(SERIES, sizes) - 2 * turn)), 1)
     assert np.exp(1j * phase) == pytest.approx(want, abs=1e-13)
+
+
+def test_pillars_of_two_sizes_have_the_entries_of_their_table():
+    draw, x, y = np.random.default_rng(4), np.array([0.12, 0.16, 0.2]), np.array([0.11, 0.19])
+    t = 0.9 * np.exp(1j * draw.uniform(-3, 3, (1, 3, 2, 2))) * draw.uniform(0.5, 1, (1, 3, 2, 2))
+    row, column = draw.integers(0, 3, (4, 5)), draw.integers(0, 2, (4, 5))
+    sizes, lengths = x[row], y[column]
+    sizes[2, 1] = lengths[2, 1] = 0
+    table = Pairs(np.array([WAVE]), x, y, t, (210.0, 900.0))
+    made = lens(4, 5)
+    made = replace(made, diameters=DiameterMap(sizes, 0.4, length_um=lengths), proxy=table.proxy, pairs=table)
+    phase, level = np.empty((4, 5)), np.empty((4, 5))
+    answers.fill(made, (WAVE, 0.0), phase, level)
+    want = np.where(sizes > 0, t[0, row, column, 0], 0)
+    assert level * np.exp(1j * phase) == pytest.approx(want, abs=1e-12)
+    assert np.abs(phase).max() <= np.pi
 
 
 def test_what_a_proxy_does_not_know_is_refused_by_name():
