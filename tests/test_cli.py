@@ -131,8 +131,8 @@ CHAIN = {
         preset = "smoke"
         test_batches = 2
         validation_batches = 2
-        scenes = { pixels = 48, margin = 4, pool = 48 }
-        inner = { steps = 12, batch = 2 }
+        scenes = { pixels = 48, margin = 4, pool = 24 }
+        inner = { steps = 6, batch = 2 }
         search = { population = 2, tournament = 1, rounds = 2 }
         run = { pitch_um = 12.0, budgets_mmacs = [4.0] }
 
@@ -158,7 +158,7 @@ CHAIN = {
         tolerance = 0.01
     """,
     "truth.toml": """
-        depths_um = [2500.0, 3200.0, 4200.0, 6000.0, 10000.0, 20000.0]
+        depths_um = [2500.0, 3600.0, 6000.0, 15000.0]
         peak_e = 6000.0
         camera = { pixel_um = 2.0, pixels = 32 }
         parameter = [{ name = "bias_nm", value = 5.0 }, { name = "distance_um", value = 12.0 }]

@@ -142,6 +142,10 @@ def test_the_uniformity_with_one_dose_is_that_of_the_exact_sum():
     mean = np.average(edges, weights=diameter**2)
     assert result.before.worst == pytest.approx(abs(edges / mean - 1).max(), rel=2e-3)
     assert result.before.rms == pytest.approx(np.sqrt(np.mean((edges / mean - 1) ** 2)), rel=2e-3)
+    given = result.factors[result.classes[rows, columns]]
+    edges = at_edges(centres, diameter, given, point, which=np.arange(len(rows)), rim_points=8)
+    left = np.sqrt(np.mean((edges / 0.5 - 1) ** 2))
+    assert result.after.rms == pytest.approx(left, rel=0.1)  # what the background moves by with the classes is added
 
 
 def test_refusals():
