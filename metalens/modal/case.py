@@ -35,6 +35,11 @@ class Case:
     p: bool
 
     @property
+    def size(self) -> float:
+        """Waves in a pitch, in the denser medium of the layer."""
+        return self.k0 * math.sqrt(max(abs(self.disc), abs(self.around))) / math.pi
+
+    @property
     def strange(self) -> float:
         """How unlike the cells of lenses it is.
 
@@ -45,14 +50,14 @@ class Case:
         Forms on a coarse mesh err more alike there.
         """
         disc, around = abs(self.disc), abs(self.around)
-        waves = math.sqrt(max(disc, around)), math.sqrt(max(self.below, self.above))
+        outside = self.k0 * math.sqrt(max(self.below, self.above)) / math.pi
         if disc < around:
             return RARER
         usual = (
             (disc >= LEAST_CONTRAST * around or self.disc.imag > disc / 2)
             and LOW <= self.height <= TALL
-            and self.k0 * waves[0] <= DENSE * math.pi
-            and self.k0 * waves[1] <= ORDERS * math.pi
+            and self.size <= DENSE
+            and outside <= ORDERS
             and self.bloch <= STEEP_RAD
         )
         return 0.0 if usual else 1.0

@@ -248,9 +248,9 @@ def climb(case: Case, tolerance: float) -> Climb:
     """
     best: Climb | None = None
     solved: list[Solution] = []
-    begin = max(first_rung(tolerance, case.rho) - (COMPARED if case.strange else 0), 0)
+    begin = first_rung(tolerance, case.rho) - COMPARED if case.strange else first_rung(tolerance, case.rho, case.size)
     last: MeshPlan | None = None
-    for rung in RUNGS[begin:]:
+    for rung in RUNGS[max(begin, 0) :]:
         plan = rung.choice(case.rho).plan
         if plan == last:  # of wide discs, for which two rungs have one mesh
             continue

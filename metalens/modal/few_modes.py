@@ -27,7 +27,8 @@ WHOLE = 2  # of them on all rows, before
 ROUNDING = 1e-14  # of the largest element
 SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
 SLOW = 4  # the rows of the lowest quarter of the levels go on alone
-ROUGH = 1e-6  # of the lowest level: what single precision is asked for
+ROUGH = 3e-7  # of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of it
+SINGLE = 3e-8  # accuracies from it on are met by that: answers move by 1.5e-8, 1e-3 of the least of 128 bars
 STRIPS = 4  # of rows of a product whose other half is a mirror image
 
 
@@ -123,7 +124,7 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
     """X with X² = square and eigenvalues in the right half plane, near the root of its diagonal; None if it is not.
 
     signs: of growth, with respect to which the square is symmetric. least: levels of the diagonal below it are
-    lifted to it. In single precision as far as it goes, half the time of double, which ends it.
+    lifted to it. In single precision as far as it goes, half the time of double, which ends it where more is asked.
     """
     n = len(square)
     diagonal = np.sqrt(np.maximum(np.diag(square), least))
@@ -135,7 +136,9 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
     aim = max(accuracy * diagonal[0], ROUNDING * diagonal[-1])
     rough = rest.astype(np.float32), weight.astype(np.float32)
     near = settled(rough[0], rough, ordered, max(aim, ROUGH * diagonal[0]), whole=WHOLE)
-    e = None if near is None else settled(near.astype(float), (rest, weight), ordered, aim, whole=1)
+    e = None if near is None else near.astype(float)
+    if e is not None and accuracy < SINGLE:
+        e = settled(e, (rest, weight), ordered, aim, whole=1)
     if e is None:
         return None
     e.ravel()[:: n + 1] += diagonal

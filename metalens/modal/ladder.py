@@ -96,8 +96,8 @@ class Choice:
 class Rung:
     """Meshes of one accuracy, thinnest disc first.
 
-    usual: the estimate that most pillars end with. alone: factors for cells unlike those of lenses, by this mesh alone,
-    times how unlike they are.
+    usual: the estimate that most pillars of many waves in a pitch end with. alone: factors for cells unlike those of
+    lenses, by this mesh alone, times how unlike they are.
     """
 
     name: str
@@ -213,6 +213,7 @@ class Measured(Protocol):
 
 SIZE, STEEP = 2.0, 6  # what polynomials of degree p get wrong of a wave goes as the 2 p-th power of its elements, and 3
 # is the least degree
+LARGE, FALL = 1.4, 3  # waves in a pitch from which on meshes have their usual estimates, and how these fall below
 AMPLIFIED = 6.0  # with a factor of a third, twice the change is the most that is told
 RESONANT = 0.1  # amplitude of a resonance, of those that move an answer by a hundredth and more
 COMPARED = 2  # meshes before, the last, that cells unlike those of lenses are judged by
@@ -328,10 +329,15 @@ RUNGS = (
 )
 
 
-def first_rung(tolerance: float, rho: float | None = None) -> int:
-    """Index of the coarsest mesh that usually meets the tolerance: for discs of ``rho`` pitches, or for most."""
+def first_rung(tolerance: float, rho: float | None = None, size: float = LARGE) -> int:
+    """Index of the coarsest mesh that usually meets the tolerance: for discs of ``rho`` pitches, or for most.
+
+    size: waves in a pitch, of cells like those of lenses. Of 70 at normal incidence estimates fell as the third power
+    of it on the coarse meshes, and faster on the mesh "good".
+    """
+    fewer = min(1.0, size / LARGE) ** FALL
 
     def usual(rung: Rung) -> float:
-        return (None if rho is None else rung.choice(rho).usual) or rung.usual
+        return fewer * ((None if rho is None else rung.choice(rho).usual) or rung.usual)
 
     return next((i for i, rung in enumerate(RUNGS) if usual(rung) <= tolerance), len(RUNGS) - 1)

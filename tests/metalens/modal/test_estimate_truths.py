@@ -10,7 +10,8 @@ from metalens.modal import engine, match
 from metalens.modal.engine import Form
 
 RNG = np.random.default_rng(77)
-CASE = SimpleNamespace(k0=1.7, disc=9.0 + 0.2j, around=1.44, bloch=0.31, rho=0.42, strange=2.5, below=2.2, above=1.21)
+LAYER = {"disc": 9.0 + 0.2j, "around": 1.44, "below": 2.2, "above": 1.21}
+CASE = SimpleNamespace(k0=1.7, bloch=0.31, rho=0.42, size=1.6, strange=2.5, **LAYER)
 
 
 def matrix(scale=1.0):
@@ -66,7 +67,7 @@ def test_the_ladder_is_climbed_until_an_estimate_meets_the_tolerance_or_the_leas
         )
 
     monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in errors))
-    monkeypatch.setattr(engine, "first_rung", lambda tolerance, rho: 0)
+    monkeypatch.setattr(engine, "first_rung", lambda tolerance, rho, size: 0 if (rho, size) == (0.42, 1.6) else 2)
     monkeypatch.setattr(engine, "evaluate", lambda case, plan, *, weak: plan)
     usual = SimpleNamespace(**{**vars(CASE), "strange": 0.0})
     met = engine.climb(usual, 0.02)

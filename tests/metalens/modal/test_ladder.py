@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from metalens import modal
+from metalens.cell import Cell, Index
 from metalens.modal import ladder
 from metalens.modal.ladder import Choice, Factors, Rung
 
@@ -122,6 +124,24 @@ def test_a_mesh_may_usually_meet_less_for_some_discs(monkeypatch):
     assert [ladder.first_rung(5e-3, rho) for rho in (0.25, 0.35)] == [0, 1]
     assert ladder.first_rung(5e-3) == 1
     assert [ladder.first_rung(2e-2, rho) for rho in (0.25, 0.35)] == [0, 0]
+
+
+def test_cells_of_few_waves_in_a_pitch_begin_on_coarser_meshes():
+    """Usual estimates are those of 1.4 waves in a pitch and more; below they fall as the third power."""
+    usual = [rung.usual for rung in ladder.RUNGS]
+    for size, share in ((0.7, 0.125), (1.3, (13 / 14) ** 3), (1.4, 1.0), (1.9, 1.0)):
+        for i, value in enumerate(usual[:-1]):
+            assert ladder.first_rung(1.001 * share * value, 0.5, size) == i
+            assert ladder.first_rung(0.999 * share * value, 0.5, size) == i + 1
+
+
+def test_a_cell_of_a_lens_meets_its_tolerance_on_the_mesh_that_its_waves_ask_for():
+    """0.92 waves in a pitch: 2.5e-4, what is usual for many on the mesh "even", led to "good"."""
+    titania = Cell(0.25, 0.6, Index(2.4), Index(1.46))
+    found = modal.solve(titania, 0.13, 0.65, tolerance=1e-4)
+    fine = modal.solve(titania, 0.13, 0.65, tolerance=3e-6)
+    assert found.reason.startswith("the even mesh")
+    assert abs(found.t - fine.t) < found.t_error < 1e-4
 
 
 def test_off_normal_incidence_waves_may_count_more():

@@ -56,10 +56,11 @@ def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
     monkeypatch, strange, tolerance, errors, last, error
 ):
     told = []
+    begun = (tolerance, 0.4) if strange else (tolerance, 0.4, 1.7)
     monkeypatch.setattr(engine, "RUNGS", rungs(errors, told=told))
-    monkeypatch.setattr(engine, "first_rung", lambda asked, rho: 3 if (asked, rho) == (tolerance, 0.4) else 5)
+    monkeypatch.setattr(engine, "first_rung", lambda *asked: 3 if asked == begun else 5)
     monkeypatch.setattr(engine, "evaluate", lambda case, plan, weak: (plan, round(10 * weak)))
-    made = engine.climb(SimpleNamespace(strange=strange, rho=0.4), tolerance)
+    made = engine.climb(SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance)
     assert (made.solution, made.rung.name, made.error) == ((last, last), f"n{last}", error)
     assert made.converged is (error <= tolerance)
     assert ("meets" in made.reason) is made.converged
@@ -72,9 +73,9 @@ def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
 def test_a_mesh_that_is_the_one_before_is_not_solved_again(monkeypatch):
     solved = []
     monkeypatch.setattr(engine, "RUNGS", rungs((0.9, 0.5, 0.01, 0.2), plans="aabb"))
-    monkeypatch.setattr(engine, "first_rung", lambda asked, rho: 0)
+    monkeypatch.setattr(engine, "first_rung", lambda *asked: 0)
     monkeypatch.setattr(engine, "evaluate", lambda case, plan, weak: solved.append(plan) or plan)
-    made = engine.climb(SimpleNamespace(strange=False, rho=0.4), 0.05)
+    made = engine.climb(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
     assert solved == ["a", "b"]
     assert (made.solution, made.error) == ("b", 0.01)
 

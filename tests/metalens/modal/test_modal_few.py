@@ -100,6 +100,21 @@ def test_root_of_a_matrix_near_a_diagonal():
     assert np.abs(signs[:, None] * found - (signs[:, None] * found).T).max() < 1e-11 * np.sqrt(level.max())
 
 
+def test_a_root_that_single_precision_holds_takes_no_steps_in_double():
+    random = np.random.default_rng(13)
+    n = 40
+    signs = np.where(random.random(n) < 0.4, 1.0, -1.0)
+    level = np.geomspace(60, 3e4, n)[random.permutation(n)]
+    rest = random.normal(size=(n, n)) * np.sqrt(level)
+    square = np.diag(level) + signs[:, None] * (rest + rest.T) / 4
+    quick, exact = (root(square, signs, 30.0, accuracy) for accuracy in (4e-8, 1e-13))
+    beside = ~np.eye(n, dtype=bool)
+    assert (quick[beside] == quick[beside].astype(np.float32)).all()
+    assert not (exact[beside] == exact[beside].astype(np.float32)).all()
+    assert np.abs(quick - exact).max() < 1e-6 * np.sqrt(level.min())  # 3e-7 is asked, of steps that halve the rest
+    assert np.abs(signs[:, None] * quick - (signs[:, None] * quick).T).max() == 0  # so the matrix stays unitary
+
+
 def test_root_of_levels_wider_apart_than_single_precision_counts():
     random = np.random.default_rng(5)
     level = np.geomspace(10.0, 1e12, 24)  # the roots of single precision are 0.1 off at the upper end
