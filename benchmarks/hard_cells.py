@@ -82,12 +82,13 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
 }
 
 
-def referee(case: Case, bar: float) -> tuple[complex, float]:
-    """t on the coarsest of the finer meshes whose own estimate, the second value, is far below the bar."""
-    found, doubt = 0j, math.inf
+def referee(case: Case, bar: float) -> tuple[tuple[complex, complex], float]:
+    """t and r on the coarsest of the finer meshes whose own estimate, the second value, is far below the bar."""
+    found, doubt = (0j, 0j), math.inf
     for rung in RUNGS[FINER:]:
         solution = evaluate(case, rung.choice(case.rho).plan)
-        found, doubt = complex(solution.matrix[1, 0]), rung.error(solution, case.rho)
+        r, t = solution.matrix[:, 0].tolist()
+        found, doubt = (t, r), rung.error(solution, case.rho)
         if doubt <= SHARE * bar:
             break
     return found, doubt
@@ -114,10 +115,11 @@ def judged(kind: str, count: int, tolerance: float, seed: int, *, other_solver: 
         if doubt > SHARE * got.t_error:
             open_ += 1
         else:
-            ratios.append((got.t_error + doubt) / max(abs(got.t - want), 1e-12))
+            error = max(abs(got.t - want[0]), abs(got.r - want[1]))
+            ratios.append((got.t_error + doubt) / max(error, 1e-12))
         if other_solver:
             against = rcwa.solve(cell, diameter, wavelength, **light, tolerance=1e-9)
-            apart += abs(against.t - got.t) > against.t_error + got.t_error
+            apart += max(abs(against.t - got.t), abs(against.r - got.r)) > against.t_error + got.t_error
     below = int(np.count_nonzero(np.array(ratios) < 1))
     text = f"{below} of {len(ratios)} bars below the error, median bar {np.median(ratios):.1f} errors"
     text += f", {refused} refused" if refused else ""

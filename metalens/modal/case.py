@@ -12,6 +12,7 @@ LEAST_CONTRAST = 2.0  # of permittivities, of a pillar that is told from its sur
 LOW, TALL = 0.5, 16.0  # heights in half pitches
 DENSE, ORDERS = 2.0, 1.05  # waves in a pitch, in the layer and in the half-spaces
 STEEP_RAD = 1.0  # half Bloch phase
+GUIDING = 1.2  # permittivity between pillars over that of the denser half-space
 RARER = 3.0
 NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
 
@@ -44,10 +45,11 @@ class Case:
         """How unlike the cells of lenses it is.
 
         0 for a pillar of the denser medium, lower than eight pitches and higher than a quarter of one, at most two
-        waves in a pitch, no order but zero at normal incidence, moderate angles; ``RARER`` for a disc of the rarer
-        medium; else 1.
+        waves in a pitch, no order but zero at normal incidence, moderate angles, between media hardly denser than
+        either half-space; ``RARER`` for a disc of the rarer medium; else 1.
 
-        Forms on a coarse mesh err more alike there.
+        Forms on a coarse mesh err more alike there. A layer that guides beside the pillars has resonances as sharp as
+        the pillars are thin: bars of three of 30 such cells were down to 0.45 of the error, of 150 others none.
         """
         disc, around = abs(self.disc), abs(self.around)
         outside = self.k0 * math.sqrt(max(self.below, self.above)) / math.pi
@@ -59,6 +61,7 @@ class Case:
             and self.size <= DENSE
             and outside <= ORDERS
             and self.bloch <= STEEP_RAD
+            and around <= GUIDING * max(self.below, self.above)
         )
         return 0.0 if usual else 1.0
 

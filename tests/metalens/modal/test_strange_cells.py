@@ -57,6 +57,11 @@ MANY_ORDERS = (
     0.28321358022201676,
     Light(0.8349581637443448, 0.2001742614769124, "s"),
 )
+GUIDED = (  # thin discs in a layer that guides without them: bars of the three coarsest meshes were 0.45 to 0.73
+    cell(0.5279752941817, 1.6047678068795, 2.7167073594087, 1.422637354039, 1.4323186819593, 1.7535734634407),
+    0.0750219081185,
+    Light(0.8912474407872),
+)
 NORMAL = [  # cell, its t and r, doubt, meshes whose bars did not hold
     ("narrow gap", NARROW_GAP, -0.12520389 + 0.10232487j, -0.30668512 - 0.93797540j, 9e-4, COARSE),
     ("low", LOW, 0.24967821 + 0.66401862j, -0.43456498 - 0.02703477j, 1e-5, FAIR),
@@ -65,10 +70,15 @@ NORMAL = [  # cell, its t and r, doubt, meshes whose bars did not hold
     ("thin hole", THIN_HOLE, 0.91909958 - 0.31851125j, -0.08151977 - 0.21716600j, 2e-6, COARSE),
     ("resonance", RESONANCE, 0.34589408 - 0.84357195j, -0.38868479 - 0.13292020j, 2e-5, COARSE),
     ("many orders", MANY_ORDERS, -0.38280652 + 0.40235310j, -0.06895376 + 0.10798189j, 4e-5, COARSE),
+    ("guided", GUIDED, 0.39696010 + 0.89700123j, -0.17837107 + 0.07742896j, 3e-6, COARSE),
+    ("guided", GUIDED, 0.39696010 + 0.89700123j, -0.17837107 + 0.07742896j, 3e-6, FAIR),
+    ("guided", GUIDED, 0.39696010 + 0.89700123j, -0.17837107 + 0.07742896j, 3e-6, EVEN),
 ]
 
 
-@pytest.mark.parametrize(("name", "drawn", "t", "r", "doubt", "rung"), NORMAL, ids=[one[0] for one in NORMAL])
+@pytest.mark.parametrize(
+    ("name", "drawn", "t", "r", "doubt", "rung"), NORMAL, ids=[f"{one[0]}, {one[5].name}" for one in NORMAL]
+)
 def test_bars_of_coarse_meshes_cover_cells_unlike_those_of_lenses(name, drawn, t, r, doubt, rung):
     case = case_of(*drawn)
     found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
@@ -186,6 +196,9 @@ def case(**other):
         ({"below": 2.8}, 1.0),  # 1.07 waves of the substrate
         ({"above": 2.8}, 1.0),
         ({"bloch": 1.01}, 1.0),
+        ({"around": 2.51}, 0.0),
+        ({"around": 2.53}, 1.0),  # 1.2 times as dense as either half-space
+        ({"around": 2.53, "above": 2.2}, 0.0),
     ],
 )
 def test_what_is_unlike_the_cells_of_lenses(other, want):
