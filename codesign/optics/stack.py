@@ -35,8 +35,6 @@ from metalens.image import (
     view,
 )
 
-MOST_VALUES = 5e8  # of the transforms of a stack of PSFs: 4 GB
-
 
 @dataclass(frozen=True, slots=True)
 class OpticsConfig:
@@ -113,10 +111,14 @@ class OpticsConfig:
         if self.window_samples < 3 or self.window_samples % 2 == 0:
             raise ConfigError(f"window_samples = {self.window_samples}: need an odd number of 3 or more")
         values = self.depth_count * (self.pupil.nodes + self.pupil.period_um / (2 * self.sample_um)) ** 2
-        if values > MOST_VALUES:
-            names = ("aperture_mm", "sensor_distance_mm", "wavelength_nm", "sample_um", "window_samples", "depth_count")
-            given = ", ".join(f"{name} = {getattr(self, name):g}" for name in names)
-            raise ConfigError(f"{given}: PSFs of {values:.1e} values, need {MOST_VALUES:.0e} or less; check the units")
+        if values > 5e8:  # 4 GB
+            raise ConfigError(f"PSFs by transforms of {values:.1e} values, need 5e8 or less; check the units in {self}")
+
+    @property
+    def fine(self) -> int:
+        """Samples of the intensity to one of ``sample_um``: at most lambda / (4 NA) apart, an odd number."""
+        need = math.ceil(self.sample_um / (self.pupil.field_step_um / 2))
+        return need + 1 - need % 2
 
     @property
     def start(self) -> Start:
@@ -322,8 +324,7 @@ def phase_at(
 
 
 def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
-    rim = settings.pupil.radius_um
-    x, y = (c.double() / rim for c in (_seen(settings).x_um, _seen(settings).y_um))
+    x, y = (c.double() / settings.pupil.radius_um for c in (_seen(settings).x_um, _seen(settings).y_um))
     return _wave_front(settings, error, x, y)
 
 
