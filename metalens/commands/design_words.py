@@ -102,7 +102,7 @@ def _neighbours(found: Unlike, quality: Quality) -> str:
             f"  with pillars among unlike neighbours {left:.3f} +- {quality.efficiency * found.error:.2g} "
             f"(rows of {rows} of its own pillars solved)"
         )
-    most = min(1.0, 1 - found.share + found.error)
+    most = min(1.0, max(1 - found.share, 0.0) + found.error)
     return (
         f"  that is of pillars one by one: unlike neighbours may cost as much as {most:.1%} of it "
         "(rough, of another cell; --own-cell solves rows of these pillars, and PSFs and images then hold them)"

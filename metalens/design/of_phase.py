@@ -180,11 +180,21 @@ def printable(
     turns = proxy.coverage_rad(wavelength_um, within_um=(low, high)) / (2 * math.pi)
     if turns < 1 and not accept_partial_turn:
         raise LensError(
-            f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um} um, need 1; "
-            "take a smaller pitch, taller pillars or looser process limits, or accept the nearest pillar "
-            "(accept_partial_turn) at the loss of efficiency that the design then states"
+            f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um} um, need 1"
+            f"{_ends(proxy, thinnest, widest)}; take a smaller pitch, taller pillars or looser process limits, or "
+            "accept the nearest pillar (accept_partial_turn) at the loss of efficiency that the design then states"
         )
     return low, high
+
+
+def _ends(proxy: Proxy, thinnest: float, widest: float) -> str:
+    """Where the library holds less than the process prints, in words."""
+    if proxy.domain_um[0] <= thinnest and proxy.domain_um[1] >= widest:
+        return ""
+    return (
+        f" (the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
+        f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep)"
+    )
 
 
 class Sums:

@@ -92,11 +92,14 @@ def unlike(lens: Lens, *, radius_um: float) -> Unlike:
 
 
 def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
-    """The same with the factor of another cell (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more."""
+    """The same with the factor of another cell (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
+
+    Where that cell gains a little, these pillars may lose as much.
+    """
     sine, weight = _rings(lens, radius_um)
     a, b = NEIGHBOURS
     share = float(abs(weight @ (1 + a * sine + b * sine**2)) ** 2)
-    return Unlike(share, 1 - share)
+    return Unlike(share, abs(1 - share))
 
 
 def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:

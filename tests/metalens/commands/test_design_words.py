@@ -26,6 +26,7 @@ def test_a_solved_share_is_stated_with_its_error_and_a_rough_one_as_a_bound():
     assert "unlike neighbours 0.720 +- 0.045" in told
     assert "rows of 3, 5, 6" in told
     assert "as much as 60.0%" in words.text("head", Layers(), QUALITY, None, rough)  # 1 - (0.7 - 0.3)
+    assert "as much as 0.4%" in words.text("head", Layers(), QUALITY, None, Unlike(1.004, 0.004))  # a gain there
     assert words.values(QUALITY, None, solved)["neighbours"] == {"share": 0.8, "error": 0.05, "pillars": (3, 5, 6)}
     assert "neighbours" not in words.values(QUALITY, None)
 

@@ -145,8 +145,14 @@ def test_empty_aperture_and_unprintable_cells_are_refused(proxy):
         _make(proxy, aperture_um=0.1)
     with pytest.raises(LensError, match="no printable pillar"):
         _make(proxy, limits=Limits(min_diameter_nm=295))
-    with pytest.raises(LensError, match="of a turn"):
+    with pytest.raises(LensError, match=r"of a turn.* need 1; take"):
         _make(proxy, limits=Limits(min_diameter_nm=230))
+
+
+def test_a_turn_that_a_resonance_cut_short_is_not_laid_to_the_process():
+    short = Proxy(np.array([[0.5, 2.0, 0.1]]), np.array([[0.9]]), (0.08, 0.16), (0.85, 0.85), 0.0, 0.0)
+    with pytest.raises(LensError, match=r"prints 0\.0900-0\.\d+ um, the library's curve holds 0\.0800-0\.1600"):
+        _make(short, limits=Limits(min_diameter_nm=90, min_gap_nm=80))
 
 
 def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):

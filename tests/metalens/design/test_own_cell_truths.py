@@ -70,6 +70,17 @@ def test_the_error_of_unlike_neighbours_adds_truncation_rows_and_a_fifth_of_the_
     assert len(counts) == 1
 
 
+def test_neighbours_that_gain_in_the_rough_cell_are_no_loss_below_nothing():
+    """At NA 0.1 the rough factor is above 1: the error was negative, and `-0.5%` the most that they may cost."""
+    flat = SimpleNamespace(**vars(LENS) | {"sensor_distance_um": 1600.0, "source_distance_um": math.inf})
+    sine, weight = own_cell._rings(flat, 80.0)
+    share = abs((weight * (1 + (0.057 - 0.289j) * sine + (-0.523 + 0.054j) * sine**2)).sum()) ** 2
+    assert share > 1.0005
+    found = own_cell.rough_unlike(flat, radius_um=80.0)
+    assert found.share == pytest.approx(share, rel=1e-12)
+    assert found.error == pytest.approx(share - 1, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("aperture", "counts"),
     [(0.93, (2, 3, 4)), (0.74, (3, 5, 6)), (0.45, (5, 8, 10)), (0.2, (6, 9, 12)), (3.0, (2, 3, 4))],
