@@ -27,7 +27,8 @@ def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
     for k, (panel, binning) in enumerate(zip(panels[0], setting.binnings, strict=True)):
         for name, found in axial.items():
             mean = float(found.information[0, k].mean())
-            panel.semilogy(depths, found.information[0, k].clamp_min(1e-6).numpy(), ".-", label=f"{name}: {mean:.3f}")
+            shown = found.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
+            panel.semilogy(depths, shown, ".-", label=f"{name}: {mean:.3g}")
         panel.set(title=f"{binning} × {binning} of {setting.pixel_um:g} µm", xlabel="source depth / mm")
         panel.legend(fontsize=7, title="mean", title_fontsize=7)
     panels[0, 0].set_ylabel(f"I(z) / mm⁻² ({setting.normalisation})")

@@ -79,7 +79,7 @@ def _axial(axial: Mapping[str, Axial], setting: Filled) -> Table:
     rows: list[tuple[str, ...]] = []
     for name, found in axial.items():
         for k, b in enumerate(setting.binnings):
-            told = [f"{float(v):.3f}" for v in found.information[:, k].mean(-1)]
+            told = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
             least = [f"{float(found.encircled[0].min()):.2f}", f"{float(found.encircled.min()):.2f}"] if k == 0 else []
             rows.append((name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""])))
     for name, numbers in PAPER_AXIAL.items():

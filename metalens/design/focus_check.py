@@ -44,7 +44,8 @@ class FocusCheck:
     @property
     def text(self) -> str:
         """One line for a person."""
-        axial = "" if math.isnan(self.z_um) else f", {self.z_um:+.2f} um from the sensor plane"
+        beyond = " or farther" if abs(self.z_um) >= _SHIFTS[-1] * self.depth_um * (1 - 1e-9) else ""
+        axial = "" if math.isnan(self.z_um) else f", {self.z_um:+.2f} um{beyond} from the sensor plane"
         verdict = "focus" if self.passed else "NO FOCUS WHERE IT SHOULD BE"
         return (
             f"{verdict}: peak at ({self.x_um:+.3f}, {self.y_um:+.3f}) um"

@@ -289,6 +289,12 @@ def placed(count: int, denser: float, span: tuple[float, float]) -> Tensor:
     return torch.from_numpy(np.unique(place) + ALONG / 2)
 
 
+DARK = (
+    "a PSF has no light within its window at some place, depth or wavelength of the scene: a frame that reaches to "
+    "80 degrees of field or beyond (take fewer or smaller samples), or a margin narrower than the blur"
+)
+
+
 class _Known:
     """PSFs of sum 1 at whole places of a line, each computed once."""
 
@@ -310,7 +316,7 @@ class _Known:
             found = self.at(torch.tensor(missing, dtype=torch.float64))
             light = found.sum((-1, -2), keepdim=True)
             if not bool((light > 0).all()):
-                raise SceneError("a PSF has no light within its window at some place, depth or wavelength of the scene")
+                raise SceneError(DARK)
             self.kept.update(zip(missing, found / light, strict=True))
         return torch.stack([self.kept[i] for i in places])
 

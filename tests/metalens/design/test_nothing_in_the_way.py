@@ -36,3 +36,11 @@ def test_paths_through_films_of_air_are_paths_through_air(tangent, source_um):
 )  # fmt: skip
 def test_a_focus_passes_within_a_quarter_of_resolution_and_depth(x_um, y_um, z_um, strehl, passed):
     assert FocusCheck(x_um, y_um, z_um, strehl, resolution_um=1.0, depth_um=8.0).passed is passed
+
+
+def test_a_peak_at_the_end_of_the_search_is_told_to_lie_there_or_farther():
+    """Half a depth of focus to either side is looked at."""
+    about = {"strehl": 0.5, "resolution_um": 1.0, "depth_um": 90.0}
+    assert "+45.00 um or farther from the sensor plane" in FocusCheck(0.0, 0.0, 45.0, **about).text
+    assert "-45.00 um or farther" in FocusCheck(0.0, 0.0, -45.0, **about).text
+    assert "+44.00 um from the sensor plane" in FocusCheck(0.0, 0.0, 44.0, **about).text

@@ -49,6 +49,15 @@ def test_as_few_depths_as_the_error_of_cubics_asks_for(between, nodes):
         plan._fewest(line(eps, plan.FINE), 0.99 * cubic_error(eps, 24), "depths")
 
 
+@pytest.mark.parametrize("light", [0.0, math.nan])
+def test_places_that_no_light_reaches_are_refused_with_what_to_do(light):
+    """As of a lens whose frame reaches to 88 degrees: windows there hold nothing, or no number."""
+    dark = plan._Known(lambda places: torch.where(places[:, None, None, None] > 90, light, 1.0) * BASE)
+    assert dark.psfs([12, 90]).shape == (2, 1, 7, 7)
+    with pytest.raises(SceneError, match=r"80 degrees of field or beyond \(take fewer or smaller samples\)"):
+        dark.psfs([12, 91])
+
+
 def test_as_few_field_points_as_the_error_of_cubics_asks_for():
     """Nodes on an axis of 192 steps, even or denser at the rim, whichever err less; what is tried next comes from how
     the error falls, so a few may be spared."""
