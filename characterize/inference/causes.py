@@ -33,6 +33,7 @@ _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
 _ENOUGH = 4e-3
 _CAMERA_DEG, _DENSE = 0.5, 3  # samples a pixel's side between which turned frames are interpolated
+WINDOWS = "a window off the chief ray at a field angle"
 _ROUND = 1e-4  # of the peak: round light does not turn, what is left is of the interpolation
 _GRID = 41  # places across the lens where write fields are told apart
 
@@ -61,9 +62,9 @@ class Change:
     amount, told: of the first, in words with a place for the number; empty where no amount is said.
     sigma: of every change, one for all or each its own, how much of it is reckoned with where nobody states it: a
     standard deviation, 0 for none.
-    frees: parameters that describe it. sought: whether it is looked for alone. roughly: the change is of the right kind
-    but of an unknown pattern, so that the frames cannot bound it by what they show of it. of_mask: of the lens
-    itself.
+    frees: parameters that describe it, but those that are stated exactly. sought: whether it is looked for alone.
+    roughly: the change is of the right kind but of an unknown pattern, so that the frames cannot bound it by what they
+    show of it. of_mask: of the lens itself.
     """
 
     cause: str
@@ -98,6 +99,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     yield Change("counts that are not in proportion to the light (a gamma)", _of_gamma(light))
     if len(image) > 2:
         yield from _of_frames(light, slopes)
+    yield from _of_windows(task, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
     turned = np.subtract(*(turned_frames(task.model, x, angle) for angle in (_CAMERA_DEG, 0.0)))[None]
@@ -108,7 +110,8 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     if held:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
         sizes = np.array([_size(task, name) for name in held]) / _LIGHT_STEP
-        yield Change("uneven illumination", uneven, _LIGHT_STEP, held[0] + " {:.3g}", sizes, held)
+        frees = tuple(name for name in held if not _exactly(task, name))
+        yield Change("uneven illumination", uneven, _LIGHT_STEP, held[0] + " {:.3g}", sizes, frees)
     if not len(task.model.modes):
         yield from _of_phase(task, x, image, slopes)
 
@@ -132,7 +135,7 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
             change = (task.model.images(after)[0] - first)[None]
             sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
             words = cause.format(before[PLACE["glass_um"]])
-            frees = () if base else (name,)
+            frees = () if base or _exactly(task, name) else (name,)
             yield Change(words, change, amount, name + " {:.3g}", sigma, frees, of_mask=name in _OF_MASK)
 
 
@@ -146,6 +149,19 @@ def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     if "wavelength_nm" in slopes:
         ramp = np.linspace(-1, 1, len(light))[:, None, None]
         yield Change("a wavelength that drifts", (slopes["wavelength_nm"] * ramp)[None])
+
+
+def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
+    """Windows of one field angle moved along x and along y, at every angle but the first: decentre moves them all."""
+    s = task.model.setting
+    sideways = [slopes[name] * s.pixel_um for name in ("decentre_x_um", "decentre_y_um") if name in slopes]
+    aside = [one.index for one in task.model.groups[1:]]
+    if aside and sideways:
+        moved = np.zeros((len(aside), len(sideways), *sideways[0].shape))
+        for k, index in enumerate(aside):
+            moved[k, :, index] = np.stack(sideways, 1)[index]
+        told = "{:.3g} px at one of the angles"
+        yield Change(WINDOWS, moved.reshape(-1, *sideways[0].shape), 1.0, told, _size(task, "window_px"))
 
 
 def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
@@ -165,6 +181,11 @@ def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> I
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
     yield Change("write fields out of place", fields, sigma=sigma, sought=False, roughly=True, of_mask=True)
+
+
+def _exactly(task: Task, name: str) -> bool:
+    """Whether a parameter is stated without an error: it stays as stated, whatever the residuals lean to."""
+    return name in task.known and task.known[name].sigma == 0
 
 
 def _size(task: Task, name: str) -> float:

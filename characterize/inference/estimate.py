@@ -102,7 +102,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
                 f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
                 f"left out falls from {rest.before:.2f} to {rest.after:.2f} a pixel"
             )
-    _refuse(_problems(task, ends[0], frames.gain), options, leans)
+    _refuse(_problems(task, ends[0], frames.gain, leans), options, leans)
     posterior = explore.explore(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
@@ -140,7 +140,7 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
 def _with_what_is_there(
     task: Task, ends: list[Solution], gain: Gain, cautions: list[str]
 ) -> tuple[Task, list[Solution], tuple[Solution, Looked] | None]:
-    """The task with parameters of causes that the residuals lean to, while these explain the frames better.
+    """The task with parameters of causes that are likely there (:func:`missing.to_fit`) and explain the frames better.
 
     With the last look beside the fit and the solution it was at; None without a known gain.
     """
@@ -148,14 +148,15 @@ def _with_what_is_there(
         return task, ends, None
     looked = missing.look(task, ends[0])
     for _ in range(_CAUSES):
-        first = looked.leans[0] if looked.leans else None
-        if first is None or first.chance > missing.CHANCE or not first.frees or not ends[0].converged:
+        first = missing.to_fit(looked.leans)
+        if first is None or not ends[0].converged:
             break
         more = dataclasses.replace(task, free=(*task.free, *first.frees))
         wide = search.wider(more, task.all_of(ends[0].value))
         if wide is None or wide[1][0].merit > ends[0].merit - first.chi2 / 2:
             break
-        cautions.append(f"{first.cause} shows in the residuals: {', '.join(first.frees)} fitted too")
+        seen = "shows in the residuals" if first.chance < missing.CHANCE else f"is likely there ({first.odds:.0f} to 1)"
+        cautions.append(f"{first.cause} {seen}: {', '.join(first.frees)} fitted too")
         task, ends = wide
         looked = missing.look(task, ends[0])
     return task, ends, (ends[0], looked)
@@ -236,7 +237,7 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
         degeneracies=_open(task, found, covariance, looked if gain.known else None),
         cautions=(*cautions, *(_seen(task, solution, looked, unseen) if gain.known else ())),
-        problems=(*_problems(task, solution, gain), *verdict.held_back(names, solution, task.prior)),
+        problems=(*_problems(task, solution, gain, looked.leans), *verdict.held_back(names, solution, task.prior)),
         low=value - np.hypot(value - within.low, more),
         high=value + np.hypot(within.high - value, more),
         draws=_drawn(task, found.draws, unstated),
@@ -312,8 +313,8 @@ def _psf_verdict(known: tuple[float, float], aside: tuple[float, float] | None, 
     return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
 
 
-def _problems(task: Task, solution: Solution, gain: Gain) -> list[str]:
-    problems = verdict.problems(task.names, solution, gain)
+def _problems(task: Task, solution: Solution, gain: Gain, leans: list[Lean]) -> list[str]:
+    problems = [*verdict.problems(task.names, solution, gain), *(missing.misplaced(leans) if gain.known else ())]
     clipped = float(task.data.saturated.mean())
     if problems and clipped > 0.1:
         problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")

@@ -24,6 +24,7 @@ from characterize.model import PLACE, background
 from metalens.ground.arrays import Array
 
 CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
+ODDS = 10.0  # for a cause of plausible size from which on it is fitted: by chance in one fit of 100 or fewer
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
 _PATCHY, _SPOT = 3.0, 0.2  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
@@ -34,7 +35,8 @@ class Lean:
     """One cause: its words, chi-square by which the residuals lean along it, its degrees, and the chance of that.
 
     taken: what takes it up, in words, where the fit cannot tell it from what is fitted; empty where it can.
-    frees: parameters that describe it.
+    frees: parameters that describe it and that nobody states exactly. odds: for it, as large as is reckoned with,
+    against its absence; 0 where no size is known.
     """
 
     cause: str
@@ -43,6 +45,7 @@ class Lean:
     chance: float
     taken: str = ""
     frees: tuple[str, ...] = ()
+    odds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,11 +125,12 @@ def look(task: Task, mode: Solution) -> Looked:
             of_mask |= {one.cause} if one.of_mask else set()
         if one.sought:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
-            found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees))
+            odds = fit.odds(unstated[one.cause]) if one.cause in unstated and one.frees else 0.0
+            found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees, odds=odds))
     found.append(_ghost(task, x, image, root, fit))
     if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / max(float((root > 0).sum()), 1.0)):
         found.append(_patch(task, x, root, fit))
-    told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: one.chance)
+    told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: (one.chance, -one.chi2))
     return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
@@ -137,6 +141,17 @@ def expected(task: Task) -> Unstated:
     none = np.zeros_like(image)
     mode = Solution(value, np.eye(p), np.eye(p), image, none, 1.0, 0.0, True, "", 0, np.zeros(p), np.asarray(slopes))
     return look(task, mode).reckoned()
+
+
+def to_fit(found: list[Lean]) -> Lean | None:
+    """The cause to fit next: what the residuals lean to beyond chance, or else what is likelier there than not.
+
+    None where no free parameters describe the first, or nothing is likely.
+    """
+    told = [one for one in found if one.chance < CHANCE]
+    if told:
+        return told[0] if told[0].frees else None
+    return max((one for one in found if one.frees and one.odds > ODDS), key=lambda one: one.odds, default=None)
 
 
 def words(found: list[Lean]) -> list[str]:
@@ -150,6 +165,21 @@ def words(found: list[Lean]) -> list[str]:
     return [
         f"residuals lean towards {first.cause}, which is not fitted (chi-square {first.chi2:.0f} with {first.degrees} "
         f"of them){more}: intervals hold only if it is absent; state it, free it, or mend the bench"
+    ]
+
+
+def misplaced(found: list[Lean]) -> list[str]:
+    """Whether windows of single field angles lie off, in words: what they explain is half of what any cause does.
+
+    The fit then bends the lens, or turns the frames, until the spots of all angles lie where their windows are.
+    """
+    most = max((one.chi2 - one.degrees for one in found), default=0.0)
+    return [
+        f"{one.cause} explains what is left (chi-square {one.chi2:.0f} with {one.degrees} degrees): one decentre is "
+        "fitted for all angles; cut the frames of every angle about its chief ray, distance times tan(angle) off that "
+        "on the axis, or fit the angles one by one"
+        for one in found
+        if one.cause == causes.WINDOWS and one.chance < CHANCE and one.chi2 - one.degrees >= most / 2
     ]
 
 
@@ -208,14 +238,27 @@ class Fitted:
         With H = GᵀG' and S the scatter of their scores s, c is (1 + H S⁻¹ H)⁻¹ H S⁻¹ s, known to (1 + H S⁻¹ H)⁻¹. As
         the error is counted from the fit, a cause that seems to be there widens intervals to where they would be.
         """
+        open_, told = self._open(changes)
+        likely = open_ @ told
+        return np.asarray(open_ + np.outer(likely, likely))
+
+    def odds(self, changes: Array) -> float:
+        """For (k, pixels) changes of one standard deviation each, in some amount, against their absence (Bayes factor).
+
+        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to exp(tᵀC t / 2) (det C)^½.
+        """
+        open_, told = self._open(changes)
+        size = float(told @ open_ @ told) / 2 + float(np.linalg.slogdet(open_)[1]) / 2
+        return math.exp(min(size, 100.0))
+
+    def _open(self, changes: Array) -> tuple[Array, Array]:
+        """(k, k) C = (1 + H S⁻¹ H)⁻¹ and (k,) H S⁻¹ s of changes whose amounts scatter by one about 0."""
         left, score = self.left(changes)
         seen = changes @ left.T
         scatter = seen + self.in_common(left)
-        scatter += 1e-9 * np.trace(scatter) * np.eye(len(scatter))
+        scatter += max(1e-9 * float(np.trace(scatter)), 1e-300) * np.eye(len(scatter))
         weight = np.linalg.solve(scatter, seen)
-        open_ = np.linalg.inv(np.eye(len(seen)) + seen @ weight)
-        likely = open_ @ weight.T @ score
-        return np.asarray(open_ + np.outer(likely, likely))
+        return np.linalg.inv(np.eye(len(seen)) + seen @ weight), weight.T @ score
 
     def in_common(self, left: Array) -> Array:
         """(k, k) by which scores scatter more since errors of dark and flat are one in all frames."""

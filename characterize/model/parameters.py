@@ -95,6 +95,7 @@ UNFITTED: tuple[Unfitted, ...] = (
     Unfitted("stitching_nm", "shift of each write field of the mask, four across the lens", 60.0),
     Unfitted("pixel_percent", "true pixel pitch over the stated one, less 1", 1.0),
     Unfitted("camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0),
+    Unfitted("window_px", "window of a field angle off the chief ray there, each way, beside the common decentre", 0.3),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}

@@ -74,16 +74,23 @@ def light(strength_rad: float = 0.0, **more: float) -> np.ndarray:
     return bench.irradiance(lens(strength_rad), truth(**more), RESPONSE)
 
 
-def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf) -> Capture:
-    """Noise on expected electrons, read out at 2 e a count with stated gain and offset."""
+def counts(
+    electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf
+) -> np.ndarray:
+    """(n, y, x) counts of 12 bits of expected electrons: shot and read noise, 2 e a count, offset 64."""
     random = np.random.default_rng(seed)
     seen = np.minimum(
         random.poisson(np.maximum(electrons, 0)) + random.normal(0, read_noise_e, electrons.shape), full_well
     )
-    counts = np.clip(np.round(seen / 2.0 + 64), 0, 4095).astype(np.uint16)
-    n = len(counts)
+    return np.clip(np.round(seen / 2.0 + 64), 0, 4095).astype(np.uint16)
+
+
+def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf) -> Capture:
+    """Noise on expected electrons, read out at 2 e a count with stated gain and offset."""
+    read = counts(electrons, seed=seed, read_noise_e=read_noise_e, full_well=full_well)
+    n = len(read)
     return Capture(
-        counts,
+        read,
         np.array(DEPTHS),
         np.zeros((n, 2)),
         np.full(n, np.nan),

@@ -1,5 +1,6 @@
 """Scores of causes that nobody fits, by hand: noise in common, what frames say of an amount, words, and a ghost."""
 
+import dataclasses
 import itertools
 import math
 from types import SimpleNamespace
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from characterize.inference import missing
+from characterize.inference import causes, missing
 from characterize.inference.causes import Change
 from characterize.inference.missing import Fitted, Lean
 from characterize.model import Setting, vector
@@ -56,6 +57,33 @@ def test_amounts_of_causes_are_those_of_a_fit_with_them_all():
     assert abs(want[0, 1]) > 0.1
 
 
+def test_odds_for_a_cause_are_those_of_gaussian_data_with_and_without_it():
+    """Data scatter by unit noise, what the priors leave open, and the cause: two densities of all pixels at once. The
+    slope without a prior is known to 30 here."""
+    data = RNG.normal(size=PIXELS) + np.array([0.9, -0.5]) @ CHANGES[:2]
+    wide = np.diag([30.0**2, *(1 / np.diag(PRIOR)[1:])])
+    known = SLOPES @ SLOPES.T + np.linalg.inv(wide)
+    mode = np.linalg.solve(known, SLOPES @ data)
+    fit = Fitted(NAMES, SLOPES, known, data - mode @ SLOPES, ALONE, np.linalg.inv(wide) @ mode)
+    absent = np.eye(PIXELS) + SLOPES.T @ wide @ SLOPES
+    for changes in (CHANGES[:2], CHANGES[2:], 0.3 * CHANGES):
+        there = stats.multivariate_normal(cov=absent + changes.T @ changes).logpdf(data)
+        want = there - stats.multivariate_normal(cov=absent).logpdf(data)
+        assert math.log(fit.odds(changes)) == pytest.approx(want, abs=1e-4)
+    assert fit.odds(np.zeros((1, PIXELS))) == 1.0
+
+
+@pytest.mark.parametrize("size", [0.05, 1.0, 20.0])
+def test_odds_of_ten_are_rare_where_there_is_nothing(size):
+    """For r sigma of three directions ten is chi-square 2 (1 + 1/r²) (ln 10 + 3/2 ln(1 + r²)), 11.7 at least: chance
+    0.0085, which 2000 draws give to 0.002. Where the frames tell nothing the odds are 1."""
+    changes = size * CHANGES / np.linalg.norm(CHANGES, axis=1)[:, None]
+    truths = RNG.normal(size=(2000, 4)) * [1.0, 0.3, 1.7, 2.1]
+    odds = np.array([fit_of(RNG.normal(size=PIXELS) + one @ SLOPES).odds(changes) for one in truths])
+    assert (odds > missing.ODDS).mean() < 0.0145
+    assert size > 0.1 or np.abs(odds - 1).max() < 0.1
+
+
 def test_scores_are_chi_square_and_no_less_where_priors_hold_what_the_frames_hardly_see():
     """Slopes as telling as the priors, truths that follow these; 2000 draws give the mean of 3 to 0.055. Without the
     pull of the priors it is below 2.5."""
@@ -100,6 +128,27 @@ def test_three_more_causes_are_named_beside_the_likeliest():
     assert "towards cause 0, " in words
     assert "(chi-square 40 with 2 of them); cause 1, cause 2, cause 3 would explain" in words
     assert "cause 1, cause 2 would" in missing.words(leans[:3])[0]
+
+
+def test_the_next_to_fit_is_what_shows_or_else_what_is_likeliest():
+    """Nothing where a cause that no parameter describes shows most."""
+    shift, light = Lean("shifts", 90.0, 9, 1e-9), Lean("light", 14.0, 3, 3e-3, frees=("light_x",), odds=16.0)
+    glass = Lean("glass", 8.0, 1, 5e-3, frees=("glass_um",), odds=11.0)
+    bare, plate = Lean("gamma", 9.0, 1, 2e-3, odds=0.0), dataclasses.replace(glass, chance=1e-7)
+    assert missing.to_fit([bare, light, glass]) is light
+    assert missing.to_fit([glass, dataclasses.replace(light, odds=9.9)]) is glass
+    assert missing.to_fit([plate, light]) is plate
+    assert missing.to_fit([shift, plate, light]) is None
+    assert missing.to_fit([bare]) is None
+
+
+@pytest.mark.parametrize(("chi2", "chance", "refused"), [(53.0, 1e-9, True), (51.0, 1e-9, False), (53.0, 2e-4, False)])
+def test_windows_off_are_a_problem_where_they_explain_half_of_what_is_left(chi2, chance, refused):
+    """Of chi-square 120 with 20 degrees: 100 beyond chance, of which two more degrees are to explain 50."""
+    leans = [Lean("shifts from frame to frame", 120.0, 20, 1e-16), Lean(causes.WINDOWS, chi2, 2, chance)]
+    assert bool(missing.misplaced(leans)) == refused
+    assert not missing.misplaced(leans[:1])
+    assert not missing.misplaced([])
 
 
 ALONG = 40 * RNG.normal(size=(2, *SHAPE))

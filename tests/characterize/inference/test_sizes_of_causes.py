@@ -45,6 +45,7 @@ class Model:
     grid: Sensor = field(default_factory=Sensor)
     lens: SimpleNamespace = field(default_factory=lambda: LENS)
     modes: tuple[int, ...] = ()
+    groups: tuple[SimpleNamespace, ...] = ()
     cut: float = 0.0
 
     def images(self, x, names=()):
@@ -127,6 +128,23 @@ def test_walls_pixels_and_uneven_light_have_units_of_their_own():
     assert some["uneven illumination"].sigma == pytest.approx([1.0, 0.25])
 
 
+@pytest.mark.parametrize(("unfitted", "sigma"), [({}, 0.3), ({"window_px": 0.07}, 0.07)])
+def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
+    """Frames 0 and 2 at the first angle, 1 and 3 at two more: by a pixel of 3 um along x, then y."""
+    x, every = vector(), {name: SLOPES[PLACE[name]] for name in ("decentre_x_um", "decentre_y_um", "stage_zero_um")}
+    groups = tuple(SimpleNamespace(index=np.array(index)) for index in ([0, 2], [1], [3]))
+    task = Asked(Model(groups=groups), ("bias_nm",), {}, unfitted)
+    every |= {name: SLOPES[PLACE[name]] for name in named(Bends)}
+    (found,) = [one for one in causes.changes(task, x, every) if one.cause == causes.WINDOWS]
+    want = np.zeros((4, *SHAPE))
+    for k, (frame, name) in enumerate((f, n) for f in (1, 3) for n in ("decentre_x_um", "decentre_y_um")):
+        want[k, frame] = 3.0 * SLOPES[PLACE[name], frame]
+    assert found.images == pytest.approx(want)
+    assert found.sigma == pytest.approx(sigma)
+    one = replace(task, model=Model(groups=groups[:1]))
+    assert causes.WINDOWS not in [cause.cause for cause in causes.changes(one, x, every)]
+
+
 def test_write_fields_are_as_far_out_of_place_as_stated_and_smooth_phases_as_their_prior():
     """32 fields, 1 um each: 60 nm where nobody says, what is stated in nm."""
     for unfitted, sigma in ({}, 0.06), ({"stitching_nm": 11.0}, 0.011):
@@ -152,6 +170,10 @@ def test_what_is_fitted_or_stated_exactly_is_no_cause():
     assert "uneven illumination" not in every
     none, _ = found(known={"glass_um": Known("glass_um", 0.0)})
     assert not [cause for cause in none if "of glass about" in cause]
+    assert none["a plate of glass in the beam"].frees == ()  # looked for by name, and kept as it is stated
+    some, _ = found(known={"glass_um": Known("glass_um", 90.0, 5.0), "light_y": Known("light_y", 0.0)})
+    assert some["a plate of glass in the beam"].frees == ("glass_um",)
+    assert some["uneven illumination"].frees == ("light_x", "light_r")
 
 
 def test_counts_of_a_gamma_differ_from_the_light_as_their_logarithm():

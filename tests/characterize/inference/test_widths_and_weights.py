@@ -12,7 +12,7 @@ from characterize.inference import arrange, causes, estimate, missing, prepare, 
 from characterize.inference.leastsquares import Data
 from characterize.inference.missing import Lean
 
-RNG = np.random.default_rng(31)
+RNG, KNOWN = np.random.default_rng(31), SimpleNamespace(known=True)
 
 
 def test_an_interval_is_told_as_a_share_of_its_prior():
@@ -45,13 +45,13 @@ def test_saturation_is_blamed_for_what_is_wrong_and_for_nothing_else(monkeypatch
     task = SimpleNamespace(
         names=(), data=SimpleNamespace(saturated=saturated), model=SimpleNamespace(modes=np.zeros(3))
     )
-    found = estimate._problems(task, None, None)
+    found = estimate._problems(task, None, KNOWN, [])
     assert len(found) == want
     assert ("15% of the pixels are saturated" in "".join(found)) is (want == 2)
     task.model.modes = np.array([0.8, 0.0, 0.6]) * residual.MOST_RAD
-    assert len(estimate._problems(task, None, None)) == want
+    assert len(estimate._problems(task, None, KNOWN, [])) == want
     task.model.modes = task.model.modes * 1.01
-    assert f"a phase of {1.01 * residual.MOST_RAD:.2f} rad rms is left" in estimate._problems(task, None, None)[-1]
+    assert f"a phase of {1.01 * residual.MOST_RAD:.2f} rad rms is left" in estimate._problems(task, None, KNOWN, [])[-1]
 
 
 @pytest.mark.parametrize(("left_rad", "refused"), [(0.5, False), (0.75, True)])
@@ -60,7 +60,7 @@ def test_a_phase_that_nobody_explains_may_cost_a_third_of_the_peak_and_no_more(m
     monkeypatch.setattr(verdict, "problems", lambda *_: [])
     model = SimpleNamespace(modes=left_rad * np.array([0.28, -0.96]))
     task = SimpleNamespace(names=(), data=SimpleNamespace(saturated=np.zeros((1, 4, 5), bool)), model=model)
-    assert ["no parameter explains" in words for words in estimate._problems(task, None, None)] == [True] * refused
+    assert ["no parameter explains" in words for words in estimate._problems(task, None, KNOWN, [])] == [True] * refused
     assert (math.exp(-(left_rad**2)) < 2 / 3) == refused
 
 
@@ -133,16 +133,28 @@ def test_the_noise_of_a_frame_is_that_of_its_usable_pixels():
     assert found.clipped == pytest.approx([0, 3 / 42])
 
 
-@pytest.mark.parametrize(("chance", "gained", "freed"), [(1e-6, 12.5, True), (1e-3, 20.0, False), (1e-6, 11.5, False)])
-def test_what_shows_in_the_residuals_is_fitted_where_that_explains_it(monkeypatch, chance, gained, freed):
-    """A lean of chi-square 24 beyond chance; kept where the misfit falls by half of that or more."""
+def test_windows_off_are_a_problem_where_the_gain_says_what_is_noise(monkeypatch):
+    task = SimpleNamespace(names=(), data=SimpleNamespace(saturated=np.zeros(3)), model=SimpleNamespace(modes=[0.0]))
+    monkeypatch.setattr(verdict, "problems", lambda *_: [])
+    aside = Lean(causes.WINDOWS, 70.0, 2, 1e-9)
+    (said,) = estimate._problems(task, None, KNOWN, [aside])
+    assert said.startswith("a window off the chief ray at a field angle explains what is left (chi-square 70 with 2 ")
+    assert not estimate._problems(task, None, SimpleNamespace(known=False), [aside])
+
+
+SHOWN = [(1e-6, 0, 12.5, "shows"), (1e-3, 9, 20.0, ""), (1e-3, 16, 20.0, "is likely there (16 to 1)")]
+
+
+@pytest.mark.parametrize(("chance", "odds", "gained", "freed"), [*SHOWN, (1e-6, 0, 11.5, ""), (1e-3, 16, 11.5, "")])
+def test_what_shows_in_the_residuals_is_fitted_where_that_explains_it(monkeypatch, chance, odds, gained, freed):
+    """A lean of chi-square 24 beyond chance or likely; kept where the misfit falls by half of that or more."""
 
     @dataclasses.dataclass(frozen=True)
     class Asked:
         free: tuple = ()
         all_of = staticmethod(lambda value: value)
 
-    lean = Lean("uneven illumination", 24.0, 3, chance, frees=("light_x", "light_y"))
+    lean = Lean("uneven illumination", 24.0, 3, chance, frees=("light_x", "light_y"), odds=odds)
     looks = iter([missing.Looked([lean], None, {}), missing.Looked([], None, {})])
     monkeypatch.setattr(missing, "look", lambda *_: next(looks))
     before = SimpleNamespace(merit=1000.0, value=np.zeros(2), converged=True)
@@ -153,7 +165,7 @@ def test_what_shows_in_the_residuals_is_fitted_where_that_explains_it(monkeypatc
     task, ends, looked = estimate._with_what_is_there(Asked(), [before], known, cautions)
     assert task.free == (("light_x", "light_y") if freed else ())
     assert ends[0] is looked[0] is (after if freed else before)
-    assert bool(cautions) == freed
+    assert [words.startswith(f"uneven illumination {freed}") for words in cautions] == [True] * bool(freed)
 
 
 def test_every_plane_of_the_data_is_turned_with_the_frames():
