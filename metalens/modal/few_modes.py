@@ -28,7 +28,7 @@ ROUNDING = 1e-14  # of the largest element
 SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
 SLOW = 4  # the rows of the lowest quarter of the levels go on alone
 ROUGH = 3e-7  # of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of it
-SINGLE = 3e-8  # accuracies from it on are met by that: answers move by 1.5e-8, 1e-3 of the least of 128 bars
+SINGLE = 3e-8  # accuracies from it on are met by that: answers move by 7e-8 on coarse meshes, 4e-3 of a bar on good
 STRIPS = 4  # of rows of a product whose other half is a mirror image
 
 

@@ -87,13 +87,19 @@ def test_dense_algebra_does_what_it_says():
         eigen_pairs(definite, symmetric)
 
 
+def near_diagonal(random, signs, ends):
+    """Levels between two ends in any order, and a matrix about them that is symmetric but for signs."""
+    n = len(signs)
+    level = np.geomspace(*ends, n)[random.permutation(n)]
+    rest = random.normal(size=(n, n)) * np.sqrt(level)
+    return level, np.diag(level) + signs[:, None] * (rest + rest.T) / 4
+
+
 def test_root_of_a_matrix_near_a_diagonal():
     random = np.random.default_rng(3)
     n = 24
     signs = np.where(np.arange(n) < 12, 1.0, -1.0)
-    level = np.geomspace(50, 1e5, n)[random.permutation(n)]
-    rest = random.normal(size=(n, n)) * np.sqrt(level)
-    square = np.diag(level) + signs[:, None] * (rest + rest.T) / 4
+    level, square = near_diagonal(random, signs, (50, 1e5))
     found = root(square, signs, 30.0, 1e-13)
     assert np.abs(found @ found - square).max() < 1e-11 * level.max()
     assert (np.linalg.eigvals(found).real > 0).all()
@@ -104,9 +110,7 @@ def test_a_root_that_single_precision_holds_takes_no_steps_in_double():
     random = np.random.default_rng(13)
     n = 40
     signs = np.where(random.random(n) < 0.4, 1.0, -1.0)
-    level = np.geomspace(60, 3e4, n)[random.permutation(n)]
-    rest = random.normal(size=(n, n)) * np.sqrt(level)
-    square = np.diag(level) + signs[:, None] * (rest + rest.T) / 4
+    level, square = near_diagonal(random, signs, (60, 3e4))
     quick, exact = (root(square, signs, 30.0, accuracy) for accuracy in (4e-8, 1e-13))
     beside = ~np.eye(n, dtype=bool)
     assert (quick[beside] == quick[beside].astype(np.float32)).all()
