@@ -158,7 +158,7 @@ def _classes(block: Array, field: Array, shift: Array, goal: Array, per_log: flo
 
 def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
     """((entries, doses) pillars, (pieces,) class, outcome) of the nearest doses, over everything."""
-    t, out = fields.table, np.zeros((2, *fields.grid.shape))
+    t, mass = fields.table, np.zeros(fields.grid.shape)
     pairs = np.zeros((len(t.own), NONE + 1), np.int64)
     dose = np.zeros(NONE + 1)
     dose[: len(steps.factors)] = steps.factors
@@ -176,17 +176,17 @@ def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
             ends[:, 0], ends[:, 1] = np.inf, -np.inf
             alone = fields.at(fields.alone, number, first, len(block), fields.near_alone) if not number else _NOTHING
             tables = np.stack([t.own, t.area_um2, CLEARS * t.goal])
-            _take(block, chosen, field, alone, tables, dose, mean, ends, pairs, yn, yw, xn, xw, out[0])
+            _take(block, chosen, field, alone, tables, dose, mean, ends, pairs, yn, yw, xn, xw, mass)
             if len(fields.near):
                 given[number][first : first + len(block)] = t.area_um2.take(block) * dose.take(chosen)
             for tally, row in ((tallies[1 if not number else 2], ends[0]), (tallies[0], ends[1])):
                 tally.merge(row)
     own_class = steps.nearest((CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own)
-    worst_rect = _rect_error(fields, own_class, dose, out[0])
-    after = fields.reach(out[0])
+    worst_rect = _rect_error(fields, own_class, dose, mass)
+    after = fields.reach(mass)
     inside = fields.alone > 1e-3 * fields.alone.max()
     shift = float(np.abs(after - fields.far)[inside].max(initial=0))
-    near = [middle(mass) for middle, mass in zip(fields.middles, given, strict=False)]
+    near = [middle(own) for middle, own in zip(fields.middles, given, strict=False)]
     shift += max(
         (float(np.abs(a - b)[m > 0].max(initial=0)) for a, b, m in zip(near, fields.near, given, strict=False)),
         default=0,

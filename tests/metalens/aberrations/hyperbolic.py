@@ -27,7 +27,7 @@ CASES = {
 }
 
 
-def made(case, *, radius_um=RADIUS, scatter_rad=0.0, turns=0):
+def made(case, *, radius_um=RADIUS, scatter_rad=0.0, seed=3, turns=0):
     """The lens file's content; scatter_rad: of every pillar's phase; turns: of a vortex in it."""
     rays, _ = CASES[case]
     count = 2 * math.ceil(radius_um / PITCH)
@@ -38,7 +38,7 @@ def made(case, *, radius_um=RADIUS, scatter_rad=0.0, turns=0):
     if math.isfinite(rays.depth_um):
         path = path + np.sqrt(rho2 + rays.depth_um**2)
     phase = -2 * np.pi / WAVE * path + turns * np.arctan2(y, x)
-    phase = phase + scatter_rad * np.random.default_rng(3).normal(size=phase.shape)
+    phase = phase + scatter_rad * np.random.default_rng(seed).normal(size=phase.shape)
     diameter = 0.2 + 0.12 * np.mod(phase, 2 * np.pi) / (3 * np.pi)
     films = [tuple(Film(Index(n), t) for n, t in side) for side in (rays.front, rays.behind)]
     layers = Layers(front=films[0], behind=films[1], stop=Stop(*rays.stop) if rays.stop else None)

@@ -57,16 +57,17 @@ def test_the_linear_image_is_the_change_of_traced_rays(case):
     assert found.source == pytest.approx((ends[0][1] + ends[1][1]) / 2, rel=1e-5)
 
 
-def test_scattered_phases_are_within_their_error():
-    """0.2 rad of every pillar: the foci of 12 angles differ from those of the even phase by the errors they state."""
-    rough, even = made("plain", scatter_rad=0.2), made("plain")
-    apart = []
-    for angle in np.radians(np.linspace(-9.0, 11.0, 12)):
-        one, other = chief_ray(rough, (angle, 0.0)), chief_ray(even, (angle, 0.0))
-        apart.append((one.focus_um - other.focus_um) / one.focus_error_um)
-    # without a stop all angles look at the same pillars: one draw of either axis, not 24
-    assert 0.02 < np.abs(apart[0]).max() < 3.0
-    assert chief_ray(rough).focus_error_um.min() > 20 * chief_ray(even).focus_error_um.max()
+def test_foci_of_scattered_phases_differ_by_their_error():
+    """0.2 rad of every pillar, 40 draws: over its stated error the change of a focus has an rms of 1; that of 80 such
+    numbers is known within 8 %. No scatter, no error to speak of."""
+    angle = (0.12, -0.05)
+    even, off = chief_ray(made("off-centre"), angle, 1900.0), []
+    for seed in range(40):
+        rough = chief_ray(made("off-centre", scatter_rad=0.2, seed=seed), angle, 1900.0)
+        off.append((rough.focus_um - even.focus_um) / rough.focus_error_um)
+    assert np.sqrt(np.mean(np.square(off), 0)) == pytest.approx([1.0, 1.0], abs=0.34)  # 11 % each, three of them
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.24)
+    assert rough.focus_error_um.min() > 20 * even.focus_error_um.max()
 
 
 @pytest.mark.parametrize("depth", [97.0, 240.0])
