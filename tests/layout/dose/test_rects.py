@@ -169,8 +169,10 @@ def test_one_box_alone_has_four_sides(interpreted):
     assert [part.shape for part in nothing] == [(0,), (0, 2), (0,)]
 
 
-def test_exposure_at_crossings_has_lines_of_y_before_those_of_x(interpreted):
-    """Two by three lines of one row, of the boxes that it sees: all but the second. Far lines have boxes there."""
+@pytest.mark.parametrize("across", [(0.2, 19.6), (0.2, 19.6, -1.1, 0.9)])
+def test_exposure_at_crossings_has_lines_of_y_before_those_of_x(interpreted, across):
+    """Fewer and more of them than the three of y, in one row, of the boxes that it sees: all but the second. Far lines
+    have boxes there."""
     boxes = np.array(
         [
             [0.0, 0.0, 1.0, 2.0],
@@ -181,11 +183,11 @@ def test_exposure_at_crossings_has_lines_of_y_before_those_of_x(interpreted):
         ]
     )
     point = PointExposure(np.array([0.8, 1.9]), np.array([0.7, 0.3]))
-    x, y = np.array([[0.2, 19.6]]), np.array([[0.3, 1.1, 30.2]])
+    x, y = np.array([across]), np.array([[0.3, 1.1, 30.2]])
     pairs = np.array([4, 5, 5, 5, 5, 6]), np.array([1, 0, 2, 3, 4, 1])
     got = rects.sums_of_boxes(x, y, np.array([5]), boxes, pairs, point)
     want = [[by_boxes(a, b, boxes[[0, 2, 3, 4]], point) for a in x[0]] for b in y[0]]
-    assert got.shape == (1, 3, 2)
+    assert got.shape == (1, 3, len(across))
     assert got[0] == pytest.approx(np.array(want), rel=1e-12)
 
 
