@@ -1,4 +1,4 @@
-"""What each of two processes does, and one alone: ``torchrun --nproc-per-node=2 -m tests.codesign.batches.of_two FOLDER``."""
+"""What each of two processes does, and one alone: ``torchrun --nproc-per-node=2 -m ...of_two FOLDER``."""
 
 import os
 import sys
