@@ -62,6 +62,19 @@ def test_defaults_are_the_promised_ones(package):
     assert len(known) > 0.8 * len(here)
 
 
+@pytest.mark.parametrize("package", ["metalens", "layout", "characterize", "codesign"])
+def test_what_must_be_above_a_number_must_be_above_nothing(package):
+    """A length, a tolerance, a count: 0 is the one limit that needs no unit."""
+    limits = []
+    for path in (ROOT / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            told = node.value if isinstance(node, ast.keyword) and node.arg == "metadata" else None
+            if isinstance(told, ast.Dict):
+                pairs = zip(told.keys, told.values, strict=True)
+                limits += [ast.literal_eval(v) for k, v in pairs if isinstance(k, ast.Constant) and k.value == "above"]
+    assert set(limits) <= {0}
+
+
 def test_priors_are_the_promised_ones():
     """Of every parameter of lens and bench: sigma, bounds, start, what is reckoned with where it is held, the step."""
     from characterize.model.parameters import PARAMETERS, UNFITTED

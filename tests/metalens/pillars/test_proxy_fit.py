@@ -218,16 +218,18 @@ def test_a_fit_costs_its_larger_error_in_units_of_the_tolerance():
         assert proxy_fit._cost(Stated(1e-3, 0.01, bad), wanted) == math.inf
 
 
-def test_the_least_largest_deviation_is_chebyshevs():
-    """x³ by parabolas errs by 1/4, x⁴ by cubics by 1/8 (its own polynomials); on points as dense as the samples are."""
-    x = np.cos(math.pi * (np.arange(60) + 0.5) / 60)
-    for power, least in ((3, 1 / 4), (4, 1 / 8)):
-        basis = np.polynomial.chebyshev.chebvander(x, power - 1)
-        found = proxy_fit._lawson(basis, np.stack([x**power, -2 * x**power]), rounds=200)
-        off = np.abs(found @ basis.T - np.stack([x**power, -2 * x**power])).max(1)
-        assert off == pytest.approx([least, 2 * least], rel=0.02)  # weights settle as 1 / rounds
-        plain = np.abs(basis @ np.linalg.lstsq(basis, x**power, rcond=None)[0] - x**power).max()
-        assert plain > 0.9 * least
+@pytest.mark.parametrize(("pole", "degree"), [(1.2, 4), (1.5, 3)])
+def test_the_least_largest_deviation_is_chebyshevs(pole, degree):
+    """1 / (x - a) by polynomials of degree n errs by (a - √(a² - 1))ⁿ / (a² - 1); least squares by 2.3 times as much.
+
+    Weights settle as 1 / rounds, 0.4 % after the 40 of a fit; those of a curve do not know of another's.
+    """
+    x = np.linspace(-1, 1, 121)
+    basis = np.polynomial.chebyshev.chebvander(x, degree)
+    values = np.stack([1 / (x - pole), -2 / (x + pole)])
+    off = np.abs(proxy_fit._lawson(basis, values) @ basis.T - values).max(1)
+    least = (pole - math.sqrt(pole**2 - 1)) ** degree / (pole**2 - 1)
+    assert off == pytest.approx([least, 2 * least], rel=0.006)
 
 
 def test_errors_of_phase_and_transmission_stand_each_in_its_place():
