@@ -87,6 +87,16 @@ def test_more_coefficients_leave_less_error():
     table = proxy_fit.fit(synthetic()).table
     assert [trial.coefficients for trial in table] == sorted(trial.coefficients for trial in table)
     assert table[-1].phase_error_rad < 1e-2 * table[0].phase_error_rad
+    assert table[-1].coefficients == 28  # two lines beyond the 24 that are taken
+
+
+def test_a_proxy_that_falls_short_has_no_more_coefficients_than_were_wanted():
+    """Less than a turn, which no more of them would complete."""
+    wanted = Wanted(coefficients=6, phase_tolerance_rad=1e-7, within_um=(0.06, 0.1))
+    made = proxy_fit.fit(synthetic(), wanted)
+    assert made.smooth_turns < 1
+    assert "1e-07" in made.shortfall
+    assert made.proxy.phase_coefficients.size == made.proxy.transmission_coefficients.size == 3
 
 
 def test_wavelengths_and_angles_between_those_of_the_library():
