@@ -44,12 +44,11 @@ class Sensitivities:
 def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) -> Sensitivities:
     """Derivatives of ln t at ``count`` diameters (of shapes: sizes) over the proxy's domain, by every answering cause.
 
-    Exact ones of RCWA at a fixed truncation, for the light that the proxy is of; central differences of a solver for a
-    section of layers, or where one is given.
+    Exact ones of RCWA at a fixed truncation, for the light that the proxy is of; central differences of a solver where
+    one is given.
 
     Args:
-        solver: (cell, diameters, wavelength, finer) to t of each; left out: RCWA of a fixed truncation, whose error
-            all but cancels in the differences.
+        solver: (cell, diameters, wavelength, finer) to t of each.
 
     Accuracy: ``error`` of the result, the change from a coarser truncation: a few percent.
 
@@ -57,9 +56,9 @@ def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) 
         CellError, MaterialError: from the solver.
     """
     diameters = np.linspace(*lens.proxy.domain_um, count)
-    if solver is None and not lens.cell.layers:
+    if solver is None:
         return _exact(lens, diameters[:: 2 if lens.cell.sidewall_rad else 1])
-    return _differences(lens, diameters, _rcwa if solver is None else solver)
+    return _differences(lens, diameters, solver)
 
 
 def _exact(lens: Lens, diameter_um: Array) -> Sensitivities:
@@ -110,11 +109,3 @@ def _some(lens: Lens, acts: Answers, diameter_um: Array) -> Array:
 def _solved(about: tuple[Solver, float], task: _Solve) -> Array:
     (solve, wavelength_um), (cell, diameter_um, finer) = about, task
     return solve(cell, diameter_um, wavelength_um, finer)
-
-
-def _rcwa(cell: Cell, diameter_um: Array, wavelength_um: float, finer: bool) -> Array:
-    """Tapered pillars are cut in slices and cost more: they get fewer harmonics."""
-    from metalens.rcwa import solve_many
-
-    harmonics = (4 if finer else 3) if cell.sidewall_rad else (8 if finer else 6)
-    return np.array([each.t for each in solve_many(cell, diameter_um, wavelength_um, harmonics=harmonics)])

@@ -1,7 +1,7 @@
 """The unit cell: one pillar of any shape on its lattice, between a substrate and a cover."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from metalens.cell.lattice import Lattice
 from metalens.cell.shapes import Outline
@@ -157,6 +157,35 @@ class Cell:
     def sections(self) -> tuple[Layer, ...]:
         """The layers, or the one section that the pillar is."""
         return self.layers or (Layer(self.height_um),)
+
+    @property
+    def height_shares(self) -> tuple[float, ...]:
+        """Of a change of the height, by section: those of the pillar's own material share it in proportion. What lies
+        under, between and on them (a pedestal, a residual mask) is of other films; all share it where none is of it."""
+        own = [layer.height_um * (layer.material is None) for layer in self.sections]
+        own = own if any(own) else [layer.height_um for layer in self.sections]
+        return tuple(height / sum(own) for height in own)
+
+    def at_height(self, height_um: float) -> "Cell":
+        """The same cell with pillars of another height; of layered ones by :attr:`height_shares`.
+
+        Raises:
+            CellError: so low that nothing is left of the pillar's own material.
+        """
+        if not self.layers:
+            return replace(self, height_um=height_um)
+        own = sum(layer.height_um for layer, share in zip(self.layers, self.height_shares, strict=True) if share)
+        more = height_um - self.height_um
+        if own + more <= 0:
+            raise CellError(
+                f"height_um = {height_um:g} of a pillar in layers, {self.height_um - own:g} um of it of other films: "
+                "need a larger height"
+            )
+        layers = tuple(
+            replace(layer, height_um=layer.height_um + more * share)
+            for layer, share in zip(self.layers, self.height_shares, strict=True)
+        )
+        return replace(self, height_um=height_um, layers=layers)
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
         """The section of a pillar of this size, wider by ``grow_um``."""

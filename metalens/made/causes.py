@@ -163,8 +163,15 @@ def _ratio(cell: Cell) -> float:
     return float(cell.shape.ratio) if isinstance(cell.shape, Rectangle | Ellipse) else 0.0
 
 
+def _heights(cell: Cell, size_um: float) -> dict[str, float]:
+    """Of the pillar, or of its sections."""
+    if not cell.layers:
+        return {"height_um": 1.0}
+    return {f"layers.{i}.height_um": share for i, share in enumerate(cell.height_shares) if share}
+
+
 def _taller(cell: Cell, amount: float, wavelength_um: float) -> Cell:
-    return dataclasses.replace(cell, height_um=cell.height_um + amount)
+    return cell.at_height(cell.height_um + amount)
 
 
 def _denser(cell: Cell, amount: float, wavelength_um: float) -> Cell:
@@ -215,7 +222,7 @@ CAUSES: tuple[Cause, ...] = (
     _widens("bias_o_nm", "oblique saddle of the diameter bias, 2xy over R²", 10.0, 15.0, ((2, 1, 1),), free=False),
     Cause(
         "height_nm", "pillar height minus design", 5.0, 10.0, -28.0, 28.0,
-        Answers(_by_height, _taller, 0.01, "height_um", _number("height_um")), 1e-3, drawn=Drawn("height_nm", 7.0),
+        Answers(_by_height, _taller, 0.01, "height_um", _heights), 1e-3, drawn=Drawn("height_nm", 7.0),
     ),
     Cause(
         "index", "refractive index of the pillars minus design", 0.02, 0.02, -0.075, 0.075,

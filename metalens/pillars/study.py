@@ -63,13 +63,13 @@ class Study:
         return self.pillar if self.cell is None else self.cell.pillar
 
     def made(self, pitch_um: float, height_um: float, pillar: Material | None = None) -> Cell:
-        """One cell of the study, or the same of another material.
+        """One cell of the study, or the same of another material; of layers those of the pillar's own take the height.
 
         Raises:
-            CellError: layers that do not add up to the height.
+            CellError: a height that the films of other materials fill.
         """
-        base = self.cell or Cell(pitch_um)
-        return replace(base, pitch_um=pitch_um, height_um=height_um, pillar=pillar or self.material)
+        base = (self.cell or Cell(pitch_um)).at_height(height_um)
+        return replace(base, pitch_um=pitch_um, pillar=pillar or self.material)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import missed, reduce
 from metalens import modal
 from metalens.cell.lattice import Lattice
-from metalens.cell.record import Cell, Index
+from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Cross, Rectangle, Square
 from metalens.ground.errors import ProcessError
 from metalens.ground.report import Figure, Table
@@ -154,6 +154,17 @@ def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, sha
     # an index change counts by the area of the pillar, to first order in the contrast (and no coupling)
     filled = share * found.diameter_um**2 / 0.3**2
     assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.7 * filled, rel=0.03)
+
+
+def test_sensitivities_of_a_layered_film_of_air_are_the_optical_path_of_its_own_sections():
+    """0.7 um, of which 0.2 um are of another film: it has no part in what the pillar's index does."""
+    layers = (Layer(0.3), Layer(0.2, material=Index(1.0)), Layer(0.2))
+    film = Cell(0.3, pillar="air", substrate="air", layers=layers)
+    narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
+    found = sensitivities(dataclasses.replace(hyperbolic(), cell=film, proxy=narrow), count=2)
+    assert found.rates[0] == pytest.approx(np.full(2, 2j * np.pi / 0.85), abs=1e-6)
+    filled = np.pi / 4 * found.diameter_um**2 / 0.3**2
+    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.5 * filled, rel=0.03)  # as in the test above
 
 
 def test_too_few_draws_are_refused():

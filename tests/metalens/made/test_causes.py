@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from metalens.cell import Cell, Index
+from metalens.cell import Cell, Index, Layer
 from metalens.made import causes, response
 from metalens.made.causes import CAUSES, Answers, Bends, Guide, Widens
 from metalens.made.response import Answer, Sensitivity
@@ -103,6 +103,19 @@ def test_changed_cells_have_so_much_more_of_the_cause():
     assert rows["height_nm"].height_um == pytest.approx(0.611)
     assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx((3.111, 0.02))
     assert rows["sidewall_deg"].sidewall_rad == pytest.approx(0.041)
+
+
+@pytest.mark.parametrize(
+    ("films", "heights"),
+    [((None, "SiO2", None), (0.103, 0.2, 0.309)), (("HfO2", "SiO2", "HfO2"), (0.102, 0.204, 0.306))],
+)
+def test_a_taller_layered_pillar_is_taller_in_its_own_material(films, heights):
+    """12 nm in proportion to the heights of its sections; of all where none is of the pillar's material."""
+    layers = tuple(Layer(h, material=film) for h, film in zip((0.1, 0.2, 0.3), films, strict=True))
+    acts = next(row.acts for _, row in causes.of_kind(Answers) if row.name == "height_nm")
+    made = acts.changed(Cell(0.4, 0.6, layers=layers), 0.012, 0.85)
+    assert [layer.height_um for layer in made.layers] == pytest.approx(heights)
+    assert made.height_um == pytest.approx(0.612)
 
 
 def test_a_drawn_gradient_points_in_its_own_direction():

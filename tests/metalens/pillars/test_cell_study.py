@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from metalens import cli
-from metalens.cell import Cell, Film, Index
+from metalens.cell import Cell, Film, Index, Layer
 from metalens.cell.shapes import Cross
 from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError, MetalensError, StoreError
@@ -105,6 +105,17 @@ def test_what_cannot_be_solved_is_refused_before_any_cell_is(cell, others, says,
     monkeypatch.setattr(workers, "run", lambda tasks: pytest.fail("cells were solved first"))
     with pytest.raises(MetalensError, match=says):
         cell_study.run(dataclasses.replace(SMALL, cell=cell, others=others))
+
+
+def test_heights_of_layered_pillars_are_made_of_their_own_material():
+    """Pedestal and residual mask stay 60 and 40 nm; what they fill leaves no pillar."""
+    layers = (Layer(0.06, material=Index(1.5)), Layer(0.5), Layer(0.04, grow_um=-0.01, material=Index(1.9)))
+    study = dataclasses.replace(SMALL, cell=Cell(0.3, 0.6, Index(3.6), layers=layers))
+    made = study.made(0.33, 0.75, Index(2.4))
+    assert [layer.height_um for layer in made.layers] == pytest.approx([0.06, 0.65, 0.04])
+    assert (made.pitch_um, made.height_um, made.pillar) == (0.33, 0.75, Index(2.4))
+    with pytest.raises(CellError, match=r"0\.1 um of it of other films: need a larger height"):
+        study.made(0.33, 0.09)
 
 
 def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
