@@ -16,6 +16,9 @@ from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Hand, Lens
 from metalens.pillars import Proxy
 
+PLACES, SEARCHED = 61, 121  # across what is lit of a lens, and across all of it, where that is looked for
+LIT = 0.5  # of the light at angle 0, below which a stop's field ends
+
 
 @dataclass(frozen=True, slots=True)
 class Quality:
@@ -238,7 +241,8 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
     exp(-sigma²) = ``strehl`` on its sensor, which is flat.
 
     sigma is the wave-front error over the aperture (of the lens, what the stop lets light on), with piston and tilt
-    taken out: at most 60 degrees.
+    taken out: at most 60 degrees. Behind a stop it ends where the light of less than half the pillars of angle 0 is
+    left, whatever the rest does.
     """
     low, high = 0.0, np.pi / 3
     for _ in range(40):
@@ -260,18 +264,31 @@ def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> flo
 
 
 def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
-    unit = np.linspace(-1, 1, 61)
-    x, y = (g[np.hypot(*np.meshgrid(unit, unit)) <= 1] * radius_um for g in np.meshgrid(unit, unit))
-    tangent = math.tan(angle_rad)
-    if focus.layers.stop is not None:  # the part of the lens that the angle's light falls on
-        lit = focus.layers.lit((tangent, 0.0), focus.source_distance_um, focus.wavelength_um, (x, y), 1e-6 * radius_um)
-        if (lit > 0).sum() < 30:  # a hundredth of the lens
-            return math.inf
-        x, y = x[lit > 0], y[lit > 0]
+    x, y, lit_um2 = _lit(focus, radius_um, math.tan(angle_rad))
+    if lit_um2 <= 0 or lit_um2 < LIT * _lit(focus, radius_um, 0.0)[2]:
+        return math.inf
     path = profiles.hyperbolic(x, y, focus)
-    for one in focus.paths_from(x, y, tangent):
+    for one in focus.paths_from(x, y, math.tan(angle_rad)):
         path = path + 2 * np.pi / focus.wavelength_um * one
     basis = np.stack([np.ones_like(x), x, y], axis=1)
     basis /= np.abs(basis).max(axis=0)
     residual = path - basis @ np.linalg.lstsq(basis, path, rcond=None)[0]
     return float((residual**2).mean())
+
+
+def _lit(focus: Focus, radius_um: float, tangent: float) -> tuple[Array, Array, float]:
+    """Places (x,) and (y,) of the lens that an angle's light falls on, ``PLACES`` across, and their area in um²."""
+    middle, half = (0.0, 0.0), radius_um
+    for look in (PLACES,) if focus.layers.stop is None else (SEARCHED, PLACES):
+        unit, step = np.linspace(-half, half, look, retstep=True)
+        x, y = np.meshgrid(middle[0] + unit, middle[1] + unit)
+        there = np.hypot(x, y) <= radius_um * (1 + 1e-12)
+        if focus.layers.stop is not None:
+            source = (tangent, 0.0), focus.source_distance_um, focus.wavelength_um
+            there &= focus.layers.lit(*source, (x, y), 1e-6 * radius_um) > 0
+        x, y = x[there], y[there]
+        if not x.size:
+            break
+        middle = (float(x.max() + x.min()) / 2, float(y.max() + y.min()) / 2)
+        half = float(max(np.ptp(x), np.ptp(y)) / 2 + step)
+    return x, y, x.size * float(step) ** 2

@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
+from metalens.cell import Film, Index
 from metalens.design import of_phase
 from metalens.design.profiles import Focus
 from metalens.lens import Layers, Stop
@@ -38,12 +40,29 @@ def test_quality_is_that_of_the_sum_of_all_pillars():
     assert made.steepest == pytest.approx(steepest, rel=1e-12)
 
 
-def test_thirty_places_of_the_lens_are_light_enough_for_a_wave_front():
-    """Places 20 um apart: a hole of 61.6 um about one holds 29 of them, one of 62.3 um about a middle of two holds 30;
-    light at 0.1 rad comes from half a step aside."""
-    few, enough = (Focus(0.79, 1700.0, math.inf, Layers(stop=Stop(r, 100.0))) for r in (61.6, 62.3))
-    assert of_phase._wavefront_variance(few, 600.0, 0.0) == math.inf
-    assert of_phase._wavefront_variance(enough, 600.0, math.atan(0.1)) < 1e-3
+def test_the_field_behind_a_stop_ends_where_half_its_light_misses_the_lens():
+    """Two circles, of the hole and of the lens, as far apart as Snell's law moves the light through the substrate: the
+    angle at which they share half the hole. Alone the wave front of what is left has no end there."""
+    hole, radius, thick, index = 31.0, 58.0, 150.0, 1.45
+
+    def shared(apart: float) -> float:
+        half = [math.acos((apart**2 + a**2 - b**2) / (2 * apart * a)) for a, b in ((hole, radius), (radius, hole))]
+        return sum(a**2 * (t - math.sin(2 * t) / 2) for a, t in zip((hole, radius), half, strict=True))
+
+    apart = brentq(lambda s: shared(s) - math.pi * hole**2 / 2, radius - 0.5 * hole, radius + 0.5 * hole)
+    inside = math.sin(math.atan(apart / thick))
+    layers = Layers(front=(Film(Index(index), thick),), stop=Stop(hole, thick))
+    found = of_phase.field_angle(Focus(0.85, 600.0, math.inf, layers), radius)
+    # 61 places across: their count is good to 1 % of the hole, by which half of it moves 0.4 um or 2e-3 rad
+    assert found == pytest.approx(math.asin(index * inside), abs=3e-3)
+
+
+def test_a_narrow_hole_before_a_wide_lens_has_the_field_that_it_lights():
+    """A hole of a twentieth of the lens, so narrow that aberrations come later: half its light leaves the lens at
+    tan = 600 / 1500, through air."""
+    found = of_phase.field_angle(Focus(0.79, 1000.0, math.inf, Layers(stop=Stop(30.0, 1500.0))), 600.0)
+    # of 61 places across the hole half a place is 0.5 um; the rim's curve takes 0.4 um: 5e-4 rad together
+    assert found == pytest.approx(math.atan(0.4), abs=1e-3)
 
 
 def test_the_field_behind_a_hole_beside_the_axis_is_that_of_its_worst_side():
