@@ -20,9 +20,11 @@ from metalens.design import Focus
 from metalens.design.free_form import Fisher, design_pupil
 from metalens.design.free_form import simple_lenses as baselines
 from metalens.ground import config, reading, store
-from metalens.ground.errors import ConfigError
+from metalens.ground.errors import ConfigError, PropagationError
 from metalens.ground.report import Figure, Section, Table, write
 from metalens.lens import Lens
+
+SPREAD = "brings no light together in one bright spot of the sensor: its beams are shown by psf --far-field"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +71,19 @@ def _measure(
     axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
     pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="field")
     seen = {name: settings.over_field.of(lens, made[0], measured.angles_deg) for name, lens in pairs}
-    scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
-    tables = [*evaluate_tables.tables(axial, scenes, measured), *field_page.tables(seen)]
+    spread = [name for name, lens in zip(names, made, strict=True) if not design.focused(lens)]
+    told = [f"{name} {SPREAD}" for name in spread]
+    try:
+        scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
+    except PropagationError as error:
+        raise ConfigError("; ".join([str(error), *told])) from error
+    tables = [*evaluate_tables.tables(axial, scenes, measured, spread=told), *field_page.tables(seen)]
     values = evaluate_tables.values(axial, scenes, measured)
     for name, one in seen.items():
-        values["lenses"][name]["field"] = field_page.values(one)
+        values["lenses"][name] |= {"focuses": name not in spread, "field": field_page.values(one)}
     if options.reader:
-        told = judged(dict(zip(names, made, strict=True)), settings.reader)
-        found = dict(options.console.track(told, total=len(made), label="reader"))
-        tables.append(reader.table(found, settings.reader))
-        values["reader"] = {"settings": dataclasses.asdict(settings.reader)}
-        values["reader"]["lenses"] = {name: one.values() for name, one in found.items()}
+        table, values["reader"] = _read(options, settings.reader, dict(zip(names, made, strict=True)))
+        tables.append(table)
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
     store.write_text(folder / "optics.json", json.dumps(values, indent=1) + "\n")
@@ -92,6 +96,13 @@ def _measure(
     }
     _write(folder, pictures, tables)
     return values, text
+
+
+def _read(options: Options, setting: ReaderConfig, made: dict[str, Lens]) -> tuple[Table, dict[str, Any]]:
+    """What the reference reader makes of every lens."""
+    found = dict(options.console.track(judged(made, setting), total=len(made), label="reader"))
+    told = {name: one.values() for name, one in found.items()}
+    return reader.table(found, setting), {"settings": dataclasses.asdict(setting), "lenses": told}
 
 
 def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:

@@ -1,7 +1,7 @@
 """Tables 1 and 3 of the paper for any lenses, as tables and as numbers, with intervals over scenes."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,17 +63,20 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
     return out
 
 
-def tables(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> list[Table]:
-    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the paper's numbers below each."""
-    return [_axial(axial, setting), _scenes(scenes)]
+def tables(
+    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled, *, spread: Sequence[str] = ()
+) -> list[Table]:
+    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the paper's numbers below each;
+    spread: what is said of lenses that do not focus, a line each."""
+    return [_axial(axial, setting, spread), _scenes(scenes)]
 
 
-def _axial(axial: Mapping[str, Axial], setting: Filled) -> Table:
+def _axial(axial: Mapping[str, Axial], setting: Filled, spread: Sequence[str]) -> Table:
     low, high = setting.depths_mm
     caption = (
         f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
         f"normalisation, averaged over sub-pixel positions; pixels of {setting.pixel_um:g} µm. Light: the least share "
-        f"within {setting.radius_um:g} µm over the depths."
+        f"within {setting.radius_um:g} µm over the depths." + "".join(f"\n{line}." for line in spread)
     )
     head = ("lens", "binning", *(f"{angle:g}°" for angle in setting.angles_deg), "light on axis", "light at all angles")
     rows: list[tuple[str, ...]] = []

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from metalens.design import profiles as profiles
     from metalens.design.focus_check import FocusCheck as FocusCheck
     from metalens.design.focus_check import check_focus as check_focus
+    from metalens.design.focusing import focused as focused
     from metalens.design.focusing import focuses as focuses
     from metalens.design.focusing import meeting_um as meeting_um
     from metalens.design.of_phase import Limits as Limits
@@ -49,6 +50,7 @@ __getattr__, __dir__, __all__ = attach(
         "Unlike": "own_cell",
         "Wanted": "several",
         "check_focus": "focus_check",
+        "focused": "focusing",
         "focuses": "focusing",
         "meeting_um": "focusing",
         "hyperbolic": "profiles",

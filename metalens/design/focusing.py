@@ -5,7 +5,7 @@ import numpy as np
 from metalens.design.profiles import Focus
 from metalens.design.sites import PhaseOf
 from metalens.ground.arrays import Array
-from metalens.lens import media
+from metalens.lens import Lens, media
 
 RAYS = 25  # along an axis
 _APART = 0.98764321  # of the even spacing of rays: never in step with the samples of a map
@@ -34,7 +34,22 @@ def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) 
         return False
     lit = np.exp(1j * (phase(axis, axis) + k * focus.path_um(x**2 + y**2)))[np.hypot(x, y) <= radius_um]
     centred = np.hypot(*(m.mean() for m in meets)) * radius_um * k / focus.sensor_distance_um < 1
-    return not centred or abs(lit.mean()) ** 2 > DARK
+    return bool(not centred or abs(lit.mean()) ** 2 > DARK)
+
+
+def focused(lens: Lens) -> bool:
+    """As :func:`focuses`, of the pillars of a lens: every place has the phase of the pillar next to it."""
+    d, phase = lens.diameters, lens.phase_rad()
+
+    def nearest(x_um: Array, y_um: Array) -> Array:
+        rows, columns = (
+            np.clip(np.rint(at / step + (n - 1) / 2).astype(int), 0, n - 1)
+            for at, step, n in zip((y_um, x_um), d.steps_um[::-1], phase.shape, strict=True)
+        )
+        return np.asarray(phase[np.ix_(rows, columns)])
+
+    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    return focuses(nearest, focus, radius_um=d.radius_um + d.pitch_um / 2, pitch_um=d.pitch_um)
 
 
 def meeting_um(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> float | None:

@@ -86,6 +86,17 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_deflector_is_told_to_have_no_focus(tmp_path, capsys):
+    focus, wave = Focus(0.85, 600.0, 2000.0), 2 * math.pi / 0.85
+    found = design.make(lambda x, y: 0.11 * wave * x + 0 * y[:, None], focus, aperture_um=60.0, cell=CELL, proxy=IDEAL)
+    lens.save(tmp_path / "prism.h5", found[0])
+    (tmp_path / "o.toml").write_text(TOML)
+    words = [str(tmp_path / "prism.h5"), "--config", str(tmp_path / "o.toml"), "--scenes", "1"]
+    cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")])
+    shown = capsys.readouterr()
+    assert "prism brings no light together in one bright spot" in shown.out + shown.err
+
+
 def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     (tmp_path / "o.toml").write_text(TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0"))

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from metalens.cell.record import Film, Index
+from metalens import design
+from metalens.cell.record import Cell, Film, Index
 from metalens.design import Focus, meeting_um
 from metalens.lens import Layers
+from metalens.pillars.proxy import Proxy
 
 K = 2 * np.pi / 1.31
 ABOUT = {"radius_um": 130.0, "pitch_um": 0.6}
@@ -38,3 +40,28 @@ def test_no_meeting_of_rays_that_spread_or_part():
         assert meeting_um(phase, focus, **ABOUT) is None
     behind = Focus(1.31, 800.0, layers=Layers(behind=(Film(Index(1.5), 201.0),)))
     assert meeting_um(lens(900.0, np.inf), behind, **ABOUT) is None
+
+
+TURNS = Proxy(np.array([[0.0, 3 * np.pi]]), np.array([[1.0]]), (0.1, 0.5), (1.31, 1.31), 1e-6, 1e-6)
+CELL = Cell(pitch_um=0.6, pillar=Index(3.4), substrate=Index(1.45))
+
+
+@pytest.mark.parametrize(
+    ("added", "focused"),
+    [
+        (lambda x, y: 0.0 * x * y, True),
+        (lambda x, y: 0.03 * K * x + 0.0 * y, True),  # the same lens aside
+        (lambda x, y: 2 * np.arctan2(y, x), False),  # dark in the middle
+        (lambda x, y: K * np.hypot(x, y) ** 2 / 600.0 + 0.1 * K * x, False),  # a deflector without power
+        (lambda x, y: K * (x * x - y * y) / 500.0, False),  # a line
+    ],
+)
+def test_pillars_focus_as_the_phase_that_they_were_made_for(added, focused):
+    focus = Focus(1.31, 300.0, np.inf)
+
+    def phase(x, y):
+        ideal = -K * (x**2 + y[:, None] ** 2) / 600.0
+        return ideal + added(*np.meshgrid(x, y))
+
+    made, _ = design.make(phase, focus, aperture_um=52.0, cell=CELL, proxy=TURNS)
+    assert design.focused(made) is focused
