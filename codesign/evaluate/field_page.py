@@ -110,10 +110,10 @@ def _told(value: float, digits: int) -> str:
 def picture(seen: Mapping[str, OverField]) -> bytes:
     """Distortion, foci and light over the field angle."""
     figure, panels = canvas(1, 3, size=(10.5, 3.4))
-    for number, (name, one) in enumerate(seen.items()):
-        order, colour = np.argsort(one.angles_deg), f"C{number % 6}"
+    for name, one in seen.items():
+        order = np.argsort(one.angles_deg)
         angle = one.angles_deg[order]
-        panels[0].plot(angle, 100 * one.distortion[order], ".-", color=colour, label=name)
+        colour = panels[0].plot(angle, 100 * one.distortion[order], ".-", label=name)[0].get_color()
         for axis, style, mark in ((0, "-", "o"), (1, "--", "s")):
             panels[1].plot(angle, one.close_um[order, axis], style, color=colour)
             panels[1].plot(angle, one.sharpest_um[order, axis], mark, color=colour, markersize=3, fillstyle="none")
@@ -132,10 +132,11 @@ def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
     """MTF over the field angle, a panel for each frequency."""
     frequencies = next(iter(seen.values())).frequencies_per_mm
     figure, panels = canvas(1, len(frequencies), size=(1 + 3.2 * len(frequencies), 3.2), squeeze=False, sharey=True)
-    for number, (name, one) in enumerate(seen.items()):
-        order, colour = np.argsort(one.angles_deg), f"C{number % 6}"
+    for name, one in seen.items():
+        order = np.argsort(one.angles_deg)
         for k, panel in enumerate(panels[0]):
-            panel.plot(one.angles_deg[order], one.mtf[order, 0, k], ".-", color=colour, label=name)
+            line = panel.plot(one.angles_deg[order], one.mtf[order, 0, k], ".-", label=name)
+            colour = line[0].get_color()
             panel.plot(one.angles_deg[order], one.mtf[order, 1, k], ".--", color=colour)
     for panel, frequency in zip(panels[0], frequencies, strict=True):
         panel.set(title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1))
