@@ -5,7 +5,7 @@ stays further than the gap from all that is drawn around every copy of the cell 
 once. The others are drawn in the cells that hold the copies, and checked there or, by the same rule, further up.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,12 +13,13 @@ import numpy as np
 from layout.rules import near
 from layout.rules.copies import ROOT, Copies, Parts, advice
 from layout.rules.layer import EMPTY, Layer, joined
-from layout.shapes import polygon, rectilinear
+from layout.shapes import polygon, rectilinear, squared
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 _AT_ONCE = 1 << 18  # shapes whose boxes are looked at together
-_SQUARES = 1024  # each way, in which a cell is marked where others are near it
+_SQUARES = 1024  # each way, in which a cell is marked where others are near it, or where it draws
+_MOST_BOXES = 1 << 22  # that are told to copies for what other copies draw
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,7 +38,7 @@ class _Work:
     """One layer number. drawn: shapes of each cell; those that are taken out of others join them. count: of all these.
 
     box: (4,) around all of a cell. held: its copies. met: boxes (n, 4) of what is drawn around the copies of a cell, as
-    they see it.
+    they see it. covered: boxes (n, 4) of what a cell draws, in so many squares each way.
     """
 
     parts: Parts
@@ -48,6 +49,7 @@ class _Work:
     box: dict[str, Array] = field(default_factory=dict)
     held: dict[str, _Held] = field(default_factory=dict)
     met: dict[str, list[Array]] = field(default_factory=dict)
+    covered: dict[tuple[str, int], Array] = field(default_factory=dict)
 
 
 def separate(parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int) -> Iterator[tuple[str, Layer]]:
@@ -95,20 +97,68 @@ def _meet(work: _Work, name: str) -> None:
     held, layer = work.held[name], work.drawn[name][0]
     if not len(held.which):
         return
-    for box in np.unique(np.concatenate(work.met.get(name, [np.empty((0, 4), np.int64)])), axis=0):
-        _enter(work, held, np.arange(len(held.which)), np.broadcast_to(box, held.box.shape))
+    met = np.unique(np.concatenate(work.met.get(name, [np.empty((0, 4), np.int64)])), axis=0)
+    _enter_each(work, held, np.arange(len(held.which)), met)
     shapes = len(layer.kind)
     for one, two in _near(held, layer, work.gap):
         of_copies = two >= shapes
-        _enter(work, held, one[of_copies] - shapes, held.box[two[of_copies] - shapes])
+        _meet_copies(work, held, one[of_copies] - shapes, two[of_copies] - shapes)
         copy, shape = one[~of_copies] - shapes, two[~of_copies]
         touching = _touch(held.box[copy], layer.boxes(shape), work.gap)
         copy, shape = copy[touching], shape[touching]
         for kind in np.unique(layer.kind[shape]).tolist():
-            pieces, own = _covering(layer.outlines[kind]), layer.kind[shape] == kind
-            place = np.column_stack([layer.x[shape[own]], layer.y[shape[own]]] * 2).astype(np.int64)
-            boxes = (place[:, None] + pieces).reshape(-1, 4)
-            _enter(work, held, np.repeat(copy[own], len(pieces)), boxes)
+            own = layer.kind[shape] == kind
+            boxes = _pieces(layer, kind, shape[own])
+            _enter(work, held, np.repeat(copy[own], len(boxes) // own.sum()), boxes)
+
+
+def _meet_copies(work: _Work, held: _Held, one: Array, two: Array) -> None:
+    """Tell copies ``one`` what copies ``two`` draw near them: in finer squares, the fewer these pairs are."""
+    touching = _touch(held.box[one], held.box[two], work.gap)
+    one, two = one[touching], two[touching]
+    squares = _squares(len(two), _SQUARES)
+    for n in np.unique(two).tolist():
+        some = held.copies[held.which[n]]
+        place = np.array([held.x[n], held.y[n]] * 2)
+        _enter_each(work, held, one[two == n], some.turn.boxes(_covered(work, some.child, squares)) + place)
+
+
+def _covered(work: _Work, name: str, squares: int) -> Array:
+    """(n, 4) boxes that cover all that a cell draws, its own copies included, in ``squares`` each way."""
+    if squares == 1:
+        return work.box[name][None]
+    if (name, squares) not in work.covered:
+        every = _boxes_drawn(work, name, squares)
+        work.covered[name, squares] = squared.Squared.of(work.box[name], squares, every).boxes()
+    return work.covered[name, squares]
+
+
+def _boxes_drawn(work: _Work, name: str, squares: int) -> Iterator[Array]:
+    """Boxes (n, 4) of what a cell draws: of its shapes, those that are wide in pieces, and of its copies."""
+    layer, held = work.drawn[name][0], work.held[name]
+    wide = np.array([np.ptp(o, axis=0).max() for o in layer.outlines]) > 4 / squares * np.ptp(work.box[name][[0, 2]])
+    for first in range(0, len(layer.kind), _AT_ONCE):
+        some = np.arange(first, min(first + _AT_ONCE, len(layer.kind)))
+        in_pieces = wide[layer.kind[some]]
+        yield layer.boxes(some[~in_pieces])
+        for kind in np.unique(layer.kind[some[in_pieces]]).tolist():
+            yield _pieces(layer, kind, some[layer.kind[some] == kind])
+    inner = _squares(len(held.which), squares)
+    for copies in held.copies:
+        boxes = copies.turn.boxes(_covered(work, copies.child, inner))
+        for x, y in zip(copies.x.tolist(), copies.y.tolist(), strict=True):
+            yield boxes + np.array([x, y, x, y])
+
+
+def _squares(times: int, most: int) -> int:
+    """Squares each way of a cell whose boxes are told so many times: as fine as their number allows."""
+    return 1 << int(np.log2(np.clip(_MOST_BOXES // (4 * max(times, 1)), 1, most)))
+
+
+def _pieces(layer: Layer, kind: int, shapes: Array) -> Array:
+    """Boxes (n * m, 4) that cover shapes (n,) of one kind, m for each."""
+    place = np.column_stack([layer.x[shapes], layer.y[shapes]] * 2).astype(np.int64)
+    return np.asarray((place[:, None] + _covering(layer.outlines[kind])).reshape(-1, 4))
 
 
 def _near(held: _Held, layer: Layer, gap: float) -> Iterator[tuple[Array, Array]]:
@@ -129,6 +179,12 @@ def _near(held: _Held, layer: Layer, gap: float) -> Iterator[tuple[Array, Array]
     for a, b in ((one, two), (two, one)):
         copies = a >= len(layer.kind)
         yield a[copies], b[copies]
+
+
+def _enter_each(work: _Work, held: _Held, copy: Array, boxes: Array) -> None:
+    """Each of boxes (m, 4), as it is drawn, beside each of copies (n,)."""
+    for some in np.array_split(boxes, max(1, -(-len(boxes) * len(copy) // _AT_ONCE))):
+        _enter(work, held, np.tile(copy, len(some)), np.repeat(some, len(copy), axis=0))
 
 
 def _enter(work: _Work, held: _Held, copy: Array, boxes: Array) -> None:
@@ -155,8 +211,10 @@ def _taken_out(work: _Work, name: str) -> Layer:
     if not met or not len(layer.kind):
         return layer
     boxes = np.unique(np.concatenate(met), axis=0) + work.gap * np.array([-1, -1, 1, 1])
-    marked = _marked(boxes, work.box[name])
-    hit = np.concatenate([marked(layer.boxes(slice(n, n + _AT_ONCE))) for n in range(0, len(layer.kind), _AT_ONCE)])
+    around = squared.Squared.of(work.box[name], _SQUARES, [boxes])
+    hit = np.concatenate(
+        [around.touched(layer.boxes(slice(n, n + _AT_ONCE))) for n in range(0, len(layer.kind), _AT_ONCE)]
+    )
     if not hit.any():
         return layer
     taken = _with_their_groups(layer, hit, work.gap)
@@ -190,25 +248,6 @@ def _with_their_groups(layer: Layer, hit: Array, gap: float) -> Array:
     groups = np.zeros(count, bool)
     groups[label[hit]] = True
     return np.asarray(groups[label])
-
-
-def _marked(boxes: Array, around: Array) -> Callable[[Array], Array]:
-    """Tells (n,) whether shapes (n, 4) share a square of a raster over ``around`` with any of the boxes (m, 4)."""
-    side = max(float((around[2:] - around[:2]).max()) / _SQUARES, 1.0)
-    first = around[[0, 1] * 2]
-    squares = (boxes - first) // side
-    outside = (squares[:, 2:] < 0).any(1) | (squares[:, :2] > _SQUARES).any(1)
-    held = np.zeros((_SQUARES + 2, _SQUARES + 2), np.int32)
-    for left, bottom, right, top in np.clip(squares[~outside], 0, _SQUARES).astype(np.int64).tolist():
-        held[left + 1 : right + 2, bottom + 1 : top + 2] = 1
-    sums = held.cumsum(0, dtype=np.int64).cumsum(1)
-
-    def marked(shapes: Array) -> Array:
-        left, bottom, right, top = np.clip((shapes - first) // side, 0, _SQUARES).astype(np.int64).T
-        found = sums[right + 1, top + 1] - sums[left, top + 1] - sums[right + 1, bottom] + sums[left, bottom]
-        return np.asarray(found > 0)
-
-    return marked
 
 
 def _touch(one: Array, two: Array, gap: float) -> Array:

@@ -203,3 +203,37 @@ def test_what_is_beyond_the_limit_even_so_says_what_would_do():
     made = wafer((3, 2), (60_000, 30_000))
     with pytest.raises(MaskFileError, match=r"draws 51,846 shapes.* 8,647 are left.*most-shapes 8647 takes"):
         foreign.check(taken_apart(made), Rules(), most=8_000)
+
+
+def eighths(rng, reach=90):
+    """A disc of boxes stored as layout folds it: an eighth, placed eight times, and its diagonal, placed four times."""
+    at, size = np.arange(1, reach) * 300, [np.array([[-s, -s], [s, -s], [s, s], [-s, s]]) for s in (60, 77, 91)]
+    x, y = (v.ravel() for v in np.meshgrid(at, at))
+    kind = rng.integers(3, size=len(x))
+    inside = x**2 + y**2 < (300 * reach) ** 2
+    some = {"EIGHTH": (y < x) & inside, "DIAGONAL": (y == x) & inside}
+    cells = {f"P{k}": CellContent(f"P{k}", {(1, 0): [o]}) for k, o in enumerate(size)}
+    placed = {n: tuple(Copies(f"P{kind[i]}", x[i], y[i]) for i in np.flatnonzero(s)) for n, s in some.items()}
+    cells |= {n: CellContent(n) for n in (*some, "LENS")}
+    turns = {"EIGHTH": QUARTERS, "DIAGONAL": QUARTERS[:4]}
+    return cells, placed | {"LENS": tuple(Copies(n, 0, 0, t) for n in some for t in turns[n])}
+
+
+def test_eighths_of_a_lens_that_lie_in_each_others_boxes_are_looked_at_once_but_for_their_edges(monkeypatch):
+    """A bar of the eighth is too near the box to its right, in each copy; only rows along the edges are taken apart."""
+    cells, placed = eighths(np.random.default_rng(3))
+    near_by = np.array([[0, 0], [25, 0], [25, 90], [0, 90]]) + np.array([12_165, 6_000])
+    cells["EIGHTH"] = CellContent("EIGHTH", {(1, 0): [near_by]})
+    content = taken_apart(Assembly("M", cells, placed))
+    shapes = sum(len(placed[n]) * times for n, times in (("EIGHTH", 8), ("DIAGONAL", 4)))
+    rules = Rules(minimum_gap_nm=70, minimum_feature_nm=20)
+    monkeypatch.setattr(copies, "_LEAST", 2000)
+    report = foreign.check(content, rules, most=len(placed["EIGHTH"]) + 8 * 6 * 90)
+    assert len(placed["EIGHTH"]) + 8 * 6 * 90 < shapes / 3
+    assert report.pillars == shapes + 8
+    monkeypatch.setattr(copies, "_LEAST", NEVER)
+    assert told(foreign.check(content, rules)) == told(report)
+    assert {rule: n for rule, n in report.counts.items() if n} == {"gap": 8}
+    beside = next(c for c in placed["EIGHTH"] if (c.x, c.y) == (12_300, 6_000))
+    half = cells[beside.child].polygons[1, 0][0].max()
+    assert report.minimum_gap_nm == 12_300 - half - 12_190
