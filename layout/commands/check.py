@@ -30,7 +30,7 @@ class Options(Common):
         output: marker database to write (.lyrdb for KLayout); left out: none.
         ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
         most_shapes: shapes that may be taken apart, some 150 bytes of memory for each; a large cell that is placed
-            again and again counts once. Left out: 4 million, and four more for each byte of the file.
+            again and again counts once. Left out: 4 million, and six more for each byte of the file.
         strict: also what readers let pass and a mask shop might not: names of cells, one top cell, doubled vertices,
             strict tables and the checksum of OASIS.
     """

@@ -180,7 +180,10 @@ class _Reader:
     def count(self, more: int) -> None:
         self.placed += more
         if self.placed > self.limit:
-            raise self.fail(f"{self.placed:,} placements up to here, at most {self.limit:,} are read")
+            raise self.fail(
+                f"{self.placed:,} placements up to here, at most {self.limit:,} are read (metalens check --most-shapes "
+                "sets another limit)"
+            )
 
     def fields(self) -> dict[int, bytes]:
         """{kind: data} up to ENDEL."""

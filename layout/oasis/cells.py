@@ -150,7 +150,7 @@ class CellReader:
         if self.budget.used > self.budget.limit:
             raise c.fail(
                 f"{self.budget.used:,} placements and copies up to here (a drawn copy counts as {_DRAWN} and its "
-                f"corners), at most {self.budget.limit:,} are read"
+                f"corners), at most {self.budget.limit:,} are read (metalens check --most-shapes sets another limit)"
             )
 
     def _need(self, c: Cursor, value: Value | None, what: str) -> Value:

@@ -26,7 +26,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
-_EACH_BYTE = 4  # more of them for each byte: our densest masks, pillars of few sizes as OASIS arrays, hold 3.8
+_EACH_BYTE = 6  # more of them for each byte: our lenses of 1 to 4 mm, not folded, hold 3.8 to 4.7 pillars in each
 _AT_ONCE = 1 << 18  # shapes that are held to the grid at once
 _CLEAR = -1  # number of all layers together whose clear areas stay
 _ROUNDED = 1e-6  # of a step of a grid that is no whole number of units

@@ -55,7 +55,7 @@ class Squared:
         ends = np.column_stack([left[new], row[new], right[new], row[last] + 1]) * self.side
         low, high = np.tile(self.around[:2], 2), np.tile(self.around[2:], 2)
         whole = np.hstack([np.floor(ends[:, :2]), np.ceil(ends[:, 2:])]).astype(np.int64) + low
-        return np.clip(whole, low, high)
+        return np.asarray(np.clip(whole, low, high))
 
 
 def _range(boxes: Array, low: Array, side: float, count: Array) -> Array:
