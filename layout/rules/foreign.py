@@ -218,6 +218,7 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
         shapes = [layer.points(n) for n in members]
         whole = len(shapes) == 1 and layers.is_convex(shapes[0])
         contours = [layers.plain(c) for c in (shapes if whole else region.union(shapes))]
+        contours = [c for c in contours if len(c) > 2]  # lines draw nothing
         for contour in contours:
             known = layers.is_convex(contour) and (whole or not _holds(contour, contours))
             if known and number < len(groups):
@@ -229,6 +230,8 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
             lines.append(np.hstack([contour, np.roll(contour, -1, axis=0)]))
             owner.append(np.full(len(contour), facing.KNOWN if known else number))
             hiding.append(np.full(len(contour), number >= len(groups)))
+    if not lines:
+        return
     edge, shape, hides = np.concatenate(lines), np.concatenate(owner), np.concatenate(hiding)
     feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
     found = facing.facing(edge, shape, feature, gap, hole=np.concatenate(within))

@@ -125,8 +125,10 @@ def groups(
 
 
 def gathered(some: list[list[flat.Shapes]]) -> Layer:
-    """All of them, those of one outline together; they are let go on the way."""
-    outlines = [filled(plain(np.asarray(group[0].outline, np.int64))) for group in some]
+    """All of them, those of one outline together; they are let go on the way. Points and lines draw nothing."""
+    corners = [plain(np.asarray(group[0].outline, np.int64)) for group in some]
+    some = [group for group, own in zip(some, corners, strict=True) if len(own) > 2]
+    outlines = [filled(own) for own in corners if len(own) > 2]
     cells = [group[0].cell for group in some]
     total, at = sum(len(shape.x) for group in some for shape in group), 0
     kind, x, y = (np.empty(total, np.int32) for _ in range(3))

@@ -63,7 +63,7 @@ def separate(parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int) ->
         MaskFileError: more than these, or shapes beyond 32 bits.
     """
     if len(parts.times) == 1:  # nothing is placed again and again
-        yield from drawn.items()
+        yield from ((name, layer) for name, layer in drawn.items() if len(layer.kind))
         return
     every = {name: [drawn.get(name, EMPTY)] for name in parts.times}
     work = _Work(parts, max(gap, 1.0), most, every, sum(len(layer.kind) for layer in drawn.values()))

@@ -1,12 +1,14 @@
 """Rules on masks made elsewhere: no disagreement with KLayout on what both can express."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 
 import layout
 from layout.commands.check import read
+from layout.files import CellContent, MaskContent
 from layout.mask import build
 from layout.process import process as processes
 from layout.process.process import Rules
@@ -326,3 +328,24 @@ def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
     assert report.ok
     assert 119 < report.minimum_feature_nm < 123
     assert foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)).counts["feature"] == 3
+
+
+@pytest.mark.parametrize(
+    "flat",
+    [
+        [[0, 0], [100, 0], [300, 0]],
+        [[5, 5], [5, 5], [5, 5]],
+        [[0, 0], [500, 0], [500, 0], [0, 0]],
+        [[10, 10], [200, 200], [300, 300]],
+        [[500, 100], [900, 100], [700, 100]],
+        [[0, 0], [100, 0], [100, 90], [100, 0], [180, 70], [100, 0]],
+    ],
+)
+def test_a_polygon_without_area_draws_nothing(flat):
+    """Alone, and on or beside a box that keeps the rules: what the box alone gives, 500 by 400 nm."""
+    box = np.array([[0, 0], [500, 0], [500, 400], [0, 400]])
+    for drawn in ([box], []):
+        cell = CellContent("T", {(1, 0): [*drawn, np.array(flat)]})
+        report = foreign.check(MaskContent("GDSII", 1.0, {"T": cell}), Rules())
+        assert report.ok
+        assert report.minimum_feature_nm == (400 if drawn else math.inf)
