@@ -12,6 +12,7 @@ import importlib
 import io
 import math
 import os
+import re
 import shutil
 import signal
 import sys
@@ -96,6 +97,7 @@ TOLD = {"mask": "layout.commands.info"}
 WHOLE = {"budget": {"process": "layout.process.process:load"}, "retrain": {"process": "layout.process.process:load"}}
 
 _LARGEST = 1e9  # size of a number among options, in its unit
+_PARTED = re.compile(r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+")  # numbers of an option, with commas
 _AGAIN_S = 0.02  # after which a dropped interrupt comes again
 _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
@@ -259,6 +261,11 @@ def _dispatch(verb: str, words: list[str]) -> int:
     except BrokenPipeError:  # whoever was shown the help went away
         console.silence()
         return SUCCESS
+    except SystemExit as end:
+        if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):
+            apart = parted.replace(",", " ").replace("=", " ")
+            return _refuse(f"{parted}: part the numbers of a list by blanks, as {apart}; a decimal has a point")
+        raise
     _refuse_beyond_reach(options)
     for name, where in WHOLE.get(verb, {}).items():
         if getattr(options, name) is not None:

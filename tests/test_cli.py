@@ -24,6 +24,15 @@ def test_help_lists_every_verb():
         assert f"  {verb}" in done.stdout
 
 
+@pytest.mark.parametrize("words", [("--heights-um", "0.1,0.25,0.4"), ("--heights-um=0,3",), ("--diameter-um", "0,15")])
+def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
+    done = run("field", "cell.toml", *words)
+    assert done.returncode == cli.BAD_INPUT
+    assert done.stderr.splitlines()[-1].startswith(
+        f"metalens: error: {words[-1]}: part the numbers of a list by blanks"
+    )
+
+
 def work(module):
     """Source of the module that does the work of a verb."""
     return inspect.getsource(importlib.import_module(getattr(module, "WORK", module.__name__)))

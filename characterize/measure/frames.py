@@ -84,7 +84,8 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
         raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml")
     frames = clean(capture)
     step = capture.pixel_um
-    light = np.stack([_above(f, u) for f, u in zip(frames.electrons, frames.usable, strict=True)])
+    shots = zip(frames.electrons, frames.usable, _places(capture), strict=True)
+    light = np.stack([_above(*shot) for shot in shots])
     notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
         notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
@@ -150,13 +151,26 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
     return metrics.strehl(image, ideal - np.median(_rim(ideal)))
 
 
-def _above(electrons: Array, usable: Array) -> Array:
-    """The frame above the median of its border; masked pixels by :func:`_filled`."""
+def _places(capture: Capture) -> list[str]:
+    """Name and depth of every frame."""
+    depths = (f" at {depth:g} um" if math.isfinite(depth) else "" for depth in capture.position_um)
+    return [f"{name}{depth}" for name, depth in zip(capture.names, depths, strict=True)]
+
+
+def _above(electrons: Array, usable: Array, place: str) -> Array:
+    """The frame above the median of its border; masked pixels by :func:`_filled`.
+
+    Raises:
+        CaptureError: none of its light stands out; the frame's place is named.
+    """
     rim = _rim(electrons)
     light = _filled(electrons - np.median(rim), usable)
     noise = 1.4826 * float(np.median(np.abs(rim - np.median(rim))))
     if light.max() < 5 * max(noise, 1e-9):
-        raise CaptureError("a frame holds no spot above five times its background's noise; expose longer, or crop")
+        raise CaptureError(
+            f"{place}: no spot above five times the noise of the frame's border; where defocus spreads "
+            "the light so far, leave the frame out or take a wider one; else expose longer, or crop around the spot"
+        )
     return np.asarray(light)
 
 

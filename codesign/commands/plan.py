@@ -24,16 +24,17 @@ def angle_rad(text: str) -> float:
     """An angle with its unit.
 
     Raises:
-        ConfigError: no number above 0, or no unit.
+        ConfigError: no number above 0, none below a right angle, or no unit.
     """
     found = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-z]+)\s*", text)
     try:
         value = float(found[1]) * UNITS[found[2]] if found else math.nan
     except (ValueError, KeyError):
         value = math.nan
-    if not (0 < value < math.inf):
+    if not 0 < value < math.pi / 2:
         raise ConfigError(
-            f"gaze error {text!r}: need a number above 0 with a unit, as 0.1deg; units: {', '.join(UNITS)}"
+            f"gaze error {text!r}: need an angle above 0 and below 90deg with its unit, as 0.1deg; units: "
+            f"{', '.join(UNITS)}"
         )
     return value
 

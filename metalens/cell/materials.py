@@ -205,6 +205,8 @@ def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
 def read_csv(path: str | Path) -> Material:
     """A material from a CSV file with the columns wavelength_um, n, k; lines that open with # are comments.
 
+    Where semicolons or tabs part the columns, a comma is the decimal point.
+
     Raises:
         MaterialError: no such file, a missing column, or a bad row; the message gives the line.
     """
@@ -240,6 +242,9 @@ def _parse(text: str, *, name: str, where: str) -> Material:
     body = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     if not body:
         raise MaterialError(f"{where}: empty; need a header {','.join(COLUMNS)} and at least two rows")
+    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), None)
+    if mark:  # as spreadsheets write it where the comma is decimal
+        body = [(i, line.replace(",", ".").replace(mark, ",")) for i, line in body]
     body = _unstacked(body, where)
     header = [field.strip().lower().replace("μ", "µ") for field in next(csv.reader([body[0][1]]))]
     place = next((header.index(column) for column in _WAVELENGTHS if column in header), None)

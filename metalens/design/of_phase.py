@@ -183,7 +183,7 @@ def printable(
     turns = proxy.coverage_rad(wavelength_um, within_um=(low, high)) / (2 * math.pi)
     if turns < 1 and not accept_partial_turn:
         raise LensError(
-            f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um} um, need 1"
+            f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um:g} um, need 1"
             f"{_ends(proxy, thinnest, widest)}; take a smaller pitch, taller pillars or looser process limits, or "
             "accept the nearest pillar (accept_partial_turn) at the loss of efficiency that the design then states"
         )

@@ -36,7 +36,8 @@ def read(shape: PhaseMap) -> Samples:
     """The file of a :class:`metalens.profiles.PhaseMap`, by the ending of its name.
 
     ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named; ``.dat`` (Zemax grid phase,
-    which brings its own spacing); anything else is text: rows of numbers parted by commas, semicolons, tabs or blanks.
+    which brings its own spacing); anything else is text: rows of numbers parted by commas, or by
+    semicolons, tabs or blanks with decimal commas.
 
     Raises:
         LensError: missing or unreadable file, no pitch, not 2-D, or a value that is not finite (row and column named).
@@ -153,8 +154,8 @@ def _text(path: Path, variable: str | None) -> Any:
         first = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
         if not first:
             raise LensError(f"{path}: not a phase map: it holds no numbers")
-        mark = next((m for m in (",", ";") if m in first), None)
-        return np.loadtxt(lines, delimiter=mark, ndmin=2)
+        mark, decimal = reading.parting(first)
+        return np.loadtxt([line.replace(",", ".") for line in lines] if decimal else lines, delimiter=mark, ndmin=2)
     except ValueError as error:
         raise LensError(f"{path}: not a phase map: {error}") from error
 

@@ -14,6 +14,7 @@ import functools
 import hashlib
 import io
 import os
+import re
 import resource
 import typing
 import warnings
@@ -32,6 +33,7 @@ _ROOM, _SECONDS = 600 << 20, 60  # address space beyond what this process has, t
 _DENSEST = 1100  # more of it for a byte of the file: what deflate can do at best, and copies
 _MOST_WORDS = 4000
 _WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
+_WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
 _PLAIN = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum: packing that the HDF5 library undoes without harm
 Stamp = tuple[tuple[int, ...], ...]
 _noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar("_noted", default=None)  # of inputs, by path
@@ -45,6 +47,27 @@ def remembered() -> Iterator[None]:
         yield
     finally:
         _noted.reset(token)
+
+
+def parting(line: str) -> tuple[str | None, bool]:
+    """What parts the columns of a line of a table (None for blanks and tabs), and whether its commas are decimal.
+
+    They are where something else parts the columns: "840,5;0,3", "840,5 0,3".
+    """
+    if ";" in line:
+        return ";", True
+    words = line.split()
+    apart = len(words) > 1 and not any(word[0] == "," or word[-1] == "," for word in words)
+    if apart and all(_WITH_COMMA.fullmatch(word) for word in words[:2]):
+        return None, True
+    return ("," if "," in line else None), False
+
+
+def columns(line: str) -> list[str]:
+    """The words of such a line, decimals with points."""
+    mark, decimal = parting(line)
+    line = line.replace(",", ".") if decimal else line
+    return (line if mark is None else line.replace(mark, " ")).split()
 
 
 def stamp(path: str | Path) -> Stamp:

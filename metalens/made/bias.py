@@ -1,11 +1,11 @@
 """Etch and exposure bias: what is drawn is not what is made; draw so that the designed pillar is made."""
 
-import csv
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
@@ -87,25 +87,27 @@ class Bias:
 
 
 def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
-    """(drawn diameter, bias) pairs in nm from a file of two columns.
+    """(drawn diameter, bias) pairs in nm from a file of two columns, below a line of words or not.
+
+    Columns are parted by commas, or by semicolons, tabs or blanks with decimal commas.
 
     Raises:
         ProcessError: missing file, a line that is not two numbers (line named), or no line at all.
     """
     path = Path(path)
-    pairs = []
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            rows = [(n, row) for n, row in enumerate(csv.reader(file), 1) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise ProcessError(f"{path}: cannot be read as a table ({error})") from None
-    for number, row in rows:
+    rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    if rows and rows[0][1].lstrip()[0] not in "+-.0123456789":
+        del rows[0]  # names of the columns
+    pairs = []
+    for number, line in rows:
         try:
-            first, second = (float(cell) for cell in row)
+            first, second = (float(cell) for cell in reading.columns(line))
         except ValueError:
-            if number == rows[0][0]:
-                continue
-            raise ProcessError(f"{path}, line {number}: {','.join(row)!r}, need two numbers") from None
+            raise ProcessError(f"{path}, line {number}: {line[:60]!r}, need two numbers") from None
         pairs.append((first, second))
     if not pairs:
         raise ProcessError(f"{path}: holds no numbers; need lines of two columns")

@@ -1,19 +1,18 @@
 """LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaterialError, PropagationError
 
 MOST_NODES = 64
 STEP_NM = 0.25  # at most, between points of a measured spectrum
 PATHS = 129  # from 0 to the longest, at which a rule is judged
-_NUMBER = re.compile(r"[+-]?\d*[.,]?\d*([eE][+-]?\d+)?")
 SUM_ERROR = 1e-6  # of weights: all light counts as so much more or less
 LEAST_FWHM_NM = 1e-3  # a narrower line is one wavelength to any lens: 1e-6 of it
 
@@ -165,7 +164,7 @@ def _curve(file: Path) -> Array:
     except (OSError, UnicodeDecodeError) as error:
         raise PropagationError(f"{file}: cannot be read as a table of wavelength and value: {error}") from None
     for number, line in enumerate(lines, 1):
-        words = _words(line)
+        words = reading.columns(line)
         if not words or words[0][0] in "#\"'" or words[0][0].isalpha():
             continue
         try:
@@ -178,17 +177,6 @@ def _curve(file: Path) -> Array:
     if (np.diff(table[:, 0]) <= 0).any():
         raise PropagationError(f"{file}: a wavelength stands twice; need one value for each")
     return table
-
-
-def _words(line: str) -> list[str]:
-    """Columns of a line; a comma is a decimal point where something else parts the columns: "840,5;0,3"."""
-    if ";" in line:
-        return line.replace(",", ".").replace(";", " ").split()
-    words = line.split()
-    apart = len(words) > 1 and not any(word[0] == "," or word[-1] == "," for word in words)
-    if apart and all(_NUMBER.fullmatch(word) for word in words[:2]):
-        return [word.replace(",", ".") for word in words]
-    return line.replace(",", " ").split()
 
 
 def nodes(source: Source | Measured, *, path_um: float | Array, tolerance: float, light: Array | None = None) -> Nodes:

@@ -44,10 +44,10 @@ def test_one_bright_pixel_of_the_rim_is_not_noise(peak, seen):
     light[4, 5] = 20.0 + peak
     if seen:
         rim = np.concatenate([light[0], light[-1], light[1:-1, 0], light[1:-1, -1]])
-        assert frames._above(light, usable)[4, 5] == pytest.approx(light[4, 5] - np.median(rim))
+        assert frames._above(light, usable, "x.tif")[4, 5] == pytest.approx(light[4, 5] - np.median(rim))
     else:
-        with pytest.raises(frames.CaptureError, match="no spot above five times"):
-            frames._above(light, usable)
+        with pytest.raises(frames.CaptureError, match=r"^x\.tif at 3\.7 um: no spot above five times .*defocus"):
+            frames._above(light, usable, "x.tif at 3.7 um")
 
 
 def test_a_pillar_is_as_wide_from_wherever_its_site_is_guessed():

@@ -92,7 +92,9 @@ def test_angles_carry_their_unit(text, rad):
     assert command_plan.angle_rad(text) == pytest.approx(rad)
 
 
-@pytest.mark.parametrize("text", ["0.1", "deg", "-1deg", "0deg", "1furlong", "nandeg", "", "1e400deg", "1.2.3deg"])
+@pytest.mark.parametrize(
+    "text", ["0.1", "deg", "-1deg", "0deg", "1furlong", "nandeg", "", "1e400deg", "1.2.3deg", "1e9deg", "90deg"]
+)
 def test_angles_without_a_unit_or_a_value_are_refused(text):
     with pytest.raises(ConfigError, match="gaze error"):
         command_plan.angle_rad(text)

@@ -93,6 +93,15 @@ def test_own_table_with_shuffled_columns_and_comments(tmp_path: Path):
     assert abs(materials.index(str(file), 0.85) - 2) < 1e-15  # a file that changed is read again
 
 
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_table_with_decimal_commas_is_the_table_with_points(tmp_path: Path, mark):
+    file = tmp_path / "ellipsometer.csv"
+    text = "k|n|wavelength_um\n0,1|3,5|0,8\n0,05|3,25|0,9\n".replace("|", mark)
+    file.write_bytes(("\ufeff" + text).encode("utf-8"))
+    assert materials.index(str(file), 0.8) == 3.5 + 0.1j
+    assert materials.index(str(file), 0.9) == 3.25 + 0.05j
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -36,6 +36,10 @@ def write(folder, kind):
     elif kind == "csv-semicolon":
         text = "\n".join(";".join(f"{v:.17g}" for v in row) for row in PHASE)
         path.write_text("\ufeff" + text, encoding="utf-8")  # Excel starts with a byte-order mark
+    elif kind in ("csv-decimal-comma", "txt-decimal-comma"):  # of a spreadsheet in half of Europe
+        mark = ";" if kind[0] == "c" else "\t"
+        rows = (mark.join(f"{v:.17g}".replace(".", ",") for v in row) for row in PHASE)
+        path.write_bytes(("\ufeff" + "\r\n".join(rows)).encode("utf-8"))
     elif kind == "txt":
         np.savetxt(path, PHASE, fmt="%.17g")
     elif kind == "mat":
@@ -48,7 +52,9 @@ def write(folder, kind):
     return path
 
 
-@pytest.mark.parametrize("kind", ["npy", "csv", "csv-semicolon", "txt", "mat", "mat-73", "dat"])
+@pytest.mark.parametrize(
+    "kind", ["npy", "csv", "csv-semicolon", "csv-decimal-comma", "txt", "txt-decimal-comma", "mat", "mat-73", "dat"]
+)
 def test_every_format_gives_the_same_samples(tmp_path, kind):
     path = write(tmp_path, kind)
     samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))

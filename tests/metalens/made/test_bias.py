@@ -86,6 +86,30 @@ def test_an_impossible_bias_is_refused(options, words):
         Bias(**options)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeff90.5,-8\n250,1.25\n",  # a spreadsheet's byte-order mark is no reason to take numbers for a head
+        "\ufeffmade of D 90;at 50 kV\n90,5;-8,0\n250;1,25\n",
+        "90,5\t-8\r\n250\t1,25\r\n",
+        '"drawn","bias"\n"90.5","-8"\n"250","1.25"\n',
+        "90.5 -8\n250 1.25\n",
+    ],
+)
+def test_a_table_of_a_spreadsheet_keeps_every_row(tmp_path, text):
+    path = tmp_path / "bias.csv"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert read_csv(path) == ((90.5, -8.0), (250.0, 1.25))
+
+
+@pytest.mark.parametrize("text", ["9O,-8\n250,1\n", "90,-8,0\n250,1,0\n", "90;-8;5\n"])
+def test_a_first_row_of_broken_numbers_is_no_head(tmp_path, text):
+    path = tmp_path / "bias.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ProcessError, match=r"line 1: .*need two numbers"):
+        read_csv(path)
+
+
 def test_csv_with_head_comments_and_a_bad_line(tmp_path):
     good = tmp_path / "bias.csv"
     good.write_text("# from micrographs\ndiameter_nm,bias_nm\n100,-3\n200,0.5\n\n", encoding="utf-8")
