@@ -115,7 +115,7 @@ def _about(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         about = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
     except (ValueError, RecursionError) as error:  # of the format, of the text, or an integer of thousands of digits
         raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
@@ -164,7 +164,7 @@ def _read_csv(path: Path) -> list[dict[str, Any]]:
 
 def _read_json(path: Path) -> list[dict[str, Any]]:
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(table, list) or not all(isinstance(row, dict) for row in table):

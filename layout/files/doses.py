@@ -52,7 +52,7 @@ def read(path: str | Path) -> dict[LayerNumber, float]:
     """
     path = Path(path)
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MaskFileError(f"{path}: cannot be read as a dose table ({error})") from None
     found: dict[LayerNumber, float] = {}

@@ -130,7 +130,7 @@ class DrcReport:
         """One line for a person."""
         found = ", ".join(f"{count} {rule}" for rule, count in self.counts.items() if count)
         return (
-            f"{self.pillars} pillars: smallest gap {told(self.minimum_gap_nm)}, "
+            f"{self.pillars:,} pillars: smallest gap {told(self.minimum_gap_nm)}, "
             f"thinnest {told(self.minimum_feature_nm)}, density up to {self.maximum_density:.1%}; "
             + (f"violations: {found}" if found else "no violation")
         )

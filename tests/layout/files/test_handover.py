@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.files import handover
+from layout.files import doses, handover
 from layout.mask import fields
 from layout.process.process import Die, Exposure, Process, WriteField
 from metalens.lens.record import DiameterMap
@@ -99,3 +99,9 @@ def test_the_sheet_names_files_doses_fields_and_leaves_currents_open(made):
     assert text.count("beam current ____") == 2
     assert all(f"{layer[0]:>4}/{layer[1]}" in text for layer in plan.doses)
     assert "nan" not in text
+
+
+def test_a_dose_table_that_an_editor_saved_is_read(tmp_path):
+    path = tmp_path / "doses.csv"
+    path.write_text("layer,datatype,relative_dose\n7,3,1.375\n2,0,0.9\n", encoding="utf-8-sig")
+    assert doses.read(path) == {(7, 3): 1.375, (2, 0): 0.9}

@@ -198,6 +198,7 @@ def test_summary_says_what_was_found():
     assert isinstance(report, DrcReport)
     assert "gap" in report.summary
     assert "3 pillars" in report.summary
+    assert "2,500 pillars" in drc.check(plan_of([200], np.full((50, 50), 1)), Rules(minimum_gap_nm=70)).summary
 
 
 def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
