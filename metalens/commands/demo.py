@@ -192,7 +192,7 @@ def _error(outcome: Outcome) -> str:
     found = outcome.values.get(key)
     if isinstance(found, dict):
         found = sum(len(differences) for differences in found.values())
-    return f"{found:.2g} {meaning}" if isinstance(found, int | float) else meaning
+    return f"{report.in_figures(float(found), 2)} {meaning}" if isinstance(found, int | float) else meaning
 
 
 def _verdict(outcomes: list[Outcome]) -> str:

@@ -111,7 +111,7 @@ WORDS = {
 }
 WORDS |= {"mmacs": "million MACs"}
 WORDS |= {"fwhm": "width at half maximum", "macs": "MACs", "chi2": "chi²", "dof": "degree of freedom", "t": "t"}
-WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time"}
+WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time / s"}
 
 
 def in_words(key: str) -> str:

@@ -254,3 +254,11 @@ def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch
     path.write_text(f"{first[: len(first) // 2]}\n{second}\n")
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
     assert seen[3:5] == ["library", "psf"]
+
+
+@pytest.mark.parametrize(
+    ("found", "told"), [(6043.0, "6000 counts"), (7.13e-7, "7.1e-07 counts"), ({"a": [3, 5]}, "2 counts")]
+)
+def test_errors_of_the_page_have_no_power_of_ten_where_none_is_needed(found, told):
+    stage = chain.Stage("Captures", "", ("capture",), ("peak", "counts"))
+    assert demo._error(demo.Outcome(stage, 0, {"peak": found}, 1.5)) == told

@@ -67,7 +67,7 @@ def test_same_drawing_gives_the_same_bytes():
         ("mtf50_x_per_um", "mtf50 x / (1/µm)"),
         ("gaze_axial_deg", "gaze axial / deg"),
         ("energy_um2", "energy / µm²"),
-        ("seconds", "time"),
+        ("seconds", "time / s"),
         ("peak_e", "peak / electrons"),
         ("strehl", "Strehl ratio"),
         ("psf_tolerance", "PSF tolerance"),
