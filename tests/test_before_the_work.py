@@ -57,7 +57,9 @@ def test_a_wavelength_outside_the_library_is_refused_before_the_search(tmp_path,
     monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
     (tmp_path / "d.toml").write_text('profile = "fisher"\nwavelength_nm = 940.0\naperture_mm = 0.05\n')
     assert main(["design", str(tmp_path / "d.toml"), "-o", str(tmp_path / "l.h5")]) == BAD_INPUT
-    assert "um, but the proxy holds from 0.84 to 0.86 um" in capsys.readouterr().err
+    assert (
+        "um, but the proxy holds from 0.84 to 0.86 um: sweep a library over the wavelengths" in capsys.readouterr().err
+    )
 
 
 # verb: words that need an output, with inputs that are there; and what must not be called

@@ -125,7 +125,10 @@ class Proxy:
             raise DomainError(f"angle {angle_rad} rad, but the proxy holds at normal incidence only")
         low, high = self.wavelengths_um
         if not low - 1e-9 <= wavelength_um <= high + 1e-9:
-            raise DomainError(f"wavelength {wavelength_um} um, but the proxy holds from {low} to {high} um")
+            raise DomainError(
+                f"wavelength {wavelength_um:.7g} um, but the proxy holds from {low:.7g} to {high:.7g} um: sweep a "
+                "library over the wavelengths ([sweep] wavelengths_um)"
+            )
         unit = 0.0 if high == low else (2 * wavelength_um - low - high) / (high - low)
         row = np.asarray(chebyshev.chebval(unit, coefficients))
         return polynomial.curve(row, self.domain_um, self.power, ceiling)
