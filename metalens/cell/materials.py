@@ -203,19 +203,16 @@ def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
 
 
 def read_csv(path: str | Path) -> Material:
-    """A material from a CSV file with the columns wavelength_um, n, k; lines that open with # are comments.
-
-    Where semicolons or tabs part the columns, a comma is the decimal point.
+    """A material of a table wavelength_um, n, k: CSV, or semicolons or tabs with decimal commas; # opens comments.
 
     Raises:
         MaterialError: no such file, a missing column, or a bad row; the message gives the line.
     """
-    path = Path(path)
     try:
-        stat = path.stat()
+        stat = Path(path).stat()
     except OSError:
         raise MaterialError(f"{path}: no such file; need a CSV with columns {', '.join(COLUMNS)}") from None
-    return _read_csv(path, (stat.st_mtime_ns, stat.st_size))
+    return _read_csv(Path(path), (stat.st_mtime_ns, stat.st_size))
 
 
 @lru_cache(maxsize=64)
@@ -242,14 +239,12 @@ def _parse(text: str, *, name: str, where: str) -> Material:
     body = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     if not body:
         raise MaterialError(f"{where}: empty; need a header {','.join(COLUMNS)} and at least two rows")
-    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), None)
-    if mark:  # as spreadsheets write it where the comma is decimal
-        body = [(i, line.replace(",", ".").replace(mark, ",")) for i, line in body]
-    body = _unstacked(body, where)
+    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), ",")
+    plain = [(i, line if mark == "," else line.replace(",", ".").replace(mark, ",")) for i, line in body]
+    body = _unstacked(plain, where)
     header = [field.strip().lower().replace("μ", "µ") for field in next(csv.reader([body[0][1]]))]
     place = next((header.index(column) for column in _WAVELENGTHS if column in header), None)
-    missing = [] if place is not None else ["wavelength_um"]
-    missing += [] if "n" in header else ["n"]
+    missing = ["wavelength_um"] * (place is None) + ["n"] * ("n" not in header)
     if missing or place is None:
         raise MaterialError(f"{where}, line {body[0][0]}: no column {', '.join(missing)} in {header}; need {COLUMNS}")
     scale = _WAVELENGTHS[header[place]]
