@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from characterize.inference import Data, Task, Unstated, invert, missing, posterior
-from characterize.model import NAMES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Known, Setting, vector
+from characterize.model import NAMES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Known, Setting, usual, vector
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
@@ -111,7 +111,7 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     Raises:
         FitError: as :class:`ForwardModel`.
     """
-    names, prior = _parameters(protocol)
+    names, prior = _parameters(lens, protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
     place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
     chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names, place=place)
@@ -308,13 +308,13 @@ def score(information: Array, criterion: str, names: tuple[str, ...]) -> float:
     return float(np.exp(np.log(values).mean()) if criterion == "D" else len(values) / (1 / values).sum())
 
 
-def _parameters(protocol: Protocol) -> tuple[tuple[str, ...], Array]:
+def _parameters(lens: Lens, protocol: Protocol) -> tuple[tuple[str, ...], Array]:
     """Names of what will be fitted, and what is known of it beforehand as (p, p) information."""
     known = {k.name: k for k in protocol.known}
     held = {k.name for k in protocol.known if k.sigma == 0}
     wanted = {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)  # the unfitted are in no NAMES
     names = tuple(name for name in NAMES if name in wanted - held)
-    sigma = [known[n].sigma if n in known else PARAMETERS[PLACE[n]].sigma for n in names]
+    sigma = [known[row.name].sigma if row.name in known else row.sigma for row in usual(names, lens)]
     return names, np.diag([s**-2.0 for s in sigma])
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model import PARAMETERS, PLACE, Setting, made, oversampling, true_depth, vector
+from characterize.model import PLACE, Setting, made, oversampling, true_depth, usual, vector
 from metalens import lens as lenses
 from metalens import psf as psfs
 from metalens.ground import store
@@ -165,7 +165,7 @@ class AsBuilt:
         Gaussian.
         """
         rng = np.random.default_rng(seed)
-        return _bounded(self.names, _drawn(rng, count, self.value, self.covariance, self.draws))
+        return _bounded(self.names, self.design, _drawn(rng, count, self.value, self.covariance, self.draws))
 
     def lens_samples(self, count: int, seed: int = 0) -> Array:
         """(count, p) draws of what the lens does to light, for training and PSFs under uncertainty.
@@ -177,7 +177,7 @@ class AsBuilt:
             return self.samples(count, seed)
         rng, one = np.random.default_rng(seed), self.within
         own = _drawn(rng, count, self.value, one.covariance, one.draws)
-        return _bounded(self.names, own + spread(rng, count, self.bench))
+        return _bounded(self.names, self.design, own + spread(rng, count, self.bench))
 
     def lens(self, value: Array | None = None) -> Lens:
         """The lens with as-built diameters and distance; ``value`` as one row of :meth:`samples`."""
@@ -246,8 +246,8 @@ def _drawn(rng: np.random.Generator, count: int, value: Array, covariance: Array
     return np.asarray(draws[np.concatenate(order)[:count]])
 
 
-def _bounded(names: tuple[str, ...], draws: Array) -> Array:
-    rows = [PARAMETERS[PLACE[name]] for name in names]
+def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
+    rows = usual(names, lens)
     return np.asarray(np.clip(draws, [row.low for row in rows], [row.high for row in rows]))
 
 

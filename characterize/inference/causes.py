@@ -15,13 +15,12 @@ from characterize.inference.search import Task
 from characterize.model import (
     LIGHT,
     MODES,
-    PARAMETERS,
     PLACE,
-    UNFITTED,
     ForwardModel,
     background,
     basis,
     prior_rad,
+    unstated,
 )
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -195,7 +194,7 @@ def _size(task: Task, name: str) -> float:
     known = task.known.get(name)
     if known is not None:
         return math.hypot(known.sigma, known.value) if name == "sidewall_deg" else known.sigma
-    return next((row.sigma for row in UNFITTED if row.name == name), 0.0) or PARAMETERS[PLACE[name]].unstated
+    return unstated(name, task.model.lens)
 
 
 def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:

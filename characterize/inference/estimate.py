@@ -23,6 +23,7 @@ from characterize.model import (
     Known,
     slopes,
     thinplate,
+    usual,
     vector,
 )
 from metalens.ground import threads
@@ -114,7 +115,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
 
 def _reach_um(known: dict[str, Known], lens: Lens) -> float:
     """Half the range of distances that is looked at: two sigma of what is known, within the bounds."""
-    prior = search.prior_of(("distance_um",), known, lens.sensor_distance_um)
+    prior = search.prior_of(("distance_um",), known, lens)
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
@@ -274,7 +275,8 @@ def _nominal(task: Task, fitted: dict[str, float]) -> Array:
 
 
 def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
-    known = verdict.process_verdict(task.names, found.low, found.high, _told(task, found), unstated)
+    rows = usual(task.names, task.model.lens)
+    known = verdict.process_verdict(rows, found.low, found.high, _told(task, found), unstated)
     errors = verdict.predicted_error(task, found), verdict.predicted_aside(task, found)
     return _psf_verdict(*errors, unseen, len(task.model.groups)), known
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from characterize.captures import Capture, Frames, merge_brackets
 from characterize.inference.leastsquares import Data
-from characterize.model import ForwardModel, Known, Setting
+from characterize.model import ForwardModel, Known, Setting, usual
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
@@ -139,9 +139,9 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
 
 
 def stated(capture: Capture, lens: Lens) -> list[Known]:
-    """Priors that the capture itself states: wavelength (0.5 nm unless wavelength_sigma_nm), pinhole, glass."""
-    offset = (capture.wavelength_um - lens.wavelength_um) * 1e3
-    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", 0.5)))]
+    """Priors that the capture itself states: wavelength (as usual unless wavelength_sigma_nm), pinhole, glass."""
+    offset, usual_nm = (capture.wavelength_um - lens.wavelength_um) * 1e3, usual(["wavelength_nm"], lens)[0].sigma
+    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", usual_nm)))]
     held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
     known += [Known(name, _number(capture, name), 0.0) for name in held if name in capture.about]
     if "pixel_sigma_um" in capture.about:

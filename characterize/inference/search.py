@@ -12,10 +12,12 @@ from characterize.inference import leastsquares, residual
 from characterize.inference.arrange import Arrangement, few_frames
 from characterize.inference.constrained import Ball
 from characterize.inference.leastsquares import Data, Prior, Settings, Solution
-from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, vector
+from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, usual, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
+from metalens.lens import Lens
+from metalens.made import coarser
 
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
@@ -53,7 +55,7 @@ class Task:
     @property
     def prior(self) -> Prior:
         """Of the fitted parameters."""
-        return prior_of(self.names, self.known, self.model.lens.sensor_distance_um)
+        return prior_of(self.names, self.known, self.model.lens)
 
     def problem(self, frames: Array | None = None) -> leastsquares.Model:
         """Images of all frames, or roughly of some."""
@@ -279,19 +281,13 @@ def names_of(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in wanted)
 
 
-def prior_of(names: Sequence[str], known: dict[str, Known], distance_um: float) -> Prior:
-    """Priors of the fitted parameters: metrology where there is, else what is usual.
-
-    distance_um: lens to sensor by design; it may be wrong by a quarter, so that no search runs into the lens.
-    """
-    table = [PARAMETERS[PLACE[name]] for name in names]
+def prior_of(names: Sequence[str], known: dict[str, Known], lens: Lens) -> Prior:
+    """Priors of the fitted parameters: metrology where there is, else what is usual for such a lens."""
+    table = usual(names, lens)
     entries = [known.get(name) for name in names]
     mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
     sigma = [k.sigma if k and k.sigma > 0 else p.sigma for k, p in zip(entries, table, strict=True)]
-    reach = [distance_um / 4 if p.name == "distance_um" else math.inf for p in table]
-    low = [max(p.low, -r) for p, r in zip(table, reach, strict=True)]
-    high = [min(p.high, r) for p, r in zip(table, reach, strict=True)]
-    return Prior(np.array(mean), np.array(sigma), np.array(low), np.array(high))
+    return Prior(np.array(mean), np.array(sigma), np.array([p.low for p in table]), np.array([p.high for p in table]))
 
 
 def with_values(x: Array, values: dict[str, float]) -> Array:
@@ -309,7 +305,10 @@ def window_um(found: Arrangement, pixel_um: float) -> tuple[float, float]:
 
 
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
-    """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames."""
+    """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames.
+
+    biases_nm: of lenses for 0.85 um, more for longer waves.
+    """
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
@@ -319,7 +318,7 @@ def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list
     base = with_values(task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]})
     out = []
     for bias in biases_nm:
-        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias})
+        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias * coarser(model.lens.wavelength_um)})
         light = model.images(with_values(x, {"background_e": 0.0}))[0]
         keep = data.usable & ~data.saturated
         gain = float((light * (data.electrons - level))[keep].sum() / (light[keep] ** 2).sum())
@@ -345,6 +344,7 @@ def _twins(task: Task, best: Solution) -> list[Array]:
         i = task.names.index("bias_nm")
         along = best.covariance[:, i] / best.covariance[i, i]
         for sign in (1, -1):
-            moved = np.clip(best.value + sign * _ALONG_NM * along, task.prior.low, task.prior.high)
+            step = sign * _ALONG_NM * coarser(task.model.lens.wavelength_um)
+            moved = np.clip(best.value + step * along, task.prior.low, task.prior.high)
             out.append(task.all_of(moved))
     return out

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,10 +16,11 @@ from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.missing import Unstated
 from characterize.inference.posterior import Valley
 from characterize.inference.search import WAVES_RAD, Task
-from characterize.model import PARAMETERS, PLACE, ForwardModel, Known, thinplate
+from characterize.model import ForwardModel, Known, Parameter, thinplate
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
+from metalens.made import coarser
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
@@ -117,7 +118,7 @@ def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
     bandwidth_nm = known["bandwidth_nm"].value if "bandwidth_nm" in known else 0.0
     low, high = (edge * 1e3 for edge in lens.proxy.wavelengths_um)
     first, last = (lens.wavelength_um * 1e3 + reach * bandwidth_nm for reach in (-2, 2))
-    room = max(high - low, _ONE_COLOUR_NM)
+    room = max(high - low, _ONE_COLOUR_NM * coarser(lens.wavelength_um))
     if low - room <= first and last <= high + room:
         return []
     return [
@@ -184,17 +185,19 @@ def _together(one: Array, other: Array) -> Array:
     return np.asarray(product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1)))
 
 
-def process_verdict(names: tuple[str, ...], low: Array, high: Array, told: Array, unstated: Unstated) -> str:
+def process_verdict(rows: Sequence[Parameter], low: Array, high: Array, told: Array, unstated: Unstated) -> str:
     """Which causes the frames fix, and which come from prior knowledge or only with others.
 
-    ``told``: (p,) interval over that of the prior alone, 1 where the frames say nothing. Numbers are those with what
-    ``unstated`` causes may have moved; where these are too large, a cause is known in the model alone, and so said.
+    ``rows``: (p,) of the fitted, for this lens. ``told``: (p,) interval over that of the prior alone, 1 where the
+    frames say nothing. Numbers are those with what ``unstated`` causes may have moved; where these are too large, a
+    cause is known in the model alone, and so said.
     """
+    names = [row.name for row in rows]
     causes = [i for i, n in enumerate(names) if n.endswith(("_nm", "_rad", "_deg")) or n == "index"]
     own = (high - low) / 3.92
-    close = [i for i in causes if own[i] <= PARAMETERS[PLACE[names[i]]].scale]
+    close = [i for i in causes if own[i] <= rows[i].scale]
     whole = np.hypot(own, unstated.sigma)
-    good = [i for i in close if whole[i] <= PARAMETERS[PLACE[names[i]]].scale]
+    good = [i for i in close if whole[i] <= rows[i].scale]
     known = ", ".join(f"{names[i]} +- {whole[i]:.2g}" for i in good) or "no cause alone"
     prior = [names[i] for i in causes if told[i] > 0.7]
     more = f"; from prior knowledge only: {', '.join(prior)}" if prior else ""

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from characterize.model.parameters import PLACE as PLACE
     from characterize.model.parameters import UNFITTED as UNFITTED
     from characterize.model.parameters import Known as Known
+    from characterize.model.parameters import Parameter as Parameter
     from characterize.model.parameters import state as state
+    from characterize.model.parameters import unstated as unstated
+    from characterize.model.parameters import usual as usual
     from characterize.model.parameters import vector as vector
     from characterize.model.pillar_slopes import slopes as slopes
     from characterize.model.pillars import incidence_rad as incidence_rad
@@ -38,6 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "LIGHT": "setting",
         "MODES": "thinplate",
         "NAMES": "parameters",
+        "Parameter": "parameters",
         "PARAMETERS": "parameters",
         "PLACE": "parameters",
         "Setting": "setting",
@@ -56,6 +60,8 @@ __getattr__, __dir__, __all__ = attach(
         "state": "parameters",
         "thinplate": "",
         "true_depth": "setting",
+        "unstated": "parameters",
+        "usual": "parameters",
         "vector": "parameters",
     },
 )

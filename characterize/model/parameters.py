@@ -3,15 +3,17 @@
 Those of the lens are the table of :mod:`metalens.made.causes`; those of the bench stand here.
 """
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, nearest
-from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, named
+from metalens.lens import Lens
+from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, larger, named
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +128,30 @@ class Known:
             )
         if not math.isfinite(self.value) or not self.sigma >= 0:
             raise ConfigError(f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0")
+
+
+def usual(names: Iterable[str], lens: Lens) -> list[Parameter]:
+    """The rows of some parameters for a lens: what is in nm grows with long waves (``made.coarser``).
+
+    The distance may be wrong by a quarter, so that no search runs into the lens.
+    """
+    rows = [_times(PARAMETERS[PLACE[name]], larger(name, lens.wavelength_um)) for name in names]
+    reach = [lens.sensor_distance_um / 4 if row.name == "distance_um" else math.inf for row in rows]
+    pairs = zip(rows, reach, strict=True)
+    return [dataclasses.replace(row, low=max(row.low, -most), high=min(row.high, most)) for row, most in pairs]
+
+
+def unstated(name: str, lens: Lens) -> float:
+    """Standard deviation of a parameter, or of what none describes, that is reckoned with where nobody states it."""
+    if name in PLACE:
+        return usual([name], lens)[0].unstated
+    row = next(row for row in UNFITTED if row.name == name)
+    return row.sigma * larger(name, lens.wavelength_um)
+
+
+def _times(row: Parameter, factor: float) -> Parameter:
+    sizes = {name: factor * getattr(row, name) for name in ("scale", "sigma", "low", "high", "plausible")}
+    return dataclasses.replace(row, **sizes)
 
 
 def vector(values: Mapping[str, float] | None = None) -> Array:

@@ -17,7 +17,18 @@ from metalens.cell import Cell
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Sensitivity, answer, biased, designed, lacking, of_kind, transmission
+from metalens.made import (
+    Answers,
+    Sensitivity,
+    answer,
+    biased,
+    coarser,
+    designed,
+    lacking,
+    larger,
+    of_kind,
+    transmission,
+)
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
@@ -40,11 +51,21 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Largest change of each kind that a low-rank basis must hold; beyond it the fit is refused."""
+    """Largest change of each kind that a low-rank basis must hold; beyond it the fit is refused.
+
+    What is here is of lenses for 0.85 um; see :meth:`of`.
+    """
 
     bias_um: float = 0.03
     answers: tuple[float, ...] = tuple(_ROOM * max(-row.low, row.high) * row.unit for row in _ROWS)
     wavelength_um: float = 0.006
+
+    @classmethod
+    def of(cls, wavelength_um: float) -> "Range":
+        """Of lenses for a wavelength: lengths are larger where it is longer (``made.coarser``)."""
+        more, rows = coarser(wavelength_um), zip(_ROWS, cls().answers, strict=True)
+        answers = tuple(amount * larger(row.name, wavelength_um) for row, amount in rows)
+        return cls(more * cls().bias_um, answers, more * cls().wavelength_um)
 
     def within(self, cell: Cell) -> "Range":
         """Without what pillars of this cell cannot have."""
@@ -69,11 +90,11 @@ class Pillars:
         tolerance: float = 3e-5,
         angle_rad: float = 0.0,
     ) -> None:
-        span = (span or Range()).within(lens.cell)
+        span = (span or Range.of(lens.wavelength_um)).within(lens.cell)
         self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
         built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
         self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
-        b = max(7, 2 * math.ceil(span.bias_um / 0.006) + 1)
+        b = max(7, 2 * math.ceil(span.bias_um / (0.006 * coarser(lens.wavelength_um))) + 1)
         for count in (b, 2 * b - 1, 3 * b - 2):  # resonances want more
             self._lay(count, tolerance)
             self.error = self._measure()

@@ -12,13 +12,13 @@ from metalens.cell import Cell, Light
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Cause, Solved, designed, of_kind
+from metalens.made import Answers, Cause, Solved, coarser, designed, larger, of_kind
 from metalens.pillars import curve, engines
 
-REACH_UM = 0.031  # of a bias beyond the designed diameters: that of the fit
+REACH_UM = 0.031  # of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter waves
 TOLERANCE = 3e-3  # of t
 _SAME, _JUDGED = 0.05, 7  # relative deviation from the proxy up to which it is of this cell, at so many diameters
-_FINE_UM = 5e-4  # between the diameters at which the curves are sampled
+_FINE_UM = 5e-4  # between the diameters at which the curves are sampled, likewise
 _FIT_SHARE = 0.4  # of the tolerance, for the rational functions
 _ROOM = 1.07  # of the amounts over the bounds of a fit
 _AMOUNTS = {"height_um": (-1.0, -0.5, 0.0, 0.5, 1.0), "n": (-1.0, 0.0, 1.0)}
@@ -27,7 +27,7 @@ _AMOUNTS = {"height_um": (-1.0, -0.5, 0.0, 0.5, 1.0), "n": (-1.0, 0.0, 1.0)}
 def solved(lens: Lens) -> Solved | None:
     """t by the modal solver; None where the lens's proxy is not of its cell (a measured one, say).
 
-    Heights: polynomial through five over +-30 nm; indices: through three.
+    Heights: polynomial through five over +-30 nm (more of longer waves, ``made.coarser``); indices: through three.
 
     Accuracy: 3e-3 of t by the solver's bar, half of it on average.
 
@@ -41,15 +41,17 @@ def solved(lens: Lens) -> Solved | None:
     ratio = np.array(exact) / designed(lens.proxy, some, lens.wavelength_um)
     if np.abs(ratio * np.exp(-1j * np.angle(ratio.mean())) - 1).max() > _SAME:
         return None
-    low, high = max(least - REACH_UM, 0.03 * pitch), min(most + REACH_UM, 0.985 * pitch)
+    reach = REACH_UM * coarser(lens.wavelength_um)
+    low, high = max(least - reach, 0.03 * pitch), min(most + reach, 0.985 * pitch)
     return _solved(lens.cell, lens.wavelength_um, round(low, 6), round(high, 6))
 
 
 @functools.lru_cache(maxsize=8)
 def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> Solved:
     """One rational curve over the diameter for every amount of every cause, sampled finely."""
-    diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / _FINE_UM) + 1)
-    changes = _changes()
+    fine = _FINE_UM * coarser(wavelength_um)
+    diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / fine) + 1)
+    changes = _changes(wavelength_um)
     cells = [
         row.acts.changed(cell, amount, wavelength_um)
         if isinstance(row.acts, Answers) and row.acts.changed and amount
@@ -77,14 +79,14 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     return np.asarray(curve.curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(diameters)[:, 0])
 
 
-def _changes() -> list[tuple[int, Cause, tuple[float, ...]]]:
+def _changes(wavelength_um: float) -> list[tuple[int, Cause, tuple[float, ...]]]:
     """(place, row, amounts in base units) of the causes that the solver knows."""
-    rows = [row for _, row in of_kind(Answers)]
-    return [
-        (n, row, tuple(_ROOM * row.high * row.unit * share for share in _AMOUNTS[row.acts.exact]))
-        for n, row in enumerate(rows)
-        if isinstance(row.acts, Answers) and row.acts.exact
-    ]
+    out = []
+    for n, (_, row) in enumerate(of_kind(Answers)):
+        if isinstance(row.acts, Answers) and row.acts.exact:
+            most = _ROOM * row.high * row.unit * larger(row.name, wavelength_um)
+            out.append((n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact])))
+    return out
 
 
 def _powers(columns: Array, changes: Sequence[tuple[int, Cause, tuple[float, ...]]]) -> Array:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from metalens.made.causes import Drawn as Drawn
     from metalens.made.causes import Guide as Guide
     from metalens.made.causes import Widens as Widens
+    from metalens.made.causes import coarser as coarser
     from metalens.made.causes import lacking as lacking
+    from metalens.made.causes import larger as larger
     from metalens.made.causes import maps as maps
     from metalens.made.causes import named as named
     from metalens.made.causes import of_kind as of_kind
@@ -66,10 +68,12 @@ __getattr__, __dir__, __all__ = attach(
         "answer": "response",
         "biased": "response",
         "causes": "",
+        "coarser": "causes",
         "designed": "response",
         "draws": "spread",
         "guide": "response",
         "lacking": "causes",
+        "larger": "causes",
         "maps": "causes",
         "named": "causes",
         "of_kind": "causes",

@@ -200,6 +200,7 @@ def _side(name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, fl
 
 
 DEG = math.pi / 180
+USUAL_UM = 0.85  # wavelength of the lenses that the sizes in nm below are of
 CAUSES: tuple[Cause, ...] = (
     _widens(
         "bias_nm", "diameter minus design, mean over the lens", 15.0, 26.0, ((1, 0, 0),), drawn=Drawn("bias_nm", 4.0)
@@ -247,6 +248,20 @@ CAUSES: tuple[Cause, ...] = (
     _bends("trefoil_y", 8, ((3, 2, 1), (-1, 0, 3))),
     _bends("spherical", 5, ((6, 4, 0), (12, 2, 2), (6, 0, 4), (-6, 2, 0), (-6, 0, 2), (1, 0, 0))),
 )  # fmt: skip
+
+
+def coarser(wavelength_um: float) -> float:
+    """How much larger what the table gives in nm is for a lens of this wavelength: wavelength / 0.85 um, 1 at least.
+
+    Pillars, their height and what their tools are asked to hold grow with the wavelength, so that errors of one kind
+    turn the phase alike; lenses of shorter waves come from the same writers and etchers, with their nanometres.
+    """
+    return max(1.0, wavelength_um / USUAL_UM)
+
+
+def larger(name: str, wavelength_um: float) -> float:
+    """By which prior and bounds of a row are multiplied for a wavelength: :func:`coarser` of what is given in nm."""
+    return coarser(wavelength_um) if name.endswith("_nm") else 1.0
 
 
 def of_kind(kind: type[Widens] | type[Answers] | type[Bends]) -> Iterator[tuple[int, Cause]]:

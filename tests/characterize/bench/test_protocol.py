@@ -195,7 +195,7 @@ def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
     information = slopes @ slopes.transpose(0, 2, 1)
     rows = np.column_stack([np.linspace(400, 900, 6), np.zeros(6), np.ones(6)])
     names, prior = ("bias_nm", "distance_um"), np.diag([0.5**-2, 30.0**-2])
-    monkeypatch.setattr(protocol, "_parameters", lambda wanted: (names, prior))
+    monkeypatch.setattr(protocol, "_parameters", lambda *words: (names, prior))
     monkeypatch.setattr(protocol, "candidate_information", lambda *words: (rows, information))
     monkeypatch.setattr(protocol, "_unstated", lambda *words: missing.Unstated.none(2))
     made = protocol.plan(b.lens(), Protocol((400.0, 900.0), frames=3), None)
@@ -209,7 +209,7 @@ def test_a_plan_s_errors_are_of_all_its_frames_and_what_was_known(monkeypatch):
 
 def test_what_is_known_of_the_bench_is_information_and_what_is_certain_is_not_fitted():
     known = (protocol.Known("height_nm", 3.0, 2.5), protocol.Known("distance_um", 0.0, 0.0))
-    names, prior = protocol._parameters(Protocol((400.0, 900.0), known=known, free=("tilt_x_deg",)))
+    names, prior = protocol._parameters(b.lens(), Protocol((400.0, 900.0), known=known, free=("tilt_x_deg",)))
     assert "distance_um" not in names
     assert "tilt_x_deg" in names
     assert prior[names.index("height_nm")][names.index("height_nm")] == pytest.approx(2.5**-2)

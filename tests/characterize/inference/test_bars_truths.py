@@ -164,7 +164,7 @@ def test_structure_is_looked_for_with_common_errors_over_the_noise(monkeypatch):
 def test_the_reach_of_distances_is_two_sigma_of_what_is_known_within_a_quarter():
     from characterize.model import Known
 
-    lens = SimpleNamespace(sensor_distance_um=1700.0)
+    lens = SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1700.0)
     assert estimate._reach_um({"distance_um": Known("distance_um", 3.0, 41.0)}, lens) == pytest.approx(82.0)
     assert estimate._reach_um({"distance_um": Known("distance_um", 3.0, 4100.0)}, lens) <= 1700 / 4
 
@@ -179,7 +179,8 @@ def test_causes_that_are_stated_are_reckoned_with_as_stated():
         "index": Known("index", 0.01, 0.003),
         "pinhole_um": Known("pinhole_um", 6.0, 0.0),
     }
-    task = SimpleNamespace(known=known, unfitted={"stitching_nm": 11.0})
+    lens = SimpleNamespace(wavelength_um=0.7)
+    task = SimpleNamespace(known=known, unfitted={"stitching_nm": 11.0}, model=SimpleNamespace(lens=lens))
     assert causes._size(task, "sidewall_deg") == pytest.approx(1.0)
     assert causes._size(task, "index") == 0.003
     assert causes._size(task, "pinhole_um") == 0.0
@@ -246,12 +247,14 @@ def test_what_the_lens_takes_along_widens_its_own_draws_and_no_more():
 
     built = object.__new__(AsBuilt)
     own, bench = np.array([[0.04, 0.03], [0.03, 0.25]]), np.array([[0.05, -0.02], [-0.02, 0.11]])
-    about = dict(names=("coma_x_rad", "coma_y_rad"), value=np.array([0.03, -0.02]), covariance=4 * own, bench=bench)
+    about = dict(
+        design=None, names=("coma_x_rad", "coma_y_rad"), value=np.array([0.03, -0.02]), covariance=4 * own, bench=bench
+    )
     about |= dict(draws=np.empty((0, 0)), within=WithinModel(covariance=own))
     for name, value in about.items():
         object.__setattr__(built, name, value)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("characterize.inference.asbuilt._bounded", lambda names, draws: draws)
+        patch.setattr("characterize.inference.asbuilt._bounded", lambda names, lens, draws: draws)
         drawn, wide = built.lens_samples(40_000, seed=3), built.samples(40_000, seed=3)
     assert drawn.mean(0) == pytest.approx([0.03, -0.02], abs=0.01)
     assert np.cov(drawn.T) == pytest.approx(own + bench, rel=0.05, abs=2e-3)  # 40 000 draws: 0.7 %
@@ -262,7 +265,7 @@ def test_a_value_that_is_held_and_asked_for_begins_with_the_usual_sigma():
     from characterize.model import PARAMETERS, PLACE, Known
 
     known = {"height_nm": Known("height_nm", 4.0, 0.0), "index": Known("index", 0.01, 0.003)}
-    prior = search.prior_of(("height_nm", "index", "bias_nm"), known, 1700.0)
+    prior = search.prior_of(("height_nm", "index", "bias_nm"), known, SimpleNamespace(wavelength_um=0.85))
     usual = [PARAMETERS[PLACE[name]].sigma for name in ("height_nm", "bias_nm")]
     assert prior.sigma == pytest.approx([usual[0], 0.003, usual[1]])
     assert prior.mean == pytest.approx([4.0, 0.01, PARAMETERS[PLACE["bias_nm"]].start])

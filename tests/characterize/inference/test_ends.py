@@ -228,7 +228,7 @@ def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not
 def test_metrology_with_an_error_takes_the_place_of_what_is_usual():
     names = ("bias_nm", "height_nm", "distance_um", "background_e")
     known = {"bias_nm": Known("bias_nm", 3.1, 0.7), "height_nm": Known("height_nm", -4.2, 0.0)}
-    got = search.prior_of(names, known, 1800.0)
+    got = search.prior_of(names, known, SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1800.0))
     table = [PARAMETERS[PLACE[name]] for name in names]
     assert got.mean.tolist() == [3.1, -4.2, table[2].start, table[3].start]
     assert got.sigma.tolist() == [0.7, table[1].sigma, table[2].sigma, table[3].sigma]

@@ -22,5 +22,8 @@ def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
     }
 
 
-def test_half_a_nanometre_of_wavelength_where_nothing_is_said():
+def test_half_a_nanometre_of_wavelength_where_nothing_is_said_and_as_much_of_a_long_one():
     assert said() == {"wavelength_nm": (pytest.approx(2.3), 0.5)}
+    capture = SimpleNamespace(wavelength_um=10.603, fill=1.0, pixel_um=12.0, about={})
+    (one,) = stated(capture, SimpleNamespace(wavelength_um=10.6))
+    assert (one.value, one.sigma) == (pytest.approx(3.0), pytest.approx(0.5 * 10.6 / 0.85))

@@ -9,9 +9,14 @@ import pytest
 from characterize.captures import Gain
 from characterize.inference import verdict
 from characterize.inference.missing import Unstated
+from characterize.model import PARAMETERS, PLACE
 
 RNG = np.random.default_rng(2)
 NOTHING = Unstated.none(3)
+
+
+def rows_of(names):
+    return [PARAMETERS[PLACE[name]] for name in names]
 
 
 def solution(chi2, pixels=800):
@@ -118,16 +123,14 @@ def test_bounds_that_a_parameter_ran_into_are_named():
 def test_what_is_known_is_an_interval_within_the_usual_uncertainty():
     """3.92 sigma make an interval of 95 %; told above 0.7 of the prior is prior knowledge."""
     names = ("bias_nm", "height_nm", "background_e")
-    from characterize.model import PARAMETERS, PLACE
-
     scales = [PARAMETERS[PLACE[name]].scale for name in names]
     low = np.array([50.0, -1.9 * scales[1], 0.0])
     high = np.array([50.0 + 3.9 * scales[0], 2.1 * scales[1], 1.0])
-    words = verdict.process_verdict(names, low, high, np.array([0.2, 0.69, 0.9]), NOTHING)
+    words = verdict.process_verdict(rows_of(names), low, high, np.array([0.2, 0.69, 0.9]), NOTHING)
     assert f"known to bias_nm +- {3.9 * scales[0] / 3.92:.2g}" in words
     assert f"loosely: height_nm {low[1]:.3g} to {high[1]:.3g}" in words
     assert "prior" not in words
-    words = verdict.process_verdict(names, low, high, np.array([0.2, 0.71, 0]), NOTHING)
+    words = verdict.process_verdict(rows_of(names), low, high, np.array([0.2, 0.71, 0]), NOTHING)
     assert "from prior knowledge only: height_nm" in words
 
 
@@ -139,7 +142,7 @@ def test_what_others_may_have_moved_is_known_within_the_model_alone():
     by_cause = np.array([[1.2, 0.0, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.003]])
     moved = np.diag(by_cause.sum(0) ** 2)
     unstated = Unstated(("a plate of glass", "an oblique saddle", "uneven light"), by_cause, moved, np.zeros((3, 3)))
-    words = verdict.process_verdict(names, low, high, np.full(3, 0.1), unstated)
+    words = verdict.process_verdict(rows_of(names), low, high, np.full(3, 0.1), unstated)
     assert words.startswith("the process is known to height_nm +- 1.1, coma_x_rad +- 0.01;")
     assert "within the model only, that is without plate of glass" in words
     assert "bias_nm +- 0.8 (else +- 1.4)" in words

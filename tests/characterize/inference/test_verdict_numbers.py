@@ -17,6 +17,10 @@ RNG = np.random.default_rng(41)
 NOTHING = Unstated.none(4)
 
 
+def rows_of(names):
+    return [PARAMETERS[PLACE[name]] for name in names]
+
+
 def test_a_cause_is_known_to_its_interval_over_3_92():
     """Known where that is within the scale of the parameter, wherever it lies; else from the prior, or only loosely."""
     scale = {name: PARAMETERS[PLACE[name]].scale for name in ("bias_nm", "height_nm", "index")}
@@ -24,7 +28,7 @@ def test_a_cause_is_known_to_its_interval_over_3_92():
     sigma = np.array([0.5 * scale["bias_nm"], 9.0, 1.1 * scale["height_nm"], 1.2 * scale["index"]])
     middle = np.array([37.0 * scale["bias_nm"], 2.0, -61.0 * scale["height_nm"], 0.3])
     said = verdict.process_verdict(
-        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.69, 0.71]), NOTHING
+        rows_of(names), middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.69, 0.71]), NOTHING
     )
     assert said.startswith(f"the process is known to bias_nm +- {sigma[0]:.2g};")
     low, high = middle[2] - 1.96 * sigma[2], middle[2] + 1.96 * sigma[2]
@@ -33,7 +37,7 @@ def test_a_cause_is_known_to_its_interval_over_3_92():
     assert "log_gain" not in said
     sigma[2] = 0.98 * scale["height_nm"]
     said = verdict.process_verdict(
-        names, middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.8, 0.7]), NOTHING
+        rows_of(names), middle - 1.96 * sigma, middle + 1.96 * sigma, np.array([0.1, 0.1, 0.8, 0.7]), NOTHING
     )
     assert f"height_nm +- {sigma[2]:.2g}" in said
     assert "loosely: index" in said
@@ -66,6 +70,7 @@ def test_an_interval_is_that_of_the_profile_or_1_96_sigma_and_draws_follow_the_c
     covariance = np.array([[0.09, -0.06], [-0.06, 0.25]])
     names = ("bias_nm", "distance_um")
     fitted = SimpleNamespace(
+        design=SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1700.0),
         names=names, value=np.array([7.0, 0.4]), covariance=covariance, low=np.array([]), high=np.array([]),
         draws=np.empty((0, 2)), sigma=AsBuilt.sigma.fget(SimpleNamespace(covariance=covariance)),
     )  # fmt: skip
@@ -185,7 +190,7 @@ def test_what_moves_a_parameter_most_in_its_own_errors_is_named_first_and_three_
     causes = ("a plate of glass", "an oblique saddle", "uneven light", "a ghost", "an echo")
     by_cause = errors * sigma
     unstated = Unstated(causes, by_cause, np.diag((by_cause**2).sum(0)) * [[9.0], [4.0]], np.zeros((2, 2)))
-    said = verdict.process_verdict(names, -1.96 * sigma, 1.96 * sigma, np.full(2, 0.1), unstated)
+    said = verdict.process_verdict(rows_of(names), -1.96 * sigma, 1.96 * sigma, np.full(2, 0.1), unstated)
     assert "that is without oblique saddle, ghost, uneven light: bias_nm" in said
 
 

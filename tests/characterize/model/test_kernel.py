@@ -222,7 +222,7 @@ def test_window_as_wide_as_the_distance_agrees_with_the_sum_over_every_pillar(an
 
 
 def test_no_search_takes_the_sensor_into_the_lens():
-    prior = prior_of(("distance_um", "bias_nm"), {}, 10.0)
+    prior = prior_of(("distance_um", "bias_nm"), {}, dataclasses.replace(b.lens(), sensor_distance_um=10.0))
     assert (prior.low[0], prior.high[0]) == (-2.5, 2.5)
-    far = prior_of(("distance_um",), {}, 1e4)
+    far = prior_of(("distance_um",), {}, dataclasses.replace(b.lens(), sensor_distance_um=1e4))
     assert (far.low[0], far.high[0]) == (-400.0, 400.0)

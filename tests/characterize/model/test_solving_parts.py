@@ -10,7 +10,7 @@ RNG = np.random.default_rng(29)
 
 
 def test_amounts_reach_beyond_the_bounds_of_a_fit():
-    changes = solving._changes()
+    changes = solving._changes(0.85)
     rows = [row for _, row in of_kind(Answers)]
     assert [row.name for _, row, _ in changes] == ["height_nm", "index"]
     assert [n for n, _, _ in changes] == [rows.index(row) for _, row, _ in changes]
@@ -20,7 +20,7 @@ def test_amounts_reach_beyond_the_bounds_of_a_fit():
 
 def test_series_go_through_what_was_solved():
     """Quartics in the height and parabolas in the index come back; a cause that is not solved has t alone."""
-    changes = solving._changes()
+    changes = solving._changes(0.85)
     t = RNG.normal(size=7) + 1j * RNG.normal(size=7)
     tall = RNG.normal(size=(4, 7)) * np.array([3.0, 40.0, 500.0, 9e3])[:, None]
     dense = RNG.normal(size=(2, 7)) * 1j
