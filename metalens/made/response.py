@@ -16,6 +16,7 @@ from metalens.made.solved import Solved
 from metalens.pillars import Proxy
 
 _END = 64  # steps in the wavelengths of a proxy, of which the last one gives the tangent at its end
+_DARKEST = 1e-3  # |T| that a tangent beyond a proxy falls to at most: what a solver has there is a multiple of it
 _NODES, _DEGREE = 9, 5  # sizes that own shapes are solved at, and of the polynomials through them
 
 
@@ -170,7 +171,7 @@ def guide(cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array, *,
 def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0) -> Array:
     """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at an angle of incidence.
 
-    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 0 to 1): by
+    Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 1e-3 to 1): by
     diameter, and by wavelength as far again as the proxy reaches, then held; of one wavelength they hold at all.
     """
     low, high = proxy.wavelengths_um
@@ -182,7 +183,7 @@ def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: floa
         before = _levels(proxy, d_um, inside - step, angle_rad)
         phase = phase + (phase - before[0]) * (away / step)
         level = level + (level - before[1]) * (away / step)
-    return np.asarray(np.clip(level, 0, 1) * np.exp(1j * phase))
+    return np.asarray(np.clip(level, _DARKEST, 1) * np.exp(1j * phase))
 
 
 def _levels(proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float) -> tuple[Array, Array]:

@@ -210,7 +210,7 @@ def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
     level = np.array([0.85, 0.7, 0.54])
     got = response.designed(Line(), d, 0.85, angle_rad=0.1)
     assert got[:3] == pytest.approx(level * np.exp(1j * phase), rel=1e-12)
-    assert np.abs(got[3:]) == pytest.approx([0, 1], abs=1e-12)  # held within 0 and 1
+    assert np.abs(got[3:]) == pytest.approx([1e-3, 1], abs=1e-12)  # held within 0.001 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
     changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0, *[0] * 3]), angle_rad=0.1)
@@ -233,6 +233,18 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
     ends = response.designed(Line(), at[[0, 3]], 0.85)
     assert beyond.factor(np.zeros(6)) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
+
+
+def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
+    """The proxy of |T| = 0.9 - D falls to nothing at 0.9 um; the solver has 0.31 there, at every height."""
+    at = np.array([0.2, 0.5, 0.95, 1.1])
+    powers = np.zeros((3, 2, 4), complex)
+    powers[:, 0] = 0.31 * np.exp(5j * at)
+    powers[0, 1] = 0.7j * powers[0, 0]
+    slopes = Sensitivity(np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers))
+    amounts = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
+    got = response.transmission(Line(), slopes, at, 0.85, amounts)
+    assert got == pytest.approx(powers[0, 0] * (1 + 0.014j), rel=1e-9)
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
