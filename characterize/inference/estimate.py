@@ -199,7 +199,7 @@ def _as_laid(task: Task, found: Arrangement) -> Task:
     """The task with its frames laid as found, and its windows held where the light then lies."""
     aside = found.clearly and found.orientation % 2 == 1
     model = task.model.exchanged() if aside else task.model
-    model = model.about(search.window_um(found, model.setting.pixel_um))
+    model = model.about(search.window_um(found, model))
     return dataclasses.replace(task, model=model, data=_rearranged(task.data, found), found=found)
 
 

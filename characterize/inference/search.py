@@ -22,7 +22,7 @@ from metalens.made import coarser
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
 _LEANING_RAD = 0.3  # of the starts that look for a twin
-_ALONG_NM = 9.0  # bias by which starts are moved along the valley
+_ALONG_NM, _ASIDE_UM = 9.0, 50.0  # bias by which starts are moved along the valley; where windows begin at most
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
@@ -298,21 +298,22 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
     return out
 
 
-def window_um(found: Arrangement, pixel_um: float) -> tuple[float, float]:
+def window_um(found: Arrangement, model: ForwardModel) -> tuple[float, float]:
     """(x, y) of the window's middle from the chief ray, as the light lies in the frames."""
-    x, y = (float(np.clip(-shift * pixel_um, -50, 50)) for shift in found.shift_px[::-1])
+    most = _ASIDE_UM * coarser(model.lens.wavelength_um)
+    x, y = (float(np.clip(-shift * model.setting.pixel_um, -most, most)) for shift in found.shift_px[::-1])
     return x, y
 
 
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
     """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames.
 
-    biases_nm: of lenses for 0.85 um, more for longer waves.
+    biases_nm: of lenses for 0.85 um; of longer waves they are larger.
     """
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
-    place = window_um(found, model.setting.pixel_um)
+    place = window_um(found, model)
     level = float(np.median(data.electrons[data.usable]))
     lies = {"stage_zero_um": found.stage_zero_um, "distance_um": found.distance_um, "background_e": level}
     base = with_values(task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]})
@@ -342,9 +343,11 @@ def _twins(task: Task, best: Solution) -> list[Array]:
     out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]
     if "bias_nm" in task.names:
         i = task.names.index("bias_nm")
-        along = best.covariance[:, i] / best.covariance[i, i]
+        along, far_nm = (
+            best.covariance[:, i] / best.covariance[i, i],
+            _ALONG_NM * coarser(task.model.lens.wavelength_um),
+        )
         for sign in (1, -1):
-            step = sign * _ALONG_NM * coarser(task.model.lens.wavelength_um)
-            moved = np.clip(best.value + step * along, task.prior.low, task.prior.high)
+            moved = np.clip(best.value + sign * far_nm * along, task.prior.low, task.prior.high)
             out.append(task.all_of(moved))
     return out

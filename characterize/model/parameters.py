@@ -5,7 +5,7 @@ Those of the lens are the table of :mod:`metalens.made.causes`; those of the ben
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, nearest
 from metalens.lens import Lens
-from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, larger, named
+from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, coarser, larger, named
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +101,7 @@ UNFITTED: tuple[Unfitted, ...] = (
 )
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}
+_IN_PIXELS = "decentre_x_um", "decentre_y_um"  # which are as wide as the blur, and that as the wave is long
 _UNFITTED = tuple(row.name for row in UNFITTED)
 _CAUSES = [PLACE[row.name] for row in CAUSES]
 
@@ -130,12 +131,14 @@ class Known:
             raise ConfigError(f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0")
 
 
-def usual(names: Iterable[str], lens: Lens) -> list[Parameter]:
-    """The rows of some parameters for a lens: what is in nm grows with long waves (``made.coarser``).
+def usual(names: Sequence[str], lens: Lens) -> list[Parameter]:
+    """The rows of some parameters for a lens: what is in nm, and decentre, grow with long waves (``made.coarser``).
 
     The distance may be wrong by a quarter, so that no search runs into the lens.
     """
-    rows = [_times(PARAMETERS[PLACE[name]], larger(name, lens.wavelength_um)) for name in names]
+    wave = lens.wavelength_um
+    factors = [coarser(wave) if name in _IN_PIXELS else larger(name, wave) for name in names]
+    rows = [_times(PARAMETERS[PLACE[name]], factor) for name, factor in zip(names, factors, strict=True)]
     reach = [lens.sensor_distance_um / 4 if row.name == "distance_um" else math.inf for row in rows]
     pairs = zip(rows, reach, strict=True)
     return [dataclasses.replace(row, low=max(row.low, -most), high=min(row.high, most)) for row, most in pairs]

@@ -43,11 +43,11 @@ def of_larger(response, factor):
     return Sensitivity(response.coefficients * powers * rates[:, None], factor * response.center_um)
 
 
-def test_what_is_in_nm_grows_with_long_waves_and_nothing_else_does():
+def test_what_is_in_nm_and_decentre_grow_with_long_waves_and_nothing_else_does():
     long, short = larger(b.lens(), LARGER), larger(b.lens(), 0.626)
     assert coarser(short.wavelength_um) == 1.0  # 532 nm: from the same writer, with its nanometres
     for row, much, same in zip(PARAMETERS, usual(NAMES, long), usual(NAMES, short), strict=True):
-        factor = LARGER if row.name.endswith("_nm") else 1.0
+        factor = LARGER if row.name.endswith("_nm") or row.name.startswith("decentre") else 1.0
         assert (much.scale, much.sigma, much.unstated) == pytest.approx(
             (factor * row.scale, factor * row.sigma, factor * row.unstated)
         )
