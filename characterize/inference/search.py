@@ -306,10 +306,7 @@ def window_um(found: Arrangement, model: ForwardModel) -> tuple[float, float]:
 
 
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
-    """Nominal, and the twins of the global bias; stage zero, place, gain and background read off the frames.
-
-    biases_nm: of lenses for 0.85 um; of longer waves they are larger.
-    """
+    """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain, background off the frames."""
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
@@ -343,11 +340,9 @@ def _twins(task: Task, best: Solution) -> list[Array]:
     out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]
     if "bias_nm" in task.names:
         i = task.names.index("bias_nm")
-        along, far_nm = (
-            best.covariance[:, i] / best.covariance[i, i],
-            _ALONG_NM * coarser(task.model.lens.wavelength_um),
-        )
+        far_nm = _ALONG_NM * coarser(task.model.lens.wavelength_um)
+        along = far_nm * best.covariance[:, i] / best.covariance[i, i]
         for sign in (1, -1):
-            moved = np.clip(best.value + sign * far_nm * along, task.prior.low, task.prior.high)
+            moved = np.clip(best.value + sign * along, task.prior.low, task.prior.high)
             out.append(task.all_of(moved))
     return out
