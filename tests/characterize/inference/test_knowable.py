@@ -109,6 +109,7 @@ def asbuilt(**more):
         "low": np.empty(0),
         "high": np.empty(0),
         "draws": np.empty((0, 0)),
+        "design": SimpleNamespace(wavelength_um=0.83, sensor_distance_um=4000.0),
     }
     for name, value in (numbers | more).items():
         object.__setattr__(found, name, value)

@@ -12,5 +12,5 @@ from characterize.model import Known
 def test_distances_are_scanned_over_two_sigma_within_the_bounds(sigma, reach):
     """Unknown to 100 um where nobody says; the bounds lie 400 um to either side."""
     known = {} if sigma is None else {"distance_um": Known("distance_um", 12.0, sigma)}
-    lens = SimpleNamespace(sensor_distance_um=5200.0)
+    lens = SimpleNamespace(sensor_distance_um=5200.0, wavelength_um=0.83)
     assert estimate._reach_um(known, lens) == pytest.approx(reach)

@@ -16,7 +16,7 @@ RNG = np.random.default_rng(41)
 SLOPES = RNG.normal(size=(len(PLACE), *SHAPE))
 LIGHT, LEANING, MOVED = RNG.uniform(3, 9, SHAPE), RNG.normal(size=SHAPE), RNG.normal(size=(MODES + 3, *SHAPE))
 LENS = SimpleNamespace(
-    wavelength_um=0.87,
+    wavelength_um=0.83,
     diameters=SimpleNamespace(radius_um=300.0),
     sensor_distance_um=1100.0,
     source_distance_um=5200.0,

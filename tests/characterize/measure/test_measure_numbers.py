@@ -112,7 +112,7 @@ def test_light_is_counted_above_the_median_of_the_rim():
     frame[2, 3], frame[3, 4] = 90.0, 80.0
     usable = np.ones(frame.shape, bool)
     usable[2, 3] = False
-    light = frames._above(frame, usable)
+    light = frames._above(frame, usable, "x.tif")
     assert light[3, 4] == 30
     assert light[0, 0] == -4
 
@@ -162,10 +162,10 @@ def test_a_spot_stands_five_robust_sigma_above_the_rim(top, seen):
     frame[1:-1, 1:-1] = 40.0
     frame[2, 5] = 50 + top * 1.4826 * 3
     if seen:
-        assert frames._above(frame, np.ones(frame.shape, bool)).max() == pytest.approx(top * 1.4826 * 3)
+        assert frames._above(frame, np.ones(frame.shape, bool), "x.tif").max() == pytest.approx(top * 1.4826 * 3)
     else:
         with pytest.raises(CaptureError, match="five times"):
-            frames._above(frame, np.ones(frame.shape, bool))
+            frames._above(frame, np.ones(frame.shape, bool), "x.tif")
 
 
 def row(depth, angle, ee80, x=0.0, *, angle_y=0.0, y=0.3):
@@ -306,5 +306,5 @@ def test_pixels_per_side_of_the_rim_take_part_alike():
     """Every border counts once: levels 10, 20, 30, 40 along top, bottom, left, right of 5 x 7 pixels."""
     frame = np.full((5, 7), 999.0)
     frame[0], frame[-1], frame[1:-1, 0], frame[1:-1, -1] = 10, 20, 30, 40
-    light = frames._above(frame, np.ones(frame.shape, bool))
+    light = frames._above(frame, np.ones(frame.shape, bool), "x.tif")
     assert light[0, 0] == 10 - np.median([10] * 7 + [20] * 7 + [30] * 3 + [40] * 3)
