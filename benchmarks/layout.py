@@ -240,8 +240,8 @@ def _certificate_rows(target: Path) -> list[Row]:
     return [Row("1 mm lens", "certificate", seconds, found.worst_exposure, text, 1, peak, "<= 10 s, 1 %, 1 nm")]
 
 
-def _lens(diameter_mm: float, pitch_um: float) -> "Lens":
-    """A focusing lens with a cubic phase, diameters in float32."""
+def _lens(diameter_mm: float, pitch_um: float, *, cubic_rad: float = 3.0) -> "Lens":
+    """A focusing lens with a cubic phase, diameters in float32; without that it is alike in all its eighths."""
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens
     from metalens.pillars import Proxy
@@ -251,7 +251,7 @@ def _lens(diameter_mm: float, pitch_um: float) -> "Lens":
     d, focus, widest = np.zeros((count, count), np.float32), 2000 * diameter_mm, 0.7 * pitch_um
     for row in range(count):
         r2 = x**2 + x[row] ** 2
-        phase = (np.sqrt(r2 + focus**2) - focus) / 0.94 + 3 * (x / reach) ** 3
+        phase = (np.sqrt(r2 + focus**2) - focus) / 0.94 + cubic_rad * (x / reach) ** 3
         d[row] = np.where(r2 < reach**2, 0.09 + (widest - 0.09) * (1 - phase % 1), 0)
     proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
     return Lens(DiameterMap(d, pitch_um), Cell(pitch_um), proxy, 0.94, focus, float("inf"), "map")
@@ -285,17 +285,33 @@ print(code, time.process_time() - start, peak_mb())
 
 
 def _foreign_check_rows(target: Path) -> list[Row]:
-    """``metalens check`` of 8.7 million pillars from OASIS, in a process of its own: CPU time, peak of all memory."""
+    """``metalens check`` of 8.7 million pillars from OASIS, in a process of its own: CPU time, peak of all memory.
+
+    A file of every pillar, and the one of an eighth and its copies that ``metalens layout`` writes of a round lens.
+    """
     from layout.mask import build
     from layout.process.process import Process
+    from metalens import lens as lenses
 
-    made = build.prepare(_lens(1.0, 0.3).diameters, Process(), furniture="none", with_doses=False)
-    layout.write_oasis(made.plan, target / "check.oas")
-    words = [sys.executable, "-c", _CHECK, str(target / "check.oas")]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    code, seconds, peak = map(float, done.stdout.split()[-3:])
+    for diameter_mm in (0.02, 1.0):  # the first compiles what the second runs
+        made = build.prepare(_lens(diameter_mm, 0.3).diameters, Process(), furniture="none", with_doses=False)
+        layout.write_oasis(made.plan, target / "check.oas")
+        code, seconds, peak = _ran(_CHECK, str(target / "check.oas"))
     text = f"exit status of {int(made.plan.counts()[1:].sum()):,} pillars; CPU s, all memory"
-    return [Row("1 mm lens", "metalens check, OASIS", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")]
+    whole = Row("1 mm lens", "metalens check, OASIS", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")
+    lenses.save(target / "round.h5", _lens(1.0, 0.3, cubic_rad=0.0))
+    _ran(_COMMAND, str(target / "round.h5"), "-o", str(target / "round"))
+    code, seconds, peak = _ran(_CHECK, str(target / "round" / "mask.oas"))
+    text = "exit status; CPU s, all memory"
+    folded = Row("1 mm lens", "metalens check, OASIS of an eighth", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")
+    return [whole, folded]
+
+
+def _ran(code: str, *words: str) -> tuple[float, float, float]:
+    """What a program tells at its end: exit status, seconds, peak of its memory in MB."""
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    status, seconds, peak = map(float, done.stdout.split()[-3:])
+    return status, seconds, peak
 
 
 def _large_command_rows(target: Path) -> Iterator[Row]:
@@ -304,16 +320,15 @@ def _large_command_rows(target: Path) -> Iterator[Row]:
 
     process = target / "process.toml"
     process.write_text("[exposure]\nalpha_um = 0.010\nbeta_um = 31.0\neta = 0.6\n", encoding="utf-8")
-    goals = ((1.0, "<= 8 s"), (2.0, ""), (4.0, "<= 60 s"), (10.0, "<= 300 s, <= 1000 MB"))
+    ways = (("", []), (", doses corrected and certified", ["--process", str(process)]))
+    goals = ((0.02, ""), (1.0, "<= 8 s"), (2.0, ""), (4.0, "<= 60 s"), (10.0, "<= 300 s, <= 1000 MB"))
     for diameter_mm, goal in goals:
         lenses.save(target / "large.h5", _lens(diameter_mm, 0.4))
-        words = [sys.executable, "-c", _COMMAND, str(target / "large.h5"), "-o", str(target / "large")]
-        ways = (("", []), (", doses corrected and certified", ["--process", str(process)]))
-        for said, more in ways if diameter_mm in (1.0, 10.0) else ways[:1]:
-            done = subprocess.run([*words, *more], capture_output=True, text=True, check=True)
-            code, seconds, peak = map(float, done.stdout.split()[-3:])
+        for said, more in ways if diameter_mm not in (2.0, 4.0) else ways[:1]:
+            code, seconds, peak = _ran(_COMMAND, str(target / "large.h5"), "-o", str(target / "large"), *more)
             method = f"metalens layout, OASIS{said}"
-            yield Row(f"{diameter_mm:g} mm lens", method, seconds, code, "exit status; all memory", 2, peak, goal)
+            if diameter_mm > 0.02:  # the smallest compiles what the others run
+                yield Row(f"{diameter_mm:g} mm lens", method, seconds, code, "exit status; all memory", 2, peak, goal)
 
 
 def peer_rows() -> list[Row]:
