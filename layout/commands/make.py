@@ -56,7 +56,7 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
     with stages("read"):
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
-        _refuse_beyond_one_size(options, source)
+        _refuse_two_sizes(options, source)
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, furniture=furniture, with_doses=options.dose)
@@ -74,15 +74,14 @@ def _room(options: Options, source: Lens) -> int:
     return gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small if options.writes_gds else small
 
 
-def _refuse_beyond_one_size(options: Options, source: Lens) -> None:
-    """What knows pillars of one size alone.
+def _refuse_two_sizes(options: Options, source: Lens) -> None:
+    """What knows pillars of one size alone, turned or not.
 
     Raises:
         ProcessError: naming the option.
     """
-    if options.study and (source.hand or source.pairs is not None):
-        what = "turned one by one" if source.hand else "of two sizes"
-        raise ProcessError(f"--study takes pillars that differ in one size alone, not pillars {what}")
+    if options.study and source.pairs is not None:
+        raise ProcessError("--study takes pillars that differ in one size, and in their turn, not pillars of two sizes")
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:

@@ -22,13 +22,16 @@ CHOICE_RAD = (0.1, 0.2, 0.3)
 def sections(lens: Lens, process: Process, plan: FieldPlan, *, answers: Sensitivities | None = None) -> list[Section]:
     """The three sections; half a minute for a 1 mm lens, most of it for the solver and the Monte Carlo.
 
+    Pillars that are turned one by one have no choice of sizes: their turn gives any phase at the size that is best.
+
     answers: of the pillars to height, wall and index; left out: from the solver.
 
     Raises:
         CellError, MaterialError: from the solver of the pillar.
     """
     answers = sensitivities(lens) if answers is None else answers
-    return [_stitching(lens, plan, process), _tolerance(lens, process, answers), _choice(lens, process, answers)]
+    found = [_stitching(lens, plan, process), _tolerance(lens, process, answers)]
+    return found if lens.hand else [*found, _choice(lens, process, answers)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:

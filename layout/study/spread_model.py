@@ -2,8 +2,8 @@
 
 A draw changes t of every pillar through a local bias b(x) and, for the whole lens, through what all pillars answer
 alike (height, wall, index). Over all such changes the curve t(D) stays in a space of few dimensions, found by a
-singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are summed once for each B_k; a draw
-only weights these sums, at the nodes of :mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
+singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are summed once for each B_k (times
+the phase of their turn, which no draw changes but for all alike); a draw only weights these sums, at the nodes of :mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
 """
 
 import functools
@@ -95,21 +95,27 @@ def reduce(lens: Lens, sens: Sensitivities, focus: Focus, spread: Spread, *, see
     basis = directions[:rank] / weight
     columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
     edges = [len(index) * i // _PARTS for i in range(_PARTS + 1)]
-    parts = [(start, index[start:stop]) for start, stop in itertools.pairwise(edges)]
+    parts = [(start, index[start:stop], _turned(lens, slice(start, stop))) for start, stop in itertools.pairwise(edges)]
     moments = functools.reduce(np.add, executor.gather(_summed, (focus, columns), parts))
     return Model(pillars, focus, diameter, count, basis, moments, lens.diameters.radius_um)
 
 
-def _summed(about: tuple[Focus, Array], part: tuple[int, Array]) -> Array:
+def _turned(lens: Lens, rows: slice) -> Array | None:
+    """(rows, x) factor that the turn of each pillar gives circular light; None where none is turned."""
+    return np.exp(1j * np.asarray(lens.geometric_rad(rows))).astype(np.complex64) if lens.hand else None
+
+
+def _summed(about: tuple[Focus, Array], part: tuple[int, Array, Array | None]) -> Array:
     """(rank, nodes y, nodes x) sums over rows of pillars.
 
-    about: and the (rank, 1 + entries) basis. part: first row; (rows, x) entry of each site.
+    about: and the (rank, 1 + entries) basis. part: first row; (rows, x) entry of each site; (rows, x) factor of each.
     """
-    (focus, columns), (first, index) = about, part
+    (focus, columns), (first, index, turned) = about, part
     moments = np.zeros((len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
     for start in range(0, len(index), _BAND):
-        some = index[start : start + _BAND]
-        moments += focus.project(columns[:, some], slice(first + start, first + start + len(some)))
+        band = slice(start, start + _BAND)
+        some = columns[:, index[band]] if turned is None else columns[:, index[band]] * turned[band]
+        moments += focus.project(some, slice(first + start, first + start + some.shape[1]))
     return moments
 
 

@@ -84,9 +84,10 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: Focus) -> tuple[int, Array
 
 
 def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    d = lens.diameters.diameter_um[rows, columns].astype(float)
+    d = lens.diameters.diameter_um[rows].astype(float)
     inside = np.where(d > 0, d, lens.proxy.domain_um[0])
-    return np.where(d > 0, designed(lens.proxy, inside, lens.wavelength_um), 0).astype(np.complex64)
+    t = designed(lens.proxy, inside, lens.wavelength_um) * np.exp(1j * lens.geometric_rad(rows))
+    return np.where(d > 0, t, 0)[:, columns].astype(np.complex64)
 
 
 def _expansion(focus: Focus, moments: Array, step_um: float) -> tuple[Array, Array]:

@@ -56,9 +56,21 @@ def hexagonal():
     return dataclasses.replace(made, cell=cell, diameters=DiameterMap(d, 0.44, cell.lattice))
 
 
-@pytest.mark.parametrize("made", [hyperbolic, hexagonal])
+def turned(n=161):
+    """Rectangles, each turned so that left circular light, whose phase falls by twice the turn, has a focus."""
+    made, cell = hyperbolic(n), Cell(0.4, shape=Rectangle(0.5))
+    d = made.diameters.diameter_um
+    x, y = made.diameters.x_um, made.diameters.y_um[:, None]
+    turn = np.pi / 0.85 * (np.hypot(np.hypot(x, y), 150.0) + np.hypot(np.hypot(x, y), 1500.0)) % np.pi
+    sizes = np.where(d > 0, 0.2 + 0.0005 * x, 0.0)
+    return dataclasses.replace(made, cell=cell, hand="left", diameters=DiameterMap(sizes, 0.4, angle_rad=turn))
+
+
+@pytest.mark.parametrize("made", [hyperbolic, hexagonal, turned])
 def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
     lens = made()
+    turn = lens.diameters.angle_rad
+    swung = 1.0 if turn is None else np.exp(-2j * turn)
     where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0, 1200.0]))
     model = reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=0)
     lenses = draws(Spread(), 4, seed=9)
@@ -72,7 +84,7 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
         height, index, wall = SENS.at(made)[:3]
         change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
         t = transmission(PROXY, SENS, made, 0.85, np.zeros(6)) * np.exp(change)
-        exact = plain_sum.field(lens, np.where(d > 0, t, 0), where)
+        exact = plain_sum.field(lens, np.where(d > 0, t * swung, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
     assert missed(model, lenses) < 2e-3
     assert len(model.basis) <= 12
@@ -232,15 +244,34 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"), [({"hand": "left"}, "turned one by one"), ({"pairs": 1}, "of two sizes")]
-)
-def test_pillars_that_differ_in_more_than_a_size_are_refused_by_name(changed, words):
-    source = SimpleNamespace(**{"hand": "", "pairs": None} | changed)
-    with pytest.raises(ProcessError, match=words):
-        make._refuse_beyond_one_size(SimpleNamespace(study=True), source)
-    make._refuse_beyond_one_size(SimpleNamespace(study=False), source)
-    make._refuse_beyond_one_size(SimpleNamespace(study=True), SimpleNamespace(hand="", pairs=None))
+def test_pillars_of_two_sizes_are_refused_by_name():
+    study, plain = SimpleNamespace(study=True), SimpleNamespace(study=False)
+    with pytest.raises(ProcessError, match="of two sizes"):
+        make._refuse_two_sizes(study, SimpleNamespace(pairs=1))
+    make._refuse_two_sizes(plain, SimpleNamespace(pairs=1))
+    make._refuse_two_sizes(study, SimpleNamespace(pairs=None))
+
+
+def test_a_turned_lens_has_its_study_without_a_choice_of_sizes(monkeypatch):
+    for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
+        monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
+    lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
+    made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
+    assert [section.title for section in made] == ["Stitching", "Tolerance"]
+
+
+def test_fields_of_a_turned_lens_add_up_to_its_light():
+    lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
+    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0]))
+    ready = focus.prepare(lens, where)
+    held, moments = stitching.field_moments(lens, fields.split(lens.diameters, process), ready)
+    d = lens.diameters.diameter_um
+    t = PROXY.transmission(np.where(d > 0, d, 0.2), 0.85) * np.exp(
+        1j * (PROXY.phase_rad(np.where(d > 0, d, 0.2), 0.85) - 2 * lens.diameters.angle_rad)
+    )
+    exact = plain_sum.field(lens, np.where(d > 0, t, 0), where)
+    assert held == 9
+    assert abs(ready.light(moments.sum(0)[None])[0] - exact).max() < 1e-4 * abs(exact).max()  # float32 sums
 
 
 def test_the_tolerant_choice_keeps_the_lattice_and_what_a_shape_may_be():
