@@ -4,7 +4,7 @@ import contextlib
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +31,8 @@ _STITCH_UM = 0.05
 _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
 _ENOUGH = 4e-3
-_CAMERA_DEG, _DENSE = 0.5, 3  # samples a pixel's side between which turned frames are interpolated
+_CAMERA_DEG, _TALL = 0.5, 0.01
+_DENSE = 3  # samples a pixel's side between which turned frames are interpolated
 WINDOWS = "a window off the chief ray at a field angle"
 _ROUND = 1e-4  # of the peak: round light does not turn, what is left is of the interpolation
 _GRID = 41  # places across the lens where write fields are told apart
@@ -101,10 +102,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     yield from _of_windows(task, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
-    turned = np.subtract(*(turned_frames(task.model, x, angle) for angle in (_CAMERA_DEG, 0.0)))[None]
-    if np.abs(turned).max() > _ROUND * light.max():
-        sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
-        yield Change("a camera that is turned", turned, _CAMERA_DEG, "{:.3g} deg against the lens", sigma)
+    yield from _of_camera(task, x, light)
     held = tuple(name for name in LIGHT if name not in task.names)
     if held:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
@@ -148,6 +146,20 @@ def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     if "wavelength_nm" in slopes:
         ramp = np.linspace(-1, 1, len(light))[:, None, None]
         yield Change("a wavelength that drifts", (slopes["wavelength_nm"] * ramp)[None])
+
+
+def _of_camera(task: Task, x: Array, light: Array) -> Iterator[Change]:
+    """Pixels that lie elsewhere: along turned axes, or farther apart along y.
+
+    Pixels that are higher too blur by a share of their own width more, which is left out.
+    """
+    places = np.eye(2), _turn(_CAMERA_DEG), np.diag([1 + _TALL, 1.0])
+    upright, *moved = seen_at(task.model, x, places)
+    turned, tall = (frames - upright for frames in moved)
+    if np.abs(turned).max() > _ROUND * light.max():
+        sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
+        yield Change("a camera that is turned", turned[None], _CAMERA_DEG, "{:.3g} deg against the lens", sigma)
+    yield Change("pixels that are not as high as wide", tall[None])
 
 
 def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
@@ -273,18 +285,27 @@ def on_pixels(model: ForwardModel, share: float) -> ForwardModel:
     return part
 
 
-def turned_frames(model: ForwardModel, x: Array, turn_deg: float) -> Array:
-    """(n, y, x) light of a camera turned from +x to +y about its window's middle, less the background.
+def seen_at(model: ForwardModel, x: Array, places: Sequence[Array]) -> Array:
+    """(k, n, y, x) light, less the background, of pixels as wide as ever that lie elsewhere.
 
-    Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order; pixels themselves stay upright.
+    Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order.
+
+    Args:
+        places: k matrices (2, 2) from (y, x) of a pixel, counted from the window's middle, to where it lies.
     """
     s, dense = model.setting, _sampled(model, _DENSE)
     close = dense.images(x)[0] - background(x, dense.setting)
-    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    across, down = np.meshgrid(np.arange(s.columns) - s.columns // 2, np.arange(s.rows) - s.rows // 2)
+    pixels = np.stack(np.meshgrid(*(np.arange(n) - n // 2 for n in (s.rows, s.columns)), indexing="ij"))
     middle = np.array([n // 2 for n in close.shape[1:]])[:, None, None]
-    places = middle + _DENSE * np.stack([sine * across + cosine * down, cosine * across - sine * down])
-    return np.stack([ndimage.map_coordinates(frame, places, order=5, mode="nearest") for frame in close])
+    seen = (middle + _DENSE * np.tensordot(one, pixels, 1) for one in places)
+    frames = [[ndimage.map_coordinates(frame, at, order=5, mode="nearest") for frame in close] for at in seen]
+    return np.array(frames)
+
+
+def _turn(turn_deg: float) -> Array:
+    """(2, 2) of :func:`seen_at` for a camera turned from +x to +y about its window's middle."""
+    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    return np.array([[cosine, sine], [-sine, cosine]])
 
 
 def _sampled(model: ForwardModel, dense: int) -> ForwardModel:

@@ -34,14 +34,14 @@ def bent(turn_deg):
 def test_frames_of_a_turned_camera_are_those_of_a_lens_turned_back(turn_deg):
     """A fifth of the change: the square lattice of 100 pillars across is not quite round, nor are the pixels."""
     plain, want = (MODEL.images(bent(angle))[0] for angle in (0.0, -turn_deg))
-    found = causes.turned_frames(MODEL, bent(0.0), turn_deg)
+    (found,) = causes.seen_at(MODEL, bent(0.0), [causes._turn(turn_deg)])
     changed = np.linalg.norm(plain - want)
     assert np.linalg.norm(found - want) < 0.2 * changed
     assert changed > 0.02 * np.linalg.norm(want)
 
 
 def test_light_is_not_turned_by_nothing_and_turns_with_the_pixels_by_a_quarter():
-    upright, quarter = (causes.turned_frames(MODEL, bent(0.0), angle) for angle in (0.0, 90.0))
+    upright, quarter = causes.seen_at(MODEL, bent(0.0), [causes._turn(angle) for angle in (0.0, 90.0)])
     assert np.abs(upright - MODEL.images(bent(0.0))[0]).max() < 1e-3 * upright.max()
     odd = upright[:, 1:, 1:]  # pixel n // 2 is its middle; what lies at +y is seen at +x
     assert np.abs(quarter[:, 1:, 1:] - np.rot90(odd, 1, (1, 2))).max() < 1e-3 * upright.max()
