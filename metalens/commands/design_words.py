@@ -75,7 +75,7 @@ def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = N
 def _cone(quality: Quality) -> list[str]:
     """Aperture and field of a lens that has a focus."""
     if not quality.focuses:
-        return ["  the phase brings no light together on the sensor: it has no focusing efficiency, NA or field"]
+        return ["  light of this phase meets in no one bright spot of the sensor: no focusing efficiency, NA or field"]
     return [
         f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
         f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)"
