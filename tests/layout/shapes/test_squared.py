@@ -32,6 +32,7 @@ def test_boxes_told_again_cover_what_was_put_in_and_little_more(seed, squares):
     wanted, found = meet(units, inside).any(1), meet(units, again).any(1)
     assert found[wanted].all()
     side = 730 / squares  # the longer side of `around`; a box told again ends within a square and a unit of one put in
+    assert made.side == side
     wider = put + (side + 1) * np.array([-1, -1, 1, 1])
     assert meet(units, wider).any(1)[found].all()
 
