@@ -12,7 +12,7 @@ from layout.dose.drawn import Discs, Outlines
 from layout.dose.exposure import PointExposure
 
 POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))
-D, ONE, OFF = 0.231, np.array([False, True]), np.array([0.0017, -0.0009])
+D, ONE, OFF = 0.231, np.array([False, True]), np.array([0.3517, -0.2109])
 
 
 def round_ones(count=256):

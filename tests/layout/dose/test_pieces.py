@@ -258,3 +258,17 @@ def test_pieces_of_many_shapes_are_no_longer_than_the_range(monkeypatch):
     monkeypatch.setattr(pieces, "_FEW_PIECES", 10)
     made, _ = pieces.cut(CROSS, NOTHING, step_um=STEP_UM, point=beam(5.0), tolerance=0.01)
     assert 2.5 < (made[:, 2:] - made[:, :2]).max() * STEP_UM <= 5.0
+
+
+@pytest.mark.parametrize("turn", [[0, 1, 2, 3], [1, 0, 3, 2]])
+def test_a_bar_drawn_as_two_is_not_cut_along_for_the_side_between_them(turn):
+    """From its edge to its middle the background changes by more than a piece may have, but no edge is there."""
+    bars, point = np.array([[0, 0, 120_000, 6_000], [0, 6_000, 120_000, 13_000]]), beam(16.0)
+    far = PointExposure(point.widths_um[1:], point.weights[1:])
+    ends = by_boxes(np.array([[60.0, 0.0], [60.0, 6.0], [60.0, 13.0]]), bars * STEP_UM, far)
+    assert np.abs(np.diff(ends)).min() / 2 > 0.2 * 0.01 * 0.5
+    made, of = pieces.cut(bars[:, turn], NOTHING, step_um=STEP_UM, point=point, tolerance=0.01)
+    made = made[:, turn]
+    middle = (made[:, 0] <= 60_000) & (made[:, 2] >= 60_000)
+    for n, (_, bottom, _, top) in enumerate(bars):
+        assert {tuple(piece) for piece in made[middle & (of == n)][:, [1, 3]].tolist()} == {(bottom, top)}
