@@ -221,6 +221,23 @@ def test_scattered_light_counts_beside_rough_neighbours_too():
     assert want > 0.05 * endless**2
 
 
+def test_pillars_off_their_curve_send_light_across_the_focus_in_step_with_it():
+    """2 √(2 (∫I)² / ∫I² / area) of an Airy disc, (2 J1(v)/v)² with v = 2π a ρ in wavelengths, as far as v = 30; at
+    most the 2 of an amplitude that is off everywhere."""
+    aperture, lit, off = 0.06, 70_000.0, 0.013
+    given = dict(aperture=aperture, polarisation="flux", has_angles=True, ghost=0.0, incidence_rad=0.0)
+    area = 2 * math.pi / (2 * math.pi * aperture) ** 2
+    power, square = (
+        area * integrate.quad(lambda v, n=n: (2 * special.j1(v) / v) ** (2 * n) * v, 1e-9, 30, limit=200)[0]
+        for n in (1, 2)
+    )
+    found = budget.with_model(Budget(0.0), **given, proxy=off, lit=lit).proxy
+    assert found == pytest.approx(off * 2 * math.sqrt(2 * power**2 / square / lit), rel=3e-3)  # cos θ of 1.8e-3
+    assert budget.with_model(Budget(0.0), **given, proxy=off, lit=0.004 * lit).proxy == pytest.approx(2 * off, rel=1e-12)
+    assert math.isnan(budget.with_model(Budget(0.0), **given, lit=lit).proxy)
+    assert budget.with_model(Budget(0.0), **given, proxy=off).proxy == 0.0  # of a lens without end
+
+
 def test_of_rows_left_out_the_one_that_matters_most_counts():
     aperture = 0.5
     factor = np.array([[0.8 + 0.1j, 0.85 - 0.2j, 0.7 + 0.3j], [0.9 - 0.1j, 0.75 + 0.2j, 0.8 - 0.3j]])
