@@ -15,7 +15,7 @@ TRUTH = Truth(
     angles_deg=(0.0, 3.0),
     camera=Camera(pixels=24),
     diameter_noise_nm=1.7,
-    parameter=(Known("bias_nm", 4.0, 0.0), Known("bandwidth_nm", 6.0, 0.0), Known("decentre_y_um", 1.3, 0.0)),
+    parameter=(Known("bias_nm", 4.0, 0.0), Known("bandwidth_nm", 1.0, 0.0), Known("decentre_y_um", 1.3, 0.0)),
 )
 
 

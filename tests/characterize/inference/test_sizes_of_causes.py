@@ -128,6 +128,15 @@ def test_walls_pixels_and_uneven_light_have_units_of_their_own():
     assert some["uneven illumination"].sigma == pytest.approx([1.0, 0.25])
 
 
+def test_a_stated_wall_is_reckoned_with_by_the_mean_square_of_its_angle():
+    """1.2 degrees with a sigma of 0.5: 1.3 about none; an index is as uncertain as it is stated, whatever it is."""
+    stated = {"sidewall_deg": Known("sidewall_deg", 1.2, 0.5), "index": Known("index", 0.03, 0.004)}
+    every, _ = found(known=stated)
+    assert every["a tilted side wall"].sigma == pytest.approx(1.3 / 0.5)
+    assert every["a side wall that leans about half height"].sigma == pytest.approx((1.3 / 1.5) ** 2)
+    assert every["another refractive index"].sigma == pytest.approx(0.004 / 0.01)
+
+
 @pytest.mark.parametrize(("unfitted", "sigma"), [({}, 0.3), ({"window_px": 0.07}, 0.07)])
 def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
     """Frames 0 and 2 at the first angle, 1 and 3 at two more: by a pixel of 3 um along x, then y."""

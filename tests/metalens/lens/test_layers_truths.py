@@ -109,6 +109,12 @@ def test_light_of_a_stop_by_similar_triangles():
     assert Layers(stop=Stop(70.0, 0.5)).lit((0.0, 0.0), 0.6, WAVE, (np.array([1.0]), np.array([2.0])), 0.5) == 1.0
 
 
+def test_plain_is_what_holds_nothing_but_air():
+    thin = Film(Index(1.5), 0.0)
+    assert all(one.plain for one in (Layers(), Layers(cover=Index(1.0), stop=Stop(3.0, 1.0)), Layers((thin,), (thin,))))
+    assert not any(one.plain for one in (Layers(cover=Index(2.0)), Layers((GLASS,)), Layers(behind=(GLASS,))))
+
+
 def test_a_film_that_absorbs_more_than_two_in_a_hundred_is_refused_and_the_rest_is_air():
     """1 - exp(-4 π k t / λ) = 0.02 at k t / λ = 1.6077e-3; films as thick as the gap leave no air."""
     least = -math.log(0.98) / (4 * math.pi) * WAVE / 31.0
