@@ -10,6 +10,7 @@ from characterize.captures.capture import Capture
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
+_HIDES = 0.3  # counts of noise from which on rounding is off by a twentieth of a count at most
 _SURE = 3.0  # standard errors from which on noise is taken to grow with light
 
 
@@ -18,13 +19,24 @@ class Gain:
     """Noise model of a sensor: variance in counts = mean / gain + (read noise / gain)² + 1/12.
 
     gain_e: electrons a count. gain_sigma_e: standard error of it.
-    read_noise_e: electrons; known: False where it was assumed, not measured.
+    read_noise_e: electrons; read_known: False where nobody says so and no two dark frames do.
+    known: False where the gain was assumed, not measured.
     """
 
     gain_e: float
     gain_sigma_e: float
     read_noise_e: float
     known: bool = True
+    read_known: bool = True
+
+    @property
+    def coarse(self) -> bool:
+        """Whether counts are too coarse for their noise to hide it.
+
+        With s counts of noise rounding is off by up to exp(-2 pi² s²) / pi of a count on average, alike wherever light
+        is alike.
+        """
+        return self.known and self.read_known and self.read_noise_e < _HIDES * self.gain_e
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -89,7 +101,7 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
         )
     gain = 1 / inverse
     read = math.sqrt(max(floor - 1 / 12, 0)) * gain
-    return Gain(gain, gain**2 * sigma, read)
+    return Gain(gain, gain**2 * sigma, read, read_known=dark_known)
 
 
 def clean(capture: Capture) -> Frames:
@@ -232,7 +244,8 @@ def _gain(capture: Capture, notes: list[str]) -> Gain:
     stated = capture.about
     if "gain_e" in stated:
         notes.append(f"gain {stated['gain_e']} e/count as stated")
-        return Gain(float(stated["gain_e"]), 0.0, float(stated.get("read_noise_e", 2.0)))
+        read_known = "read_noise_e" in stated
+        return Gain(float(stated["gain_e"]), 0.0, float(stated.get("read_noise_e", 2.0)), read_known=read_known)
     if capture.flat is not None and len(capture.flat) > 1:
         gain = photon_transfer(capture.flat, capture.dark)
         notes.append(f"gain {gain.gain_e:.3g} +- {gain.gain_sigma_e:.1g} e/count, read noise {gain.read_noise_e:.2g} e")

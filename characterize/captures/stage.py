@@ -197,7 +197,7 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
         page=_pages(table, path) if "page" in head else (None,) * len(table),
         position_um=_column(table, place, path, np.nan) * _POSITIONS.get(place or "", 1.0),
         angle_rad=np.stack(columns, 1),
-        exposure_s=_column(table, "exposure_s" if "exposure_s" in head else None, path, np.nan),
+        exposure_s=_exposures(table, path) if "exposure_s" in head else np.full(len(table), np.nan),
         source=str(path),
     )
 
@@ -230,6 +230,14 @@ def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
         if page != round(page):
             raise CaptureError(f"{path}, row {row}: page is {page:g}, need a whole number from 0 on")
     return tuple(int(page) for page in pages)
+
+
+def _exposures(table: list[dict[str, Any]], path: Path) -> Array:
+    times = _column(table, "exposure_s", path)
+    for row, time in enumerate(times, 2):
+        if time <= 0:
+            raise CaptureError(f"{path}, row {row}: exposure_s is {time:g}, need above 0; leave the column out if unknown")
+    return times
 
 
 def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0) -> Array:

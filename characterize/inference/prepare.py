@@ -18,13 +18,19 @@ _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
 def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
-    """Exposures of one depth and angle as one frame each, by inverse variance; as they are where none are known."""
+    """Exposures of one depth and angle as one frame each, by inverse variance.
+
+    As they are where exposures are not known, or differ and nobody says what is counted without light.
+    """
     place = np.column_stack([capture.position_um, capture.angle_rad])
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
     exposure = np.asarray(capture.exposure_s, float)
-    known = np.isfinite(exposure).all() and (exposure > 0).all() and np.isfinite(place).all()
+    known = _timed(capture) and np.isfinite(place).all()
     if not known or len(set(group.tolist())) == len(group):
         return capture, frames
+    if not _dark_known(capture) and any(np.ptp(exposure[group == one]) for one in set(group.tolist())):
+        said = "exposures of one depth are fitted one by one: no dark frame tells what is added to all of them"
+        return capture, dataclasses.replace(frames, corrections=(*frames.corrections, said))
     merged, first = merge_brackets(frames, exposure, group)
     longest = np.array([exposure[group == group[i]].max() for i in first])
     kept = dataclasses.replace(
@@ -51,7 +57,7 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
     if math.isnan(capture.wavelength_um):
         raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
     window = _window(capture, largest)
-    exposure = capture.exposure_s / np.nanmax(capture.exposure_s) if np.isfinite(capture.exposure_s).all() else 1.0
+    exposure = capture.exposure_s / capture.exposure_s.max() if _timed(capture) else 1.0
     n = len(capture.frames)
     rows, columns = (s.stop - s.start for s in window)
     return Setting(
@@ -62,7 +68,18 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
         rows,
         columns,
         fill=capture.fill,
+        dark_known=_dark_known(capture),
     ), window
+
+
+def _timed(capture: Capture) -> bool:
+    """Whether the exposure of every frame is known."""
+    return bool((np.isfinite(capture.exposure_s) & (capture.exposure_s > 0)).all())
+
+
+def _dark_known(capture: Capture) -> bool:
+    """Whether the counts without light are known, and so subtracted."""
+    return capture.dark is not None or "offset" in capture.about
 
 
 def _window(capture: Capture, largest: int) -> tuple[slice, slice]:

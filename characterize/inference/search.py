@@ -311,7 +311,7 @@ def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
     place = window_um(found, model)
-    level = float(np.median(data.electrons[data.usable]))
+    level = float(np.median((data.electrons / model.setting.glow)[data.usable]))
     lies = {"stage_zero_um": found.stage_zero_um, "distance_um": found.distance_um, "background_e": level}
     base = with_values(task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]})
     out = []
@@ -319,7 +319,7 @@ def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list
         x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias * coarser(model.lens.wavelength_um)})
         light = model.images(with_values(x, {"background_e": 0.0}))[0]
         keep = data.usable & ~data.saturated
-        gain = float((light * (data.electrons - level))[keep].sum() / (light[keep] ** 2).sum())
+        gain = float((light * (data.electrons - level * model.setting.glow))[keep].sum() / (light[keep] ** 2).sum())
         out.append(with_values(x, {"log_gain": math.log(max(gain, 1e-12))}))
     return out
 

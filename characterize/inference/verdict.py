@@ -35,7 +35,16 @@ def explained(solution: Solution, gain: Gain) -> bool:
 
 
 def quiet(solution: Solution, gain: Gain) -> list[str]:
-    """What to say of frames with less noise than stated: chi-square as far below 1 as it may not be above."""
+    """What to say of frames with less noise than stated: chi-square as far below 1 as it may not be above.
+
+    Of counts too coarse for their noise the opposite: what rounding takes is counted as noise, and is none.
+    """
+    if gain.coarse:
+        return [
+            f"counts are {gain.gain_e:.3g} electrons apart and noise in the dark is {gain.read_noise_e:.2g}: rounding "
+            "is no noise there, but one error wherever light is alike, and intervals within the model are too narrow; "
+            "save more bits, or raise the camera's gain"
+        ]
     if not gain.known or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
         return []
     return [

@@ -181,8 +181,8 @@ class ForwardModel:
         if wanted is None:
             return image, None
         out = np.zeros((len(wanted), *light.shape))
-        plain: dict[str, Any] = {"background_e": 1.0, "log_gain": sampled}
-        plain |= dict(zip(("background_y_e", "background_x_e"), s.edges, strict=True))
+        plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
+        plain |= {name: s.glow * edge for name, edge in zip(("background_y_e", "background_x_e"), s.edges, strict=True)}
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
         for name, rate in dimming(x, s, centre_um).items():

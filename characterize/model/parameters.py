@@ -89,7 +89,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False, plausible=5.0),
     Parameter("crosstalk_px", "standard deviation of pixel crosstalk and vibration", 0.1, 0.3, 0.02, 3.0, start=0.2),
     Parameter("log_gain", "logarithm of the electrons through the aperture in a frame at the reference depth", 0.02),
-    Parameter("background_e", "background at the window's centre", 2.0),
+    Parameter("background_e", "background at the window's centre, in the longest exposure", 2.0),
     Parameter("background_x_e", "background at the right edge less that at the centre", 2.0),
     Parameter("background_y_e", "background at the lower edge less that at the centre", 2.0),
 )  # fmt: skip

@@ -23,6 +23,7 @@ class Setting:
     pixel_um: of the sensor; rows, columns: of the window about the chief ray.
     margin: pixels around it that blur may reach in from. fill: width of a pixel over the pitch.
     tolerance: relative error of the field allowed to the reduction.
+    dark_known: the dark level is subtracted, so that the background is light and grows with the exposure.
     """
 
     depth_um: Array
@@ -34,6 +35,7 @@ class Setting:
     margin: int = 4
     tolerance: float = 5e-4
     fill: float = 1.0
+    dark_known: bool = True
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.depth_um).all() and (self.depth_um > 0).all()):
@@ -46,6 +48,11 @@ class Setting:
         """(rows, 1) and (1, columns) of the pixels, -1 to 1 from edge to edge about the middle one."""
         y, x = ((np.arange(n) - n // 2) / (n / 2) for n in (self.rows, self.columns))
         return y[:, None], x[None]
+
+    @property
+    def glow(self) -> Array:
+        """(n, 1, 1) background of every frame over that of exposure 1; what nobody subtracted is alike in all."""
+        return np.where(self.dark_known, self.exposure, 1.0)[:, None, None]
 
 
 def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
@@ -69,10 +76,10 @@ def dimming(x: Array, setting: Setting, centre_um: float) -> dict[str, Array]:
 
 
 def background(x: Array, setting: Setting) -> Array:
-    """(rows, columns) electrons of the background plane."""
+    """(n, rows, columns) electrons of the background, a plane in every frame."""
     edge_y, edge_x = setting.edges
     along = x[PLACE["background_x_e"]] * edge_x + x[PLACE["background_y_e"]] * edge_y
-    return np.asarray(x[PLACE["background_e"]] + along)
+    return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
 LIGHT = ("light_x", "light_y", "light_r")

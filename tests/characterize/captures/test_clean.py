@@ -183,3 +183,22 @@ def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
     left, right = np.split(np.array(z), 2, axis=-1)
     for half in (left, right):
         assert half.std() == pytest.approx(1, abs=0.04)  # 65000 draws over shared darks: 0.01
+
+
+@pytest.mark.parametrize(("read_e", "least", "most"), [(0.1, 0.15, 0.5), (0.3, 0.0, 0.055), (0.45, 0.0, 0.01)])
+def test_rounding_is_off_on_average_where_noise_does_not_hide_it(read_e, least, most):
+    """Means of 40 000 rounded counts at every twentieth of a count: to 0.003, against which the gain's word is held."""
+    level = np.arange(0, 1, 0.05)[:, None]
+    noise = np.random.default_rng(3).normal(0, read_e, (20, 40_000))
+    off = np.abs(np.rint(level + noise).mean(1) - level[:, 0] - noise.mean(1)).max()
+    assert least <= off <= most + 0.004
+    assert clean.Gain(1.0, 0.01, read_e).coarse == (off > 0.06)
+
+
+def test_noise_in_the_dark_is_known_from_two_dark_frames():
+    rng = np.random.default_rng(8)
+    flat = np.stack([shoot(np.full((40, 40), 4000.0), rng) for _ in range(6)])
+    dark = np.stack([shoot(np.zeros((40, 40)), rng) for _ in range(4)])
+    known = [clean.photon_transfer(flat, some).read_known for some in (dark, dark[:1], None)]
+    assert known == [True, False, False]
+    assert not clean.photon_transfer(flat, None).coarse

@@ -164,3 +164,10 @@ def test_images_that_the_table_does_not_name_are_told_and_dark_ones_refused(tmp_
     with pytest.raises(CaptureError, match=r"'darks_2.tif' is not named .* one stack dark.tif"):
         stage.left_out([tmp_path / "darks_2.tif"], rows)
     assert stage.left_out([tmp_path / "darkroom.tif"], rows)
+
+
+@pytest.mark.parametrize("time", ["0", "-0.02"])
+def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
+    (tmp_path / "stage.csv").write_text(f"file,depth_um,exposure_s\na.tif,2.5,0.1\nb.tif,3.5,{time}\n")
+    with pytest.raises(CaptureError, match=r"stage\.csv, row 3: exposure_s is -?0.*above 0"):
+        stage.read_stage(tmp_path)

@@ -235,7 +235,7 @@ def test_background_is_a_plane_with_its_slopes_at_the_edge():
     from characterize.model import Setting, background, vector
 
     x = vector({"background_e": 20.0, "background_x_e": 3.0, "background_y_e": -5.0})
-    plane = background(x, Setting(np.ones(1), np.zeros((1, 2)), np.ones(1), 1.5, rows=6, columns=8))
+    (plane,) = background(x, Setting(np.ones(1), np.zeros((1, 2)), np.ones(1), 1.5, rows=6, columns=8))
     for i in range(6):
         for j in range(8):
             assert plane[i, j] == pytest.approx(20 + 3 * (j - 4) / 4 - 5 * (i - 3) / 3)

@@ -33,7 +33,8 @@ def test_exposures_of_one_place_and_angle_are_one_frame_in_the_order_of_the_firs
     angle = np.array([[0.0, 0.1]] * 3 + [[0.1, 0.0], [0.0, 0.1]])
     depth, exposure = [27e3, 22e3, 27e3, 22e3, 27e3], [0.2, 0.7, 0.8, 0.3, 0.4]
     counted = np.array(exposure)[:, None, None] * np.full((5, 4, 6), 100.0)
-    before = capture(np.arange(5.0)[:, None, None] + counted, depth, exposure, angle_rad=angle)
+    counts = np.arange(5.0)[:, None, None] + counted
+    before = capture(counts, depth, exposure, angle_rad=angle, about={"offset": 0.0})
     every = np.ones(counted.shape, bool)
     frames = Frames(counted, every, ~every, 2.0 + 0 * counted, np.ones((1, 1, 1)) + 0 * counted, Gain(1, 0, 2), ())
     after, merged = prepare.merged(before, frames)

@@ -33,6 +33,7 @@ class Sensor:
     fill: float = 1.0
     oversample: int = 2
     edges = Setting.edges
+    glow: float = 1.0
 
 
 @dataclass
