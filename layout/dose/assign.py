@@ -134,17 +134,23 @@ def _span(block: Array, field: Array, own: Array, goal: Array, soft: Array, most
                 span[2] = max(span[2], left / goal[k] / min(most, soft[k] * dose / goal[k]))
 
 
-def classes(fields: Fields, number: int, first: int, block: Array, steps: Ladder) -> Array:
-    """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is none."""
+def classes(fields: Fields, number: int, first: int, block: Array, steps: Ladder, *, aside: float = 0.0) -> Array:
+    """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is none.
+
+    aside: steps of the ladder by which the wanted doses are moved before they are rounded.
+    """
     t, out = fields.table, np.empty(block.shape, np.uint8)
     field = fields.at(fields.far, number, first, len(block), fields.near)
     shift = np.log(np.where(t.used, t.own, 1.0) * steps.factors[0])
-    _classes(block, field, shift, CLEARS * t.goal, steps.per_log, len(steps.factors), out)
+    _classes(block, field, shift, CLEARS * t.goal, (steps.per_log, aside), len(steps.factors), out)
     return out
 
 
 @compiled
-def _classes(block: Array, field: Array, shift: Array, goal: Array, per_log: float, count: int, out: Array) -> None:
+def _classes(
+    block: Array, field: Array, shift: Array, goal: Array, scale: tuple[float, float], count: int, out: Array
+) -> None:
+    per_log, aside = scale
     for row in range(block.shape[0]):
         for column in range(block.shape[1]):
             k = block[row, column]
@@ -152,7 +158,7 @@ def _classes(block: Array, field: Array, shift: Array, goal: Array, per_log: flo
                 out[row, column] = 255
                 continue
             left = max(goal[k] - field[row, column], 1e-9)
-            level = np.rint((np.log(left) - shift[k]) * per_log)
+            level = np.rint((np.log(left) - shift[k]) * per_log + aside)
             out[row, column] = min(max(level, 0.0), count - 1.0)
 
 

@@ -75,9 +75,12 @@ class Solution:
     point: PointExposure
     _fields: assign.Fields
 
-    def classes(self, number: int, first: int, block: Array) -> Array:
-        """(rows, columns) uint8 dose class of the pillars of a block of body ``number``, 255 where there is none."""
-        return assign.classes(self._fields, number, first, block, self.ladder)
+    def classes(self, number: int, first: int, block: Array, *, aside: float = 0.0) -> Array:
+        """(rows, columns) uint8 dose class of the pillars of a block of body ``number``, 255 where there is none.
+
+        aside: steps of the ladder by which the wanted doses are moved before they are rounded.
+        """
+        return assign.classes(self._fields, number, first, block, self.ladder, aside=aside)
 
 
 def solve(

@@ -31,6 +31,13 @@ def is_square_symmetric(lattice: Lattice) -> bool:
     return np.array_equal(a, a[::-1]) and np.array_equal(a, a[:, ::-1]) and np.array_equal(a, a.T)
 
 
+def least(values: Array) -> Array:
+    """(n, n) the least of the values at a site and its seven images, which makes all eighths alike."""
+    up = np.minimum(values, values[::-1])
+    quarters = np.minimum(up, up[:, ::-1])
+    return np.minimum(quarters, quarters.T)
+
+
 def pieces(lattice: Lattice) -> list[Piece]:
     """The open eighth between the +x axis and the diagonal, the diagonal, and (odd counts) axis and centre."""
     quarter = _upper_right(lattice)
