@@ -233,7 +233,9 @@ def test_pillars_off_their_curve_send_light_across_the_focus_in_step_with_it():
     )
     found = budget.with_model(Budget(0.0), **given, proxy=off, lit=lit).proxy
     assert found == pytest.approx(off * 2 * math.sqrt(2 * power**2 / square / lit), rel=3e-3)  # cos θ of 1.8e-3
-    assert budget.with_model(Budget(0.0), **given, proxy=off, lit=0.004 * lit).proxy == pytest.approx(2 * off, rel=1e-12)
+    assert budget.with_model(Budget(0.0), **given, proxy=off, lit=0.004 * lit).proxy == pytest.approx(
+        2 * off, rel=1e-12
+    )
     assert math.isnan(budget.with_model(Budget(0.0), **given, lit=lit).proxy)
     assert budget.with_model(Budget(0.0), **given, proxy=off).proxy == 0.0  # of a lens without end
 

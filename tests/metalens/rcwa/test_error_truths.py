@@ -88,6 +88,17 @@ def test_pillars_between_the_orders_are_not_believed():
     assert solver._blur(this, wide, 10, change, error) == pytest.approx([0.2, 0.013, 0.01])
 
 
+def test_a_pillar_that_turns_light_by_more_than_a_right_angle_is_doubted_as_far_as_t_can_lie():
+    """The film that would be there without it is Fresnel's face and a way through air; its t and the pillar's lie 1.32
+    to 1.85 apart. Two amplitudes of passive cells are at most 2 apart, and no error is larger."""
+    for height, share in ((1.4, 0.32), (1.9, 0.32)):
+        cell = Cell(0.4, height, Index(3.6), Index(1.45))
+        film = 2 * math.sqrt(1.45) / 2.45 * np.exp(2j * math.pi / 0.85 * height)
+        for orders in (1, 2, 3):
+            found = rcwa.solve(cell, 0.4 * share, 0.85, harmonics=orders)
+            assert 1.25 < abs(found.t - film) <= found.t_error <= 2.0
+
+
 def test_each_diameter_stops_at_the_first_truncation_that_meets_the_tolerance(monkeypatch):
     """Truncations off by a / reach², a of 0.5 and 0.1, and 2e-4 left of a wall: reaches, counts and errors by hand."""
     size = {0.11: 0.5, 0.23: 0.1}
