@@ -10,7 +10,7 @@ from torch import Tensor
 
 from metalens.field import gathered
 from metalens.field import patches as cutting
-from metalens.field.forming import Imager, between_nodes, blurred, psfs_used, trimmed, with_psfs
+from metalens.field.forming import Imager, between_nodes, blurred, evened, psfs_used, trimmed, with_psfs
 from metalens.field.patches import relative
 from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
 from metalens.field.points import Optics, sampling
@@ -78,7 +78,7 @@ def imager(
     plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, plan)
     whole = patched(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
-    made = thinned(whole, tolerance=tolerance)
+    made = evened(thinned(whole, tolerance=tolerance))
     parts = {**made.parts, **_held_out(optics, whole)}
     return replace(
         made, parts=parts, stray=stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
@@ -143,7 +143,8 @@ def patched(grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance:
 def thinned(whole: Imager, *, tolerance: float) -> Imager:
     """As few kernels as image a texture of two sheets (:func:`trial`) within their share of the tolerance.
 
-    What a patch lacks differs from pixel to pixel, and adds up to less than the worst PSF says.
+    What a patch lacks differs from pixel to pixel, and adds up to less than the worst PSF says. The error is of the
+    kernels alone: that even light is put right afterwards is not counted, since points gain nothing by it.
     """
     share = tolerance * SHARES["kernels"]
     seen = trial(whole.grid)

@@ -18,7 +18,7 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from metalens.field import compiled, products
+from metalens.field import compiled, even, products
 from metalens.field.patches import Patch, dense, lagrange
 from metalens.field.plan import Grid, Plan
 from metalens.field.stray import Stray, add_stray
@@ -36,6 +36,7 @@ class Imager:
     grid, plan: where the scene is sampled, and where the PSFs are known.
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1. energy: (rows, columns, depths) E of each.
     patches: of the frame. transfer: of each patch's kernels, (rank, Y, X // 2 + 1).
+    even: (y, x) of the frame, what makes even light even through the patches (:func:`evened`); None: left as it is.
     parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, polarisation (components of
         the field that are left out, all but a scalar where that is within the tolerance), edge (light that the rim
         bends out of the window, and that the transform folds back), pillars (taken together a few micrometres at a
@@ -52,6 +53,7 @@ class Imager:
     patches: list[Patch]
     transfer: list[Tensor]
     parts: Mapping[str, float]
+    even: Tensor | None = field(default=None)
     stray: Stray | None = field(default=None)
 
     @property
@@ -196,9 +198,11 @@ def blurred(frames: Frames, optics: Imager) -> Tensor:
     """(frames, y, x) image on the whole frame, without stray light."""
     if _far_alone(frames):
         light, cover, depth_um = (getattr(frames, name)[:, 1:] for name in Frames.__slots__)
-        return _through(light, cover, depth_um, optics, kinds=1)[:, 0, 0]
-    both = blur(frames, optics)
-    return _over(both[:, 0], both[:, 1])
+        total = _through(light, cover, depth_um, optics, kinds=1)[:, 0, 0]
+    else:
+        both = blur(frames, optics)
+        total = _over(both[:, 0], both[:, 1])
+    return total if optics.even is None else total * optics.even
 
 
 def _far_alone(frames: Frames) -> bool:
@@ -221,7 +225,21 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
         kernels = torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes])
         transfer.append(_transfer(kernels, _size(patch, stack.shape[-1])))
         made.append(replace(patch, energy=_illumination(patch, optics, energy)))
-    return replace(optics, stack=stack, energy=energy, patches=made, transfer=transfer)
+    changed = replace(optics, stack=stack, energy=energy, patches=made, transfer=transfer)
+    return changed if optics.even is None else evened(changed)
+
+
+def evened(optics: Imager) -> Imager:
+    """The patches with the map that gives even light of the middle depth as the nodes' PSFs do (:mod:`.even`)."""
+    depths = optics.stack.shape[2]
+    middle = torch.tensor([(depths - 1) / 2], dtype=torch.float64)
+    deep = dense(middle, torch.arange(depths, dtype=torch.float64))[0].to(optics.stack)
+    stack, energy = (torch.einsum("z,abz...->ab...", deep, part.to(deep)) for part in (optics.stack, optics.energy))
+    wanted = even.light(stack, energy, between_nodes(optics.grid, optics.plan))
+    one = torch.ones_like(wanted)[None, None]
+    depth_um = 1 / (1 / optics.plan.depths_um[[0, -1]]).mean()
+    found = _through(one, one, torch.full_like(one, float(depth_um)), optics, kinds=1)[0, 0, 0]
+    return replace(optics, even=even.ratio(wanted, found))
 
 
 def _illumination(patch: Patch, optics: Imager, energy: Tensor) -> Tensor:

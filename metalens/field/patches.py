@@ -25,7 +25,8 @@ class Patch:
     """One patch of the image.
 
     rows, columns: first pixel and the one behind the last, in the frame.
-    weights: (pixels, depths, rank) of the kernels for a source at each pixel and depth, the patch's share included.
+    share: (pixels,) of the patch in what a source gives; those of all patches add up to 1.
+    weights: (pixels, depths, rank) of the kernels for a source at each pixel and depth, whose light is the share.
     energy: (pixels, depths) relative illumination: light of a PSF.
     mix: (rank, nodes) rows of kernels over :attr:`nodes`; kernels = mix @ PSFs of the nodes.
     nodes: (nodes,) indices (row, column, depth, flattened) of the PSFs it is made of.
@@ -36,6 +37,7 @@ class Patch:
 
     rows: tuple[int, int]
     columns: tuple[int, int]
+    share: Tensor
     weights: Tensor
     energy: Tensor
     mix: Tensor
@@ -47,8 +49,19 @@ class Patch:
         """The first kernels alone, as many as the tolerances of light and of coverage need."""
         rank, few = (max(int((self.missing > t).sum()), 1) for t in (tolerance, coverage))
         rank = min(rank, len(self.mix))
-        weights = self.weights[..., :rank].contiguous()
+        weights = _lit(self.weights[..., :rank], self.mix[:rank], self.share)
         return replace(self, weights=weights, mix=self.mix[:rank], coverage=min(few, rank))
+
+
+def _lit(weights: Tensor, mix: Tensor, share: Tensor) -> Tensor:
+    """The weights scaled so that a source's kernels hold its share of light, as the PSFs that they stand for (sum 1).
+
+    What few kernels lack of a PSF is light, too, and other light at every depth. Kernels that hold less than half of it
+    show something else, and stay as they are.
+    """
+    held, whole = weights @ mix.sum(1), share[:, None]
+    scale = torch.where(held > whole / 2, whole / held, 1.0)
+    return (weights * scale[..., None]).contiguous()
 
 
 def lagrange(wanted: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -154,6 +167,7 @@ def _patch(
     inside = [g[a:b].to(seen) for g, (a, b, _) in zip(grid, (row, column), strict=True)]
     touched = [torch.nonzero(part.abs().amax(0) > 0)[:, 0] for part in inside]
     near, depths = seen[touched[0]][:, touched[1]], seen.shape[2]
+    share = (row[2].to(seen)[:, None] * column[2].to(seen)).flatten()
     some = [_places(len(part), PLACES) for part in inside]
     rows, at_y, at_x = _at_places(near, inside, some, touched)
     values, vectors = torch.linalg.eigh(rows @ rows.mT)
@@ -169,16 +183,15 @@ def _patch(
         dense(torch.arange(len(part), dtype=torch.float64), at.double()).to(seen)
         for part, at in zip(inside, more, strict=True)
     )
-    table = torch.einsum("yp,xq,pqzr->yxzr", to_y, to_x, table)
-    light = torch.einsum("ya,xb,abz->yxz", *inside, energy.to(seen))
-    share = row[2].to(seen)[:, None] * column[2].to(seen)
-    mix = torch.einsum("pa,qb,pqzr->rabz", at_y, at_x, left.reshape(len(some[0]), len(some[1]), depths, rank))
+    table = torch.einsum("yp,xq,pqzr->yxzr", to_y, to_x, table).flatten(0, 1) * share[:, None, None]
+    mix = torch.einsum("pa,qb,pqzr->rabz", at_y, at_x, left.unflatten(0, (len(at_y), len(at_x), depths))).flatten(1)
     return Patch(
         (row[0], row[1]),
         (column[0], column[1]),
-        (table * share[..., None, None]).flatten(0, 1).float(),
-        light.flatten(0, 1).float(),
-        mix.flatten(1).float(),
+        share.float(),
+        _lit(table, mix, share).float(),
+        torch.einsum("ya,xb,abz->yxz", *inside, energy.to(seen)).flatten(0, 1).float(),
+        mix.float(),
         _flat(touched, seen.shape[1], depths),
         torch.cat([missing, missing.new_zeros(1)])[: rank + 1],
         rank,
