@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from codesign.network import losses as losses
     from codesign.network import running as running
     from codesign.network import soap as soap
+    from codesign.network import windows as windows
     from codesign.network.architecture import Architecture as Architecture
     from codesign.network.architecture import Space as Space
     from codesign.network.architecture import active as active
@@ -51,5 +52,6 @@ __getattr__, __dir__, __all__ = attach(
         "sample": "architecture",
         "smallest": "architecture",
         "soap": "",
+        "windows": "",
     },
 )

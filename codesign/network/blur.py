@@ -1,12 +1,4 @@
-"""Local blur: log power of windows of the frame under quadrature filters, and the depth that it tells in each.
-
-A window is a quarter of the frame wide, and the filters are waves of 0 … 8 periods a window under a Hann weight:
-
-    P(i, f) = |Σ_x w(x - x_i) e^{2πi f·x} frame(x)|² / Σ w²         log P: texture and blur add up in it
-
-Places and frequencies are fractions of the frame, so frames of any number of pixels give the same features as far as
-their pixels reach; waves beyond Nyquist are left out. The filters are separable: along x first, then along y.
-"""
+"""The depth of every window of the frame, from what blur leaves of its texture (:mod:`codesign.network.windows`)."""
 
 import functools
 import math
@@ -15,12 +7,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-GRID = 7  # windows along a side; neighbours overlap by half
-WAVES = 8  # periods a window of the finest filter
-COLUMNS, ROWS = WAVES + 1, 2 * WAVES  # of frequencies: 0 … 8 along x, -7 … 8 along y
-FEATURES = COLUMNS * ROWS + 1  # and the mean of the window
+from codesign.network.windows import (
+    COLUMNS,
+    FLOOR,
+    GRID,
+    ROWS,
+    STEP_FEATURES,
+    STEP_MACS,
+    spectra,
+    spectra_macs,
+    step_of,
+    steps,
+)
+
+FEATURES = COLUMNS * ROWS + 1 + STEP_FEATURES  # powers, the mean of the window, steps of brightness
 PLACES = 5  # polynomials of the place in the frame
-FLOOR = 1e-2  # of the power, in units of the frame's variance a pixel
 HIDDEN = (48, 32)
 REACH = 5  # windows along a side that a block reads together: a face is smooth, and neighbours tell of a window
 BLOCKS = 2  # one after the other
@@ -30,70 +31,16 @@ SLIP_FEATURES = (3 + BESIDE) * GRID**2 + 2  # vergence, its spread, the mean and
 VERGENCE_PER_M, VERGENCE_UNIT_PER_M = 45.0, 8.0  # 1 / depth of a face before the camera: mean and spread
 
 
-def step_of(size: int) -> int:
-    """Pixels from window to window; a window is two of them wide."""
-    return max(size // (GRID + 1), 1)
-
-
 def macs(size: int) -> int:
-    """Multiply-accumulates of the branch for a square frame of ``size`` pixels: filters and the layers behind them."""
-    step = step_of(size)
-    width, rows = 2 * step, (GRID + 1) * step
-    along_x = rows * GRID * 2 * COLUMNS * width
-    along_y = GRID**2 * COLUMNS * 2 * ROWS * 2 * width
+    """Multiply-accumulates of the branch for a square frame of ``size`` pixels: waves, steps, layers."""
     around = HIDDEN[0] * REACH**2 + HIDDEN[0] ** 2
     layers = (FEATURES + PLACES) * HIDDEN[0] + BLOCKS * around + HIDDEN[0] * HIDDEN[1] + HIDDEN[1] * (2 + BESIDE)
-    return along_x + along_y + GRID**2 * layers
+    return spectra_macs(size) + STEP_MACS + GRID**2 * layers + BLOCKS * 3 * HIDDEN[0] ** 2
 
 
 def content_macs(channels: int) -> int:
     """Multiply-accumulates that :class:`InformedBranch` adds, for frames of any size."""
     return GRID**2 * (channels * HIDDEN[0] + HIDDEN[1] * 2)
-
-
-@functools.lru_cache(maxsize=64)
-def filters(size: int) -> tuple[Tensor, Tensor]:
-    """Real and imaginary waves under their Hann weight: (2 COLUMNS, 1, 1, w) along x, (2 ROWS, 2, w, 1) along y.
-
-    The second takes the real and imaginary part of the first and gives those of the product.
-    """
-    step = step_of(size)
-    place = torch.arange(2 * step, dtype=torch.float64) + 0.5
-    weight = torch.sin(math.pi * place / (2 * step)) ** 2
-    weight = weight / weight.norm()
-    period = size / ((GRID + 1) / 2)  # pixels of one wave a window, whatever the window was rounded to
-
-    def waves(first: int, count: int) -> tuple[Tensor, Tensor]:
-        frequency = (torch.arange(count) + first)[:, None] / period
-        seen = (frequency.abs() <= 0.5 + 1e-9) * weight
-        turn = 2 * math.pi * frequency * (place - step)
-        return seen * torch.cos(turn), seen * torch.sin(turn)
-
-    real, imaginary = waves(0, COLUMNS)
-    across = torch.stack([real, imaginary], 1).reshape(2 * COLUMNS, 1, 1, -1)
-    real, imaginary = waves(1 - WAVES, ROWS)
-    down = torch.cat([torch.stack([real, -imaginary], 1), torch.stack([imaginary, real], 1)])[..., None]
-    return across.float(), down.float()
-
-
-def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID, GRID) its mean under the weight.
-
-    Args:
-        frames: (batch, 1, size, size), standardised; the margin that no window covers is cut off evenly.
-    """
-    size = int(frames.shape[-1])
-    step = step_of(size)
-    first = (size - (GRID + 1) * step) // 2
-    inside = slice(first, first + (GRID + 1) * step)
-    across, down = (f.to(frames) for f in filters(size))
-    half = F.conv2d(frames[..., inside, inside], across, stride=(1, step))
-    rows = int(half.shape[2])
-    both = F.conv2d(half.reshape(-1, 2, rows, GRID), down, stride=(step, 1))
-    both = both.reshape(-1, COLUMNS, 2, ROWS, GRID, GRID)
-    power = both[:, :, 0] ** 2 + both[:, :, 1] ** 2
-    mean = both[:, 0, 0, WAVES - 1] / (4 / 3 * step)  # frequency 0 along both axes; the weight's sum squared
-    return power.reshape(-1, COLUMNS * ROWS, GRID, GRID), mean[:, None]
 
 
 @functools.lru_cache(maxsize=16)
@@ -146,6 +93,21 @@ class Around(nn.Module):
         return x + added
 
 
+class Overall(nn.Module):
+    """What all windows together tell, added to each: x + give(hardswish(take(mean and spread over the windows)))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.take = nn.Linear(2 * channels, channels)
+        self.give = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        mean = x.mean((2, 3))
+        spread = torch.sqrt(((x - mean[:, :, None, None]) ** 2).mean((2, 3)) + 1e-4)
+        added: Tensor = self.give(F.hardswish(self.take(torch.cat([mean, spread], 1))))
+        return x + added[:, :, None, None]
+
+
 class BlurBranch(nn.Module):
     """Depth of every window from its blur, with its spread: ``forward(frames) -> (depth, features)``.
 
@@ -154,8 +116,8 @@ class BlurBranch(nn.Module):
 
     A PSF differs from window to window of the field, so every window weighs the spectra that the first layer has
     learned by gains and offsets of its own; they cost next to nothing. Its depth is then read together with its
-    neighbours'. Beside it every window tells the slippage a few numbers that no label holds: depths alone, trained on
-    their own, leave a fifth more error.
+    neighbours', twice, each time with what all windows of the frame hold. Beside it every window tells the slippage a
+    few numbers that no label holds: depths alone, trained on their own, leave a fifth more error.
     """
 
     place: Tensor
@@ -167,7 +129,8 @@ class BlurBranch(nn.Module):
         self.first = nn.Conv2d(FEATURES + PLACES, HIDDEN[0], 1)
         self.gain = nn.Parameter(torch.ones(HIDDEN[0], GRID, GRID))
         self.offset = nn.Parameter(torch.zeros(HIDDEN[0], GRID, GRID))
-        self.around = nn.Sequential(*(Around(HIDDEN[0]) for _ in range(BLOCKS)))
+        pairs = ((Around(HIDDEN[0]), Overall(HIDDEN[0])) for _ in range(BLOCKS))
+        self.together = nn.Sequential(*(block for pair in pairs for block in pair))
         self.second = nn.Conv2d(HIDDEN[0], HIDDEN[1], 1)
         self.depth = nn.Conv2d(HIDDEN[1], 2 + BESIDE, 1)
         line = torch.linspace(-1, 1, GRID)
@@ -181,13 +144,13 @@ class BlurBranch(nn.Module):
     def _weighed(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID, GRID), and its mean."""
         power, mean = spectra(frames)
-        told = self.norm(torch.cat([torch.log(power + FLOOR), mean], 1))
+        told = self.norm(torch.cat([torch.log(power + FLOOR), mean, steps(frames)], 1))
         told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
         return self.first(told) * self.gain + self.offset, mean
 
     def _read(self, weighed: Tensor) -> Tensor:
         """(batch, HIDDEN[1], GRID, GRID) of every window with its neighbours."""
-        read: Tensor = F.hardswish(self.second(self.around(F.hardswish(weighed))))
+        read: Tensor = F.hardswish(self.second(self.together(F.hardswish(weighed))))
         return read
 
     def _told(self, out: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,6 +28,7 @@ from codesign.network.cost import (
     network,
 )
 from codesign.network.running import RunningNorm
+from codesign.network.windows import resampled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
@@ -247,15 +248,6 @@ def scaled(frames: Tensor, resolution: float) -> Tensor:
     """Frames resized to ``resolution`` of their size (to the nearest pixel)."""
     height, width = (max(1, round(int(s) * resolution)) for s in frames.shape[-2:])
     return resampled(frames, (height, width))
-
-
-def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """(batch, channels, *size): averaged by whole factors, then interpolated where the size is no divisor."""
-    factor = [max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)]
-    pooled = F.avg_pool2d(x, factor) if max(factor) > 1 else x
-    if tuple(int(s) for s in pooled.shape[-2:]) == size:
-        return pooled
-    return F.interpolate(pooled, size=size, mode="bilinear", align_corners=False)
 
 
 def soft_argmax(logits: Tensor) -> Tensor:

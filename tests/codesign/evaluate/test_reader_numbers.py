@@ -192,7 +192,7 @@ def test_what_the_reader_s_sensor_is():
     assert config.margin == 12  # 144 um of 13: 11.08
     assert (sensor.pitch_um, sensor.base_pitch_um, sensor.exposure_e) == (13.0, 9.0, 1500.0)
     assert (sensor.ambient_e, sensor.full_well_e, sensor.read_noise_e, sensor.bits) == (0.0, 3000.0, 5.0, 10)
-    assert blur.FEATURES == 9 * 16 + 1
+    assert blur.FEATURES == 9 * 16 + 1 + 3 * 14
 
 
 def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometres(monkeypatch):

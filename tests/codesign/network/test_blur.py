@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from codesign.network import blur, losses
+from codesign.network import blur, losses, windows
 from codesign.network.supernet import Prediction, SlicedNorm
 
 
@@ -18,14 +18,14 @@ def _frames(count=2, size=64, seed=4):
 def test_power_is_that_of_the_windows_own_fourier_transform():
     """The referee cuts the windows out and transforms them; a window of 16 pixels has just these frequencies."""
     frames = _frames()
-    power, mean = blur.spectra(frames)
+    power, mean = windows.spectra(frames)
     weight = np.hanning(33)[1::2]  # sin² at the pixels' middles
     weight = np.outer(weight, weight) / (weight**2).sum()
     for row, column in ((0, 0), (2, 5), (6, 3)):
         cut = frames[1, 0, 8 * row : 8 * row + 16, 8 * column : 8 * column + 16].numpy()
         want = np.abs(np.fft.fft2(cut * weight)) ** 2
         for fx, fy in ((0, 3), (5, -2), (8, 7), (1, 0)):
-            got = float(power[1, fx * blur.ROWS + fy + blur.WAVES - 1, row, column])
+            got = float(power[1, fx * windows.ROWS + fy + windows.WAVES - 1, row, column])
             assert got == pytest.approx(want[fy, fx], rel=1e-4, abs=1e-5)  # float32 sums of 256 terms
         assert float(mean[1, 0, row, column]) == pytest.approx((cut * weight).sum() / weight.sum(), rel=1e-4, abs=1e-6)
 
@@ -39,18 +39,18 @@ def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
     for size in (64, 96):
         place = (torch.arange(size, dtype=torch.float64) + 0.5) / size
         wave = torch.cos(2 * math.pi * (10 * place + 6.4 * place[:, None]))
-        found.append(blur.spectra(wave[None, None].float())[0][0, :, 3, 4])
+        found.append(windows.spectra(wave[None, None].float())[0][0, :, 3, 4])
     assert int(found[0].argmax()) == int(found[1].argmax())
     top = int(found[0].argmax())
     assert float(found[1][top] / found[0][top]) == pytest.approx((96 / 64) ** 2, rel=0.01)
 
 
 def test_waves_beyond_nyquist_are_left_out_on_few_pixels():
-    power, _ = blur.spectra(_frames(size=24))  # 6 pixels a window: 3 periods and no more
-    grid = power.reshape(2, blur.COLUMNS, blur.ROWS, blur.GRID, blur.GRID)
-    assert bool((grid[:, :4, blur.WAVES - 1 - 3 : blur.WAVES + 3] > 0).all())
+    power, _ = windows.spectra(_frames(size=24))  # 6 pixels a window: 3 periods and no more
+    grid = power.reshape(2, windows.COLUMNS, windows.ROWS, blur.GRID, blur.GRID)
+    assert bool((grid[:, :4, windows.WAVES - 1 - 3 : windows.WAVES + 3] > 0).all())
     assert not bool(grid[:, 4:].any())
-    assert not bool(grid[:, :, : blur.WAVES - 1 - 3].any())
+    assert not bool(grid[:, :, : windows.WAVES - 1 - 3].any())
 
 
 @pytest.mark.parametrize("size", [16, 63, 100])
@@ -58,7 +58,7 @@ def test_the_count_is_that_of_a_counted_pass(size):
     branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         depth, features = branch(_frames(1, size))
-    assert counter.get_total_flops() // 2 == blur.macs(size)
+    assert counter.get_total_flops() // 2 == blur.macs(size) - windows.STEP_MACS  # sums of slices: it counts them not
     assert depth.shape == (1, 2, blur.GRID, blur.GRID)
     assert features.shape == (1, blur.SLIP_FEATURES)
 
@@ -67,8 +67,11 @@ def test_the_depth_of_a_window_is_read_from_it_and_two_more_around_it_a_block():
     branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
     frames = _frames(2, 64)
     changed = frames.clone()
-    changed[..., :8, -8:] += 1.0  # a step of the windows: seen by the upper right one alone
+    changed[..., :5, -5:] += 1.0  # with what steps of brightness reach: seen by the upper right window alone
     with torch.no_grad():
+        assert bool(((branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > 0).all())  # all tell all, and
+        for block in branch.together[1::2]:
+            block.give.weight.zero_()
         moved = (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > 0
     wanted = torch.zeros(blur.GRID, blur.GRID, dtype=torch.bool)
     reach = 1 + blur.BLOCKS * (blur.REACH // 2)
@@ -91,6 +94,28 @@ def test_a_block_adds_to_a_window_what_its_mixed_neighbours_tell():
     around = torch.full_like(x, 0.3)
     around[0, 1, 0:5, 1:6] += 0.7
     torch.testing.assert_close(got, x - 0.5 * around * (around + 3) / 6, rtol=1e-6, atol=1e-7)
+
+
+def test_all_windows_tell_each_their_mean_and_their_spread():
+    """One window of 49 is 0.7: mean 0.7 / 49, variance 0.49 (1/49 - 1/49²), by layers of one and two."""
+    block = blur.Overall(2)
+    with torch.no_grad():
+        block.take.weight.copy_(torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]]))
+        block.take.bias.copy_(torch.tensor([4.0, 5.0]))  # beyond 3 hardswish is its argument
+        block.give.weight.copy_(torch.tensor([[1.0, 0.0], [0.0, 3.0]]))
+        block.give.bias.copy_(torch.tensor([0.1, 0.2]))
+        x = torch.zeros(1, 2, blur.GRID, blur.GRID)
+        x[0, 0, 2, 3] = 0.7
+        got = (block(x) - x)[0]
+    spread = math.sqrt(0.49 * (1 / 49 - 1 / 49**2) + 1e-4)
+    assert got[0].numpy() == pytest.approx(4.1 + 0.7 / 49, rel=1e-6)
+    assert got[1].numpy() == pytest.approx(3 * (5 + 2 * spread) + 0.2, rel=1e-6)
+
+
+def test_windows_that_are_all_alike_have_slopes():
+    x = torch.ones(1, 2, blur.GRID, blur.GRID, requires_grad=True)
+    blur.Overall(2)(x).sum().backward()
+    assert bool(torch.isfinite(x.grad).all())
 
 
 def test_windows_hold_the_vergence_under_them():

@@ -9,7 +9,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from codesign.network import architecture as arch
-from codesign.network import blur
+from codesign.network import blur, windows
 from codesign.network.running import RunningNorm
 from codesign.network.supernet import SlicedConv, SlicedNorm, Supernet
 
@@ -37,19 +37,17 @@ def test_a_wave_that_no_frame_held_is_blown_up_ten_times_at_most():
 
 
 def test_filters_are_waves_of_the_frame_under_a_hann_weight_of_power_one():
-    """90 pixels: windows of 22, waves by 90 / 4 = 22.5 pixels, from the middle of the window."""
-    across, down = blur.filters(90)
+    """90 pixels: windows of 22, waves by 90 / 4 = 22.5 pixels, from the middle of the window on."""
+    cosine, sine = windows.filters(90)
     place = np.arange(22) + 0.5
     weight = np.sin(np.pi * place / 22) ** 2
     weight /= math.sqrt((weight**2).sum())
     turn = 2 * np.pi * (place - 11) / 22.5
+    assert (cosine.shape, sine.shape) == ((11, 9), (11, 8))
     for f in (0, 3, 8):
-        assert across[2 * f, 0, 0].numpy() == pytest.approx(weight * np.cos(f * turn), abs=1e-6)
-        assert across[2 * f + 1, 0, 0].numpy() == pytest.approx(weight * np.sin(f * turn), abs=1e-6)
-    for i, f in ((0, -7), (7, 0), (12, 5)):  # real part: from both parts of the line, then the imaginary one
-        c, s = weight * np.cos(f * turn), weight * np.sin(f * turn)
-        assert down[i, :, :, 0].numpy() == pytest.approx(np.array([c, -s]), abs=1e-6)
-        assert down[16 + i, :, :, 0].numpy() == pytest.approx(np.array([s, c]), abs=1e-6)
+        assert cosine[:, f].numpy() == pytest.approx((weight * np.cos(f * turn))[11:], abs=1e-6)
+    for f in (1, 4, 8):
+        assert sine[:, f - 1].numpy() == pytest.approx((weight * np.sin(f * turn))[11:], abs=1e-6)
 
 
 def test_a_window_without_light_has_the_power_of_the_floor():
@@ -62,9 +60,12 @@ def test_a_window_without_light_has_the_power_of_the_floor():
             return x
 
     blur.BlurBranch(Told())(torch.zeros(1, 1, 64, 64))
-    power, mean = given[0][0, :-1], given[0][0, -1]
+    power, mean, (level, spread, steepest) = given[0][0, :144], given[0][0, 144], given[0][0, 145:].reshape(3, 14, 7, 7)
     assert power.detach().numpy() == pytest.approx(math.log(0.01), rel=1e-6)
     assert not mean.any()
+    assert not level.any()
+    assert spread.numpy() == pytest.approx(0.01, rel=1e-5)  # what is added under the root
+    assert not steepest.any()
 
 
 def test_the_place_of_a_window_is_told_along_x_first():
@@ -78,7 +79,7 @@ def test_what_the_content_adds_is_counted_as_a_pass_counts_it(size):
     branch = blur.InformedBranch(SlicedNorm(blur.FEATURES), CHANNELS).eval()
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         branch(torch.zeros(1, 1, size, size), torch.zeros(1, CHANNELS, size // 4, size // 4))
-    assert counter.get_total_flops() // 2 == blur.macs(size) + blur.content_macs(CHANNELS)
+    assert counter.get_total_flops() // 2 == blur.macs(size) - windows.STEP_MACS + blur.content_macs(CHANNELS)
 
 
 def test_windows_of_maps_that_are_not_square_lie_over_both_sides_evenly():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from codesign.network import blur, losses
+from codesign.network import losses, windows
 
 RNG = np.random.default_rng(21)
 SLIP, TRUTH = RNG.normal(size=(4, 3)), RNG.normal(size=(4, 3))
@@ -154,7 +154,7 @@ def test_a_pose_needs_both_and_one_landmark_counts_whole():
 def test_windows_are_read_by_waves_under_a_hann_weight(size):
     """The power at a window and frequency pair by the sum in the module's heading, over Σw²; beyond Nyquist nothing."""
     frames = RNG.normal(size=(2, 1, size, size))
-    power, mean = blur.spectra(torch.from_numpy(frames))
+    power, mean = windows.spectra(torch.from_numpy(frames))
     step, margin = size // 8, (size - 8 * (size // 8)) // 2
     weight = np.sin(np.pi * (np.arange(2 * step) + 0.5) / (2 * step)) ** 2
     w = np.outer(weight, weight)

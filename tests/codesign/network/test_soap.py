@@ -156,7 +156,9 @@ def test_the_layers_are_the_dense_ones_that_every_member_uses_whole():
     net = Supernet(Space(widths=(0.5,), depths=(2,), expansions=(3,), kernels=(3,), resolution=(1.0,)))
     names = {id(p): name for name, p in net.named_parameters()}
     assert [names[id(p)] for p in soap.layers(net)] == [
-        "blur.first.weight", "blur.around.0.mix.weight", "blur.around.1.mix.weight", "blur.second.weight",
+        "blur.first.weight", "blur.together.0.mix.weight", "blur.together.1.take.weight",
+        "blur.together.1.give.weight", "blur.together.2.mix.weight", "blur.together.3.take.weight",
+        "blur.together.3.give.weight", "blur.second.weight",
         "blur.depth.weight", "blur.content.weight", "calibration.hidden.weight", "calibration.depths.weight",
         "calibration.points.weight", "calibration.joined.weight", "calibration.turned.weight",
     ]  # fmt: skip

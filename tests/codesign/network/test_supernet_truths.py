@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.network import blur, cost, supernet
+from codesign.network import blur, cost, supernet, windows
 from codesign.network.architecture import Block, divisible, smallest
 from codesign.network.cost import MASK_CHANNELS, POINT_FEATURES, SLIP_CHANNELS, SLIP_GRID, lateral_strides
 from metalens.ground.errors import TrainingError
@@ -52,9 +52,9 @@ def test_frames_are_averaged_by_whole_factors_and_then_drawn_between():
     frames = torch.from_numpy(np.random.default_rng(5).uniform(1, 9, (1, 1, 6, 8)))
     half = supernet.scaled(frames, 0.5)
     assert half[0, 0].numpy() == pytest.approx(frames[0, 0].reshape(3, 2, 4, 2).mean((1, 3)).numpy(), rel=1e-12)
-    quarter = supernet.resampled(frames, (6, 2))  # fours: drawn between two of them alone, it would be another
+    quarter = windows.resampled(frames, (6, 2))  # fours: drawn between two of them alone, it would be another
     assert quarter[0, 0].numpy() == pytest.approx(frames[0, 0].reshape(6, 2, 4).mean(2).numpy(), rel=1e-12)
-    odd = supernet.resampled(frames, (4, 3))  # 8 to 4 by pairs, then 4 to 3; 6 to 4 as they are
+    odd = windows.resampled(frames, (4, 3))  # 8 to 4 by pairs, then 4 to 3; 6 to 4 as they are
     pooled = frames[0, 0].reshape(6, 4, 2).mean(2).numpy()
     for i in range(4):
         for j in range(3):

@@ -1,0 +1,150 @@
+"""What a window of the frame holds that blur changes: log powers of waves, and how its steps of brightness are spread.
+
+A window is a quarter of the frame wide; 7 x 7 of them overlap by half. The waves have 0 … 8 periods a window under a
+Hann weight:
+
+    P(i, f) = |Σ_x w(x - x_i) e^{2πi f·x} frame(x)|² / Σ w²         log P: texture and blur add up in it
+
+Places and frequencies are fractions of the frame, so frames of any number of pixels give the same features as far as
+their pixels reach; waves beyond Nyquist are left out. A power says how much a window varies at a scale, not whether
+along one lash or everywhere; how the steps between neighbouring samples are distributed says it, and blur takes the
+steepest steps first.
+"""
+
+import functools
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+GRID = 7  # windows along a side; neighbours overlap by half
+WAVES = 8  # periods a window of the finest wave
+COLUMNS, ROWS = WAVES + 1, 2 * WAVES  # of frequencies: 0 … 8 along x, -7 … 8 along y
+FLOOR = 1e-2  # of the power, in units of the frame's variance a pixel
+
+SAMPLES = 8 * (GRID + 1)  # along a side, on which steps are taken: the finest wave is at their Nyquist frequency
+STEP_FLOOR = FLOOR / 4  # of a squared step, in units of the frame's variance
+STEPS: tuple[tuple[tuple[int, int, int], ...], ...] = (  # of a sample from its neighbours: (x, y, weight)
+    ((0, 0, 1), (-1, 0, -1)),
+    ((0, 0, 1), (0, -1, -1)),
+    ((0, 0, 1), (-1, -1, -1)),
+    ((0, 0, 1), (1, -1, -1)),
+    ((-1, 0, 1), (0, 0, -2), (1, 0, 1)),
+    ((0, -1, 1), (0, 0, -2), (0, 1, 1)),
+    ((-1, 0, 1), (1, 0, 1), (0, -1, 1), (0, 1, 1), (0, 0, -4)),
+)
+REACHES = (1, 2)  # samples from neighbour to neighbour, of means over as many
+TOLD = 3  # of every kind of step: mean and spread of the logarithm of its square, and its steepest
+STEP_FEATURES = TOLD * len(STEPS) * len(REACHES)
+STEP_MACS = SAMPLES**2 * (len(REACHES) * sum(len(taps) for taps in STEPS) + 4)
+
+
+def step_of(size: int) -> int:
+    """Pixels from window to window; a window is two of them wide."""
+    return max(size // (GRID + 1), 1)
+
+
+def spectra_macs(size: int) -> int:
+    """Multiply-accumulates of :func:`spectra` for a square frame of ``size`` pixels."""
+    step = step_of(size)
+    kinds = 2 * WAVES + 1  # cosines and sines
+    return ((GRID + 1) * step * GRID + GRID**2 * COLUMNS * 2) * kinds * step
+
+
+@functools.lru_cache(maxsize=64)
+def filters(size: int) -> tuple[Tensor, Tensor]:
+    """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) under their Hann weight, on the second half of a window.
+
+    From its middle on: cosines are even about it, sines are odd.
+    """
+    step = step_of(size)
+    place = torch.arange(step, dtype=torch.float64)[:, None] + 0.5
+    weight = torch.cos(math.pi * place / (2 * step)) ** 2
+    weight = weight / (math.sqrt(2) * weight.norm())
+    period = size / ((GRID + 1) / 2)  # pixels of one wave a window, whatever the window was rounded to
+    frequency = torch.arange(WAVES + 1) / period
+    seen = (frequency <= 0.5 + 1e-9) * weight
+    turn = 2 * math.pi * frequency * place
+    return (seen * torch.cos(turn)).float(), (seen * torch.sin(turn))[:, 1:].float()
+
+
+def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID, GRID) its mean under the weight.
+
+    Separable, and folded about the middle of a window: one product serves a pixel and its mirror image, a frequency
+    and its negative.
+
+    Args:
+        frames: (batch, 1, size, size), standardised; the margin that no window covers is cut off evenly.
+    """
+    size = int(frames.shape[-1])
+    step = step_of(size)
+    first = (size - (GRID + 1) * step) // 2
+    inside = slice(first, first + (GRID + 1) * step)
+    cosine, sine = (f.to(frames) for f in filters(size))
+    even, odd = _folded(frames[:, 0, inside, inside], 2, step)
+    real, imaginary = even @ cosine, F.pad(odd @ sine, (1, 0))  # (batch, rows, windows along x, COLUMNS)
+    (real_even, real_odd), (imaginary_even, imaginary_odd) = (_folded(part, 1, step) for part in (real, imaginary))
+    rc, ic = real_even @ cosine, imaginary_even @ cosine  # (batch, windows along y, along x, COLUMNS, frequencies)
+    rs, js = (F.pad(part @ sine, (1, 0)) for part in (real_odd, imaginary_odd))
+    up = (rc - js) ** 2 + (ic + rs) ** 2
+    down = (rc + js) ** 2 + (ic - rs) ** 2
+    power = torch.cat([down[..., 1:WAVES].flip(-1), up], -1)
+    mean = rc[..., 0, 0] / (4 / 3 * step)  # frequency 0 along both axes; the weight's sum squared
+    return power.permute(0, 3, 4, 1, 2).reshape(-1, COLUMNS * ROWS, GRID, GRID), mean[:, None]
+
+
+def steps(frames: Tensor) -> Tensor:
+    """(batch, STEP_FEATURES, GRID, GRID) how squared steps between neighbours are spread over every window.
+
+    By kind of step, in units of STEP_FLOOR: the mean of log(1 + square), its standard deviation, and the logarithm of
+    1 + the fourth powers' mean, a fourth of it: the steepest rule it.
+
+    Args:
+        frames: (batch, 1, size, size), standardised; brought to SAMPLES along a side.
+    """
+    fine = resampled(frames, (SAMPLES, SAMPLES))
+    coarse = F.avg_pool2d(F.pad(fine, (0, 1, 0, 1), mode="replicate"), 2, 1)
+    square = torch.cat([_steps(of, reach) for of, reach in zip((fine, coarse), REACHES, strict=True)], 1) ** 2
+    told = torch.log1p(square / STEP_FLOOR)
+    mean, second, steepest = (_over(part) for part in (told, told**2, square**4))
+    spread = torch.sqrt((second - mean**2).clamp_min(0) + 1e-4)
+    return torch.cat([mean, spread, torch.log1p(steepest / STEP_FLOOR**4) / 4], 1)
+
+
+def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """(batch, channels, *size): averaged by whole factors, then interpolated where the size is no divisor."""
+    factor = [max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)]
+    pooled = F.avg_pool2d(x, factor) if max(factor) > 1 else x
+    if tuple(int(s) for s in pooled.shape[-2:]) == size:
+        return pooled
+    return F.interpolate(pooled, size=size, mode="bilinear", align_corners=False)
+
+
+def _folded(x: Tensor, along: int, step: int) -> tuple[Tensor, Tensor]:
+    """Windows along an axis, appended as the last one from their middle on: sums and differences with their mirror."""
+    window = x.unfold(along, 2 * step, step)
+    before, after = window[..., :step].flip(-1), window[..., step:]
+    return after + before, after - before
+
+
+def _steps(samples: Tensor, reach: int) -> Tensor:
+    """(batch, kinds, y, x) of (batch, 1, y, x), of variance 1 on white samples of it; beyond the edge it goes on."""
+    rows, columns = (int(n) for n in samples.shape[-2:])
+    wide = F.pad(samples, (reach,) * 4, mode="replicate")
+
+    def shifted(x: int, y: int) -> Tensor:
+        top, left = reach * (1 + y), reach * (1 + x)
+        return wide[..., top : top + rows, left : left + columns]
+
+    kinds = []
+    for taps in STEPS:
+        norm = math.sqrt(sum(weight**2 for _, _, weight in taps))
+        kinds.append(sum((weight / norm * shifted(x, y) for x, y, weight in taps), torch.zeros_like(samples)))
+    return torch.cat(kinds, 1)
+
+
+def _over(x: Tensor) -> Tensor:
+    """Mean over every window of maps of SAMPLES along a side."""
+    return F.avg_pool2d(F.avg_pool2d(x, SAMPLES // (GRID + 1)), 2, 1)
