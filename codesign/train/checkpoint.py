@@ -13,7 +13,7 @@ from metalens.ground import config
 from metalens.ground.errors import TrainingError
 from metalens.ground.store import replacing
 
-VERSION = 9
+VERSION = 10
 ABOUT = "about"
 _TENSOR = "\0tensor"
 
