@@ -83,9 +83,9 @@ def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     first = (size - (GRID + 1) * step) // 2
     inside = slice(first, first + (GRID + 1) * step)
     cosine, sine = (f.to(frames) for f in filters(size))
-    even, odd = _folded(frames[:, 0, inside, inside], 2, step)
+    even, odd = _folded(frames[:, 0, inside, inside], 2)
     real, imaginary = even @ cosine, F.pad(odd @ sine, (1, 0))  # (batch, rows, windows along x, COLUMNS)
-    (real_even, real_odd), (imaginary_even, imaginary_odd) = (_folded(part, 1, step) for part in (real, imaginary))
+    (real_even, real_odd), (imaginary_even, imaginary_odd) = (_folded(part, 1) for part in (real, imaginary))
     rc, ic = real_even @ cosine, imaginary_even @ cosine  # (batch, windows along y, along x, COLUMNS, frequencies)
     rs, js = (F.pad(part @ sine, (1, 0)) for part in (real_odd, imaginary_odd))
     up = (rc - js) ** 2 + (ic + rs) ** 2
@@ -122,10 +122,12 @@ def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(pooled, size=size, mode="bilinear", align_corners=False)
 
 
-def _folded(x: Tensor, along: int, step: int) -> tuple[Tensor, Tensor]:
+def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
     """Windows along an axis, appended as the last one from their middle on: sums and differences with their mirror."""
-    window = x.unfold(along, 2 * step, step)
-    before, after = window[..., :step].flip(-1), window[..., step:]
+    sides = [int(n) for n in x.shape[1:]]
+    sides[along - 1 : along] = [GRID + 1, sides[along - 1] // (GRID + 1)]
+    halves = x.reshape(-1, *sides).movedim(along + 1, -1)
+    before, after = halves.narrow(along, 0, GRID).flip(-1), halves.narrow(along, 1, GRID)
     return after + before, after - before
 
 
