@@ -48,7 +48,7 @@ def fit():
 
     assert [PARAMETERS[PLACE[name]].sigma for name in (LEAN, LOSS)] == [10.0, 2e-3]
     depths = np.array([380.0, 800.0])
-    rows = np.vstack([b.RESPONSE.coefficients, np.zeros((3, 2)), [[-4.0, -20.0]]])
+    rows = np.vstack([b.RESPONSE.coefficients, np.zeros((5, 2)), [[-4.0, -20.0]]])
     response = dataclasses.replace(b.RESPONSE, coefficients=rows)
     model = ForwardModel(b.lens(), Setting(depths, np.zeros((2, 2)), np.ones(2), 1.5, 24, 24), response)
     x = vector({"log_gain": 10.0, "bias_x_nm": 2.0, "height_nm": -8.0, Known(LEAN, 3.0).name: 3.0, LOSS: 7e-4})
@@ -71,8 +71,8 @@ def mask_study():
     from layout.study.sensitivity import Sensitivities
 
     lens, d = m.small(), np.linspace(0.08, 0.32, 5)
-    rates = np.zeros((7, 5), complex)
-    rates[6] = -6.0
+    rates = np.zeros((9, 5), complex)
+    rates[8] = -6.0
     study = tolerance.analyse(lens, Process(), sens=Sensitivities(d, rates, 0.0), depths_um=(2500.0,), draws=10)
     effects = {e.cause: e for e in study.effects}
     built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]

@@ -23,7 +23,7 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle
 from metalens.ground.errors import ConfigError, FitError, ProcessError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Bias, Printed, Spread, State, lacking, sensitivity
+from metalens.made import Answers, Bias, Printed, Spread, State, lacking, named, sensitivity
 from metalens.pillars import Proxy
 from metalens.rcwa import jones
 from tests.codesign.process_entry import process_entry
@@ -102,7 +102,7 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
     assert np.abs(anew(lens, turn_deg=1.5) - anew(lens)).max() < 2e-3
     oblique = dataclasses.replace(lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5)))
     found = sensitivity(oblique)
-    rate = found.at(np.array([0.19]))[-1, 0]
+    rate = found.at(np.array([0.19]))[named(Answers).index("turn_deg"), 0]
     up, down = (solved(0.19, RATIO * 0.19, 0.5 + step) for step in (0.02, -0.02))
     # derivatives hold the field of normals that a truncation samples, differences move it: what truncations differ by
     assert abs(rate / (np.log(up / down) / 0.04) - 1) < found.error < 0.15
@@ -132,9 +132,10 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
     # the guide's slope is that of the proxy, smoothed
     assert variance_rad2(wide) == pytest.approx(variance_rad2(all_round), rel=0.05)
     assert variance_rad2(LensError({"length_nm": 6.0}).state()) == pytest.approx(variance_rad2(wide), rel=1e-12)
-    with pytest.raises(ConfigError, match="turn_deg"):
-        LensErrors(turn_deg=0.1)
-    assert LensErrors(width_nm=3.0).deviations[-3:] == (3.0, 0.0, 0.0)
+    for name in ("turn_deg", "pedestal_nm", "cap_nm"):
+        with pytest.raises(ConfigError, match=name):
+            LensErrors(**{name: 0.1})
+    assert LensErrors(width_nm=3.0).deviations[-5:] == (3.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response):
@@ -170,8 +171,8 @@ def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(len
 
 def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     plain = dataclasses.replace(lens, cell=dataclasses.replace(CELL, shape=Circle()))
-    assert lacking(plain.cell) == ("width_nm", "length_nm", "turn_deg")
-    assert lacking(CELL) == ()
+    assert lacking(plain.cell) == ("width_nm", "length_nm", "turn_deg", "pedestal_nm", "cap_nm")
+    assert lacking(CELL) == ("pedestal_nm", "cap_nm")
     with pytest.raises(FitError, match="length_nm"):
         pillar_slopes.slopes(plain, wanted={"length_nm"})
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
@@ -179,4 +180,4 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     about = SimpleNamespace(given=Given(mask=Printed(spread=Spread.only(width_nm=1.0))), lens=plain)
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
         list(links.process(about))
-    assert State.of({"width_nm": 3.0}).answers()[-3] == pytest.approx(3e-3)
+    assert State.of({"width_nm": 3.0}).answers()[named(Answers).index("width_nm")] == pytest.approx(3e-3)

@@ -46,7 +46,8 @@ class LensErrors(_Entries):  # type: ignore[misc]
     rows one after the other; empty for none.
     bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of the bias from axis to rim,
     along an axis and in all directions. index: of the pillars. sidewall_deg: lean of their walls.
-    width_nm, length_nm: of all pillars along x and y alone. turn_deg: refused, since round pillars have none.
+    width_nm, length_nm: of all pillars along x and y alone. turn_deg, pedestal_nm, cap_nm: refused, since plain round
+    pillars have none.
     """
 
     correlation: tuple[float, ...] = ()
@@ -54,8 +55,9 @@ class LensErrors(_Entries):  # type: ignore[misc]
     def __post_init__(self) -> None:
         if min(self.deviations) < 0:
             raise ConfigError(f"spread {self.deviations}: need standard deviations of 0 or more")
-        if self.turn_deg:
-            raise ConfigError("spread.turn_deg: pillars are drawn as round ones, which no turn changes; need 0")
+        for name in ("turn_deg", "pedestal_nm", "cap_nm"):
+            if getattr(self, name):
+                raise ConfigError(f"spread.{name}: pillars are drawn as plain round ones, which have none; need 0")
         if self.correlation:
             self._check()
 

@@ -133,8 +133,8 @@ def _by_side(g: Guide) -> Array:
     return 0.5j * g.k * g.height_um * g.slope
 
 
-def _by_turn(g: Guide) -> Array:
-    """A round pillar is the same at any turn."""
+def _by_none(g: Guide) -> Array:
+    """A plain round pillar is the same at any turn, and has no other films under or on it."""
     return np.zeros_like(g.effective, complex)
 
 
@@ -170,6 +170,16 @@ def _heights(cell: Cell, size_um: float) -> dict[str, float]:
     return {f"layers.{i}.height_um": share for i, share in enumerate(cell.height_shares) if share}
 
 
+def _films(cell: Cell, *, under: bool) -> dict[str, float]:
+    """Of the films under all sections of the pillar's own material, or on them, in proportion to their heights."""
+    own = [i for i, layer in enumerate(cell.layers) if layer.material is None]
+    if not own:
+        return {}
+    places = range(own[0]) if under else range(own[-1] + 1, len(cell.layers))
+    whole = sum(cell.layers[i].height_um for i in places)
+    return {f"layers.{i}.height_um": cell.layers[i].height_um / whole for i in places}
+
+
 def _taller(cell: Cell, amount: float, wavelength_um: float) -> Cell:
     return cell.at_height(cell.height_um + amount)
 
@@ -197,6 +207,11 @@ def _bends(name: str, norm: float, terms: Terms) -> Cause:
 def _side(name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]) -> Cause:
     acts = Answers(_by_side, None, 2e-3, numbers=numbers)
     return Cause(name, meaning, 1.0, 2.0, -12.0, 12.0, acts, 1e-3, free=False, drawn=Drawn(name, 0.0))
+
+
+def _film(name: str, meaning: str, *, under: bool) -> Cause:
+    acts = Answers(_by_none, None, 1e-2, numbers=lambda cell, size_um: _films(cell, under=under))
+    return Cause(name, meaning, 2.0, 5.0, -30.0, 30.0, acts, 1e-3, free=False, drawn=Drawn(name, 0.0))
 
 
 DEG = math.pi / 180
@@ -238,8 +253,10 @@ CAUSES: tuple[Cause, ...] = (
     _side("length_nm", "side of a rectangle or ellipse along its y, minus design and bias", _length),
     Cause(
         "turn_deg", "turn of every pillar in the plane, from +x to +y, minus design", 0.2, 0.3, -3.0, 3.0,
-        Answers(_by_turn, None, DEG / 2, numbers=_turn), DEG, free=False, drawn=Drawn("turn_deg", 0.0),
+        Answers(_by_none, None, DEG / 2, numbers=_turn), DEG, free=False, drawn=Drawn("turn_deg", 0.0),
     ),
+    _film("pedestal_nm", "height of the films under a layered pillar's own material, minus design", under=True),
+    _film("cap_nm", "height of the films on it (a residual mask), minus design", under=False),
     _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _bends("oblique_astigmatism", 6, ((2, 1, 1),)),
     _bends("coma_x", 8, ((3, 3, 0), (3, 1, 2), (-2, 1, 0))),
@@ -280,7 +297,8 @@ def with_missing(rows: Sequence[Array]) -> Array:
 
 
 def lacking(cell: Cell) -> tuple[str, ...]:
-    """Names of the causes that pillars of this shape cannot have: a round one has no length, and no turn."""
+    """Names of the causes that pillars of this kind cannot have: a round one has no length and no turn, one
+    without layers no pedestal."""
     size = cell.pitch_um / 2
     rows = [row for _, row in of_kind(Answers) if isinstance(row.acts, Answers) and row.acts.numbers]
     return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]

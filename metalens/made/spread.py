@@ -25,6 +25,7 @@ class Spread(_Entries):  # type: ignore[misc]
     bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the other, in a random direction.
     bow_nm: bias from centre to edge. height_nm, index, sidewall_deg: of the whole lens.
     width_nm, length_nm, turn_deg: of the sides of all rectangles or ellipses and of their turn; none unless stated.
+    pedestal_nm, cap_nm: of the heights of films under and on a layered pillar's own material; none unless stated.
     """
 
     def __post_init__(self) -> None:

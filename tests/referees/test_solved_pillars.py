@@ -75,7 +75,7 @@ def test_rates_are_derivatives_of_the_factor(response):
 
 def test_few_functions_hold_every_change(response):
     pillars = Pillars(hidden.lens(), response)
-    change = Change((0.0163, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0007)
+    change = Change((0.0163, *[0.0] * (len(named(Answers)) - 1)), 0.0007)
     for bias_um in (-0.0117, 0.0, 0.0193):
         weight, rate = pillars.weights(np.array(bias_um))
         coefficients = pillars.coefficients(change)

@@ -80,9 +80,10 @@ def test_low_rank_pillars_know_their_error():
 
 
 SIDES = ("width_nm", "length_nm", "turn_deg")  # of rectangles, below: round pillars have none
+FILMS = ("pedestal_nm", "cap_nm")  # of pillars in layers
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES)])
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES, *FILMS)])
 def test_derivatives_match_finite_differences(model, name):
     x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0} | GLASS)
     slopes_are_differences(model, name, x)

@@ -15,7 +15,7 @@ from characterize.model import pillar_slopes
 from characterize.model.pillar_slopes import slopes
 from metalens import rcwa
 from metalens.cell.record import Cell, Film, Index
-from metalens.made import sensitivity
+from metalens.made import Answers, named, sensitivity
 
 CELL = Cell(pitch_um=0.3, height_um=0.7, pillar=Index(3.6), substrate="SiO2")
 
@@ -58,4 +58,4 @@ def test_a_slope_that_no_solver_knows_is_a_difference_where_it_is_wanted(monkeyp
     monkeypatch.setattr(pillar_slopes.rcwa, "derivatives", solved)
     found = pillar_slopes._exact(CELL, 0.11, 0.85, {"sidewall_deg"}, None)
     assert found[2] == pytest.approx(rate * 1.25 * 180 / np.pi, rel=1e-9)  # (0.5 + 0.125) / 0.5
-    assert pillar_slopes._exact(CELL, 0.11, 0.85, (), None) == [*found[:2], 0, 0, 0, 0]
+    assert pillar_slopes._exact(CELL, 0.11, 0.85, (), None) == [*found[:2], *[0] * (len(named(Answers)) - 2)]

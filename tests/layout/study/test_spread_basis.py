@@ -10,7 +10,7 @@ from scipy import stats
 
 from layout.study import focus, spread_model
 from layout.study.spread_model import Model, _summed, missed, reduce
-from metalens.made import Draw, Spread, State, draws, transmission
+from metalens.made import Answers, Draw, Spread, State, draws, named, transmission
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 
 KEPT = 3e-4  # of the variation of t, in amplitude: lenses drawn anew then miss 2e-3 of theirs
@@ -29,7 +29,7 @@ def overlaps(lens, spread, seed):
         d = size * 5e-5 + bias_nm * 1e-3
         height, index, wall = SENS.at(d)[:3]
         change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
-        curves.append(transmission(PROXY, SENS, d, 0.85, np.zeros(6)) * np.exp(change))
+        curves.append(transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(Answers)))) * np.exp(change))
     return (np.array(curves) * count) @ np.conj(curves).T
 
 
@@ -95,13 +95,15 @@ def test_what_a_basis_misses_is_what_least_squares_leave_at_the_worst_of_three_p
     assert missed(fewer, lenses[1:]) == pytest.approx(max(worst[3:]), rel=1e-6)
 
 
-def test_rows_of_a_part_are_summed_from_its_first_on(reduced):
-    """40 rows from row 70 on, more than are taken at once."""
+@pytest.mark.parametrize("turned", [False, True])
+def test_rows_of_a_part_are_summed_from_its_first_on(reduced, turned):
+    """40 rows from row 70 on, more than are taken at once; each pillar with the factor of its turn where it has one."""
     lens, model = reduced
     columns = np.random.default_rng(2).normal(size=(2, 5, 2)).view(complex)[..., 0].astype(np.complex64)
     index = np.random.default_rng(3).integers(0, 5, (40, lens.diameters.diameter_um.shape[1]))
-    got = _summed((model.focus, columns), (70, index))
-    want = model.focus.project(columns[:, index], slice(70, 110))
+    swung = np.exp(1j * np.random.default_rng(5).uniform(0, 7, index.shape)).astype(np.complex64) if turned else None
+    got = _summed((model.focus, columns), (70, index, swung))
+    want = model.focus.project(columns[:, index] * (1 if swung is None else swung), slice(70, 110))
     assert np.abs(got - want).max() < 1e-5 * np.abs(want).max()  # float32 sums
 
 
@@ -144,7 +146,7 @@ def test_curves_of_a_basis_are_of_places_anywhere_in_the_lens(monkeypatch):
         places.append((float(u), float(v)))
         return np.zeros(1)
 
-    made = SimpleNamespace(bias_um=bias_um, answers=lambda: np.zeros(6))
+    made = SimpleNamespace(bias_um=bias_um, answers=lambda: np.zeros(len(named(Answers))))
     one = SimpleNamespace(state=lambda: made)
     monkeypatch.setattr(spread_model, "draws", lambda spread, count, *, seed: [one] * count)
     lens = hyperbolic()

@@ -16,6 +16,12 @@ from metalens.made.state import State
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
+COUNT = len(causes.named(Answers))
+
+
+def answering(*first):
+    """Amounts of the answering causes, the first of them these and the rest 0."""
+    return np.array([*first, *[0.0] * (COUNT - len(first))])
 
 
 def test_biases_over_the_lens_by_hand():
@@ -56,9 +62,9 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
 
 
 def test_answers_travel_in_micrometres_radians_and_one():
-    sides = {"width_nm": 5.0, "length_nm": -3.0, "turn_deg": 0.4}
+    sides = {"width_nm": 5.0, "length_nm": -3.0, "turn_deg": 0.4, "pedestal_nm": 2.0, "cap_nm": -6.0}
     made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9, **sides})
-    want = [-7e-3, 0.013, math.radians(0.9), 5e-3, -3e-3, math.radians(0.4)]
+    want = [-7e-3, 0.013, math.radians(0.9), 5e-3, -3e-3, math.radians(0.4), 2e-3, -6e-3]
     assert made.answers() == pytest.approx(want, rel=1e-12)
     assert not State.of().amounts.any()
     assert len(State.of().amounts) == len(CAUSES)
@@ -128,7 +134,7 @@ def test_a_drawn_gradient_points_in_its_own_direction():
 
 def test_lenses_are_drawn_with_the_stated_sigma_and_in_all_directions():
     sigma = {"bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 0.0, "height_nm": 7.0, "index": 0.013, "sidewall_deg": 0.4}
-    sides = {"width_nm", "length_nm", "turn_deg"}
+    sides = {"width_nm", "length_nm", "turn_deg", "pedestal_nm", "cap_nm"}
     assert set(sigma) == set(DRAWN) - sides
     lenses = draws(Spread(**sigma), 4000, seed=3)
     for name, want in sigma.items():
@@ -154,13 +160,15 @@ def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_f
     for d in (0.14, 0.31):
         o = d - 0.2
         assert made.at(np.array([d]))[:, 0] == pytest.approx(
-            [*(r[0] + r[1] * o + r[2] * o * o for r in rows), *[0] * 4]
+            [*(r[0] + r[1] * o + r[2] * o * o for r in rows), *[0] * (COUNT - 2)]
         )
     for d, edge in ((0.05, 0.1), (0.5, 0.35)):
         o = edge - 0.2
         want = [r[0] + r[1] * o + r[2] * o * o + (d - edge) * (r[1] + 2 * r[2] * o) for r in rows]
-        assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx([*want, *[0] * 4])  # the other causes are not there
-        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], *[0] * 4])
+        assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx(
+            [*want, *[0] * (COUNT - 2)]
+        )  # the other causes are not there
+        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], *[0] * (COUNT - 2)])
 
 
 def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_series():
@@ -213,7 +221,7 @@ def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
     assert np.abs(got[3:]) == pytest.approx([1e-3, 1], abs=1e-12)  # held within 0.001 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
-    changed = response.transmission(Line(), response_, d[:3], 0.85, np.array([0.5, -0.1, 3.0, *[0] * 3]), angle_rad=0.1)
+    changed = response.transmission(Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1)
     assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
 
 
@@ -226,13 +234,13 @@ def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
     solved = Solved(0.85, at, powers)
     slopes = Sensitivity(np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved)
     made = response.answer(Line(), slopes, np.array([0.18, 0.24]))
-    amounts = np.array([0.5, 0.02, -0.3, 0.0, 0.0, 0.0])
+    amounts = answering(0.5, 0.02, -0.3)
     want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
     proxy = response.designed(Line(), at[1:3], 0.85)
     assert made.factor(amounts) * proxy == pytest.approx(want * np.exp(0.15j - 0.03), rel=1e-9)
     beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
     ends = response.designed(Line(), at[[0, 3]], 0.85)
-    assert beyond.factor(np.zeros(6)) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
+    assert beyond.factor(answering()) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
 
 
 def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
@@ -242,7 +250,7 @@ def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
     powers[:, 0] = 0.31 * np.exp(5j * at)
     powers[0, 1] = 0.7j * powers[0, 0]
     slopes = Sensitivity(np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers))
-    amounts = np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
+    amounts = answering(0.02)
     got = response.transmission(Line(), slopes, at, 0.85, amounts)
     assert got == pytest.approx(powers[0, 0] * (1 + 0.014j), rel=1e-9)
 
