@@ -57,6 +57,14 @@ def test_within_the_model_the_gain_widens_what_is_counted_in_electrons_and_nothi
     assert within.draws is found.draws
 
 
+def test_a_parameter_is_told_by_the_width_of_its_interval_over_that_of_the_prior():
+    """Of 1.96 sigma to both sides: a posterior of 0.31, 0.9 and 1.02 of the prior's sigma."""
+    share, sigma = np.array([0.31, 0.9, 1.02]), np.array([3.0, 0.02, 7.0])
+    found = SimpleNamespace(low=VALUE[:3] - 0.4 * share * sigma, high=VALUE[:3] + (2 * Z - 0.4) * share * sigma)
+    task = SimpleNamespace(prior=SimpleNamespace(sigma=sigma))
+    assert estimate._told(task, found) == pytest.approx(share, rel=1e-3)  # 1.96 for 1.95996
+
+
 def test_draws_scatter_by_what_nobody_stated_and_stay_inside_the_bounds():
     """Each about its own place, with the second moment of the shifts; cut at the bounds of the prior."""
     places = np.tile([[1.0, -2.0, 0.5, 3.0], [-6.0, 4.0, 2.0, -1.0]], (30_000, 1))

@@ -234,7 +234,11 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
     off = np.array([[0.5, 0.0, -0.7], [-0.4, 0.9, 0.2]])[trial.subject]
     read = trial.slip_mm + off + judged[:, None] * np.array([0.1, -0.2, 0.3])
     blank, error = np.zeros((len(read), 2)), np.where(judged, 1.0, np.nan)
-    found = experiment.Result("a", 1.0, trial, read, blank, error, error, blank, error).slip_rest_mm
+    result = experiment.Result("a", 1.0, trial, read, blank, error, error, blank, error)
+    whole = np.array([[0.6, 0.2, 0.4], [0.3, 0.7, 0.5]])[trial.subject]
+    assert result.slip_error_mm[judged] == pytest.approx(whole[judged])
+    assert result.slip_error_mm[~judged] == pytest.approx(np.abs(off[~judged]))
+    found = result.slip_rest_mm
     assert np.isnan(found[~judged]).all()
     assert found[judged] == pytest.approx(np.tile([0.1, 0.2, 0.3], (judged.sum(), 1)))
 

@@ -12,6 +12,7 @@ from metalens.cell.shapes import Cross, Ellipse, Polygon, Rectangle, RegularPoly
 from metalens.ground.errors import CellError
 from metalens.rcwa import any_shape, pattern
 from metalens.rcwa.problem import problem
+from metalens.rcwa.rates import verb
 from metalens.rcwa.rates.parameters import motion, parameters
 from metalens.rcwa.rates.truncated import truncated
 
@@ -107,6 +108,22 @@ def test_an_upright_wall_knows_what_a_tilt_would_do(case, one_normal_field):
     about = light | {"harmonics": 1, "tolerance": 1e-8}
     want = differenced(lambda x: both(*varied(cell, 0.25, "sidewall_rad", x), **about), 1e-3)
     assert np.abs(np.stack([rate.t, rate.r]) - want).max() < 1e-5 * np.abs(want).max()
+
+
+def test_what_the_last_stage_of_a_tilted_wall_changes_is_told_of_every_derivative(one_normal_field):
+    """By differences of values with two and with three stages, too few for either; none of an upright wall."""
+    cell, _ = CASES["tilted rectangle"]
+
+    def values(stages, x):
+        moved = dataclasses.replace(cell, height_um=cell.height_um + x)
+        return truncated(problem(moved, 0.25, WAVE, 0.15, 0.1), 1, stages, {}).both
+
+    this = problem(cell, 0.25, WAVE, 0.15, 0.1)
+    motions = {"height_um": motion(parameters(cell, 0.25, WAVE)["height_um"], WAVE)}
+    few, more = (differenced(lambda x, count=count: values(count, x), 3e-5) for count in (2, 3))
+    told = verb._left_by_collocation(this, motions, 3, 1)
+    assert told == {"height_um": pytest.approx(np.abs(more - few).max(), rel=1e-5)}
+    assert verb._left_by_collocation(this, motions, 0, 1) == {"height_um": 0.0}
 
 
 def test_round_pillars_have_the_derivatives_of_the_modal_method():
