@@ -173,7 +173,8 @@ def _text(stored: store.Stored, arrays: dict[str, str]) -> str:
 
 
 def _short(value: object) -> str:
-    text = str(value).strip().replace("\n", "; ")
+    """One line; of a float the digits that arithmetic leaves right: 0.94 for 0.9400000000000001."""
+    text = repr(float(f"{value:.12g}")) if isinstance(value, float) else str(value).strip().replace("\n", "; ")
     return text if len(text) <= 100 else text[:97] + "..."
 
 
