@@ -236,7 +236,9 @@ def _exposures(table: list[dict[str, Any]], path: Path) -> Array:
     times = _column(table, "exposure_s", path)
     for row, time in enumerate(times, 2):
         if time <= 0:
-            raise CaptureError(f"{path}, row {row}: exposure_s is {time:g}, need above 0; leave the column out if unknown")
+            raise CaptureError(
+                f"{path}, row {row}: exposure_s is {time:g}, need above 0; leave the column out if unknown"
+            )
     return times
 
 

@@ -170,7 +170,7 @@ def left(history: list[Array], reach: int, before: int) -> float:
     rule. Over 123 random cells (rectangles to free polygons and holes, turned, layered, of metal, walls and gaps of a
     hundredth of the pitch, at cutoffs; 455 results of 7 to 11 orders against finer ones and against another solver) the
     largest error was 0.73 of the bar, the second 0.56, and the bar 8.6 errors in the median, for 17 of the farthest. Of
-    forty such sums, roots of sums of squares and shares of distances none has its largest error below five of its
+    some thirty such sums, roots of sums of squares and shares of distances none has its largest error below five of its
     medians: bars of four errors would lie below some. Of fewer than seven orders moves tell less, and count up to six
     times as much.
     """

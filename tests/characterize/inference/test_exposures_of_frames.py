@@ -1,4 +1,4 @@
-"""Frames of unlike exposures: what light stands behind them grows with the exposure, what nobody subtracted does not."""
+"""Frames of unlike exposures: light behind them grows with the exposure, what nobody subtracted does not."""
 
 import dataclasses
 import sys
