@@ -3,6 +3,7 @@
 See :mod:`layout.certify.exposed` for the model. Of marks, labels and any other shape the edges are sampled.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -33,7 +34,8 @@ def survey(
     Args:
         content: read back; sums over its placements, that agree with the plan, are enough.
         doses: its dose table. height_um: of the pillars, for their feet.
-        keep: is given each band of pillars with the (n,) layer numbers of its pillars; memory is bounded.
+        keep: is given each band of pillars, at their sites, with the (n,) layer numbers of its pillars; memory is
+            bounded.
 
     Accuracy: backscatter to 1e-3 of itself (pixels of a quarter of its range), edges to 0.01 nm. Edges are sampled
     away from corners, which round off.
@@ -47,7 +49,9 @@ def survey(
 
     def some(band: Band) -> None:
         if keep is not None:
-            keep(band, layer[band.kind])
+            aside = scene.places.centre_um[band.kind]
+            at_site = dataclasses.replace(band, x_um=band.x_um - aside[:, 0], y_um=band.y_um - aside[:, 1])
+            keep(at_site, layer[band.kind])
 
     return _surveyed(scene, process, terms, height_um, some)
 

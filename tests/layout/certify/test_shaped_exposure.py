@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.certify import survey
+from layout.certify import MadeRows, survey
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
@@ -84,6 +84,23 @@ def test_every_shape_comes_out_with_its_area_and_the_certificate_says_how_nearly
         told = found[np.hypot(found[:, 0] - x, found[:, 1] - y).argmin(), 2]
         size = 2e3 * math.sqrt(area / math.pi) if cls.round else cls.diameter_nm
         assert abs(told - size - wider_nm) < 0.2, (x, y, cls.name)
+
+
+@pytest.mark.parametrize("lattice", [Lattice(), HEX], ids=lambda one: one.kind)
+def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(tmp_path, lattice):
+    """The middle of a triangle is the mean of its corners: here (0.1, -0.1) sizes off, 32 nm at a pitch of 400 nm."""
+    corner = Polygon(((-0.4, -0.5), (0.6, -0.5), (0.1, 0.7)))
+    assert np.mean(corner.corners, axis=0) == pytest.approx([0.1, -0.1])
+    process = Process(exposure=Exposure(alpha_um=0.019, beta_um=3.9, eta=0.75))
+    source = lens(corner, lattice, (0.22, 0.226), turned=False)
+    plan = build.prepare(source, process, furniture="none").plan
+    layout.write_oasis(plan, tmp_path / "m.oas")
+    doses.write(plan, process, tmp_path / "doses.csv")
+    rows = MadeRows(plan)
+    survey(layout.read_oasis(tmp_path / "m.oas"), plan, doses.read(tmp_path / "doses.csv"), process, keep=rows.take)
+    made, want = rows.lens(source).diameters.diameter_um, source.diameters.diameter_um
+    assert np.array_equal(made > 0, want > 0)
+    assert np.abs(made - want).max() < 2.1e-3  # 1 nm of the step of sizes, 1 nm of the exposure, the grid
 
 
 def certified(content, plan, table, process):
