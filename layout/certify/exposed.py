@@ -69,9 +69,9 @@ class Wide:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Band:
-    """What comes out in some strips: places (of the middles of shapes), kinds, (n,) float32 exposure, resist and made diameters (nm).
+    """What comes out in some strips: places, kinds, (n,) float32 exposure, resist and made diameters (nm).
 
-    Of shapes the diameters are the sizes that they go by, all edges moved alike.
+    Of shapes the places are those of their middles, the diameters the sizes that they go by, all edges moved alike.
     """
 
     first: int
