@@ -9,7 +9,9 @@ from pathlib import Path
 BARS = re.compile(
     r"error|sigma|varian|weight|covar|noise|spread|tolerance|uncertain|(^|_)(std|bar|bars|cov)(_|$)", re.I
 )
-NOT_NUMERIC = re.compile(r"(^|_)(plots?|(?<!tiff_)pages?|report|picture|console|commands?|journal|cli|lazy)(_|$)|^errors$")
+NOT_NUMERIC = re.compile(
+    r"(^|_)(plots?|(?<!tiff_)pages?|report|picture|console|commands?|journal|cli|lazy)(_|$)|^errors$"
+)
 OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 INVERSE = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 COMPARISONS = {ast.Lt: (">", "<="), ast.Gt: ("<", ">="), ast.LtE: (">", "<"), ast.GtE: ("<", ">"), ast.Eq: ("!=",)}
