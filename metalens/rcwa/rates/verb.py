@@ -1,5 +1,6 @@
 """The public derivatives of a cell of any shape, each with an estimate of its error."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -8,7 +9,7 @@ import numpy as np
 from metalens.cell import Cell, check_tolerance
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.rcwa.any_shape import Jones, climbed, collocation, ladder, left, unjudged
+from metalens.rcwa.any_shape import Jones, climbed, collocation, ladder, moved, unjudged
 from metalens.rcwa.problem import Problem, problem
 from metalens.rcwa.rates.parameters import Parameter, motion, parameters
 from metalens.rcwa.rates.truncated import Motion, Rates, truncated
@@ -83,12 +84,12 @@ def jones_derivatives(
 
     value = climbed(climb, cut, tolerance, at)
     last = climb.reaches[len(found) - 1]
-    walls = _left_by_collocation(this, motions, stages, climb.reaches[0])
+    left = _left_by_collocation(this, motions, stages, climb.reaches[0])
     rates = {}
     for name in motions:
         history = [one.by[name] for one in found]
-        error = climb.crowded * left(history, last, climb.before)
-        rates[name] = Rate(history[-1][0], history[-1][1], error + walls[name])
+        error = climb.crowded * moved(history, last, climb.before) if len(history) > 1 else math.inf
+        rates[name] = Rate(history[-1][0], history[-1][1], error + left[name])
     return JonesDerivatives(value, rates)
 
 

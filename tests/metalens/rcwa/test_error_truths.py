@@ -35,29 +35,13 @@ def test_an_error_is_the_farthest_of_four_truncations_before_the_last_times_what
     narrow = 9.0 - 0.11  # r of the second diameter, whose five before are looked at
     assert solver._estimate(amplitudes, 9, np.array([4, 5])) == pytest.approx([5.4 * apart[0], 5.4 * narrow], rel=1e-9)
     assert np.isinf(solver._estimate(amplitudes[:1], 9, np.array([4, 4]))).all()
-
-
-def test_an_error_of_any_shape_is_what_the_last_truncations_have_moved_together():
-    """Moves of 0.3, 0.04, 0.81 and 0.05, of coarse orders a share by the cube: of nine orders and of fifteen."""
-    t = np.array([7.0, 0.5, 0.8, 0.84, 0.81j + 0.84, 0.86j + 0.84])
-    steps = np.array([0.3, 0.04, 0.81, 0.05])
-    history = [np.array([[a, 0.1], [0.2j, 0.3]]) for a in t]
-    assert any_shape.left(history, 7, 4) == pytest.approx(1.5 * (np.array([4, 5, 6, 7]) / 7) ** 3 @ steps, rel=1e-9)
-    more = np.array([6.5, *steps])  # a narrow wall asks for the one before, too
-    assert any_shape.left(history, 7, 5) == pytest.approx(1.5 * (np.arange(3, 8) / 7) ** 3 @ more, rel=1e-9)
-    few = (np.array([4, 5]) / 5) ** 3 @ steps[2:]  # of five orders: two short of seven, twice as much
-    assert any_shape.left(history[-3:], 5, 4) == pytest.approx(1.5 * 2 * few, rel=1e-9)
-    assert np.isinf(any_shape.left(history[:1], 9, 4))
-
-
-@pytest.mark.parametrize(("fall", "most"), [(1.0, 1.0), (1.5, 2.0), (2.0, 3.5), (3.0, 12.0)])
-@pytest.mark.parametrize("last", [2, 5, 7, 9, 15])
-def test_truncations_that_creep_to_a_limit_stay_within_their_bar(fall, most, last):
-    """Errors of 1 / n^fall, all of one sign: their moves add up to less than is left where they fall as 1 / n."""
-    history = [np.array([[1 + n**-fall, 0.0], [0.0, 1j]]) for n in range(1, last + 1)]
-    bar = any_shape.left(history, last, 4)
-    assert last**-fall < bar
-    assert last < 7 or bar < 1.001 * most * last**-fall
+    both = [np.array([[a, 0.1], [0.2j, b]]) for a, b in t]
+    two = 49 / (81 - 49) * 0.02  # of nine orders, seven leave 1.5: whole; six 0.8, five 0.45, four 0.25 of the way
+    assert two > 0.02
+    assert any_shape.moved(both, 9, 4) == pytest.approx(5.4 * 36 / 45 * 0.04, rel=1e-9)
+    assert any_shape.moved(both, 9, 5) == pytest.approx(5.4 * 16 / 65 * (9.0 - 0.31), rel=1e-9)
+    assert any_shape.moved(both, 15, 4) == pytest.approx(3 * 0.04, rel=1e-9)
+    assert any_shape.moved(both[:1], 9, 4) == pytest.approx(5.4)
 
 
 @pytest.mark.parametrize(("gap_um", "times"), [(0.0, 6.0), (0.0019, 4.75), (0.0057, 2.25), (0.0076, 1.0), (0.1, 1.0)])
@@ -243,8 +227,8 @@ def test_shifts_are_solved_at_chebyshev_s_diameters_between_foot_and_top():
     [(0.0019, 1 + 5 * (1 - 0.0019 / 0.008), 0.0, 0.0), (0.05, 1.0, 0.0, 0.0), (0.05, 1.0, 0.02, 3e-3)],
 )
 def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(monkeypatch, gap_um, times, wall_rad, cut):
-    """Truncations off by 0.1 / reach², trusted less where pillars all but touch, and what is left of a wall: the bar
-    is what would be left were they to fall as 1 / reach."""
+    """Truncations off by 0.1 / reach², trusted less where pillars all but touch, and what is left of a wall: each tells
+    just what is left of the last one, 0.1 / 81."""
     cell = dataclasses.replace(CELL, sidewall_rad=wall_rad)
 
     def truncated(this, reach, stages):
@@ -255,7 +239,7 @@ def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(monkeypatc
     monkeypatch.setattr(any_shape, "_truncated", truncated)
     monkeypatch.setattr(any_shape.wall, "enough", lambda both, tolerance: (5, 3e-3))
     found = any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1e-9)
-    want = times * 5 / 4 * 0.1 * (1 / 25 - 1 / 81) + cut
+    want = times * (5.4 * 0.1 / 81 + 1e-13) + cut
     assert found.t_error == pytest.approx(want, rel=1e-3)  # the gap between polygons is 3 pm wider
     assert not found.converged
     assert any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1.001 * want).converged

@@ -230,7 +230,7 @@ def test_an_error_is_what_truncations_moved_as_that_of_t_and_what_a_stage_fewer_
         assert (stages > 0) is (cell is tilted)
         for name in names:
             history = [np.stack([one[name].t, one[name].r]) for one in parts]
-            want = climb.crowded * any_shape.left(history, most, climb.before)
+            want = climb.crowded * any_shape.moved(history, most, climb.before)
             if stages:
                 moves = {name: motion(parameters(cell, 0.3, WAVE)[name], WAVE)}
                 ends = [truncated(this, climb.reaches[0], count, moves).by[name] for count in (stages - 1, stages)]
