@@ -23,7 +23,7 @@ from characterize.inference.search import Task
 from characterize.model import PLACE, background
 from metalens.ground.arrays import Array
 
-CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 500 with them all
+CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 350 with the 28 of a small lens
 ODDS = 10.0  # for a cause of plausible size from which on it is fitted: by chance in one fit of 100 or fewer
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost

@@ -143,10 +143,10 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
 def test_budgets_of_a_run_are_trained_in_turn():
     made = inner.model(OPTICS, pitch_um=9.0, seed=0)
     still = replace(MOVING, budget_mmacs=0.0, pitch=Schedule(0.0), subnets=0)
-    trainer = Trainer(still, OPTICS, SENSOR, Discs(), made, budgets_mmacs=(3.0, 1.3))
+    trainer = Trainer(still, OPTICS, SENSOR, Discs(), made, budgets_mmacs=(3.0, 1.4))
     spent = [record.mmacs for record in trainer.run()]
     assert all(a > 1.2 * b for a, b in zip(spent[::2], spent[1::2], strict=True))
-    assert max(spent[1::2]) <= 1.3
+    assert max(spent[1::2]) <= 1.4
 
 
 def test_a_bad_gradient_is_skipped_and_counted():
