@@ -18,6 +18,7 @@ from codesign.network.windows import (
     spectra_macs,
     step_of,
     steps,
+    window_content,
 )
 
 FEATURES = COLUMNS * ROWS + 1 + STEP_FEATURES  # powers, the mean of the window, steps of brightness
@@ -60,19 +61,6 @@ def window_vergence(depth_um: Tensor) -> Tensor:
     rows, columns = (window_weights(int(n)).to(depth_um) for n in depth_um.shape[-2:])
     vergence = (1e6 / depth_um - VERGENCE_PER_M) / VERGENCE_UNIT_PER_M
     return rows @ vergence @ columns.mT
-
-
-def window_content(maps: Tensor) -> Tensor:
-    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y, x) of the whole frame.
-
-    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is two of them wide.
-    """
-    height, width = (int(n) for n in maps.shape[-2:])
-    steps, sides = GRID + 1, (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
-    coarse = F.avg_pool2d(maps, sides)
-    if tuple(coarse.shape[-2:]) != (steps, steps):
-        coarse = F.interpolate(coarse, size=(steps, steps), mode="bilinear", align_corners=False)
-    return F.avg_pool2d(coarse, 2, 1)
 
 
 def depth_mm(vergence: Tensor) -> Tensor:

@@ -108,9 +108,22 @@ def steps(frames: Tensor) -> Tensor:
     coarse = F.avg_pool2d(F.pad(fine, (0, 1, 0, 1), mode="replicate"), 2, 1)
     square = torch.cat([_steps(of, reach) for of, reach in zip((fine, coarse), REACHES, strict=True)], 1) ** 2
     told = torch.log1p(square / STEP_FLOOR)
-    mean, second, steepest = (_over(part) for part in (told, told**2, square**4))
+    mean, second, steepest = (window_content(part) for part in (told, told**2, square**4))
     spread = torch.sqrt((second - mean**2).clamp_min(0) + 1e-4)
     return torch.cat([mean, spread, torch.log1p(steepest / STEP_FLOOR**4) / 4], 1)
+
+
+def window_content(maps: Tensor) -> Tensor:
+    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y, x) of the whole frame.
+
+    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is two of them wide.
+    """
+    height, width = (int(n) for n in maps.shape[-2:])
+    steps, sides = GRID + 1, (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
+    coarse = F.avg_pool2d(maps, sides)
+    if tuple(coarse.shape[-2:]) != (steps, steps):
+        coarse = F.interpolate(coarse, size=(steps, steps), mode="bilinear", align_corners=False)
+    return F.avg_pool2d(coarse, 2, 1)
 
 
 def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
@@ -145,8 +158,3 @@ def _steps(samples: Tensor, reach: int) -> Tensor:
         norm = math.sqrt(sum(weight**2 for _, _, weight in taps))
         kinds.append(sum((weight / norm * shifted(x, y) for x, y, weight in taps), torch.zeros_like(samples)))
     return torch.cat(kinds, 1)
-
-
-def _over(x: Tensor) -> Tensor:
-    """Mean over every window of maps of SAMPLES along a side."""
-    return F.avg_pool2d(F.avg_pool2d(x, SAMPLES // (GRID + 1)), 2, 1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.network import blur
+from codesign.network import blur, windows
 from codesign.network.supernet import SlicedNorm
 from tests.codesign.network.told import Told
 
@@ -21,7 +21,7 @@ def test_a_window_is_told_the_mean_of_the_maps_under_it(size):
     """Of ramps, its middle: windows lie at 1/8 ... 7/8 of the frame."""
     line = (torch.arange(size) + 0.5) / size
     maps = torch.stack([3.7 * line.expand(size, size), 1.3 - line[:, None].expand(size, size)])[None]
-    got = blur.window_content(maps)
+    got = windows.window_content(maps)
     middle = np.arange(1, blur.GRID + 1) / 8
     assert got[0, 0].numpy() == pytest.approx(np.tile(3.7 * middle, (7, 1)), rel=1e-5)
     assert got[0, 1].numpy() == pytest.approx(np.tile(1.3 - middle[:, None], (1, 7)), rel=1e-5)
@@ -30,7 +30,7 @@ def test_a_window_is_told_the_mean_of_the_maps_under_it(size):
 @pytest.mark.parametrize("size", [4, 5, 13])
 def test_maps_of_any_size_are_told(size):
     """Maps coarser than the windows are interpolated: what is the same everywhere stays it."""
-    got = blur.window_content(torch.full((2, 1, size, size), -2.9))
+    got = windows.window_content(torch.full((2, 1, size, size), -2.9))
     assert got.shape == (2, 1, blur.GRID, blur.GRID)
     assert got.numpy() == pytest.approx(-2.9)
 

@@ -86,7 +86,7 @@ def test_windows_of_maps_that_are_not_square_lie_over_both_sides_evenly():
     """Ramps over 16 rows and 40 columns: their middles at 1/8 … 7/8 of either side."""
     down, across = ((torch.arange(n) + 0.5) / n for n in (16, 40))
     maps = torch.stack([down[:, None].expand(16, 40), across.expand(16, 40)])[None]
-    got = blur.window_content(maps)[0].numpy()
+    got = windows.window_content(maps)[0].numpy()
     middle = np.arange(1, 8) / 8
     assert got[0] == pytest.approx(np.tile(middle[:, None], (1, 7)), rel=1e-5)
     assert got[1] == pytest.approx(np.tile(middle, (7, 1)), rel=1e-5)
