@@ -11,9 +11,9 @@ from tests.characterize import bench_lens
 from tests.lost_worker import losing_one
 
 TRUTH = Truth(
-    depths_um=bench_lens.DEPTHS[1:3],
+    depths_um=bench_lens.DEPTHS[1:2],
     angles_deg=(0.0, 3.0),
-    camera=Camera(pixels=24),
+    camera=Camera(pixels=12),
     diameter_noise_nm=1.7,
     parameter=(Known("bias_nm", 4.0, 0.0), Known("bandwidth_nm", 1.0, 0.0), Known("decentre_y_um", 1.3, 0.0)),
 )

@@ -231,8 +231,8 @@ def _drawn(study, most, *given, **more):
 def test_the_report_sections_say_what_was_found(monkeypatch):
     for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
         monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
-    lens = hyperbolic(51)
-    process = Process(write_field=WriteField(size_um=10.0))
+    lens = hyperbolic(31)
+    process = Process(write_field=WriteField(size_um=6.0))
     made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
     assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
     tables = [item for section in made for item in section.items if isinstance(item, Table)]

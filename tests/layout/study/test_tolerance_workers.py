@@ -13,21 +13,21 @@ from tests.lost_worker import losing_one
 
 
 def content(lens):
-    """All numbers of a study with 60 draws, three batches, as bytes."""
-    found = tolerance.analyse(lens, Process(), sens=SENS, draws=60, seed=3)
+    """All numbers of a study with 40 draws, two batches, as bytes."""
+    found = tolerance.analyse(lens, Process(), sens=SENS, draws=40, seed=3)
     rows = [getattr(found.draws, field.name).tobytes() for field in dataclasses.fields(found.draws)]
     return [*rows, repr((found.effects, found.rank, found.error))]
 
 
 @pytest.fixture(scope="module")
 def plain():
-    lens = hyperbolic()
+    lens = hyperbolic(51)
     return lens, content(lens)
 
 
 def test_draws_are_the_same_from_more_workers_than_batches(plain):
     lens, here = plain
-    with executor.on(processes=4):  # three batches
+    with executor.on(processes=3):  # two batches
         assert content(lens) == here
 
 
