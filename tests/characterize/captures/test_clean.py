@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from characterize.captures import electrons as clean
 from characterize.captures.capture import Capture
@@ -202,3 +203,13 @@ def test_noise_in_the_dark_is_known_from_two_dark_frames():
     known = [clean.photon_transfer(flat, some).read_known for some in (dark, dark[:1], None)]
     assert known == [True, False, False]
     assert not clean.photon_transfer(flat, None).coarse
+
+
+@pytest.mark.parametrize("noise_counts", [0.16, 0.27, 0.33, 0.61])
+def test_counts_are_coarse_where_rounding_is_off_by_a_twentieth_of_a_count(noise_counts):
+    """What rounded counts are off by on average is summed over the counts; a twentieth is reached at 0.306."""
+    light, whole = np.linspace(0, 1, 41), np.arange(-8, 10)
+    below, above = (norm.cdf((whole[:, None] + half - light) / noise_counts) for half in (-0.5, 0.5))
+    off = np.abs((whole[:, None] * (above - below)).sum(0) - light).max()
+    gain = clean.Gain(gain_e=2.3, gain_sigma_e=0.01, read_noise_e=2.3 * noise_counts)
+    assert gain.coarse is bool(off > 0.05)

@@ -5,6 +5,8 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
+from layout.certify import outlines
+from layout.certify.gathered import Polygons
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
@@ -102,3 +104,15 @@ def outward(drawn, at):
             free.append(across)
     assert len(free) == 1
     return free[0]
+
+
+@pytest.mark.parametrize("alpha_um", [0.01, 0.043])
+def test_the_slope_across_an_edge_is_that_of_an_error_function(alpha_um):
+    """Outside a half-plane E is dose erfc(x / a) / 2: dose / (a sqrt(pi)), over 2 h less by (h / a)² / 3, 1.3 %."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    drawn = Polygons((square,), np.array([1.3]), np.array([4]))
+    middle = np.array([[1.0, 0.07], [-0.11, -1.0]])
+    points = outlines.Samples(middle, np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([4, 4]))
+    outside, inside = (outlines.exposure(at, drawn, [(alpha_um, 1.0)]) for at in outlines.slope_aside(points))
+    want = 1.3 / (alpha_um * np.sqrt(np.pi))
+    assert (inside - outside) / outlines.aside_um() == pytest.approx([want] * 2, rel=0.016)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import layout
+from layout.commands import check as checking
 from layout.commands.check import read
 from layout.files import CellContent, MaskContent
 from layout.mask import build
@@ -349,3 +350,12 @@ def test_a_polygon_without_area_draws_nothing(flat):
         report = foreign.check(MaskContent("GDSII", 1.0, {"T": cell}), Rules())
         assert report.ok
         assert report.minimum_feature_nm == (400 if drawn else math.inf)
+
+
+@pytest.mark.parametrize("size", [0, 1_700_000])
+def test_a_file_is_taken_apart_to_what_the_help_says(tmp_path, size):
+    """4 million shapes, and six more for each byte of the file."""
+    (tmp_path / "m.oas").write_bytes(bytes(size))
+    said = " ".join(checking.Options.__doc__.split())
+    assert "4 million, and six more for each byte of the file" in said
+    assert foreign.most_of(tmp_path / "m.oas") == 4_000_000 + 6 * size

@@ -143,3 +143,16 @@ def test_a_lens_shows_no_seam_where_its_patches_meet():
         index = torch.arange(225)
         want = float((seen[index, 14 - index // 15, 14 - index % 15] * fall).sum())
         assert float(got[row, column]) == pytest.approx(want, rel=0.015), (row, column)
+
+
+def test_faint_light_is_put_right_by_halves_at_a_hundredth_of_the_most():
+    """wanted / found where there is light; at f = 1 % of the most the change (w - f) / f halves, below it fades."""
+    wanted = torch.tensor([[2.0, 0.03, 0.0], [0.0, 1.7, 0.0002]], dtype=torch.float64)
+    found = torch.tensor([[1.6, 0.02, 0.0], [0.02, 1.9, 0.0001]], dtype=torch.float64)
+    ratio = even.ratio(wanted, found)
+    assert ratio[0, 1].item() == pytest.approx(1 + 0.5 * 0.5)
+    assert ratio[0, 2].item() == 1.0
+    assert ratio[1, 0].item() == pytest.approx(1 - 0.5)
+    assert ratio[1, 2].item() == pytest.approx(1.0, abs=3e-5)  # (f / 1 %)² of a change of 1
+    lit = wanted > 1
+    assert ratio[lit].numpy() == pytest.approx((wanted / found)[lit].numpy(), rel=4e-5)  # a quarter of (0.02 / 1.6)²

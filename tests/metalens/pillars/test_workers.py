@@ -189,3 +189,12 @@ def test_bars_of_a_shared_mesh_are_no_less_than_those_of_the_mesh_that_a_thin_di
     first = max(ends)
     assert at(thin).t_error == pytest.approx(first / (1 - first / 0.1), rel=1e-6)  # with the orders of a resonance
     assert ends[0] > 1.5 * ends[1]
+
+
+def test_one_mesh_for_a_span_is_that_of_its_widest_pillar():
+    """Wide discs ask for other meshes than slim ones: a slim one's answer then shows which its span has taken."""
+    spans = (0.07, 0.23), (0.20, 0.23), (0.07, 0.10)
+    own = [engines.smooth(CELL, engines.Light(0.85), span, tolerance=1e-2, engine="modal")(0.09) for span in spans]
+    assert (own[0].t, own[0].orders) == (own[1].t, own[1].orders)
+    assert own[2].orders < own[0].orders
+    assert abs(own[2].t - own[0].t) < own[0].t_error + own[2].t_error
