@@ -1,6 +1,6 @@
 """``python -m benchmarks [TOPIC ...] [--peers]``: print the tables, keep them in benchmarks/results and in the README.
 
-Without a topic all are run but those that take a quarter of an hour or need an extra package (``LONG``).
+Without a topic all are run but those that take a quarter of an hour, or need an extra package or a GPU (``LONG``).
 """
 
 import argparse
@@ -17,7 +17,9 @@ from pathlib import Path
 import benchmarks
 from benchmarks import Row, figures
 
-LONG = ("closure", "engines", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee", "shaped_cells")
+LONG = (
+    "closure", "engines", "gpu", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee", "shaped_cells"
+)  # fmt: skip
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 
 

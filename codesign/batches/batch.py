@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from codesign.batches.flat import Flat
@@ -23,6 +24,10 @@ class Pose:
     axis: Tensor
     points: Tensor
 
+    def to(self, device: torch.device) -> "Pose":
+        """The same on a device."""
+        return Pose(*(getattr(self, name).to(device) for name in Pose.__slots__))
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Batch:
@@ -37,6 +42,11 @@ class Batch:
     mask: Tensor
     slip_mm: Tensor
     pose: Pose | None = None
+
+    def to(self, device: torch.device) -> "Batch":
+        """What is true of the frames on a device; the frames themselves go there as they are imaged."""
+        pose = None if self.pose is None else self.pose.to(device)
+        return Batch(self.frames, self.mask.to(device), self.slip_mm.to(device), pose)
 
 
 class Scenes(Protocol):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import SceneError
-from metalens.image import CODES, Frames, Imager, UniformImager, image, weight_maps
+from metalens.image import CODES, Frames, Imager, UniformImager, image, scene, weight_maps
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,32 +55,42 @@ def samples(frames: Frames | Flat) -> int:
     return int((frames.light if isinstance(frames, Flat) else frames.radiance).shape[-1])
 
 
-def depth_um(frames: Frames | Flat, *, margin: int = 0) -> Tensor:
+def depth_um(frames: Frames | Flat, *, margin: int = 0, device: torch.device | str = "cpu") -> Tensor:
     """(n, y, x) depth of what is seen at every sample without the margin: of the sheet that covers more of it."""
-    if isinstance(frames, Flat):
-        made = torch.from_numpy(frames.depth_um.astype(np.float32) * frames.scale.astype(np.float32)[:, None, None])
+    if isinstance(frames, Flat):  # no more than the frames' own bytes travel to a device
+        scale = torch.from_numpy(frames.scale.astype(np.float32)).to(device)
+        whole = torch.from_numpy(frames.depth_um.view(np.int16)).to(device).int() & 0xFFFF
+        made = whole.float() * scale[:, None, None]
     else:
-        made = torch.where(frames.coverage[:, 1] > 0.5, frames.depth_um[:, 1], frames.depth_um[:, 0])
+        few = frames.to(device)
+        made = torch.where(few.coverage[:, 1] > 0.5, few.depth_um[:, 1], few.depth_um[:, 0])
     inside = slice(margin, made.shape[-1] - margin)
     return made[:, inside, inside].clamp_min(1.0)
 
 
-def sheets(frames: Frames | Flat) -> Frames:
-    """Flat frames as a far sheet that covers all; frames of two sheets as they are."""
+def sheets(frames: Frames | Flat, device: torch.device | str = "cpu") -> Frames:
+    """Flat frames as a far sheet that covers all, frames of two sheets as they are; on a device."""
     if isinstance(frames, Frames):
-        return frames
-    cover = torch.zeros(len(frames.light), 2, *frames.light.shape[-2:])
+        return frames.to(device)
+    light, depth = _radiance(frames, device)[:, None], depth_um(frames, device=device)[:, None]
+    cover = torch.zeros(len(light), 2, *light.shape[-2:], device=light.device)
     cover[:, 1] = 1
-    light = torch.from_numpy(frames.light.astype(np.float32) * np.float32(1 / 255))[:, None]
-    return Frames(light * cover, cover, depth_um(frames)[:, None].expand_as(cover).contiguous())
+    return Frames(light * cover, cover, depth.expand_as(cover).contiguous())
+
+
+def _radiance(frames: Flat, device: torch.device | str) -> Tensor:
+    return torch.from_numpy(frames.light).to(device).float() * (1 / 255)
 
 
 def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin: int) -> Tensor:
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the kernels of ``optics``."""
+    device = optics.transfer[0].device
     if isinstance(optics, Imager):
-        return optics(sheets(frames))
+        return optics(sheets(frames, device))
     if isinstance(frames, Frames):
-        return image(frames, optics, margin=margin)
+        return image(frames.to(device), optics, margin=margin)
+    if device.type != "cpu":
+        return _elsewhere(frames, optics, margin=margin)
     table = _table(optics)
     near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
     size = frames.light.shape[-2:]
@@ -96,6 +106,18 @@ def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin:
     return torch.cat(out)
 
 
+def _elsewhere(frames: Flat, optics: UniformImager, *, margin: int) -> Tensor:
+    """As :func:`irradiance` of flat frames, all at once on another device than the processor."""
+    light, depth = (part(frames, device=optics.transfer.device) for part in (_radiance, depth_um))
+    table = torch.from_numpy(_table(optics)).to(light.device)
+    near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
+    code = ((near - 1 / depth) * ((len(table) - 1) / (near - far)) + 0.5).clamp(0, len(table) - 1).long()
+    sources = scene.padded(table[code].movedim(-1, 0) * light, optics.shape)
+    blurred = torch.fft.irfft2((torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape)
+    inside = [slice(margin, n - margin) for n in light.shape[-2:]]
+    return blurred[:, inside[0], inside[1]]
+
+
 def _table(optics: UniformImager) -> Array:
     """(codes, rank) weights of the kernels at depths at equal steps of 1/z.
 
@@ -107,8 +129,8 @@ def _table(optics: UniformImager) -> Array:
         raise SceneError("flat frames take one PSF for the whole image; give two-sheet frames for a field of PSFs")
     near, far = 1 / float(psf.depths_um[0]), 1 / float(psf.depths_um[-1])
     depths = 1 / torch.linspace(near, far, CODES, dtype=torch.float64)
-    maps = weight_maps(psf, depths[None])[:, 0]
-    return np.ascontiguousarray(maps.detach().float().numpy().T)
+    maps = weight_maps(psf, depths[None].to(psf.weights.device))[:, 0]
+    return np.ascontiguousarray(maps.detach().float().cpu().numpy().T)
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)

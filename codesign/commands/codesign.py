@@ -46,7 +46,7 @@ def run(options: Options) -> int:
     if options.export and settings.network != "supernet":
         raise ConfigError(f"--export writes elastic networks; network = {settings.network!r} has no such export")
     device = device_of(options.device)
-    parallel.join()
+    parallel.join(device)
     if parallel.rank():
         return _assist(transaction.unfinished(options.output), settings, device)
     with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:

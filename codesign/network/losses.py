@@ -103,7 +103,7 @@ def place(centre: Tensor, mask: Tensor, *, unit: float = 0.02, knee: float = 0.3
         centre: (batch, 2) x, y as a fraction of the frame from its middle. mask: (batch, y, x) coverage.
     """
     total = mask.sum((1, 2))
-    y, x = ((torch.arange(n, dtype=mask.dtype) + 0.5) / n - 0.5 for n in mask.shape[-2:])
+    y, x = ((torch.arange(n, dtype=mask.dtype, device=mask.device) + 0.5) / n - 0.5 for n in mask.shape[-2:])
     truth = torch.stack([(mask.sum(1) * x).sum(1), (mask.sum(2) * y).sum(1)], -1) / total.clamp_min(1e-6)[:, None]
     each = F.smooth_l1_loss(centre / unit, truth / unit, beta=knee, reduction="none").mean(1)
     seen = total > 0.5

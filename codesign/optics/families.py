@@ -9,12 +9,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from metalens.design import Focus
-from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 
 Family = Literal["free", "radial"]
@@ -45,7 +43,7 @@ class Start:
     def phase_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
         """The phase at any places of the lens, float64."""
         x, y = x_um + torch.zeros_like(y_um), y_um + torch.zeros_like(x_um)
-        total = torch.zeros(x.shape, dtype=torch.float64)
+        total = torch.zeros_like(x, dtype=torch.float64)
         if not (self.zones or self.foci_um or (self.parts > 1 and self.apart_um)):
             return total
         share = (x**2 + y**2) / self.radius_um**2  # of the aperture's area within
@@ -69,7 +67,7 @@ class Start:
     def _refocused(self, r2: Tensor, share: Tensor) -> Tensor:
         """Phase of each ring's own source distance less that of the common one."""
         ring = torch.floor(share * len(self.foci_um)).clamp(0, len(self.foci_um) - 1).long()
-        own = torch.tensor(self.foci_um, dtype=torch.float64)[ring]
+        own = torch.tensor(self.foci_um, dtype=torch.float64, device=ring.device)[ring]
         k, s = 2 * math.pi / self.focus.wavelength_um, self.focus.source_distance_um
 
         def path(distance: Tensor | float) -> Tensor:
@@ -79,19 +77,19 @@ class Start:
         return -k * (path(own) - path(s))
 
 
-def terms(x: Array, y: Array, count: int, family: Family) -> list[Array]:
-    """The first ``count`` terms over the unit disc.
+def terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
+    """The first ``count`` terms over the unit disc, where x and y lie.
 
     free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n. radial: rho^2, rho^4, …
     """
-    rho = np.hypot(x, y)
+    rho = torch.hypot(x, y)
     if family == "radial":
         return [rho ** (2 * n + 2) for n in range(count)]
-    theta = np.arctan2(y, x)
-    found: list[Array] = []
+    theta = torch.atan2(y, x)
+    found: list[Tensor] = []
     order = 2
     while len(found) < count:
         for m in range(-order, order + 1, 2):
-            found.append(rho**order * (np.cos(m * theta) if m >= 0 else np.sin(-m * theta)))
+            found.append(rho**order * (torch.cos(m * theta) if m >= 0 else torch.sin(-m * theta)))
         order += 1
     return found[:count]

@@ -25,6 +25,8 @@ from metalens.image import Frames, Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
 from metalens.psf import Source
 
+There = tuple[int, int, torch.device]  # samples along a side of the frames, margin included; margin; where they are
+
 
 def source_of(settings: OpticsConfig) -> Source | None:
     """The light that reaches the sensor; None for one wavelength.
@@ -62,53 +64,57 @@ def imager(
     margin: int,
     error: LensError | None = None,
     made: Stack | None = None,
+    device: torch.device | str = "cpu",
 ) -> UniformImager | Imager:
     """What images frames of ``frame`` samples, margin included.
 
     Args:
         error: one draw of the lenses that are made. made: a lens that is made in place of the coefficients.
+        device: where the frames are imaged, and the true image's PSFs are computed.
 
     Raises:
         TrainingError: of the lens that is made only PSFs of one chief ray are known, and the true image is asked for.
     """
     if settings.image == "uniform":
         found = made or lens.stack(settings, coefficients_rad, error=error)
-        return lens.prepared(settings, found, frame, margin=margin)
+        return lens.prepared(settings, found, frame, margin=margin).to(device)
+    there = frame, margin, torch.device(device)
     if made is not None:
-        return _made(settings, made, frame, margin)
+        return _made(settings, made, there)
     key = tuple(coefficients_rad.detach().tolist())
     if error is None:
-        return _still(settings, key, frame, margin)
-    return _hazy(settings, _formed(settings, key, frame, margin, error), error)
+        return _still(settings, key, there)
+    return _hazy(settings, _formed(settings, key, there, error), error)
 
 
 @functools.lru_cache(maxsize=32)
-def _made(settings: OpticsConfig, made: Stack, frame: int, margin: int) -> Imager:
+def _made(settings: OpticsConfig, made: Stack, there: There) -> Imager:
     """The true image of a lens that is made: formed once for all who look at it."""
     if made.plane is None:
         raise TrainingError(
             "optics.image = 'true', but the lens is given by its PSFs on axis alone: they cannot stand for the field; "
             "use a run of optics.image = 'uniform' for it"
         )
-    return _through(settings, made.plane, frame, margin)
+    return _through(settings, made.plane, there)
 
 
 @functools.lru_cache(maxsize=3)
-def _still(settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int) -> Imager:
-    return _formed(settings, coefficients_rad, frame, margin, None)
+def _still(settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There) -> Imager:
+    return _formed(settings, coefficients_rad, there, None)
 
 
 @torch.no_grad()
 def _formed(
-    settings: OpticsConfig, coefficients_rad: tuple[float, ...], frame: int, margin: int, error: LensError | None
+    settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There, error: LensError | None
 ) -> Imager:
     wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
-    return _through(settings, _in_place(settings, wave), frame, margin)
+    return _through(settings, _in_place(settings, wave), there)
 
 
 @torch.no_grad()
-def _through(settings: OpticsConfig, plane: Optics, frame: int, margin: int) -> Imager:
+def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
     """The image through a lens plane in its surroundings, in the settings' light."""
+    frame, margin, device = there
     whole = field_imager(
         plane.wave,
         grid_of(settings, frame, margin),
@@ -117,6 +123,7 @@ def _through(settings: OpticsConfig, plane: Optics, frame: int, margin: int) -> 
         field=(math.radians(settings.angle_deg), 0.0),
         tolerance=settings.image_tolerance,
         distance_um=plane.distance_um,
+        device=device,
     )
     if settings.passed == 1:
         return whole

@@ -117,8 +117,9 @@ class LensError:
 
 def wave_front_rad(state: State, u: Tensor, v: Tensor) -> Tensor:
     """Phase at lens places over the radius that all pillars share: their mean answer, and the causes that bend."""
-    shared = _answers()[0][0] * (state.bias_um(u.numpy(), v.numpy()) - state.bias_um(np.zeros(1), np.zeros(1)))
-    return torch.from_numpy(shared + state.phase_rad(u.numpy(), v.numpy()))
+    x, y = u.cpu().numpy(), v.cpu().numpy()
+    shared = _answers()[0][0] * (state.bias_um(x, y) - state.bias_um(np.zeros(1), np.zeros(1)))
+    return torch.from_numpy(shared + state.phase_rad(x, y)).to(u.device)
 
 
 def variance_rad2(state: State, *, rings: int = 12) -> float:

@@ -214,16 +214,16 @@ def phase_of(settings: OpticsConfig, coefficients_rad: Array) -> PhaseOf:
     """The trained phase as a function of pillar positions, for :func:`metalens.design.make`."""
     count, family = settings.polynomials, settings.family
     mix = _polynomials(settings.pupil, count, family)[1] if count else torch.zeros(0, 0)
-    weights = (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).numpy() if len(mix) else np.zeros(0)
+    weights = (mix.T @ torch.as_tensor(coefficients_rad, dtype=torch.float64)).tolist() if len(mix) else []
     rim = settings.aperture_mm * 500
 
     def phase(x_um: Array, y_um: Array) -> Array:
-        x, y = x_um, y_um[:, None]
-        places = torch.from_numpy(np.asarray(x, float)), torch.from_numpy(np.asarray(y, float))
-        total = profiles.hyperbolic(x, y, settings.focus) + settings.start.phase_rad(*places).numpy()
+        x, y = (torch.from_numpy(np.asarray(a, float)) for a in (x_um, y_um[:, None]))
+        focused = torch.from_numpy(profiles.hyperbolic(x_um, y_um[:, None], settings.focus))
+        total = focused + settings.start.phase_rad(x, y)
         for weight, term in zip(weights, families.terms(x / rim, y / rim, len(weights), family), strict=True):
             total = total + weight * term
-        return np.asarray(total)
+        return total.numpy()
 
     return phase
 
@@ -236,8 +236,8 @@ def prepared(settings: OpticsConfig, made: Stack, frame: int, *, margin: int) ->
 @functools.lru_cache(maxsize=8)
 def _polynomials(pupil: Pupil, count: int, family: Family = "free") -> tuple[Tensor, Tensor]:
     """Terms on the nodes, orthonormal over the aperture (unit root mean square), and their mix of the plain ones."""
-    x, y = (c.numpy() / pupil.radius_um for c in coordinates(pupil))
-    raw = torch.from_numpy(np.stack(families.terms(x, y, count, family)))
+    x, y = (c / pupil.radius_um for c in coordinates(pupil))
+    raw = torch.stack(families.terms(x, y, count, family))
     inside = radius(pupil) <= pupil.radius_um
     samples = raw[:, inside]
     _, upper = torch.linalg.qr(samples.T)
@@ -252,8 +252,7 @@ def _modes(settings: OpticsConfig) -> Tensor:
     if not settings.angle_deg:
         return terms
     seen, rim = _seen(settings), settings.pupil.radius_um
-    place = (seen.x_um / rim).numpy(), (seen.y_um / rim).numpy()
-    raw = torch.from_numpy(np.stack(families.terms(*place, len(mix), settings.family)))
+    raw = torch.stack(families.terms(seen.x_um / rim, seen.y_um / rim, len(mix), settings.family))
     return torch.einsum("nm,myx->nyx", mix, raw) * (seen.weight > 0)
 
 
@@ -318,8 +317,8 @@ def phase_at(
     total = settings.start.phase_rad(x_um, y_um)
     if settings.polynomials:
         weights = _polynomials(settings.pupil, settings.polynomials, settings.family)[1].mT @ coefficients_rad.double()
-        terms = families.terms((x_um / rim).numpy(), (y_um / rim).numpy(), settings.polynomials, settings.family)
-        total = total + torch.einsum("n,nyx->yx", weights, torch.from_numpy(np.stack(terms)))
+        terms = torch.stack(families.terms(x_um / rim, y_um / rim, settings.polynomials, settings.family))
+        total = total + torch.einsum("n,nyx->yx", weights.to(terms.device), terms)
     return total if error is None else total + _wave_front(settings, error, x_um / rim, y_um / rim)
 
 

@@ -54,8 +54,8 @@ def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | Non
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
             given = trainer.optics, trainer.model.coefficients_rad, samples(batch.frames)
-            prepared = formed.imager(*given, margin=scenes.margin, made=stack)
-        light = irradiance(batch.frames, prepared, margin=scenes.margin)
+            prepared = formed.imager(*given, margin=scenes.margin, made=stack, device=trainer.device)
+        light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
         noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
         wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
         pixels.append(read_out(light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))

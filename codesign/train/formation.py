@@ -58,7 +58,7 @@ def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None, rea
     well = sensor.full_well_e * float(camera.kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = mean.clamp(max=well)
     share, size = parallel.ranks(), len(mean)  # the noise of the whole batch, whoever takes which part of it
-    noise = torch.randn((share * size, *mean.shape[1:]), generator=generator, dtype=mean.dtype, device=mean.device)
+    noise = camera.normal((share * size, *mean.shape[1:]), mean, generator)
     noise = noise[parallel.rank() * size : (parallel.rank() + 1) * size]
     return collected + noise * torch.sqrt(collected + sensor.read_noise_e**2 * reads.to(mean) + 1e-6)
 

@@ -6,8 +6,9 @@ gradients of phase coefficients are a hundred times smaller than those of weight
 The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`), on the schedule of the weights.
 """
 
+import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,7 @@ from codesign.batches import Batch, Flat, PoolScenes, Pose, Scenes, depth_um, ir
 from codesign.network import Architecture, Baseline, Prediction, blur, cost, losses, running, smallest, soap
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
+from codesign.train import moving
 from codesign.train.ahead import Ahead
 from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
@@ -149,6 +151,7 @@ class Trainer:
             for name, (_, parameters) in self.groups.items()
             if parameters
         }
+        self.device = torch.device("cpu")  # see :mod:`codesign.train.placement`
         self.step, self.skipped, self.bad_run = 0, 0, 0
         self.pitch_held_um: float | None = None  # where the last step was held back from a finer or coarser pitch
         self._begins_um = float(made.pitch_um.detach())
@@ -162,9 +165,14 @@ class Trainer:
         """
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        with Ahead(lambda step: self._given(step, live=False, seen=True), end=end) as ahead:
+        work: Callable[[int], Given | Batch] = self._standing if self._still else self._batch
+        aside = self._still or self.device.type != "cpu"  # the processor is free there, and renders meanwhile
+        with Ahead(work, end=end) as ahead:
             while self.step < end:
-                yield self._advance(ahead if self._still else None)
+                made = ahead.take(self.step) if aside else work(self.step)
+                with ahead.beside() if aside else contextlib.nullcontext():
+                    record = self._advance(made)
+                yield record
 
     def state(self) -> dict[str, object]:
         """Everything that the next step depends on."""
@@ -186,35 +194,35 @@ class Trainer:
             self.model.log_pitch.copy_(state["log_pitch"])  # type: ignore[arg-type]
         for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])  # type: ignore[index]
-            _laid_out(optimiser)
+            moving.laid_out(optimiser)
         self.step, self.skipped, self.bad_run = state["counters"]  # type: ignore[misc]
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
-    def _advance(self, ahead: Ahead[Given] | None) -> Record:
+    def _advance(self, made: Given | Batch) -> Record:
         progress = self.step / self.inner.steps
         rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        if ahead is not None:
-            given = ahead.take(self.step)
-            with ahead.beside():
-                return self._stepped(given, rates)
+        if isinstance(made, Given):
+            return self._stepped(made, rates)
         moves, live = rates["pitch"] > 0, rates["optics"] > 0 and "optics" in self.optimisers
-        return self._stepped(self._given(self.step, live=live, seen=not moves), rates)
+        return self._stepped(self._given(self.step, made, live=live, seen=not moves), rates)
 
     def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
         """A step of every optimiser on what is given."""
         means = running.kept(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
-        total, macs = task + self.inner.optics_weight * optics_loss, each.mean()
+        total, macs = task + self.inner.optics_weight * optics_loss.to(self.device), each.mean()
         if self._budget:
-            total = total + self.inner.budget_weight * losses.over_budget(each, self._budget).mean()
+            over = losses.over_budget(each, self._budget).mean()
+            total = total + self.inner.budget_weight * over.to(self.device)
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.step, self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
-        finite = math.isfinite(parallel.mean_of([float(total.detach())])[0]) and self._finite()
+        finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
+        finite = finite and moving.finite(p for _, ps in self.groups.values() for p in ps)
         if not finite:
             running.put_back(means)
         self._apply(rates, finite=finite)
@@ -230,15 +238,23 @@ class Trainer:
         drawn = not self.light.stacks and self._lens_error(0) is not None
         return fixed and self.inner.pitch.rate == 0 and not drawn and isinstance(self.scenes, PoolScenes)
 
-    def _given(self, step: int, *, live: bool, seen: bool) -> Given:
+    def _batch(self, step: int) -> Batch:
+        """The frames of a step, by its number alone."""
+        return parallel.part_of(self.scenes.batch(step, self.inner.batch))
+
+    def _standing(self, step: int) -> Given:
+        """What a step trains on where neither lens nor pitch move."""
+        return self._given(step, self._batch(step), live=False, seen=True)
+
+    def _given(self, step: int, batch: Batch, *, live: bool, seen: bool) -> Given:
         """What a step trains on; ``seen``: as the pixels give it, which takes a pitch that does not move."""
-        batch = parallel.part_of(self.scenes.batch(step, self.inner.batch))
+        margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(step, batch.frames, live)
-            light = irradiance(batch.frames, optics, margin=self.scenes.margin)
-        vergence = blur.window_vergence(depth_um(batch.frames, margin=self.scenes.margin))
-        pitch = self.model.pitch_um.detach()
-        return Given(step, batch, light, optics_loss, vergence, self._read(step, light, pitch, False) if seen else None)
+            light = irradiance(batch.frames, optics, margin=margin)
+        vergence = blur.window_vergence(depth_um(batch.frames, margin=margin, device=self.device))
+        frames = self._read(step, light, pitch, False) if seen else None
+        return Given(step, batch.to(self.device), light, optics_loss, vergence, frames)
 
     def _read(self, step: int, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
         """Frames of the sensor. All readings of a step begin the same noise: networks differ by what they see."""
@@ -248,7 +264,7 @@ class Trainer:
     def _losses(self, given: Given, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
         """Mean task loss of the step's members, and the multiply-accumulates of each."""
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
-        scale = torch.tensor(self.inner.slip_scale_mm)
+        scale = torch.tensor(self.inner.slip_scale_mm, device=self.device)
         size = given.light.shape[-1] * self.optics.sample_um
         self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
         members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
@@ -304,10 +320,6 @@ class Trainer:
         seed = int(np.random.SeedSequence([self.inner.seed, at, stream]).generate_state(1, np.uint64)[0])
         return torch.Generator().manual_seed(seed >> 1)
 
-    def _finite(self) -> bool:
-        grads = [p.grad for _, ps in self.groups.values() for p in ps if p.grad is not None]
-        return all(bool(torch.isfinite(g).all()) for g in grads)
-
     def _apply(self, rates: dict[str, float], *, finite: bool) -> None:
         if not finite:
             self.skipped, self.bad_run = self.skipped + 1, self.bad_run + 1
@@ -330,20 +342,8 @@ class Trainer:
             self.pitch_held_um = self.model.hold(finest, max(self._coarsest_um, self._begins_um))
 
     def _culprits(self) -> str:
-        bad = [
-            name
-            for name, (_, parameters) in self.groups.items()
-            if any(p.grad is not None and not bool(torch.isfinite(p.grad).all()) for p in parameters)
-        ]
+        bad = [name for name, (_, parameters) in self.groups.items() if not moving.finite(parameters)]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
-
-
-def _laid_out(optimiser: torch.optim.Optimizer) -> None:
-    """Moments laid out in memory as their parameters: a fused step walks through both in one order without asking."""
-    for parameter, kept in optimiser.state.items():
-        for name, value in kept.items():
-            if name != "step" and value.shape == parameter.shape:  # the count of a scalar is no moment of it
-                kept[name] = torch.empty_like(parameter).copy_(value)
 
 
 __all__ = ["Batch", "InnerConfig", "Model", "Record", "Scenes", "Schedule", "Trainer", "model"]

@@ -29,6 +29,7 @@ class Light:
         self.optics, self.stacks, self.draw = optics, tuple(stacks), draw
         self.refresh, self.draws, self.seed = refresh, draws, seed
         self.imaged_step, self.imaged_rad = -1, torch.zeros(0, dtype=torch.float64)
+        self.device = torch.device("cpu")  # where frames are imaged
         self._ready: UniformImager | Imager | None = None
         self._given: dict[int, UniformImager | Imager] = {}
         self._live: formed.Live | None = None
@@ -70,7 +71,7 @@ class Light:
         if not live and error is None and self._ready is not None:
             return self._ready
         made = lens.stack(self.optics, coefficients_rad, error=error)
-        prepared = lens.prepared(self.optics, made, frame, margin=margin)
+        prepared = lens.prepared(self.optics, made, frame, margin=margin).to(self.device)
         self._ready = None if live or error is not None else prepared
         return prepared
 
@@ -83,7 +84,8 @@ class Light:
             self.imaged_step, self.imaged_rad, self._ready = step, coefficients_rad.clone(), None
         if not isinstance(self._ready, Imager):
             error = self.draw(self.imaged_step)
-            self._ready = formed.imager(self.optics, self.imaged_rad, frame, margin=margin, error=error)
+            about = {"margin": margin, "error": error, "device": self.device}
+            self._ready = formed.imager(self.optics, self.imaged_rad, frame, **about)
         if not isinstance(self._ready, Imager):
             raise TypeError("the true image needs a field of PSFs")
         return self._ready
@@ -93,5 +95,6 @@ class Light:
         number = int(np.random.default_rng([self.seed, step, 4]).integers(len(self.stacks)))
         if number not in self._given:
             made = self.stacks[number]
-            self._given[number] = formed.imager(self.optics, coefficients_rad, frame, margin=margin, made=made)
+            about = {"margin": margin, "made": made, "device": self.device}
+            self._given[number] = formed.imager(self.optics, coefficients_rad, frame, **about)
         return self._given[number]

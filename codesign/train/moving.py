@@ -1,6 +1,7 @@
 """What training moves, and how: network weights, phase of the lens, pixel pitch, each on a schedule of its own."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -75,3 +76,18 @@ def model(
         nn.Parameter(torch.zeros(settings.polynomials, dtype=torch.float64)),
         nn.Parameter(torch.tensor(math.log(pitch_um), dtype=torch.float64)),
     )
+
+
+def finite(parameters: Iterable[nn.Parameter]) -> bool:
+    """Whether all gradients that there are have finite numbers alone; a device is asked once."""
+    found = [torch.isfinite(p.grad).all() for p in parameters if p.grad is not None]
+    places = {one.device for one in found}
+    return all(bool(torch.stack([one for one in found if one.device == place]).all()) for place in places)
+
+
+def laid_out(optimiser: torch.optim.Optimizer) -> None:
+    """Moments laid out in memory as their parameters: a fused step walks through both in one order without asking."""
+    for parameter, kept in optimiser.state.items():
+        for name, value in kept.items():
+            if name != "step" and value.shape == parameter.shape:  # the count of a scalar is no moment of it
+                kept[name] = torch.empty_like(parameter).copy_(value)

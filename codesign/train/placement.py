@@ -1,8 +1,8 @@
-"""Where the network computes: on the processor, or on a GPU while scenes, optics and sensor stay on the processor.
+"""Where a run computes: on the processor, or on a GPU while the processor renders the frames of the next step.
 
-Frames go to the network's device as they enter it and its answers come back, so nothing else of a run knows of devices,
-and gradients pass through to lens and pitch. A GPU sums in another order than the processor: two runs on one are equal
-to rounding, not to the bit.
+PSFs, images, pixels, network and losses lie on the GPU; of the frames three bytes a pixel travel there. The noise is
+drawn on the processor, so that a step has the same everywhere, and gradients come back to lens and pitch, which stay.
+A GPU sums in another order than the processor: two runs on one are equal to rounding, not to the bit.
 """
 
 import os
@@ -34,9 +34,10 @@ def device_of(wanted: Place) -> torch.device:
 
 
 def place(trainer: Trainer, device: torch.device) -> None:
-    """Move a trainer's network, and what its optimiser remembers, to a device."""
+    """Let a trainer image and train on a device: its network and what its optimiser remembers move there."""
     if device.type == "cpu":
         return
+    trainer.device = trainer.light.device = device
     torch.backends.cudnn.deterministic = True
     net = trainer.model.net
     net.to(device)
@@ -46,14 +47,17 @@ def place(trainer: Trainer, device: torch.device) -> None:
 
 
 def attend(net: nn.Module, device: torch.device) -> None:
-    """From now on frames on the processor are taken to ``device``, and predictions there are brought back."""
+    """From now on frames on the processor are taken to ``device``, and what is predicted of those is brought back."""
+    brought = False
 
     def enter(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(v.to(device) if isinstance(v, Tensor) and v.device.type == "cpu" else v for v in given)
+        nonlocal brought
+        brought = any(isinstance(v, Tensor) and v.device.type == "cpu" for v in given)
+        return tuple(v.to(device) if isinstance(v, Tensor) else v for v in given)
 
     def leave(_: nn.Module, __: tuple[Any, ...], answer: Prediction) -> Prediction:
         parts = (getattr(answer, name) for name in Prediction.__slots__)
-        return Prediction(*(part.cpu() if part is not None and part.device == device else part for part in parts))
+        return Prediction(*(part.cpu() if brought and part is not None else part for part in parts))
 
     net.register_forward_pre_hook(enter)
     net.register_forward_hook(leave)

@@ -56,6 +56,7 @@ def imager(
         polarisation: ``flux`` (of unpolarised light through the sensor's plane, which a pixel counts), ``scalar``,
             ``auto``: one scalar where its error, ``parts["polarisation"]``, is below the tolerance, else the flux, or
             ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
+        device: where PSFs and patches are computed and frames will be; a few PSFs are judged on the processor.
 
     Raises:
         SceneError: a field that is not within 90 degrees, a polarisation that is none, wavelengths, depths or field
@@ -76,13 +77,12 @@ def imager(
     round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
     round_ = round_ and (layers.stop is None or layers.stop.centred)
     plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_, polarisation=polarisation)
-    stack, energy = node_psfs(optics, plan)
-    whole = patched(scene_grid, plan, stack.to(device), energy.to(device), tolerance=tolerance)
+    stack, energy = node_psfs(optics, plan, device)
+    whole = patched(scene_grid, plan, stack, energy, tolerance=tolerance)
     made = evened(thinned(whole, tolerance=tolerance))
     parts = {**made.parts, **_held_out(optics, whole)}
-    return replace(
-        made, parts=parts, stray=stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
-    )
+    stray = stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
+    return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
 
 
 def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
@@ -93,13 +93,13 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
         raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
 
 
-def node_psfs(optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
+def node_psfs(optics: Optics, plan: Plan, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
     """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in the wave's factor."""
     if plan.folds:
-        light = _folded(optics, plan)
+        light = _folded(optics, plan, device)
     else:
         y, x = torch.meshgrid(plan.y_um, plan.x_um, indexing="ij")
-        at = torch.stack([x.flatten(), y.flatten()], -1)
+        at = torch.stack([x.flatten(), y.flatten()], -1).to(device)
         light = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
         light = light.reshape(*x.shape, *light.shape[1:])
     return normalised(light, optics, plan)
@@ -116,12 +116,12 @@ def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tenso
     return light / total[..., None, None], total * (cosine2**2).to(total)
 
 
-def _folded(optics: Optics, plan: Plan) -> Tensor:
+def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     """PSFs of a round lens on a square grid about its axis, from one eighth of the nodes."""
     count = len(plan.x_um)
     half = (count + 1) // 2
     pairs = [(i, j) for i in range(half) for j in range(i, half)]
-    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs])
+    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs]).to(device)
     few = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
     out = few.new_zeros(count, count, *few.shape[1:])
     for (i, j), psf in zip(pairs, few, strict=True):
@@ -147,7 +147,7 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
     kernels alone: that even light is put right afterwards is not counted, since points gain nothing by it.
     """
     share = tolerance * SHARES["kernels"]
-    seen = trial(whole.grid)
+    seen = trial(whole.grid).to(whole.stack.device)
     with torch.no_grad():
         want = blurred(seen, whole)
         for looser in LOOSER:

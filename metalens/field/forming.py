@@ -26,6 +26,7 @@ from metalens.ground.errors import SceneError
 from metalens.image import Frames
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
+CHUNK, AT_ONCE = 8, 32  # frames that are imaged together: on the processor, on another device
 COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
 
 
@@ -69,10 +70,24 @@ class Imager:
         """
         return image(frames, self)
 
+    def to(self, device: torch.device | str) -> "Imager":
+        """The same on a device, for frames there; grid and plan stay where they are."""
+        return replace(
+            self,
+            stack=self.stack.to(device),
+            energy=self.energy.to(device),
+            patches=[patch.to(device) for patch in self.patches],
+            transfer=[part.to(device) for part in self.transfer],
+            even=None if self.even is None else self.even.to(device),
+            stray=None if self.stray is None else self.stray.to(device),
+        )
 
-def image(frames: Frames, optics: Imager, *, chunk: int = 8) -> Tensor:
-    """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time share the reading of a patch's tables."""
+
+def image(frames: Frames, optics: Imager, *, chunk: int | None = None) -> Tensor:
+    """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time share the reading of a patch's tables, by
+    default as many as a processor's cache holds, or as keep a GPU busy."""
     grid = optics.grid
+    chunk = chunk or (CHUNK if optics.stack.device.type == "cpu" else AT_ONCE)
     size = tuple(n + 2 * grid.margin for n in grid.samples)
     if tuple(frames.radiance.shape[-2:]) != size:
         raise SceneError(f"frames of {tuple(frames.radiance.shape[-2:])} samples, need {size}: grid and margin")

@@ -45,6 +45,11 @@ class Patch:
     missing: Tensor
     coverage: int
 
+    def to(self, device: torch.device | str) -> "Patch":
+        """The same on a device."""
+        parts = ("share", "weights", "energy", "mix", "nodes", "missing")
+        return replace(self, **{name: getattr(self, name).to(device) for name in parts})
+
     def trimmed(self, tolerance: float, coverage: float) -> "Patch":
         """The first kernels alone, as many as the tolerances of light and of coverage need."""
         rank, few = (max(int((self.missing > t).sum()), 1) for t in (tolerance, coverage))
@@ -168,7 +173,7 @@ def _patch(
     touched = [torch.nonzero(part.abs().amax(0) > 0)[:, 0] for part in inside]
     near, depths = seen[touched[0]][:, touched[1]], seen.shape[2]
     share = (row[2].to(seen)[:, None] * column[2].to(seen)).flatten()
-    some = [_places(len(part), PLACES) for part in inside]
+    some = [_places(part, PLACES) for part in inside]
     rows, at_y, at_x = _at_places(near, inside, some, touched)
     values, vectors = torch.linalg.eigh(rows @ rows.mT)
     values, vectors = values.flip(0).clamp_min(1e-14 * float(values[-1])), vectors.flip(1)
@@ -176,11 +181,11 @@ def _patch(
     missing = torch.sqrt(power.flip(1).cumsum(1).flip(1) / power.sum(1, keepdim=True)).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
     left = vectors[:, :rank]
-    more = [_places(len(part), max(PLACES, len(nodes))) for part, nodes in zip(inside, touched, strict=True)]
+    more = [_places(part, max(PLACES, len(nodes))) for part, nodes in zip(inside, touched, strict=True)]
     weighed = _at_places(near, inside, more, touched)[0] @ (rows.mT @ (left / values[:rank]))
     table = weighed.reshape(len(more[0]), len(more[1]), depths, rank)
     to_y, to_x = (
-        dense(torch.arange(len(part), dtype=torch.float64), at.double()).to(seen)
+        dense(torch.arange(len(part), dtype=torch.float64, device=seen.device), at.double()).to(seen)
         for part, at in zip(inside, more, strict=True)
     )
     table = torch.einsum("yp,xq,pqzr->yxzr", to_y, to_x, table).flatten(0, 1) * share[:, None, None]
@@ -198,9 +203,10 @@ def _patch(
     )
 
 
-def _places(pixels: int, count: int) -> Tensor:
-    """(count,) pixels of a patch from its first to its last, at most all of them."""
-    return torch.linspace(0, pixels - 1, min(count, pixels), dtype=torch.float64).round().long()
+def _places(inside: Tensor, count: int) -> Tensor:
+    """(count,) pixels of a patch (pixels, nodes) from its first to its last, at most all of them."""
+    last, few = len(inside) - 1, min(count, len(inside))
+    return torch.linspace(0, last, few, dtype=torch.float64, device=inside.device).round().long()
 
 
 def _at_places(

@@ -6,7 +6,7 @@ media on the way). Order 1 is the image.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -32,6 +32,10 @@ class Stray:
     transfer: Tensor
     shape: tuple[int, int]
     illumination: Tensor
+
+    def to(self, device: torch.device | str) -> "Stray":
+        """The same on a device."""
+        return replace(self, transfer=self.transfer.to(device), illumination=self.illumination.to(device))
 
 
 def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]) -> Stray | None:
@@ -68,7 +72,7 @@ def _reduced(optics: Optics, depth_um: float) -> float:
 def add_stray(image: Tensor, frames: Frames, stray: Stray, grid: Grid) -> Tensor:
     """The image with the discs of all sources added."""
     light = frames.radiance.sum(1) * stray.illumination.to(frames.radiance)
-    spectrum = torch.fft.rfft2(light, s=stray.shape) * stray.transfer.to(light.device)
+    spectrum = torch.fft.rfft2(light, s=stray.shape) * stray.transfer
     edge = grid.margin + grid.spare
     rows, columns = (slice(edge, edge + n) for n in grid.samples)
     haze: Tensor = torch.fft.irfft2(spectrum, s=stray.shape)[..., rows, columns]

@@ -44,7 +44,7 @@ def term(optics: Optics, plan: Plan, gradient: Tensor, point: int, wave: int) ->
     places = _places(plan)
     light = psfs(
         optics,
-        places[point : point + 1],
+        places[point : point + 1].to(gradient.device),
         depths_um=plan.depths_um,
         wavelength_um=float(plan.waves.wavelengths_um[wave]),
         window=plan.window,

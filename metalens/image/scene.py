@@ -37,6 +37,10 @@ class Frames:
             found = [tuple(a.shape) for a in (self.radiance, self.coverage, self.depth_um)]
             raise SceneError(f"radiance, coverage, depth have shapes {found}, need the same (frames, 2, y, x)")
 
+    def to(self, device: torch.device | str) -> "Frames":
+        """The same on a device."""
+        return Frames(*(getattr(self, name).to(device) for name in Frames.__slots__))
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Layers:
@@ -131,7 +135,8 @@ def weight_maps(psf: PsfBasis, depth_um: Tensor) -> Tensor:
     table = _table(psf)
     if table.shape[:2] == (1, 1):
         return table[0, 0].index_select(1, code.flatten()).reshape(-1, *code.shape)
-    (rows, y), (columns, x) = (_span(n, f) for n, f in zip(depth_um.shape[-2:], table.shape[:2], strict=True))
+    sides = zip(depth_um.shape[-2:], table.shape[:2], strict=True)
+    (rows, y), (columns, x) = (_span(n, f, code.device) for n, f in sides)
     total = table.new_zeros(())
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         r = (rows + down).clamp(max=table.shape[0] - 1)[:, None].expand(code.shape)
@@ -155,11 +160,12 @@ def _table(psf: PsfBasis) -> Tensor:
     wanted = torch.linspace(float(vergence[0]), float(vergence[-1]), CODES, dtype=torch.float64)
     upper = torch.searchsorted(-vergence, -wanted).clamp(1, len(vergence) - 1)
     part = ((wanted - vergence[upper - 1]) / (vergence[upper] - vergence[upper - 1])).clamp(0, 1).to(psf.weights)
+    upper = upper.to(psf.weights.device)
     return torch.lerp(psf.weights[:, :, upper - 1], psf.weights[:, :, upper], part[:, None]).mT
 
 
-def _span(pixels: int, points: int) -> tuple[Tensor, Tensor]:
-    position = torch.linspace(0, points - 1, pixels, dtype=torch.float64)
+def _span(pixels: int, points: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    position = torch.linspace(0, points - 1, pixels, dtype=torch.float64, device=device)
     first = position.floor().long()
     return first, position - first
 
@@ -176,6 +182,11 @@ class UniformImager:
     transfer: Tensor
     shape: tuple[int, int]
     table: Tensor
+
+    def to(self, device: torch.device | str) -> "UniformImager":
+        """The same on a device, for frames there; differentiable."""
+        psf = replace(self.psf, kernels=self.psf.kernels.to(device), weights=self.psf.weights.to(device))
+        return replace(self, psf=psf, transfer=self.transfer.to(device), table=self.table.to(device))
 
 
 def uniform_imager(psf: PsfBasis, frame: tuple[int, int], *, margin: int = 0) -> UniformImager:
@@ -241,8 +252,8 @@ def _sources(frames: Frames, optics: UniformImager) -> Tensor:
         return torch.from_numpy(weighted(light, cover, depth, table, ends_um=ends, shape=optics.shape))
     pair = torch.stack([frames.radiance, frames.coverage], 1)
     if single:  # weights of the depth alone: pad once, not once a kernel
-        return weight_maps(psf, _padded(frames.depth_um, optics.shape))[:, :, None] * _padded(pair, optics.shape)
-    return _padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
+        return weight_maps(psf, padded(frames.depth_um, optics.shape))[:, :, None] * padded(pair, optics.shape)
+    return padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
 
 
 def plain(a: Tensor) -> bool:
@@ -312,7 +323,7 @@ def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
     return transfer
 
 
-def _padded(sources: Tensor, shape: tuple[int, int]) -> Tensor:
+def padded(sources: Tensor, shape: tuple[int, int]) -> Tensor:
     """Continue the border pixels into the spare columns and rows: half of them belong to the far border."""
     for axis in (-1, -2):
         spare = shape[axis] - sources.shape[axis]

@@ -162,7 +162,8 @@ def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     The expectation of the gradient of k is 1 and of k² is 2m + 1, those of the true distribution for every m > 0;
     for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong skewness, and negative counts.
     """
-    count = torch.poisson(mean.detach(), generator=generator)
+    where = mean.device if generator is None else generator.device
+    count = torch.poisson(mean.detach().to(where), generator=generator).to(mean.device)
     safe = mean.detach().clamp_min(torch.finfo(mean.dtype).tiny)
     slope = torch.where(mean.detach() > 0, 0.5 * (1 + count / safe), 1.0)
     return count + slope * (mean - mean.detach())
@@ -177,8 +178,15 @@ def expose(
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = photons(mean, generator).clamp(max=well)
-    noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
+    noise = normal(tuple(mean.shape), mean, generator)
     return collected + sensor.read_noise_e * torch.as_tensor(reads).to(noise).sqrt() * noise
+
+
+def normal(shape: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Standard normal numbers of the kind of ``like``, where it lies: drawn where the generator is, so that the same
+    seed gives the same noise on every device."""
+    where = like.device if generator is None else generator.device
+    return torch.randn(shape, generator=generator, dtype=like.dtype, device=where).to(like.device)
 
 
 def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:

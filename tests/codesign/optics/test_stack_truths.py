@@ -104,10 +104,10 @@ def by_hand(x, y, *, wrong=False):
     """Phase on top of the hyperbolic one at places over the radius: terms made orthonormal on the pupil's nodes."""
     nodes = [c.numpy() / 350 for c in coordinates(BENT.pupil)]
     inside = np.hypot(*nodes) <= 1
-    raw = np.stack(families.terms(*nodes, 4, "free"))[:, inside].T
+    raw = np.stack(families.terms(*map(torch.from_numpy, nodes), 4, "free"))[:, inside].T
     mix = np.linalg.inv(np.linalg.qr(raw)[1]) * math.sqrt(len(raw))
     assert (raw @ mix).T @ (raw @ mix) / len(raw) == pytest.approx(np.eye(4), abs=1e-9)
-    total = np.tensordot(mix @ RAD.numpy(), np.stack(families.terms(x, y, 4, "free")), 1)
+    total = np.tensordot(mix @ RAD.numpy(), np.stack(families.terms(*map(torch.from_numpy, (x, y)), 4, "free")), 1)
     ring = np.ceil(2 * (x**2 + y**2)).clip(1, 2)
     total += (2 * ring - 1) * np.arctan2(y, x)  # a double helix of two rings
     if wrong:

@@ -1,5 +1,6 @@
 """Where the network computes."""
 
+import contextlib
 import math
 
 import pytest
@@ -9,13 +10,15 @@ from codesign.network import largest
 from codesign.train import placement, run
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
+from tests.elsewhere import AWAY, elsewhere
 
 GPU = torch.cuda.is_available()
 SMALL = {"scenes": {"pixels": 64, "margin": 8, "pool": 16}, "inner": {"steps": 4, "batch": 8}}
 
 
-def _going():
-    table = config.merged(run.preset_table("smoke"), SMALL)
+def _going(change=None, frozen=()):
+    small = config.merged(run.preset_table("smoke"), SMALL)
+    table = config.merged(small, (change or {}) | {"run": {"frozen": list(frozen)}})
     return run.start(config.from_table(table, run.RunConfig, where="a test"))
 
 
@@ -44,6 +47,46 @@ def test_frames_and_gradients_pass_through_an_attended_network():
     placement.attend(attended.model.net, torch.device("cpu"))
     for one, other in zip(plain.run(), attended.run(), strict=True):
         assert one == other
+
+
+@pytest.mark.parametrize(
+    ("change", "frozen"),
+    [
+        ({"inner": {name: {"rate": 5e-3, "start": 0.0} for name in ("optics", "pitch")}}, ()),
+        ({"optics": {"image": "uniform"}}, ("optics", "pitch")),  # flat frames of a pool, a step ahead
+        ({"scenes": {"pool": 0}, "network": "popovic"}, ("optics",)),  # frames of two sheets, a step ahead
+    ],
+)
+def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
+    """Images, pixels, network, losses and the way back to lens and pitch: nothing of it is for the processor alone."""
+    plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
+    (want,) = plain.run(until=1)
+    with elsewhere() as done, swapped():
+        placement.place(moved, AWAY)
+        for group in (g for o in moved.optimisers.values() for g in o.param_groups):
+            group["fused"] = False  # one kernel of PyTorch's own, which knows no devices but its list
+        (found,) = moved.run(until=1)
+        there = {name: p.cpu() for name, p in moved.model.net.named_parameters()}
+    assert {"convolution", "convolution_backward", "_fft_r2c"} <= done
+    for name in ("loss", "task", "optics", "pitch_um", "mmacs"):
+        assert getattr(found, name) == pytest.approx(getattr(want, name), rel=1e-5), name
+    budgets = {"optics": ("coefficients_rad", 1e-3), "pitch": ("log_pitch", 3e-2)}  # PSFs in single precision; a count
+    for part in budgets.keys() - set(frozen):  # of a pixel that falls the other way is a hundredth of a steep frame's
+        name, share = budgets[part]
+        one, other = (getattr(trainer.model, name).grad for trainer in (plain, moved))
+        assert float((one - other).norm()) <= share * float(one.norm()), name
+    for name, p in plain.model.net.named_parameters():
+        assert there[name].shape == p.shape
+
+
+@contextlib.contextmanager
+def swapped():
+    """Parameters that move stay the same objects, which a GPU's do."""
+    torch.__future__.set_swap_module_params_on_conversion(True)
+    try:
+        yield
+    finally:
+        torch.__future__.set_swap_module_params_on_conversion(False)
 
 
 @pytest.mark.skipif(not GPU, reason="needs a GPU")

@@ -1,0 +1,92 @@
+"""A device that is not the processor, played by the processor: for code that must run on a GPU as it is.
+
+Tensors on :data:`AWAY` hold true numbers and say that they lie on another device. What a GPU refuses is refused:
+tensors of two devices in one operation (numbers without axes aside), ``numpy()``, a generator of another device. What
+code for the processor alone would read or write is therefore found here, without a GPU.
+"""
+
+import contextlib
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+AWAY = torch.device("meta")
+MOVES = ("_to_copy", "copy_")  # what may take tensors of two devices
+
+
+class There(torch.Tensor):
+    """A tensor elsewhere; ``held``: its numbers."""
+
+    held: torch.Tensor
+
+    @staticmethod
+    def __new__(cls, held):
+        about = {"dtype": held.dtype, "strides": held.stride(), "storage_offset": held.storage_offset()}
+        made = torch.Tensor._make_wrapper_subclass(cls, held.shape, device=AWAY, requires_grad=False, **about)
+        made.held = held
+        return made
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return _done(func, args, kwargs or {})
+
+
+@contextlib.contextmanager
+def elsewhere():
+    """Within it ``device=AWAY`` gives tensors with numbers; yields the names of the operations that ran there."""
+    with _Given(), _Done():
+        DONE.clear()
+        yield DONE
+
+
+DONE: set[str] = set()
+
+
+class _Given(TorchFunctionMode):
+    """Tensors from lists and back, which no dispatch sees."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func in (torch.tensor, torch.as_tensor) and kwargs.get("device") == AWAY:
+            return func(*args, **kwargs | {"device": "cpu"}).to(AWAY)
+        if isinstance(args[0] if args else None, There):
+            if func is torch.Tensor.tolist:
+                return args[0].cpu().detach().tolist()
+            if func is torch.Tensor.new_tensor:
+                return torch.tensor(*args[1:], **{"dtype": args[0].dtype} | kwargs).to(AWAY)
+        return func(*args, **kwargs)
+
+
+class _Done(TorchDispatchMode):
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        return _done(func, args, kwargs or {})
+
+
+def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    tensors = [a for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
+    name, there = func.overloadpacket.__name__, [a for a in tensors if isinstance(a, There)]
+    wanted = kwargs.get("device")
+    stays = bool(there) if wanted is None else torch.device(wanted) == AWAY
+    if name == "copy_":
+        stays = isinstance(args[0], There)
+    elif there and name not in MOVES and any(a.ndim and not isinstance(a, There) for a in tensors):
+        raise RuntimeError(f"{func}: tensors of two devices")
+    if stays and kwargs.get("generator") is not None:
+        raise RuntimeError(f"{func}: a generator of the processor")
+    if wanted is not None:
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    plain, named = tree_map(lambda a: a.held if isinstance(a, There) else a, (args, kwargs))
+    out = func(*plain, **named)
+    if not stays:
+        return out
+    DONE.add(name)
+    same = {id(a.held): a for a in there}
+    return tree_map(lambda a: same[id(a)] if id(a) in same else _wrapped(a), out)
+
+
+def _wrapped(value: Any) -> Any:
+    """Signs that torch puts off are carried out: a wrapper has no room for them."""
+    return There(value.resolve_conj().resolve_neg()) if isinstance(value, torch.Tensor) else value
