@@ -29,8 +29,9 @@ class Options(Common):
         process: PROCESS.toml with the rules; left out: the defaults.
         output: marker database to write (.lyrdb for KLayout); left out: none.
         ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
-        most_shapes: shapes that may be taken apart, some 150 bytes of memory for each; a large cell that is placed
-            again and again counts once. Left out: 4 million, and six more for each byte of the file.
+        most_shapes: shapes that may be taken apart, some 25 bytes of memory for each copy of a cell and 150 for each
+            shape that is drawn by itself; a large cell that is placed again and again counts once. Left out: 4
+            million, and 20 more for each byte of the file.
         strict: also what readers let pass and a mask shop might not: names of cells, one top cell, doubled vertices,
             strict tables and the checksum of OASIS.
     """
@@ -55,10 +56,11 @@ def run(options: Options) -> int:
         most = foreign.most_of(options.mask) if options.most_shapes is None else options.most_shapes
         content = read(options.mask, most)
         skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
-        found = foreign.check(content, process.rules, skip=skip, negative=_negative(content, process), most=most)
-        if draft is not None:
-            markers.write_lyrdb(markers.Top(content.tops[0], content.unit_nm), found, draft.path)
         form = validate(options.mask, content) if options.strict else []
+        negative, tops = _negative(content, process), content.tops
+        found = foreign.check(content, process.rules, skip=skip, negative=negative, most=most, last=True)
+        if draft is not None:
+            markers.write_lyrdb(markers.Top(tops[0], content.unit_nm), found, draft.path)
     told = "".join(f"\n  form: {finding.text}" for finding in form)
     values = _values(found) | ({"form": [finding.text for finding in form]} if options.strict else {})
     options.console.result(values, _text(options.mask, found, form) + told)

@@ -74,8 +74,19 @@ class Placed:
     turn: Array
     turns: tuple[Turn, ...] = QUARTERS
 
+    def counts(self) -> Array:
+        """(children, turns) how often each child is placed with each turn."""
+        kinds, size = len(self.turns), len(self.children) * len(self.turns)
+        found = np.zeros(size, np.int64)
+        for first in range(0, len(self.child), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            found += np.bincount(self.child[some].astype(np.int64) * kinds + self.turn[some], minlength=size)
+        return found.reshape(-1, kinds)
+
 
 _DEEPEST = 64
+_AT_ONCE = 1 << 20  # placements that are counted at once
+_LARGE = 1 << 23  # placements of which each column has 32 MB
 NOTHING = Placed((), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
 
 
@@ -108,7 +119,7 @@ class CellContent:
         """(children,) how often each of ``placed.children`` is placed; of sums too."""
         if self.sums is not None:
             return self.sums.count
-        return np.bincount(self.placed.child, minlength=len(self.placed.children))
+        return np.asarray(self.placed.counts().sum(1))
 
     @property
     def taken(self) -> int:
@@ -229,13 +240,16 @@ def forget(data: Array, end: int) -> None:
 class Gathered:
     """Placements of a cell while it is read: kept up to a number (None: all), beyond it only their sums.
 
-    parts: (child, x, y, turn) of what is kept; child as the reader numbers it.
+    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged: how many of them are large;
+    small: placements in the others.
     """
 
     keep: int | None = None
     parts: list[tuple[Array, Array, Array, Array]] = field(default_factory=list)
     count: int = 0
     digest: Digest | None = None
+    merged: int = 0
+    small: int = 0
 
     def add(self, child: Array, x: Array, y: Array, turn: Array) -> None:
         """Take in some more."""
@@ -243,6 +257,7 @@ class Gathered:
         if self.digest is None:
             self.parts.append((child, x, y, turn))
             if self.keep is None or self.count <= self.keep:
+                self._merge(len(child))
                 return
             self.digest = Digest()
             for part in self.parts:
@@ -250,3 +265,19 @@ class Gathered:
             self.parts = []
             return
         self.digest.take(child, x, y, turn)
+
+    def _merge(self, more: int) -> None:
+        """Make one of the last parts where they are many: large arrays go back to the system when they are let go."""
+        self.small += more
+        if self.small >= _LARGE:
+            child, x, y, turn = (np.concatenate(part) for part in zip(*self.parts[self.merged :], strict=True))
+            self.parts[self.merged :] = [(child, x, y, turn)]
+            self.merged, self.small = self.merged + 1, 0
+
+    def columns(self) -> tuple[Array, Array, Array, Array]:
+        """child, x, y, turn of all that is kept; the parts are let go, one column after the other."""
+        columns = [list(part) for part in zip(*self.parts, strict=True)]
+        self.parts, made = [], []
+        while columns:
+            made.append(np.concatenate(columns.pop(0)))
+        return made[0], made[1], made[2], made[3]

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from layout.files.content import QUARTERS, MaskContent, Turn
+from layout.files.content import QUARTERS, MaskContent, Placed, Turn
 from layout.process import LayerNumber
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 _DEEPEST = 64
 _CIRCLE = 64  # corners of a true circle
+_AT_ONCE = 1 << 22  # placements that are sorted by cell at once
 NONE: Set[str] = frozenset()
 
 
@@ -124,7 +125,7 @@ def _cells(
 ) -> Iterator[tuple[str, Array, Array, Turn, bool]]:
     """(cell, x, y, turn, whether it is kept whole) of every cell below ``name`` and of itself.
 
-    Equal ones come together where they are leaves or whole.
+    Equal ones come together where they are leaves or whole, four million placements of a cell at once.
 
     Below a cell that is turned by no quarter nothing is whole.
     """
@@ -136,24 +137,31 @@ def _cells(
     placed = content.cells[name].kept()
     if not len(placed.child):
         return
-    px, py = turn.apply(placed.x.astype(np.int64), placed.y.astype(np.int64))
-    px += at[0]
-    py += at[1]
+    below = whole if turn.quarter else NONE
+    for first in range(0, len(placed.child), _AT_ONCE):
+        px, py = _moved(placed, slice(first, first + _AT_ONCE), turn, at, name)
+        child_of, turn_of = (v[first : first + _AT_ONCE] for v in (placed.child, placed.turn))
+        small: type[np.integer[Any]] = np.uint16 if len(placed.children) * len(placed.turns) < 1 << 16 else np.int64
+        key = np.asarray(child_of, small) * len(placed.turns) + np.asarray(turn_of, small)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+        kinds = key[starts]
+        for kind, some in zip(kinds.tolist(), np.split(order, starts[1:]), strict=True):
+            number, way = divmod(kind, len(placed.turns))
+            child, inner = placed.children[number], turn.after(placed.turns[way])
+            kept = child in below and inner.quarter
+            if kept or (child in content.cells and not len(content.cells[child].kept().child)):
+                yield child, px[some], py[some], inner, kept
+            else:
+                for i in some.tolist():
+                    yield from _cells(content, child, (int(px[i]), int(py[i])), inner, (*above, name), below)
+
+
+def _moved(placed: Placed, some: slice, turn: Turn, at: tuple[int, int], name: str) -> tuple[Array, Array]:
+    """(n,) int32 places of some copies below a cell that is turned and stands ``at``."""
+    px, py = turn.apply(placed.x[some].astype(np.int64), placed.y[some].astype(np.int64))
+    px, py = px + at[0], py + at[1]
     if max(px.max(), py.max(), -px.min(), -py.min()) > 2**31 - 1:
         raise MaskFileError(f"cell {name!r} holds places beyond 32 bits")
-    px, py = px.astype(np.int32), py.astype(np.int32)
-    below = whole if turn.quarter else NONE
-    small: type[np.integer[Any]] = np.uint16 if len(placed.children) * len(placed.turns) < 1 << 16 else np.int64
-    key = np.asarray(placed.child, small) * len(placed.turns) + np.asarray(placed.turn, small)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
-    kinds = key[first]
-    for kind, some in zip(kinds.tolist(), np.split(order, first[1:]), strict=True):
-        child, inner = placed.children[kind // len(placed.turns)], turn.after(placed.turns[kind % len(placed.turns)])
-        kept = child in below and inner.quarter
-        if kept or (child in content.cells and not len(content.cells[child].kept().child)):
-            yield child, px[some], py[some], inner, kept
-        else:
-            for i in some.tolist():
-                yield from _cells(content, child, (int(px[i]), int(py[i])), inner, (*above, name), below)
+    return px.astype(np.int32), py.astype(np.int32)

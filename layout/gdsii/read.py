@@ -57,8 +57,7 @@ class _Batch:
         names = tuple(name.decode("ascii") for name in self.names)
         if self.held.digest is not None:
             return dataclasses.replace(NOTHING, children=names)
-        child, x, y, turn = (np.concatenate(part) for part in zip(*self.held.parts, strict=True))
-        return Placed(names, child, x, y, turn, tuple(self.turns))
+        return Placed(names, *self.held.columns(), tuple(self.turns))
 
 
 def read(path: str | Path, *, limit: int = LIMIT, keep: int | None = None) -> MaskContent:

@@ -81,17 +81,27 @@ class OpenCell:
         if self.held.digest is not None:
             every = self.held.digest.children.tolist()
             return dataclasses.replace(NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every))
-        child, x, y, turn = (np.concatenate(part) for part in zip(*self.held.parts, strict=True))
-        low, high = int(child.min()), int(child.max())
-        if high - low < 1 << 22:
-            used = np.flatnonzero(np.bincount(child - low)) + low
-            lookup = np.zeros(high - low + 1, np.int32)
-            lookup[used - low] = np.arange(len(used))
-            index = lookup[child - low]
-        else:
-            used, index = np.unique(child, return_inverse=True)
+        child, x, y, turn = self.held.columns()
+        used, index = _numbered(child)
         names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
-        return Placed(names, index.astype(np.int32), x, y, turn, tuple(self.turns))
+        return Placed(names, index, x, y, turn, tuple(self.turns))
+
+
+def _numbered(child: Array) -> tuple[Array, Array]:
+    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it is changed in place."""
+    low, high = int(child.min()), int(child.max())
+    if high - low >= 1 << 22:
+        used, index = np.unique(child, return_inverse=True)
+        return used, index.astype(np.int32)
+    occurs = np.zeros(high - low + 1, bool)
+    pieces = [child[n : n + _BATCH] for n in range(0, len(child), _BATCH)]  # numpy widens what it indexes by
+    for some in pieces:
+        some -= low
+        occurs[some] = True
+    lookup = np.cumsum(occurs, dtype=np.int32) - 1
+    for some in pieces:
+        some[:] = lookup[some]
+    return np.flatnonzero(occurs) + low, child
 
 
 class CellReader:

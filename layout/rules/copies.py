@@ -118,10 +118,10 @@ def _offset(turn: Turn, x: "Array | float", y: "Array | float", step: float) -> 
 def _counts(content: MaskContent, name: str) -> tuple[dict[str, int], dict[str, int]]:
     """{child: copies} that are upright or turned by quarters, and those that are turned or scaled in another way."""
     placed = content.cells[name].kept()
-    upright = np.array([turn.quarter for turn in placed.turns])[placed.turn]
+    counts, upright = placed.counts(), np.array([turn.quarter for turn in placed.turns])
     made = []
     for some in (upright, ~upright):
-        numbers = np.bincount(placed.child[some], minlength=len(placed.children)).tolist()
+        numbers = counts[:, some].sum(1).tolist()
         made.append({child: n for child, n in zip(placed.children, numbers, strict=True) if n})
     return made[0], made[1]
 
@@ -151,5 +151,6 @@ def refuse_beyond(parts: Parts, content: MaskContent, most: int) -> None:
 
 def advice(needed: int) -> str:
     """What a user may do."""
-    memory = 150e-9 * needed
-    return f"metalens check --most-shapes {needed} takes them, with some {memory:,.3g} GB of memory"
+    low, high = (0.15 + size * needed for size in (25e-9, 150e-9))
+    memory = f"{low:,.2g} GB of memory where they are copies of cells, up to {high:,.2g} GB where each is drawn"
+    return f"metalens check --most-shapes {needed} takes them, with some {memory}"

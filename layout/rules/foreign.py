@@ -26,7 +26,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
-_EACH_BYTE = 6  # more of them for each byte: our lenses of 1 to 4 mm, not folded, hold 3.8 to 4.7 pillars in each
+_EACH_BYTE = 20  # more of them for each byte: our lenses, not folded, hold 4 pillars in each, of two sizes 17
 _AT_ONCE = 1 << 18  # shapes that are held to the grid at once
 _CLEAR = -1  # number of all layers together whose clear areas stay
 _ROUNDED = 1e-6  # of a step of a grid that is no whole number of units
@@ -44,6 +44,7 @@ def check(
     skip: Sequence[int] = (),
     negative: Collection[int] = (),
     most: int = MOST_SHAPES,
+    last: bool = False,
 ) -> DrcReport:
     """Gap, feature and grid of every shape below the top cells, each layer number (all its datatypes) by itself.
 
@@ -55,6 +56,7 @@ def check(
         negative: layer numbers that are exposed together, and what they leave empty stays: it is held to the least
             feature, what they draw to the least gap.
         most: shapes that are taken apart.
+        last: the cells of ``content`` are let go once their shapes are gathered.
 
     Raises:
         MaskFileError: no top cell, a hierarchy that is broken, more than ``most`` shapes or 4e6
@@ -70,6 +72,8 @@ def check(
     whole, offsets = parts.times.keys() - {copies.ROOT}, parts.offsets(step)
     number_of = {number: _CLEAR for number in negative}
     groups = {name: layers.groups(content, parts.tops(content, name), skip, whole, number_of) for name in parts.times}
+    if last:
+        content.cells.clear()
     for number in sorted({number for some in groups.values() for number in some}):
         drawn = {name: layers.gathered(some.pop(number)) for name, some in groups.items() if number in some}
         held = _exchanged(rules) if number == _CLEAR else rules

@@ -1,9 +1,10 @@
 """Pairs of shapes that can be nearer than a rule, of any sizes, by bins in sorted order: no tree, no object for each.
 
 Shapes of like size (within a factor of four) are sorted into squares as wide as two of the largest and the rule: those
-that can be near each other lie in neighbouring squares.
+that can be near each other lie in neighbouring squares. Of many shapes a band of rows is sorted after the other.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +20,8 @@ from metalens.ground.errors import MaskFileError
 MOST_PAIRS = 1 << 22
 _OCTAVES = 2  # of size that are sorted together
 _AT_ONCE = 1 << 20
+_BAND = 1 << 22  # shapes that are sorted at once, at some 60 bytes each
+_BEYOND = 1 << 31  # above all places
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,17 +56,8 @@ def pairs(discs: Discs, gap: float, *, beside: Array | None = None) -> tuple[Arr
     Raises:
         MaskFileError: more than 4e6 pairs.
     """
-    sized = np.floor(np.log2(np.maximum(discs.reach, 1)) / _OCTAVES).astype(np.int64)
-    used = np.bincount(discs.kind, minlength=len(sized)) > 0
-    wanted = np.ones(len(sized), bool) if beside is None else beside
-    groups = [
-        _group(discs, (sized == size) & used & (wanted == mark), gap, seeks=mark)
-        for size in np.unique(sized[used])
-        for mark in (False, True)
-        if ((sized == size) & used & (wanted == mark)).any()
-    ]
     ones, twos, total = [], [], 0
-    for one, two in _found(discs, groups, gap):
+    for one, two in _banded(discs, gap, beside):
         total += len(one)
         if total > MOST_PAIRS:
             raise MaskFileError(
@@ -74,6 +68,54 @@ def pairs(discs: Discs, gap: float, *, beside: Array | None = None) -> tuple[Arr
         twos.append(two)
     nothing = np.empty(0, np.int32)
     return np.concatenate([nothing, *ones]), np.concatenate([nothing, *twos])
+
+
+def _banded(discs: Discs, gap: float, beside: Array | None) -> Iterator[tuple[Array, Array]]:
+    """As :func:`pairs`, piece by piece.
+
+    A band holds its own rows and those above them that its shapes can reach; a pair counts where its lower place is.
+    The few widest kinds, which reach over many rows, join every band, and count with the other one of their pair.
+    """
+    if len(discs.kind) <= _BAND:
+        yield from _found(discs, _groups(discs, gap, beside), gap)
+        return
+    wide, edges, reach = _bands(discs, gap)
+    for low, high in itertools.pairwise(edges):
+        within = (discs.y >= low) & (discs.y < high + reach)
+        members = np.flatnonzero(within | wide[discs.kind]).astype(np.int32)
+        x, y, kind = (v[members] for v in (discs.x, discs.y, discs.kind))
+        some = Discs(x, y, kind, discs.middle, discs.reach)
+        place = np.where(wide[kind], np.int64(_BEYOND), y)
+        for one, two in _found(some, _groups(some, gap, beside), gap):
+            here = np.minimum(place[one], place[two]) < high
+            yield members[one[here]], members[two[here]]
+
+
+def _bands(discs: Discs, gap: float) -> tuple[Array, list[int], int]:
+    """(kinds,) which join every band; edges of the bands along y; how far above its band a place can be reached."""
+    extent = np.abs(discs.middle[:, 1]) + discs.reach
+    order = np.argsort(-extent)
+    before = np.cumsum(np.bincount(discs.kind, minlength=len(extent))[order])
+    wide = np.zeros(len(extent), bool)
+    wide[order[before <= _BAND // 8]] = True
+    reach = int(np.ceil(2 * extent[~wide].max() + gap))
+    low, high = int(discs.y.min()), int(discs.y.max())
+    count = int(np.clip((high - low) // (2 * reach), 1, -(-len(discs.kind) // _BAND)))
+    inner = np.quantile(discs.y[:: max(1, len(discs.kind) >> 16)], np.arange(1, count) / count).astype(np.int64)
+    return wide, [low, *inner.tolist(), _BEYOND + 1], reach
+
+
+def _groups(discs: Discs, gap: float, beside: Array | None) -> list[_Group]:
+    """Shapes by size, and apart whether pairs with them are wanted."""
+    sized = np.floor(np.log2(np.maximum(discs.reach, 1)) / _OCTAVES).astype(np.int64)
+    used = np.bincount(discs.kind, minlength=len(sized)) > 0
+    wanted = np.ones(len(sized), bool) if beside is None else beside
+    return [
+        _group(discs, (sized == size) & used & (wanted == mark), gap, seeks=mark)
+        for size in np.unique(sized[used])
+        for mark in (False, True)
+        if ((sized == size) & used & (wanted == mark)).any()
+    ]
 
 
 def _group(discs: Discs, kinds: Array, gap: float, *, seeks: bool) -> _Group:

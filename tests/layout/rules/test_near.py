@@ -53,6 +53,40 @@ def test_a_lattice_has_the_neighbours_that_its_gap_says():
     assert len(found(some, np.hypot(370, 410) - 300 + 0.1)) == 9 * 6 + 8 * 7 + 2 * 8 * 6
 
 
+@given(
+    seed=st.integers(0, 10_000),
+    band=st.integers(8, 60),
+    spread=st.integers(100, 9000),
+    gap=st.floats(0.5, 90),
+    far=st.floats(0, 4000),
+)
+def test_pairs_are_the_same_by_bands_of_rows(seed, band, spread, gap, far):
+    some = discs(seed, 90, spread, [4.0, 9.0, 31.0, 30.0, 700.0])
+    some.middle[3] += far  # circles far from their places
+    most = near._BAND
+    try:
+        near._BAND = band
+        assert found(some, gap) == every(some, gap)
+    finally:
+        near._BAND = most
+
+
+def test_several_bands_are_made_of_a_tall_lens_and_each_pair_counts_once(monkeypatch):
+    monkeypatch.setattr(near, "_BAND", 100)
+    i, j = (v.ravel().astype(np.int32) for v in np.meshgrid(np.arange(12), np.arange(100)))
+    kind = np.zeros(1201, np.int32)
+    kind[-1] = 1  # one wide shape beside all of them
+    x, y = np.append(410 * i, -30_200).astype(np.int32), np.append(370 * j - 999, 17_000).astype(np.int32)
+    some = near.Discs(x, y, kind, np.zeros((2, 2)), np.array([150.0, 30_000.0]))
+    wide, edges, reach = near._bands(some, 80.0)
+    assert wide.tolist() == [False, True]
+    assert len(edges) == 14
+    assert reach == 380
+    beside = np.hypot(x[:-1] + 30_200.0, y[:-1] - 17_000.0) < 30_000 + 150 + 80
+    assert len(found(some, 80.0)) == 12 * 99 + beside.sum()
+    assert 0 < beside.sum() < 100
+
+
 @pytest.mark.parametrize("room", [7, 64])
 def test_pairs_are_the_same_however_many_are_taken_at_once(monkeypatch, room):
     some = discs(5, 120, 700, [9.0, 14.0, 130.0])
