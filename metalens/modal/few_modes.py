@@ -23,10 +23,10 @@ SPARE = 3.0  # low levels reach this many times the level of the weakest mode th
 EXTRA = 60.0  # and this much further
 ROUNDS = 6  # of enlarging the low levels, at most
 STEPS = 80  # of the fixed point, at most
-WHOLE = 2  # of them on all rows, before
+WHOLE = 1  # of them on all rows, before
 ROUNDING = 1e-14  # of the largest element
 SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
-SLOW = 4  # the rows of the lowest quarter of the levels go on alone
+SLOW = 8  # the rows of the lowest eighth of the levels go on alone
 ROUGH = 3e-7  # of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of it
 SINGLE = 3e-8  # accuracies from it on are met by that: answers move by 7e-8 on coarse meshes, 4e-3 of a bar on good
 STRIPS = 4  # of rows of a product whose other half is a mirror image
@@ -62,13 +62,21 @@ def solve_ritz(pencil: Pencil, trial: Ritz, height: float, weak: float) -> tuple
     k = trial.te.shape[1]
     sign = np.concatenate([trial.te_sign, trial.tm_sign])
     matrix = np.zeros((len(sign), len(sign)))
-    matrix[:k, :k] = (trial.te.T * (pencil.te * pencil.te_sign)) @ trial.te
-    matrix[k:, k:] = (trial.tm.T * (pencil.tm * pencil.tm_sign)) @ trial.tm
+    matrix[:k, :k] = trial.te.T @ (pencil.te_sign[:, None] * beside(pencil.te, pencil.te_rest, trial.te))
+    matrix[k:, k:] = trial.tm.T @ (pencil.tm_sign[:, None] * beside(pencil.tm, pencil.tm_rest, trial.tm))
     matrix[:k, k:] = trial.te.T @ (pencil.coupling @ trial.tm)
     matrix[k:, :k] = matrix[:k, k:].T
     level, vectors = np.linalg.eig(sign[:, None] * matrix)
     carry = np.flatnonzero(np.abs(np.exp(1j * axial(-level) * height)) > weak)
     return level[carry], trial.te @ vectors[:k, carry], trial.tm @ vectors[k:, carry]
+
+
+def beside(level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray) -> np.ndarray:
+    """(diag(level) + rest) vectors."""
+    out = level[:, None] * vectors
+    if rest is not None:
+        out += rest @ vectors
+    return out
 
 
 def enlarge(
@@ -107,15 +115,19 @@ def carrying(pencil: Pencil, height: float, weak: float, accuracy: float) -> tup
         level, te, tm = solve_ritz(pencil, trial, height, weak)
         off_te, off_tm = np.zeros_like(te), np.zeros_like(tm)
         pull = pencil.coupling[high_te] @ tm
+        if pencil.te_rest is not None:
+            pull += pencil.te_rest[high_te] @ te
         off_te[high_te] = te[high_te] + pull / (pencil.te[high_te, None] - level)
         pull = pencil.tm_sign[high_tm, None] * (pencil.coupling[:, high_tm].T @ te)
+        if pencil.tm_rest is not None:
+            pull += pencil.tm_rest[high_tm] @ tm
         off_tm[high_tm] = tm[high_tm] + pull / (pencil.tm[high_tm, None] - level)
         if max(np.abs(off_te).max(initial=0.0), np.abs(off_tm).max(initial=0.0)) < accuracy:
             return level, te, tm
         te_block = enlarge(trial.te, trial.te_sign, low_te, off_te, 1.0)
         tm_block = enlarge(trial.tm, trial.tm_sign, low_tm, off_tm, -1.0)
         trial = Ritz(te_block[0], tm_block[0], te_block[1], tm_block[1])
-        if len(trial.te_sign) + len(trial.tm_sign) > 0.7 * (len(pencil.te) + len(pencil.tm)):
+        if len(trial.te_sign) + len(trial.tm_sign) > 0.8 * (len(pencil.te) + len(pencil.tm)):
             return None
     return None
 
@@ -131,7 +143,7 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
     order = np.argsort(diagonal)
     diagonal, ordered = diagonal[order], signs[order]
     weight = 1 / (diagonal[:, None] + diagonal)
-    rest = square[order[:, None], order] * weight
+    rest = square.take(order, 0).take(order, 1) * weight
     rest.ravel()[:: n + 1] -= diagonal / 2
     aim = max(accuracy * diagonal[0], ROUNDING * diagonal[-1])
     rough = rest.astype(np.float32), weight.astype(np.float32)
@@ -143,7 +155,7 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
         return None
     e.ravel()[:: n + 1] += diagonal
     back = np.argsort(order)
-    return np.asarray(e[back[:, None], back])
+    return np.asarray(e.take(back, 0).take(back, 1))
 
 
 def settled(
@@ -207,6 +219,10 @@ def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
     square.ravel()[:: len(sign) + 1] = np.concatenate([pencil.te, pencil.tm])
     square[:a, a:] = pencil.te_sign[:, None] * pencil.coupling
     square[a:, :a] = pencil.tm_sign[:, None] * pencil.coupling.T
+    if pencil.te_rest is not None:
+        square[:a, :a] += pencil.te_rest
+    if pencil.tm_rest is not None:
+        square[a:, a:] += pencil.tm_rest
     common = max(float(np.abs(level).max(initial=0.0)), 1.0)
     norm = np.einsum("ij,ij->j", partner, field)
     square += ((field * ((common - level) / norm)) @ partner.T).real

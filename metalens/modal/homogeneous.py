@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as sl
-from scipy.linalg import lapack
 
+from metalens.modal.dense import eigen_pairs
 from metalens.modal.spaces import Space
 
 
@@ -114,9 +114,10 @@ def quick_modes(space: Space) -> Basis:
     disc = (down_to @ space.disc.mass).T
     across = x.T @ (disc[c] @ unit)
     low = unit.T @ (down_to @ disc) @ unit
-    mixed = across @ down
-    high = x.T @ space.disc.mass[corner] @ x - mixed - mixed.T + down.T @ (low @ down)
-    across -= down.T @ low
+    drawn = (low @ down).T
+    mixed = (across - drawn / 2) @ down
+    high = x.T @ space.disc.mass[corner] @ x - mixed - mixed.T
+    across -= drawn
     a = len(te)
     disc_mass = np.empty((a + len(tm), a + len(tm)))
     disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = high, across, across.T, low
@@ -150,34 +151,3 @@ def made(
         disc_curl=disc[1],
         disc_scalar=scalar.T @ space.disc.scalar @ scalar,
     )
-
-
-# Dense symmetric linear algebra without the cost of general-purpose checks: matrices here have a hundred rows.
-
-
-def below(lower: np.ndarray, right: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-    """lower⁻¹ right, or lower⁻ᵀ right if ``transposed``; real, lower triangular with zeros above."""
-    solved: np.ndarray = lapack.dtrtrs(lower.T, right, lower=0, trans=0 if transposed else 1)[0]
-    return solved
-
-
-def definite_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive definite matrix, symmetric to the last digit.
-
-    Raises:
-        LinAlgError: it is not definite.
-    """
-    upper: np.ndarray = lapack.dtrtri(np.linalg.cholesky(matrix).T, lower=0)[0]
-    inverse: np.ndarray = upper @ upper.T
-    return inverse
-
-
-def eigen_pairs(matrix: np.ndarray, definite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values, rising, and vectors of matrix x = value definite x, with xᵀ definite x = 1.
-
-    Raises:
-        LinAlgError: ``definite`` is not positive definite.
-    """
-    lower = np.linalg.cholesky(definite)
-    value, vectors = np.linalg.eigh(below(lower, below(lower, matrix).T))
-    return value, below(lower, vectors, transposed=True)

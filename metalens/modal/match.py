@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from metalens.modal.dense import below, cholesky
 from metalens.modal.few_modes import FewModes
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import LayerModes, axial
@@ -123,15 +124,15 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
     near, ports = decaying(admittance, dual=pencil.dual), half.ports
     a, c = len(pencil.te), len(modes.q)
     operator = modes.near.copy()
-    operator[:a, :a] += pencil.te_turn.T @ (near[:a, None] * pencil.te_turn)
-    operator[a:, a:] += pencil.tm_turn.T @ (near[a:, None] * pencil.tm_turn)
+    pencil.te_turn.onto(operator[:a, :a], near[:a])
+    pencil.tm_turn.onto(operator[a:, a:], near[a:])
     fed = np.zeros((len(operator), len(ports)))
     te = ports < a
-    fed[:a, te], fed[a:, ~te] = pencil.te_turn[ports[te]].T, pencil.tm_turn[ports[~te] - a].T
+    fed[:a, te], fed[a:, ~te] = pencil.te_turn.rows(ports[te]).T, pencil.tm_turn.rows(ports[~te] - a).T
     partner = modes.partner
     parts = [partner.real, partner.imag] if np.iscomplexobj(partner) else [partner]
     columns = np.concatenate([*parts, fed], 1)
-    found = np.linalg.solve(operator, columns)
+    found = eliminated(operator, a, columns, first=not pencil.dual)
     green = columns.T @ found
     if len(parts) == 2:
         whole = np.zeros((2 * c + len(ports), c + len(ports)), complex)
@@ -143,6 +144,23 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
         partner.T @ modes.field,
         Rates(1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]),
     )
+
+
+def eliminated(operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool) -> np.ndarray:
+    """operator⁻¹ columns, symmetric: the definite block goes first, in three quarters of the time of a plain solve.
+
+    The first ``a`` unknowns are negative definite (``first``), or the others positive definite; if not, the plain way.
+    """
+    if not first:
+        swapped, fed = np.roll(-operator, (-a, -a), (0, 1)), np.roll(-columns, -a, 0)
+        return np.roll(eliminated(swapped, len(operator) - a, fed, first=True), a, 0)
+    try:
+        lower = cholesky(-operator[:a, :a])
+    except np.linalg.LinAlgError:
+        return np.linalg.solve(operator, columns)
+    across, fed = below(lower, operator[:a, a:]), below(lower, columns[:a])
+    rest = np.linalg.solve(operator[a:, a:] + across.T @ across, columns[a:] + across.T @ fed)
+    return np.concatenate([below(lower, across @ rest - fed, transposed=True), rest])
 
 
 def decaying(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:

@@ -9,14 +9,57 @@ so that growth⁻¹ stiffness (whose eigenvalues are -q²) is diagonal but for t
 levels but the lowest. The magnetic form is taken in its dual unknown, the partner p (tangential E): there
 stiffness⁻¹ plays the part of growth and growth⁻¹ that of stiffness, half-space admittances are inverted, and the
 reflection changes its sign. It needs no inverse of an indefinite matrix.
+
+One block of each form, the TE of the electric and the TM of the magnetic, is a diagonal plus k0² times permittivities:
+only its low levels are diagonalised, and what is left beside the others (``rest``) is as weak as the coupling.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.homogeneous import Basis, below, definite_inverse
+from metalens.modal.dense import added, below, cholesky, definite_inverse, eigenvectors, gram, whitened
+from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium
+
+LOW = 32.0  # levels up to this many times the most that permittivities add to a diagonal are diagonalised
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Turn:
+    """Fields of y in the homogeneous basis, square: of the first alone ``low`` (m, m), of each other ``beyond`` times
+    itself; size: of all."""
+
+    low: np.ndarray
+    size: int
+    beyond: float = 1.0
+
+    def down(self, matrix: np.ndarray) -> np.ndarray:
+        """turnᵀ matrix."""
+        m = len(self.low)
+        if m == self.size:
+            return np.asarray(self.low.T @ matrix)
+        out = matrix * self.beyond
+        out[:m] = self.low.T @ matrix[:m]
+        return out
+
+    def onto(self, block: np.ndarray, diagonal: np.ndarray) -> None:
+        """Add turnᵀ diag turn to a block, in place."""
+        m = len(self.low)
+        block[:m, :m] += self.low.T @ (diagonal[:m, None] * self.low)
+        beyond = np.arange(m, self.size)
+        block[beyond, beyond] += self.beyond**2 * diagonal[m:]
+
+    def rows(self, places: np.ndarray) -> np.ndarray:
+        """Some of its rows."""
+        m = len(self.low)
+        out = np.zeros((len(places), self.size))
+        for row, place in zip(out, places.tolist(), strict=True):
+            if place < m:
+                row[:m] = self.low[place]
+            else:
+                row[place] = self.beyond
+        return out
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,7 +67,8 @@ class Pencil:
     """Real and symmetric; see the module.
 
     te (a,), tm (b,): levels. te_sign, tm_sign: of growth. coupling: (a, b).
-    te_turn (a, a), tm_turn (b, b): fields of the y in the homogeneous basis. dual: the unknown is the partner.
+    te_turn, tm_turn: fields of the y in the homogeneous basis. dual: the unknown is the partner.
+    te_rest (a, a) or tm_rest (b, b): of growth⁻¹ stiffness beside the levels, zero among the low ones; the other None.
     """
 
     te: np.ndarray
@@ -32,8 +76,10 @@ class Pencil:
     te_sign: np.ndarray
     tm_sign: np.ndarray
     coupling: np.ndarray
-    te_turn: np.ndarray
-    tm_turn: np.ndarray
+    te_turn: Turn
+    tm_turn: Turn
+    te_rest: np.ndarray | None
+    tm_rest: np.ndarray | None
     dual: bool
 
 
@@ -42,42 +88,44 @@ def lossless(medium: Medium) -> bool:
     return all(e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around)))
 
 
-def added(matrix: np.ndarray, diagonal: np.ndarray | float) -> np.ndarray:
-    """The matrix with a diagonal added in place."""
-    matrix.ravel()[:: len(matrix) + 1] += diagonal
-    return matrix
+def low_levels(matrix: np.ndarray, square: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels (n,), vectors (m, m) of the low ones, and what is left, of diag(square) and as much as ``most`` beside it.
 
-
-def whitened(definite: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Levels of lowerᵀ inner lower with lower lowerᵀ = definite, and lower⁻ᵀ vectors sqrt(|level|)."""
-    lower = np.linalg.cholesky(definite)
-    level, vectors = np.linalg.eigh(lower.T @ inner @ lower)
-    return level, below(lower, vectors, transposed=True) * np.sqrt(np.abs(level))
+    square: rising. Of the matrix the lower triangle counts.
+    """
+    m, n = max(1, int(np.searchsorted(square, LOW * most))), len(square)
+    low, vectors = eigenvectors(matrix[:m, :m])
+    level = np.concatenate([low, matrix.diagonal()[m:]])
+    rest = np.zeros((n, n))
+    rest[m:, :m] = matrix[m:, :m] @ vectors
+    rest[m:, m:] = np.tril(matrix[m:, m:], -1)
+    return level, vectors, rest + rest.T
 
 
 def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
     """u = E_t: growth = diag(1, (scalar_eps⁻¹ tm / k0² - 1)⁻¹ negative), stiffness = curl - k0² mass_eps."""
     around = float(medium.around.real)
-    a, k2, step = len(basis.te), medium.k0**2, float((medium.disc - medium.around).real)
+    a, b, k2, step = len(basis.te), len(basis.tm), medium.k0**2, float((medium.disc - medium.around).real)
     first = added(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
-    te, te_turn = np.linalg.eigh(first)
+    te, te_low, rest = low_levels(first, basis.te, k2 * abs(step))
     second = added(k2 * step * basis.disc_mass[a:, a:], k2 * around)
-    scalar = np.linalg.cholesky(added(step * basis.disc_scalar, around))
+    scalar = cholesky(added(step * basis.disc_scalar, around))
     rise = below(scalar, np.diag(np.sqrt(basis.tm / k2)))
-    tm, tm_turn = whitened(second, added(rise.T @ rise, -1.0))
-    coupling = te_turn.T @ (-k2 * step * basis.disc_mass[:a, a:]) @ tm_turn
-    return Pencil(te, tm, np.ones(a), -np.sign(tm), coupling, te_turn, tm_turn, dual=False)
+    tm, tm_turn = whitened(second, added(gram(rise), -1.0))
+    turn = Turn(te_low, a)
+    coupling = turn.down(-k2 * step * basis.disc_mass[:a, a:] @ tm_turn)
+    return Pencil(te, tm, np.ones(a), -np.sign(tm), coupling, turn, Turn(tm_turn, b), rest, None, dual=False)
 
 
 def magnetic_pencil(basis: Basis, medium: Medium) -> Pencil:
     """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ - diag(0, tm / k0²)."""
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
-    a, k2 = len(basis.te), medium.k0**2
+    a, b, k2 = len(basis.te), len(basis.tm), medium.k0**2
     weighted = definite_inverse(added((disc - around) * basis.disc_mass, around))
     curl = added((disc - around) * basis.disc_curl, around * basis.te - k2)
     te, te_turn = whitened(weighted[:a, :a], curl)
     second = added(-k2 * weighted[a:, a:], basis.tm)
-    tm, tm_turn = np.linalg.eigh(second)
-    tm_turn = tm_turn * medium.k0
-    coupling = te_turn.T @ weighted[:a, a:] @ tm_turn
-    return Pencil(te, tm, np.sign(te), -np.ones(len(tm)), coupling, te_turn, tm_turn, dual=True)
+    tm, tm_low, rest = low_levels(second, basis.tm, k2 * abs(1 / disc - 1 / around))
+    turn = Turn(tm_low * medium.k0, b, medium.k0)
+    coupling = turn.down(weighted[a:, :a] @ te_turn).T
+    return Pencil(te, tm, np.sign(te), -np.ones(b), coupling, Turn(te_turn, a), turn, None, rest, dual=True)

@@ -70,7 +70,7 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: b
 
     rate: its derivative in the half phase, which enters by the weights at x = pitch / 2.
     """
-    picked = matrix[rows.order[:, None], columns.order]
+    picked = matrix.take(rows.order, 0).take(columns.order, 1)
     if not rows.periodic:
         return np.zeros_like(picked) if rate else picked
     out = np.zeros((rows.size, columns.size))

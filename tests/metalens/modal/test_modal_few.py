@@ -9,7 +9,7 @@ from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
 from metalens.modal.few_modes import few_modes, root, squared
-from metalens.modal.homogeneous import below, corrected, definite_inverse, eigen_pairs, modes
+from metalens.modal.homogeneous import corrected, modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import few_scattering, half_space, scattering
@@ -68,23 +68,6 @@ def test_absorbing_and_metallic_layers_take_all_modes():
     assert not lossless(Medium(1.0, 3.6**2 + 0.1j, 1.0))
     assert not lossless(Medium(1.0, -4.0, 1.0))
     assert lossless(Medium(1.0, 3.6**2, 1.0))
-
-
-def test_dense_algebra_does_what_it_says():
-    random = np.random.default_rng(1)
-    left, right = random.normal(size=(2, 20, 20))
-    definite, symmetric = left @ left.T + np.eye(20), right + right.T
-    lower = np.linalg.cholesky(definite)
-    assert np.abs(lower @ below(lower, right) - right).max() < 1e-12
-    assert np.abs(lower.T @ below(lower, right, transposed=True) - right).max() < 1e-12
-    inverse = definite_inverse(definite)
-    assert np.abs(inverse @ definite - np.eye(20)).max() < 1e-11
-    assert (inverse == inverse.T).all()
-    value, vectors = eigen_pairs(symmetric, definite)
-    assert np.abs(symmetric @ vectors - definite @ vectors * value).max() < 1e-11
-    assert np.abs(vectors.T @ definite @ vectors - np.eye(20)).max() < 1e-11
-    with pytest.raises(np.linalg.LinAlgError):
-        eigen_pairs(definite, symmetric)
 
 
 def near_diagonal(random, signs, ends):
