@@ -152,7 +152,8 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
         return electric
     w = (first[0] ** 2 + first[1] ** 2) * order[0] ** 2
     sine, least = torch.sqrt(w), torch.finfo(w.dtype).tiny
-    ux, uy = torch.where(sine > least, first[:2] * order[0] / sine.clamp_min(least), torch.ones_like(first[:2]))
+    along_x = torch.stack([torch.ones_like(w), torch.zeros_like(w)])  # of the ray along the axis any plane is its own
+    ux, uy = torch.where(sine > least, first[:2] * order[0] / sine.clamp_min(least), along_x)
     steep, cosine = sine / order[-1], torch.sqrt(1 - w / order[-1] ** 2)
     s_power, p_power = media.passed_apart(order, w)
     both = (s_power + p_power) / 2 * cosine / first[2]

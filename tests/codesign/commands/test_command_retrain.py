@@ -156,7 +156,7 @@ def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(fol
     assert "Written to no file" in page
 
 
-LOOK = ["--subjects", "2", "--grid", "4", "3", "--share", "0.3", "--people", "3"]
+LOOK = ["--subjects", "1", "--grid", "3", "3", "--share", "0.3", "--people", "2"]
 
 
 def _shown(folder, *runs, out):
