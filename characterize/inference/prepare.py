@@ -1,19 +1,22 @@
-"""From a capture to what a fit needs: brackets merged, the window about the light, what the capture itself states."""
+"""From a capture to what a fit needs: brackets merged, the window about the light, what the capture itself states, and
+how little of the model is enough."""
 
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from characterize.captures import Capture, Frames, merge_brackets
-from characterize.inference.leastsquares import Data
-from characterize.model import ForwardModel, Known, Setting, usual
+from characterize.inference.leastsquares import Data, Model
+from characterize.model import ForwardModel, Known, Setting, background, usual
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
+_DARK = 3e-5  # share of what light tells that may lie where a quick model knows nothing of it
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
@@ -118,6 +121,48 @@ def quick_enough(model: ForwardModel, data: Data, x: Array) -> ForwardModel:
         if float((((rough.images(x)[0] - exact) / noise)[data.usable] ** 2).sum()) < _NOTHING:
             return rough
     return model
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LeftOut:
+    """What a quick model leaves out at (p,) ``value``: (n, y, x) of the images, (p, n, y, x) of the slopes.
+
+    beside: (y, x) pixels that it knows nothing of; there images go straight on from ``value``.
+    """
+
+    value: Array
+    image: Array
+    slopes: Array
+    beside: Array
+
+    def added(self, plain: Model, frames: Array | None) -> Model:
+        """The model with what it leaves out, of all frames or some."""
+        some = slice(None) if frames is None else frames
+        image, slopes = self.image[some], self.slopes[:, some]
+        dark = slopes[:, :, self.beside]
+
+        def images(value: Array, jacobian: bool) -> tuple[Array, Array | None]:
+            found, rates = plain(value, jacobian)
+            found = found + image
+            found[:, self.beside] += np.tensordot(value - self.value, dark, 1)
+            return found, None if rates is None else rates + slopes
+
+        return images
+
+
+def lit_part(model: ForwardModel, data: Data, x: Array, image: Array) -> tuple[slice, slice]:
+    """Rows and columns beside which there is next to nothing of what the light of all frames tells over its noise.
+
+    Args:
+        x: all parameters, of ``image`` (n, y, x).
+    """
+    light = np.maximum(image - background(x, model.setting), 0.0)
+    told, out = (light**2 / data.variance(image) * data.usable).sum(0), []
+    for axis in (1, 0):
+        share = np.cumsum(told.sum(axis)) / max(float(told.sum()), 1e-300)
+        first, last = np.searchsorted(share, (_DARK / 4, 1 - _DARK / 4)).tolist()
+        out.append(slice(first, min(last, len(share) - 1) + 1))
+    return out[0], out[1]
 
 
 def check_enough(data: Data, names: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ from characterize.inference import leastsquares, residual
 from characterize.inference.arrange import Arrangement, few_frames
 from characterize.inference.constrained import Ball
 from characterize.inference.leastsquares import Data, Prior, Settings, Solution
+from characterize.inference.prepare import LeftOut, lit_part
 from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, usual, vector
 from metalens.ground import threads
 from metalens.ground.arrays import Array
@@ -35,7 +36,7 @@ class Task:
 
     found: None before frames are there: no search begins without it.
     unfitted: how large is stated to be what no parameter describes (``characterize.model.UNFITTED``).
-    left_out: (n, y, x) images and (p, n, y, x) slopes that are added to those of the model; see :func:`anchored`.
+    left_out: what is added to images and slopes of the model; see :func:`anchored`.
     """
 
     model: ForwardModel
@@ -45,7 +46,7 @@ class Task:
     found: Arrangement | None
     free: tuple[str, ...] = ()
     unfitted: dict[str, float] = field(default_factory=dict)
-    left_out: tuple[Array, Array] | None = None
+    left_out: LeftOut | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,9 +63,7 @@ class Task:
         model = self.model if frames is None else self.model.only(frames)
         if self.left_out is None:
             return residual.problem(model if frames is None else model.quick(), self.names, self.start)
-        some = slice(None) if frames is None else frames
-        image, slopes = self.left_out
-        return _added(residual.problem(model, self.names, self.start), image[some], slopes[:, some])
+        return self.left_out.added(residual.problem(model, self.names, self.start), frames)
 
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
@@ -72,25 +71,20 @@ class Task:
 
 
 def anchored(task: Task, at: Solution) -> Task:
-    """The task by a quick model put right at a fit: a third of the work for an image.
+    """The task by a quick model put right at a fit, where there is light: a third of the work for an image, or less.
 
     Few terms leave out a percent or two of the light, and of a change of the light. All lenses that explain the frames
     give images a few sigma apart: what is left out differs among them by about a tenth of one (a test holds it on a
     small lens; on 1 mm, two tenths were met where images are 20 sigma apart).
     """
-    quick = dataclasses.replace(task, model=task.model.quick(), left_out=None)
+    lit = lit_part(task.model, task.data, task.all_of(at.value), at.image)
+    quick = dataclasses.replace(task, model=task.model.quick(*lit), left_out=None)
     image, slopes = quick.problem()(at.value, True)
-    return dataclasses.replace(quick, left_out=(at.image - image, at.slopes - np.asarray(slopes)))
-
-
-def _added(plain: leastsquares.Model, image: Array, slopes: Array) -> leastsquares.Model:
-    """A model and what it leaves out."""
-
-    def images(value: Array, jacobian: bool) -> tuple[Array, Array | None]:
-        found, rates = plain(value, jacobian)
-        return found + image, None if rates is None else rates + slopes
-
-    return images
+    beside = np.ones(at.image.shape[1:], bool)
+    beside[lit] = False
+    return dataclasses.replace(
+        quick, left_out=LeftOut(at.value, at.image - image, at.slopes - np.asarray(slopes), beside)
+    )
 
 
 def oriented(tasks: Sequence[Task]) -> Task:

@@ -1,5 +1,6 @@
 """From the intensity in front of the sensor to expected electrons: source size, blur, pixel area, gain, background."""
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from scipy import fft, special
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
+_ROOM_UM = 20.0  # for decentre
 _LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
 
 
@@ -34,7 +36,7 @@ class Grid:
 
     rows, columns: pixels of the window. oversample: fine samples per pixel side.
     margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief ray.
-    fill: width of a pixel over the pitch.
+    fill: width of a pixel over the pitch. aside: (y, x) pixels from the window's middle to that of a part of it.
     """
 
     rows: int
@@ -44,6 +46,7 @@ class Grid:
     margin: int = 2
     middle_um: tuple[float, float] = (0.0, 0.0)
     fill: float = 1.0
+    aside: tuple[int, int] = (0, 0)
 
     @property
     def fine_um(self) -> float:
@@ -57,12 +60,32 @@ class Grid:
 
     def axes_um(self) -> tuple[Array, Array]:
         """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows // 2, columns // 2)."""
-        return self._axis(self.rows) + self.middle_um[1], self._axis(self.columns) + self.middle_um[0]
+        y, x = self._centre_um()
+        return self._axis(self.rows) + y, self._axis(self.columns) + x
 
     def ends_um(self) -> tuple[Array, Array]:
         """(y, x) of the first and last pixels from the chief ray."""
         ends = [(np.array([0, n - 1]) - n // 2) * self.pixel_um for n in (self.rows, self.columns)]
-        return ends[0] + self.middle_um[1], ends[1] + self.middle_um[0]
+        y, x = self._centre_um()
+        return ends[0] + y, ends[1] + x
+
+    def across_um(self, near_um: float) -> float:
+        """Side of a square about the chief ray that holds all that is seen; of what is farther off than ``near_um``."""
+        off = max(0.0, *(abs(v) - near_um for v in self._centre_um()))
+        return (max(self.rows, self.columns) + self.margin) * self.pixel_um + _ROOM_UM + 2 * off
+
+    def part(self, rows: slice, columns: slice, margin: int) -> "Grid":
+        """Of neighbouring rows and columns, with so many pixels at most around them."""
+        some = range(self.rows)[rows], range(self.columns)[columns]
+        moved = (one[len(one) // 2] - n // 2 for one, n in zip(some, (self.rows, self.columns), strict=True))
+        y, x = (off + by for off, by in zip(self.aside, moved, strict=True))
+        margin = min(margin, self.margin)
+        return dataclasses.replace(self, rows=len(some[0]), columns=len(some[1]), margin=margin, aside=(y, x))
+
+    def _centre_um(self) -> tuple[float, float]:
+        """(y, x) of the middle pixel from the chief ray."""
+        x, y = self.middle_um
+        return y + self.aside[0] * self.pixel_um, x + self.aside[1] * self.pixel_um
 
     def _axis(self, pixels: int) -> Array:
         fine = np.arange((pixels + 2 * self.margin) * self.oversample)

@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,46 +16,39 @@ from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad
 from characterize.model.reduced import Bench, Reduced
-from characterize.model.setting import LIGHT, Setting, Spectrum, background, brightness, dimming, light_maps, true_depth
+from characterize.model.setting import (
+    BENDING,
+    LIGHT,
+    Group,
+    Setting,
+    Spectrum,
+    background,
+    brightness,
+    dimming,
+    light_maps,
+    true_depth,
+)
 from characterize.model.window import Operators
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import sensor_path
 from metalens.lens import Lens
-from metalens.made import Answers, Bends, Sensitivity, Widens, maps, named, of_kind
+from metalens.made import Answers, Sensitivity, Widens, named, of_kind
 
 GEOMETRY = (
     "distance_um", "wavelength_nm", "decentre_x_um", "decentre_y_um", "tilt_x_deg", "tilt_y_deg", "source_x_um",
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
-WIDENING, ANSWERING, BENDING = ({name: n for n, name in enumerate(named(k))} for k in (Widens, Answers, Bends))
+WIDENING, ANSWERING = ({name: n for n, name in enumerate(named(kind))} for kind in (Widens, Answers))
+EVERY = slice(None)
 Light = tuple[Array, dict[str, Array]]  # and its derivatives by name
 _SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
 _WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
 _WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
 _NEAR_UM = 5.0  # off the chief ray, within which windows need no more directions than those of the middle
 _FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Group:
-    """Frames of one field angle."""
-
-    index: Array
-    pillars: Pillars
-    reduced: Reduced
-    bending: Array
-    widening: Array
-    residual: Array
-
-    def turning(self, name: str) -> Array | None:
-        """Phase on the nodes for one unit of a wave-front parameter, imaginary of uneven light; None for any other."""
-        if name.startswith("residual_"):
-            return np.asarray(self.residual[int(name.removeprefix("residual_"))])
-        if name in LIGHT:
-            return np.asarray(-0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)])
-        return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
+_NARROW = 2  # pixels around a part of a window: what blur brings from farther off changes little
 
 
 class ForwardModel:
@@ -78,6 +70,7 @@ class ForwardModel:
         self.grid = detector.Grid(s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill)
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
+        self._lit = EVERY, EVERY
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
@@ -85,21 +78,20 @@ class ForwardModel:
         self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
 
-    def _group(self, angle_rad: Array) -> _Group:
+    def _group(self, angle_rad: Array) -> Group:
+        """Of the frames at one field angle."""
         setting = self.setting
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
         bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
-        window = (max(setting.rows, setting.columns) + setting.margin) * setting.pixel_um + 20.0  # margin: half is seen
-        window += 2 * max(0.0, *(abs(v) - _NEAR_UM for v in self.grid.middle_um))
+        window = self.grid.across_um(_NEAR_UM)
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
             self._pillars[incidence] = Pillars(self.lens, self.response, span=self._span, angle_rad=incidence)
         pillars = self._pillars[incidence]
         reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
-        bending, widening = (maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens))
-        return _Group(index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape)))
+        return Group.of(index, pillars, reduced)
 
     def only(self, frames: Array) -> "ForwardModel":
         """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
@@ -136,11 +128,17 @@ class ForwardModel:
         part.cut = tolerance
         return part
 
-    def quick(self) -> "ForwardModel":
-        """The same model by few terms of every field and on fewer samples: for differences to images of this one."""
-        part = self.rough(_FEW)
-        part._missed, part.grid = _SMOOTHER * moments.MISSED, self._sparser()
-        part.groups = [dataclasses.replace(group, reduced=group.reduced.quick()) for group in self.groups]
+    def quick(self, rows: slice = EVERY, columns: slice = EVERY) -> "ForwardModel":
+        """The same model by few terms of every field and on fewer samples: for differences to images of this one.
+
+        rows, columns: of the window, where there is light enough to differ; its images are background alone beside it.
+        """
+        part, window_um = self.rough(_FEW), None
+        part._missed, part.grid, part._lit = _SMOOTHER * moments.MISSED, self._sparser(), (rows, columns)
+        narrow = part.grid.part(rows, columns, _NARROW)
+        if narrow.rows < self.grid.rows or narrow.columns < self.grid.columns:
+            part.grid, window_um = narrow, narrow.across_um(_NEAR_UM)
+        part.groups = [group.quick(window_um) for group in self.groups]
         return part
 
     def _sparser(self) -> detector.Grid:
@@ -164,7 +162,7 @@ class ForwardModel:
             part.groups = [dataclasses.replace(g, residual=self._shapes(g, len(modes), basis)) for g in self.groups]
         return part
 
-    def _shapes(self, group: _Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
+    def _shapes(self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
         """(count, q, p) of a basis on the nodes of a group; kept, since a search asks again for every step."""
         key = group.reduced, basis, count
         if key not in self._kept:
@@ -199,10 +197,10 @@ class ForwardModel:
         for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
             for group in self.groups:
                 part, more = self._group_light(x, group, offset_nm, names)
-                light[group.index] += weight * part
+                light[group.index, *self._lit] += weight * part
                 for name in names:
                     if name in more:
-                        slopes[name][group.index] += weight * more[name]
+                        slopes[name][group.index, *self._lit] += weight * more[name]
         if "bandwidth_nm" in names:
             up = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
             slopes["bandwidth_nm"] = (self._light(up, None, wide_nm)[0] - light) / _WIDER_NM
@@ -210,7 +208,7 @@ class ForwardModel:
             slopes["stage_scale"] = slopes["stage_zero_um"] * (s.depth_um - self.stage_centre_um)[:, None, None]
         return light, slopes
 
-    def _group_light(self, x: Array, group: _Group, offset_nm: float, names: list[str]) -> Light:
+    def _group_light(self, x: Array, group: Group, offset_nm: float, names: list[str]) -> Light:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, lens = threads.beside(
@@ -247,7 +245,7 @@ class ForwardModel:
         return light, out
 
     def _quick(
-        self, x: Array, seen: tuple[Operators, Array], group: _Group, bases: Bases, factors: dict[str, Factor]
+        self, x: Array, seen: tuple[Operators, Array], group: Group, bases: Bases, factors: dict[str, Factor]
     ) -> dict[str, Array]:
         """Derivatives that are had from those of the field: what smooth factors make of a point, on small pixels."""
         (operators, coarse), turned, grid = seen, seen[0].turned, self._sparser()
@@ -261,7 +259,7 @@ class ForwardModel:
 
         return moments.rates(turned, grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
 
-    def _factors(self, x: Array, group: _Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
+    def _factors(self, x: Array, group: Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
         """(name, what one unit does to the light on the nodes) of all parameters that change it."""
         for name in names:
             if name in WIDENING:
@@ -276,7 +274,7 @@ class ForwardModel:
                 slope = functools.partial(self._phase_slope, x, group, name)
                 yield name, Factor(LIT, slope, moves, um, added)
 
-    def _pupil(self, x: Array, group: _Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
+    def _pupil(self, x: Array, group: Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
         """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
         the wavelength per nm."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
@@ -295,7 +293,7 @@ class ForwardModel:
         by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
         return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
-    def _phase(self, x: Array, group: _Group, cut: Cut = WHOLE) -> Array:
+    def _phase(self, x: Array, group: Group, cut: Cut = WHOLE) -> Array:
         """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken off, aberrations; light."""
         reduced, index, nominal = group.reduced, group.index, group.reduced.bench
         here, every = (reduced.x_um[cut], reduced.y_um[cut]), (slice(None), *cut)
@@ -316,30 +314,30 @@ class ForwardModel:
         light = -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1) if uneven.any() else 0.0
         return out + light + (np.tensordot(self.modes, group.residual[every], 1) if len(self.modes) else 0.0)
 
-    def _phase_slope(self, x: Array, group: _Group, name: str, cut: Cut) -> Array:
+    def _phase_slope(self, x: Array, group: Group, name: str, cut: Cut) -> Array:
         """Derivative of i times :meth:`_phase` by a geometric parameter: central difference of a smooth function."""
         step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
         way = step * (np.arange(len(x)) == PLACE[name])
         return 0.5j / step * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
 
-    def _operators(self, x: Array, group: _Group) -> Operators:
+    def _operators(self, x: Array, group: Group) -> Operators:
         nominal = group.reduced.bench
         return group.reduced.operators(
             wavelength_um=nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
             distance_um=nominal.distance_um + x[PLACE["distance_um"]],
             axes_um=self.grid.axes_um(),
-            edge_um=self.setting.margin * self.setting.pixel_um,
+            edge_um=self.grid.margin * self.setting.pixel_um,
             turned_um=self._sparser().axes_um(),
         )
 
-    def _growth(self, x: Array, group: _Group) -> dict[str, Array]:
+    def _growth(self, x: Array, group: Group) -> dict[str, Array]:
         """(frames,) relative growth of the source's image with the parameters that change its magnification."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
         distance = np.full(len(depth), self.lens.sensor_distance_um + x[PLACE["distance_um"]])
         return {"distance_um": 1 / distance, "stage_zero_um": -1 / depth}
 
     def _transfer(
-        self, x: Array, group: _Group, names: list[str], grid: detector.Grid | None = None
+        self, x: Array, group: Group, names: list[str], grid: detector.Grid | None = None
     ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
         """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
         depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from characterize.model import gather
-from characterize.model.kernel import Kernel, Span, digits, factors, precision, real_of, turns
+from characterize.model.kernel import Kernel, digits, factors, precision, real_of, turns
 from characterize.model.pillars import Pillars
 from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, Ways, turned, ways
 from metalens.ground import legendre, threads
@@ -71,20 +71,41 @@ class Reduced:
         self._near, self._usual = False, dict[tuple[float, ...], Terms]()
         self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
-        self._directions(depths_um)
-        self.gathered = self._gather(lens, pillars).astype(self.kind)
-        self._parts = [np.ascontiguousarray(part).reshape(len(self.gathered), -1) for part in _pair(self.gathered)]
-        self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
-        self.known = self.k * self.path(self.x_um, self.y_um, bench.distance_um, bench)
+        self._defocus = float(np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max())
+        self._directions()
+        self._hold(self._gather(lens, pillars))
 
-    def quick(self) -> "Reduced":
-        """The same nodes, with terms that belong to the nominal wavelength and distance: what is left of the kernel
-        when its factors are put on hardly changes with either."""
+    def _hold(self, gathered: Array) -> None:
+        """Take the (r, q, p) fields of the lens on the nodes, and what else belongs to these."""
+        self.gathered = gathered.astype(self.kind)
+        self._parts = [np.ascontiguousarray(part).reshape(len(gathered), -1) for part in _pair(self.gathered)]
+        self.u, self.v = self.x_um / self.radius_um, self.y_um / self.radius_um
+        self.known = self.k * self.path(self.x_um, self.y_um, self.bench.distance_um, self.bench)
+
+    def quick(self, window_um: float | None = None) -> "Reduced":
+        """With terms that belong to the nominal wavelength and distance: what is left of the kernel when its factors
+        are put on hardly changes with either. For a window narrower than its own on fewer nodes."""
         part = copy.copy(self)
         part._operators, part._near, part._usual = {}, True, {}
+        if window_um is not None and window_um < self.window_um:
+            part.window_um, part._from_few = window_um, {}
+            part._directions()
+            to_q, to_p = self._between(part, self)
+            part._hold(to_q.T @ self.gathered @ to_p)
         return part
 
-    def _directions(self, depths_um: Array) -> None:
+    def seen_by(self, other: "Reduced", values: Array) -> Array:
+        """(..., q, p) a smooth function on the nodes as it is on those of another one of the same lens."""
+        to_q, to_p = self._between(self, other)
+        return np.asarray(to_q @ values @ to_p.T)
+
+    @staticmethod
+    def _between(one: "Reduced", other: "Reduced") -> list[Array]:
+        """Interpolation along q and along p from the nodes of one to those of the other."""
+        ends = (one._q, other.q[:, 0]), (one._p, other.p[0])
+        return [gather.at(one.nodes, one._pull, span, at) for span, at in ends]
+
+    def _directions(self) -> None:
         d, (cx, cy) = self.bench.distance_um, self.center_um
         hy, hx = self.half_um
         edge = np.linspace(-1, 1, 41)
@@ -93,27 +114,18 @@ class Reduced:
         self._p = float((x / r).min()), float((x / r).max())
         self._q = float((y / r).min()), float((y / r).max())
         swing = self.k * self.window_um / 2 * max(np.ptp(self._p), np.ptp(self._q)) / 2
-        inverse = np.abs(1 / np.asarray(depths_um) - 1 / self.bench.reference_um).max()
-        blur = self.k * inverse * self.radius_um**2 / 2
+        blur = self.k * self._defocus * self.radius_um**2 / 2
         bands = swing + 2 * blur + 8 + 2 * (swing + 1) ** (1 / 3) + 1.5 * digits(self.tolerance)
-        self.nodes = next(n for n in itertools.count(12) if n * self._density(n) >= bands)
+        self.nodes = next(n for n in itertools.count(12) if n * gather.density(n, self.tolerance) >= bands)
         if self.nodes > 600:
             raise FitError(f"window of {self.window_um:.0f} um needs {self.nodes} nodes a side; fit a smaller window")
-        p, q = (_even(self.nodes, self._pull(self.nodes), *span) for span in (self._p, self._q))
+        self._pull = gather.pull(self.nodes, self.tolerance)
+        p, q = (gather.even(self.nodes, self._pull, *span) for span in (self._p, self._q))
         self.p, self.q = np.meshgrid(p, q)
         if (self.p**2 + self.q**2).max() >= 0.98:
             raise FitError("the aperture angle is too wide for the reduced model; need below 45 degrees across corners")
         r_w = d / np.sqrt(1 - self.p**2 - self.q**2)
         self.x_um, self.y_um = cx + r_w * self.p, cy + r_w * self.q
-
-    def _pull(self, count: int) -> float:
-        """Of :func:`_even`: how near its branch may come to the ends of the nodes, for a wave as steep as they hold."""
-        return 1 / math.cosh((math.log(1e5 / self.tolerance) + count / 60) / count)
-
-    def _density(self, count: int) -> float:
-        """Of the nodes in the middle over that of Gauss-Legendre nodes."""
-        pull = self._pull(count)
-        return math.asin(pull) / pull
 
     def combined(self, weight: Array, series: Array) -> Array:
         """(q, p) sum over r of the gathered fields times the series (b, r) in ``weight`` (b, q, p) real functions."""
@@ -140,8 +152,8 @@ class Reduced:
         hy, hx = self.half_um
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = real_of(self.kind)
-        pull = self._pull(n)
-        across, along = (_at(n, pull, (-h, h), t).astype(real_kind) for h, t in ((hx, x), (hy, y)))
+        pull = gather.pull(n, self.tolerance)
+        across, along = (gather.at(n, pull, (-h, h), t).astype(real_kind) for h, t in ((hx, x), (hy, y)))
         table = np.ascontiguousarray(pillars.table().astype(self.kind).T)
         block = max(1, 100_000 // len(x))
         parts = [slice(start, start + block) for start in range(0, len(y), block)]
@@ -166,10 +178,10 @@ class Reduced:
     def _to_directions(self, fields: Array, n: int) -> Array:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
         hy, hx = self.half_um
-        x, y = (_even(n, self._pull(n), -h, h) for h in (hx, hy))
+        x, y = (gather.even(n, gather.pull(n, self.tolerance), -h, h) for h in (hx, hy))
         (cx, cy), d, m = self.center_um, self.bench.distance_um, self.nodes
         p = (x[None] - cx) / np.sqrt((x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2)
-        at = functools.partial(_at, m, self._pull(m))
+        at = functools.partial(gather.at, m, self._pull)
         turned = np.stack([fields[:, j] @ at(self._p, p[j]) for j in range(n)], 1)
         q = (y - cy)[None] * np.sqrt(1 - self.p[0][:, None] ** 2) / np.sqrt((y - cy)[None] ** 2 + d**2)
         out = np.stack([turned[:, :, a] @ at(self._q, q[a]) for a in range(m)], 2)
@@ -297,7 +309,7 @@ class Reduced:
     def _to_nodes(self, count: int) -> Array:
         """(nodes, count) from Legendre nodes of the directions; kept."""
         if count not in self._from_few:
-            self._from_few[count] = legendre.interpolation(count, _even(self.nodes, self._pull(self.nodes), -1.0, 1.0))
+            self._from_few[count] = legendre.interpolation(count, gather.even(self.nodes, self._pull, -1.0, 1.0))
         return self._from_few[count]
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
@@ -326,19 +338,3 @@ def _as(way: Ways, kind: Any) -> Ways:
 
 def _pair(values: Array) -> tuple[Array, Array]:
     return values.real, values.imag
-
-
-def _even(count: int, pull: float, low: float, high: float) -> Array:
-    """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre nodes t (Kosloff and Tal-Ezer 1993).
-
-    A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at the ends; pulled apart, 0.7 n.
-    """
-    t = np.arcsin(pull * legendre.nodes(count)[0]) / math.asin(pull)
-    return np.asarray((low + high) / 2 + (high - low) / 2 * t)
-
-
-def _at(count: int, pull: float, span: Span, values: Array) -> Array:
-    """(*values, count) interpolation from :func:`_even` places."""
-    low, high = span
-    t = (2 * values - low - high) / (high - low)
-    return np.asarray(legendre.interpolation(count, np.sin(math.asin(pull) * t) / pull))

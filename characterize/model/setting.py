@@ -1,5 +1,6 @@
-"""Which frames are predicted: depths, angles, exposures, window; where the source truly stood, and its spectrum."""
+"""Which frames are predicted: depths, angles, exposures, window, groups; where the source stood, and its spectrum."""
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -7,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from characterize.model.parameters import PLACE
+from characterize.model.pillars import Pillars
+from characterize.model.reduced import Reduced
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
+from metalens.made import Bends, Widens, maps, named
 
 LEAST_NM = 0.02  # of a spectrum that colours are chosen for: none has no slope by its width
 _RIM, _TURN_STEP, _MOST_COLOURS = 48, 0.05, 64
@@ -82,12 +86,48 @@ def background(x: Array, setting: Setting) -> Array:
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
+BENDING = {name: n for n, name in enumerate(named(Bends))}
 LIGHT = ("light_x", "light_y", "light_r")
 
 
 def light_maps(u: Array, v: Array) -> Array:
     """(3, *shape) ln of the irradiance at lens places over the radius, for one unit of each of ``LIGHT``."""
     return np.stack([u, v, u * u + v * v - 0.5])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Group:
+    """Frames of one field angle, by their ``index``, and the lens as they see it.
+
+    bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the diameters, of a residual phase.
+    """
+
+    index: Array
+    pillars: Pillars
+    reduced: Reduced
+    bending: Array
+    widening: Array
+    residual: Array
+
+    @classmethod
+    def of(cls, index: Array, pillars: Pillars, reduced: Reduced) -> "Group":
+        """Without a residual phase."""
+        bending, widening = (maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens))
+        return cls(index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape)))
+
+    def quick(self, window_um: float | None) -> "Group":
+        """See :meth:`Reduced.quick`."""
+        reduced = self.reduced.quick(window_um)
+        residual = self.reduced.seen_by(reduced, self.residual) if window_um else self.residual
+        return dataclasses.replace(Group.of(self.index, self.pillars, reduced), residual=residual)
+
+    def turning(self, name: str) -> Array | None:
+        """Phase on the nodes for one unit of a wave-front parameter, imaginary of uneven light; None for any other."""
+        if name.startswith("residual_"):
+            return np.asarray(self.residual[int(name.removeprefix("residual_"))])
+        if name in LIGHT:
+            return np.asarray(-0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)])
+        return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
 
 
 @dataclass(frozen=True, slots=True)

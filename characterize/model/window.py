@@ -18,6 +18,7 @@ from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 MIXED = 0.1  # of the tolerance, for functions of p in the terms
+_MIXED_FEW = 0.5  # the same where terms are left out: beside these it adds an eighth to what is missed
 ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
 _COARSEST = 0.2  # tolerance of a small part of a derivative
@@ -59,7 +60,7 @@ class Terms:
     def some(self, tolerance: float) -> tuple[Array, Array, Array]:
         """Functions, amounts and terms that leave a relative ``tolerance`` out."""
         r = max(1, int((self.remainder > tolerance).sum()))
-        b = max(1, int((self.mixed > MIXED * tolerance).sum()))
+        b = max(1, int((self.mixed > _MIXED_FEW * tolerance).sum()))
         return self.across[:b], self.amounts[:, :r, :b], self.window[:, :r]
 
 

@@ -178,7 +178,7 @@ class _Stack:
     def only(self, index):
         return _Stack(self.index[index])
 
-    def quick(self):
+    def quick(self, *_part):
         return self
 
     def exchanged(self):

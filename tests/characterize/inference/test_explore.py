@@ -27,7 +27,7 @@ class Straight:
         self.setting = Setting(depth, np.zeros((len(depth), 2)), np.ones(len(depth)), 1.7, *bright.shape[1:])
         self.groups = [SimpleNamespace(index=np.arange(len(depth)))]
 
-    def quick(self):
+    def quick(self, *_part):
         return self
 
     def only(self, index):

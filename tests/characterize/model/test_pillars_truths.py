@@ -147,7 +147,8 @@ def plain(light, y, x, some):
 
 def test_terms_are_left_out_by_what_is_behind_them():
     one = terms()
-    assert [part.shape for part in one.some(0.03)] == [(2, 6), (5, 3, 2), (7, 3, 8)]  # 0.04 > 0.03; 0.009 > 0.003
+    assert [part.shape for part in one.some(0.03)] == [(1, 6), (5, 3, 1), (7, 3, 8)]  # 0.04 > 0.03; 0.009 < 0.015
+    assert [part.shape for part in one.some(0.017)] == [(2, 6), (5, 3, 2), (7, 3, 8)]  # 0.04 > 0.017; 0.009 > 0.0085
     assert [part.shape for part in one.some(0.3)] == [(1, 6), (5, 1, 1), (7, 1, 8)]
     assert [part.shape for part in one.some(0.0)] == [(3, 6), (5, 4, 3), (7, 4, 8)]
 

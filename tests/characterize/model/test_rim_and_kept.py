@@ -11,9 +11,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.inference import explore
+from characterize.model import gather
 from characterize.model.kernel import digits
 from characterize.model.pillars import Change, Pillars
-from characterize.model.reduced import Bench, Reduced, _at, _even
+from characterize.model.reduced import Bench, Reduced
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.ground import legendre
@@ -86,12 +87,10 @@ def test_coarse_samples_stay_where_they_are_over_the_distances_of_a_fit(lens):
 @pytest.mark.parametrize(("count", "tolerance"), [(40, 5e-4), (131, 5e-4), (400, 5e-4), (67, 1e-6)])
 def test_nodes_that_are_nearly_even_hold_steeper_waves_than_gauss_legendre_nodes(count, tolerance):
     """exp(i slope t) of the slope that they are made for: to the tolerance where Gauss-Legendre nodes fail."""
-    reduced = object.__new__(Reduced)
-    reduced.tolerance = tolerance
-    held = count * reduced._density(count) - 8 - 1.5 * digits(tolerance)
+    held = count * gather.density(count, tolerance) - 8 - 1.5 * digits(tolerance)
     slope = next(s for s in np.arange(held, 0, -0.1) if s + 2 * (s + 1) ** (1 / 3) <= held)
-    t, pull, wave = np.linspace(-1, 1, 1901), reduced._pull(count), lambda t: np.exp(1j * slope * t)
-    even = _at(count, pull, (-1.0, 1.0), t) @ wave(_even(count, pull, -1.0, 1.0)) - wave(t)
+    t, pull, wave = np.linspace(-1, 1, 1901), gather.pull(count, tolerance), lambda t: np.exp(1j * slope * t)
+    even = gather.at(count, pull, (-1.0, 1.0), t) @ wave(gather.even(count, pull, -1.0, 1.0)) - wave(t)
     plain = legendre.interpolation(count, t) @ wave(legendre.nodes(count)[0]) - wave(t)
     assert np.sqrt((np.abs(even) ** 2).mean()) < tolerance
     assert np.sqrt((np.abs(plain) ** 2).mean()) > 10 * np.sqrt((np.abs(even) ** 2).mean())

@@ -1,0 +1,119 @@
+"""A quick model looks at the part of a window where there is light, on fewer nodes; beside it images go straight on."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
+from characterize.inference.leastsquares import Data
+from characterize.inference.prepare import LeftOut, lit_part
+from characterize.model import PLACE, ForwardModel, Setting, detector, vector
+
+ROWS, COLUMNS = slice(9, 22), slice(6, 20)
+ANGLES = np.array([[0.0, 0.0], [0.11, -0.07]])
+SETTING = Setting(np.array([560.0, 650.0]), ANGLES, np.array([1.0, 1.3]), 1.5, 29, 28)
+HIDDEN = b.VALUES | {"background_e": 7.0, "background_x_e": 3.0, "distance_um": 1.3, "log_gain": 13.0}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ForwardModel(b.lens(), SETTING, b.RESPONSE).about((1.4, -2.2))
+
+
+@pytest.fixture(scope="module")
+def part(model):
+    return model.quick(ROWS, COLUMNS)
+
+
+def test_a_part_of_the_window_has_the_light_of_the_whole_model_there_and_background_alone_beside(model, part):
+    """Fewer nodes hold what reaches the part: light to the percent of the brightest that few terms leave out."""
+    x = vector(HIDDEN)
+    want, got = model.images(x)[0], part.images(x)[0]
+    assert all(few.reduced.nodes < one.reduced.nodes for few, one in zip(part.groups, model.groups, strict=True))
+    assert np.abs(got - want)[:, ROWS, COLUMNS].max() < 0.01 * want.max()
+    beside = np.ones(want.shape[1:], bool)
+    beside[ROWS, COLUMNS] = False
+    edge = (np.arange(28) - 14) / 14
+    plane = SETTING.exposure[:, None, None] * np.broadcast_to(7.0 + 3.0 * edge, want.shape)
+    assert got[:, beside] == pytest.approx(plane[:, beside], abs=1e-9)
+
+
+def test_derivatives_of_a_part_are_differences_of_its_own_images(part):
+    names, x = ("bias_x_nm", "coma_y_rad", "decentre_x_um", "distance_um"), vector(HIDDEN)
+    slopes = part.images(x, names)[1]
+    for name, step, got in zip(names, (0.2, 5e-3, 1e-2, 5e-2), slopes, strict=True):
+        way = step * (np.arange(len(x)) == PLACE[name])
+        want = (part.images(x + way)[0] - part.images(x - way)[0]) / (2 * step)
+        assert np.linalg.norm(got - want) < 0.06 * np.linalg.norm(want), name  # slopes of a quick model: 5 %
+
+
+def test_a_residual_phase_goes_along_to_fewer_nodes(model, part):
+    def bumps(u, v, count):
+        return np.stack([u**2 - 0.3 * v, u * v**2][:count])
+
+    modes = np.array([0.31, -0.22])
+    whole, few = model.with_residual(modes, bumps), part.with_residual(modes, bumps)
+    after = whole.quick(ROWS, COLUMNS)
+    x = vector(HIDDEN)
+    want = few.images(x)[0]
+    assert after.images(x)[0] == pytest.approx(want, abs=1e-4 * want.max())
+    assert np.abs(want - part.images(x)[0]).max() > 0.05 * want.max()
+
+
+def test_places_of_a_part_are_those_of_the_same_pixels_in_the_whole():
+    """Two samples a pixel; of 3 to 7 of 11 rows, 2 to 5 of 8 columns, and a part of that."""
+    whole = detector.Grid(11, 8, 1.5, 2, 4, (0.7, -1.1))
+    one = whole.part(slice(3, 8), slice(2, 6), 1)
+    two = one.part(slice(1, 4), slice(1, 4), 3)
+    for grid, rows, columns in ((one, (3, 8), (2, 6)), (two, (4, 7), (3, 6))):
+        assert grid.margin == 1
+        for axis, every, (first, last) in zip(grid.axes_um(), whole.axes_um(), (rows, columns), strict=True):
+            assert axis == pytest.approx(every[2 * (first + 4 - 1) : 2 * (last + 4 + 1)], abs=1e-12)
+        y, x = grid.ends_um()
+        assert y == pytest.approx((np.array([rows[0], rows[1] - 1]) - 5) * 1.5 - 1.1)
+        assert x == pytest.approx((np.array([columns[0], columns[1] - 1]) - 4) * 1.5 + 0.7)
+
+
+def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in_a_million(model):
+    """Two frames of a bright pixel, 900 electrons over 90, and of dim ones that tell 1e-6 and 1e-3 of what it does."""
+    x = vector({"background_e": 5.0, "background_x_e": 2.0})
+    plane = np.broadcast_to(5.0 + 2.0 * (np.arange(28) - 14) / 14, (2, 29, 28)) * SETTING.exposure[:, None, None]
+    light = np.zeros((2, 29, 28))
+    light[0, 12, 9], light[1, 14, 11] = 900.0, 900.0
+    light[0, 20, 25] = 900.0 * 1e-3  # 1e-6 of what the bright one tells
+    light[1, 8, 7] = 900.0 * 0.03
+    noise = np.full(light.shape, 90.0)
+    data = Data(light, np.ones(light.shape, bool), np.zeros(light.shape, bool), noise, np.full(light.shape, 1e9))
+    assert lit_part(model, data, x, light + plane) == (slice(8, 15), slice(7, 12))
+    usable = np.ones(light.shape, bool)
+    usable[1, 8, 7] = False
+    masked = dataclasses.replace(data, usable=usable)
+    assert lit_part(model, masked, x, light + plane) == (slice(12, 15), slice(9, 12))
+
+
+def test_beside_the_part_images_go_straight_on_and_within_it_what_is_left_out_stays():
+    rng = np.random.default_rng(4)
+    value, image, slopes = np.array([1.0, -2.0]), rng.normal(size=(3, 4, 5)), rng.normal(size=(2, 3, 4, 5))
+    beside = np.zeros((4, 5), bool)
+    beside[0], beside[2, 3] = True, True
+    left = LeftOut(value, image, slopes, beside)
+
+    def plain(x, jacobian):
+        rates = np.broadcast_to(np.array([2.0, -1.0])[:, None, None, None], (2, 3, 4, 5))
+        return np.full((3, 4, 5), 2 * x[0] - x[1]), rates if jacobian else None
+
+    x = np.array([1.3, -1.4])
+    got, rates = left.added(plain, None)(x, True)
+    want = 4.0 + image
+    want[:, beside] += 0.3 * slopes[0][:, beside] + 0.6 * slopes[1][:, beside]
+    assert got == pytest.approx(want, abs=1e-12)
+    assert rates == pytest.approx(np.array([2.0, -1.0])[:, None, None, None] + slopes)
+    some = np.array([2, 0])
+    few, none = left.added(lambda *a: (plain(*a)[0][some], None), some)(x, False)
+    assert few == pytest.approx(want[some], abs=1e-12)
+    assert none is None
