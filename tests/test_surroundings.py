@@ -195,7 +195,10 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(tmp_path, monkeyp
     (tmp_path / "library.h5").touch()
     inside = tmp_path / "library.h5" / "out.h5"
     for target, found in (
-        (tmp_path / "out.h5", "out.h5: folder .* cannot be written .Read-only file system"),
+        (
+            tmp_path / "out.h5",
+            "out.h5: folder .* cannot be written: give another .Read-only file system folder",
+        ),
         (inside, "out.h5: folder .*library.h5 is a file: give another name"),
     ):
         monkeypatch.setattr(lock, "_taken", refused)

@@ -106,8 +106,7 @@ def _gap(found: DrcReport) -> str:
 
 
 def _text(path: Path, found: DrcReport, form: list[Finding]) -> str:
-    broken = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
-    broken += f"{', ' if broken else ''}{len(form)} of form" if form else ""
+    broken = ", ".join(filter(None, [found.broken, f"{len(form):,} of form" if form else ""]))
     verdict = f"FAILS: design rules broken: {broken}" if broken else "keeps the design rules"
     lines = [
         f"{path}: {verdict}",

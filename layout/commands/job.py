@@ -119,8 +119,7 @@ class Job:
                 for name, c in self.certified.items()
                 if not c.ok
             ]
-        broken = ", ".join(f"{count} {rule}" for rule, count in self.drc.counts.items() if count)
-        return found + ([f"design rules broken: {broken}"] if broken else [])
+        return found + ([f"design rules broken: {self.drc.broken}"] if self.drc.broken else [])
 
     @property
     def _too_few(self) -> str:

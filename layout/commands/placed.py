@@ -54,9 +54,8 @@ class Work:
     def broken(self, name: str, found: DrcReport) -> None:
         """Enter what was found of the rules of a part."""
         self.rules[name] = found
-        text = ", ".join(f"{count} {rule}" for rule, count in found.counts.items() if count)
-        if text:
-            self.failures.append(f"{name}: design rules broken: {text}")
+        if found.broken:
+            self.failures.append(f"{name}: design rules broken: {found.broken}")
 
     def beside(self, file: Path) -> Path:
         """A file that the arrangement names."""

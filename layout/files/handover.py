@@ -113,7 +113,7 @@ def _lines(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[st
     areas = areas_um2(plan)
     for layer, dose in sorted(plan.doses.items()):
         absolute, name = dose * process.exposure.base_uC_cm2, plan.layer_names.get(layer, "")
-        yield f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} {areas[layer]:>14.1f}  {name}"
+        yield f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} {areas[layer]:>14,.1f}  {name}"
     yield ""
     steps = sequence(split)
     yield f"Write fields: {len(steps)} ({split.mode}), in the order of fields.csv"

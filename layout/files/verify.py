@@ -186,5 +186,5 @@ def _differences(lattice: Lattice, read: Array, count: int) -> list[str]:
         if unlike.any():
             row, column = np.unravel_index(int(unlike.argmax()), unlike.shape)
             place = f"row {first + int(row)}, column {int(column)}"
-            return [f"{lattice.name}: {int(unlike.sum())} sites differ, the first at {place}"]
-    return [] if count == planned else [f"{lattice.name}: {count} pillars, planned {planned}"]
+            return [f"{lattice.name}: {int(unlike.sum()):,} sites differ, the first at {place}"]
+    return [] if count == planned else [f"{lattice.name}: {count:,} pillars, planned {planned:,}"]

@@ -66,7 +66,7 @@ def write_lyrdb(plan: Named, report: DrcReport, path: str | Path) -> None:
     for rule, count in report.counts.items():
         category = ElementTree.SubElement(categories, "category")
         ElementTree.SubElement(category, "name").text = rule
-        ElementTree.SubElement(category, "description").text = f"{count} violations, limit {report.limits[rule]:g}"
+        ElementTree.SubElement(category, "description").text = f"{count:,} violations, limit {report.limits[rule]:g}"
         ElementTree.SubElement(category, "categories")
     cell = ElementTree.SubElement(ElementTree.SubElement(root, "cells"), "cell")
     for key, value in (("name", plan.name), ("variant", ""), ("layout-name", "")):

@@ -126,11 +126,15 @@ class DrcReport:
         return other
 
     @property
+    def broken(self) -> str:
+        """The rules that are broken, with how often, for a person; empty where all are kept."""
+        return ", ".join(f"{count:,} {rule}" for rule, count in self.counts.items() if count)
+
+    @property
     def summary(self) -> str:
         """One line for a person."""
-        found = ", ".join(f"{count} {rule}" for rule, count in self.counts.items() if count)
         return (
             f"{self.pillars:,} pillars: smallest gap {told(self.minimum_gap_nm)}, "
             f"thinnest {told(self.minimum_feature_nm)}, density up to {self.maximum_density:.1%}; "
-            + (f"violations: {found}" if found else "no violation")
+            + (f"violations: {self.broken}" if self.broken else "no violation")
         )

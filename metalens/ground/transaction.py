@@ -163,7 +163,7 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
         try:
             held.enter_context(lock.held(target))
         except OSError as error:
-            raise OutputError(f"{target}: folder {target.parent} cannot be written ({error.strerror})") from error
+            raise OutputError(f"{target}: its folder cannot be written ({error.strerror}); give another") from error
         for left in lock.left(target):
             _recover(left, target)
         store.clear(target.with_name(target.name + JOURNAL))  # scratch of a journal whose writer was killed

@@ -51,7 +51,7 @@ def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving
     plans = [(one.seconds + one.parts**2 * _PLAN_SECONDS, one.nodes) for one in found if one is not None]
     windowed = sum(seconds + pillars * _PILLAR for seconds, _ in plans)
     if exact < windowed and not differentiable:
-        size = f"{pillars} pillars at {_points(case)} points"
+        size = f"{pillars:,} pillars at {_points(case)} points"
         reason = f"exact sum: {size} take {_told(exact)} s, windowed {_told(windowed)} s"
         return Choice("exact", reason, ((case,),), exact)
     times = f"{_told(windowed)} s, exact sum {_told(exact)} s"

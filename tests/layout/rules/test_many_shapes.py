@@ -8,7 +8,7 @@ import pytest
 from layout.files import QUARTERS, CellContent, Gathered, MaskContent, Placed, content, flat
 from layout.oasis import cells
 from layout.process import Rules
-from layout.rules import foreign, near
+from layout.rules import DrcReport, foreign, near
 
 SQUARE = np.array([[-70, -50], [60, -50], [60, 50], [-70, 50]])
 
@@ -82,3 +82,11 @@ def test_cells_are_numbered_by_those_that_occur(spread):
     assert used.tolist() == sorted(set(child.tolist()))
     assert np.array_equal(used[index], child)
     assert index.dtype == np.int32
+
+
+def test_counts_of_broken_rules_are_parted_by_thousands():
+    report = DrcReport.empty(MaskContent("OASIS", 1.0, {}), Rules())
+    assert report.broken == ""
+    report.counts |= {"gap": 8_721_433, "feature": 907}
+    assert report.broken == "8,721,433 gap, 907 feature"
+    assert report.summary.endswith("violations: 8,721,433 gap, 907 feature")
