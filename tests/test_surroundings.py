@@ -197,7 +197,7 @@ def test_an_output_that_cannot_be_made_is_named_with_the_cause(tmp_path, monkeyp
     for target, found in (
         (
             tmp_path / "out.h5",
-            "out.h5: folder .* cannot be written: give another .Read-only file system folder",
+            "out.h5: its folder cannot be written .Read-only file system.; give another",
         ),
         (inside, "out.h5: folder .*library.h5 is a file: give another name"),
     ):
