@@ -80,9 +80,10 @@ def model(
 
 def finite(parameters: Iterable[nn.Parameter]) -> bool:
     """Whether all gradients that there are have finite numbers alone; a device is asked once."""
-    found = [torch.isfinite(p.grad).all() for p in parameters if p.grad is not None]
-    places = {one.device for one in found}
-    return all(bool(torch.stack([one for one in found if one.device == place]).all()) for place in places)
+    grads = [p.grad for p in parameters if p.grad is not None]
+    places = {g.device for g in grads}
+    largest = (nn.utils.get_total_norm([g for g in grads if g.device == place], math.inf) for place in places)
+    return all(bool(torch.isfinite(one)) for one in largest)
 
 
 def laid_out(optimiser: torch.optim.Optimizer) -> None:

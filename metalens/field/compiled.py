@@ -6,6 +6,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.threads import split
+from metalens.image.scene import fixed as fixed
 from metalens.image.scene import plain as plain
 from metalens.image.scene import values as values
 from metalens.lens import answers

@@ -18,7 +18,7 @@ import scipy.fft
 import torch
 from torch import Tensor
 
-from metalens.field import compiled, even, products
+from metalens.field import compiled, even, products, together
 from metalens.field.patches import Patch, dense, lagrange
 from metalens.field.plan import Grid, Plan
 from metalens.field.stray import Stray, add_stray
@@ -26,7 +26,7 @@ from metalens.ground.errors import SceneError
 from metalens.image import Frames
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
-CHUNK, AT_ONCE = 8, 32  # frames that are imaged together: on the processor, on another device
+CHUNK, AT_ONCE = 8, 128  # frames that are imaged together: on the processor, on another device
 COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
 
 
@@ -126,6 +126,8 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
         seen = given[0].numpy(), given[1].numpy(), given[2].numpy()
         kernels = [t.contiguous().numpy() for t in optics.transfer]
         products.through(seen, optics.patches, kernels, shapes, out.numpy())
+    elif out.device.type != "cpu":
+        together.through(given, optics.patches, optics.transfer, shapes, out)
     else:
         for patch, transfer, shape in zip(optics.patches, optics.transfer, shapes, strict=True):
             _add(patch, transfer, shape, given, out)
@@ -223,7 +225,7 @@ def blurred(frames: Frames, optics: Imager) -> Tensor:
 def _far_alone(frames: Frames) -> bool:
     """Whether the far sheet covers everything, so that nothing is hidden; never where coverage has derivatives."""
     cover, light = frames.coverage, frames.radiance
-    if not (compiled.plain(cover) and compiled.plain(light)):
+    if not (compiled.fixed(cover) and compiled.fixed(light)):
         return False
     return not bool(cover[:, 0].any()) and not bool(light[:, 0].any()) and bool((cover[:, 1] == 1).all())
 

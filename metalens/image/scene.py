@@ -263,9 +263,12 @@ def plain(a: Tensor) -> bool:
 
 def values(a: Tensor) -> bool:
     """Whether it lies in main memory and carries no derivatives, backward or forward."""
-    if a.device.type != "cpu" or a.requires_grad:
-        return False
-    return forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
+    return a.device.type == "cpu" and fixed(a)
+
+
+def fixed(a: Tensor) -> bool:
+    """Whether it carries no derivatives, backward or forward."""
+    return not a.requires_grad and forward_ad.unpack_dual(a).tangent is None  # type: ignore[no-untyped-call]
 
 
 def with_kernels(optics: UniformImager, kernels: Tensor) -> UniformImager:

@@ -1,13 +1,16 @@
 """The true image on another device than the processor: the same numbers to rounding, by the same code."""
 
+import dataclasses
+import functools
 import math
 
 import pytest
+import scipy.fft
 import torch
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import Grid, Layers, SmoothWave, imager, surrogate
+from metalens.field import Grid, Layers, SmoothWave, forming, imager, patches, surrogate, together
 from metalens.field.points import Optics
 from metalens.image import Frames, basis, image, uniform_imager
 from tests.elsewhere import AWAY, elsewhere
@@ -58,6 +61,38 @@ def test_psfs_and_images_are_those_of_the_processor(both):
     assert there.parts.keys() == here.parts.keys()
     for name, value in here.parts.items():
         assert there.parts[name] == pytest.approx(value, abs=1e-4), name
+
+
+@pytest.mark.parametrize("kinds", [1, 2])
+def test_patches_taken_together_are_those_one_by_one(both, kinds):
+    """Of unlike sizes and numbers of kernels, a few at a time; light, coverage, and the slopes of their transforms."""
+    here, frames = both[0], _frames(GRID, seed=6)
+    about = {"patches": 3, "overlap": 3, "tolerance": 0.02}
+    cut = patches.cut(here.stack, here.energy, forming.between_nodes(GRID, here.plan), **about)
+    made = [patch.trimmed(0.2, 0.4) if i % 3 else patch for i, patch in enumerate(cut)]
+    assert len({len(patch.mix) for patch in made}) > 1
+    assert len({patch.coverage for patch in made}) > 1
+    made = forming.with_psfs(dataclasses.replace(here, patches=made, transfer=[], even=None), here.stack, here.energy)
+    given = frames.radiance, frames.coverage, forming.vergence(frames.depth_um, here.plan.depths_um)
+    sides = [(b - a for a, b in (patch.rows, patch.columns)) for patch in made.patches]
+    shapes = [tuple(scipy.fft.next_fast_len(n + GRID.window - 1, real=True) for n in pair) for pair in sides]
+    few = functools.partial(together.through, held_bytes=3 * 6 * 8 * made.transfer[0].numel())
+    found = []
+    for way in (few, _one_by_one):
+        transfer = [part.clone().requires_grad_() for part in made.transfer]
+        out = torch.zeros(3, kinds, 2, *(n + 2 * (GRID.window // 2) for n in GRID.frame))
+        way(given, made.patches, transfer, shapes, out)
+        (out.square() * torch.linspace(0.2, 1.7, out.shape[-1])).sum().backward()
+        found.append((out.detach(), [part.grad for part in transfer]))
+    (seen, slopes), (want, steep) = found
+    assert torch.allclose(seen, want, rtol=0, atol=SINGLE * float(want.max()))
+    for one, other in zip(slopes, steep, strict=True):
+        assert torch.allclose(one, other, rtol=0, atol=1e-5 * float(other.abs().max()))
+
+
+def _one_by_one(given, patches, transfer, shapes, out):
+    for patch, kernels, shape in zip(patches, transfer, shapes, strict=True):
+        forming._add(patch, kernels, shape, given, out)
 
 
 def test_an_imager_moves_and_comes_back(both):
