@@ -12,6 +12,7 @@ to 1, are folded into the weights.
 import itertools
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -155,66 +156,102 @@ def cut(
         patches: along each axis. overlap: pixels that two neighbours share.
         tolerance: of the image of a 1/f texture, relative L2, at the worst depth of every patch.
     """
-    along = [shares(len(part), patches, overlap) for part in grid]
-    seen = texture_view(stack.detach().double())
-    return [_patch(seen, energy, grid, row, column, tolerance) for row, column in itertools.product(*along)]
+    along = [[_line(part, *one) for one in shares(len(part), patches, overlap)] for part in grid]
+    pairs = list(itertools.product(*along))
+    known = Products(texture_view(stack.detach().double()), [len(y.nodes) * len(x.nodes) for y, x in pairs])
+    return [_patch(known, energy, line, tolerance) for line in pairs]
 
 
-def _patch(
-    seen: Tensor,
-    energy: Tensor,
-    grid: list[Tensor],
-    row: tuple[int, int, Tensor],
-    column: tuple[int, int, Tensor],
-    tolerance: float,
-) -> Patch:
+class Line(NamedTuple):
+    """A patch along one axis.
+
+    ends: first pixel and the one behind the last. share: of them. between: (pixels, nodes) interpolation from the nodes
+    of these numbers. few: rows of it from whose PSFs the kernels are made; many: whose weights are interpolated, at
+    pixels ``at``.
+    """
+
+    ends: tuple[int, int]
+    share: Tensor
+    between: Tensor
+    nodes: Tensor
+    few: Tensor
+    many: Tensor
+    at: Tensor
+
+
+def _line(grid: Tensor, first: int, behind: int, share: Tensor) -> Line:
+    inside = grid[first:behind]
+    nodes = torch.nonzero(inside.abs().amax(0) > 0)[:, 0]
+    inside = inside[:, nodes]
+    few, many = (_places(len(inside), count) for count in (PLACES, max(PLACES, len(nodes))))
+    return Line((first, behind), share, inside, nodes, inside[few], inside[many], many)
+
+
+class Products:
+    """Scalar products of the nodes' PSFs as a texture shows them: all that patches are made of, since PSFs between the
+    nodes are mixtures of theirs.
+
+    All products at once where that is less work than those of every patch, whose nodes are shared with its neighbours.
+    """
+
+    def __init__(self, seen: Tensor, counts: list[int]) -> None:
+        """``seen``: (node rows, node columns, depths, features). ``counts``: nodes of every patch."""
+        self.seen, self.depths, self.columns = seen.flatten(0, 2), seen.shape[2], seen.shape[1]
+        apart = sum((count * self.depths) ** 2 for count in counts)
+        self.whole = self.seen @ self.seen.mT if len(self.seen) ** 2 <= apart else None
+
+    def of(self, nodes: Tensor) -> Tensor:
+        """(nodes, depths, nodes, depths) of some nodes, all depths: those of their flat numbers."""
+        if self.whole is not None:
+            found = self.whole[nodes[:, None], nodes]
+        else:
+            near = self.seen[nodes]
+            found = near @ near.mT
+        return found.unflatten(1, (-1, self.depths)).unflatten(0, (-1, self.depths))
+
+
+def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance: float) -> Patch:
     """Leading singular vectors of the PSFs at a few places of a patch, and what they weigh at every pixel and depth."""
-    inside = [g[a:b].to(seen) for g, (a, b, _) in zip(grid, (row, column), strict=True)]
-    touched = [torch.nonzero(part.abs().amax(0) > 0)[:, 0] for part in inside]
-    near, depths = seen[touched[0]][:, touched[1]], seen.shape[2]
-    share = (row[2].to(seen)[:, None] * column[2].to(seen)).flatten()
-    some = [_places(part, PLACES) for part in inside]
-    rows, at_y, at_x = _at_places(near, inside, some, touched)
-    values, vectors = torch.linalg.eigh(rows @ rows.mT)
+    seen, depths = known.seen, known.depths
+    along = [Line(line.ends, *(part.to(seen.device) for part in line[1:])) for line in lines]
+    share = (along[0].share.to(seen)[:, None] * along[1].share.to(seen)).flatten()
+    nodes = _flat([line.nodes for line in along], known.columns, depths)
+    few, many = (torch.kron(*(getattr(line, name).to(seen) for line in along)) for name in ("few", "many"))
+    to_few = torch.einsum("uzsw,ps->uzpw", known.of(nodes), few)  # the nodes' PSFs with those at the places
+    values, vectors = torch.linalg.eigh(torch.einsum("uzpw,qu->qzpw", to_few, few).flatten(2).flatten(0, 1))
     values, vectors = values.flip(0).clamp_min(1e-14 * float(values[-1])), vectors.flip(1)
     power = (vectors**2 * values).reshape(-1, depths, len(values)).mean(0)
     missing = torch.sqrt(power.flip(1).cumsum(1).flip(1) / power.sum(1, keepdim=True)).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
     left = vectors[:, :rank]
-    more = [_places(part, max(PLACES, len(nodes))) for part, nodes in zip(inside, touched, strict=True)]
-    weighed = _at_places(near, inside, more, touched)[0] @ (rows.mT @ (left / values[:rank]))
-    table = weighed.reshape(len(more[0]), len(more[1]), depths, rank)
-    to_y, to_x = (
-        dense(torch.arange(len(part), dtype=torch.float64, device=seen.device), at.double()).to(seen)
-        for part, at in zip(inside, more, strict=True)
-    )
-    table = torch.einsum("yp,xq,pqzr->yxzr", to_y, to_x, table).flatten(0, 1) * share[:, None, None]
-    mix = torch.einsum("pa,qb,pqzr->rabz", at_y, at_x, left.unflatten(0, (len(at_y), len(at_x), depths))).flatten(1)
+    weighed = torch.einsum("uzr,qu->qzr", to_few.flatten(2) @ (left / values[:rank]), many)
+    table = weighed.unflatten(0, [len(line.at) for line in along])
+    table = torch.einsum("yp,xq,pqzr->yxzr", *(_to_pixels(line).to(seen) for line in along), table)
+    table = table.flatten(0, 1) * share[:, None, None]
+    mix = torch.einsum("qu,qzr->ruz", few, left.unflatten(0, (-1, depths))).flatten(1)
+    lit = energy[along[0].nodes][:, along[1].nodes].to(seen)
     return Patch(
-        (row[0], row[1]),
-        (column[0], column[1]),
+        along[0].ends,
+        along[1].ends,
         share.float(),
         _lit(table, mix, share).float(),
-        torch.einsum("ya,xb,abz->yxz", *inside, energy.to(seen)).flatten(0, 1).float(),
+        torch.einsum("ya,xb,abz->yxz", *(line.between.to(seen) for line in along), lit).flatten(0, 1).float(),
         mix.float(),
-        _flat(touched, seen.shape[1], depths),
+        nodes,
         torch.cat([missing, missing.new_zeros(1)])[: rank + 1],
         rank,
     )
 
 
-def _places(inside: Tensor, count: int) -> Tensor:
-    """(count,) pixels of a patch (pixels, nodes) from its first to its last, at most all of them."""
-    last, few = len(inside) - 1, min(count, len(inside))
-    return torch.linspace(0, last, few, dtype=torch.float64, device=inside.device).round().long()
+def _to_pixels(line: Line) -> Tensor:
+    """(pixels, many) interpolation from the places whose weights are known."""
+    pixel = torch.arange(len(line.between), dtype=torch.float64, device=line.at.device)
+    return dense(pixel, line.at.double())
 
 
-def _at_places(
-    near: Tensor, inside: list[Tensor], places: list[Tensor], touched: list[Tensor]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(places × depths, features) PSFs at pixels of a patch, and the weights of the nodes in them along y and x."""
-    at_y, at_x = (part[at][:, few] for part, at, few in zip(inside, places, touched, strict=True))
-    return torch.einsum("pa,qb,abzf->pqzf", at_y, at_x, near).flatten(0, 2), at_y, at_x
+def _places(pixels: int, count: int) -> Tensor:
+    """(count,) pixels of a patch from its first to its last, at most all of them."""
+    return torch.linspace(0, pixels - 1, min(count, pixels), dtype=torch.float64).round().long()
 
 
 def _flat(touched: list[Tensor], columns: int, depths: int) -> Tensor:
