@@ -155,3 +155,12 @@ def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
 def test_pixels_wider_than_a_spot_are_refused():
     with pytest.raises(ConfigError, match="pixel_um = 40"):
         Fisher(pixel_um=40.0).about(Focus(0.85, 2000.0, 20e3), 500.0)
+
+
+@pytest.mark.parametrize("even", [0.0, 0.3, 1.0])
+def test_information_of_nothing_counts_as_a_ten_thousandth(even):
+    """Of objects 5 to 9 m away an aperture of 0.8 mm tells no depth, by fewer than 1e-7 per mm²: log 1e-4 of all."""
+    settings = dataclasses.replace(QUICK, depths_mm=(5000.0, 9000.0), step_um=1e5, even=even, angles_deg=(0.0, 3.0))
+    phase = torch.zeros_like(pupils.radius(SMALL))
+    loss, _ = AxialObjective(SMALL, settings).loss(phase, 20e3, None)
+    assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)
