@@ -59,8 +59,9 @@ def test_rounding_does_not_keep_a_lens_from_being_alike_in_its_eighths():
     assert (own - lowest).max() == 1  # the lower of two neighbouring steps
 
 
-@pytest.mark.parametrize("away_um", [2.0, 6.0])
+@pytest.mark.parametrize("away_um", [2.0, 6.8])
 def test_a_lens_beside_a_pad_keeps_its_own_doses(away_um):
+    """At 6.8 um 0.41 erfc(6.8 / 3.2) / 2 = 5e-4 of 0.4 is 8e-2 of a step: eight times what passes for rounding."""
     before = plan(away_um)
     made, found = dosed.corrected(before, PROCESS)
     own = nearest(before, found)
