@@ -138,7 +138,7 @@ def climbed(climb: Ladder, cut: float, tolerance: float, at: Callable[[int], Jon
         error = climb.crowded * moved(history, reach, before) + cut
         if len(history) > before and error <= tolerance:
             break
-    error = min(error, 2.0)
+    error = min(error, 1 + max(1.0, float(np.abs(history[-1]).max())))  # the true ones are 1 at most
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
     looked_at = [both[0] for both in history[-1 - before : -1]]

@@ -245,6 +245,19 @@ def test_a_general_cell_s_bar_is_as_wide_as_its_truncations_lie_apart(monkeypatc
     assert any_shape.jones(cell, 0.4 - gap_um, 0.85, harmonics=9, tolerance=1.001 * want).converged
 
 
+@pytest.mark.parametrize(("most", "want"), [(0.7, 2.0), (4.9, 5.9)])
+def test_a_bar_is_no_wider_than_to_the_farthest_that_a_passive_cell_may_be(monkeypatch, most, want):
+    """Coarse truncations of a metal at a resonance give |t| = 4.9, whose true t, of size 1 at most, may be 5.9 away."""
+
+    def truncated(this, reach, stages):
+        t = np.diag([most * (-1) ** reach, 0.5j])
+        return any_shape.Jones(("x", "y"), t, 0.2 * t, math.nan, np.ones(2), 0, False, "")
+
+    monkeypatch.setattr(any_shape, "_truncated", truncated)
+    found = any_shape.jones(CELL, 0.2, 0.85, harmonics=9)
+    assert found.t_error == pytest.approx(want, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("angle_rad", "azimuth_rad", "upright", "tilted"), [(0, 0, 15, 10), (0.2, 0, 10, 7), (0.2, 0.5, 9, 6)]
 )
