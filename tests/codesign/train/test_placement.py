@@ -61,7 +61,7 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
     """Images, pixels, network, losses and the way back to lens and pitch: nothing of it is for the processor alone."""
     plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
     (want,) = plain.run(until=1)
-    with elsewhere() as done, swapped():
+    with elsewhere() as done, swapped(), one_thread():  # the other device is that of one thread
         placement.place(moved, AWAY)
         for group in (g for o in moved.optimisers.values() for g in o.param_groups):
             group["fused"] = False  # one kernel of PyTorch's own, which knows no devices but its list
@@ -76,6 +76,16 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
         assert float((one - other).norm()) <= 5e-2 * float(one.norm()), part  # a count that falls the other way: 1e-2
     for name, p in plain.model.net.named_parameters():
         assert there[name].shape == p.shape
+
+
+@contextlib.contextmanager
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager
