@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from metalens.field import gathered
+from metalens.field import left_out
 from metalens.field import patches as cutting
-from metalens.field.forming import Imager, between_nodes, blurred, evened, psfs_used, trimmed, with_psfs
-from metalens.field.patches import relative
-from metalens.field.plan import SHARES, Grid, Plan, neglected, planned, spectral, unpolarised
+from metalens.field.forming import Imager, between_nodes, blurred, evened, lights_used, psfs_used, trimmed, with_psfs
+from metalens.field.plan import SHARES, Grid, Plan, planned, spectral
 from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
 from metalens.field.through import through
@@ -109,11 +108,15 @@ def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tenso
     """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
     y, x = torch.meshgrid(plan.y_um.to(plan.x_um), plan.x_um, indexing="ij")
-    places = torch.stack([x, y], -1).numpy()
-    tangents = places / optics.layers.after(optics.distance_um, wave).reduced_um
-    rays = [optics.layers.through_middle(tangents, depth, wave) for depth in plan.depths_um.tolist()]
-    cosine2 = torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)))
-    return light / total[..., None, None], total * (cosine2**2).to(total)
+    cosine4 = _cosine4(optics, torch.stack([x, y], -1), plan.depths_um, wave)
+    return light / total[..., None, None], total * cosine4.to(total)
+
+
+def _cosine4(optics: Optics, at_um: Tensor, depths_um: Tensor, wavelength_um: float) -> Tensor:
+    """(…, depths) cos⁴ of the field angles of places (…, [x, y]), at the middle of the stop where there is one."""
+    tangents = at_um.numpy() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    rays = [optics.layers.through_middle(tangents, depth, wavelength_um) for depth in depths_um.tolist()]
+    return torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)) ** 2)
 
 
 def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
@@ -177,8 +180,8 @@ def trial(grid: Grid) -> Frames:
 
 
 def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
-    """Errors at places, depths and wavelengths that no node holds: interpolation, transform, components of the field
-    that are left out, pillars taken together; light left outside."""
+    """Errors at places, depths and wavelengths that no node holds: interpolation of PSFs and of their light,
+    transform, components of the field that are left out, pillars taken together; light left outside."""
     plan = made.plan
     draw = np.random.default_rng(7)
     pixels = torch.from_numpy(np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)).long()
@@ -192,35 +195,37 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     true = spectral(optics, at, depths, plan.waves, plan.window).detach()
     wave = float(plan.waves.wavelengths_um[0])
     whole = through(optics, at, depths_um=depths, wavelength_um=wave, window=plan.window)
-    held = true.sum((-1, -2)) / whole
-    true = true / true.sum((-1, -2), keepdim=True)
+    light = true.sum((-1, -2))
+    level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[..., None, None]
     with torch.no_grad():
-        got = psfs_used(made, pixels, depths)
-    nodes = float((relative(got.cpu().double(), true.double()) ** 2).mean().sqrt())
+        got = (psfs_used(made, pixels, depths) * lights_used(made, pixels, depths)[..., None, None]).cpu()
+    nodes = cutting.together(got, true * level)
     few = at[:NEGLECTED], depths
-    transform = neglected(optics, plan.waves, plan.window, few)
+    share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt())  # of the brightest of few places in the image
+    transform = left_out.neglected(optics, plan.waves, plan.window, few) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
-    found["polarisation"] = unpolarised(optics, plan.waves, plan.window, few)
-    found["pillars"] = gathered.missing(optics, wave, plan.window, (at[:ALL], depths))
+    found["polarisation"] = left_out.unpolarised(optics, plan.waves, plan.window, few) * share
+    found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
-        shown = true[:NEGLECTED], held[:NEGLECTED]
+        shown = (true / light[..., None, None])[:NEGLECTED], (light / whole)[:NEGLECTED], (light / light.amax(0))
         found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um)
-    return {**found, "edge": edge, "outside": 1 - float(held.mean())}
+    return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
 
 
 def _ripples(
-    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: tuple[Tensor, Tensor], step_um: float
+    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: tuple[Tensor, ...], step_um: float
 ) -> float:
-    """Error of the stop's shadow, the worst of some places and depths; light: their PSFs, and the share of it that
-    these hold."""
+    """Error of the stop's shadow, the worst of some places and depths; light: their PSFs, the share of their light that
+    these hold, and their light over that of the brightest place."""
     places, depths_um = seen
     held = light[1].cpu().numpy().clip(1e-6, 1)
     blurs_um = blur_um(light[0].cpu().numpy(), step_um, held)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     found = []
-    for place, row, parts in zip((places / reduced).tolist(), blurs_um / reduced, held, strict=True):
+    for place, row, parts, lit in zip((places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=False):
         rads = row / math.hypot(1, *place)
-        each = zip(depths_um.tolist(), rads.tolist(), parts.tolist(), strict=True)
-        found += [optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, *rest) for z, *rest in each]
+        for z, rad, part, bright in zip(depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True):
+            error = optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad, part)
+            found.append(error * bright)
     return max(found)

@@ -288,6 +288,16 @@ def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
     return out
 
 
+def lights_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
+    """(n, depths) E of sources at (n, [row, column]) of the frame."""
+    depths, energy = optics.plan.depths_um, optics.energy
+    position = vergence(depths_um, depths)
+    deep = dense(position, torch.arange(len(depths), dtype=position.dtype))
+    ends = [part[at] for part, at in zip(between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True)]
+    light: Tensor = torch.einsum("na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy)
+    return light
+
+
 def trimmed(optics: Imager, tolerance: float) -> Imager:
     """The first kernels of every patch, as many as its own account of the tolerance needs."""
     made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]

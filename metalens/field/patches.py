@@ -32,7 +32,7 @@ class Patch:
     mix: (rank, nodes) rows of kernels over :attr:`nodes`; kernels = mix @ PSFs of the nodes.
     nodes: (nodes,) indices (row, column, depth, flattened) of the PSFs it is made of.
     missing: (kernels + 1,) relative L2 error of the image of a 1/f texture through so many of the kernels, at the worst
-        depth, if it were the same at all pixels.
+        depth, if it were the same at all pixels as bright as the patch's brightest.
     coverage: kernels that coverage takes.
     """
 
@@ -121,6 +121,19 @@ def relative(one: Tensor, other: Tensor) -> Tensor:
     a, b = texture_view(one.double()), texture_view(other.double())
     difference: Tensor = (a - b).norm(dim=-1) / b.norm(dim=-1)
     return difference
+
+
+def together(one: Tensor, other: Tensor) -> float:
+    """Relative L2 difference of the images of a 1/f texture through PSFs (places, depths, h, w), each as bright as its
+    light, over all places, at the worst depth; over what the brightest depth shows."""
+    a, b = texture_view(one.double()), texture_view(other.double())
+    return float(torch.sqrt(((a - b) ** 2).sum((0, -1)).max() / (b**2).sum((0, -1)).max()))
+
+
+def in_light(errors: Tensor, light: Tensor) -> float:
+    """Root mean square of the relative errors of PSFs (places, depths), each as bright as its light, over the brightest
+    place: what is dark shows little."""
+    return float(((errors * light / light.amax(0)) ** 2).mean().sqrt())
 
 
 def shares(pixels: int, count: int, overlap: int) -> list[tuple[int, int, Tensor]]:
@@ -221,7 +234,10 @@ def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance:
     values, vectors = torch.linalg.eigh(torch.einsum("uzpw,qu->qzpw", to_few, few).flatten(2).flatten(0, 1))
     values, vectors = values.flip(0).clamp_min(1e-14 * float(values[-1])), vectors.flip(1)
     power = (vectors**2 * values).reshape(-1, depths, len(values)).mean(0)
-    missing = torch.sqrt(power.flip(1).cumsum(1).flip(1) / power.sum(1, keepdim=True)).amax(0)
+    lit = energy[along[0].nodes][:, along[1].nodes].to(seen)
+    lit = torch.einsum("ya,xb,abz->yxz", *(line.between.to(seen) for line in along), lit).flatten(0, 1)
+    bright = (lit.detach().max() / energy.detach().max()).clamp(0, 1)
+    missing = bright * torch.sqrt(power.flip(1).cumsum(1).flip(1) / power.sum(1, keepdim=True)).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
     left = vectors[:, :rank]
     weighed = torch.einsum("uzr,qu->qzr", to_few.flatten(2) @ (left / values[:rank]), many)
@@ -229,13 +245,12 @@ def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance:
     table = torch.einsum("yp,xq,pqzr->yxzr", *(_to_pixels(line).to(seen) for line in along), table)
     table = table.flatten(0, 1) * share[:, None, None]
     mix = torch.einsum("qu,qzr->ruz", few, left.unflatten(0, (-1, depths))).flatten(1)
-    lit = energy[along[0].nodes][:, along[1].nodes].to(seen)
     return Patch(
         along[0].ends,
         along[1].ends,
         share.float(),
         _lit(table, mix, share).float(),
-        torch.einsum("ya,xb,abz->yxz", *(line.between.to(seen) for line in along), lit).flatten(0, 1).float(),
+        lit.float(),
         mix.float(),
         nodes,
         torch.cat([missing, missing.new_zeros(1)])[: rank + 1],

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled
-from metalens.field.patches import dense, relative
+from metalens.field.left_out import neglected, polarised
+from metalens.field.patches import dense, relative, together
 from metalens.field.points import Optics, Window, psfs
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
@@ -114,8 +115,7 @@ def planned(
     """
     if not 0 < tolerance < 1:
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
-    window = Window(grid.window, grid.step_um)
-    half = grid.half_um
+    window, half = Window(grid.window, grid.step_um), grid.half_um
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
     coarse = waves if isinstance(source, Nodes) else _coarse(source, 2)
     ends = depth_nodes(grid, 3)
@@ -135,7 +135,8 @@ def planned(
     if neglected(optics, coarse, window, (_corner(middle_um, half), ends)) > tolerance * SHARES["transform"]:
         window = replace(window, curved=True)
     some = torch.cat([_corner(middle_um, half), torch.tensor([middle_um], dtype=torch.float64)]), ends
-    window = polarised(optics, coarse, window, some, tolerance, polarisation=polarisation)
+    within = tolerance, tolerance * SHARES["polarisation"]
+    window = polarised(optics, coarse, window, some, polarisation, within=within)
     counts = [max(2, math.ceil((count - 1) * h / half[1]) + 1) for h in half]
     y, x = (
         m + (2 * placed(c, denser, (m, h)) / ALONG - 1) * h
@@ -181,68 +182,6 @@ def _corner(middle_um: tuple[float, float], half_um: list[float]) -> Tensor:
     return unit * torch.tensor([half_um[1], half_um[0]]) + torch.tensor(middle_um, dtype=torch.float64)
 
 
-def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
-    """What the transform neglects: PSFs of the first wavelength at (field points, depths), with the rays seen from
-    their own width beside the field point, against themselves."""
-
-    def found(shift_um: tuple[float, float]) -> Tensor:
-        wave = float(waves.wavelengths_um[0])
-        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=wave, window=window, shift_um=shift_um)
-        return light.detach()
-
-    plain = found((0.0, 0.0))
-    wide = width(plain / plain.sum((-1, -2), keepdim=True)) * window.step_um
-    return float((relative(found((wide * 0.6, wide * 0.8)), plain) ** 2).mean().sqrt())
-
-
-def polarised(
-    optics: Optics,
-    waves: Nodes,
-    window: Window,
-    at: tuple[Tensor, Tensor],
-    tolerance: float,
-    *,
-    polarisation: Polarisation,
-) -> Window:
-    """The window with one scalar where that images within the tolerance (``auto``), else with as few components of
-    the fields of both polarisations as image within their share of it."""
-    window = replace(window, flux=polarisation != "vector")
-    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= tolerance):
-        return window
-    tried = [replace(window, components=count) for count in range(1, window.whole + 1)]
-    whole, least = _of_sum_one(optics, waves, tried[-1], at), tolerance * SHARES["polarisation"]
-    return next(one for one in tried if unpolarised(optics, waves, one, at, whole) <= least)
-
-
-def unpolarised(
-    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], whole: Tensor | None = None
-) -> float:
-    """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
-    (field points, depths) against those of all components, ``whole`` where they are known."""
-    if window.components == window.whole:
-        return 0.0
-    few = _of_sum_one(optics, waves, window, at)
-    whole = _of_sum_one(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
-    return float((relative(few, whole) ** 2).mean().sqrt())
-
-
-def _of_sum_one(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> Tensor:
-    """PSFs of the first wavelength at (field points, depths)."""
-    with torch.no_grad():
-        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=float(waves.wavelengths_um[0]), window=window)
-        return light / light.sum((-1, -2), keepdim=True)
-
-
-def width(psfs: Tensor) -> float:
-    """Root mean square distance of the light from its centroid, samples, mean over the PSFs."""
-    n = psfs.shape[-1]
-    place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
-    total = psfs.sum((-1, -2))
-    x, y = (psfs.sum(-2) * place).sum(-1) / total, (psfs.sum(-1) * place).sum(-1) / total
-    square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
-    return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
-
-
 def waves_of(
     optics: Optics,
     grid: Grid,
@@ -262,7 +201,8 @@ def waves_of(
     for count in range(2, 17):
         made = _coarse(source, count)
         found = spectral(optics, at, ends, made, window)
-        error = float(relative(last, found).max())
+        light = found.sum((-1, -2))
+        error = float((relative(last, found) * light / light.amax(0)).max())  # of the image, where that is dark too
         if error + beside <= tolerance:  # of the rule before; this one is finer
             return replace(_coarse(source, count - 1), error=error + beside)
         last = found
@@ -296,29 +236,30 @@ DARK = (
 
 
 class _Known:
-    """PSFs of sum 1 at whole places of a line, each computed once."""
+    """PSFs at whole places of a line, of sum 1, and their light, each computed once."""
 
     def __init__(self, at: Callable[[Tensor], Tensor]) -> None:
-        self.at, self.kept = at, dict[int, Tensor]()
+        self.at, self.kept = at, dict[int, tuple[Tensor, Tensor]]()
 
     def error(self, nodes: list[int]) -> float:
-        """Of the interpolation half-way between the nodes, root mean square, at the worst depth."""
+        """Of the image of even radiance, by interpolation half-way between the nodes, at the worst depth."""
         between = sorted({(a + b) // 2 for a, b in itertools.pairwise(nodes)} - set(nodes))
-        want, given = self.psfs(between), self.psfs(nodes)
-        weights = dense(*(torch.tensor(places, dtype=torch.float64) for places in (between, nodes)))
-        got = torch.einsum("nk,kzyx->nzyx", weights.to(want), given)
-        return float((relative(got, want) ** 2).mean(0).sqrt().max())
+        (want, bright), given = self.psfs(between), self.psfs(nodes)
+        weights = dense(*(torch.tensor(places, dtype=torch.float64) for places in (between, nodes))).to(want)
+        got, light = (torch.tensordot(weights, part, 1) for part in given)
+        return together(got * light[..., None, None], want * bright[..., None, None])
 
-    def psfs(self, places: list[int]) -> Tensor:
-        """(places, depths, h, w)."""
+    def psfs(self, places: list[int]) -> tuple[Tensor, Tensor]:
+        """(places, depths, h, w) and (places, depths)."""
         missing = [i for i in places if i not in self.kept]
         if missing:
             found = self.at(torch.tensor(missing, dtype=torch.float64))
-            light = found.sum((-1, -2), keepdim=True)
+            light = found.sum((-1, -2))
             if not bool((light > 0).all()):
                 raise SceneError(DARK)
-            self.kept.update(zip(missing, found / light, strict=True))
-        return torch.stack([self.kept[i] for i in places])
+            self.kept.update(zip(missing, zip(found / light[..., None, None], light, strict=True), strict=True))
+        psfs, lights = zip(*(self.kept[i] for i in places), strict=True)
+        return torch.stack(psfs), torch.stack(lights)
 
 
 def _line(at: Callable[[Tensor], Tensor], span: tuple[float, float], tolerance: float) -> tuple[int, float]:

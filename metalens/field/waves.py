@@ -69,7 +69,7 @@ class PillarWave:
 
     Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`, the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image; what of it lands in the window is
-    measured by :mod:`metalens.field.gathered`.
+    measured by :mod:`metalens.field.left_out`.
 
     Raises:
         SceneError: another lattice than a square one, turned pillars, or pillars that answer x and y apart.

@@ -9,7 +9,7 @@ import torch
 
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus, profiles
-from metalens.field import Grid, Layers, Optics, PillarWave, SmoothWave, Window, gathered, imager, psfs
+from metalens.field import Grid, Layers, Optics, PillarWave, SmoothWave, Window, imager, left_out, psfs
 from metalens.field.patches import relative
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
@@ -66,7 +66,7 @@ def missing(made):
     for one, depth in zip(got, DEPTHS, strict=True):
         want = plane_waves(made.diameters.diameter_um, PLACE, depth)
         errors.append(float(relative(one / one.sum(), want / want.sum())))
-    return gathered.missing(optics, WAVELENGTH, window, at), math.hypot(*errors) / math.sqrt(2)
+    return left_out.missing(optics, WAVELENGTH, window, at), math.hypot(*errors) / math.sqrt(2)
 
 
 @pytest.mark.parametrize("levels", [None, 8])
@@ -81,7 +81,7 @@ def test_what_cells_of_pillars_leave_out_is_what_sums_over_all_pillars_have(leve
 def test_a_smooth_phase_takes_no_pillars_together():
     at = torch.tensor([PLACE], dtype=torch.float64), torch.tensor([5e3], dtype=torch.float64)
     optics = Optics(SmoothWave(FOCUS, RADIUS), Layers(), DISTANCE)
-    assert gathered.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at) == 0
+    assert left_out.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at) == 0
 
 
 def test_of_a_wide_window_the_middle_is_looked_at(monkeypatch):
@@ -89,10 +89,10 @@ def test_of_a_wide_window_the_middle_is_looked_at(monkeypatch):
     optics = Optics(PillarWave(lens(levels=8)), Layers(), DISTANCE)
     at = torch.tensor([PLACE], dtype=torch.float64), torch.tensor([5e3], dtype=torch.float64)
     seen = []
-    kept = gathered._of_pillars
-    monkeypatch.setattr(gathered, "_of_pillars", lambda *given: seen.append(given[-1]) or kept(*given))
-    monkeypatch.setattr(gathered, "MOST", 85)
-    found = gathered.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at)
+    kept = left_out._of_pillars
+    monkeypatch.setattr(left_out, "_of_pillars", lambda *given: seen.append(given[-1]) or kept(*given))
+    monkeypatch.setattr(left_out, "MOST", 85)
+    found = left_out.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at)
     ((_, samples, points),) = seen
     assert samples * points <= 85
     assert samples == 6
@@ -122,4 +122,4 @@ def test_films_shift_the_chief_ray_and_not_the_window():
     made = replace(lens(), layers=layers)
     optics = Optics(PillarWave(made), layers, DISTANCE)
     at = torch.tensor([[60.0, -35.0]], dtype=torch.float64), torch.tensor([5e3], dtype=torch.float64)
-    assert gathered.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at) < 2e-2
+    assert left_out.missing(optics, WAVELENGTH, Window(SAMPLES, STEP), at) < 2e-2

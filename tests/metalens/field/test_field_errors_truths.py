@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from metalens.cell import Film, Index
-from metalens.field import Grid, engine, plan
+from metalens.field import Grid, engine, left_out, patches, plan
 from metalens.field.forming import Imager
 from metalens.field.plan import Plan
 from metalens.field.points import Window
@@ -53,25 +53,28 @@ def test_the_width_of_light_is_its_root_mean_square_distance_from_its_middle():
         y, x = np.mgrid[:7, :7]
         cy, cx = (psf * y).sum() / psf.sum(), (psf * x).sum() / psf.sum()
         want.append(math.sqrt(max((psf * ((y - cy) ** 2 + (x - cx) ** 2)).sum() / psf.sum(), 0.25)))
-    assert plan.width(light) == pytest.approx(np.mean(want), rel=1e-9)
+    assert left_out.width(light) == pytest.approx(np.mean(want), rel=1e-9)
 
 
 def test_the_transform_is_judged_by_rays_seen_from_a_width_aside(monkeypatch):
-    """By 0.6 and 0.8 of the width along x and y, at the first wavelength; root of the mean square over all PSFs."""
+    """By 0.6 and 0.8 of the width along x and y, at the first wavelength; root of the mean square over all PSFs, each
+    by its light."""
     plain, other, asked = psf_of(1.0, (2, 3)), psf_of(1.0, (2, 3)), []
+    light = torch.tensor([[0.8, 0.75, 0.7], [0.1, 0.04, 0.02]])[..., None, None]
 
     def psfs(optics, at, *, depths_um, wavelength_um, window, shift_um):
         asked.append((at, depths_um, wavelength_um, shift_um))
-        return 0.8 * plain if shift_um == (0.0, 0.0) else other
+        return light * plain if shift_um == (0.0, 0.0) else light * other
 
-    monkeypatch.setattr(plan, "psfs", psfs)
+    monkeypatch.setattr(left_out, "psfs", psfs)
     at, depths = torch.zeros(2, 2), torch.ones(3)
-    found = plan.neglected(OPTICS, WAVES, PLAN.window, (at, depths))
-    wide = plan.width(plain) * 2.0
+    found = left_out.neglected(OPTICS, WAVES, PLAN.window, (at, depths))
+    wide = left_out.width(plain) * 2.0
     assert [wave for _, _, wave, _ in asked] == [0.82, 0.82]
     assert asked[1][3] == pytest.approx((0.6 * wide, 0.8 * wide))
-    errors = [float(plan.relative(o, 0.8 * p)) for o, p in zip(other.flatten(0, 1), plain.flatten(0, 1), strict=True)]
-    assert found == pytest.approx(math.sqrt(np.mean(np.square(errors))), rel=1e-9)
+    errors = [float(plan.relative(o, p)) for o, p in zip(other.flatten(0, 1), plain.flatten(0, 1), strict=True)]
+    level = (light / light[0]).flatten().numpy()  # of the brighter place
+    assert found == pytest.approx(math.sqrt(np.mean((errors * level) ** 2)), rel=1e-6)
 
 
 @pytest.mark.parametrize("slopes", [False, True])  # with derivatives one point after the other
@@ -90,12 +93,13 @@ def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monke
 
 
 def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
-    """Places of the pixels between the outermost nodes, depths at 13 and 58 % of the range of 1/z; light through
-    the lens that the true PSFs lose is outside; the transform is judged at five of the places, pillars taken together
-    at two; half of what lies beyond a window is edge."""
+    """Places of the pixels between the outermost nodes, depths at 13 and 58 % of the range of 1/z; PSFs count by their
+    light, and that by itself; light through the lens that the true PSFs lose is outside; the transform is judged at
+    five of the places, pillars taken together at two; half of what lies beyond a window is edge."""
     seen = {}
     true, used = psf_of(1.0, (16, 2)), psf_of(1.0, (16, 2))
-    passed, through = (torch.from_numpy(RNG.uniform(*ends, (16, 2))) for ends in ((0.8, 0.9), (0.9, 0.97)))
+    passed, through = (torch.from_numpy(RNG.uniform(*ends, (16, 2))) for ends in ((0.1, 0.9), (0.9, 0.97)))
+    told = torch.from_numpy(RNG.uniform(0.1, 0.9, (16, 2)))
 
     def spectral(optics, at, depths, waves, window):
         seen.update(at=at, depths=depths)
@@ -105,25 +109,29 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
         seen.update(pixels=pixels)
         return used.float()
 
+    def lights_used(made, pixels, depths):
+        return told.float()
+
     def neglected(optics, waves, window, at):
         seen.update(few=at)
         return 0.017
 
     monkeypatch.setattr(engine, "spectral", spectral)
     monkeypatch.setattr(engine, "psfs_used", psfs_used)
+    monkeypatch.setattr(engine, "lights_used", lights_used)
 
     def unpolarised(optics, waves, window, at):
         seen.update(turned=at)
         return 0.0031
 
-    monkeypatch.setattr(engine, "neglected", neglected)
-    monkeypatch.setattr(engine, "unpolarised", unpolarised)
+    monkeypatch.setattr(engine.left_out, "neglected", neglected)
+    monkeypatch.setattr(engine.left_out, "unpolarised", unpolarised)
 
     def missing(optics, wave, window, at):
         seen.update(wave=wave, every=at)
         return 0.0023
 
-    monkeypatch.setattr(engine.gathered, "missing", missing)
+    monkeypatch.setattr(engine.left_out, "missing", missing)
     monkeypatch.setattr(engine, "sampling", lambda optics, window, wave: SimpleNamespace(beyond=0.05 * wave))
     monkeypatch.setattr(engine, "through", lambda optics, at, *, depths_um, wavelength_um, window: through)
     grid = Grid((31, 44), 2.0, (3e3, 9e3), window=7)
@@ -137,12 +145,15 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     x = -500 + 1200 * pixels[:, 1] / (columns - 1)
     assert seen["at"].numpy() == pytest.approx(np.stack([x, y], 1))
     assert seen["depths"].tolist() == pytest.approx([1 / (1 / 3e3 + s * (1 / 9e3 - 1 / 3e3)) for s in (0.13, 0.58)])
-    errors = [float(plan.relative(u.double(), t)) for u, t in zip(used.flatten(0, 1), true.flatten(0, 1), strict=True)]
-    assert parts["nodes"] == pytest.approx(math.sqrt(np.mean(np.square(errors))), rel=1e-5)
-    assert parts["outside"] == pytest.approx(1 - float((passed / through).mean()), rel=1e-9)
+    cosine4 = torch.from_numpy(1 / (1 + (x**2 + y**2) / OPTICS.distance_um**2) ** 2)[:, None]
+    want, got = (part * light[..., None, None] for part, light in ((true, passed * cosine4), (used, told)))
+    shown = [[(patches.texture_view(part[:, z]) ** 2).sum() for z in (0, 1)] for part in (got - want, want)]
+    assert parts["nodes"] == pytest.approx(math.sqrt(max(shown[0]) / max(shown[1])), rel=1e-5)
+    assert parts["outside"] == pytest.approx(1 - float(passed.sum() / through.sum()), rel=1e-9)
+    share = float(passed[:5].max() / passed.norm() * math.sqrt(32))
     assert parts["spectrum"] == 0.004
-    assert parts["transform"] == 0.017
-    assert parts["polarisation"] == 0.0031
+    assert parts["transform"] == pytest.approx(0.017 * share, rel=1e-9)
+    assert parts["polarisation"] == pytest.approx(0.0031 * share, rel=1e-9)
     assert parts["pillars"] == 0.0023
     assert seen["wave"] == 0.82
     assert seen["every"][0].numpy() == pytest.approx(seen["at"].numpy()[:2])
@@ -252,20 +263,22 @@ def test_a_near_sheet_hides_what_it_covers_of_a_far_one():
 
 def test_of_places_and_depths_the_worst_shadow_of_a_stop_counts(monkeypatch):
     """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray, and R b cos / (λ d) zones of a blur b, over
-    held^¼ of windows that hold a share of the light; the sensor lies as far as 240 um of air."""
+    held^¼ of windows that hold a share of the light, by the light of the place; the sensor lies as far as 240 um of
+    air."""
     layers = Layers(stop=Stop(31.0, 70.0), behind=(Film(Index(1.5), 90.0),))
     optics = SimpleNamespace(distance_um=270.0, layers=layers)
     places = torch.tensor([[20.0, -31.0], [60.0, 95.0], [-3.0, 8.0]]).double()
     depths = torch.tensor([400.0, 2100.0]).double()
     told, light, held = {}, torch.rand(3, 2, 5, 5), np.array([[0.9, 0.7], [0.2, 0.6], [0.8, 0.5]])
+    lit = np.array([[0.9, 1.0], [0.7, 0.4], [1.0, 0.8]])
     for blurs in (np.array([[2.0, 1.0], [5.0, 0.3], [9.0, 2.5]]), np.array([[2.0, 1.0], [5.0, 0.3], [2.0, 17.0]])):
         monkeypatch.setattr(engine, "blur_um", lambda *given, blurs=blurs: blurs)
-        for (x, y), row, parts in zip(places.tolist(), blurs, held, strict=True):
+        for (x, y), row, parts, level in zip(places.tolist(), blurs, held, lit, strict=True):
             cosine = 240 / math.hypot(x, y, 240)
-            for z, blur, part in zip((400.0, 2100.0), row, parts, strict=True):
+            for z, blur, part, bright in zip((400.0, 2100.0), row, parts, level, strict=True):
                 number = 31.0**2 * cosine**3 / (0.8 * 70 * (z - 70) / z)
-                told[x, z] = (0.005 + 0.055 * 31.0 * blur / 240 * cosine / 0.8 / part**0.25) / number
-        got = engine._ripples(optics, 0.8, (places, depths), (light, torch.from_numpy(held)), 1.3)
+                told[x, z] = bright * (0.005 + 0.055 * 31.0 * blur / 240 * cosine / 0.8 / part**0.25) / number
+        got = engine._ripples(optics, 0.8, (places, depths), (light, *map(torch.from_numpy, (held, lit))), 1.3)
         assert got == pytest.approx(max(told.values()), rel=1e-9)
         assert max(told, key=told.get) == ((-3.0, 400.0) if blurs[2, 0] == 9.0 else (-3.0, 2100.0))
 

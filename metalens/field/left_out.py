@@ -1,0 +1,138 @@
+"""What PSFs of the field leave out: by the transform, by components of the field, by pillars taken together.
+
+Errors are of the image: those of PSFs count by their light, so that places in the shadow of a stop count little.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from metalens import propagate
+from metalens.field.patches import in_light, relative
+from metalens.field.points import Optics, Window, psfs, sampling
+from metalens.field.waves import PillarWave
+from metalens.psf import Nodes, Polarisation, psf_stack
+
+JUDGE = 3e-4  # tolerance of the PSFs of every pillar
+MOST = 256  # of their samples along an axis; the middle of a wider window is looked at, where the light is
+
+
+def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+    """What the transform neglects: PSFs of the first wavelength at (field points, depths), with the rays seen from
+    their own width beside the field point, against themselves."""
+
+    def found(shift_um: tuple[float, float]) -> Tensor:
+        wave = float(waves.wavelengths_um[0])
+        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=wave, window=window, shift_um=shift_um)
+        return light.detach()
+
+    plain = found((0.0, 0.0))
+    wide = width(plain / plain.sum((-1, -2), keepdim=True)) * window.step_um
+    return in_light(relative(found((wide * 0.6, wide * 0.8)), plain), plain.sum((-1, -2)))
+
+
+def polarised(
+    optics: Optics,
+    waves: Nodes,
+    window: Window,
+    at: tuple[Tensor, Tensor],
+    polarisation: Polarisation,
+    *,
+    within: tuple[float, float],
+) -> Window:
+    """The window with one scalar where that images within the first tolerance (``auto``), else with as few components
+    of the fields of both polarisations as image within the second."""
+    window = replace(window, flux=polarisation != "vector")
+    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= within[0]):
+        return window
+    tried = [replace(window, components=count) for count in range(1, window.whole + 1)]
+    whole = _light(optics, waves, tried[-1], at)
+    return next(one for one in tried if unpolarised(optics, waves, one, at, whole) <= within[1])
+
+
+def unpolarised(
+    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], whole: Tensor | None = None
+) -> float:
+    """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
+    (field points, depths) against those of all components, ``whole`` where they are known."""
+    if window.components == window.whole:
+        return 0.0
+    few = _light(optics, waves, window, at)
+    whole = _light(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
+    shown = whole.sum((-1, -2))
+    few, whole = few / few.sum((-1, -2), keepdim=True), whole / shown[..., None, None]
+    return in_light(relative(few, whole), shown)
+
+
+def _light(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> Tensor:
+    """PSFs of the first wavelength at (field points, depths), with their light."""
+    with torch.no_grad():
+        return psfs(optics, at[0], depths_um=at[1], wavelength_um=float(waves.wavelengths_um[0]), window=window)
+
+
+def width(psfs: Tensor) -> float:
+    """Root mean square distance of the light from its centroid, samples, mean over the PSFs."""
+    n = psfs.shape[-1]
+    place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
+    total = psfs.sum((-1, -2))
+    x, y = (psfs.sum(-2) * place).sum(-1) / total, (psfs.sum(-1) * place).sum(-1) / total
+    square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
+    return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
+
+
+def missing(optics: Optics, wavelength_um: float, window: Window, at: tuple[Tensor, Tensor]) -> float:
+    """What gathering pillars over cells changes: PSFs of sum 1 at (field points, depths) against those of every pillar,
+    to the same samples; 0 of a wave that is no lens of pillars. Light of other orders in the window is in it."""
+    wave = optics.wave
+    if not isinstance(wave, PillarWave):
+        return 0.0
+    grid = sampling(optics, window, wavelength_um)
+    # points of a sample, half of Nyquist's step apart: triangles of a sample are then summed to 2e-3 of fine detail
+    finer = 2 * math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
+    count = min(window.samples, max(MOST // finer - 2, 3) | 1)
+    share, edge = _triangles(count, finer), (window.samples - count) // 2
+    few = slice(edge, edge + count)
+    errors, lights = [], []
+    with torch.no_grad():
+        for place in at[0]:
+            light = _of_pillars(optics, wave, wavelength_um, (place, at[1]), (window.step_um, count + 1, finer))
+            want = share @ light @ share.T
+            got = psfs(optics, place[None], depths_um=at[1], wavelength_um=wavelength_um, window=window)[0, :, few, few]
+            errors.append(relative(got / got.sum((-1, -2), keepdim=True), want / want.sum((-1, -2), keepdim=True)))
+            lights.append(got.sum((-1, -2)))
+    return in_light(torch.stack(errors), torch.stack(lights))
+
+
+def _triangles(count: int, finer: int) -> Tensor:
+    """(samples, points) share of the light at points of a window one sample wider: a square source over a square."""
+    points = (np.arange((count + 1) * finer) - ((count + 1) * finer - 1) / 2) / finer
+    away = np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None])
+    return torch.from_numpy(np.maximum(1 - away, 0))
+
+
+def _of_pillars(
+    optics: Optics, wave: PillarWave, wavelength_um: float, at: tuple[Tensor, Tensor], sampled: tuple[float, int, int]
+) -> Tensor:
+    """(depths, y, x) light of point sources, from every pillar; sampled: step of a sample, samples, points of each."""
+    (place, depths_um), (step_um, count, finer) = at, sampled
+    tangents = place.cpu() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    angle = torch.atan(tangents).tolist()
+    t = wave.answer(wavelength_um, math.atan(math.hypot(*tangents.tolist()))).cpu()
+    about: dict[str, Any] = {
+        "pitch_um": wave.lens.diameters.pitch_um,
+        "wavelength_um": wavelength_um,
+        "sensor_distance_um": optics.distance_um,
+        "depths_um": depths_um.tolist(),
+        "angle_rad": angle,
+        "window_um": count * step_um,
+        "samples": count * finer,
+        "layers": optics.layers,
+    }
+    chief = propagate.case(tuple(t.shape), **about | {"layers": optics.layers.open}).centre_um
+    offset = [float(a) - b for a, b in zip(place, chief, strict=True)]
+    made = psf_stack(torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False, tolerance=JUDGE)
+    return torch.as_tensor(made.intensity).double()
