@@ -172,7 +172,7 @@ def test_kernels_are_thinned_to_what_a_texture_shows_and_the_error_is_that_of_th
     off = {8.0: 1.3, 6.0: 0.98, 4.5: 0.96}
     image = torch.from_numpy(RNG.uniform(0.5, 1.5, (1, 9, 8)))
     grid = Grid((9, 8), 2.0, (3e3, 9e3), window=3)
-    whole = Imager(grid, PLAN, None, None, [], [], {"kernels": 0.005})
+    whole = Imager(grid, PLAN, torch.zeros(1), None, [], [], {"kernels": 0.005})
     asked = []
 
     def trimmed(optics, tolerance):
@@ -205,7 +205,7 @@ def test_eighths_of_a_round_field_give_all_of_it(monkeypatch):
 
     monkeypatch.setattr(engine, "spectral", spectral)
     made = Plan(ring, ring, torch.ones(1).double(), WAVES, Window(7, 1.0), folds=True)
-    out = engine._folded(OPTICS, made)
+    out = engine._folded(OPTICS, made, "cpu")
     for i, y in enumerate(ring):
         for j, x in enumerate(ring):
             assert out[i, j, 0].numpy() == pytest.approx(psf(x, y).numpy(), rel=1e-9), (i, j)
