@@ -113,7 +113,7 @@ def _elsewhere(frames: Flat, optics: UniformImager, *, margin: int) -> Tensor:
     near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
     code = ((near - 1 / depth) * ((len(table) - 1) / (near - far)) + 0.5).clamp(0, len(table) - 1).long()
     sources = scene.padded(table[code].movedim(-1, 0) * light, optics.shape)
-    blurred = torch.fft.irfft2((torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape)
+    blurred: Tensor = torch.fft.irfft2((torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape)
     inside = [slice(margin, n - margin) for n in light.shape[-2:]]
     return blurred[:, inside[0], inside[1]]
 

@@ -84,7 +84,7 @@ class Light:
             self.imaged_step, self.imaged_rad, self._ready = step, coefficients_rad.clone(), None
         if not isinstance(self._ready, Imager):
             error = self.draw(self.imaged_step)
-            about = {"margin": margin, "error": error, "device": self.device}
+            about: dict[str, Any] = {"margin": margin, "error": error, "device": self.device}
             self._ready = formed.imager(self.optics, self.imaged_rad, frame, **about)
         if not isinstance(self._ready, Imager):
             raise TypeError("the true image needs a field of PSFs")
@@ -95,6 +95,6 @@ class Light:
         number = int(np.random.default_rng([self.seed, step, 4]).integers(len(self.stacks)))
         if number not in self._given:
             made = self.stacks[number]
-            about = {"margin": margin, "made": made, "device": self.device}
+            about: dict[str, Any] = {"margin": margin, "made": made, "device": self.device}
             self._given[number] = formed.imager(self.optics, coefficients_rad, frame, **about)
         return self._given[number]

@@ -227,5 +227,5 @@ def _ripples(
         rads = row / math.hypot(1, *place)
         for z, rad, part, bright in zip(depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True):
             error = optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad, part)
-            found.append(error * bright)
+            found.append(float(error * bright))
     return max(found)

@@ -169,8 +169,8 @@ def cut(
         patches: along each axis. overlap: pixels that two neighbours share.
         tolerance: of the image of a 1/f texture, relative L2, at the worst depth of every patch.
     """
-    along = [[_line(part, *one) for one in shares(len(part), patches, overlap)] for part in grid]
-    pairs = list(itertools.product(*along))
+    rows, columns = ([_line(part, *one) for one in shares(len(part), patches, overlap)] for part in grid)
+    pairs = list(itertools.product(rows, columns))
     known = Products(texture_view(stack.detach().double()), [len(y.nodes) * len(x.nodes) for y, x in pairs])
     return [_patch(known, energy, line, tolerance) for line in pairs]
 
@@ -220,7 +220,9 @@ class Products:
         else:
             near = self.seen[nodes]
             found = near @ near.mT
-        return found.unflatten(1, (-1, self.depths)).unflatten(0, (-1, self.depths))
+        shape = 2 * (len(nodes) // self.depths, self.depths)
+        products: Tensor = found.reshape(shape)
+        return products
 
 
 def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance: float) -> Patch:
@@ -241,10 +243,10 @@ def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance:
     rank = max(int((missing > tolerance).sum()), 1)
     left = vectors[:, :rank]
     weighed = torch.einsum("uzr,qu->qzr", to_few.flatten(2) @ (left / values[:rank]), many)
-    table = weighed.unflatten(0, [len(line.at) for line in along])
+    table = weighed.reshape(*(len(line.at) for line in along), depths, rank)
     table = torch.einsum("yp,xq,pqzr->yxzr", *(_to_pixels(line).to(seen) for line in along), table)
     table = table.flatten(0, 1) * share[:, None, None]
-    mix = torch.einsum("qu,qzr->ruz", few, left.unflatten(0, (-1, depths))).flatten(1)
+    mix = torch.einsum("qu,qzr->ruz", few, left.reshape(-1, depths, rank)).flatten(1)
     return Patch(
         along[0].ends,
         along[1].ends,

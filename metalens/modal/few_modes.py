@@ -73,7 +73,7 @@ def solve_ritz(pencil: Pencil, trial: Ritz, height: float, weak: float) -> tuple
 
 def beside(level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray) -> np.ndarray:
     """(diag(level) + rest) vectors."""
-    out = level[:, None] * vectors
+    out: np.ndarray = level[:, None] * vectors
     if rest is not None:
         out += rest @ vectors
     return out

@@ -21,7 +21,7 @@ import numpy as np
 from metalens.cell import Cell, Light, Response
 from metalens.ground.arrays import Array
 from metalens.rcwa.conditions import Case, case, check_diameter
-from metalens.rcwa.solver import truncated, wall_stages
+from metalens.rcwa.solver import farthest, truncated, wall_stages
 
 REACHES = (4, 5, 6, 7, 8, 9)  # truncations; any four neighbours are compared
 COMPARED = 4
@@ -94,7 +94,8 @@ def solve_anchored(
     met = error <= tolerance
     reason = f"orders within {reach}, anchored: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
     count = int(np.count_nonzero(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach))
-    return Response(complex(t), complex(r), min(error, 2.0), count, float(energy.real), "anchored", met, reason)
+    error = min(error, float(farthest(np.array([t, r]))))
+    return Response(complex(t), complex(r), error, count, float(energy.real), "anchored", met, reason)
 
 
 def plain(cell: Cell) -> Cell:

@@ -17,7 +17,7 @@ from metalens.rcwa.conditions import direction
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import Operation
 from metalens.rcwa.problem import Problem, classes, problem, tangent, waves_of
-from metalens.rcwa.solver import MOST_COMPARED, NARROWEST, compared, crowding, safety
+from metalens.rcwa.solver import MOST_COMPARED, NARROWEST, compared, crowding, farthest, safety
 from metalens.rcwa.stack import respond
 
 _FIRST = 3  # orders of the first truncation
@@ -138,7 +138,7 @@ def climbed(climb: Ladder, cut: float, tolerance: float, at: Callable[[int], Jon
         error = climb.crowded * moved(history, reach, before) + cut
         if len(history) > before and error <= tolerance:
             break
-    error = min(error, 1 + max(1.0, float(np.abs(history[-1]).max())))  # the true ones are 1 at most
+    error = min(error, float(farthest(np.ravel(history[-1]))))
     met = error <= tolerance
     reason = f"orders within {reach}: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
     looked_at = [both[0] for both in history[-1 - before : -1]]

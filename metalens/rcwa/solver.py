@@ -106,7 +106,7 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
         change = np.maximum(np.abs(found.t - empty.t), np.abs(found.r - empty.r))
         crowded = crowding(this.cell.pitch_um - wide, this.cell.pitch_um)
         estimate = crowded * _estimate(np.array(history), reach, lags[left])
-        error = np.minimum(_blur(this, wide, reach, change, estimate) + cut, 2.0)
+        error = np.minimum(_blur(this, wide, reach, change, estimate) + cut, farthest(found.both))
         settled = (error <= tolerance) | (reach == ladder[-1])
         chosen = np.flatnonzero(settled)
         found = Truncated(found.t[chosen], found.r[chosen], found.energy[chosen])
@@ -115,6 +115,11 @@ def solve_case(this: Case, diameter_um: Array, *, tolerance: float, harmonics: i
         history = [both[:, ~settled] for both in history]
         left = left[~settled]
     return [done[i] for i in range(len(diameter_um))]
+
+
+def farthest(both: Array) -> Array:
+    """Most that t and r along the first axis may be wrong by: the true ones of a passive cell are 1 at most."""
+    return np.asarray(1 + np.maximum(1.0, np.abs(both).max(0)))
 
 
 _FIRST = 4  # orders of the first truncation, too few for any use but to see t move

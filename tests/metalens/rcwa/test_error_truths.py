@@ -258,6 +258,17 @@ def test_a_bar_is_no_wider_than_to_the_farthest_that_a_passive_cell_may_be(monke
     assert found.t_error == pytest.approx(want, rel=1e-12)
 
 
+@pytest.mark.parametrize(("most", "want"), [(0.7, 2.0), (4.9, 5.9)])
+def test_a_round_pillar_s_bar_is_no_wider_either(monkeypatch, most, want):
+    def truncated(this, diameter_um, reach, stages=0, **moved):
+        t = np.full(len(diameter_um), most * (-1) ** reach + 0j)
+        return Truncated(t, 0.2 * t, np.ones(len(diameter_um)))
+
+    monkeypatch.setattr(solver, "truncated", truncated)
+    (found,) = solver.solve_case(case(CELL, Light(0.85)), np.array([0.23]), tolerance=1e-3, harmonics=9)
+    assert found.t_error == pytest.approx(want, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("angle_rad", "azimuth_rad", "upright", "tilted"), [(0, 0, 15, 10), (0.2, 0, 10, 7), (0.2, 0.5, 9, 6)]
 )
