@@ -22,7 +22,7 @@ from metalens.image import Frames
 
 def join(device: torch.device | None = None) -> None:
     """Join the other processes of ``torchrun``, if it started this one; ``device``: where this one computes."""
-    if "WORLD_SIZE" in os.environ and not dist.is_initialized():
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
         if device is not None and device.type == "cuda":
             torch.cuda.set_device(device)
             dist.init_process_group("cpu:gloo,cuda:nccl", device_id=device)
