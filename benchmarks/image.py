@@ -11,7 +11,8 @@ from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
 from metalens.field import Grid, Imager, Layers, Optics, PillarWave, SmoothWave, Window, imager
-from metalens.field.plan import neglected, spectral, unpolarised
+from metalens.field.left_out import neglected, unpolarised
+from metalens.field.plan import spectral
 from metalens.image import Frames
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
