@@ -9,7 +9,7 @@ import torch
 from codesign.network.architecture import Space, smallest
 from codesign.optics.lens_errors import LensErrors
 from codesign.optics.stack import OpticsConfig
-from codesign.train import inner
+from codesign.train import inner, moving
 from codesign.train.inner import Batch, InnerConfig, Schedule, Trainer
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image.scene import Frames
@@ -244,7 +244,7 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
     optimiser.step()
     before = optimiser.state[pitch]["step"].clone()
     moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel]["exp_avg"].contiguous()
-    inner._laid_out(optimiser)
+    moving.laid_out(optimiser)
     step, after = optimiser.state[pitch]["step"], optimiser.state[kernel]["exp_avg"]
     assert (step.dtype, float(step)) == (before.dtype, 1.0)
     assert after.stride() == kernel.stride()

@@ -63,7 +63,7 @@ def _never(step):
 def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monkeypatch):
     made = []
 
-    def imaged(settings, coefficients, frame, *, margin, error=None, made_of=made):
+    def imaged(settings, coefficients, frame, *, margin, device, error=None, made_of=made):
         made_of.append(float(coefficients[0]))
         return formed_once
 

@@ -102,7 +102,7 @@ def test_a_depth_takes_the_nearest_of_4096_steps_of_inverse_depth():
 
 def test_border_pixels_go_on_half_to_either_side():
     row = torch.arange(4.0).reshape(1, 1, 4)
-    got = scene._padded(row, (1, 9))[0, 0].tolist()
+    got = scene.padded(row, (1, 9))[0, 0].tolist()
     assert got == [0, 1, 2, 3, 3, 3, 3, 0, 0]
 
 

@@ -118,7 +118,7 @@ def test_exact_sums_add_wavelengths_by_their_weights():
     assert double.intensity.numpy() == pytest.approx(want, rel=1e-9, abs=1e-12 * want.max())  # 7000 rad in float64
     assert double.power == pytest.approx(float(0.7 * squares[0] + 0.4 * squares[1]), rel=1e-12)
     assert double.error == pytest.approx(4e-12, rel=1e-3)
-    assert double.reason.startswith("exact sum: 1230 pillars at 99 points")
+    assert double.reason.startswith("exact sum: 1,230 pillars at 99 points")
     single = compute.intensity(*maps(SINGLE, 2), [CASE, OTHER], [0.7, 0.4], tolerance=1e-3)
     assert single.error == pytest.approx(1e-7)
 
