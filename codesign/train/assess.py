@@ -54,7 +54,7 @@ def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | Non
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
             given = trainer.optics, trainer.model.coefficients_rad, samples(batch.frames)
-            prepared = formed.imager(*given, margin=scenes.margin, made=stack, device=trainer.device)
+            prepared = formed.imager(*given, margin=scenes.margin, made=stack, device=trainer.light.device)
         light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
         noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
         wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))

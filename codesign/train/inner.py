@@ -151,7 +151,6 @@ class Trainer:
             for name, (_, parameters) in self.groups.items()
             if parameters
         }
-        self.device = torch.device("cpu")  # see :mod:`codesign.train.placement`
         self.step, self.skipped, self.bad_run = 0, 0, 0
         self.pitch_held_um: float | None = None  # where the last step was held back from a finer or coarser pitch
         self._begins_um = float(made.pitch_um.detach())
@@ -166,7 +165,7 @@ class Trainer:
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
         work: Callable[[int], Given | Batch] = self._standing if self._still else self._batch
-        aside = self._still or self.device.type != "cpu"  # the processor is free there, and renders meanwhile
+        aside = self._still or self.light.device.type != "cpu"  # the processor is free there, and renders meanwhile
         with Ahead(work, end=end) as ahead:
             while self.step < end:
                 made = ahead.take(self.step) if aside else work(self.step)
@@ -214,10 +213,10 @@ class Trainer:
         means = running.kept(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
-        total, macs = task + self.inner.optics_weight * optics_loss.to(self.device), each.mean()
+        total, macs = task + self.inner.optics_weight * optics_loss.to(self.light.device), each.mean()
         if self._budget:
             over = losses.over_budget(each, self._budget).mean()
-            total = total + self.inner.budget_weight * over.to(self.device)
+            total = total + self.inner.budget_weight * over.to(self.light.device)
         total.backward()  # type: ignore[no-untyped-call]
         self.light.pass_on(self.step, self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
@@ -252,9 +251,9 @@ class Trainer:
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(step, batch.frames, live)
             light = irradiance(batch.frames, optics, margin=margin)
-        vergence = blur.window_vergence(depth_um(batch.frames, margin=margin, device=self.device))
+        vergence = blur.window_vergence(depth_um(batch.frames, margin=margin, device=self.light.device))
         frames = self._read(step, light, pitch, False) if seen else None
-        return Given(step, batch.to(self.device), light, optics_loss, vergence, frames)
+        return Given(step, batch.to(self.light.device), light, optics_loss, vergence, frames)
 
     def _read(self, step: int, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
         """Frames of the sensor. All readings of a step begin the same noise: networks differ by what they see."""
@@ -264,7 +263,7 @@ class Trainer:
     def _losses(self, given: Given, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
         """Mean task loss of the step's members, and the multiply-accumulates of each."""
         pitch = self.model.pitch_um if pitch_moves else self.model.pitch_um.detach()
-        scale = torch.tensor(self.inner.slip_scale_mm, device=self.device)
+        scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
         size = given.light.shape[-1] * self.optics.sample_um
         self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
         members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))

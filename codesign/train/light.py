@@ -29,7 +29,7 @@ class Light:
         self.optics, self.stacks, self.draw = optics, tuple(stacks), draw
         self.refresh, self.draws, self.seed = refresh, draws, seed
         self.imaged_step, self.imaged_rad = -1, torch.zeros(0, dtype=torch.float64)
-        self.device = torch.device("cpu")  # where frames are imaged
+        self.device = torch.device("cpu")  # of images and losses: see :mod:`codesign.train.placement`
         self._ready: UniformImager | Imager | None = None
         self._given: dict[int, UniformImager | Imager] = {}
         self._live: formed.Live | None = None

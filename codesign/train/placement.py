@@ -37,7 +37,7 @@ def place(trainer: Trainer, device: torch.device) -> None:
     """Let a trainer image and train on a device: its network and what its optimiser remembers move there."""
     if device.type == "cpu":
         return
-    trainer.device = trainer.light.device = device
+    trainer.light.device = device
     torch.backends.cudnn.deterministic = True
     net = trainer.model.net
     net.to(device)

@@ -1,6 +1,7 @@
 """From a lens to an imager: field points, PSFs, patches, and the error that it says."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args
 
@@ -208,13 +209,13 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     found["polarisation"] = left_out.unpolarised(optics, plan.waves, plan.window, few) * share
     found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
-        shown = (true / light[..., None, None])[:NEGLECTED], (light / whole)[:NEGLECTED], (light / light.amax(0))
+        shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]
         found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um)
     return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
 
 
 def _ripples(
-    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: tuple[Tensor, ...], step_um: float
+    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: Sequence[Tensor], step_um: float
 ) -> float:
     """Error of the stop's shadow, the worst of some places and depths; light: their PSFs, the share of their light that
     these hold, and their light over that of the brightest place."""
@@ -223,7 +224,7 @@ def _ripples(
     blurs_um = blur_um(light[0].cpu().numpy(), step_um, held)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     found = []
-    for place, row, parts, lit in zip((places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=False):
+    for place, row, parts, lit in zip((places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=True):
         rads = row / math.hypot(1, *place)
         for z, rad, part, bright in zip(depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True):
             error = optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad, part)

@@ -50,7 +50,8 @@ def test_seeds_of_judged_frames_are_of_their_stream_and_number(monkeypatch):
     monkeypatch.setattr(assess.formed, "imager", lambda *_, **__: None)
     monkeypatch.setattr(assess.blur, "window_vergence", lambda depth: part)
     trainer = SimpleNamespace(
-        inner=SimpleNamespace(batch=2), device="cpu", optics=SimpleNamespace(sample_um=1.0), sensor=None,
+        inner=SimpleNamespace(batch=2), light=SimpleNamespace(device="cpu"), sensor=None,
+        optics=SimpleNamespace(sample_um=1.0),
         model=SimpleNamespace(coefficients_rad=None, pitch_um=torch.tensor(1.0)),
     )  # fmt: skip
     for stream in (0, 4):
