@@ -16,15 +16,21 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import DAMAGE, MaterialError
 
 LEAST = {1: 3, 2: 3, 3: 3, 4: 5, 5: 3, 6: 3, 7: 2, 8: 3, 9: 3}  # coefficients without which a formula says nothing
+MOST = {7: 6, 8: 4, 9: 6}  # coefficients that a formula has; of all others the terms go on in pairs, after one alone
+_NOISE = 1e-3  # by how far k of a measured table may lie below 0: it is 0 there
 
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """n of a wavelength by one of the nine formulas; it holds from range_um[0] to range_um[1]."""
+    """n of a wavelength by one of the nine formulas; it holds from range_um[0] to range_um[1].
+
+    where: file and formula, in the words of a refusal.
+    """
 
     number: int
     coefficients: tuple[float, ...]
     range_um: tuple[float, float]
+    where: str
 
     def at(self, wavelength_um: float) -> tuple[complex, complex]:
         """n and dn/d(wavelength_um), the latter by a complex step (exact to rounding).
@@ -35,9 +41,7 @@ class Formula:
         step = 1e-20
         n = self._index(complex(wavelength_um, step))
         if not (math.isfinite(n.real) and n.real > 0 and abs(n.imag) < 1e-6):
-            raise MaterialError(
-                f"formula {self.number} gives n = {n.real:g} at {wavelength_um} um: no real index there"
-            )
+            raise MaterialError(f"{self.where} gives n = {n.real:g} at {wavelength_um} um: no real index there")
         return complex(n.real), complex(n.imag / step)
 
     def _index(self, w: complex) -> complex:
@@ -124,19 +128,33 @@ def read(text: str, where: str) -> tuple[Part, Part | None, str]:
     for i, block in enumerate(blocks, 1):
         if not isinstance(block, dict):
             raise MaterialError(f"{where}: entry {i} of DATA is no table; need type and data, or type and coefficients")
-        kind = _words(block, "type")
-        if kind.startswith("formula"):
-            n = _formula(block, kind, where)
-        elif kind.startswith("tabulated"):
-            columns = kind.split()[-1]
-            table = _rows(_words(block, "data"), len(columns) + 1, f"{where}, {kind}")
-            if columns not in ("nk", "n", "k"):
-                raise MaterialError(f"{where}: type {kind!r}, need tabulated nk, n or k")
-            n = Table(table[:2]) if "n" in columns else n
-            k = Table(table[[0, -1]]) if "k" in columns else k
+        real, absorbed = _parts(block, where)
+        if (n and real) or (k and absorbed):
+            raise MaterialError(
+                f"{where}: entry {i} of DATA gives {'n' if n and real else 'k'} a second time; need one"
+            )
+        n, k = n or real, k or absorbed
     if n is None:
         raise MaterialError(f"{where}: neither a formula nor a table of n; need one of them")
     return n, k, _source(page)
+
+
+def _parts(block: dict[str, Any], where: str) -> tuple[Part | None, Part | None]:
+    """n and k of an entry, None for what it does not hold."""
+    kind = _words(block, "type")
+    if kind.startswith("formula"):
+        return _formula(block, kind, where), None
+    if not kind.startswith("tabulated"):
+        return None, None
+    columns = kind.split()[-1]
+    if columns not in ("nk", "n", "k"):
+        raise MaterialError(f"{where}: type {kind!r}, need tabulated nk, n or k")
+    table = _rows(_words(block, "data"), len(columns) + 1, f"{where}, {kind}")
+    if "n" in columns and table[1].min() <= 0:
+        raise MaterialError(f"{where}, {kind}: n = {table[1].min():g}; need n above 0")
+    if "k" in columns and table[-1].min() < -_NOISE:
+        raise MaterialError(f"{where}, {kind}: k = {table[-1].min():g}; need k of 0 or above (exp(-iwt))")
+    return Table(table[:2]) if "n" in columns else None, Table(table[[0, -1]]) if "k" in columns else None
 
 
 def _words(block: dict[str, Any], key: str) -> str:
@@ -157,7 +175,21 @@ def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
             f"{where}, {kind}: {len(values)} coefficients, range {span}; need formula 1 to 9 with its coefficients and "
             "two ends of wavelength_range"
         )
-    return Formula(number, values, (ends[0], ends[1]))
+    _complete(number, len(values), f"{where}, {kind}")
+    return Formula(number, values, (min(ends), max(ends)), f"{where}, {kind}")
+
+
+def _complete(number: int, count: int, where: str) -> None:
+    """Refuses coefficients without their partners, and more than a formula has.
+
+    Raises:
+        MaterialError: with the number found.
+    """
+    whole = count <= MOST[number] if number in MOST else count % 2 == 1
+    if number == 4:
+        whole = whole and count != 7  # its first two terms have four coefficients each
+    if not whole:
+        raise MaterialError(f"{where}: {count} coefficients, the last of them of no whole term; need whole terms")
 
 
 def _rows(text: str, width: int, where: str) -> Array:

@@ -5,7 +5,6 @@ Time factor exp(-iwt): an absorbing material has k > 0. Nothing is extrapolated.
 """
 
 import bisect
-import csv
 import importlib.resources
 import math
 from dataclasses import dataclass
@@ -15,13 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from metalens import cell
-from metalens.cell import database
+from metalens.cell import database, tables
 from metalens.cell.database import Part
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaterialError, nearest
-
-COLUMNS = ("wavelength_um", "n", "k")
-_WAVELENGTHS = {"wavelength_um": 1.0, "wavelength, um": 1.0, "wavelength, µm": 1.0, "wl": 1.0, "wavelength_nm": 1e-3}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -198,12 +194,14 @@ def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
     if k is not None:
         low, high = max(low, k.range_um[0]), min(high, k.range_um[1])
     if low >= high:
-        raise MaterialError(f"{name}: n and k hold at no common wavelength")
+        raise MaterialError(
+            f"{name}: n holds from {n.range_um[0]:g} to {n.range_um[1]:g} um, and k at no wavelength of these"
+        )
     return Material(name, source, (low, high), _NO_TABLE, (), (n,) if k is None else (n, k))
 
 
 def read_csv(path: str | Path) -> Material:
-    """A material of a table wavelength_um, n, k: CSV, or semicolons or tabs with decimal commas; # opens comments.
+    """A material of a table wavelength_um, n, k (:mod:`metalens.cell.tables`).
 
     Raises:
         MaterialError: no such file, a missing column, or a bad row; the message gives the line.
@@ -211,7 +209,7 @@ def read_csv(path: str | Path) -> Material:
     try:
         stat = Path(path).stat()
     except OSError:
-        raise MaterialError(f"{path}: no such file; need a CSV with columns {', '.join(COLUMNS)}") from None
+        raise MaterialError(f"{path}: no such file; need a CSV with columns {tables.COLUMNS}") from None
     return _read_csv(Path(path), (stat.st_mtime_ns, stat.st_size))
 
 
@@ -234,62 +232,8 @@ def _shipped(name: str) -> Material:
 
 
 def _parse(text: str, *, name: str, where: str) -> Material:
-    lines = text.splitlines()
-    comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
-    body = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    if not body:
-        raise MaterialError(f"{where}: empty; need a header {','.join(COLUMNS)} and at least two rows")
-    mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), ",")
-    plain = [(i, line if mark == "," else line.replace(",", ".").replace(mark, ",")) for i, line in body]
-    body = _unstacked(plain, where)
-    header = [field.strip().lower().replace("μ", "µ") for field in next(csv.reader([body[0][1]]))]
-    place = next((header.index(column) for column in _WAVELENGTHS if column in header), None)
-    missing = ["wavelength_um"] * (place is None) + ["n"] * ("n" not in header)
-    if missing or place is None:
-        raise MaterialError(f"{where}, line {body[0][0]}: no column {', '.join(missing)} in {header}; need {COLUMNS}")
-    scale = _WAVELENGTHS[header[place]]
-    order = [place, header.index("n"), header.index("k") if "k" in header else -1]
-    rows = [_row(line, order, len(header), f"{where}, line {i}", scale) for i, line in body[1:]]
-    _check_rows(rows, [i for i, _ in body[1:]], where)
-    table = np.array(rows).T
-    return Material(name, " ".join(comments) or f"the file {where}", (table[0, 0], table[0, -1]), table)
-
-
-def _unstacked(body: list[tuple[int, str]], where: str) -> list[tuple[int, str]]:
-    """The rows of a file whose k follows its n as a second table (as refractiveindex.info exports) in one table."""
-    heads = [i for i, (_, line) in enumerate(body) if line.replace(" ", "").lower().startswith("wl,")]
-    if len(heads) != 2:
-        return body
-    first, second = body[: heads[1]], body[heads[1] + 1 :]
-    waves = [line.split(",")[0].strip() for _, line in first[1:]]
-    if waves != [line.split(",")[0].strip() for _, line in second]:
-        raise MaterialError(f"{where}, line {body[heads[1]][0]}: n and k stand at different wavelengths; need the same")
-    rows = [(i, f"{line},{other.split(',')[1]}") for (i, line), (_, other) in zip(first[1:], second, strict=True)]
-    return [(first[0][0], "wl,n,k"), *rows]
-
-
-def _row(line: str, order: list[int], width: int, where: str, scale: float) -> list[float]:
-    fields = next(csv.reader([line]))
-    if len(fields) != width:
-        raise MaterialError(f"{where}: {len(fields)} fields, the header has {width}")
-    try:
-        values = [float(fields[column]) if column >= 0 else 0.0 for column in order]
-    except ValueError:
-        raise MaterialError(f"{where}: {line!r} is not numbers; need wavelength_um, n, k") from None
-    wavelength_um, n, k = values = [values[0] * scale, *values[1:]]
-    if not (all(math.isfinite(v) for v in values) and wavelength_um > 0 and n > 0 and k >= 0):
-        raise MaterialError(f"{where}: {line!r}; need finite wavelength_um > 0, n > 0 and k >= 0 (exp(-iwt))")
-    return values
-
-
-def _check_rows(rows: list[list[float]], numbers: list[int], where: str) -> None:
-    if len(rows) < 2:
-        raise MaterialError(f"{where}: {len(rows)} rows of numbers; need at least two")
-    for before, after, number in zip(rows, rows[1:], numbers[1:], strict=False):
-        if after[0] <= before[0]:
-            raise MaterialError(
-                f"{where}, line {number}: wavelength {after[0]} um follows {before[0]} um; need increasing wavelengths"
-            )
+    table, comments = tables.read(text, where)
+    return Material(name, comments or f"the file {where}", (table[0, 0], table[0, -1]), table)
 
 
 def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> tuple[complex, complex]:

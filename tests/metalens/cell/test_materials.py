@@ -106,12 +106,13 @@ def test_a_table_with_decimal_commas_is_the_table_with_points(tmp_path: Path, ma
     ("text", "message"),
     [
         ("", "empty"),
-        ("wavelength_um,k\n0.8,3\n", "line 1: no column n"),
-        ("lambda,n\n0.8,3\n", "line 1: no column wavelength_um"),
+        ("wavelength_um,k\n0.8,3\n", "line 1: columns wavelength_um, k; need .* n and"),
+        ("lambda,n\n0.8,3\n", "line 1: columns lambda, n; need wavelength_um .or wavelength_nm"),
         ("wavelength_um,n,k\n0.8,3,0\n", "1 rows"),
         ("wavelength_um,n,k\n0.8,3,0\n0.9,x,0\n", "line 3: .* not numbers"),
         ("wavelength_um,n,k\n# c\n0.8,3,0\n0.9,3\n", "line 4: 2 fields"),
-        ("wavelength_um,n,k\n0.8,3,0\n0.7,3,0\n", "line 3: wavelength 0.7 um follows 0.8"),
+        ("wavelength_um,n,k\n0.7,3,0\n0.8,3,0\n0.8,3,0\n0.9,3,0\n", "line 4: wavelength 0.8 um follows 0.8"),
+        ("wavelength_um,n,k\n0.9,3,0\n0.95,3,0\n0.8,3,0\n", "line 3: wavelength 0.95 um follows 0.9"),
         ("wavelength_um,n,k\n0.8,3,0\n0.9,3,-1e-3\n", "line 3: .*k >= 0"),
         ("wavelength_um,n,k\n0.8,nan,0\n0.9,3,0\n", "line 2: .*finite"),
     ],
@@ -141,6 +142,15 @@ def test_any_table_comes_back_at_its_rows_and_never_leaves_them_in_between(tmp_p
         assert abs(materials.index(record, w) - complex(n, k)) < 1e-12 * (n + k)
     middle = materials.index(record, (rows[0][0] + rows[1][0]) / 2)
     assert min(rows[0][2], rows[1][2]) * (1 - 1e-12) <= middle.imag <= max(rows[0][2], rows[1][2]) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", ["Wavelength (nm)", '"wavelength, nm"', "wavelength_nm", "Wavelength [nm]"])
+def test_a_table_that_falls_in_nanometres_is_the_table_that_rises(tmp_path: Path, name):
+    file = tmp_path / "falls.csv"
+    file.write_text(f"{name},k,n\n900,0.05,3.2\n840,0.02,3.5\n800,0.01,3.9\n")
+    assert materials.index(str(file), 0.855) == pytest.approx(3.425 + 0.0275j, abs=1e-12)  # a quarter on from 840 nm
+    assert materials.slope(str(file), 0.855) == pytest.approx(-5 + 0.5j, abs=1e-9)  # per um
+    assert materials.material(str(file)).range_um == pytest.approx((0.8, 0.9))
 
 
 def test_missing_and_binary_files_are_refused(tmp_path: Path):
@@ -213,6 +223,15 @@ def test_a_rational_formula_ends_after_a_term_and_holds_where_an_absent_pole_wou
     page.write_text(f"DATA:\n  - type: formula 4\n    wavelength_range: 0.8 1.2\n    coefficients: {words}\n")
     square = 2.25 + 0.4 / (1 - 0.2**2) + (0.01 / (1 - 0.3**3) if count > 5 else 0)
     assert materials.index(str(page), 1.0) == pytest.approx(math.sqrt(square), rel=1e-12)
+
+
+def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Path):
+    page = tmp_path / "falling.yml"
+    page.write_text("DATA:\n  - type: formula 2\n    wavelength_range: 0.9 0.4\n    coefficients: 0.2 0.7 0.36\n")
+    assert materials.material(str(page)).range_um == (0.4, 0.9)
+    assert materials.index(str(page), 0.8) == pytest.approx(math.sqrt(1.2 + 0.7 * 0.64 / (0.64 - 0.36)), rel=1e-12)
+    with pytest.raises(MaterialError, match=r"falling.yml, formula 2 gives n = "):
+        materials.index(str(page), 0.5)  # below the pole at 0.6 um n² is negative
 
 
 def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
@@ -299,6 +318,27 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
         ("DATA:\n  - x\n", "entry 1 of DATA is no table"),
         ("DATA:\n  - type: [formula, 1]\n    data: 3\n", "neither a formula"),
         ("DATA:\n  - type: tabulated k\n    data: |\n        0.5 0.1\n        0.6 0.1\n", "neither a formula"),
+        (
+            "DATA:\n  - type: tabulated n2\n    data: |\n        0.5 1e-19\n        0.6 1e-19\n",
+            "need tabulated nk, n or k",
+        ),
+        (
+            "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 0.2 -3.1\n        0.6 0.3 -3.4\n",
+            "k = -3.4; need k",
+        ),
+        ("DATA:\n  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 -1.5\n", "n = -1.5; need n"),
+        (
+            "DATA:\n  - type: formula 5\n    wavelength_range: 0.4 0.9\n    coefficients: 1.5 0.01 -2\n"
+            "  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 1.5\n",
+            "entry 2 of DATA gives n a second time",
+        ),
+        *(
+            (
+                f"DATA:\n  - type: formula {i}\n    wavelength_range: 0.4 0.9\n    coefficients: {'1.3 ' * n}\n",
+                "whole term",
+            )
+            for i, n in [(1, 4), (2, 6), (3, 4), (4, 6), (4, 7), (4, 8), (5, 4), (6, 4), (7, 7), (8, 5), (9, 7)]
+        ),
     ],
 )
 def test_a_bad_page_is_refused(tmp_path: Path, text, message):
