@@ -96,6 +96,20 @@ def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in
     assert lit_part(model, masked, x, light + plane) == (slice(12, 15), slice(9, 12))
 
 
+@pytest.mark.parametrize(
+    ("share", "taken"), [(7e-6, (slice(12, 15), slice(9, 12))), (8e-6, (slice(3, 26), slice(2, 25)))]
+)
+def test_each_of_four_sides_may_hold_a_quarter_of_thirty_parts_in_a_million(model, share, taken):
+    """One dim pixel beyond each side of two bright ones, each with this share of all that light tells."""
+    light = np.zeros((2, 29, 28))
+    light[0, 12, 9], light[1, 14, 11] = 900.0, 900.0
+    dim = 900.0 * np.sqrt(2 * share / (1 - 4 * share))  # of all is told (1 - 4 share) by the two
+    light[0, 3, 10], light[1, 25, 10], light[1, 13, 2], light[0, 13, 24] = dim, dim, dim, dim
+    noise = np.full(light.shape, 1e4)  # beside which the noise of the light is none
+    data = Data(light, np.ones(light.shape, bool), np.zeros(light.shape, bool), noise, np.full(light.shape, 1e9))
+    assert lit_part(model, data, vector({}), light) == taken
+
+
 def test_beside_the_part_images_go_straight_on_and_within_it_what_is_left_out_stays():
     rng = np.random.default_rng(4)
     value, image, slopes = np.array([1.0, -2.0]), rng.normal(size=(3, 4, 5)), rng.normal(size=(2, 3, 4, 5))

@@ -108,6 +108,36 @@ def test_a_bent_valley_is_followed_to_its_ends():
     assert asked.count(False) <= 12  # two on the way out, and five an end
 
 
+def test_slopes_met_along_one_way_count_by_how_far_a_place_lies_that_way_in_sigmas():
+    """Slopes that change with a projection by the curvature, of two parameters that go almost together: what was met
+    at one place gives those of any other, without a further derivative, and at right angles to it those of the mode."""
+    shapes = np.stack([SHAPES[0], SHAPES[0] + 0.11 * SHAPES[1]])
+    curvature = shapes.reshape(2, -1) @ shapes.reshape(2, -1).T / NOISE**2
+    place = np.array([0.9, -0.4])
+    toward = curvature @ place / (place @ curvature @ place)  # of what lies along the place, 1 at the place itself
+    bow, asked = 1.7 * np.random.default_rng(5).standard_normal(SHAPES[0].shape), []
+
+    def bowed(x, jacobian):
+        asked.append(jacobian)
+        share = toward @ x
+        image = np.tensordot(x, shapes, 1) + bow * share**2 / 2
+        return image, shapes + np.multiply.outer(toward, bow * share) if jacobian else None
+
+    mode = np.zeros(2)
+    exact = dataclasses.replace(data(np.zeros(SHAPES[0].shape)), electrons=np.zeros(SHAPES[0].shape))
+    valley = Valley(bowed, exact, mode, Prior.none(mode))
+    valley.slopes_at(place)
+    assert asked.count(True) == 2  # of the mode, and of the place
+    across = np.array([-curvature[1] @ place, curvature[0] @ place])  # at right angles in sigmas
+    assert across @ curvature @ place == pytest.approx(0, abs=1e-6 * abs(across @ curvature @ across))
+    across *= 3 / np.sqrt(across @ curvature @ across)
+    for x in (1.4 * place, 0.6 * place + across, across, 1.1 * place - 2 * across):
+        got, share = valley.slopes_at(x), toward @ x
+        want = (shapes + np.multiply.outer(toward, bow * share)).reshape(2, -1).T / NOISE
+        assert np.abs(got[:-2] - want).max() < 1e-6 * np.abs(want).max()
+    assert asked.count(True) == 2
+
+
 def test_draws_of_a_bent_valley_have_the_data_s_spread():
     seen = data(bent(np.array([-1.1, 0.8]), False)[0])
     amplitude, covariance = best(seen)

@@ -5,6 +5,7 @@ The files themselves are read by strangers: lib3mf, the format's own library, an
 
 import dataclasses
 import json
+import math
 import re
 import struct
 import zipfile
@@ -52,6 +53,20 @@ def test_3mf_is_whole_and_every_damage_is_told(tmp_path, pattern, text, told):
     assert differences_3mf(path, PILLARS) == ()
     edited(path, pattern, text)
     assert any(told in line for line in differences_3mf(path, PILLARS)), differences_3mf(path, PILLARS)
+
+
+def test_how_far_corners_lie_is_told_from_the_nearest_to_the_farthest(tmp_path):
+    """One corner of the foot of the first class drawn in to half its way: read from the file's own words."""
+    path = tmp_path / "a.3mf"
+    mesh.write_3mf(path, PILLARS)
+    with zipfile.ZipFile(path) as file:
+        first = file.read("3D/3dmodel.model").decode().partition("</object>")[0]
+    x, y = (float(v) for v in re.findall(r'<vertex x="([^"]*)" y="([^"]*)" z="0"', first)[0])
+    edited(path, r'<vertex x="[^"]*" y="[^"]*" z="0"', f'<vertex x="{x / 2!r}" y="{y / 2!r}" z="0"')
+    (told,) = (line for line in differences_3mf(path, PILLARS) if "corners of its foot lie" in line)
+    low, high = (float(v) for v in re.search(r"lie (\S+) to (\S+) um", told).groups())
+    assert low == pytest.approx(math.hypot(x, y) / 2, rel=1e-5)  # six digits
+    assert high == pytest.approx(math.hypot(x, y), rel=0.02)  # the others of a round outline
 
 
 @pytest.mark.parametrize(

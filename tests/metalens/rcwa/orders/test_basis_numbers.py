@@ -71,6 +71,18 @@ def test_rates_are_differences(diameter, share, near):
     assert np.abs(basis.disc_rate(WHOLE, np.array(diameter), PITCH) - want).max() < near * np.abs(want).max()
 
 
+def test_squares_of_the_radial_field_add_to_one_at_every_truncation():
+    """x² / r² + y² / r² = 1, whatever the order: its coefficients are 1 at (0, 0) and 0 elsewhere. Cosines of 60 turns
+    across the cell on a rule that is exact to rounding."""
+    even, odd = basis._radial_field(60)
+    whole = even + even.T
+    whole[0, 0] -= 1
+    assert np.abs(whole).max() < 1e-11
+    few = basis._radial_field(7)
+    assert np.abs(few[0] - even[:8, :8]).max() < 1e-12
+    assert np.abs(few[1] - odd[:8, :8]).max() < 1e-12
+
+
 def test_series_and_bessel_functions_meet():
     """On both sides of x = 0.01 for every shell: no jump but that of the next term, x⁴ / 3000."""
     for shell in (1, 5, 8):
