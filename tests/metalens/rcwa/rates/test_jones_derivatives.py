@@ -240,6 +240,14 @@ def test_an_error_is_what_truncations_moved_as_that_of_t_and_what_a_stage_fewer_
             assert parts[-1][name].error == pytest.approx(want, rel=1e-9)
 
 
+def test_one_truncation_alone_tells_nothing_of_a_derivative_s_error():
+    """|t| is at most 1, which bounds the error of a value that nothing is compared with; no such bound has its rate."""
+    cell = CASES["square at normal incidence"][0]
+    found = rcwa.jones_derivatives(cell, 0.3, WAVE, harmonics=1, by=["size_um"])
+    assert found.by["size_um"].error == math.inf
+    assert 0 < found.jones.t_error < math.inf
+
+
 def test_a_film_of_no_thickness_can_have_some():
     """One-sided differences of fourth order over 1 nm: 1e-8 and their own order."""
 
