@@ -44,6 +44,26 @@ def test_illumination_falls_with_the_fourth_power_of_the_cosine_of_its_own_place
                 assert unit[i, j, k].numpy() == pytest.approx(light[i, j, k].numpy() / total, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("tolerance", "coverage", "rank", "few"),
+    [(0.05, 0.2, 3, 2), (0.2, 0.05, 2, 2), (0.011, 0.4, 4, 1), (2.0, 3.0, 1, 1)],
+)
+def test_of_a_patch_the_first_kernels_are_kept_that_either_tolerance_needs(tolerance, coverage, rank, few):
+    """Without any, 1 is missing, then 0.3, 0.08, 0.02, 0.01; what is left holds the light that all of them did."""
+    missing = torch.tensor([1.0, 0.3, 0.08, 0.02, 0.01]).double()
+    mix, weights = (torch.from_numpy(RNG.uniform(0.5, 1.5, shape)) for shape in ((4, 5), (6, 3, 4)))
+    share = torch.from_numpy(RNG.uniform(0.7, 1.3, 6)) * float((weights @ mix.sum(1)).mean())
+    whole = patches.Patch((2, 4), (1, 4), share, weights, torch.ones(6, 3), mix, torch.arange(5), missing, 4)
+    kept = whole.trimmed(tolerance, coverage)
+    assert (kept.mix.shape, kept.coverage) == ((rank, 5), few)
+    assert torch.equal(kept.mix, mix[:rank])
+    light = kept.weights @ kept.mix.sum(1)
+    first = weights[..., :rank] @ mix[:rank].sum(1)
+    told = first > share[:, None] / 2
+    want = torch.where(told, share[:, None].expand(6, 3), first)
+    assert light.numpy() == pytest.approx(want.numpy(), rel=1e-12)
+
+
 def test_the_width_of_light_is_its_root_mean_square_distance_from_its_middle():
     light = psf_of(3.0, (2, 2)) * torch.tensor([[1.0, 0.4], [2.5, 0.7]])[..., None, None]
     light[0, 1] = 0.0

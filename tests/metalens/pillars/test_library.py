@@ -36,6 +36,13 @@ def test_entries_lie_within_their_error_bars(made):
             assert abs(made.t[0, 0, k, i] - exact.t) <= made.t_error[0, 0, k, i] + exact.t_error
 
 
+def test_one_bar_above_the_tolerance_is_enough_to_miss_it(made):
+    bars = np.full(made.t_error.shape, 0.9 * COARSE.tolerance)
+    assert dataclasses.replace(made, t_error=bars).converged
+    bars[0, 0, 1, 3] = 1.1 * COARSE.tolerance
+    assert not dataclasses.replace(made, t_error=bars).converged
+
+
 def test_energy_is_conserved_within_the_error_bars(made):
     assert np.abs(made.energy - 1).max() < 2 * COARSE.tolerance
 

@@ -51,6 +51,13 @@ def test_a_short_design_gains_information_and_keeps_the_energy():
     assert float(made.score.information.mean()) > 1.15 * float(before.information.mean())
 
 
+def test_depths_that_no_image_tells_apart_are_worth_the_least_logarithm():
+    """A kilometre away images do not change: both terms are the log of the floor of 1e-4 per mm² that keeps it finite."""
+    far = dataclasses.replace(QUICK, depths_mm=(1e6, 2e6))
+    loss, _ = AxialObjective(SMALL, far).loss(torch.zeros(136, 136, dtype=torch.float64), 20e3, None)
+    assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)  # 1e-7 of information over the floor
+
+
 def test_the_same_seed_gives_the_same_phase():
     brief = Fisher(grids=(5,), iterations=2, starts=1).about(FOCUS, 400.0)
     assert torch.equal(free.optimise(SMALL, brief).controls, free.optimise(SMALL, brief).controls)
