@@ -52,7 +52,7 @@ def test_a_short_design_gains_information_and_keeps_the_energy():
 
 
 def test_depths_that_no_image_tells_apart_are_worth_the_least_logarithm():
-    """A kilometre away images do not change: both terms are the log of the floor of 1e-4 per mm² that keeps it finite."""
+    """A kilometre away images do not change: both terms are the log of the floor of 1e-4 per mm²."""
     far = dataclasses.replace(QUICK, depths_mm=(1e6, 2e6))
     loss, _ = AxialObjective(SMALL, far).loss(torch.zeros(136, 136, dtype=torch.float64), 20e3, None)
     assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)  # 1e-7 of information over the floor
