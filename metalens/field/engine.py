@@ -11,7 +11,18 @@ from torch import Tensor
 
 from metalens.field import left_out
 from metalens.field import patches as cutting
-from metalens.field.forming import Imager, between_nodes, blurred, evened, lights_used, psfs_used, trimmed, with_psfs
+from metalens.field.forming import (
+    Imager,
+    between_nodes,
+    blurred,
+    even_light,
+    evened,
+    lights_used,
+    psfs_used,
+    returned,
+    trimmed,
+    with_psfs,
+)
 from metalens.field.plan import SHARES, Grid, Plan, planned, spectral
 from metalens.field.points import Optics, sampling
 from metalens.field.stray import stray_of
@@ -148,7 +159,8 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
     """As few kernels as image a texture of two sheets (:func:`trial`) within their share of the tolerance.
 
     What a patch lacks differs from pixel to pixel, and adds up to less than the worst PSF says. The error is of the
-    kernels alone: that even light is put right afterwards is not counted, since points gain nothing by it.
+    kernels alone: that even light is put right afterwards is not counted, since points gain nothing by it; of the frame
+    or of what is returned of it, where that is the darker part.
     """
     share = tolerance * SHARES["kernels"]
     seen = trial(whole.grid).to(whole.stack.device)
@@ -156,7 +168,9 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
         want = blurred(seen, whole)
         for looser in LOOSER:
             few = trimmed(whole, share * looser)
-            error = float((blurred(seen, few) - want).norm() / want.norm())
+            missed = blurred(seen, few) - want
+            pairs = (missed, want), (returned(missed, whole.grid), returned(want, whole.grid))
+            error = max(float(part.norm() / light.norm().clamp_min(1e-30)) for part, light in pairs)
             if error <= share * 0.97:
                 break
     few = trimmed(whole, share * looser)
@@ -182,7 +196,10 @@ def trial(grid: Grid) -> Frames:
 
 def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     """Errors at places, depths and wavelengths that no node holds: interpolation of PSFs and of their light,
-    transform, components of the field that are left out, pillars taken together; light left outside."""
+    transform, components of the field that are left out, pillars taken together; light left outside.
+
+    Those that count by the light of a place are over the whole frame's light: more of an image that is dimmer than it.
+    """
     plan = made.plan
     draw = np.random.default_rng(7)
     pixels = torch.from_numpy(np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)).long()
@@ -200,9 +217,11 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[..., None, None]
     with torch.no_grad():
         got = (psfs_used(made, pixels, depths) * lights_used(made, pixels, depths)[..., None, None]).cpu()
-    nodes = cutting.together(got, true * level)
+    dimmer = _dimmer(made)
+    nodes = cutting.together(got, true * level) * dimmer
     few = at[:NEGLECTED], depths
-    share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt())  # of the brightest of few places in the image
+    # of the brightest of few places in the image
+    share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
     transform = left_out.neglected(optics, plan.waves, plan.window, few) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
@@ -210,8 +229,17 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
         shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]
-        found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um)
+        found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um) * dimmer
     return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
+
+
+def _dimmer(made: Imager) -> float:
+    """By how much an image of even light is dimmer than the whole frame's, 1 at least: margins may be in the light
+    where an image lies in the shadow of a stop."""
+    with torch.no_grad():
+        lit = even_light(made)
+        whole, image = (float(part.square().mean().sqrt()) for part in (lit, returned(lit, made.grid)))
+    return max(whole / max(image, 1e-12 * whole), 1.0)
 
 
 def _ripples(

@@ -95,9 +95,7 @@ def image(frames: Frames, optics: Imager, *, chunk: int | None = None) -> Tensor
     for start in range(0, len(frames.radiance), chunk):
         part = [_continued(getattr(frames, n)[start : start + chunk], grid.spare) for n in Frames.__slots__]
         few = Frames(*part)
-        total = blurred(few, optics)
-        edge = grid.margin + grid.spare
-        total = total[..., edge : edge + grid.samples[0], edge : edge + grid.samples[1]]
+        total = returned(blurred(few, optics), grid)
         out.append(total if optics.stray is None else add_stray(total, few, optics.stray, grid))
     return torch.cat(out)
 
@@ -248,15 +246,26 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
 
 def evened(optics: Imager) -> Imager:
     """The patches with the map that gives even light of the middle depth as the nodes' PSFs do (:mod:`.even`)."""
-    depths = optics.stack.shape[2]
-    middle = torch.tensor([(depths - 1) / 2], dtype=torch.float64)
-    deep = dense(middle, torch.arange(depths, dtype=torch.float64))[0].to(optics.stack)
-    stack, energy = (torch.einsum("z,abz...->ab...", deep, part.to(deep)) for part in (optics.stack, optics.energy))
-    wanted = even.light(stack, energy, between_nodes(optics.grid, optics.plan))
+    wanted = even_light(optics)
     one = torch.ones_like(wanted)[None, None]
     depth_um = 1 / (1 / optics.plan.depths_um[[0, -1]]).mean()
     found = _through(one, one, torch.full_like(one, float(depth_um)), optics, kinds=1)[0, 0, 0]
     return replace(optics, even=even.ratio(wanted, found))
+
+
+def even_light(optics: Imager) -> Tensor:
+    """(y, x) image of even light of the middle depth on the whole frame, by the nodes' PSFs."""
+    depths = optics.stack.shape[2]
+    middle = torch.tensor([(depths - 1) / 2], dtype=torch.float64)
+    deep = dense(middle, torch.arange(depths, dtype=torch.float64))[0].to(optics.stack)
+    stack, energy = (torch.einsum("z,abz...->ab...", deep, part.to(deep)) for part in (optics.stack, optics.energy))
+    return even.light(stack, energy, between_nodes(optics.grid, optics.plan))
+
+
+def returned(whole: Tensor, grid: Grid) -> Tensor:
+    """(…, y, x) samples of an image of the whole frame that are returned, without margin and spare."""
+    edge = grid.margin + grid.spare
+    return whole[..., edge : edge + grid.samples[0], edge : edge + grid.samples[1]]
 
 
 def _illumination(patch: Patch, optics: Imager, energy: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ sample's size can show.
 import functools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -20,7 +21,7 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled, polarised
-from metalens.field.rays import Paths, Rays, rays, source_paths, through_stop
+from metalens.field.rays import Paths, Rays, landing, rays, source_paths, through_stop
 from metalens.field.waves import Wave
 from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, media
@@ -28,6 +29,7 @@ from metalens.psf import Mixed, strongest
 
 SPARE = 1.06  # period of the nodes per width of the window
 CLEAR = 0.7  # of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
+DARK = 1e-6  # of samples that no light reaches: a PSF of next to nothing keeps a shape
 LARGEST_P = 0.9  # of a ray, in units of the rarest index
 
 
@@ -151,7 +153,7 @@ def psfs(
         at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with tangents at_um / reduced
             distance through the middle of the lens comes from. Without films that is the chief ray.
         depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in vacuum.
-        shift_um: the window's rays are seen from a place (x, y) beside the field point; the samples stay. A check of
+        shift_um: the window's rays are seen from a place (x, y) beside :func:`view_um`; the samples stay. A check of
             what the transform neglects.
         finest_um: shortest wavelength of a spectrum, whose nodes are then those of all its wavelengths.
 
@@ -162,8 +164,35 @@ def psfs(
         PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
     grid = sampling(optics, window, wavelength_um, finest_um)
-    ends = tuple(_to_samples(grid, window, shift, at_um.device) for shift in shift_um)
-    return torch.stack([_one(optics, grid, place, depths_um, wavelength_um, (*ends,), shift_um) for place in at_um])
+    views = [view_um(optics, place, depths_um, min(wavelength_um, finest_um)) for place in at_um]
+    return torch.stack(
+        [
+            _one(optics, grid, place, depths_um, wavelength_um, _view(grid, window, view, shift_um, at_um.device))
+            for place, view in zip(at_um, views, strict=True)
+        ]
+    )
+
+
+def view_um(optics: Optics, place: Tensor, depths_um: Tensor, wavelength_um: float) -> tuple[float, float]:
+    """(x, y) beside a field point from where its rays are seen: where the light lands that a stop lets through."""
+    after = optics.layers.after(optics.distance_um, wavelength_um)
+    x, y = place.tolist()
+    wave = optics.wave
+    return landing(optics.layers, wave.carrier_rad, wave.radius_um, ((x, y), after), depths_um, wavelength_um)
+
+
+class _View(NamedTuple):
+    """From where the rays of a field point are seen, (x, y) beside it, and the samples along x and y from there."""
+
+    beside_um: tuple[float, float]
+    ends: tuple[Samples, ...]
+
+
+def _view(
+    grid: Sampling, window: Window, view: tuple[float, float], shift_um: tuple[float, float], device: torch.device
+) -> _View:
+    ends = tuple(_to_samples(grid, window, v, s, device) for v, s in zip(view, shift_um, strict=True))
+    return _View((view[0] + shift_um[0], view[1] + shift_um[1]), ends)
 
 
 def _one(
@@ -172,11 +201,11 @@ def _one(
     place: Tensor,
     depths_um: Tensor,
     wavelength_um: float,
-    ends: tuple[Samples, ...],
-    shift_um: tuple[float, float],
+    view: _View,
 ) -> Tensor:
     """(depths, h, w) PSFs of one field point."""
-    found, pupil = seen(optics, place, grid, wavelength_um, shift_um)
+    ends = view.ends
+    found, pupil = seen(optics, place, grid, wavelength_um, view.beside_um)
     after = optics.layers.after(optics.distance_um, wavelength_um)
     tangents = place / after.reduced_um
     paths = source_paths(optics.layers, tangents, found, depths_um, wavelength_um)
@@ -272,11 +301,11 @@ def _moved(power: Tensor, ends: tuple[Samples, ...], move: Tensor) -> tuple[Tens
 
 
 def seen(
-    optics: Optics, place: Tensor, grid: Sampling, wavelength_um: float, shift_um: tuple[float, float] = (0.0, 0.0)
+    optics: Optics, place: Tensor, grid: Sampling, wavelength_um: float, beside_um: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[Rays, Pupil]:
-    """The rays of the nodes for one window centre, and the lens' carrier with the path to that centre."""
+    """The rays of the nodes to a place beside the field point, and the lens' carrier with the path to there."""
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    at = float(place[0]) + shift_um[0], float(place[1]) + shift_um[1]
+    at = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
     found = rays(after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device)
     phase = optics.wave.carrier_rad(found.x_um, found.y_um) + 2 * math.pi / wavelength_um * found.away_um
     return found, Pupil(found.whole * found.passed, phase, float((found.whole**2).sum()))
@@ -294,15 +323,18 @@ def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
-def _to_samples(grid: Sampling, window: Window, shift_um: float, device: torch.device) -> Samples:
+def _to_samples(grid: Sampling, window: Window, view_um: float, shift_um: float, device: torch.device) -> Samples:
     """From the points of the padded transform to the samples along an axis: sinc² up to its second zero.
 
     Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics to harmonics, by a transform.
+    Samples more than half a period from where the light lands are dark (``DARK``): the transform has other light there.
     """
     harmonic = np.arange(grid.harmonics + 1)
     box = np.sinc(harmonic / grid.period_um * window.step_um) ** 2
-    place = (np.arange(window.samples) - (window.samples - 1) / 2) * window.step_um - shift_um
-    wave = box * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
+    place = (np.arange(window.samples) - (window.samples - 1) / 2) * window.step_um - view_um
+    seen_as = np.where(np.abs(place) <= grid.period_um / 2, 1.0, DARK)
+    place = place - shift_um
+    wave = seen_as[:, None] * box * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
     scale = window.step_um / grid.period_um * grid.size
     light = scale * np.fft.irfft(wave, grid.size)
     slope = scale * np.fft.irfft(wave * (2j * np.pi / grid.period_um * harmonic), grid.size)

@@ -6,6 +6,7 @@ are the same directions share it: what was computed last is kept.
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from metalens.lens import Layers, Media, media, smooth
 
 VERGENCES = 5  # Chebyshev points of 1/z for the paths of many depths
+FEW = 24  # rays along an axis that tell where the light behind a stop lands
 KEPT = 4  # field points whose rays are kept: a few MB each
 
 
@@ -89,6 +91,39 @@ def through_stop(
     for one, depth in zip(out, depths_um, strict=True):
         one[lit] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
     return torch.from_numpy(out).to(seen.x_um.device)
+
+
+def landing(
+    layers: Layers,
+    carrier_rad: Callable[[Tensor, Tensor], Tensor],
+    radius: float,
+    seen_from: tuple[tuple[float, float], Media],
+    depths_um: Tensor,
+    wavelength_um: float,
+) -> tuple[float, float]:
+    """(x, y) um beside a field point at which its light lands, mean over its rays and depths; (0, 0) without a stop.
+
+    A ray of direction p lands at -(1/k) ∂(phase)/∂p. A stop before a lens lets light from the side through one part of
+    it alone, by which it lands beside the ray through the middle.
+
+    Args:
+        carrier_rad: phase of the lens at places (x, y). seen_from: the field point, and the media behind the lens.
+    """
+    if layers.stop is None:
+        return 0.0, 0.0
+    place, after = seen_from
+    step = 2 * float(media.direction(after, torch.tensor(radius, dtype=torch.float64))) / FEW
+    found = rays(after, radius, place, (FEW, step), torch.device("cpu"))
+    tangents = place[0] / after.reduced_um, place[1] / after.reduced_um
+    own = carrier_rad(found.x_um, found.y_um) * (wavelength_um / (2 * math.pi)) + found.away_um
+    paths = own + source_paths(layers, torch.tensor(tangents), found, depths_um, wavelength_um).um
+    sums = torch.zeros(3, dtype=torch.float64)
+    for depth, path in zip(depths_um.tolist(), paths, strict=True):
+        light = found.whole**2 * layers.lit(tangents, depth, wavelength_um, (found.x_um, found.y_um), found.width_um)
+        y, x = torch.gradient(path, spacing=step)
+        sums += torch.stack([-(light * x).sum(), -(light * y).sum(), light.sum()])
+    x_um, y_um, given = sums.tolist()
+    return (x_um / given, y_um / given) if given > 0 else (0.0, 0.0)
 
 
 def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:

@@ -154,6 +154,7 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     monkeypatch.setattr(engine.left_out, "missing", missing)
     monkeypatch.setattr(engine, "sampling", lambda optics, window, wave: SimpleNamespace(beyond=0.05 * wave))
     monkeypatch.setattr(engine, "through", lambda optics, at, *, depths_um, wavelength_um, window: through)
+    monkeypatch.setattr(engine, "_dimmer", lambda made: 1.3)
     grid = Grid((31, 44), 2.0, (3e3, 9e3), window=7)
     parts = engine._held_out(OPTICS, SimpleNamespace(plan=PLAN, grid=grid))
     rows, columns = grid.frame
@@ -168,9 +169,9 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     cosine4 = torch.from_numpy(1 / (1 + (x**2 + y**2) / OPTICS.distance_um**2) ** 2)[:, None]
     want, got = (part * light[..., None, None] for part, light in ((true, passed * cosine4), (used, told)))
     shown = [[(patches.texture_view(part[:, z]) ** 2).sum() for z in (0, 1)] for part in (got - want, want)]
-    assert parts["nodes"] == pytest.approx(math.sqrt(max(shown[0]) / max(shown[1])), rel=1e-5)
+    assert parts["nodes"] == pytest.approx(1.3 * math.sqrt(max(shown[0]) / max(shown[1])), rel=1e-5)
     assert parts["outside"] == pytest.approx(1 - float(passed.sum() / through.sum()), rel=1e-9)
-    share = float(passed[:5].max() / passed.norm() * math.sqrt(32))
+    share = 1.3 * float(passed[:5].max() / passed.norm() * math.sqrt(32))
     assert parts["spectrum"] == 0.004
     assert parts["transform"] == pytest.approx(0.017 * share, rel=1e-9)
     assert parts["polarisation"] == pytest.approx(0.0031 * share, rel=1e-9)
@@ -316,3 +317,21 @@ def test_the_texture_that_kernels_are_judged_by_fills_all_depths_with_two_sheets
     light = (frames.radiance[0] / cover)[cover > 1e-5]  # of both sheets, but where one is all there is
     assert float(light.mean()) == pytest.approx(1.0, abs=0.02)
     assert float(light.std()) == pytest.approx(0.3, abs=0.02)  # less what is cut off at 0
+
+
+def test_an_image_in_the_shadow_counts_errors_over_its_own_light():
+    """Light falls by a factor of 20 over a frame whose margin lies in the light: even light of PSFs of one sample."""
+    grid = Grid((1, 3), 2.0, (3e3, 9e3), margin=3, window=3)
+    point = torch.zeros(3, 3)
+    point[1, 1] = 1.0
+    nodes = [torch.linspace(-half, half, 2).double() for half in grid.half_um]
+    about = Plan(*nodes, torch.tensor([4e3]).double(), WAVES, Window(3, 2.0), folds=False)
+    stack = point.expand(2, 2, 1, 3, 3)
+    energy = torch.tensor([20.0, 1.0]).expand(2, 2)[..., None]
+    lit = np.linspace(20.0, 1.0, 9)
+    for light in (energy, energy.flip(1)):
+        made = Imager(grid, about, stack, light, [], [], {})
+        want = math.sqrt(np.mean(lit**2) / np.mean(lit[3:6] ** 2))
+        assert engine._dimmer(made) == pytest.approx(want, rel=1e-6)
+    peak = torch.tensor([[1.0, 1.0], [1.0, 1.0]])[..., None]
+    assert engine._dimmer(Imager(grid, about, stack, peak, [], [], {})) == 1.0
