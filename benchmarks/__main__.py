@@ -18,8 +18,8 @@ import benchmarks
 from benchmarks import Row, figures
 
 LONG = (
-    "closure", "engines", "gpu", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee", "shaped_cells",
-    "shaped_seen",
+    "closure", "engines", "gpu", "gpu_training", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee",
+    "shaped_cells", "shaped_seen",
 )  # fmt: skip
 HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
 

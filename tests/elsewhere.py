@@ -6,6 +6,7 @@ code for the processor alone would read or write is therefore found here, withou
 """
 
 import contextlib
+import importlib
 from typing import Any
 
 import torch
@@ -36,10 +37,25 @@ class There(torch.Tensor):
 
 @contextlib.contextmanager
 def elsewhere():
-    """Within it ``device=AWAY`` gives tensors with numbers; yields the names of the operations that ran there."""
-    with _Given(), _Done():
-        DONE.clear()
-        yield DONE
+    """Within it ``device=AWAY`` gives tensors with numbers; yields the names of the operations that ran there.
+
+    The other device is that of one thread and has fused steps of optimisers; parameters that move there stay the same
+    objects, as a GPU's do.
+    """
+    threads, swapped = torch.get_num_threads(), torch.__future__.get_swap_module_params_on_conversion()
+    optimiser = importlib.import_module("torch.optim.optimizer")
+    fused = optimiser._get_fused_kernels_supported_devices
+    torch.set_num_threads(1)
+    torch.__future__.set_swap_module_params_on_conversion(True)
+    optimiser._get_fused_kernels_supported_devices = lambda: [*fused(), AWAY.type]
+    try:
+        with _Given(), _Done():
+            DONE.clear()
+            yield DONE
+    finally:
+        optimiser._get_fused_kernels_supported_devices = fused
+        torch.__future__.set_swap_module_params_on_conversion(swapped)
+        torch.set_num_threads(threads)
 
 
 DONE: set[str] = set()

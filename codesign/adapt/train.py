@@ -31,6 +31,7 @@ from codesign.train import (
     assess,
     checkpoint,
     model,
+    place,
 )
 from metalens.ground.errors import TrainingError
 
@@ -107,7 +108,7 @@ def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth 
 
 
 def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:
-    """The inner loop of the run, from its trained weights, on given PSFs; only the weights move."""
+    """The inner loop of the run, from its trained weights and where it is placed, on given PSFs; only weights move."""
     settings, origin = source.settings, source.run.trainer
     fresh = model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
@@ -117,10 +118,12 @@ def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> T
     with torch.no_grad():
         fresh.coefficients_rad.copy_(origin.model.coefficients_rad)
         fresh.log_pitch.copy_(origin.model.log_pitch)
-    return Trainer(
+    made = Trainer(
         fine_tuning(settings.inner, config), settings.optics, origin.sensor, origin.scenes, fresh,
         architecture=source.architecture, stacks=stacks,
     )  # fmt: skip
+    place(made, origin.light.device)
+    return made
 
 
 def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:

@@ -16,7 +16,7 @@ from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
-from codesign.train import Record, Trainer, checkpoint
+from codesign.train import Record, Trainer, checkpoint, device_of, place
 from metalens import __version__, lens
 from metalens.ground import config, reading, store
 from metalens.ground.errors import TrainingError
@@ -33,6 +33,7 @@ def run(options: Options) -> int:
     """Train on, judge, correct, report; exit 0."""
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
     retraining.network(source.run.trainer)  # refused now, not after the lenses were imaged
+    place(source.run.trainer, device_of(options.device))
     result = asbuilt.load(options.asbuilt)
     design = lens.load_plain(options.run_dir / "lens.h5")
     retraining.check_lens(design, result, insist=options.insist)

@@ -153,6 +153,7 @@ def _tuned(run: Run, architecture: Architecture, number: int) -> Trainer:
     going = Trainer(
         inner, source.optics, source.sensor, source.scenes, made, architecture=architecture, stacks=source.light.stacks
     )
+    going.light.device = source.light.device  # where the copied network lies already
     for _ in going.run() if steps else ():
         pass
     return going

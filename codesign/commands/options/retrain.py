@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from codesign.adapt import RetrainConfig
+from codesign.train import Place
 from metalens.commands import Common, Output
 
 WORK = "codesign.commands.retrain"
@@ -24,6 +25,7 @@ class Options(Common):
         process: PROCESS.toml that the mask was drawn with; its bias table is the one to be corrected.
         settings: how to train on.
         resume: go on from the folder's checkpoints, bit for bit.
+        device: of images and network, as in ``metalens codesign``.
         export: write the retrained network as ONNX too, as ``metalens codesign --export`` does.
         insist: use a fit that failed its own checks.
     """
@@ -35,5 +37,6 @@ class Options(Common):
     process: Path | None = None
     settings: tyro.conf.OmitArgPrefixes[RetrainConfig] = field(default_factory=RetrainConfig)
     resume: bool = False
+    device: Place = "auto"
     export: bool = False
     insist: bool = False

@@ -23,8 +23,10 @@ from codesign.adapt.train import Outcome
 from codesign.optics import formed
 from codesign.optics.built import MadeLens
 from codesign.optics.stack import Stack
+from codesign.train import place
 from metalens.ground.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
+from tests.elsewhere import AWAY, elsewhere
 
 SHORT = RetrainConfig(steps=2, draws=2, judge=1, test_batches=1)
 TRUTH = Truth((3000.0,), parameter=tuple(Known(n, v) for n, v in m.TRUE.items()))
@@ -136,6 +138,22 @@ def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_
         assert torch.equal(a, b)
     before = source.run.trainer.model.net.state_dict()
     assert any(not torch.equal(before[n], v) for n, v in whole.model.net.state_dict().items())
+
+
+def test_a_job_trains_where_its_run_is_placed(folder, found):
+    """On the played device its losses are the processor's, and its frames are imaged there."""
+    plain = retraining.job(retraining.load(folder), SHORT, found, "retrained")
+    want = next(plain.run(until=1))
+    source = retraining.load(folder)
+    with elsewhere() as done:
+        place(source.run.trainer, AWAY)
+        going = retraining.job(source, SHORT, found, "retrained")
+        told = next(going.run(until=1))
+        judged = retraining.judge(going, source, SHORT, found.judges)
+    assert {"convolution_backward", "_fft_r2c"} <= done
+    assert told.loss == pytest.approx(want.loss, rel=1e-5)
+    list(plain.run(until=1))
+    assert judged.slip_mm == pytest.approx(retraining.judge(plain, source, SHORT, found.judges).slip_mm, rel=1e-3)
 
 
 def test_only_weights_move(folder, found):

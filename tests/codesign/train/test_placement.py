@@ -1,13 +1,12 @@
 """Where the network computes."""
 
-import contextlib
 import math
 
 import pytest
 import torch
 
 from codesign.network import largest
-from codesign.train import placement, run
+from codesign.train import finish, placement, run
 from metalens.ground import config
 from metalens.ground.errors import ConfigError
 from tests.elsewhere import AWAY, elsewhere
@@ -18,7 +17,7 @@ SMALL = {"scenes": {"pixels": 64, "margin": 8, "pool": 16}, "inner": {"steps": 4
 
 def _going(change=None, frozen=()):
     small = config.merged(run.preset_table("smoke"), SMALL)
-    table = config.merged(small, (change or {}) | {"run": {"frozen": list(frozen)}})
+    table = config.merged(config.merged(small, {"run": {"frozen": list(frozen)}}), change or {})
     return run.start(config.from_table(table, run.RunConfig, where="a test"))
 
 
@@ -61,10 +60,8 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
     """Images, pixels, network, losses and the way back to lens and pitch: nothing of it is for the processor alone."""
     plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
     (want,) = plain.run(until=1)
-    with elsewhere() as done, swapped(), one_thread():  # the other device is that of one thread
+    with elsewhere() as done:
         placement.place(moved, AWAY)
-        for group in (g for o in moved.optimisers.values() for g in o.param_groups):
-            group["fused"] = False  # one kernel of PyTorch's own, which knows no devices but its list
         (found,) = moved.run(until=1)
         there = {name: p.cpu() for name, p in moved.model.net.named_parameters()}
     assert {"convolution", "convolution_backward", "_fft_r2c"} <= done
@@ -78,24 +75,17 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
         assert there[name].shape == p.shape
 
 
-@contextlib.contextmanager
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def swapped():
-    """Parameters that move stay the same objects, which a GPU's do."""
-    torch.__future__.set_swap_module_params_on_conversion(True)
-    try:
-        yield
-    finally:
-        torch.__future__.set_swap_module_params_on_conversion(False)
+def test_what_a_run_ends_with_is_formed_where_it_trained():
+    """Fine-tuning, test frames and the test of depth, beside the processor's."""
+    change = {"network": "popovic", "run": {"finetune_steps": 1}, "test_batches": 1, "ambiguity_pairs": 8}
+    plain, moved = _going(change), _going(change)
+    (want,) = finish.finish(plain)
+    with elsewhere() as done:
+        placement.place(moved.trainer, AWAY)
+        (found,) = finish.finish(moved)
+    assert {"convolution_backward", "_fft_r2c"} <= done  # trained on, and imaged
+    for name in want.keys() - {"architecture", "budget_mmacs"}:
+        assert found[name] == pytest.approx(want[name], rel=1e-3, abs=1e-5), name
 
 
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
