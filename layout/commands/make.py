@@ -26,7 +26,6 @@ from layout.rules import markers
 from metalens import lens as lenses
 from metalens.ground import config, store, transaction
 from metalens.ground.arrays import Array
-from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
 from metalens.lens import Lens
 
@@ -56,7 +55,6 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
     with stages("read"):
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
         rules = processes.Process() if options.process is None else processes.load(options.process)
-        _refuse_two_sizes(options, source)
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
         made = build.prepare(source, rules, name=options.name, furniture=furniture, with_doses=options.dose)
@@ -72,16 +70,6 @@ def _room(options: Options, source: Lens) -> int:
     """Bytes that the mask files need: a reference of GDSII for each pillar, of OASIS a byte for each site at most."""
     small = math.prod(source.diameters.diameter_um.shape)
     return gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small if options.writes_gds else small
-
-
-def _refuse_two_sizes(options: Options, source: Lens) -> None:
-    """What knows pillars of one size alone, turned or not.
-
-    Raises:
-        ProcessError: naming the option.
-    """
-    if options.study and source.pairs is not None:
-        raise ProcessError("--study takes pillars that differ in one size, and in their turn, not pillars of two sizes")
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:

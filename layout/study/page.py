@@ -7,7 +7,7 @@ import numpy as np
 from layout.mask import FieldPlan
 from layout.process import Process
 from layout.study import stitching, tolerance, tolerant
-from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.sensitivity import PairSensitivities, Sensitivities, pair_sensitivities, sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
 from metalens.ground import report
@@ -23,15 +23,28 @@ def sections(lens: Lens, process: Process, plan: FieldPlan, *, answers: Sensitiv
     """The three sections; half a minute for a 1 mm lens, most of it for the solver and the Monte Carlo.
 
     Pillars that are turned one by one have no choice of sizes: their turn gives any phase at the size that is best.
+    Those of two sizes have none either, and two sections for light along x and two for light along y.
 
     answers: of the pillars to height, wall and index; left out: from the solver.
 
     Raises:
         CellError, MaterialError: from the solver of the pillar.
     """
+    if lens.pairs is not None:
+        return [
+            replace(section, title=f"{section.title}, light along {light}")
+            for light, answer in pair_sensitivities(lens).items()
+            for section in _of_light(lens.seen("x" if light == "x" else "y"), process, plan, answer)
+        ]
     answers = sensitivities(lens) if answers is None else answers
-    found = [_stitching(lens, plan, process), _tolerance(lens, process, answers)]
+    found = _of_light(lens, process, plan, answers)
     return found if lens.hand else [*found, _choice(lens, process, answers)]
+
+
+def _of_light(
+    lens: Lens, process: Process, plan: FieldPlan, answers: Sensitivities | PairSensitivities
+) -> list[Section]:
+    return [_stitching(lens, plan, process), _tolerance(lens, process, answers)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
@@ -76,7 +89,7 @@ def _stitched(found: StitchReport) -> bytes:
     return report.png(figure)
 
 
-def _tolerance(lens: Lens, process: Process, answers: Sensitivities) -> Section:
+def _tolerance(lens: Lens, process: Process, answers: Sensitivities | PairSensitivities) -> Section:
     study = tolerance.analyse(lens, process, sens=answers)
     rows = [
         [e.cause, e.deviation, e.phase_rad, *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information))]
@@ -87,10 +100,11 @@ def _tolerance(lens: Lens, process: Process, answers: Sensitivities) -> Section:
         [name, *(float(v) for v in study.band(name)), float(getattr(study.nominal, name)[0])]
         for name in ("strehl", "efficiency", "psf_change")
     ]
+    through = "the diameter through the proxy" if lens.pairs is None else "both sizes through the table of the library"
     text = (
         "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
-        f"derivatives of the solver (known to {100 * answers.error:.0f} %), the diameter through the proxy; the "
+        f"derivatives of the solver (known to {100 * answers.error:.0f} %), {through}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     )
     items: list[Figure | Table] = [

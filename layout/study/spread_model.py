@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.study.focus import Focus
-from layout.study.sensitivity import Sensitivities
+from layout.study.pillars import Pillars, kinds
+from layout.study.sensitivity import PairSensitivities, Sensitivities
 from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Draw, Spread, State, draws, transmission
-from metalens.pillars import Proxy
+from metalens.made import Draw, Spread, State, draws
 
-_ENTRY_UM = 5e-5  # resolution of the diameters in the table
 _BAND, _PARTS = 16, 16  # rows that are summed at once, by any one worker; parts of a lens that workers take
 _LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss
 _DEGREE = 10  # of the dependence on the local bias
@@ -30,32 +29,16 @@ _SAMPLES = 160
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pillars:
-    """What t of a pillar follows from: the proxy of the lens at its wavelength, and the answers of a solver."""
-
-    proxy: Proxy
-    wavelength_um: float
-    sens: Sensitivities
-
-    def curve(self, diameter_um: Array, bias_um: Array, state: State) -> Array:
-        """(bias, diameters) complex t for local biases and one made lens."""
-        bias = np.reshape(bias_um, (-1, 1))
-        d = diameter_um + bias
-        return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Model:
     """Sums over the pillars of a lens for all draws of its process.
 
-    pillars: what any of them answers to.
-    diameter_um, count: (entries,) of the pillars, to 0.05 nm. basis: (rank, entries) B_k, orthonormal over pillars.
+    pillars: the kinds of them (sizes to 0.05 nm), and what their t answers to. count: (kinds,) how many of each.
+    basis: (rank, kinds) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
 
     pillars: Pillars
     focus: Focus
-    diameter_um: Array
     count: Array
     basis: Array
     moments: Array
@@ -69,7 +52,7 @@ class Model:
         for state in lenses:
             bias = state.bias_um(x, y)
             middle, half = (bias.max() + bias.min()) / 2, (bias.max() - bias.min()) / 2 + 1e-9
-            curves = self.pillars.curve(self.diameter_um, middle + half * knots, state)
+            curves = self.pillars.curve(middle + half * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
             series = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
             at_nodes = np.polynomial.chebyshev.chebval((bias - middle) / half, series)
@@ -78,16 +61,15 @@ class Model:
         return np.stack(found)
 
 
-def reduce(lens: Lens, sens: Sensitivities, focus: Focus, spread: Spread, *, seed: int) -> Model:
+def reduce(lens: Lens, sens: Sensitivities | PairSensitivities, focus: Focus, spread: Spread, *, seed: int) -> Model:
     """Find the basis from random draws of the spread, and sum the pillars for each of its functions."""
-    index, diameter, count = _table(lens)
-    pillars = Pillars(lens.proxy, lens.wavelength_um, sens)
+    index, count, pillars = kinds(lens, sens)
     states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
     angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
     u, v = place * np.cos(angle), place * np.sin(angle)
-    curves = [pillars.curve(diameter, state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)]
+    curves = [pillars.curve(state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)]
     weight = np.sqrt(count)
     with threads.one_blas_thread():  # the same bits on any machine's number of them
         size, directions = np.linalg.svd(np.stack(curves) * weight, full_matrices=False)[1:]
@@ -98,7 +80,7 @@ def reduce(lens: Lens, sens: Sensitivities, focus: Focus, spread: Spread, *, see
     edges = [len(index) * i // _PARTS for i in range(_PARTS + 1)]
     parts = [(start, index[start:stop], _turned(lens, slice(start, stop))) for start, stop in itertools.pairwise(edges)]
     moments = functools.reduce(np.add, executor.gather(_summed, (focus, columns), parts))
-    return Model(pillars, focus, diameter, count, basis, moments, lens.diameters.radius_um)
+    return Model(pillars, focus, count, basis, moments, lens.diameters.radius_um)
 
 
 def _turned(lens: Lens, rows: slice) -> Array | None:
@@ -109,7 +91,7 @@ def _turned(lens: Lens, rows: slice) -> Array | None:
 def _summed(about: tuple[Focus, Array], part: tuple[int, Array, Array | None]) -> Array:
     """(rank, nodes y, nodes x) sums over rows of pillars.
 
-    about: and the (rank, 1 + entries) basis. part: first row; (rows, x) entry of each site; (rows, x) factor of each.
+    about: and the (rank, 1 + kinds) basis. part: first row; (rows, x) kind of each site; (rows, x) factor of each.
     """
     (focus, columns), (first, index, turned) = about, part
     moments = np.zeros((len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
@@ -126,19 +108,8 @@ def missed(model: Model, lenses: Sequence[Draw]) -> float:
     for draw in lenses:
         state, along = draw.state(), np.array([0.0, 1.0, -1.0])
         bias = state.bias_um(along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad))
-        curves = model.pillars.curve(model.diameter_um, bias, state)
+        curves = model.pillars.curve(bias, state)
         weights = (curves * model.count) @ model.basis.conj().T
         rest = (abs(curves - weights @ model.basis) ** 2) @ model.count / (abs(curves) ** 2 @ model.count)
         worst = max(worst, float(np.sqrt(rest.max())))
     return worst
-
-
-def _table(lens: Lens) -> tuple[Array, Array, Array]:
-    """((y, x) entry of each site, 0 none; (entries,) diameters from entry 1 on; how many of each)."""
-    raw = np.rint(lens.diameters.diameter_um / _ENTRY_UM).astype(np.int32)
-    count = np.bincount(raw.ravel())
-    count[0] = 0
-    used = np.flatnonzero(count)
-    position = np.zeros(len(count), np.int32)
-    position[used] = np.arange(1, len(used) + 1)
-    return position[raw], used * _ENTRY_UM, count[used]

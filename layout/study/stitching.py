@@ -84,7 +84,9 @@ def field_moments(lens: Lens, plan: FieldPlan, focus: Focus) -> tuple[int, Array
 
 
 def _amplitude(lens: Lens, rows: slice, columns: slice) -> Array:
-    d = lens.diameters.diameter_um[rows].astype(float)
+    d, long = lens.diameters.diameter_um[rows].astype(float), lens.diameters.length_um
+    if lens.pairs is not None and long is not None:
+        return lens.pairs.amplitude(d, long[rows], lens.wavelength_um, lens.light)[:, columns].astype(np.complex64)
     inside = np.where(d > 0, d, lens.proxy.domain_um[0])
     t = designed(lens.proxy, inside, lens.wavelength_um) * np.exp(1j * lens.geometric_rad(rows))
     return np.where(d > 0, t, 0)[:, columns].astype(np.complex64)

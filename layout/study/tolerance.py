@@ -1,13 +1,12 @@
 """What the spread of the process does to a lens: effect of each cause, and Monte Carlo with confidence bands."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from layout.process import Process
 from layout.study.focus import Window, peak, prepare, window
-from layout.study.sensitivity import Sensitivities, sensitivities
+from layout.study.sensitivity import PairSensitivities, Sensitivities, pair_sensitivities, sensitivities
 from layout.study.spread_model import Model, missed, reduce
 from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
@@ -83,7 +82,7 @@ def analyse(
     lens: Lens,
     process: Process,
     *,
-    sens: Sensitivities | None = None,
+    sens: Sensitivities | PairSensitivities | None = None,
     depths_um: tuple[float, ...] = (),
     draws: int = 100,
     seed: int = 0,
@@ -103,7 +102,8 @@ def analyse(
     if draws < 10:
         raise ProcessError(f"draws = {draws}: need 10 or more for confidence bands")
     process.spread.check(lens.cell)
-    sens = sensitivities(lens) if sens is None else sens
+    if sens is None:
+        sens = sensitivities(lens) if lens.pairs is None else pair_sensitivities(lens)[lens.light]
     near, far = reach.depth_range_um(lens)
     depths_um, step_um = depths_um or (near, (near + far) / 2, far), (far - near) / STEPS
     every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))])
@@ -184,8 +184,7 @@ def _pillar_change(model: Model, state: State) -> tuple[float, float]:
     """(rms phase change about the mean, rms change of |T|) over pillars spread evenly over the aperture."""
     radius, angle = np.sqrt((np.arange(64) + 0.5) / 64), np.arange(64) * np.pi * (3 - np.sqrt(5))
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    answered = functools.partial(model.pillars.curve, model.diameter_um)
-    before, after = answered(np.zeros(1), State.of()), answered(state.bias_um(u, v), state)
+    before, after = (model.pillars.curve(np.zeros(1), State.of()), model.pillars.curve(state.bias_um(u, v), state))
     weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
     turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
     turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))

@@ -75,7 +75,7 @@ class Layer:
     """
 
     height_um: float
-    grow_um: float = 0.0
+    grow_um: float = field(default=0.0, metadata={"signed": True})
     material: Material | None = None
     between: Material | None = None
     coat_um: float = 0.0

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from metalens.made.causes import with_missing as with_missing
     from metalens.made.own import OwnRates as OwnRates
     from metalens.made.own import own_rates as own_rates
+    from metalens.made.own import pair_rates as pair_rates
     from metalens.made.printed import Printed as Printed
     from metalens.made.printed import of_process as of_process
     from metalens.made.printed import with_table as with_table
@@ -79,6 +80,7 @@ __getattr__, __dir__, __all__ = attach(
         "of_kind": "causes",
         "of_process": "printed",
         "own_rates": "own",
+        "pair_rates": "own",
         "read_csv": "bias",
         "sensitivity": "response",
         "spread": "",

@@ -10,6 +10,7 @@ from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.made.causes import Answers, Cause, of_kind
+from metalens.pillars.axes import sized
 
 if TYPE_CHECKING:
     from metalens.lens import Lens
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 _UPRIGHT, _TILTED = (6, 8), (5, 6)  # harmonics of the coarser and the finer truncation
 _HANDS = {"left": -1.0, "right": 1.0}
+_ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,14 +42,36 @@ def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
     Accuracy: ``error``, the change from a coarser truncation: a few percent.
 
     Raises:
-        CellError, MaterialError: from the solver. LensError: pillars of two sizes, which no single size tells.
+        CellError, MaterialError: from the solver. LensError: pillars of two sizes (:func:`pair_rates`).
     """
     if lens.pairs is not None:
         raise LensError("pillars of two sizes: their derivatives are no function of one size")
+    edges = {} if lens.cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
+    (found,) = _rates(lens, [(lens.cell, float(d)) for d in size_um], edges, (seen(lens),))
+    return found
+
+
+def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, OwnRates]:
+    """As :func:`own_rates`, of pillars of two sizes, for light along "x" and along "y".
+
+    Their table knows both sizes, so that nothing is left of a bias of all edges: ``edges`` are 0.
+    """
+    cells = [(sized(lens.cell, float(w), float(d)), float(w)) for w, d in zip(width_um, length_um, strict=True)]
+    return dict(zip("xy", _rates(lens, cells, {}, (_ALONG_X, _ALONG_Y)), strict=True))
+
+
+def _rates(
+    lens: "Lens", cells: list[tuple[Cell, float]], edges: dict[str, float], weights: tuple[Array, ...]
+) -> list[OwnRates]:
+    """Of pillars of these cells and sizes, for each weighting of the Jones matrix."""
     reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
-    tasks = [(float(d), harmonics) for harmonics in reach for d in size_um]
-    some = list(executor.gather(_derived, (lens.cell, lens.wavelength_um, seen(lens)), tasks))
-    coarse, fine = np.array(some).reshape(len(reach), len(size_um), -1).transpose(0, 2, 1)
+    tasks = [(cell, size, harmonics) for harmonics in reach for cell, size in cells]
+    some = list(executor.gather(_derived, (lens.wavelength_um, edges, weights), tasks))
+    every = np.array(some).reshape(len(reach), len(cells), len(weights), -1).transpose(2, 0, 3, 1)
+    return [_judged(coarse, fine) for coarse, fine in every]
+
+
+def _judged(coarse: Array, fine: Array) -> OwnRates:
     off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
     known = np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()  # a turn that a mirror of the cell forbids is rounding
     return OwnRates(fine[:-1], fine[-1], float((off * known).max()))
@@ -59,28 +83,29 @@ def seen(lens: "Lens") -> Array:
         come = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)
         return np.outer(come, come)
     one = lens.one_light and lens.proxy.max_angle_rad == 0
-    return np.diag([1.0, 0.0] if one else [0.5, 0.5])
+    return _ALONG_X if one else (_ALONG_X + _ALONG_Y) / 2
 
 
-def _derived(about: tuple[Cell, float, Array], task: tuple[float, int]) -> list[complex]:
-    """Derivatives of ln t by every answering cause, and by the edges less by the size."""
+def _derived(
+    about: tuple[float, dict[str, float], tuple[Array, ...]], task: tuple[Cell, float, int]
+) -> list[list[complex]]:
+    """For each weighting: derivatives of ln t by every answering cause, and by the edges less by the size."""
     from metalens.rcwa import jones_derivatives
 
-    (cell, wavelength_um, weight), (size_um, harmonics) = about, task
+    (wavelength_um, edges, weights), (cell, size_um, harmonics) = about, task
     causes = [row for _, row in of_kind(Answers)]
     wanted = [_numbers(row, cell, size_um) for row in causes]
-    edges = {} if cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
     names = dict.fromkeys(name for some in (*wanted, edges) for name in some or {})
     found = jones_derivatives(cell, size_um, wavelength_um, harmonics=harmonics, by=names)
 
-    def by(numbers: dict[str, float]) -> complex:
+    def by(numbers: dict[str, float], weight: Array) -> complex:
         return sum((share * _of(found, name, weight) for name, share in numbers.items()), 0j)
 
     differ = [
-        by(some) if some is not None else _difference(row, about, task)
+        [by(some, weight) for weight in weights] if some is not None else _difference(row, wavelength_um, weights, task)
         for row, some in zip(causes, wanted, strict=True)
     ]
-    return [*differ, by(edges)]
+    return np.transpose([*differ, [by(edges, weight) for weight in weights]]).tolist()
 
 
 def _numbers(row: Cause, cell: Cell, size_um: float) -> dict[str, float] | None:
@@ -92,13 +117,15 @@ def _of(found: "JonesDerivatives", name: str, weight: Array) -> complex:
     return complex((weight * found.by[name].t).sum() / (weight * found.jones.t).sum())
 
 
-def _difference(row: Cause, about: tuple[Cell, float, Array], task: tuple[float, int]) -> complex:
-    """Central difference of ln t by a cause of which no number of the cell tells."""
+def _difference(
+    row: Cause, wavelength_um: float, weights: tuple[Array, ...], task: tuple[Cell, float, int]
+) -> list[complex]:
+    """Central differences of ln t by a cause of which no number of the cell tells, for each weighting."""
     from metalens.rcwa import jones
 
-    (cell, wavelength_um, weight), (size_um, harmonics), acts = about, task, row.acts
+    (cell, size_um, harmonics), acts = task, row.acts
     if not isinstance(acts, Answers) or acts.changed is None:
-        return 0j
+        return [0j] * len(weights)
     ends = (acts.changed(cell, sign * acts.step, wavelength_um) for sign in (-1, 1))
-    less, more = ((weight * jones(end, size_um, wavelength_um, harmonics=harmonics).t).sum() for end in ends)
-    return complex(np.log(more / less) / (2 * acts.step))
+    less, more = (jones(end, size_um, wavelength_um, harmonics=harmonics).t for end in ends)
+    return [complex(np.log((w * more).sum() / (w * less).sum()) / (2 * acts.step)) for w in weights]

@@ -87,7 +87,7 @@ def test_what_a_basis_misses_is_what_least_squares_leave_at_the_worst_of_three_p
         a = draw.amounts
         for along in (0.0, 1.0, -1.0):
             bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (along**2 - 0.5)
-            size = model.diameter_um + bias_nm * 1e-3
+            size = model.pillars.diameter_um + bias_nm * 1e-3
             t = transmission(PROXY, SENS, size, 0.85, draw.state().answers()) * root
             left = t - (fewer.basis * root).T @ np.linalg.lstsq((fewer.basis * root).T, t, rcond=None)[0]
             worst.append(np.linalg.norm(left) / np.linalg.norm(t))
@@ -110,9 +110,9 @@ def test_rows_of_a_part_are_summed_from_its_first_on(reduced, turned):
 def one_function(turns_per_um):
     """A lens of one kind of pillar whose light turns with its bias, summed at nodes in no symmetrical place."""
     at = SimpleNamespace(nodes_x_um=30.0 * np.linspace(-0.9, 0.7, 9), nodes_y_um=30.0 * np.linspace(-0.5, 0.8, 7))
-    pillars = SimpleNamespace(curve=lambda d, bias_um, state: np.exp(1j * turns_per_um * bias_um)[:, None])
+    pillars = SimpleNamespace(curve=lambda bias_um, state: np.exp(1j * turns_per_um * bias_um)[:, None])
     moments = np.random.default_rng(4).normal(size=(1, 7, 18)).view(complex)
-    return Model(pillars, at, np.array([0.2]), np.array([1.0]), np.ones((1, 1)), moments, 30.0)
+    return Model(pillars, at, np.array([1.0]), np.ones((1, 1)), moments, 30.0)
 
 
 def test_a_bias_is_followed_between_its_ends_as_chebyshev_s_points_allow():

@@ -3,12 +3,10 @@
 import dataclasses
 import functools
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from layout.commands import make
 from layout.mask import fields
 from layout.process.process import Process, Rules, WriteField
 from layout.study import focus, stitching, tolerance, tolerant
@@ -242,14 +240,6 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     )
     pictures = [item for section in made for item in section.items if isinstance(item, Figure)]
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
-
-
-def test_pillars_of_two_sizes_are_refused_by_name():
-    study, plain = SimpleNamespace(study=True), SimpleNamespace(study=False)
-    with pytest.raises(ProcessError, match="of two sizes"):
-        make._refuse_two_sizes(study, SimpleNamespace(pairs=1))
-    make._refuse_two_sizes(plain, SimpleNamespace(pairs=1))
-    make._refuse_two_sizes(study, SimpleNamespace(pairs=None))
 
 
 def test_a_turned_lens_has_its_study_without_a_choice_of_sizes(monkeypatch):

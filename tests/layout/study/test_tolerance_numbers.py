@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.process.process import Process
-from layout.study import spread_model, tolerance, tolerant
+from layout.study import pillars, tolerance, tolerant
 from layout.study.sensitivity import Sensitivities
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -86,9 +86,7 @@ def test_a_bias_changes_phase_and_light_by_the_slopes_of_the_proxy():
     """rms of dφ about the mean and of d|T| over the pillars, for a bias of 2 nm that is the same everywhere."""
     diameter, count = np.array([0.12, 0.2, 0.27, 0.29]), np.array([2, 3, 1, 1])
     sens = Sensitivities(np.array([0.1, 0.2, 0.3]), np.zeros((3, 3), complex), 0.0)
-    model = SimpleNamespace(
-        pillars=spread_model.Pillars(LENS.proxy, LENS.wavelength_um, sens), diameter_um=diameter, count=count
-    )
+    model = SimpleNamespace(pillars=pillars.OneSize(LENS.proxy, LENS.wavelength_um, sens, diameter), count=count)
     phase, light = tolerance._pillar_change(model, Draw({"bias_nm": 2.0}).state())
     share = count / count.sum()
     before, after = ((PROXY.phase_rad(d, 0.85), PROXY.transmission(d, 0.85)) for d in (diameter, diameter + 2e-3))
@@ -100,7 +98,8 @@ def test_a_bias_changes_phase_and_light_by_the_slopes_of_the_proxy():
 
 
 def test_entries_of_a_lens_are_its_diameters_and_their_counts():
-    index, diameter, count = spread_model._table(LENS)
+    index, count, made = pillars.kinds(LENS, Sensitivities(np.array([0.1, 0.3]), np.zeros((3, 2)), 0.0))
+    diameter = made.diameter_um
     assert diameter == pytest.approx([0.12, 0.2, 0.27, 0.29], abs=2.6e-5)
     assert count.tolist() == [2, 3, 1, 1]
     assert np.where(index > 0, diameter[index - 1], 0) == pytest.approx(MAP, abs=2.6e-5)

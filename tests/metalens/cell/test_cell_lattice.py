@@ -11,6 +11,7 @@ from metalens.cell import Cell, Lattice, Layer
 from metalens.cell.orders import check_subwavelength, propagating
 from metalens.cell.record import Index
 from metalens.cell.shapes import Circle, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
+from metalens.ground import config
 from metalens.ground.errors import CellError, MaterialError
 
 LATTICES = (Lattice(), Lattice("rectangular", 1.7), Lattice("rectangular", 0.6), Lattice("hexagonal"))
@@ -142,3 +143,14 @@ def test_silica_ends_where_its_source_does():
 def test_a_table_in_nanometres_is_that_in_micrometres(tmp_path):
     (tmp_path / "nm.csv").write_text("wavelength_nm,n,k\n800,3.5,0.1\n900,3.3,0\n")
     assert materials.index(str(tmp_path / "nm.csv"), 0.825) == pytest.approx(3.45 + 0.075j, rel=1e-12)
+
+
+def test_a_cap_narrower_than_its_pillar_is_read_and_comes_back_from_its_own_text():
+    """20 nm narrower on a pedestal 30 nm wider: sections are that much wider than the size, whose gap is to neighbours."""
+    text = (
+        "pitch_um = 0.4\nheight_um = 0.75\n[[layers]]\nheight_um = 0.05\ngrow_um = 0.03\n[[layers]]\nheight_um = 0.6\n"
+        "[[layers]]\nheight_um = 0.1\ngrow_um = -0.02\nmaterial = 'SiO2'\n"
+    )
+    cell = config.loads(text, Cell, where="cell.toml")
+    assert cell.widening_um == pytest.approx((-0.02, 0.03))
+    assert config.loads(config.dumps(cell), Cell, where="again") == cell
