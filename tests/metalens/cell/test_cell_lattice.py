@@ -146,7 +146,7 @@ def test_a_table_in_nanometres_is_that_in_micrometres(tmp_path):
 
 
 def test_a_cap_narrower_than_its_pillar_is_read_and_comes_back_from_its_own_text():
-    """20 nm narrower on a pedestal 30 nm wider: sections are that much wider than the size, whose gap is to neighbours."""
+    """20 nm narrower, on a pedestal 30 nm wider."""
     text = (
         "pitch_um = 0.4\nheight_um = 0.75\n[[layers]]\nheight_um = 0.05\ngrow_um = 0.03\n[[layers]]\nheight_um = 0.6\n"
         "[[layers]]\nheight_um = 0.1\ngrow_um = -0.02\nmaterial = 'SiO2'\n"
