@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from characterize.captures.electrons import Gain as Gain
     from characterize.captures.electrons import clean as clean
     from characterize.captures.electrons import merge_brackets as merge_brackets
+    from characterize.captures.rounding import told as told
     from characterize.captures.turns import MIRRORED as MIRRORED
     from characterize.captures.turns import TURNS as TURNS
     from characterize.captures.turns import between as between
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "clean": "electrons",
         "likeness": "alike",
         "merge_brackets": "electrons",
+        "told": "rounding",
         "turn": "turns",
     },
 )

@@ -7,10 +7,12 @@ import numpy as np
 from scipy import ndimage
 
 from characterize.captures.capture import Capture
+from characterize.captures.rounding import Dark
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 _HIDES = 0.3  # counts of noise from which on rounding is off by a twentieth of a count at most
+_ROUGH = 0.35  # counts²: variance between dark frames up to which noise may be below that, wherever their level lies
 _SURE = 3.0  # standard errors from which on noise is taken to grow with light
 
 
@@ -52,6 +54,7 @@ class Frames:
     common_floor: share of ``variance_e2`` that is the same error in all frames, that of the dark level.
     common_light: relative error of a pixel's light that is the same in all frames, that of the flat (not in the
         variance).
+    count_e: electrons of a count where pixels are rounded counts, ``count_e / scale`` apart; 0 where they are means.
     """
 
     electrons: Array
@@ -61,8 +64,9 @@ class Frames:
     scale: Array
     gain: Gain
     corrections: tuple[str, ...]
-    common_floor: float = 0.0
+    common_floor: float | Array = 0.0
     common_light: float = 0.0
+    count_e: float = 0.0
 
 
 def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
@@ -83,7 +87,7 @@ def photon_transfer(flat: Array, dark: Array | None = None) -> Gain:
     if len(flat) < 2:
         raise CaptureError(f"photon transfer: {len(flat)} flat frame; need two or more of one level")
     offset = float(np.mean(dark)) if dark is not None else 0.0
-    floor = _pair_variance(dark) if dark is not None and len(dark) > 1 else None
+    floor = _floor(dark) if dark is not None and len(dark) > 1 else None
     order = np.argsort([_middle(f) for f in flat], kind="stable")
     pairs = [(flat[a], flat[b]) for a, b in zip(order[:-1:2], order[1::2], strict=False)]
     mean = np.array([(_middle(a) + _middle(b)) / 2 - offset for a, b in pairs])
@@ -116,7 +120,7 @@ def clean(capture: Capture) -> Frames:
     notes = list(capture.corrections)
     raw = np.asarray(capture.frames, float)
     gain = _gain(capture, notes)
-    dark = _dark_level(capture, notes)
+    dark, dark_error = _dark_level(capture, gain, notes)
     flat, flat_error = _flat_field(capture, dark, notes)
     bad = bad_pixels(capture)
     notes.append(f"{int(bad.sum())} of {bad.size} pixels hot, dead or in a dead row: masked")
@@ -130,18 +134,18 @@ def clean(capture: Capture) -> Frames:
         notes.append(f"{saturated.mean():.2%} of the pixels saturated at {top:g} counts: taken as lower bounds")
     if bad.all() or (saturated | bad).all():
         raise CaptureError("no usable pixel: all are saturated, hot or dead; lower the exposure")
-    repeats = len(capture.dark) if capture.dark is not None else math.inf
-    floor = (gain.read_noise_e**2 + gain.gain_e**2 / 12) * (1 + 1 / repeats)
+    once, dark_e2 = gain.read_noise_e**2 + gain.gain_e**2 / 12, (gain.gain_e * dark_error) ** 2
     return Frames(
         (raw - dark) / flat * gain.gain_e,
         np.broadcast_to(~bad, raw.shape).copy(),
         saturated,
-        np.broadcast_to(floor / flat**2, raw.shape),
+        np.broadcast_to((once + dark_e2) / flat**2, raw.shape),
         np.broadcast_to(flat, raw.shape),
         gain,
         tuple(notes),
-        common_floor=1 / (1 + repeats),
+        common_floor=np.broadcast_to(dark_e2 / (once + dark_e2), raw.shape),
         common_light=flat_error,
+        count_e=gain.gain_e,
     )
 
 
@@ -255,15 +259,21 @@ def _gain(capture: Capture, notes: list[str]) -> Gain:
     return Gain(1.0, math.inf, math.sqrt(noise), known=False)
 
 
-def _dark_level(capture: Capture, notes: list[str]) -> Array | float:
+def _dark_level(capture: Capture, gain: Gain, notes: list[str]) -> tuple[Array | float, Array | float]:
+    """(counts without light, their standard error), of every pixel where there are dark frames."""
     if capture.dark is None and "offset" in capture.about:
         notes.append(f"offset of {capture.about['offset']} counts subtracted as stated")
-        return float(capture.about["offset"])
+        return float(capture.about["offset"]), 0.0
     if capture.dark is None:
         notes.append("no dark frame: the offset is left to the fit's background")
-        return 0.0
-    notes.append(f"dark of {len(capture.dark)} frames subtracted, mean {np.mean(capture.dark):.4g} counts")
-    return np.asarray(np.mean(capture.dark, axis=0))
+        return 0.0, 0.0
+    level, error = np.mean(capture.dark, axis=0), math.hypot(gain.read_noise_e / gain.gain_e, 12**-0.5)
+    told, errors = level, np.full_like(level, error / math.sqrt(len(capture.dark)))
+    if gain.coarse:
+        rounded = Dark.of(capture.dark)
+        told, errors = rounded.level, rounded.error
+    notes.append(f"dark of {len(capture.dark)} frames subtracted, mean {np.mean(told):.4g} counts")
+    return np.asarray(told), errors
 
 
 def _flat_field(capture: Capture, dark: Array | float, notes: list[str]) -> tuple[Array, float]:
@@ -290,6 +300,12 @@ def _lonely(frames: Array) -> Array:
     brightest = np.stack([ndimage.maximum_filter(f, footprint=ring) for f in frames])
     spike = (frames - brightest > 6 * spread) & (frames > 1.5 * brightest)
     return np.asarray(spike.mean(0) > (0.8 if len(frames) >= 3 else 2))
+
+
+def _floor(dark: Array) -> float:
+    """Variance of a count without light where noise hides rounding: 1/12 more than before rounding."""
+    variance = _pair_variance(dark)
+    return variance if variance > _ROUGH else Dark.of(dark).noise ** 2 + 1 / 12
 
 
 def _pair_variance(frames: Array) -> float:

@@ -297,3 +297,23 @@ def rearranged(values: Array, arrangement: Arrangement) -> Array:
     """Frames turned and put in order as the arrangement says, where it is clear."""
     out = turn(values, arrangement.orientation) if arrangement.clearly else values
     return np.asarray(out[arrangement.order] if arrangement.reordered else out)
+
+
+def laid_words(found: Arrangement) -> list[str]:
+    """What to say of how the frames lie: turned or reordered, and what of that cannot be seen."""
+    words = []
+    if found.clearly:
+        words.append(f"frames fit the design only {found.words}: used so")
+    if found.reordered:
+        words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
+    if found.alike:
+        which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
+        words.append(
+            f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
+            "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
+        )
+    if not found.order_seen:
+        words.append(
+            "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
+        )
+    return words

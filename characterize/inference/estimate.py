@@ -6,14 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import MIRRORED, TURNS, Capture, Gain, clean
+from characterize.captures import Capture, Gain, clean
 from characterize.inference import explore, knowable, missing, residual, search, verdict
-from characterize.inference.arrange import Arrangement, arrange, rearranged
+from characterize.inference.arrange import Arrangement, arrange, laid_words, rearranged
 from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
 from characterize.inference.explore import Posterior
-from characterize.inference.leastsquares import Data, Solution
+from characterize.inference.leastsquares import Solution
 from characterize.inference.missing import Lean, Looked, Unstated
-from characterize.inference.prepare import check_depths, check_enough, data_of, merged, quick_enough, setting_of, stated
+from characterize.inference.prepare import (
+    check_depths,
+    check_enough,
+    data_of,
+    merged,
+    quick_enough,
+    setting_of,
+    stated,
+    unrounded,
+)
 from characterize.inference.search import Task, with_values
 from characterize.model import (
     NAMES,
@@ -35,6 +44,7 @@ from metalens.made import Sensitivity
 LIKENESS = 0.45
 MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
 _CAUSES = 2  # that are found in the residuals, one after the other
+_ROUNDS, _STAYS = 5, 0.1  # of rounded counts; sigma by which the last moves nothing farther
 _LEFT_OUT = 1.25  # chi-square a pixel of frames left out, with what their prediction is uncertain by
 
 
@@ -86,12 +96,13 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     _check_likeness(found, lens)
     whole = Task(model, data, start, known, found, options.free, unfitted)
     task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
-    cautions = [*frames.corrections, *_arranged_words(task.found or found), *verdict.colours(lens, known)]
+    cautions = [*frames.corrections, *laid_words(task.found or found), *verdict.colours(lens, known)]
     if model.response.error > 0.1:
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     unbiased = search.starts(task, biases_nm=(0.0,))[0]
     task = dataclasses.replace(task, model=quick_enough(task.model, task.data, unbiased))
     task, ends = search.placed(*_ends(task, frames.gain, cautions))
+    task, ends = _unrounded(task, ends, frames.gain)
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):
@@ -107,7 +118,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     posterior = explore.explore(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
-    cautions += verdict.quiet(posterior.best, frames.gain)
+    cautions += verdict.quiet(posterior.best, frames.gain, whole=frames.count_e > 0)
     result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
     _refuse(result.problems, options, leans)
     return result
@@ -136,6 +147,20 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
         return task, ends
     cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
     return wide
+
+
+def _unrounded(task: Task, ends: list[Solution], gain: Gain) -> tuple[Task, list[Solution]]:
+    """The fit by the likelihood of rounded counts, where these are too coarse for their noise."""
+    if not (gain.coarse and task.data.count_e):
+        return task, ends
+    counts = task.data
+    for _ in range(_ROUNDS):
+        task = dataclasses.replace(task, data=unrounded(counts, ends[0].image))
+        before, ends = ends[0], search.distinct([search.refine(task, end.value) for end in ends])
+        off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
+        if np.abs(off).max() < _STAYS:
+            break
+    return task, ends
 
 
 def _with_what_is_there(
@@ -176,37 +201,14 @@ def _check_likeness(found: Arrangement, lens: Lens) -> None:
         )
 
 
-def _arranged_words(found: Arrangement) -> list[str]:
-    words = []
-    if found.clearly:
-        words.append(f"frames fit the design only {found.words}: used so")
-    if found.reordered:
-        words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
-    if found.alike:
-        which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
-        words.append(
-            f"the design looks the same {which}: the orientation of the frames cannot be seen as far as these go; "
-            "gradients, coma, astigmatism, trefoil and decentre are along the camera's axes"
-        )
-    if not found.order_seen:
-        words.append(
-            "images of neighbouring depths differ by less than the noise: the order of the frames cannot be seen"
-        )
-    return words
-
-
 def _as_laid(task: Task, found: Arrangement) -> Task:
     """The task with its frames laid as found, and its windows held where the light then lies."""
     aside = found.clearly and found.orientation % 2 == 1
     model = task.model.exchanged() if aside else task.model
     model = model.about(search.window_um(found, model))
-    return dataclasses.replace(task, model=model, data=_rearranged(task.data, found), found=found)
-
-
-def _rearranged(data: Data, found: Arrangement) -> Data:
-    part = [rearranged(a, found) for a in (data.electrons, data.usable, data.saturated, data.variance_e2, data.scale)]
-    common = {"common_floor": data.common_floor, "common_light": data.common_light}
-    return Data(part[0], part[1], part[2], part[3], part[4], **common)
+    return dataclasses.replace(
+        task, model=model, data=task.data.arranged(lambda part: rearranged(part, found)), found=found
+    )
 
 
 def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked) -> AsBuilt:

@@ -6,6 +6,7 @@ equations, McCullagh and Nelder). A saturated pixel says only "at least this muc
 is below it and is silent above. Residuals beyond ``huber`` sigma count linearly (Huber 1964).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ class Data:
     model_error: standard deviation of the model itself, as a share of the light in a pixel; added to the noise.
     common_floor: share of ``variance_e2`` that is one error in all frames. common_light: relative error of the light of
         a pixel that is one in all frames, not in the variance. Neither weighs; both widen intervals.
+    count_e: electrons of a count, over ``scale`` apart, where pixels are rounded counts; 0 where they are means.
     """
 
     electrons: Array
@@ -37,8 +39,9 @@ class Data:
     variance_e2: Array
     scale: Array
     model_error: float = 0.0
-    common_floor: float = 0.0
+    common_floor: float | Array = 0.0
     common_light: float = 0.0
+    count_e: float = 0.0
 
     def variance(self, image: Array) -> Array:
         """(n, y, x) variance of a pixel whose expected light is ``image``."""
@@ -54,9 +57,13 @@ class Data:
 
     def planes(self, index: Array) -> "Data":
         """Some of the frames."""
-        part = [a[index] for a in (self.electrons, self.usable, self.saturated, self.variance_e2, self.scale)]
-        common = self.common_floor, self.common_light
-        return Data(part[0], part[1], part[2], part[3], part[4], self.model_error, *common)
+        return self.arranged(lambda part: part[index])
+
+    def arranged(self, change: Callable[[Array], Array]) -> "Data":
+        """The same of frames that are laid otherwise, or of some of them."""
+        parts = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        moved = {name: change(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+        return dataclasses.replace(self, **moved)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from characterize.captures import Capture, Frames, merge_brackets
+from characterize.captures import Capture, Frames, merge_brackets, told
 from characterize.inference.leastsquares import Data, Model
 from characterize.model import ForwardModel, Known, Setting, background, usual
 from metalens.ground.arrays import Array
@@ -17,6 +17,7 @@ from metalens.lens import Lens
 
 MOST_OF_ONE_FRAME = 8
 _DARK = 3e-5  # share of what light tells that may lie where a quick model knows nothing of it
+_STILL = 0.05  # counts of noise at least that levels of pixels add, whatever is stated
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
@@ -104,9 +105,29 @@ def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
     """What is fitted, cut to the window."""
     shape = frames.electrons.shape
     cut = (slice(None), *window)
-    floor, scale = (np.broadcast_to(a, shape)[cut] for a in (frames.variance_e2, frames.scale))
-    common = {"common_floor": frames.common_floor, "common_light": frames.common_light}
-    return Data(frames.electrons[cut], frames.usable[cut], frames.saturated[cut], floor, scale, **common)
+    wide = frames.variance_e2, frames.scale, frames.common_floor
+    floor, scale, dark = (np.broadcast_to(a, shape)[cut] for a in wide)
+    seen = frames.electrons[cut], frames.usable[cut], frames.saturated[cut]
+    return Data(*seen, floor, scale, common_floor=dark, common_light=frames.common_light, count_e=frames.count_e)
+
+
+def unrounded(data: Data, image: Array) -> Data:
+    """Rounded counts as the means and variances that say the same of light near ``image`` (n, y, x).
+
+    Fisher's scoring, of a pixel: I + score / information with a variance of 1 / information, so that a fit to them ends
+    where the likelihood of the counts (:mod:`characterize.captures.rounding`) is greatest, once ``image`` is of it.
+    """
+    step, variance = data.count_e / data.scale, data.variance(image)
+    noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
+    score, information = told((data.electrons - image) / step, noise)
+    floor = np.where(data.saturated, data.variance_e2, data.variance_e2 + step**2 / information - variance)
+    return dataclasses.replace(
+        data,
+        electrons=np.where(data.saturated, data.electrons, image + step * score / information),
+        variance_e2=floor,
+        common_floor=data.common_floor * data.variance_e2 / floor,
+        count_e=0.0,
+    )
 
 
 def quick_enough(model: ForwardModel, data: Data, x: Array) -> ForwardModel:

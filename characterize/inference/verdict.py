@@ -34,17 +34,24 @@ def explained(solution: Solution, gain: Gain) -> bool:
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
 
 
-def quiet(solution: Solution, gain: Gain) -> list[str]:
+def quiet(solution: Solution, gain: Gain, *, whole: bool) -> list[str]:
     """What to say of frames with less noise than stated: chi-square as far below 1 as it may not be above.
 
-    Of counts too coarse for their noise the opposite: what rounding takes is counted as noise, and is none.
+    Of counts too coarse for their noise how they were fitted: in the middle of a count most pixels tell nothing.
+
+    Args:
+        whole: the frames are counts and no means of them: fitted as rounded.
     """
     if gain.coarse:
-        return [
+        said = (
             f"counts are {gain.gain_e:.3g} electrons apart and noise in the dark is {gain.read_noise_e:.2g}: rounding "
-            "is no noise there, but one error wherever light is alike, and intervals within the model are too narrow; "
-            "save more bits, or raise the camera's gain"
-        ]
+            "is no noise there, but one error wherever light is alike, and "
+        )
+        exact = "they are fitted as rounded counts; more bits, or a higher gain of the camera, tell more"
+        rough = (
+            "of merged exposures intervals within the model are too narrow; save more bits, or raise the camera's gain"
+        )
+        return [said + (exact if whole else rough)]
     if not gain.known or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
         return []
     return [

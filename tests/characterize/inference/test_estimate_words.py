@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from characterize.inference import estimate
+from characterize.inference import arrange
 from characterize.inference.arrange import Arrangement
 
 
 def told(**how):
     about = {"reordered": False, "order_seen": True, "orientation": 0, "clearly": False, "alike": ()}
-    return estimate._arranged_words(Arrangement(0.0, 110.0, (0.0, 0.0), 0.9, np.array([2, 0, 1]), **about | how))
+    return arrange.laid_words(Arrangement(0.0, 110.0, (0.0, 0.0), 0.9, np.array([2, 0, 1]), **about | how))
 
 
 def test_each_finding_about_the_frames_has_its_words():

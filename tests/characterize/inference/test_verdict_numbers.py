@@ -225,16 +225,19 @@ def test_expected_error_without_draws_is_that_of_the_covariance(monkeypatch):
 def test_frames_with_less_noise_than_stated_are_told(chi2, pixels, gain_sigma_e, said):
     """Averages of frames, or a gain of counts 16 times as large: chi-square 0.11 was passed over."""
     solution = SimpleNamespace(chi2_per_dof=chi2, residual_sigma=np.ones(pixels))
-    words = verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7))
+    words = verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7), whole=True)
     assert len(words) == said
     assert not said or f"is {chi2:.2f}, below 1" in words[0]
-    assert not verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7, known=False))
+    assert not verdict.quiet(solution, Gain(2.1, gain_sigma_e, 2.7, known=False), whole=True)
 
 
 @pytest.mark.parametrize(("read_noise_e", "coarse"), [(0.0, True), (9.2, True), (9.4, False)])
 def test_counts_that_are_coarser_than_noise_hides_are_told_whatever_chi_square_is(read_noise_e, coarse):
     """31 electrons a count: 9.3 of noise are 0.3 of a count. Where nobody says how much there is, nothing is told."""
     solution = SimpleNamespace(residual_sigma=np.ones((4, 9, 11)), chi2_per_dof=0.99)
-    words = verdict.quiet(solution, Gain(31.0, 0.4, read_noise_e))
-    assert [one.startswith("counts are 31 electrons apart and noise") for one in words] == [True] * coarse
-    assert not verdict.quiet(solution, Gain(31.0, 0.4, read_noise_e, read_known=False))
+    words = [verdict.quiet(solution, Gain(31.0, 0.4, read_noise_e), whole=whole) for whole in (True, False)]
+    for said, end in zip(words, ("fitted as rounded counts", "of merged exposures"), strict=True):
+        assert [one.startswith("counts are 31 electrons apart and noise") and end in one for one in said] == [
+            True
+        ] * coarse
+    assert not verdict.quiet(solution, Gain(31.0, 0.4, read_noise_e, read_known=False), whole=True)

@@ -175,7 +175,7 @@ def test_every_plane_of_the_data_is_turned_with_the_frames():
     data = Data(planes[0], masks[0], masks[1], planes[1], planes[2], common_floor=0.3, common_light=0.02)
     order = np.array([2, 0, 1])
     mirrored = arrange.Arrangement(0.0, 700.0, (0.0, 0.0), 0.9, order, True, True, 2, True, ())
-    found = estimate._rearranged(data, mirrored)
+    found = data.arranged(lambda part: arrange.rearranged(part, mirrored))
     for made, given in (
         (found.electrons, planes[0]),
         (found.usable, masks[0]),
