@@ -143,7 +143,7 @@ def clean(capture: Capture) -> Frames:
         np.broadcast_to(flat, raw.shape),
         gain,
         tuple(notes),
-        common_floor=np.broadcast_to(dark_e2 / (once + dark_e2), raw.shape),
+        common_floor=dark_e2 / (once + dark_e2),
         common_light=flat_error,
         count_e=gain.gain_e,
     )

@@ -101,8 +101,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
         cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
     unbiased = search.starts(task, biases_nm=(0.0,))[0]
     task = dataclasses.replace(task, model=quick_enough(task.model, task.data, unbiased))
-    task, ends = search.placed(*_ends(task, frames.gain, cautions))
-    task, ends = _unrounded(task, ends, frames.gain)
+    task, ends = _unrounded(*search.placed(*_ends(task, frames.gain, cautions)), frames.gain)
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):
