@@ -232,7 +232,11 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     """The same patches with other PSFs: kernels as the first ones were mixed, differentiable in both arguments.
 
     The gradient is that of the PSFs projected on the kept weights: changes that vary over field and depth in a way
-    that the first stack does not show need patches of their own (:func:`prepared`).
+    that the first stack does not show need patches of their own (:func:`metalens.field.engine.patched`).
+
+    Accuracy: of slopes not stated. Of bright points through a stop and a film at 25 degrees, against plane waves, those
+    by a coma and a defocus are off by 0.16 through 8 kernels (image 0.009), 0.085 through 13, 0.03 to 0.06 through 19;
+    those of the PSFs alone by 0.03.
     """
     flat = stack.flatten(0, 2)
     transfer, made = [], []
