@@ -160,7 +160,7 @@ def _load_folder(folder: Path) -> Capture:
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
     colours = Colours.of(about, str(folder))
-    said = stage.left_out(files, rows) if rows else ()
+    said = (*stage.left_out(files, rows), *stage.unread(about)) if rows else stage.unread(about)
     if rows is None:
         names, frames = _all_frames(files, folder, colours)
         rows = stage.Rows.unknown(names)

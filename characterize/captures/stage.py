@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, nearest
 
@@ -217,6 +218,12 @@ def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
                 f"stack {kind[1]}.tif"
             )
     return (f"{len(rest)} images that {rows.source} does not name left out: {', '.join(rest[:5])}",) if rest else ()
+
+
+def unread(about: dict[str, Any]) -> tuple[str, ...]:
+    """What to say of entries of a capture's description that nothing reads."""
+    rest = [reading.shown(name) for name in about if name not in _KNOWN]
+    return (f"entries of the description that change nothing, kept as notes: {', '.join(rest[:8])}",) if rest else ()
 
 
 def spelt(name: str) -> str:

@@ -33,6 +33,7 @@ _LIGHT_STEP = 0.2
 _ENOUGH = 4e-3
 _CAMERA_DEG, _TALL = 0.5, 0.01
 _DENSE = 3  # samples a pixel's side between which turned frames are interpolated
+LAMP = "a lamp or exposure that changes from frame to frame"
 WINDOWS = "a window off the chief ray at a field angle"
 _ROUND = 1e-4  # of the peak: round light does not turn, what is left is of the interpolation
 _GRID = 41  # places across the lens where write fields are told apart
@@ -138,7 +139,7 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
 
 def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     """What changes from frame to frame."""
-    yield Change("a lamp or exposure that changes from frame to frame", _each(light))
+    yield Change(LAMP, _each(light))
     sideways = [_each(np.gradient(light, axis=a)) for a in (1, 2)]
     yield Change("shifts from frame to frame", np.concatenate(sideways))
     yield Change("vibration or blur in single frames", _each(_curvature(light)))

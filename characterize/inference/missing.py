@@ -162,9 +162,12 @@ def words(found: list[Lean]) -> list[str]:
     first = told[0]
     alike = [one.cause for one in told[1:4]]
     more = f"; {', '.join(alike)} would explain much of it too" if alike else ""
+    cure = "state it, free it, or mend the bench"
+    if first.cause == causes.LAMP:
+        cure = "state the light of every frame, by a monitor diode, in proportion as exposure_s of stage.csv"
     return [
         f"residuals lean towards {first.cause}, which is not fitted (chi-square {first.chi2:.0f} with {first.degrees} "
-        f"of them){more}: intervals hold only if it is absent; state it, free it, or mend the bench"
+        f"of them){more}: intervals hold only if it is absent; {cure}"
     ]
 
 

@@ -171,3 +171,10 @@ def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
     (tmp_path / "stage.csv").write_text(f"file,depth_um,exposure_s\na.tif,2.5,0.1\nb.tif,3.5,{time}\n")
     with pytest.raises(CaptureError, match=r"stage\.csv, row 3: exposure_s is -?0.*above 0"):
         stage.read_stage(tmp_path)
+
+
+def test_entries_that_nothing_reads_are_named():
+    """Where the sensor's window lay is not read: the axis is sought in the frames."""
+    (said,) = stage.unread({"pixel_um": 3.0, "roi_x_px": 12, "window": "fixed", "operator": "K"})
+    assert said.endswith(": roi_x_px, operator")
+    assert not stage.unread({"wavelength_um": 0.53, "gain_e": 2.3})

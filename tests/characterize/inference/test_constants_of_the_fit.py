@@ -168,3 +168,10 @@ def test_a_pixel_far_off_counts_in_the_valley_as_it_did_in_the_fit(off):
     held = Prior(mode, np.array([np.inf]), mode, mode)
     fit = leastsquares.fit(lambda x, jacobian: (image + x[0] * slopes[0], slopes), data, mode, prior=held)
     assert fit.information[0, 0] == pytest.approx(1 / want, rel=1e-6)
+
+
+def test_a_lamp_that_drifts_is_told_with_its_cure():
+    """No parameter can be freed for it; its readings as exposures take it out."""
+    for cause, cure in ((causes.LAMP, "as exposure_s of stage.csv"), ("any", "or mend the bench")):
+        (said,) = missing.words([Lean(cause, 40.0, 5, 1e-9)])
+        assert said.endswith(cure)
