@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from characterize.captures import Spectra, above_rim, likeness
+from characterize.captures import Spectra, above_rim, likeness, turn
 from characterize.inference import arrange
 from characterize.inference.arrange import Arrangement
 from characterize.inference.leastsquares import Data
@@ -213,3 +213,23 @@ def test_frames_that_are_shuffled_are_put_in_order_at_any_distance():
     assert found.reordered
     assert shuffle[found.order].tolist() == list(range(9))
     assert found.distance_um == 0.0
+
+
+@pytest.mark.parametrize("way", range(8))
+def test_turned_frames_are_held_against_those_of_a_camera_on_its_side_where_it_lies_so(way):
+    upright, aside = RNG.uniform(0, 1, (2, 3, 9, 9)) ** 4
+    wanted = aside if way % 2 else upright
+    (back,) = [k for k in range(8) if np.array_equal(turn(turn(wanted, k), way), wanted)]
+    assert arrange._orientation(1.9 * turn(wanted, back), (upright, aside), np.zeros(3)) == (way, way > 0)
+
+
+def test_orientations_are_apart_by_squares_over_the_noise_of_every_frame():
+    """Of noise per frame, shared out to its 25 pixels; frames as bright as the light."""
+    expected = RNG.uniform(0, 1, (2, 2, 5, 5))
+    noise = np.array([0.7, 3.1])
+    light = 1.6 * expected[0]
+    bright = np.sqrt(((light**2).sum() - (noise**2).sum()) / (expected[0] ** 2).sum())
+    for way, other in ((2, np.rot90(expected[0], 2, (1, 2))), (1, np.rot90(expected[0], 1, (1, 2)))):
+        against = expected[way % 2]
+        each = ((bright * (other - against)) ** 2).sum((1, 2)) / (noise**2 / 25)
+        assert arrange._apart(way, tuple(expected), light, noise) == pytest.approx(each.sum(), rel=1e-9)

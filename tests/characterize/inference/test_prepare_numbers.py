@@ -7,6 +7,7 @@ import pytest
 
 from characterize.captures import Capture, Frames, Gain
 from characterize.inference import prepare
+from characterize.inference.leastsquares import Data
 from metalens.ground.errors import CaptureError
 
 RNG = np.random.default_rng(67)
@@ -141,3 +142,22 @@ def test_depths_a_thousand_times_off_are_told_their_column(source, sensor):
     assert [said(factor * 26e3) for factor in (0.1, 1.0, 10.0)] == [""] * 3
     assert ["depth_mm" in said(factor * 26) for factor in (0.19, 0.21, 4.9, 5.1)] == [False, True, True, False]
     assert ["depth_nm" in said(factor * 26e6) for factor in (0.19, 0.21, 4.9, 5.1)] == [False, True, True, False]
+
+
+@pytest.mark.parametrize(("size", "kept"), [(1.2, None), (0.5, 1e-3), (0.26, 3e-3), (0.09, 8e-3), (0.03, 2e-2)])
+def test_terms_are_left_out_while_chi_square_rises_by_less_than_a_fiftieth(size, kept):
+    """Of differences up and down that add up to none, over the noise of 40 and of 90 electrons; 7 pixels count not."""
+    up = np.where(np.indices((2, 6, 9)).sum(0) % 2, 1.0, -1.0)
+    exact = np.stack([np.full((6, 9), 40.0), np.full((6, 9), 90.0)])
+    usable = np.ones(exact.shape, bool)
+    usable[0, 2, :7] = False
+
+    def model(cut):
+        moved = exact + 100 * cut * size * up + np.where(usable, 0, 1e3 * cut)
+        return SimpleNamespace(images=lambda x: (moved, None), rough=model, cut=cut)
+
+    data = Data(exact, usable, np.zeros(exact.shape, bool), np.zeros(exact.shape), np.ones(exact.shape))
+    cuts = {cut: (100 * cut * size) ** 2 * (47 / 40 + 54 / 90) for cut in (2e-2, 8e-3, 3e-3, 1e-3)}
+    want = next((cut for cut, rise in cuts.items() if rise < 0.02), 0.0)
+    assert (want or None) == kept
+    assert prepare.quick_enough(model(0.0), data, None).cut == want

@@ -59,3 +59,14 @@ def test_a_slope_that_no_solver_knows_is_a_difference_where_it_is_wanted(monkeyp
     found = pillar_slopes._exact(CELL, 0.11, 0.85, {"sidewall_deg"}, None)
     assert found[2] == pytest.approx(rate * 1.25 * 180 / np.pi, rel=1e-9)  # (0.5 + 0.125) / 0.5
     assert pillar_slopes._exact(CELL, 0.11, 0.85, (), None) == [*found[:2], *[0] * (len(named(Answers)) - 2)]
+
+
+def test_slopes_that_are_kept_are_known_by_the_least_and_the_largest_diameter():
+    whole = b.lens().diameters.diameter_um
+    lit = whole[whole > 0]
+    told = set()
+    for low, high in ((lit.min(), lit.max()), (lit.min() + 0.011, lit.max()), (lit.min(), lit.max() - 0.013)):
+        d = np.where(whole > 0, np.clip(whole, low, high), 0.0)
+        lens = dataclasses.replace(b.lens(), diameters=dataclasses.replace(b.lens().diameters, diameter_um=d))
+        told.add(pillar_slopes._about(lens, 1e-3, ["height_nm"]))
+    assert len(told) == 3

@@ -168,3 +168,17 @@ def test_the_layers_are_the_dense_ones_that_every_member_uses_whole():
 def test_a_closure_is_refused():
     with pytest.raises(ValueError, match="no closure"):
         Soap([nn.Parameter(torch.zeros(8, 8))]).step(lambda: 0.0)
+
+
+@pytest.mark.parametrize(
+    ("layer", "turned"),
+    [
+        (nn.Linear(8, 11), True),
+        (nn.Linear(11, 7), False),
+        (nn.Linear(7, 11), False),
+        (nn.Conv2d(12, 8, 1), True),
+        (nn.Conv2d(12, 8, 3), False),
+    ],
+)
+def test_dense_layers_of_eight_on_either_side_and_more_are_turned(layer, turned):
+    assert soap._dense(layer) is turned

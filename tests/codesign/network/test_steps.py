@@ -102,3 +102,13 @@ def test_a_blank_frame_has_slopes():
 def test_the_count_of_steps_is_one_a_tap():
     """Four steps of two samples, two of three and one of five, twice; a mean of four samples before the second time."""
     assert windows.STEP_MACS == 64 * 64 * (2 * (4 * 2 + 2 * 3 + 5) + 4)
+
+
+def test_steps_that_are_alike_all_over_are_not_spread():
+    """A ramp along x: in windows that do not meet the rim a kind of step has one size: no spread but a floor."""
+    ramp = (torch.linspace(-2.3, 1.9, 128)[None] + torch.zeros(128, 1))[None, None]
+    found = windows.steps(ramp)
+    kinds = found.shape[1] // windows.TOLD
+    mean, spread = found[0, :kinds, 2:-2, 2:-2], found[0, kinds : 2 * kinds, 2:-2, 2:-2]
+    assert float(mean.max()) > 0.05
+    assert float((spread - 0.01).abs().max()) < 2e-3  # the root of 1e-4, and of rounding of squares

@@ -299,3 +299,14 @@ def test_the_table_says_what_the_documents_say():
     assert rows["index"] == (0.02, 0.02, -0.075, 0.075, 1.0, False)
     assert rows["sidewall_deg"] == (0.3, 0.5, -1.6, 1.6, pytest.approx(math.pi / 180), False)
     assert rows["coma_x_rad"] == (0.05, 1.0, -6.0, 6.0, 1.0, True)
+
+
+def test_what_every_process_has_is_stated_even_where_it_is_none():
+    """And what no process has unless it says so only where it does."""
+    usual = {name for name, row in DRAWN.items() if row.sigma}
+    rare = sorted(DRAWN.keys() - usual)
+    assert usual
+    assert rare
+    still = Spread(**dict.fromkeys(DRAWN, 0.0))
+    assert still.stated == dict.fromkeys((n for n in DRAWN if n in usual), 0.0)
+    assert Spread(**dict.fromkeys(DRAWN, 0.0) | {rare[0]: 3.7}).stated.keys() == usual | {rare[0]}

@@ -8,7 +8,7 @@ import pytest
 from metalens import rcwa
 from metalens.cell import Light, Response
 from metalens.cell.record import Cell, Index
-from metalens.pillars import workers
+from metalens.pillars import engines, workers
 from metalens.pillars.curve import Nodes
 
 CELL = Cell(0.30, 0.7, Index(3.6))
@@ -68,3 +68,12 @@ def test_elements_of_a_jones_matrix_are_rows_and_take_the_energy_of_what_comes(m
     assert np.array(made["r"]) @ (1, 1j) == pytest.approx((0.1 * t + 0.5).ravel(), rel=1e-15)
     assert made["energy"] == [0.98, 0.93, 0.98, 0.93]
     assert made["error"] == [4e-4] * 4
+
+
+@pytest.mark.parametrize(
+    ("coarse", "fine", "kept"),
+    [((0.03, True), (0.01, True), 0.03), ((0.03, False), (0.01, False), 0.01), ((0.02, False), (0.05, False), 0.02)],
+)
+def test_a_diameter_takes_the_coarse_mesh_where_it_serves_and_else_the_better_one(coarse, fine, kept):
+    made = [lambda at, one=one: SimpleNamespace(t_error=one[0], converged=one[1]) for one in (coarse, fine)]
+    assert engines._met(*made, 0.17).t_error == kept

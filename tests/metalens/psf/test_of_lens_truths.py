@@ -13,7 +13,7 @@ from metalens.pillars import Proxy
 from metalens.psf import of_lens
 from metalens.psf.budget import Budget
 from metalens.psf.record import PsfStack
-from metalens.psf.spectrum import Nodes
+from metalens.psf.spectrum import Nodes, Source
 
 RNG = np.random.default_rng(3)
 
@@ -158,3 +158,15 @@ def test_sums_get_what_the_spectrum_s_error_leaves_of_the_tolerance(monkeypatch,
     assert [one[1] for one in asked] == pytest.approx([left] * 2, rel=1e-12)
     assert [one[2:] for one in asked] == [([0.84, 0.87], [0.3, 0.7], [list(angle)]) for angle in view.angles_rad]
     assert found.tolerance == tolerance
+
+
+def test_the_direction_that_takes_most_wavelengths_says_how_many():
+    """Paths of 4, 70 and 30 um across the same light: the second alone asks for as many."""
+    source, light = Source(850.0, 24.0), np.ones((1, 5, 5))
+    spans = [np.full((1, 5, 5), path_um) for path_um in (4.0, 70.0, 30.0)]
+
+    def asked(some):
+        stack = SimpleNamespace(intensity=[light] * len(some))
+        return len(of_lens._asked(source, some, stack, 1e-3).weights)
+
+    assert asked(spans) == asked(spans[1:2]) > asked(spans[2:]) > asked(spans[:1])
