@@ -38,7 +38,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def fitted():
-    return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
+    known = dataclasses.replace(b.RESPONSE, error=0.08)
+    return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=known)
 
 
 @pytest.mark.slow
@@ -164,6 +165,7 @@ def test_degeneracies_are_named(fitted):
 
 def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fitted):
     assert "residuals lean" not in " ".join(fitted.cautions)
+    assert "slopes of the pillars" not in " ".join(fitted.cautions)  # known to 8 %
     assert any("glass" in words and "would be taken for" in words for words in fitted.degeneracies)
 
 
@@ -303,7 +305,8 @@ def test_what_is_stated_is_not_reckoned_with():
     shots = b.capture(b.electrons())
     shots = dataclasses.replace(shots, about=shots.about | stated)
     options = dataclasses.replace(USUAL, known=(Known("stitching_nm", 0.0), Known("sidewall_deg", 0.0)))
-    found = characterize.fit(shots, b.lens(), options, response=b.RESPONSE)
+    found = characterize.fit(shots, b.lens(), options, response=dataclasses.replace(b.RESPONSE, error=0.23))
+    assert "slopes of the pillars by height and index are known to 23% only" in found.cautions
     assert found.causes
     for word in ("glass", "source of finite", "write field", "pixel", "side wall"):
         assert not any(word in cause for cause in found.causes), word

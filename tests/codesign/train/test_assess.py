@@ -30,7 +30,7 @@ def test_architectures_are_chosen_by_the_mean_of_three_axes():
 def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     monkeypatch.setattr(assess, "recalibrate", lambda *words: None)
     truth = torch.tensor([[0.3, -0.2, 1.1], [-0.6, 0.4, 0.2], [0.1, 0.9, -1.5]])
-    off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.2, 0.1]])
+    off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.8, 0.1]])
     scale = torch.tensor([0.5, 2.0, 4.0])
     logits, mask = -torch.ones(3, 5, 5), torch.zeros(3, 5, 5)
     logits[0, :2], mask[0, 1:3] = 1.0, 1.0  # 10 and 10 pixels, 5 of them shared: 5 of 15
@@ -40,7 +40,7 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     inner = SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
     got = assess.assess(net, None, seen, inner)
     assert got.axial_mm == pytest.approx((0.7 + 0.4 + 0.1) / 3)
-    assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.2) / 6)
+    assert got.lateral_mm == pytest.approx((0.1 + 0.2 + 0.3 + 0.3 + 0.1 + 0.8) / 6)
     assert got.iou == pytest.approx((1 / 3 + 1 + 1) / 3)  # two empty masks agree
     assert [len(part) for part in assess.parts(seen)] == [2, 1]
 

@@ -335,3 +335,17 @@ def test_an_image_in_the_shadow_counts_errors_over_its_own_light():
         assert engine._dimmer(made) == pytest.approx(want, rel=1e-6)
     peak = torch.tensor([[1.0, 1.0], [1.0, 1.0]])[..., None]
     assert engine._dimmer(Imager(grid, about, stack, peak, [], [], {})) == 1.0
+
+
+def test_four_nodes_interpolate_cubics_at_places_of_any_shape():
+    """Positions in two axes: the weights come last, and what they add up is a cubic's value."""
+    place = torch.from_numpy(RNG.uniform(0, 6, (3, 5)))
+    first, weights = patches.lagrange(place, 7)
+    assert weights.shape == (3, 5, 4)
+    nodes = torch.arange(7, dtype=torch.float64)
+
+    def cubic(x):
+        return 0.3 * x**3 - 1.7 * x**2 + 0.9 * x + 2.1
+
+    found = (weights * cubic(nodes)[first[..., None] + torch.arange(4)]).sum(-1)
+    assert found.numpy() == pytest.approx(cubic(place).numpy(), rel=1e-9)

@@ -79,8 +79,10 @@ def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
     assert found == dict(workers.run(tasks))
 
 
-def test_no_cluster_at_the_address_is_told():
+def test_no_cluster_at_the_address_is_told(monkeypatch):
+    """Within the seconds that it waits for one: fewer here, that nobody else has to."""
     pytest.importorskip("distributed")
+    monkeypatch.setattr(executor, "_CONNECT_S", 0.5)
     with pytest.raises(WorkerError, match="no dask scheduler at"), executor.on("tcp://127.0.0.1:9"):
         list(executor.run(abs, [1]))
 

@@ -233,3 +233,13 @@ def test_noise_beside_a_field_errs_light_by_its_part_along_the_field():
     change = (np.abs(field + drawn) ** 2 - light) / whole
     want = math.sqrt((change**2).sum() / 4000 / ((light / whole) ** 2).sum())
     assert compute._noisy_sum(light, noise) == pytest.approx(2 * want, rel=0.04)
+
+
+def test_components_of_both_polarisations_are_asked_for_at_the_pillars_rows_and_columns():
+    asked = []
+    (phase, level), rows, columns = maps(DOUBLE), 30, 41
+    made = compute._of_pillars((phase, level), CASE, 0.7, lambda y, x: asked.append((y, x)) or "components")
+    assert made.pupils == "components"
+    ((y, x),) = asked
+    assert np.ravel(y) == pytest.approx((np.arange(rows) - (rows - 1) / 2) * 0.37, abs=1e-12)
+    assert np.ravel(x) == pytest.approx((np.arange(columns) - (columns - 1) / 2) * 0.37, abs=1e-12)
