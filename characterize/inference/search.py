@@ -27,6 +27,7 @@ _ALONG_NM, _ASIDE_UM = 9.0, 50.0  # bias by which starts are moved along the val
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
+_ONWARD = Settings(iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False)
 _WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
 
 
@@ -90,12 +91,18 @@ def anchored(task: Task, at: Solution) -> Task:
 def oriented(tasks: Sequence[Task]) -> Task:
     """Of tasks that differ by how the frames lie the one that a short fit to some of them makes likeliest.
 
-    The first unless another is better by what a short fit may be off; those within that cannot be told from it.
+    The first unless another is better by what a short fit may be off, and still is once both go on; those within that
+    cannot be told from it.
     """
     if len(tasks) == 1:
         return tasks[0]
     few = few_frames(tasks[0].model.setting)
-    merits = np.array([_short(task, few, starts(task, biases_nm=(0.0,)))[0].merit for task in tasks])
+    tries = [_short(task, few, starts(task, biases_nm=(0.0,)))[0] for task in tasks]
+    merits = np.array([one.merit for one in tries])
+    if merits[0] >= merits.min() + _PROMISING:
+        for k in (0, int(merits.argmin())):
+            part, begin, prior = tasks[k].data.planes(few), tries[k].value, tasks[k].prior
+            merits[k] = leastsquares.fit(tasks[k].problem(few), part, begin, prior=prior, settings=_ONWARD).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
     found = [task.found for task in tasks if task.found is not None]
     near = [one for one, merit in zip(found, merits, strict=True) if merit < merits[best] + _PROMISING]

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -92,3 +93,20 @@ def test_frames_of_a_camera_on_its_side_that_are_not_square_lie_as_if_never_turn
 def test_half_a_turn_that_noise_hides_is_said():
     _, taken = laid(0, peak_e=40.0)
     assert (taken.orientation, taken.alike) == (0, (2,))
+
+
+@pytest.mark.parametrize(
+    ("ends", "turned"), [((9000.0, 9500.0), False), ((9300.0, 9265.0), False), ((9300.0, 9250.0), True)]
+)
+def test_a_turn_is_taken_where_it_is_better_once_both_fits_have_gone_on(monkeypatch, ends, turned):
+    """Short fits put the turned frames 100 ahead; what counts is where both end, and 40 between these."""
+    shots = b.capture(b.electrons())
+    plain = task_of(shots, b.lens())
+    tasks = [plain, dataclasses.replace(plain, found=dataclasses.replace(plain.found, orientation=1, clearly=True))]
+    merit = {0: 9600.0, 1: 9500.0}
+    shorts = [types.SimpleNamespace(value=np.full(1, float(k)), merit=merit[k]) for k in merit]
+    monkeypatch.setattr(search, "_short", lambda task, few, begins: [shorts[task.found.orientation]])
+    monkeypatch.setattr(search, "starts", lambda task, **_: [])
+    gone_on = lambda images, data, begin, **_: types.SimpleNamespace(merit=ends[int(begin[0])])  # noqa: E731
+    monkeypatch.setattr(search.leastsquares, "fit", gone_on)
+    assert search.oriented(tasks).found.orientation == int(turned)
