@@ -119,10 +119,12 @@ def _shaped(job: Job) -> Section:
     """Of pillars that are not round."""
     turned = job.source.diameters.angle_rad is not None
     turns = f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees" if turned else ""
+    two = job.source.pairs is not None
+    shape = f"{job.source.cell.shape.kind} of its own width and length" if two else job.source.cell.shape.name
     area = [made.twice_area / 2 for made in job.plan.classes]
     rows = [["classes", len(area)], ["least area / nm²", min(area)], ["largest area / nm²", max(area)]]
     text = (
-        f"Each is a {job.source.cell.shape.name}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"
+        f"Each is a {shape}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"
         f"{turns}, its corners on the grid; rounding by the etch is not made up for."
     )
     return Section("Pillars", text, [Table(("what", "value"), rows)])

@@ -61,7 +61,7 @@ class TwoSizes:
         """(bias, kinds) complex t for local biases and one made lens."""
         bias = np.reshape(bias_um, (-1, 1))
         change = np.exp(np.tensordot(state.answers(), self.rates, 1))
-        return self.t(self.width_um + bias, self.length_um + bias) * change
+        return np.asarray(self.t(self.width_um + bias, self.length_um + bias) * change)
 
     def t(self, width_um: Array, length_um: Array) -> Array:
         """(*shape) of the table."""

@@ -105,7 +105,8 @@ def _derived(
         [by(some, weight) for weight in weights] if some is not None else _difference(row, wavelength_um, weights, task)
         for row, some in zip(causes, wanted, strict=True)
     ]
-    return np.transpose([*differ, [by(edges, weight) for weight in weights]]).tolist()
+    differ.append([by(edges, weight) for weight in weights])
+    return [list(each) for each in zip(*differ, strict=True)]
 
 
 def _numbers(row: Cause, cell: Cell, size_um: float) -> dict[str, float] | None:

@@ -288,7 +288,7 @@ def _head(data: Data, count: int) -> Data:
 
 
 def _turns(data: Data) -> float:
-    return float((data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
+    return float(abs(data.phase[..., -1] - data.phase[..., 0]).min() / TURN)
 
 
 def _notes(smooth: Stretch, data: Data, kept: Data, terms: int) -> tuple[str, ...]:

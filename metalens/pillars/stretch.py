@@ -1,4 +1,4 @@
-"""The stretch of a library's diameters without resonances: where the phase rises smoothly and the light passes."""
+"""The stretch of a library's diameters without resonances: where the phase goes one way and the light passes."""
 
 from dataclasses import dataclass
 
@@ -35,7 +35,8 @@ def stretch(
     within_um: tuple[float, float] | None = None,
 ) -> Stretch:
     """The stretch of most phase over which, at all wavelengths, angles and polarisations, |t| stays above
-    ``least_transmission``, the phase rises, and no resonance is narrower than ``least_half_width_um``.
+    ``least_transmission``, the phase rises (of openings, which leave less film the wider they are, falls), and no
+    resonance is narrower than ``least_half_width_um``.
 
     Raises:
         DomainError: fewer than 12 entries in any such stretch; the message says what is in the way.
@@ -54,7 +55,7 @@ def stretch(
             f"no {LEAST_ENTRIES} diameters in a row are free of resonances ({reasons}): choose another pitch, height "
             "or material, fewer wavelengths or angles, or sweep with more samples"
         )
-    best = max(runs, key=lambda run: float((phase[..., run.stop - 1] - phase[..., run.start]).min()))
+    best = max(runs, key=lambda run: float(abs(phase[..., run.stop - 1] - phase[..., run.start]).min()))
     mean = t.mean(axis=0)[..., best]
     spread = float(np.abs(t[0] - t[-1])[..., best].max()) / 2
     return Stretch(d[best], _unwrapped(np.angle(mean)), np.abs(mean), _notes(best, d, faults), spread)
@@ -68,11 +69,14 @@ def _faults(
     level = np.abs(t)
     dark = np.asarray((level < least).any(axis=(0, 1, 2)))
     faults.append((dark, f"|t| falls to {level.min():.2f}, below {least:g}"))
-    falls = np.diff(phase, axis=-1) < 0
+    hole = library.cell.shape.hole
+    turns = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
     back = np.zeros(len(d), bool)
-    back[1:] |= falls.any(axis=(0, 1, 2))
-    back[:-1] |= falls.any(axis=(0, 1, 2))
-    faults.append((back, "the phase falls with the diameter"))
+    back[1:] |= turns
+    back[:-1] |= turns
+    faults.append(
+        (back, "the phase rises with the size of the opening" if hole else "the phase falls with the diameter")
+    )
     for _, angle, wavelength, centre, width in library.resonances:
         if width < half_width and len(d) and d[0] <= centre <= d[-1]:
             near = np.abs(d - centre) <= REACH * width

@@ -1,5 +1,6 @@
 """Proxy fits on synthetic libraries whose phase and |t| are known functions."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from metalens import library, proxy
 from metalens.cell.record import Cell, Index
+from metalens.cell.shapes import Circle
 from metalens.ground.errors import DomainError
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars import stretch as smooth
@@ -143,6 +145,25 @@ def test_dark_entries_cut_the_domain():
 def test_falling_phase_cuts_the_domain():
     made = proxy_fit.fit(synthetic(factor=lambda d: np.exp(-100j * np.maximum(d - 0.18, 0) / 0.5)))
     assert made.proxy.monotone(0.85)
+
+
+def test_openings_in_a_film_are_the_mirror_image_of_pillars():
+    """The wider an opening, the less film: conjugate t, so that the phase changes its sign and nothing else does."""
+    pillars = synthetic(factor=lambda d: np.where(d < 0.08, 0.5, 1.0))
+    cell = dataclasses.replace(CELL, shape=Circle(hole=True))
+    openings = dataclasses.replace(pillars, cell=cell, t=pillars.t.conj())
+    made, other = proxy_fit.fit(openings), proxy_fit.fit(pillars)
+    assert made.proxy.domain_um == other.proxy.domain_um
+    assert other.turns > 1
+    assert made.turns == pytest.approx(other.turns)
+    d = np.linspace(0.1, 0.2, 7)
+    turn = made.proxy.phase_rad(d, 0.85) + phase_of(d, 0.85, 0.0)
+    assert np.exp(1j * turn) == pytest.approx(np.ones(7), abs=2e-3)  # tolerances of the fit
+    wanted = np.array([-3.0, -0.4, 1.7])
+    found = made.proxy.phase_rad(made.proxy.diameter_um(wanted, 0.85), 0.85)
+    assert np.exp(1j * found) == pytest.approx(np.exp(1j * wanted))
+    with pytest.raises(DomainError, match="rises with the size of the opening"):
+        proxy_fit.fit(dataclasses.replace(pillars, cell=cell))
 
 
 def test_resonances_everywhere_are_refused():
