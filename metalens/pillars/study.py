@@ -168,8 +168,10 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
     """The smooth stretch that covers most phase on one curve."""
     d = np.linspace(curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES)
     value, error = curve(d)
-    level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0]))
-    faults = {"|t| falls": level < study.least_transmission, "the phase falls": np.diff(phase, append=np.inf) < 0}
+    hole = cell.shape.hole  # the wider an opening, the less phase: taken with the other sign
+    level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
+    back = "the phase rises" if hole else "the phase falls"
+    faults = {"|t| falls": level < study.least_transmission, back: np.diff(phase, append=np.inf) < 0}
     sharp = np.zeros(SAMPLES, bool)
     for centre, width in curve.resonances(study.least_half_width_um):
         sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index
-from metalens.cell.shapes import Ellipse, Rectangle
+from metalens.cell.shapes import Circle, Ellipse, Rectangle
 from metalens.ground.errors import CellError
 from metalens.pillars import converted, study
 
@@ -47,6 +47,20 @@ def test_the_whole_range_of_a_clean_curve_with_its_mean_power_even_in_phase():
     rate = 30 + 400 * (d - 0.1)
     assert found.mean_power == pytest.approx((rate * (0.95 - d) ** 2).sum() / rate.sum(), rel=1e-4)
     assert (found.pitch_um, found.height_um, found.wavelength_um) == (0.36, 0.6, 0.85)
+
+
+def test_openings_cover_what_their_mirror_image_does():
+    """Conjugate t of pillars whose phase rises: the same stretch, turns and power."""
+
+    class Mirrored(Curve):
+        def __call__(self, d):
+            t, error = super().__call__(d)
+            return t.conj(), error
+
+    opening = dataclasses.replace(CELL, shape=Circle(hole=True))
+    found, other = study.judge(ABOUT, opening, 0.85, Mirrored(0.175)), study.judge(ABOUT, CELL, 0.85, Curve(0.175))
+    assert dataclasses.asdict(found) == pytest.approx(dataclasses.asdict(other))
+    assert study.judge(ABOUT, opening, 0.85, Curve()).turns == 0  # rises: no opening does
 
 
 @pytest.mark.parametrize(("at", "low", "high"), [(0.175, 0.1, 0.175 - 0.004), (0.112, 0.112 + 0.004, 0.2)])
