@@ -1,32 +1,35 @@
 """The frames of the next step formed beside the training of this one: another thread, the same numbers."""
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, Self, TypeVar
 
 import torch
 
+from metalens.ground.executor import cores
+
 Made = TypeVar("Made")
 
 
 class Ahead(Generic[Made]):
-    """``work(step)`` of the step that is asked for, while that of the next begins on a thread of its own.
+    """``work(step)`` of the step that is asked for, while that of the next ones begins, each on a thread of its own.
 
-    For work that depends on the step alone. It takes one of torch's threads from the steps (:meth:`beside`) and is done
-    on one thread always; where torch has only one it is done when it is asked for. So the bytes of both depend on how
-    many threads there are, never on what was ready when, and one and two threads give the same.
+    For work that depends on the step alone. It takes as many of torch's threads from the steps (:meth:`beside`) and is
+    done on one thread always; where torch has only one it is done when it is asked for. So the bytes of both depend on
+    how many threads there are, never on what was ready when, and one and two threads give the same.
     """
 
-    def __init__(self, work: Callable[[int], Made], *, end: int) -> None:
-        """``end``: the first step that is not wanted any more."""
-        self.work, self.end, self.threads = work, end, torch.get_num_threads()
+    def __init__(self, work: Callable[[int], Made], *, end: int, workers: int = 1) -> None:
+        """``end``: the first step that is not wanted any more. ``workers``: steps that are begun beside the one."""
+        self.work, self.end, self.threads, self.workers = work, end, torch.get_num_threads(), workers
         self._pool: ThreadPoolExecutor | None = None
         self._begun: dict[int, Future[Made]] = {}
 
     def __enter__(self) -> Self:
         if self.threads > 1:
-            self._pool = ThreadPoolExecutor(1, "ahead", torch.set_num_threads, (1,))
+            self._pool = ThreadPoolExecutor(self.workers, "ahead", torch.set_num_threads, (1,))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -37,7 +40,7 @@ class Ahead(Generic[Made]):
     @contextlib.contextmanager
     def beside(self) -> Iterator[None]:
         """The threads that the work leaves, and all of them again after."""
-        torch.set_num_threads(max(1, self.threads - 1))
+        torch.set_num_threads(max(1, self.threads - self.workers))
         try:
             yield
         finally:
@@ -47,7 +50,15 @@ class Ahead(Generic[Made]):
         """What the work makes of a step."""
         if self._pool is None:
             return self.work(step)
-        for one in (step, step + 1):
+        for one in range(step, step + 1 + self.workers):
             if one not in self._begun and one < max(self.end, step + 1):
                 self._begun[one] = self._pool.submit(self.work, one)
         return self._begun.pop(step).result()
+
+
+def renderers(device: torch.device) -> int:
+    """Threads that render for a process that trains on ``device``: one beside a processor; beside a GPU half of the
+    processor's cores, eight at most, shared by the processes of ``torchrun`` on this machine."""
+    if device.type == "cpu":
+        return 1
+    return max(1, min(8, cores() // (2 * int(os.environ.get("LOCAL_WORLD_SIZE", "1")))))

@@ -20,7 +20,7 @@ from codesign.network import Architecture, Baseline, Prediction, blur, cost, los
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train import moving
-from codesign.train.ahead import Ahead
+from codesign.train.ahead import Ahead, renderers
 from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
 from codesign.train.light import Light
@@ -166,7 +166,7 @@ class Trainer:
         end = min(until or self.inner.steps, self.inner.steps)
         work: Callable[[int], Given | Batch] = self._standing if self._still else self._batch
         aside = self._still or self.light.device.type != "cpu"  # the processor is free there, and renders meanwhile
-        with Ahead(work, end=end) as ahead:
+        with Ahead(work, end=end, workers=1 if self._still else renderers(self.light.device)) as ahead:
             while self.step < end:
                 made = ahead.take(self.step) if aside else work(self.step)
                 with ahead.beside() if aside else contextlib.nullcontext():

@@ -13,10 +13,12 @@ frames whose far sheet covers all take that sum alone, at less than half the cos
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import scipy.fft
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from metalens.field import compiled, even, products, together
 from metalens.field.patches import Patch, dense, lagrange
@@ -238,14 +240,30 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     by a coma and a defocus are off by 0.16 through 8 kernels (image 0.009), 0.085 through 13, 0.03 to 0.06 through 19;
     those of the PSFs alone by 0.03.
     """
-    flat = stack.flatten(0, 2)
-    transfer, made = [], []
-    for patch in optics.patches:
-        kernels = torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes])
-        transfer.append(_transfer(kernels, _size(patch, stack.shape[-1])))
-        made.append(replace(patch, energy=_illumination(patch, optics, energy)))
+    mixed = _Mixed.apply(stack.flatten(0, 2), optics.patches)  # type: ignore[no-untyped-call]
+    transfer = [_transfer(k, _size(p, stack.shape[-1])) for k, p in zip(mixed, optics.patches, strict=True)]
+    between = [part.to(energy) for part in between_nodes(optics.grid, optics.plan)]
+    made = [replace(patch, energy=_illumination(patch, between, energy)) for patch in optics.patches]
     changed = replace(optics, stack=stack, energy=energy, patches=made, transfer=transfer)
     return changed if optics.even is None else evened(changed)
+
+
+class _Mixed(torch.autograd.Function):
+    """Kernels (rank, y, x) of every patch from the nodes' PSFs (nodes, y, x): to the gradient of all nodes a patch adds
+    that of its own, where a gradient a patch of as many PSFs as there are, nearly all zeros, would be added up."""
+
+    @staticmethod
+    def forward(ctx: Any, flat: Tensor, patches: list[Patch]) -> tuple[Tensor, ...]:
+        ctx.patches, ctx.of = patches, flat.shape
+        return tuple(torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes]) for patch in patches)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *kernels: Tensor) -> tuple[Tensor, None]:
+        found = kernels[0].new_zeros(ctx.of)
+        for patch, kernel in zip(ctx.patches, kernels, strict=True):
+            found.index_add_(0, patch.nodes, torch.einsum("rn,ryx->nyx", patch.mix, kernel))
+        return found, None
 
 
 def evened(optics: Imager) -> Imager:
@@ -272,10 +290,9 @@ def returned(whole: Tensor, grid: Grid) -> Tensor:
     return whole[..., edge : edge + grid.samples[0], edge : edge + grid.samples[1]]
 
 
-def _illumination(patch: Patch, optics: Imager, energy: Tensor) -> Tensor:
+def _illumination(patch: Patch, between: list[Tensor], energy: Tensor) -> Tensor:
     """(pixels, depths) E at every pixel of a patch."""
-    both = zip((patch.rows, patch.columns), between_nodes(optics.grid, optics.plan), strict=True)
-    ends = [weights[a:b].to(energy) for (a, b), weights in both]
+    ends = [weights[a:b] for (a, b), weights in zip((patch.rows, patch.columns), between, strict=True)]
     return torch.einsum("ya,xb,abz->yxz", *ends, energy).flatten(0, 1)
 
 

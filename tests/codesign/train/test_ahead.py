@@ -5,6 +5,7 @@ import threading
 import pytest
 import torch
 
+from codesign.train import ahead
 from codesign.train.ahead import Ahead
 
 
@@ -25,14 +26,14 @@ def test_the_next_step_is_begun_and_none_beyond_the_end(threads):
             began.set()
         return step**2
 
-    with Ahead(work, end=7) as ahead:
-        assert ahead.take(5) == 25
+    with Ahead(work, end=7) as going:
+        assert going.take(5) == 25
         assert began.wait(10)  # nobody asked for 6 yet
-        with ahead.beside():
+        with going.beside():
             assert torch.get_num_threads() == 2
         assert torch.get_num_threads() == 3
-        assert ahead.take(6) == 36
-        ahead._pool.submit(int).result()  # of one worker: what was begun before is done
+        assert going.take(6) == 36
+        going._pool.submit(int).result()  # of one worker: what was begun before is done
     assert [step for step, _, _ in done] == [5, 6]
     assert all(name.startswith("ahead") and count == 1 for _, name, count in done)
     assert torch.get_num_threads() == 3
@@ -40,14 +41,41 @@ def test_the_next_step_is_begun_and_none_beyond_the_end(threads):
 
 def test_one_thread_of_torch_stays_one_thread(threads):
     threads(1)
-    with Ahead(lambda step: threading.current_thread(), end=9) as ahead:
-        assert ahead.take(2) is threading.main_thread()
+    with Ahead(lambda step: threading.current_thread(), end=9) as going:
+        assert going.take(2) is threading.main_thread()
 
 
 def test_what_goes_wrong_beside_the_step_is_raised_in_it(threads):
     threads(2)
-    with Ahead(lambda step: 1 // (step - 4), end=9) as ahead:
-        assert ahead.take(3) == -1
+    with Ahead(lambda step: 1 // (step - 4), end=9) as going:
+        assert going.take(3) == -1
         with pytest.raises(ZeroDivisionError):
-            ahead.take(4)
-        assert ahead.take(5) == 1
+            going.take(4)
+        assert going.take(5) == 1
+
+
+def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
+    """Two workers: both steps beyond the one asked for wait for each other, so they must run at the same time."""
+    threads(4)
+    done, both = [], threading.Barrier(2)
+
+    def work(step):
+        done.append(step)
+        if step in (4, 5):
+            both.wait(10)
+        return step**2
+
+    with Ahead(work, end=6, workers=2) as going:
+        assert [going.take(step) for step in range(3, 6)] == [9, 16, 25]
+        with going.beside():
+            assert torch.get_num_threads() == 2
+    assert sorted(done) == [3, 4, 5]
+
+
+def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(monkeypatch):
+    monkeypatch.setattr(ahead, "cores", lambda: 12)
+    monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+    assert ahead.renderers(torch.device("cpu")) == 1
+    assert ahead.renderers(torch.device("cuda")) == 6
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert ahead.renderers(torch.device("cuda")) == 1
