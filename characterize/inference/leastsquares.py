@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class Data:
     def arranged(self, change: Callable[[Array], Array]) -> "Data":
         """The same of frames that are laid otherwise, or of some of them."""
         parts = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
-        moved = {name: change(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+        moved: dict[str, Any] = {name: change(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
         return dataclasses.replace(self, **moved)
 
 

@@ -258,7 +258,7 @@ class _Mixed(torch.autograd.Function):
         return tuple(torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes]) for patch in patches)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *kernels: Tensor) -> tuple[Tensor, None]:
         found = kernels[0].new_zeros(ctx.of)
         for patch, kernel in zip(ctx.patches, kernels, strict=True):
