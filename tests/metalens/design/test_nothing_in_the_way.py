@@ -35,7 +35,10 @@ def test_paths_through_films_of_air_are_paths_through_air(tangent, source_um):
     ],
 )  # fmt: skip
 def test_a_focus_passes_within_a_quarter_of_resolution_and_depth(x_um, y_um, z_um, strehl, passed):
-    assert FocusCheck(x_um, y_um, z_um, strehl, resolution_um=1.0, depth_um=8.0).passed is passed
+    found = FocusCheck(x_um, y_um, z_um, strehl, resolution_um=1.0, depth_um=8.0)
+    assert found.passed is passed
+    assert ("BUT DIM" in found.text) is (strehl < 0.8)  # the one that fails by its light alone
+    assert ("NO FOCUS" in found.text) is (not passed and strehl >= 0.8)
 
 
 def test_a_peak_at_the_end_of_the_search_is_told_to_lie_there_or_farther():
