@@ -1,7 +1,7 @@
 """What the axial error of a run of the study is made of: noise, persons, windows that err together, shapes of faces.
 
     python -m benchmarks.codesign_parts --work DIR                        # every run of case p18blur that is kept there
-    python -m benchmarks.codesign_parts --work DIR --only p18blur/hyper40/0
+    python -m benchmarks.codesign_parts --work DIR --only p18blur/hyper40/0   # the others' rows stay
 
 Ambiguous frames of which training saw none. They come in pairs of one person, one after the other. What a reader could
 know beside blur is read by ridge regression, every pair by the fit of the others.
@@ -156,7 +156,9 @@ def main() -> None:
         found = asdict(parts(options.work, line, given[lens]))
         rows.append({"run": line["run"]} | {name: round(value, 4) for name, value in found.items()})
         print(json.dumps(rows[-1]), flush=True)
-    store.write_text(RESULTS / "codesign_parts.json", json.dumps(rows, indent=1) + "\n")
+    path = RESULTS / "codesign_parts.json"
+    known = {row["run"]: row for row in (*json.loads(path.read_text("utf-8")), *rows)}
+    store.write_text(path, json.dumps([known[run] for run in sorted(known)], indent=1) + "\n")
 
 
 if __name__ == "__main__":

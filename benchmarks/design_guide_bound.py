@@ -7,6 +7,7 @@ not such patches: they hold edges, and say what they show.
 """
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -57,7 +58,7 @@ def told(
     """
     near, far = (1 / (1e3 * d) for d in depths_mm)
     depths = 1 / torch.linspace(far, near, COUNT, dtype=torch.float64).flip(0)
-    fine = Window(FOLDS * seen.samples, config.pitch_um / FOLDS, seen.curved, seen.components, seen.flux)
+    fine = replace(seen, samples=FOLDS * seen.samples, step_um=config.pitch_um / FOLDS)
     noise = relative_noise(config.sensor, albedo=ALBEDO)
     texture = Texture(config.pitch_um, 2 * blur.step_of(config.pixels), CONTRAST, noise, folds=FOLDS)
     plane = formed.optics_of(settings, place)

@@ -225,6 +225,7 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     transform = left_out.neglected(optics, plan.waves, plan.window, few) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
+    found["folded"] = left_out.folded(optics, plan.waves, plan.window, few) * share
     found["polarisation"] = left_out.unpolarised(optics, plan.waves, plan.window, few) * share
     found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:

@@ -40,9 +40,10 @@ class Imager:
     stack: (rows, columns, depths, h, w) PSFs of the nodes, of sum 1. energy: (rows, columns, depths) E of each.
     patches: of the frame. transfer: of each patch's kernels, (rank, Y, X // 2 + 1).
     even: (y, x) of the frame, what makes even light even through the patches (:func:`evened`); None: left as it is.
-    parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, polarisation (components of
-        the field that are left out, all but a scalar where that is within the tolerance), edge (light that the rim
-        bends out of the window, and that the transform folds back), pillars (taken together a few micrometres at a
+    parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, folded (light from beyond the
+        windows that the transform shows in them), polarisation (components of the field that are left out, all but a
+        scalar where that is within the tolerance), edge (light that the rim bends out of the window, of which the
+        same is taken off), pillars (taken together a few micrometres at a
         time; 0 of a smooth phase), stop (of its shadow, where there is one).
         Beside them ``outside``: of the light that goes through the lens (:mod:`metalens.field.through`), what
         windows leave out.

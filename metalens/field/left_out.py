@@ -35,6 +35,13 @@ def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Te
     return in_light(relative(found((wide * 0.6, wide * 0.8)), plain), plain.sum((-1, -2)))
 
 
+def folded(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+    """What the transform folds back from beyond the period of the nodes: PSFs of the first wavelength at (field points,
+    depths), with their light, against those of twice the period."""
+    want = _light(optics, waves, replace(window, period=2 * window.period), at)
+    return in_light(relative(_light(optics, waves, window, at), want), want.sum((-1, -2)))
+
+
 def polarised(
     optics: Optics,
     waves: Nodes,

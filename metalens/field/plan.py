@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled
-from metalens.field.left_out import neglected, polarised
+from metalens.field.left_out import folded, neglected, polarised
 from metalens.field.patches import dense, relative, together
 from metalens.field.points import Optics, Window, psfs
 from metalens.ground.errors import SceneError
@@ -23,6 +23,7 @@ FINE = 96
 ALONG = 192  # steps of an axis of the field, on which its nodes lie
 MOST = 57  # nodes along an axis
 DENSER = (0.0, 2.0)  # by how much more the nodes lie at the rim of the field than on the axis
+LONGEST = 4.0  # period of the nodes, in windows, from which on none is twice as long
 ORDER = 2.5  # power of their distance by which the error falls; more would need PSFs without edges
 SHARES = {  # of the tolerance; together 0.98 of it
     "kernels": 0.6,
@@ -31,6 +32,7 @@ SHARES = {  # of the tolerance; together 0.98 of it
     "spectrum": 0.4,
     "transform": 0.4,
     "polarisation": 0.2,
+    "folded": 0.15,
 }
 
 
@@ -119,6 +121,7 @@ def planned(
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
     coarse = waves if isinstance(source, Nodes) else _coarse(source, 2)
     ends = depth_nodes(grid, 3)
+    window = _unfolded(optics, coarse, window, (_corner(middle_um, half), ends), tolerance * SHARES["folded"])
 
     def across(places: Tensor) -> Tensor:
         x = torch.stack([(2 * places / ALONG - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
@@ -174,6 +177,13 @@ def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, win
     else:  # derivatives, or another device
         some(0, len(others))
     return torch.cat(found)
+
+
+def _unfolded(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], tolerance: float) -> Window:
+    """The window with nodes of the least period that folds no more light back than is tolerated, or of the longest."""
+    while window.period < LONGEST and folded(optics, waves, window, at) > tolerance:
+        window = replace(window, period=2 * window.period)
+    return window
 
 
 def _corner(middle_um: tuple[float, float], half_um: list[float]) -> Tensor:

@@ -41,6 +41,7 @@ class Window:
     components: of the fields of both polarisations, so many of the strongest mixtures
         (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one scalar.
     flux: whether those give the flux through the sensor's plane, which a pixel counts, or |Ex|² + |Ey|² + |Ez|².
+    period: of the nodes, in widths of the window. Light from beyond half of it is seen folded back.
     """
 
     samples: int
@@ -48,12 +49,15 @@ class Window:
     curved: bool = False
     components: int = 0
     flux: bool = True
+    period: float = SPARE
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.samples % 2 == 0 or not self.step_um > 0:
             raise PropagationError(f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3")
         if not 0 <= self.components <= self.whole:
             raise PropagationError(f"{self.components} components of the field: need 0 to {self.whole}")
+        if not self.period >= SPARE:
+            raise PropagationError(f"nodes of a period of {self.period} windows: need {SPARE} or more")
 
     @property
     def whole(self) -> int:
@@ -96,8 +100,8 @@ class Sampling:
     """period_um of the nodes, their number along an axis and their step of p, size of the padded transform, harmonics
     that are kept.
 
-    beyond: share of the light that the rim bends beyond the window, 4√2 / (π² k p h) of a sharp round rim at p and a
-        window of half width h; the transform folds it back, and it is taken off.
+    beyond: share of the light that the rim bends beyond the period, 4√2 / (π² k p h) of a sharp round rim at p and half
+        a period h, less the spare; the transform folds it back, and it is taken off.
     """
 
     period_um: float
@@ -118,11 +122,11 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     edge = float(media.direction(after, rim))
     if edge > LARGEST_P * after.layers[0][0]:
         raise PropagationError(f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}")
-    step = min(wavelength_um, finest_um) / (window.samples * window.step_um * SPARE)
+    step = min(wavelength_um, finest_um) / (window.samples * window.step_um * window.period)
     period = wavelength_um / step
     nodes = 2 * math.ceil(edge / step) + 2
     harmonics = math.floor(2 * period / window.step_um)
-    half = window.samples * window.step_um / 2
+    half = window.samples * window.step_um / 2 * window.period / SPARE
     stop = optics.layers.stop
     lit = edge if stop is None else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
     beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5)
