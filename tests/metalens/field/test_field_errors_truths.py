@@ -146,6 +146,7 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
 
     monkeypatch.setattr(engine.left_out, "neglected", neglected)
     monkeypatch.setattr(engine.left_out, "unpolarised", unpolarised)
+    monkeypatch.setattr(engine.left_out, "folded", lambda optics, waves, window, at: 0.0047 * len(at[0]))
 
     def missing(optics, wave, window, at):
         seen.update(wave=wave, every=at)
@@ -175,6 +176,7 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert parts["spectrum"] == 0.004
     assert parts["transform"] == pytest.approx(0.017 * share, rel=1e-9)
     assert parts["polarisation"] == pytest.approx(0.0031 * share, rel=1e-9)
+    assert parts["folded"] == pytest.approx(5 * 0.0047 * share, rel=1e-9)
     assert parts["pillars"] == 0.0023
     assert seen["wave"] == 0.82
     assert seen["every"][0].numpy() == pytest.approx(seen["at"].numpy()[:2])

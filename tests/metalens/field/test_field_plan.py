@@ -94,6 +94,7 @@ def test_a_field_off_the_axis_is_tried_where_it_lies(monkeypatch):
 
     monkeypatch.setattr(plan, "spectral", spectral)
     monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
+    monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
     monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
     grid, waves = Grid((10, 32), 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
     plan.planned(None, grid, waves, (70.0, -40.0), tolerance=0.01, folds=False)
@@ -155,6 +156,7 @@ def test_a_spectrum_is_judged_where_it_changes_an_image_most_and_by_what_lies_be
 def test_a_field_folds_only_where_it_is_square(monkeypatch, samples, middle, folds):
     monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
     monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
+    monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
     monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
     grid = Grid(samples, 2.0, (3e3, 9e3), window=7)
     round_lens = folds or samples[0] != samples[1]
@@ -173,6 +175,7 @@ def test_nodes_lie_as_densely_along_y_as_a_line_along_x_asks_for(monkeypatch, sa
     """Five along x: steps of a quarter of its length, no longer ones along y; two at least. Rays that err by more than
     0.4 of the tolerance are seen from every place."""
     monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
+    monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
     monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
     grid, waves = Grid(samples, 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
     for left in (0.0039, 0.0041):
