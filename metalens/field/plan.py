@@ -140,12 +140,11 @@ def planned(
     some = torch.cat([_corner(middle_um, half), torch.tensor([middle_um], dtype=torch.float64)]), ends
     within = tolerance, tolerance * SHARES["polarisation"]
     window = polarised(optics, coarse, window, some, polarisation, within=within)
-    counts = [max(2, math.ceil((count - 1) * h / half[1]) + 1) for h in half]
     y, x = (
-        m + (2 * placed(c, denser, (m, h)) / ALONG - 1) * h
-        for m, h, c in zip(middle_um[::-1], half, counts, strict=True)
+        m + (2 * placed(max(2, math.ceil((count - 1) * h / half[1]) + 1), denser, (m, h)) / ALONG - 1) * h
+        for m, h in zip(middle_um[::-1], half, strict=True)
     )
-    return Plan(y, x, depth_nodes(grid, depths), waves, window, folds and counts[0] == counts[1] and half[0] == half[1])
+    return Plan(y, x, depth_nodes(grid, depths), waves, window, folds and half[0] == half[1])
 
 
 def depth_nodes(grid: Grid, count: int) -> Tensor:
