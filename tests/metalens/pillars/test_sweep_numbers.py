@@ -103,7 +103,7 @@ def library(level=None, phase=None, poles=()):
         t[1, 0, 1] *= level
     if phase is not None:
         t[0, 1, 0] *= np.exp(1j * phase)
-    return SimpleNamespace(diameter_um=D, t=t, resonances=np.array(poles, float).reshape(-1, 5))
+    return SimpleNamespace(cell=DEFAULT_CELL, diameter_um=D, t=t, resonances=np.array(poles, float).reshape(-1, 5))
 
 
 def cut(**about):
