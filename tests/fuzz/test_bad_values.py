@@ -4,9 +4,10 @@ import pytest
 
 from benchmarks import _hardness_values as matrix
 
-# what may be below 0: turns and offsets either way, parameters of a made lens, a stage that runs backwards
-SIGNED = {"grow_um", "n_offset", "k_offset", "angle_rad", "strength_rad", "isolated_nm", "sidewall_deg", "value", "step_um",
-          "elevation_deg", "angle_deg", "gaze_step_deg", "slip_step_mm", "mask_turn_deg",
+# what may be below 0: turns and offsets either way, sections narrower than their mask, parameters of a made lens, a
+# stage that runs backwards
+SIGNED = {"n_offset", "k_offset", "angle_rad", "strength_rad", "isolated_nm", "sidewall_deg", "value", "step_um",
+          "elevation_deg", "angle_deg", "gaze_step_deg", "slip_step_mm", "mask_turn_deg", "grow_um",
           "turn_deg", "x_um", "y_um", "x_mm", "y_mm"}  # fmt: skip
 # a measure of these has no meaning at 0
 ABOVE_ZERO = ("tolerance", "wavelength", "pitch_um", "aperture", "pixel_um", "samples", "window", "frames")
