@@ -64,11 +64,14 @@ def errors(bench, optics):
 
 
 def test_a_rounded_mask_turns_every_pillar_by_its_own_rounding():
-    """The lens drawn anew with diameters that are whole steps of 4 nm, at 55 rad a um; without a mask no entry."""
+    """The lens drawn anew with diameters that are whole steps of 4 nm, at 55 rad a um; without a mask no entry.
+
+    Diameters as the table knows them: 32 of 19 856 lie so near half a step that it takes them the other way.
+    """
     bench = small.bare()
     (got,) = links.mask(bench)
-    d = bench.lens.diameters.diameter_um
-    rounded = np.rint(d / 4e-3) * 4e-3
+    d, table = bench.lens.diameters.diameter_um, bench.aperture
+    rounded = np.where(d > 0, np.rint(table.diameter_um[table.place] / 4e-3) * 4e-3, 0.0)
     turn = small.SLOPE * (rounded - d)[d > 0]
     assert got.phase_rad == pytest.approx(np.std(turn), abs=ROUNDING_RAD)
     other = replace(bench.lens, diameters=replace(bench.lens.diameters, diameter_um=rounded))

@@ -190,7 +190,8 @@ def test_settings_of_the_optics_are_believed_against_their_finest(uniform, exact
 def test_a_true_image_costs_its_stacks_and_its_frames(true, exact, monkeypatch):
     """PSFs in 0.5 s and an image of two scenes in 0.9 s at best, then in 4.0 and 1.2; then in less, which is noise.
 
-    So small a field has the same few nodes at every tolerance: nothing is misread.
+    So small a field has the same few nodes at every tolerance; the coarser ones fold light from beyond their windows
+    back, which is all that is misread.
     """
     one = copy.copy(true)
     one.levels = {"image_tolerance": (0.5, 0.2, 0.06)}
@@ -199,8 +200,11 @@ def test_a_true_image_costs_its_stacks_and_its_frames(true, exact, monkeypatch):
     errors, seconds, nodes = plan.image_knob(one, exact)
     finest = 7 * 4.0 + 110 * 0.6
     assert seconds == pytest.approx([7 * 0.5 + 110 * 0.45, finest, finest])
-    assert errors == pytest.approx(np.zeros((3, 2, 2)), abs=1e-9)
-    coarse, fine = (true.optics(exact, tolerance) for tolerance in (0.5, 0.06))
+    coarse, middle, fine = (true.optics(exact, tolerance) for tolerance in (0.5, 0.2, 0.06))
+    assert coarse.plan.window.period < fine.plan.window.period
+    for found, optics in zip(errors, (coarse, middle, fine), strict=True):
+        assert found == pytest.approx(misread(true, fine, optics), rel=1e-6, abs=1e-9)
+    assert errors[2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)
     for found, optics in zip(nodes[[0, 2]].tolist(), (coarse, fine), strict=True):
         assert found[:3] == [*optics.stack.shape[:2], len(optics.plan.depths_um)]
         assert found[3] == len(optics.plan.waves.weights)
