@@ -33,8 +33,8 @@ def rows() -> Iterator[Row]:
     """
     there = device_of("cuda")
     spent: dict[str, _Spent] = {}
+    next(_trainer("smoke", {"scenes": {"pool": 16}}).run())  # compiles
     for device in (torch.device("cpu"), there):
-        next(_trainer("smoke", {"scenes": {"pool": 16}}).run())  # compiles
         trainer = _trainer("laptop", {"scenes": {"pool": 256}})
         spent[device.type] = one = _trained(trainer, device)
         method = f"{trainer.inner.batch / one.step:.0f} frames/s; image formed in {one.forming:.1f} s"

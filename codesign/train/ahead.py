@@ -1,4 +1,4 @@
-"""The frames of the next step formed beside the training of this one: another thread, the same numbers."""
+"""The frames of the next steps formed beside the training of this one: other threads, the same numbers."""
 
 import contextlib
 import os
