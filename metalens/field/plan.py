@@ -30,9 +30,9 @@ SHARES = {  # of the tolerance; together all of it
     "field": 0.4,
     "depth": 0.3,
     "spectrum": 0.4,
-    "transform": 0.4,
+    "transform": 0.36,
     "polarisation": 0.2,
-    "folded": 0.17,
+    "folded": 0.24,
 }
 
 

@@ -60,8 +60,8 @@ def test_what_is_folded_back_is_the_error_that_plane_waves_find(true):
 
 
 def test_the_error_of_an_image_counts_what_is_folded_back(aside):
-    """What is left of it lies within its share of the tolerance, 0.17 of 0.1, at the places that nobody planned."""
-    assert 0 < aside.parts["folded"] < 0.017
+    """What is left of it lies within its share of the tolerance, 0.24 of 0.1, at the places that nobody planned."""
+    assert 0 < aside.parts["folded"] < 0.024
     assert aside.error >= aside.parts["folded"]
     assert aside.parts["outside"] > 0.2  # 0.07 when light from beyond counted as held
 
