@@ -18,7 +18,7 @@ from metalens.field.waves import PillarWave
 from metalens.psf import Nodes, Polarisation, psf_stack
 
 JUDGE = 3e-4  # tolerance of the PSFs of every pillar
-MOST = 256  # of their samples along an axis; the middle of a wider window is looked at, where the light is
+MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
 
 def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
@@ -98,8 +98,10 @@ def missing(optics: Optics, wavelength_um: float, window: Window, at: tuple[Tens
     if not isinstance(wave, PillarWave):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
-    # points of a sample, half of Nyquist's step apart: triangles of a sample are then summed to 2e-3 of fine detail
-    finer = 2 * math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
+    # points of a sample, half of Nyquist's step apart: triangles of a sample are then summed to 2e-3 of fine detail. At
+    # Nyquist's step it is 5e-3 too much; what scatters to the rim of a window is more, so that no window is cut for it.
+    finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
+    finer *= 2 if (window.samples + 2) * 2 * finer <= MOST else 1
     count = min(window.samples, max(MOST // finer - 2, 3) | 1)
     share, edge = _triangles(count, finer), (window.samples - count) // 2
     few = slice(edge, edge + count)

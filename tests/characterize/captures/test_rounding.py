@@ -132,6 +132,23 @@ def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
     assert made.count_e == 0.0
 
 
+def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_is_stated():
+    """0.43 counts of light on steps of 1700 electrons, without read noise: 0.016 counts by themselves."""
+    step, light, noise = 1700.0, 0.43, 0.05
+    electrons = step * np.array([[[0.0, 1.0]]])
+    image, full = np.full_like(electrons, light * step), np.ones(electrons.shape, bool)
+    data = Data(electrons, full, ~full, np.full_like(electrons, step**2 / 12), np.ones(electrons.shape), count_e=step)
+    made = prepare.unrounded(data, image)
+    counts, chance = chances(light, noise)
+    up, down = (chances(light + sign * 1e-5, noise)[1] for sign in (1, -1))
+    some = chance > 1e-14
+    score = (up - down)[some] / 2e-5 / chance[some]
+    information = float(chance[some] @ score**2)
+    want = [light + float(score[counts[some] == k][0]) / information for k in (0, 1)]
+    assert made.electrons.ravel() / step == pytest.approx(want, rel=1e-4)  # the difference: (1e-5 / 0.05)² x 7²
+    assert made.variance(image).ravel() == pytest.approx(step**2 / information, rel=1e-4)
+
+
 def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count():
     rng = np.random.default_rng(21)
     gain, read, level = 31.0, 4.0, 9.3

@@ -79,3 +79,6 @@ def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(mo
     assert ahead.renderers(torch.device("cuda")) == 6
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     assert ahead.renderers(torch.device("cuda")) == 1
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    monkeypatch.setattr(ahead, "cores", lambda: 44)
+    assert ahead.renderers(torch.device("cuda")) == 8  # not 11

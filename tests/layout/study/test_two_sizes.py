@@ -2,9 +2,11 @@
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 import pytest
+from scipy import interpolate
 
 from layout.mask import fields
 from layout.process.process import Process, WriteField
@@ -98,6 +100,16 @@ def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
     assert found == pytest.approx(
         formula(0.3 + np.array([-5e-3, 0, 5e-3]), 0.12 + np.array([-5e-3, 0, 5e-3]), "x"), abs=1e-3
     )
+
+
+def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
+    """|t| = 0.9 - 3 (width - 0.1) - 0.3 (length - 0.12), two of its ends followed by 0.3 um in width."""
+    x, y = np.meshgrid(X_UM, Y_UM, indexing="ij")
+    level = 0.9 - 3 * (x - 0.1) - 0.3 * (y - 0.12)
+    spline = [interpolate.RectBivariateSpline(X_UM, Y_UM, level * part) for part in (math.cos(0.7), math.sin(0.7))]
+    made = pillars.TwoSizes(np.ones(1), np.ones(1), np.zeros((0, 1)), X_UM, Y_UM, tuple(spline))
+    found = made.t(np.array([0.6, 0.32, 0.02]), np.array([0.2, 0.2, 0.2]))
+    assert found == pytest.approx(np.array([1e-3, 0.216, 1.0]) * np.exp(0.7j), rel=1e-9)
 
 
 @pytest.mark.parametrize("light", [0, 1])

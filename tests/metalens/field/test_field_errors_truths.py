@@ -339,6 +339,17 @@ def test_an_image_in_the_shadow_counts_errors_over_its_own_light():
     assert engine._dimmer(Imager(grid, about, stack, peak, [], [], {})) == 1.0
 
 
+@pytest.mark.parametrize(("counts", "whole"), [([6, 6, 6], False), ([6, 6, 6, 7], True), ([12], True)])
+def test_products_of_all_nodes_are_taken_at_once_where_those_of_the_patches_are_more(counts, whole):
+    """12 nodes of two depths: 576 products, or 144 of every patch of 6 nodes; both ways they are the same sums."""
+    seen = torch.from_numpy(RNG.uniform(-1, 1, (3, 4, 2, 5)))
+    known = patches.Products(seen, counts)
+    assert (known.whole is not None) is whole
+    flat, nodes = seen.reshape(24, 5).numpy(), np.array([2, 3, 8, 9, 20, 21])
+    want = np.einsum("if,jf->ij", flat[nodes], flat[nodes]).reshape(3, 2, 3, 2)
+    assert known.of(torch.from_numpy(nodes)).numpy() == pytest.approx(want, rel=1e-12, abs=1e-14)
+
+
 def test_four_nodes_interpolate_cubics_at_places_of_any_shape():
     """Positions in two axes: the weights come last, and what they add up is a cubic's value."""
     place = torch.from_numpy(RNG.uniform(0, 6, (3, 5)))

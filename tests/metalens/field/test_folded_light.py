@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager
+from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, plan
 from metalens.field.left_out import folded
 from metalens.field.patches import relative
 from metalens.field.points import SPARE, psfs
@@ -69,6 +69,14 @@ def test_the_error_of_an_image_counts_what_is_folded_back(aside):
 def test_on_the_axis_the_period_stays_the_least():
     grid = Grid((3, 5), STEP_UM, (3000.0, 9000.0), margin=SAMPLES // 2, window=SAMPLES)
     assert imager(WAVE, grid, tolerance=0.1).plan.window.period == SPARE
+
+
+def test_a_period_is_doubled_no_further_than_beyond_four_windows():
+    """However little may be folded back: nodes grow with its square."""
+    window, waves = Window(SAMPLES, STEP_UM), Nodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0)
+    at = torch.tensor([PLACE], dtype=torch.float64), torch.tensor([DEPTH_UM], dtype=torch.float64)
+    assert plan._unfolded(OPTICS, waves, window, at, 0.0).period == pytest.approx(4 * SPARE)
+    assert plan._unfolded(OPTICS, waves, window, at, 1.0).period == SPARE
 
 
 def test_a_period_shorter_than_the_window_is_refused():

@@ -3,10 +3,12 @@
 import dataclasses
 import functools
 import math
+from types import SimpleNamespace
 
 import pytest
 import scipy.fft
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
@@ -88,6 +90,61 @@ def test_patches_taken_together_are_those_one_by_one(both, kinds):
     assert torch.allclose(seen, want, rtol=0, atol=SINGLE * float(want.max()))
     for one, other in zip(slopes, steep, strict=True):
         assert torch.allclose(one, other, rtol=0, atol=1e-5 * float(other.abs().max()))
+
+
+class _Spectra(TorchDispatchMode):
+    """Bytes of every transform to frequencies that is asked for."""
+
+    def __init__(self):
+        super().__init__()
+        self.bytes = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        found = func(*args, **(kwargs or {}))
+        if func.overloadpacket.__name__ == "_fft_r2c":
+            self.bytes.append(found.numel() * found.element_size())
+        return found
+
+
+def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_where_there_are_patches():
+    """Seven patches of five kernels, 6 frames of two sheets: a patch's spectra are 0.63 GB, three at a time, the last
+    alone. Shapes without numbers."""
+    side, size, kernels, nothing = 900, 1600, 5, functools.partial(torch.empty, device=AWAY)
+    patch = patches.Patch(
+        (0, side),
+        (0, side),
+        nothing(side * side),
+        nothing(side * side, 2, kernels),
+        nothing(side * side, 2),
+        nothing(kernels, 4),
+        nothing(4),
+        nothing(kernels + 1),
+        kernels,
+    )
+    given = nothing(6, 2, side, side), nothing(6, 2, side, side), nothing(6, 2, side, side)
+    transfer = [nothing(kernels, size, size // 2 + 1, dtype=torch.complex64)] * 7
+    out = nothing(6, 1, 2, size, size)
+    with _Spectra() as seen:
+        together.through(given, [patch] * 7, transfer, [(size, size)] * 7, out)
+    each = 8 * 6 * 2 * kernels * size * (size // 2 + 1)
+    assert 3 * each < 2**31 < 4 * each
+    assert seen.bytes == [3 * each, 3 * each, each]
+
+
+@pytest.mark.parametrize(("device", "sizes"), [("cpu", [8, 8, 1]), (AWAY, [17])])
+def test_a_cache_holds_eight_frames_and_a_gpu_is_given_a_hundred_and_twenty_eight(monkeypatch, device, sizes):
+    seen = []
+    monkeypatch.setattr(forming, "blurred", lambda few, optics: seen.append(len(few.radiance)) or few.radiance[:, 0])
+    monkeypatch.setattr(forming, "returned", lambda total, grid: total)
+    optics = SimpleNamespace(grid=GRID, stack=torch.empty(1, device=device), stray=None)
+    size = tuple(n + 2 * GRID.margin for n in GRID.samples)
+    many = torch.empty(17, 2, *size, device=device)
+    forming.image(Frames(many, many, many), optics)
+    assert seen == sizes
+    if device == AWAY:
+        more = torch.empty(300, 2, *size, device=device)
+        forming.image(Frames(more, more, more), optics)
+        assert seen[1:] == [128, 128, 44]
 
 
 def _one_by_one(given, patches, transfer, shapes, out):
