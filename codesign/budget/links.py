@@ -112,7 +112,7 @@ def pillars(about: Bench) -> Iterator[Entry]:
     lens, given = about.lens, about.given
     low, high = supercell.printed(lens)
     at = np.linspace(low, high, SOLVED)
-    tolerance = given.library.sweep.tolerance if given.library else given.tolerance
+    tolerance = given.library.sweep.bar if given.library else given.tolerance
     engine = engines.choose(lens.cell)
     solve = engines.precise(lens.cell, Light(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine)
     exact = np.array([solve(float(d)).t for d in at])

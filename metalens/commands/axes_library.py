@@ -37,7 +37,7 @@ def failures(made: AxesLibrary) -> list[str]:
     found, share = [], float(made.usable.mean())
     if share < LEAST_USABLE:
         found.append(
-            f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {made.sweep.tolerance:g} "
+            f"error bars of {1 - share:.0%} of the pairs of sizes are above the tolerance {made.sweep.bar:g} "
             f"(median {np.median(made.t_error):.2g}): allow a larger tolerance or take narrower ranges"
         )
     if made.missed:
@@ -76,7 +76,7 @@ def _text(target: Path, made: AxesLibrary, seconds: float, failures: list[str]) 
         f"Jones matrices at {len(made.wavelength_um)} wavelength(s)",
         f"  {made.solves} solves (rcwa, orders within {made.harmonics}), {seconds:.1f} s",
         f"  t within {np.median(made.t_error):.1e} in the median; {made.usable.mean():.1%} of the sizes are within "
-        f"{made.sweep.tolerance:g}, the others are excluded bands of resonances",
+        f"{made.sweep.bar:g}, the others are excluded bands of resonances",
         f"  {len(held)} pairs held out: interpolated within {np.median(held[:, 3]):.1e} in the median, "
         f"{held[:, 3].max():.1e} at most, {made.missed} above their bar",
     ]

@@ -12,7 +12,7 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import DomainError
 from metalens.pillars import circular
-from metalens.pillars.fit import Data, ProxyFit, Wanted, fit_terms, missed, shortfall
+from metalens.pillars.fit import Data, ProxyFit, Wanted, entry_error, fit_terms, missed, shortfall
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary
 
@@ -28,7 +28,7 @@ def converted(library: PillarLibrary) -> Array:
 def best_size_um(library: PillarLibrary) -> float:
     """The size whose least conversion over the wavelengths is largest, off resonances (bars within the tolerance)."""
     least = np.abs(converted(library)).min(axis=0)
-    sure = (library.t_error <= library.sweep.tolerance).all(axis=(0, 1, 2))
+    sure = (library.t_error <= library.sweep.bar).all(axis=(0, 1, 2))
     return float(library.diameter_um[int(np.where(sure | ~sure.any(), least, -1.0).argmax())])
 
 
@@ -55,7 +55,10 @@ def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
     phase = np.unwrap(np.angle(t[:, run]), axis=-1)
     phase += (np.unwrap(phase[:, middle - run.start]) - phase[:, middle - run.start])[:, None]
     kept = Data(phase[None], np.abs(t[:, run])[None], d[run], library.wavelength_um, library.angle_rad)
+    wanted = wanted.settled(entry_error(library, kept.diameter))
     proxy = _widest(kept, middle - run.start, wanted)
+    inside = (d >= proxy.domain_um[0]) & (d <= proxy.domain_um[1])
+    proxy = dataclasses.replace(proxy, entry_error=entry_error(library, d[inside]))
     notes = (f"converted light: at {d[middle]:.4f} um {np.abs(t[:, middle]).min() ** 2:.3f} of it changes hand",)
     return ProxyFit(proxy, notes, (), math.nan, 0.0, shortfall(proxy, wanted), math.nan)
 
@@ -63,7 +66,7 @@ def fit(library: PillarLibrary, wanted: Wanted) -> ProxyFit:
 def with_turns(library: PillarLibrary) -> PillarLibrary:
     """With the best pillar solved at several turns, at the middle wavelength."""
     wavelength = float(library.wavelength_um[len(library.wavelength_um) // 2])
-    turned = circular.solve(library.cell, best_size_um(library), wavelength, tolerance=library.sweep.tolerance)
+    turned = circular.solve(library.cell, best_size_um(library), wavelength, tolerance=library.sweep.bar)
     return dataclasses.replace(library, turned=turned)
 
 

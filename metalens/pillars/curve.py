@@ -81,6 +81,13 @@ class Curve:
             value[hit], error[hit] = self.nodes.response[order[side[hit]]], solver[side[hit]]
         return value, error
 
+    def solver_error(self, diameter_um: Array) -> Array:
+        """(...) of the solver at the better of the two nodes around."""
+        order = np.argsort(self.nodes.diameter_um)
+        x, error = self.nodes.diameter_um[order], self.nodes.error[order]
+        right = np.clip(np.searchsorted(x, diameter_um), 1, len(x) - 1)
+        return np.asarray(np.minimum(error[right - 1], error[right]))
+
     def _doubt(self, d: Array) -> Array:
         value = self.best(d)
         doubt = np.max([np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0)

@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 
 from metalens.cell import Cell, Light, Response
+from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
-from metalens.pillars.curve import starts
+from metalens.pillars.curve import FIRST, starts
 
-PROBES = [4, 7, -1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
+PROBES = [4, 7, FIRST - 1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
 Engine = Literal["auto", "rcwa", "modal"]
 
 
@@ -70,6 +71,12 @@ def smooth_all(
 def upright(cell: Cell, engine: str) -> bool:
     """Whether the modal engine solves the pillar by itself: its lights of one direction then share modes and a mesh."""
     return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
+
+
+def at_the_finest(cell: Cell, errors: Array, tolerance: float) -> bool:
+    """Whether :func:`smooth` took the finest discretisation there is, by the errors of the nodes that came of it (the
+    first ones as a curve begins with): a pillar solved by itself has no less error then."""
+    return not cell.round and bool(errors[PROBES].max() > tolerance)
 
 
 def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:

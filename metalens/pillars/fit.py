@@ -1,6 +1,7 @@
 """Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least coefficients in tolerance."""
 
 import contextlib
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -15,6 +16,7 @@ from metalens.pillars.record import PillarLibrary
 from metalens.pillars.stretch import Stretch, stretch
 
 TURN = 2 * math.pi
+FOLLOWED, KNOWN_SHARE = 1e-3, 0.5  # deviation from entries where none is stated, and that of the entries' own bars
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
@@ -26,7 +28,8 @@ MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 class Wanted:
     """What a proxy must meet.
 
-    phase_tolerance_rad, transmission_tolerance: largest deviation from the library entries.
+    phase_tolerance_rad, transmission_tolerance: largest deviation from the library entries; left out, 1e-3, or half
+        of what the entries' own error bars say on the domain where that is more.
     coefficients: real ones, of phase and |T| together at one wavelength and angle; more are taken only where
         fewer would leave less than a full turn.
     least_transmission: a domain ends where |t| falls below.
@@ -34,12 +37,23 @@ class Wanted:
     within_um: (least, largest) diameter to consider; all entries without it.
     """
 
-    phase_tolerance_rad: float = field(default=1e-3, metadata={"above": 0})
-    transmission_tolerance: float = field(default=1e-3, metadata={"above": 0})
+    phase_tolerance_rad: float | None = field(default=None, metadata={"above": 0})
+    transmission_tolerance: float | None = field(default=None, metadata={"above": 0})
     coefficients: int = field(default=24, metadata={"above": 0})
     least_transmission: float = 0.7
     least_half_width_um: float = 0.005
     within_um: tuple[float, float] | None = None
+
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """Of phase (rad) and |T|."""
+        return self.phase_tolerance_rad or FOLLOWED, self.transmission_tolerance or FOLLOWED
+
+    def settled(self, entry_error: float) -> "Wanted":
+        """What is left out, by the errors of the entries themselves: no curve need follow what is not known."""
+        usual = max(FOLLOWED, KNOWN_SHARE * entry_error)
+        phase, level = self.phase_tolerance_rad or usual, self.transmission_tolerance or usual
+        return dataclasses.replace(self, phase_tolerance_rad=phase, transmission_tolerance=level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,14 +115,22 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         least_half_width_um=wanted.least_half_width_um,
         within_um=wanted.within_um,
     )
+    wanted = wanted.settled(entry_error(library, smooth.diameter_um))
     data = Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
     kept, proxy, terms = _followed(data, wanted)
+    proxy = dataclasses.replace(proxy, entry_error=entry_error(library, kept.diameter))
     counts = range(4, max(18, 2 * terms + 5), 2)
     trials = (_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
     table = tuple(trial for trial in trials if trial is not None)
     notes = _notes(smooth, data, kept, terms)
     short = TURNS_BACK if math.isinf(_cost(proxy, wanted)) else shortfall(proxy, wanted)
     return ProxyFit(proxy, notes, table, _turns(kept), smooth.polarization_spread, short, _turns(data))
+
+
+def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
+    """Root mean square of the error bars of t, relative to |t|, of the entries at some of a library's diameters."""
+    some = np.isin(library.diameter_um, diameter_um)
+    return float(np.sqrt(np.mean((library.t_error / np.abs(library.t))[..., some] ** 2)))
 
 
 def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
@@ -168,20 +190,19 @@ def shortfall(proxy: Proxy, wanted: Wanted) -> str:
     """By how much a proxy misses its tolerances, for a person; empty where it meets them."""
     if missed(proxy, wanted) <= 1:
         return ""
+    phase, level = wanted.tolerances
     return (
         f"the proxy follows the phase within {proxy.max_phase_error_rad:.1e} rad and |T| within "
-        f"{proxy.max_transmission_error:.1e}, where {wanted.phase_tolerance_rad:g} and "
-        f"{wanted.transmission_tolerance:g} are wanted: sweep with more samples, or loosen phase_tolerance_rad and "
+        f"{proxy.max_transmission_error:.1e}, where {phase:.2g} and "
+        f"{level:.2g} are wanted: sweep with more samples, or loosen phase_tolerance_rad and "
         "transmission_tolerance"
     )
 
 
 def missed(proxy: Proxy, wanted: Wanted) -> float:
     """The larger error in units of its tolerance."""
-    return max(
-        proxy.max_phase_error_rad / wanted.phase_tolerance_rad,
-        proxy.max_transmission_error / wanted.transmission_tolerance,
-    )
+    phase, level = wanted.tolerances
+    return max(proxy.max_phase_error_rad / phase, proxy.max_transmission_error / level)
 
 
 def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:

@@ -12,6 +12,8 @@ from metalens.ground.errors import DomainError
 from metalens.pillars import inverse, polynomial
 from metalens.pillars.inverse import Values
 
+AVERAGED = 65  # diameters over which |t| is averaged
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proxy:
@@ -25,6 +27,7 @@ class Proxy:
     max_phase_error_rad, max_transmission_error: largest deviation from held-out library entries.
     power: the polynomials run in diameter^power.
     max_angle_rad: largest angle of incidence in air; the polynomials run in the square of its sine.
+    entry_error: what the entries may be wrong by themselves, relative to |t|: their error bars' root mean square.
 
     Raises:
         DomainError: |T| leaves [0, 1] inside the domain, or an empty domain.
@@ -38,6 +41,7 @@ class Proxy:
     max_transmission_error: float
     power: int = 1
     max_angle_rad: float = 0.0
+    entry_error: float = 0.0
 
     def __post_init__(self) -> None:
         low, high = self.domain_um
@@ -102,6 +106,11 @@ class Proxy:
         ends = self.phase_rad(np.array(within_um or self.domain_um), wavelength_um, angle_rad)
         return float(abs(ends[1] - ends[0]))
 
+    def error(self, wavelength_um: float) -> float:
+        """What t by the curves may be wrong by, relative to its mean: deviation from entries, and the entries' own."""
+        level = np.asarray(self.transmission(np.linspace(*self.domain_um, AVERAGED), wavelength_um)).mean()
+        return math.hypot(self.max_phase_error_rad, self.max_transmission_error / float(level), self.entry_error)
+
     def monotone(
         self, wavelength_um: float, angle_rad: float = 0.0, within_um: tuple[float, float] | None = None
     ) -> bool:
@@ -157,6 +166,7 @@ class Proxy:
             "max_error": np.array([self.max_phase_error_rad, self.max_transmission_error]),
             "power": np.array(self.power),
             "max_angle_rad": np.array(self.max_angle_rad),
+            "entry_error": np.array(self.entry_error),
         }
 
     @classmethod
@@ -172,6 +182,7 @@ class Proxy:
             error[1],
             int(arrays["power"]),
             float(arrays["max_angle_rad"]),
+            float(arrays.get("entry_error", 0.0)),  # older files hold none
         )
 
 

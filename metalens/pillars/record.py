@@ -1,5 +1,6 @@
 """The pillar library: response over diameter, wavelength, angle and polarisation, an error bar on every entry."""
 
+import dataclasses
 import itertools
 import math
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from metalens.pillars.proxy import Proxy
 PLAIN = Index(3.6)
 DEFAULT_CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=PLAIN)
 MOST_ALONG = 1000  # samples along a size, where there are two
+USUAL = {"modal": 1e-3, "rcwa": 0.02, "axes": 0.05}  # round pillars, others (corners converge slowly), two sizes
 EDGE_GAP_UM = 0.05  # a sweep ends this far below the pitch: 10 nm of bias beyond a printable gap of 60 nm
 
 
@@ -34,7 +36,8 @@ class Sweep:
     angles_deg: of incidence in air, in the plane of a lattice axis; both polarisations where one is not 0.
     diameters_um: (least, largest); without it from 0.06 (or a fifth of a smaller pitch) to the pitch less 0.05.
     samples: evenly spaced diameters; more are added around resonances.
-    tolerance: error bar that is asked of every entry's t.
+    tolerance: error bar that is asked of every entry's t; left out, what the solver of such cells reaches but beside
+        resonances (:data:`USUAL`).
     engine: auto, rcwa or modal.
     lengths_um: (least, largest) size along y of a rectangle or an ellipse; diameters_um is then that along x, and the
         library one over both sizes (``samples`` entries along the longer range) with Jones matrices.
@@ -46,7 +49,7 @@ class Sweep:
     angles_deg: tuple[float, ...] = (0.0,)
     diameters_um: tuple[float, float] | None = None
     samples: int = 200
-    tolerance: float = 1e-3
+    tolerance: float | None = None
     engine: str = "auto"
     light: Literal["linear", "circular"] = "linear"
     lengths_um: tuple[float, float] | None = None
@@ -61,7 +64,7 @@ class Sweep:
             raise ConfigError(f"angles_deg = {list(self.angles_deg)}: need 0 <= angle < 90")
         if not 20 <= self.samples <= 100_000:
             raise ConfigError(f"samples = {self.samples}: need 20 to 100000")
-        if not 1e-8 <= self.tolerance <= 0.1:
+        if self.tolerance is not None and not 1e-8 <= self.tolerance <= 0.1:
             raise ConfigError(f"tolerance = {self.tolerance}: need 1e-8 to 0.1")
         if self.engine not in ("auto", "rcwa", "modal"):
             raise ConfigError(f"engine = {self.engine!r}: need auto, rcwa or modal")
@@ -87,6 +90,18 @@ class Sweep:
         if self.light == "circular":
             return ("x", "y")
         return ("x",) if self.angles_deg == (0.0,) else ("s", "p")
+
+    @property
+    def bar(self) -> float:
+        """The tolerance, that of round pillars where none is stated."""
+        return USUAL["modal"] if self.tolerance is None else self.tolerance
+
+    def settled(self, cell: Cell) -> "Sweep":
+        """The same with the tolerance that pillars of such a cell have where none is stated."""
+        if self.tolerance is not None:
+            return self
+        usual = "axes" if self.lengths_um is not None else "modal" if cell.round else "rcwa"
+        return dataclasses.replace(self, tolerance=USUAL[usual])
 
     def span_um(self, cell: Cell) -> tuple[float, float]:
         """(least, largest) diameter.
@@ -151,7 +166,7 @@ class PillarLibrary:
     @property
     def converged(self) -> bool:
         """Whether every error bar meets the tolerance."""
-        return bool(self.t_error.max() <= self.sweep.tolerance)
+        return bool(self.t_error.max() <= self.sweep.bar)
 
 
 def check(cell: Cell, sweep: Sweep) -> None:

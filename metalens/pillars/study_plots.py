@@ -65,7 +65,7 @@ def library_figure(path: Path, library: "PillarLibrary", made: "ProxyFit | None"
         bars.semilogy(d, error, lw=0.9)
     phase.set_ylabel("phase (turns)")
     level.set(ylabel="|t|", ylim=(0, 1.05))
-    bars.axhline(library.sweep.tolerance, color="0.5", lw=0.8, ls="--")
+    bars.axhline(library.sweep.bar, color="0.5", lw=0.8, ls="--")
     bars.set_ylabel("error bar of t")
     if library.t.shape[0] * library.t.shape[1] * library.t.shape[2] <= 12:
         phase.legend(fontsize=7)

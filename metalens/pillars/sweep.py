@@ -47,6 +47,7 @@ def sweep(
     if wavelengths_um is not None:
         settings = dataclasses.replace(settings, wavelengths_um=wavelengths_um)
     check(cell, settings)
+    settings = settings.settled(cell)
     return _run(cell, settings, console=console, checkpoint=checkpoint)
 
 
@@ -64,9 +65,9 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
 
     def solved(lights: list[Light], label: str) -> dict[Light, Curve]:
         groups = _together(lights, engines.upright(cell, engine))
-        tasks = [workers.curves_task(cell, some, span, tolerance=sweep.tolerance, engine=engine) for some in groups]
+        tasks = [workers.curves_task(cell, some, span, tolerance=sweep.bar, engine=engine) for some in groups]
         results = journal.run(tasks, console, label)
-        made = [curve for one in results for curve in workers.curves(one, tolerance=sweep.tolerance)]
+        made = [curve for one in results for curve in workers.curves(one, tolerance=sweep.bar)]
         return dict(zip(itertools.chain(*groups), made, strict=True))
 
     first = few_nodes.lights(sweep, few_nodes.picks(sweep.wavelengths_um), few_nodes.picks(sweep.angles_deg), normal)
@@ -80,7 +81,7 @@ def _run(cell: Cell, sweep: Sweep, *, console: Console | None, checkpoint: Path 
         curves |= more
         rows |= {light: _evaluate(curve, diameters) for light, curve in more.items()}
         full = few_nodes.complete(sweep, rows, _poles(curves), diameters, normal)
-    extra = _points(cell, sweep, engine, diameters, full)
+    extra = _points(cell, sweep, engine, diameters, full, curves)
     for task, result in zip(extra, journal.run(extra, console, "entries one by one"), strict=True):
         _replace(full[Light(*task["lights"][0])], diameters, result)
     solves = sum(len(c.nodes.diameter_um) for c in curves.values()) + sum(len(t["diameters_um"]) for t in extra)
@@ -105,7 +106,7 @@ def _poles(curves: dict[Light, Curve]) -> dict[Light, Array]:
 
 
 def _misses(row: Array, sweep: Sweep) -> Array:
-    return np.asarray(row[2].real > sweep.tolerance)
+    return np.asarray(row[2].real > sweep.bar)
 
 
 def _evaluate(curve: Curve, diameters: Array) -> Array:
@@ -125,14 +126,19 @@ def _diameters(span: tuple[float, float], samples: int, curves: list[Curve]) -> 
     return np.unique(np.concatenate([even, added[:: max(1, math.ceil(len(added) / MOST_ADDED))]]))
 
 
-def _points(cell: Cell, sweep: Sweep, engine: str, diameters: Array, full: Rows) -> list[Task]:
-    """Tasks for the entries whose error bar is above the tolerance."""
+def _points(
+    cell: Cell, sweep: Sweep, engine: str, diameters: Array, full: Rows, curves: dict[Light, Curve]
+) -> list[Task]:
+    """Tasks for the entries whose error bar is above the tolerance, but where a solve by itself is no better."""
     tasks = []
     for light, row in full.items():
-        bad = diameters[_misses(row, sweep)].tolist()
+        misses = _misses(row, sweep)
+        if light in curves and engines.at_the_finest(cell, curves[light].nodes.error, sweep.bar * workers.SOLVE_SHARE):
+            misses &= curves[light].solver_error(diameters) <= sweep.bar
+        bad = diameters[misses].tolist()
         for start in range(0, len(bad), POINTS):
             some = bad[start : start + POINTS]
-            tasks.append(workers.points_task(cell, light, some, tolerance=sweep.tolerance, engine=engine))
+            tasks.append(workers.points_task(cell, light, some, tolerance=sweep.bar, engine=engine))
     return tasks
 
 

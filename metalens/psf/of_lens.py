@@ -35,7 +35,6 @@ from metalens.psf.record import PsfStack
 from metalens.psf.spectrum import Measured, Nodes, Source
 from metalens.psf.stack import psf_stack
 
-CURVE = 65  # diameters over which |t| of a proxy is averaged
 PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
 ROWS, NEARBY = 64, 1e-4  # rows of pillars whose delays are taken, and how far apart their wavelengths are
 TRIES = 3  # at a spectrum: the light of one tells the paths for the next
@@ -278,14 +277,8 @@ def _budget(
         left_out=left_out,
         light=(nodes.wavelengths_um, nodes.weights),
         lit=lens.diameters.pillars * lens.diameters.site_um2 / lens.wavelength_um**2,
-        proxy=math.nan if lens.pairs is not None else _of_curve(lens),
+        proxy=math.nan if lens.pairs is not None else lens.proxy.error(lens.wavelength_um),
     )
-
-
-def _of_curve(lens: Lens) -> float:
-    """Largest error of the pillars' t by the proxy, relative to the mean |t| of its pillars."""
-    level = np.asarray(lens.proxy.transmission(np.linspace(*lens.proxy.domain_um, CURVE), lens.wavelength_um))
-    return math.hypot(lens.proxy.max_phase_error_rad, lens.proxy.max_transmission_error / float(level.mean()))
 
 
 def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> Polarisation:

@@ -67,7 +67,7 @@ def axes_panels(path: Path) -> list[Panel]:
     middle = [1e3 * float(v[0] + v[-1]) / 2 for v in (made.x_um, made.y_um)]
     words = (
         f"Along x the size along x, along y that along y, from their middles ({middle[0]:.4g} and {middle[1]:.4g} nm); "
-        f"{1 - made.usable.mean():.1%} is left out (error bars above {made.sweep.tolerance:g})."
+        f"{1 - made.usable.mean():.1%} is left out (error bars above {made.sweep.bar:g})."
     )
     turns = np.where(kept, np.angle(own) / (2 * math.pi) % 1, 0.0)
     held = [tuple(row) for row in (made.held_out * (1, 1e3, 1e3, 1, 1)).tolist()]

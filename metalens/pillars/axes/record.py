@@ -63,7 +63,7 @@ class AxesLibrary:
     @property
     def usable(self) -> Array:
         """(w, m, n) whether the error bar meets the tolerance; the others are the excluded bands of resonances."""
-        return np.asarray(self.t_error <= self.sweep.tolerance)
+        return np.asarray(self.t_error <= self.sweep.bar)
 
     @property
     def missed(self) -> int:

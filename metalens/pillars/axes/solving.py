@@ -41,7 +41,7 @@ class _Nodes:
 
     def __init__(self, cell: Cell, sweep: Sweep, wavelength_um: float, reach: int, journal: Journal) -> None:
         self._cell, self._wavelength, self._reach, self._journal = cell, wavelength_um, reach, journal
-        self.swaps, self._tolerance = swaps(cell, sweep), sweep.tolerance
+        self.swaps, self._tolerance = swaps(cell, sweep), sweep.bar
         self._known: dict[tuple[float, float], Solved] = {}
         self.solves = 0
 
@@ -93,6 +93,7 @@ def sweep(
         ConfigError, CellError, MaterialError: see :func:`metalens.pillars.axes.check`.
     """
     check(cell, settings)
+    settings = settings.settled(cell)
     console = console or Console(quiet=True)
     journal = Journal(checkpoint, cell, settings)
     places = entries(settings)
@@ -102,7 +103,7 @@ def sweep(
         nodes = _Nodes(cell, settings, wavelength, reach, journal)
         x, y = _lines(nodes, settings, console)
         values, bars = nodes.grid(x, y, console, "pillars")
-        made = surface((x, y), values, places, tolerance=settings.tolerance)
+        made = surface((x, y), values, places, tolerance=settings.bar)
         judged = _held_out(nodes, places, made.value, made.doubt, console)
         wide = max(LEAST_WIDE, SPREAD * float((judged[::2, 2] / judged[::2, 3]).max()))
         bar = np.minimum(wide * made.doubt + _carried((x, y), bars, places, made.value), MOST_ERROR)
@@ -143,7 +144,7 @@ def _reach(cell: Cell, sweep: Sweep) -> int:
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
     most = most_harmonics(sized(cell, *sizes[0]), sizes[0][0])
     for reach in range(min(COARSEST, most), most):
-        wanted = SOLVER_SHARE * sweep.tolerance
+        wanted = SOLVER_SHARE * sweep.bar
         about = {"tolerance": wanted, "harmonics": reach}
         if all(
             jones(sized(cell, x, y), x, wavelength, **about).converged  # type: ignore[arg-type]
@@ -165,11 +166,11 @@ def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]
     while True:
         x, y = lines
         values, _ = nodes.grid(x, y, console, "pillars")
-        doubt = surface((x, y), values, look, tolerance=sweep.tolerance).doubt
-        above = (doubt > (1 - SOLVER_SHARE) * sweep.tolerance).mean()
+        doubt = surface((x, y), values, look, tolerance=sweep.bar).doubt
+        above = (doubt > (1 - SOLVER_SHARE) * sweep.bar).mean()
         if above <= LEFT_OUT or len(x) >= MOST:
             return x, y
-        some = np.minimum(doubt, 10 * sweep.tolerance)  # a resonance is not chased for ever
+        some = np.minimum(doubt, 10 * sweep.bar)  # a resonance is not chased for ever
         profiles = [some.mean(axis=1), some.mean(axis=0)]
         if nodes.swaps:
             profiles = [profiles[0] + profiles[1]] * 2

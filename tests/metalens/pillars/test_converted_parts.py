@@ -53,7 +53,7 @@ def library(width_um=0.08, resonances=(), t_error=None):
     t = np.stack([common + wanted, common - wanted])[:, None]
     bars = np.zeros(t.shape) if t_error is None else np.broadcast_to(t_error, t.shape)
     lines = np.array(resonances, float).reshape(-1, 5)
-    sweep = SimpleNamespace(tolerance=1e-3)
+    sweep = SimpleNamespace(bar=1e-3)
     about = {"wavelength_um": WAVES, "angle_rad": np.zeros(1), "resonances": lines, "sweep": sweep}
     return SimpleNamespace(t=t, t_error=bars, diameter_um=d, **about)
 

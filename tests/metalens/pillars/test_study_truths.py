@@ -94,7 +94,7 @@ def library():
     bars = np.full(t.shape, 1e-4)
     bars[0, 0, 1, 2] = 0.02
     return SimpleNamespace(
-        t=t, t_error=bars, diameter_um=np.array([0.1, 0.12, 0.15, 0.2]), sweep=SimpleNamespace(tolerance=1e-3)
+        t=t, t_error=bars, diameter_um=np.array([0.1, 0.12, 0.15, 0.2]), sweep=SimpleNamespace(bar=1e-3)
     )
 
 

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from metalens.cell import Light
+from metalens.cell import Cell, Light
+from metalens.cell.shapes import Square
 from metalens.ground.errors import DomainError
 from metalens.pillars import few_nodes, stretch, sweep
+from metalens.pillars.curve import Curve, Nodes, starts
 from metalens.pillars.record import DEFAULT_CELL, Sweep
 
 
@@ -38,9 +40,28 @@ def test_entries_above_the_tolerance_are_solved_eight_at_a_time():
     bad = [1, 4, 5, 6, 9, 10, 11, 15, 16, 20]
     error[bad] = 0.0201
     rows = {Light(0.85): np.stack([d, d, error]).astype(complex), Light(0.9): np.stack([d, d, 0 * d]).astype(complex)}
-    tasks = sweep._points(DEFAULT_CELL, settings, "modal", d, rows)
+    tasks = sweep._points(DEFAULT_CELL, settings, "modal", d, rows, {})
     assert [task["diameters_um"] for task in tasks] == [d[bad[:8]].tolist(), d[bad[8:]].tolist()]
     assert all(task["lights"] == [[0.85, 0.0, "x", 0.0]] for task in tasks)
+
+
+def test_entries_are_left_where_the_finest_truncation_cannot_do_better():
+    """Of squares whose probes missed half of the tolerance; where either node is good, interpolation is to blame."""
+    square = Cell(0.36, shape=Square())
+    settings, d, light = Sweep(samples=20, tolerance=0.02), np.linspace(0.1, 0.2, 24), Light(0.85)
+    rows = {light: np.stack([d, d, np.full(24, 0.03)]).astype(complex)}
+    nodes = np.array(starts(0.1, 0.2))
+    solver = np.where(nodes > 0.14, 0.021, 0.011)  # the first node above lies at 0.15, the last below at 0.1371
+
+    def tasks(cell, errors):
+        held = Nodes(nodes, np.ones((13, 2)), errors, np.ones(13), True, "")
+        made = sweep._points(cell, settings, "rcwa", d, rows, {light: Curve(held, None, (), 0.02)})
+        return [one for task in made for one in task["diameters_um"]]
+
+    assert tasks(square, solver) == [one for one in d.tolist() if one < 0.15]
+    assert tasks(square, np.where(nodes > 0.14, 0.0099, 0.021)) == [one for one in d.tolist() if one > 0.1371]
+    assert tasks(square, np.full(13, 0.0099)) == d.tolist()  # coarser orders serve the probes: finer ones are there
+    assert tasks(DEFAULT_CELL, solver) == d.tolist()  # round pillars by themselves climb higher
 
 
 def test_lights_share_a_task_where_they_share_modes_and_oblique_ones_come_first():
