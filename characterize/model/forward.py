@@ -280,7 +280,7 @@ class ForwardModel:
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
         bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
-        weight, rate = group.pillars.weights(bias)
+        weight = group.pillars.weights(bias)
         values = group.pillars.coefficients(change(x), self._lean_um)
         pupil = group.reduced.combined(weight, values)
         if not slopes:
@@ -291,6 +291,7 @@ class ForwardModel:
         up = x.copy()
         up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
         by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
+        rate = group.pillars.rates(bias, weight)
         return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
     def _phase(self, x: Array, group: Group, cut: Cut = WHOLE) -> Array:
