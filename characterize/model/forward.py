@@ -73,7 +73,7 @@ class ForwardModel:
         self._lit = EVERY, EVERY
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
-        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
+        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
         self.stage_centre_um = float(setting.depth_um.mean())
         self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]

@@ -178,7 +178,7 @@ class Pillars:
     def place(self, diameter_um: Array) -> Array:
         """Entry of :meth:`table` nearest to designed diameters (any shape)."""
         low, high = self.diameter_um[0], self.diameter_um[-1]
-        entry = np.rint((diameter_um - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
+        entry = np.rint((np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
         return np.where(diameter_um > 0, entry, _ENTRIES)
 
     def weights(self, bias_um: Array) -> Array:

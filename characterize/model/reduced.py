@@ -64,8 +64,8 @@ class Reduced:
     ) -> None:
         self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
         self.kind = precision(tolerance)
-        self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
-        self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
+        self.half_um = np.array([lens.diameters.y_um[-1], lens.diameters.x_um[-1]])
+        self.site_um2, self.radius_um = lens.diameters.site_um2, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
         self._near, self._usual = False, dict[tuple[float, ...], Terms]()
@@ -172,7 +172,8 @@ class Reduced:
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
                 path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
                 place = pillars.place(d.diameter_um[rows, built])
-                light = gather.lit(table, place, turns(self.k * path, self.kind))
+                turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[:, built]
+                light = gather.lit(table, place, turns(self.k * path + turn, self.kind))
                 halves = across[built].T @ light.reshape(len(light), -1)
                 sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
@@ -302,7 +303,7 @@ class Reduced:
         left, size, across = np.linalg.svd((rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False)
         mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
         some = int((mixed > MIXED * self.tolerance).sum())
-        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.pitch_um**2
+        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.site_um2
         iy, ix = (_on_even(w, float(a[0] / r), float(a[-1] / r), len(a)) for a, r in ((y, wy), (x, wx)))
         to_p = self._to_nodes(m)
         shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)
