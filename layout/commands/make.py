@@ -54,6 +54,10 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
     stages = Stages(options.console.say)
     with stages("read"):
         source = (lenses.load if options.study else lenses.streamed)(options.lens)
+        if options.study:
+            from layout import study
+
+            study.check(source)
         rules = processes.Process() if options.process is None else processes.load(options.process)
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):

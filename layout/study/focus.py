@@ -97,6 +97,15 @@ class Focus:
         return np.asarray(np.remainder(self.case.wavenumber * path, 2 * np.pi))
 
 
+def check(lens: Lens) -> None:
+    """Refuse a lens that no study takes, before any work: one behind a stop."""
+    if lens.layers.stop is not None:
+        raise PropagationError(
+            f"a lens behind a stop of {2 * lens.layers.stop.radius_um:g} um is not studied: its pillars are summed "
+            "once for all depths, and a stop lights others at each; study the same lens designed without layers.stop"
+        )
+
+
 def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
     """Basis for a lens and a window; as many nodes as the phase between them turns, and ``margin`` more.
 
@@ -107,11 +116,7 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
         PropagationError: a window of fewer than 2 samples a side, a lens of fewer than 2 sites a side, or one behind a
             stop, whose shadow is another at each depth where these sums are shared by all.
     """
-    if lens.layers.stop is not None:
-        raise PropagationError(
-            f"a lens behind a stop of {2 * lens.layers.stop.radius_um:g} um is not studied: its pillars are summed "
-            "once for all depths, and a stop lights others at each; study the same lens designed without layers.stop"
-        )
+    check(lens)
     if min(len(window.x_um), len(window.y_um), *lens.diameters.diameter_um.shape) < 2:
         raise PropagationError("the window and the lens need 2 samples and sites a side or more")
     seen = case(

@@ -2,12 +2,13 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import layout
-from layout.commands import page
+from layout.commands import make, page
 from layout.dose.exposure import point_exposure
 from layout.files import dxf
 from layout.process.process import Exposure, Rules
@@ -17,6 +18,7 @@ from layout.shapes import polygon
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.ground.errors import MaskFileError, ProcessError
+from metalens.lens import Layers, Stop
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 
@@ -52,6 +54,15 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     page = (target / "report.html").read_text()
     assert "violations" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(lens_file, tmp_path, monkeypatch, capsys):
+    behind = replace(lens.load(lens_file), layers=Layers(stop=Stop(9.0, 4.0)))
+    lens.save(tmp_path / "behind.h5", behind)
+    monkeypatch.setattr(make.build, "prepare", None)
+    assert run(tmp_path / "behind.h5", "-o", tmp_path / "mask", "--study") == 2
+    assert "study the same lens designed without layers.stop" in capsys.readouterr().err
+    assert not (tmp_path / "mask").exists()
 
 
 def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(tmp_path):
