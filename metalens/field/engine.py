@@ -222,11 +222,12 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     few = at[:NEGLECTED], depths
     # of the brightest of few places in the image
     share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
-    transform = left_out.neglected(optics, plan.waves, plan.window, few) * share
+    seen = optics, plan.waves, plan.window, few, left_out.lit(optics, plan.waves, plan.window, few)
+    transform = left_out.neglected(*seen) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
-    found["folded"] = left_out.folded(optics, plan.waves, plan.window, few) * share
-    found["polarisation"] = left_out.unpolarised(optics, plan.waves, plan.window, few) * share
+    found["folded"] = left_out.folded(*seen) * share
+    found["polarisation"] = left_out.unpolarised(*seen) * share
     found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
     if optics.layers.stop is not None:
         shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]

@@ -42,9 +42,9 @@ class Imager:
     even: (y, x) of the frame, what makes even light even through the patches (:func:`evened`); None: left as it is.
     parts: share of the error by cause: kernels, nodes of the field, spectrum, transform, folded (light from beyond the
         windows that the transform shows in them), polarisation (components of the field that are left out, all but a
-        scalar where that is within the tolerance), edge (light that the rim bends out of the window, of which the
-        same is taken off), pillars (taken together a few micrometres at a time; 0 of a smooth phase), stop (of its
-        shadow, where there is one).
+        scalar where that is within the tolerance), edge (of light that the rim bends about
+        the window and beyond it), pillars (taken together a few micrometres at a time; 0 of a smooth phase), stop (of
+        its shadow, where there is one).
         Beside them ``outside``: of the light that goes through the lens (:mod:`metalens.field.through`), what
         windows leave out.
     stray: light of other diffraction orders, None where the lens tells nothing of them.

@@ -21,25 +21,25 @@ JUDGE = 3e-4  # tolerance of the PSFs of every pillar
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
 
-def neglected(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+def neglected(
+    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], shown: Tensor | None = None
+) -> float:
     """What the transform neglects: PSFs of the first wavelength at (field points, depths), with the rays seen from
-    their own width beside the field point, against themselves."""
-
-    def found(shift_um: tuple[float, float]) -> Tensor:
-        wave = float(waves.wavelengths_um[0])
-        light = psfs(optics, at[0], depths_um=at[1], wavelength_um=wave, window=window, shift_um=shift_um)
-        return light.detach()
-
-    plain = found((0.0, 0.0))
-    wide = width(plain / plain.sum((-1, -2), keepdim=True)) * window.step_um
-    return in_light(relative(found((wide * 0.6, wide * 0.8)), plain), plain.sum((-1, -2)))
+    their own width beside the field point, against themselves (``shown``: :func:`lit`, where it is known)."""
+    shown = lit(optics, waves, window, at) if shown is None else shown
+    wide = width(shown / shown.sum((-1, -2), keepdim=True)) * window.step_um
+    aside = lit(optics, waves, window, at, shift_um=(wide * 0.6, wide * 0.8))
+    return in_light(relative(aside, shown), shown.sum((-1, -2)))
 
 
-def folded(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> float:
+def folded(
+    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], shown: Tensor | None = None
+) -> float:
     """What the transform folds back from beyond the period of the nodes: PSFs of the first wavelength at (field points,
-    depths), with their light, against those of twice the period."""
-    want = _light(optics, waves, replace(window, period=2 * window.period), at)
-    return in_light(relative(_light(optics, waves, window, at), want), want.sum((-1, -2)))
+    depths), with their light (``shown``: :func:`lit`, where it is known), against those of twice the period."""
+    want = lit(optics, waves, replace(window, period=2 * window.period), at)
+    shown = lit(optics, waves, window, at) if shown is None else shown
+    return in_light(relative(shown, want), want.sum((-1, -2)))
 
 
 def polarised(
@@ -57,28 +57,42 @@ def polarised(
     if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= within[0]):
         return window
     tried = [replace(window, components=count) for count in range(1, window.whole + 1)]
-    whole = _light(optics, waves, tried[-1], at)
-    return next(one for one in tried if unpolarised(optics, waves, one, at, whole) <= within[1])
+    whole = lit(optics, waves, tried[-1], at)
+    return next(one for one in tried if unpolarised(optics, waves, one, at, whole=whole) <= within[1])
 
 
 def unpolarised(
-    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], whole: Tensor | None = None
+    optics: Optics,
+    waves: Nodes,
+    window: Window,
+    at: tuple[Tensor, Tensor],
+    shown: Tensor | None = None,
+    *,
+    whole: Tensor | None = None,
 ) -> float:
     """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
-    (field points, depths) against those of all components, ``whole`` where they are known."""
+    (field points, depths) against those of all components; ``shown`` and ``whole``: :func:`lit` of both, where they
+    are known."""
     if window.components == window.whole:
         return 0.0
-    few = _light(optics, waves, window, at)
-    whole = _light(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
-    shown = whole.sum((-1, -2))
-    few, whole = few / few.sum((-1, -2), keepdim=True), whole / shown[..., None, None]
-    return in_light(relative(few, whole), shown)
+    few = lit(optics, waves, window, at) if shown is None else shown
+    whole = lit(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
+    light = whole.sum((-1, -2))
+    return in_light(relative(few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]), light)
 
 
-def _light(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor]) -> Tensor:
-    """PSFs of the first wavelength at (field points, depths), with their light."""
+def lit(
+    optics: Optics,
+    waves: Nodes,
+    window: Window,
+    at: tuple[Tensor, Tensor],
+    *,
+    shift_um: tuple[float, float] = (0.0, 0.0),
+) -> Tensor:
+    """PSFs of the first wavelength at (field points, depths), with their light, which all of these judge."""
+    about: dict[str, Any] = {"wavelength_um": float(waves.wavelengths_um[0]), "window": window, "shift_um": shift_um}
     with torch.no_grad():
-        return psfs(optics, at[0], depths_um=at[1], wavelength_um=float(waves.wavelengths_um[0]), window=window)
+        return psfs(optics, at[0], depths_um=at[1], **about)
 
 
 def width(psfs: Tensor) -> float:

@@ -78,7 +78,7 @@ class Optics:
 class Pupil:
     """Weight and phase of the rays of a field point; (nodes, nodes) float64.
 
-    given: sum of squares of the weights if no face of a film reflected: the light on the aperture.
+    given: the light on the aperture. The squares of the weights are less: a node across the rim has the mean field.
     """
 
     weight: Tensor
@@ -100,8 +100,10 @@ class Sampling:
     """period_um of the nodes, their number along an axis and their step of p, size of the padded transform, harmonics
     that are kept.
 
-    beyond: share of the light that the rim bends beyond the period, 4√2 / (π² k p h) of a sharp round rim at p and half
-        a period h, less the spare; the transform folds it back, and it is taken off.
+    beyond: share of the light that a sharp round rim at p bends beyond the period (half of it, less the spare, is h),
+        4√2 / (π² k p h); the transform folds it back.
+    dimmed: share that a window lacks and is given back: nodes are the mean of their width at the rim, whose light at X
+        is so times sinc²(X / period): ∫ (1 - sinc²) d(4√2 / (π² k p X)) over the window, to second order.
     """
 
     period_um: float
@@ -110,6 +112,7 @@ class Sampling:
     size: int
     harmonics: int
     beyond: float
+    dimmed: float
     curved: bool
     components: int
     flux: bool
@@ -118,8 +121,7 @@ class Sampling:
 def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf) -> Sampling:
     """Nodes that fill the aperture for a window on the axis, where it is widest in p; of the shorter wave."""
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    rim = torch.tensor(optics.wave.radius_um, dtype=torch.float64)
-    edge = float(media.direction(after, rim))
+    edge = float(media.direction(after, torch.tensor(optics.wave.radius_um, dtype=torch.float64)))
     if edge > LARGEST_P * after.layers[0][0]:
         raise PropagationError(f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}")
     step = min(wavelength_um, finest_um) / (window.samples * window.step_um * window.period)
@@ -133,7 +135,9 @@ def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: fl
     # the harmonics that are kept may not wrap round, and the autocorrelation only onto the last of them
     size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
     quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
-    return Sampling(period, nodes, step, quick, harmonics, beyond, window.curved, window.components, window.flux)
+    dimmed = beyond * math.pi**2 / (12 * SPARE * window.period)
+    how = window.curved, window.components, window.flux
+    return Sampling(period, nodes, step, quick, harmonics, beyond, dimmed, *how)
 
 
 def psfs(
@@ -217,7 +221,7 @@ def _one(
     tilt = math.atan(math.hypot(*tangents.tolist()))
     factor = optics.wave.factor(found.x_um, found.y_um, wavelength_um, tilt)
     light = light if factor is None else light * factor.to(torch.complex64)
-    total: float | Tensor = pupil.given * grid.size**2 / (1 - grid.beyond)
+    total: float | Tensor = pupil.given * grid.size**2 * (1 - grid.dimmed)
     if optics.layers.stop is not None:
         shade, taken = stopped(optics, tangents, found, depths_um, wavelength_um)
         light, total = light * shade, total * taken
@@ -312,7 +316,7 @@ def seen(
     at = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
     found = rays(after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device)
     phase = optics.wave.carrier_rad(found.x_um, found.y_um) + 2 * math.pi / wavelength_um * found.away_um
-    return found, Pupil(found.whole * found.passed, phase, float((found.whole**2).sum()))
+    return found, Pupil(found.whole * found.passed, phase, float((found.whole * found.width_um).sum()) / grid.step)
 
 
 def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:

@@ -5,13 +5,15 @@ import math
 import torch
 from torch import Tensor
 
-from metalens.field.points import Optics, Window, sampling, seen, stopped
+from metalens.field.points import Optics, Window, sampling, seen
+from metalens.field.rays import Rays
 from metalens.field.waves import PillarWave
 
 
 def through(optics: Optics, at_um: Tensor, *, depths_um: Tensor, wavelength_um: float, window: Window) -> Tensor:
     """(points, depths) light through stop, lens and faces behind it, over that on the aperture as
-    :func:`metalens.field.points.psfs` counts it: σ = Σ |S|² |T|² spread / Σ spread on the nodes.
+    :func:`metalens.field.points.psfs` counts it: σ = Σ S |T|² spread / Σ spread on the nodes, S 1 for rays that pass
+    the stop.
 
     Of pillars |T|² is the mean of all of them: what single ones scatter is in it, whether it lands in a window or not.
     """
@@ -22,14 +24,24 @@ def through(optics: Optics, at_um: Tensor, *, depths_um: Tensor, wavelength_um: 
             rays, pupil = seen(optics, place, grid, wavelength_um)
             tangents = place / reduced
             tilt = math.atan(math.hypot(*tangents.tolist()))
-            light = (pupil.weight**2).expand(len(depths_um), -1, -1)
+            light = (pupil.weight * rays.passed * rays.width_um / grid.step).expand(len(depths_um), -1, -1)
             if isinstance(wave, PillarWave):
                 light = light * wave.transmittance(wavelength_um, tilt)
             elif (factor := wave.factor(rays.x_um, rays.y_um, wavelength_um, tilt)) is not None:
                 light = light * factor.abs() ** 2
-            given = torch.tensor(pupil.given, dtype=light.dtype, device=light.device)
-            if optics.layers.stop is not None:
-                shade, share = stopped(optics, tangents, rays, depths_um, wavelength_um)
-                light, given = light * shade.abs() ** 2, given * share.flatten().to(light)
-            out.append(light.sum((-1, -2)) / given)
+            out.append((light * _passed(optics, tangents, rays, depths_um, wavelength_um)).sum((-1, -2)) / pupil.given)
     return torch.stack(out)
+
+
+def _passed(optics: Optics, tangents: Tensor, found: Rays, depths_um: Tensor, wavelength_um: float) -> Tensor | float:
+    """(depths, nodes, nodes) of rays that pass the stop, over its light's share of the whole lens on the axis; 1
+    without one. Of rays, since what a node's mean of the edge's waves lacks goes through all the same."""
+    layers, radius = optics.layers, optics.wave.radius_um
+    if layers.stop is None:
+        return 1.0
+    x, y, width = (part.cpu() for part in (found.x_um, found.y_um, found.width_um))
+    slopes, each = (float(tangents[0]), float(tangents[1])), []
+    for depth in depths_um.tolist():
+        share = (layers.footprint_um(depth, wavelength_um) / radius) ** 2
+        each.append(layers.lit(slopes, depth, wavelength_um, (x, y), width) / share)
+    return torch.stack(each).to(found.x_um.device)

@@ -72,14 +72,21 @@ class PillarWave:
     measured by :mod:`metalens.field.left_out`.
 
     Raises:
-        SceneError: another lattice than a square one, turned pillars, or pillars that answer x and y apart.
+        SceneError: another lattice than a square one, turned pillars, those of two sizes, or such that answer x and y
+            apart.
     """
 
     def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
+        if lens.pairs is not None:
+            raise SceneError(
+                "pillars of two sizes answer x and y apart: the image of the whole field is of unpolarised light and "
+                "of pillars of one size; metalens psf LENS --light x (or y, or both) gives PSFs of single directions"
+            )
         if not lens.diameters.plain:
             raise SceneError(
                 f"pillars on a {lens.diameters.lattice.kind} lattice{', turned one by one' if lens.hand else ''}: the "
-                "image of the whole field knows square lattices of pillars that are not turned (metalens.psf takes any)"
+                "image of the whole field knows square lattices of pillars that are not turned; metalens psf gives "
+                "PSFs of single directions"
             )
         if lens.one_light:
             raise SceneError(

@@ -115,8 +115,9 @@ def test_a_spectrum_is_the_sum_of_its_wavelengths_by_weight_at_every_point(monke
 def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     """Places of the pixels between the outermost nodes, depths at 13 and 58 % of the range of 1/z; PSFs count by their
     light, and that by itself; light through the lens that the true PSFs lose is outside; the transform is judged at
-    five of the places, pillars taken together at two; half of what lies beyond a window is edge."""
-    seen = {}
+    five of the places, by PSFs that are computed once, pillars taken together at two; half of what lies beyond a window
+    is edge."""
+    seen, asked, plain = {}, [], torch.zeros(5, 2, 7, 7)
     true, used = psf_of(1.0, (16, 2)), psf_of(1.0, (16, 2))
     passed, through = (torch.from_numpy(RNG.uniform(*ends, (16, 2))) for ends in ((0.1, 0.9), (0.9, 0.97)))
     told = torch.from_numpy(RNG.uniform(0.1, 0.9, (16, 2)))
@@ -132,21 +133,23 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     def lights_used(made, pixels, depths):
         return told.float()
 
-    def neglected(optics, waves, window, at):
-        seen.update(few=at)
+    def neglected(optics, waves, window, at, shown):
+        seen.update(few=at, plain=shown)
         return 0.017
 
     monkeypatch.setattr(engine, "spectral", spectral)
     monkeypatch.setattr(engine, "psfs_used", psfs_used)
     monkeypatch.setattr(engine, "lights_used", lights_used)
 
-    def unpolarised(optics, waves, window, at):
+    def unpolarised(optics, waves, window, at, shown):
+        assert shown is plain
         seen.update(turned=at)
         return 0.0031
 
     monkeypatch.setattr(engine.left_out, "neglected", neglected)
     monkeypatch.setattr(engine.left_out, "unpolarised", unpolarised)
-    monkeypatch.setattr(engine.left_out, "folded", lambda optics, waves, window, at: 0.0047 * len(at[0]))
+    monkeypatch.setattr(engine.left_out, "folded", lambda *given: 0.0047 * len(given[3][0]) * (given[4] is plain))
+    monkeypatch.setattr(engine.left_out, "lit", lambda *given: asked.append(given) or plain)
 
     def missing(optics, wave, window, at):
         seen.update(wave=wave, every=at)
@@ -181,6 +184,9 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert seen["wave"] == 0.82
     assert seen["every"][0].numpy() == pytest.approx(seen["at"].numpy()[:2])
     assert seen["every"][1] is seen["depths"]
+    assert seen["plain"] is plain
+    assert len(asked) == 1
+    assert asked[0][1:3] == (WAVES, PLAN.window)
     for name in ("turned", "few"):
         assert seen[name][0].numpy() == pytest.approx(seen["at"].numpy()[:5])
     assert parts["edge"] == pytest.approx(0.05 * 0.82 / 2)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.special import j1
 
 from metalens import design
 from metalens.cell import Cell, Film, Index
@@ -37,8 +38,8 @@ def test_light_outside_is_that_of_the_psf_of_every_pillar():
 
 
 def test_nothing_of_a_smooth_wave_is_lost_but_at_faces_and_the_stop():
-    """On the axis a face passes 4 n / (n + 1)² (the sensor lies on the glass); light through a hole before the lens is
-    that on its area but for 0.18 / N, and what both have in common where its shadow lies on the rim."""
+    """On the axis a face passes 4 n / (n + 1)² (the sensor lies on the glass); all light of a hole before the lens
+    falls on it, and what both have in common where its shadow lies on the rim."""
     at = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
     about = dict(depths_um=torch.tensor([2e3, math.inf], dtype=torch.float64), wavelength_um=0.85)
     faces = 4 * 1.7 / 2.7**2
@@ -51,13 +52,33 @@ def test_nothing_of_a_smooth_wave_is_lost_but_at_faces_and_the_stop():
     smooth = SmoothWave(Focus(0.85, 400.0, 2e3, hole), 140.0)
     lost = 0.18 / (60.0**2 / (0.85 * 400 / 1.5))
     found = through(Optics(smooth, hole, 400.0), at, window=window, **about)
-    assert found.numpy() == pytest.approx(np.full((1, 2), 1 - lost), abs=0.005)  # of nodes, 4 um
+    assert found.numpy() == pytest.approx(np.ones((1, 2)), abs=0.005)  # of nodes, 6 um
     slope = math.tan(math.asin(1.5 * math.sin(math.atan(140 / 400))))
     aside = torch.tensor([[400 * slope, 0.0]], dtype=torch.float64)
     beside = float(through(Optics(smooth, hole, 400.0), aside, window=window, **about)[0, 1])
     assert beside == pytest.approx(_common(60.0, 140.0) / (math.pi * 60.0**2), abs=2 * lost)
     light = psfs(Optics(smooth, hole, 400.0), aside, window=window, **about)[0, 1].sum()
     assert float(light) < beside
+
+
+@pytest.mark.parametrize(("period", "within"), [(1.06, 1.3e-2), (2.12, 3e-3), (4.24, 1e-3), (8.48, 5e-4)])
+def test_a_window_holds_what_a_round_aperture_sends_there(period, within):
+    """∫ (2 J1(v) / v)² π (p / λ)² over the samples' triangles, v = k p r: 0.965 of the light in a window of ten rings.
+
+    What nodes lack falls with the square of their number, to the next power of p, 0.068 at the rim: 2e-4. Counted by
+    the squares of their weights the light was 5e-3, 4e-3 and 2e-3 too bright in the last three.
+    """
+    wave = SmoothWave(Focus(0.85, 2200.0, 20e3), 150.0)
+    at, depth = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([20e3], dtype=torch.float64)
+    window = Window(7, 9.6, period=period)
+    light = psfs(Optics(wave, Layers(), 2200.0), at, depths_um=depth, wavelength_um=0.85, window=window)
+    p = 150.0 / math.hypot(150.0, 2200.0)
+    x = (np.arange(640) + 0.5) * (4 * 9.6 / 640)  # a quarter of it, out to where the last sample ends
+    shown = np.clip(4 - x / 9.6, 0, 1)  # Σ of the triangles
+    v = 2 * math.pi / 0.85 * p * np.hypot(x, x[:, None])
+    airy = math.pi * (p / 0.85) ** 2 * (2 * j1(v) / v) ** 2
+    want = 4 * float(shown @ airy @ shown) * (x[1] - x[0]) ** 2
+    assert float(light.sum()) / want == pytest.approx(1, abs=within)
 
 
 def _common(r: float, big: float) -> float:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,6 +103,15 @@ def _differentiates(lens):
     with torch.no_grad():
         wide = 0.5 * (score(diameter + step) - score(diameter - step))
     assert float((slope * step).sum()) == pytest.approx(float(wide), rel=2e-2)  # float32
+
+
+def test_an_image_through_pillars_of_two_sizes_is_refused_with_what_knows_them(lens):
+    """Not for its lattice, which is square, nor for turns that it has not."""
+    sizes = replace(lens.diameters, length_um=lens.diameters.diameter_um * 1.2)
+    paired = SimpleNamespace(diameters=sizes, pairs=object(), cell=lens.cell, one_light="", hand="")
+    with pytest.raises(SceneError, match=r"pillars of two sizes .* metalens psf LENS --light x") as refused:
+        PillarWave(paired)
+    assert "lattice" not in str(refused.value)
 
 
 def test_other_orders_are_weak_and_sum_to_less_than_the_light(lens):
