@@ -226,7 +226,7 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
     stack = psf.psf_stack(
         np.angle(t),
         np.abs(t),
-        pitch_um=lens.diameters.pitch_um,
+        **lens.diameters.grid._asdict(),
         wavelength_um=wavelength_um,
         sensor_distance_um=distance,
         depths_um=depth_um,

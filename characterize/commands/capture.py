@@ -27,7 +27,7 @@ def run(options: Options) -> int:
 def _plan(options: Options, path: Path) -> int:
     if options.spread:
         raise ConfigError("--workers and --scheduler share out the frames of --truth; a plan takes none")
-    target, wanted, design = options.output, config.load(path, Protocol), lenses.load_plain(options.lens)
+    target, wanted, design = options.output, config.load(path, Protocol), lenses.load(options.lens)
     with options.claim(target) as draft:
         found = protocol.plan(design, wanted, slopes(design))
         store.write_text(draft.path, _listed(found))
@@ -63,7 +63,7 @@ def _listed(found: Plan) -> str:
 def _shoot(options: Options, path: Path) -> int:
     target = options.output
     truth = config.load(path, Truth)
-    design = lenses.load_plain(options.lens)
+    design = lenses.load(options.lens)
     frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
     room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
     with options.claim_folder(target, room=room) as draft, options.shared():

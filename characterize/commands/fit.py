@@ -50,7 +50,7 @@ def run(options: Options) -> int:
 
 
 def _run_lens(options: Options, design: Path, target: Path) -> int:
-    lens, shots = lenses.load_plain(design), captures.load(options.capture)
+    lens, shots = lenses.load(design), captures.load(options.capture)
     told = config.load(options.metrology, Metrology) if options.metrology else Metrology()
     choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
     truth = config.load(options.truth, Truth) if options.truth else None

@@ -69,7 +69,7 @@ def run(options: Options) -> int:
 def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
     """Measure captures into the folder: numbers, text, and that all is well."""
     shots = captures.load(options.source)
-    design = lenses.load_plain(options.design) if options.design else None
+    design = lenses.load(options.design) if options.design else None
     found = frames.measure(shots, design=design, reference_e=options.reference_e)
     rows = [_plain(row) for row in found.frames]
     values: dict[str, object] = {

@@ -73,7 +73,7 @@ class ForwardModel:
         self._lit = EVERY, EVERY
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
-        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.pitch_um**2
+        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
         self.stage_centre_um = float(setting.depth_um.mean())
         self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
         self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
@@ -280,7 +280,7 @@ class ForwardModel:
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
         bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
-        weight, rate = group.pillars.weights(bias)
+        weight = group.pillars.weights(bias)
         values = group.pillars.coefficients(change(x), self._lean_um)
         pupil = group.reduced.combined(weight, values)
         if not slopes:
@@ -291,6 +291,7 @@ class ForwardModel:
         up = x.copy()
         up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
         by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
+        rate = group.pillars.rates(bias, weight)
         return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
 
     def _phase(self, x: Array, group: Group, cut: Cut = WHOLE) -> Array:

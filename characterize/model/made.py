@@ -54,7 +54,7 @@ def pillars(
         t *= np.exp(1j * _on_pillars(d, made.phase_rad))
     if modes is not None and len(modes):
         t *= np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
-    return np.asarray(np.where(d.diameter_um > 0, t, 0))
+    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))), 0))
 
 
 def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Array]) -> Array:
@@ -74,16 +74,13 @@ def built_lens(design: Lens, x: Array) -> Lens:
     bias = _on_pillars(d, state(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
-    return Lens(
-        diameters=DiameterMap(np.where(d.diameter_um > 0, grown, 0.0), d.pitch_um),
-        cell=design.cell,
-        proxy=design.proxy,
+    return dataclasses.replace(
+        design,
+        diameters=dataclasses.replace(d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0)),
         wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
         sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
-        source_distance_um=design.source_distance_um,
         profile="as-built",
-        provenance=design.provenance,
-        layers=design.layers,
+        neighbours=None,
     )
 
 
@@ -112,7 +109,7 @@ def psf_stack(
             psf.psf_stack(
                 np.angle(t).astype(np.float32),
                 np.abs(t).astype(np.float32),
-                pitch_um=lens.diameters.pitch_um,
+                **lens.diameters.grid._asdict(),
                 wavelength_um=lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
                 sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
                 angle_rad=[list(angle)],

@@ -45,6 +45,10 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
         FitError: a cause is wanted that pillars of this shape cannot have. CellError, MaterialError: pillars that are
             not round, and that no solver takes.
     """
+    if lens.pairs is not None:
+        raise FitError(
+            "pillars of two sizes: captures tell one bias of pillars of one size; such lenses are not fitted"
+        )
     for name in lacking(lens.cell):
         if name in wanted:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")

@@ -178,19 +178,26 @@ class Pillars:
     def place(self, diameter_um: Array) -> Array:
         """Entry of :meth:`table` nearest to designed diameters (any shape)."""
         low, high = self.diameter_um[0], self.diameter_um[-1]
-        entry = np.rint((diameter_um - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
+        entry = np.rint((np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
         return np.where(diameter_um > 0, entry, _ENTRIES)
 
-    def weights(self, bias_um: Array) -> tuple[Array, Array]:
-        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, and their derivatives, in its precision."""
-        x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
+    def weights(self, bias_um: Array) -> Array:
+        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, in its precision."""
+        x = np.asarray(bias_um) / self.span.bias_um
         value = np.empty((len(self.nodes_um), *x.shape), x.dtype)
-        slope = np.empty_like(value)
-        value[0], value[1], slope[0], slope[1] = 1.0, x, 0.0, 1.0
+        value[0], value[1] = 1.0, x
         for n in range(2, len(value)):
             value[n] = 2 * x * value[n - 1] - value[n - 2]
-            slope[n] = 2 * value[n - 1] + 2 * x * slope[n - 1] - slope[n - 2]
-        return value, slope / reach
+        return value
+
+    def rates(self, bias_um: Array, weights: Array) -> Array:
+        """(b, *shape) derivatives of :meth:`weights` by the bias, from their values there."""
+        x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
+        slope = np.empty_like(weights)
+        slope[0], slope[1] = 0.0, 1.0
+        for n in range(2, len(weights)):
+            slope[n] = 2 * weights[n - 1] + 2 * x * slope[n - 1] - slope[n - 2]
+        return slope / reach
 
     def _training(self) -> list[Change]:
         s, waves = self.span, self._waves()
@@ -206,7 +213,7 @@ class Pillars:
         worst = 0.0
         for _ in range(40):
             change, bias = _draw(random, self.span, self._waves()), random.uniform(-0.7, 0.7) * self.span.bias_um
-            c = self.weights(np.array(bias))[0] @ self.coefficients(change)
+            c = self.weights(np.array(bias)) @ self.coefficients(change)
             worst = max(worst, float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()))
         return worst
 

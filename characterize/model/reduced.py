@@ -64,15 +64,16 @@ class Reduced:
     ) -> None:
         self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
         self.kind = precision(tolerance)
-        self.half_um = (np.array(lens.diameters.diameter_um.shape) - 1) / 2 * lens.diameters.pitch_um
-        self.pitch_um, self.radius_um = lens.diameters.pitch_um, lens.diameters.radius_um
+        self.half_um = np.array([lens.diameters.y_um[-1], lens.diameters.x_um[-1]])
+        self.site_um2, self.radius_um = lens.diameters.site_um2, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
         self._near, self._usual = False, dict[tuple[float, ...], Terms]()
         self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
-        self._defocus = float(np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max())
-        self._directions()
+        self._blur = self.k * float(np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max())
+        self._blur *= self.radius_um**2 / 2
+        self._directions(2 * self._blur)
         self._hold(self._gather(lens, pillars))
 
     def _hold(self, gathered: Array) -> None:
@@ -84,12 +85,17 @@ class Reduced:
 
     def quick(self, window_um: float | None = None) -> "Reduced":
         """With terms that belong to the nominal wavelength and distance: what is left of the kernel when its factors
-        are put on hardly changes with either. For a window narrower than its own on fewer nodes."""
+        are put on hardly changes with either. On fewer nodes, and fewer yet for a window narrower than its own, beside
+        which there is no light: light that lands s off a place of the window turns by s over the nodes, and n of these
+        show it there only where s is 2 n; half of what tells s from all others is enough to keep it off."""
         part = copy.copy(self)
         part._operators, part._near, part._usual = {}, True, {}
-        if window_um is not None and window_um < self.window_um:
-            part.window_um, part._from_few = window_um, {}
-            part._directions()
+        narrow = window_um is not None and window_um < self.window_um
+        if narrow:
+            part.window_um = window_um
+        part._directions(0.0 if narrow else self._blur)
+        if part.nodes < self.nodes:
+            part._from_few = {}
             to_q, to_p = self._between(part, self)
             part._hold(to_q.T @ self.gathered @ to_p)
         return part
@@ -105,7 +111,8 @@ class Reduced:
         ends = (one._q, other.q[:, 0]), (one._p, other.p[0])
         return [gather.at(one.nodes, one._pull, span, at) for span, at in ends]
 
-    def _directions(self) -> None:
+    def _directions(self, beyond: float) -> None:
+        """Nodes for waves as steep as the window makes them, and ``beyond``: radians a half span."""
         d, (cx, cy) = self.bench.distance_um, self.center_um
         hy, hx = self.half_um
         edge = np.linspace(-1, 1, 41)
@@ -114,8 +121,7 @@ class Reduced:
         self._p = float((x / r).min()), float((x / r).max())
         self._q = float((y / r).min()), float((y / r).max())
         swing = self.k * self.window_um / 2 * max(np.ptp(self._p), np.ptp(self._q)) / 2
-        blur = self.k * self._defocus * self.radius_um**2 / 2
-        bands = swing + 2 * blur + 8 + 2 * (swing + 1) ** (1 / 3) + 1.5 * digits(self.tolerance)
+        bands = swing + beyond + 8 + 2 * (swing + 1) ** (1 / 3) + 1.5 * digits(self.tolerance)
         self.nodes = next(n for n in itertools.count(12) if n * gather.density(n, self.tolerance) >= bands)
         if self.nodes > 600:
             raise FitError(f"window of {self.window_um:.0f} um needs {self.nodes} nodes a side; fit a smaller window")
@@ -166,7 +172,8 @@ class Reduced:
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
                 path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
                 place = pillars.place(d.diameter_um[rows, built])
-                light = gather.lit(table, place, turns(self.k * path, self.kind))
+                turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[:, built]
+                light = gather.lit(table, place, turns(self.k * path + turn, self.kind))
                 halves = across[built].T @ light.reshape(len(light), -1)
                 sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
@@ -296,7 +303,7 @@ class Reduced:
         left, size, across = np.linalg.svd((rows.reshape(-1, m, m) / weight).reshape(-1, m), full_matrices=False)
         mixed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
         some = int((mixed > MIXED * self.tolerance).sum())
-        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.pitch_um**2
+        amounts = (left * size)[:, :some].reshape(-1, m, some).transpose(1, 0, 2) * self.site_um2
         iy, ix = (_on_even(w, float(a[0] / r), float(a[-1] / r), len(a)) for a, r in ((y, wy), (x, wx)))
         to_p = self._to_nodes(m)
         shown = (columns / seen.reshape(-1, 1)).reshape(w, w, -1)

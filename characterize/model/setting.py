@@ -118,7 +118,7 @@ class Group:
     def quick(self, window_um: float | None) -> "Group":
         """See :meth:`Reduced.quick`."""
         reduced = self.reduced.quick(window_um)
-        residual = self.reduced.seen_by(reduced, self.residual) if window_um else self.residual
+        residual = self.reduced.seen_by(reduced, self.residual)
         return dataclasses.replace(Group.of(self.index, self.pillars, reduced), residual=residual)
 
     def turning(self, name: str) -> Array | None:

@@ -142,10 +142,11 @@ class Operators:
         flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
 
         def some(first: int, last: int) -> None:
-            for i in range(first, last):
-                for y, x, amounts, window in products:
-                    mixed = amounts @ (flat[i] @ x).reshape(len(amounts), -1, nx)
-                    seen = (y @ mixed.reshape(len(mixed), -1)).reshape(ny, -1, nx)
+            frames = flat[first:last].reshape(-1, flat.shape[-1])
+            for y, x, amounts, window in products:
+                mixed = amounts @ (frames @ x).reshape(last - first, len(amounts), -1, nx)
+                for i, one in enumerate(mixed.reshape(last - first, len(amounts), -1), first):
+                    seen = (y @ one).reshape(ny, -1, nx)
                     result[i] += np.multiply(seen, window, out=seen).sum(1)  # five times as quick as einsum
 
         with threads.one_blas_thread():

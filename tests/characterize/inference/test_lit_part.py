@@ -10,6 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
+from characterize.bench import bench
 from characterize.inference.leastsquares import Data
 from characterize.inference.prepare import LeftOut, lit_part
 from characterize.model import PLACE, ForwardModel, Setting, detector, vector
@@ -41,6 +42,24 @@ def test_a_part_of_the_window_has_the_light_of_the_whole_model_there_and_backgro
     edge = (np.arange(28) - 14) / 14
     plane = SETTING.exposure[:, None, None] * np.broadcast_to(7.0 + 3.0 * edge, want.shape)
     assert got[:, beside] == pytest.approx(plane[:, beside], abs=1e-9)
+
+
+@pytest.mark.parametrize(("lit", "most"), [((), 41), ((slice(4, 13), slice(4, 12)), 33)])
+def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has_it(lit, most):
+    """Defocus to either side: its light lands elsewhere, and would be shown again where nodes are fewer yet.
+
+    Few terms leave 2 % of the field out where that is dim, and less than a percent of the brightest light.
+    """
+    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
+    whole = ForwardModel(b.lens(), setting, b.RESPONSE)
+    few = whole.quick(*lit)
+    want = bench.irradiance(b.lens(), b.truth(), b.RESPONSE)
+    got = few.images(vector(b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}))[0]
+    seen = (slice(None), *(lit or (slice(None), slice(None))))
+    want, got = want[seen], got[seen]
+    got = got * (got * want).sum() / (got**2).sum()
+    assert np.abs(got - want).max() < 0.01 * want.max()
+    assert few.groups[0].reduced.nodes < most < whole.groups[0].reduced.nodes == 42
 
 
 def test_derivatives_of_a_part_are_differences_of_its_own_images(part):

@@ -86,9 +86,8 @@ def test_terms_of_the_usual_distance_are_turned_and_as_bright_as_own_ones():
     for group in model.groups:
         own, near = group.reduced, group.reduced.quick()
         about = {"wavelength_um": 0.8585, "distance_um": 112.2, "axes_um": model.grid.axes_um()}
-        light = own.gathered[0]
-        whole = own.operators(**about).coarse(light)
-        one, got = (part.operators(**about).coarse(light, np.inf) for part in (own, near))
+        whole = own.operators(**about).coarse(own.gathered[0])
+        one, got = (part.operators(**about).coarse(part.gathered[0], np.inf) for part in (own, near))
         missed = np.linalg.norm(one - whole) / np.linalg.norm(whole)
         assert 1e-3 < missed < 0.2
         assert np.linalg.norm(got - one) / np.linalg.norm(one) < 0.5 * missed

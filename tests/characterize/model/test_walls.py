@@ -19,7 +19,7 @@ def test_two_heights_stand_for_the_whole_wall(bias_um):
     """41 slices of ln t: the effect is 0.013 of t; a tenth of it is the basis, which was not made for walls."""
     pillars = Pillars(b.lens(), b.RESPONSE)
     upright, leaning = (
-        pillars.basis.conj().T @ (pillars.weights(np.array(bias_um))[0] @ pillars.coefficients(Change(), lean))
+        pillars.basis.conj().T @ (pillars.weights(np.array(bias_um)) @ pillars.coefficients(Change(), lean))
         for lean in (0.0, LEAN_UM)
     )
     heights = (np.arange(41) + 0.5) / 41 - 0.5
