@@ -8,7 +8,7 @@ import pytest
 
 from characterize.inference.knowable import density
 from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import REACH, Valley, draws, shares
+from characterize.inference.posterior import REACH, Valley, draws, half_volume, shares
 from tests.referees.one_profile import profile
 
 NOISE = 0.7
@@ -56,6 +56,31 @@ def test_a_straight_model_has_the_parabola_s_interval():
     assert found.parabolic
     assert found.low == pytest.approx(mode[1] - reach, rel=1e-9)
     assert found.high == pytest.approx(mode[1] + reach, rel=1e-9)
+
+
+def test_half_the_volume_of_a_valley_is_that_of_its_covariance():
+    """ln det C / 2 of two shapes that are alike in part: by the two sigmas and their correlation."""
+    alike = np.stack([SHAPES[0], SHAPES[0] + 0.6 * SHAPES[1]])
+    seen = data(np.tensordot([1.3, -0.4], alike, 1))
+    mode = np.array([1.3, -0.4])
+    valley = Valley(lambda x, j: (np.tensordot(x, alike, 1), alike), seen, mode, Prior.none(mode))
+    a, b, both = ((one * other).sum() / NOISE**2 for one, other in ((alike[0],) * 2, (alike[1],) * 2, alike))
+    assert both**2 / (a * b) > 0.5
+    assert half_volume(valley) == pytest.approx(-math.log(a * b - both**2) / 2, rel=1e-9)
+
+
+def test_moved_by_one_sigma_a_parameter_takes_the_others_to_their_best():
+    """Of a straight model: the rest fitted by least squares with one amplitude held a sigma beside its best."""
+    seen = data(straight(np.array([1.3, -0.4]), False)[0])
+    mode, covariance = best(seen)
+    valley = Valley(straight, seen, mode, Prior.none(mode))
+    for i in (0, 1):
+        held, free = SHAPES[i].ravel(), SHAPES[1 - i].ravel()
+        moved = mode[i] + math.sqrt(covariance[i, i])
+        rest = free @ (seen.electrons.ravel() - moved * held) / (free @ free)
+        want = np.zeros(2)
+        want[i], want[1 - i] = moved, rest
+        assert mode + valley.along(i) == pytest.approx(want, rel=1e-9)
 
 
 def test_errors_of_dark_and_flat_spread_the_estimate_as_the_whole_covariance_of_the_pixels_says():

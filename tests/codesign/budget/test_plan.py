@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from codesign.budget import plan
+from codesign.budget import chain, plan
 from codesign.budget.plan import Pilot, PlanConfig
 from codesign.budget.task import TaskSetting
 from codesign.commands import plan as command_plan
@@ -29,6 +29,14 @@ def _pilot(**changed):
         errors[name][0, :, 0] = (k + 1) * 1e-4
     seconds = {name: np.array([1.0, 10.0]) for name in levels}
     return Pilot(levels, errors | changed, seconds, 1e-3, 5.0)
+
+
+@pytest.mark.parametrize("table", ["LEVELS", "TRUE_LEVELS"])
+def test_levels_go_from_the_coarsest_to_the_finest(table):
+    """Tolerances and steps fall, counts rise."""
+    for name, row in getattr(chain, table).items():
+        steps = np.diff(row) * (1 if name.endswith("_count") else -1)
+        assert (steps > 0).all(), name
 
 
 def test_a_loose_goal_takes_the_coarsest_of_everything():

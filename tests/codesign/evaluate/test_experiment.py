@@ -30,6 +30,13 @@ from tests.referees.seen_pupil import pupil_of
 SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, people=9)
 
 
+def test_looks_points_people_and_noise_are_drawn_apart():
+    """Of the same seed and number no two draws are alike."""
+    streams = experiment.LOOKS, experiment.POINTS, experiment.PEOPLE, experiment.NOISE, 2 * experiment.NOISE
+    drawn = [np.random.default_rng([7, 3, one]).random(4).tolist() for one in streams]
+    assert len({tuple(one) for one in drawn}) == len(streams)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("experiment")

@@ -107,6 +107,17 @@ def test_twin_derivative_is_the_limit_of_differences_and_usual_steps_are_not():
     assert error(math.radians(0.5)) > 0.2
 
 
+def test_a_pupil_smaller_than_a_pixel_is_seen_as_whole_as_it_is():
+    """The same eyes on pixels sixty times as wide: of pupils of less than one pixel nearly all is visible still."""
+    coarse = Camera(pixels=5, pitch_um=600.0)
+    wide = replace(
+        STATES, gaze_rad=torch.zeros(4, 2, dtype=torch.float64), slip_um=torch.zeros(4, 3, dtype=torch.float64)
+    )
+    out = renderer.render(wide, rig=Rig(elevation_rad=0.0), camera=coarse)
+    area = out.pupil.sum((-1, -2))
+    assert float(area.max()) < 0.8 < float(out.labels.visible.min())  # pixels are sampled, not integrated: 0.85
+
+
 def test_nothing_is_seen_behind_closed_lids():
     shut = replace(STATES, aperture=torch.zeros(4, dtype=torch.float64))
     out = renderer.render(shut, camera=SMALL)

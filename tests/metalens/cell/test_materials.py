@@ -234,6 +234,14 @@ def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Pat
         materials.index(str(page), 0.5)  # below the pole at 0.6 um n² is negative
 
 
+def test_noise_of_a_measured_k_below_nothing_is_no_gain(tmp_path: Path):
+    """Ellipsometry has k to 1e-3; what is farther below 0 is the other sign of time."""
+    page = tmp_path / "noisy.yml"
+    page.write_text("DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.4 -8e-4\n        0.6 1.5 2e-3\n")
+    assert materials.index(str(page), 0.5) == pytest.approx(1.4, abs=1e-15)
+    assert materials.index(str(page), 0.6) == pytest.approx(1.5 + 2e-3j, abs=1e-15)
+
+
 def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
     page = tmp_path / "page.yaml"
     page.write_text(
@@ -325,6 +333,10 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
         (
             "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 0.2 -3.1\n        0.6 0.3 -3.4\n",
             "k = -3.4; need k",
+        ),
+        (
+            "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.4 1e-4\n        0.6 1.5 -1.5e-3\n",
+            "k = -0.0015; need k",
         ),
         ("DATA:\n  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 -1.5\n", "n = -1.5; need n"),
         (

@@ -337,13 +337,23 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
         assert got == pytest.approx(want, rel=2e-6), name  # finite differences: 1e-9 of the value over the step
 
 
-@pytest.mark.parametrize("shape", [(6, 9), (70, 130)])
-def test_torch_path_for_other_devices_equals_the_compiled_loops(shape, monkeypatch):
-    """Field on the window and gradients: pillars themselves as nodes, some rows at a time, against nodes of blocks."""
+@pytest.fixture
+def threads():
+    """Sets how many there are, for one test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("shape", "count"), [((6, 9), 1), ((70, 130), 1), ((300, 20), 2)])
+def test_torch_path_for_other_devices_equals_the_compiled_loops(shape, count, monkeypatch, threads):
+    """Field on the window and gradients: pillars themselves as nodes, some rows at a time, against nodes of blocks; of
+    the last 16 nodes a block along y and single ones along x, the lower half by another thread."""
     from metalens.propagate import pillars
     from metalens.propagate.window import from_moments, plan
 
     monkeypatch.setattr(pillars, "DEVICE_ROWS", 32)
+    threads(count)
     made = plan(propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu"))
     blocks, case = made.moments, made.case
     places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)

@@ -17,6 +17,15 @@ def test_a_rule_has_the_whole_weight_and_a_narrow_line_201_points():
     assert len(spectrum.weight(spectrum.Source(850.0, 3.0))[0]) == 201  # 5 widths in fortieths
 
 
+@pytest.mark.parametrize("more", [1.5e-6, -1.5e-6, 0.5])
+def test_weights_add_up_to_one_within_a_millionth(more):
+    """All light would count as so much more or less; rounding of sums of many weights is 1e-14."""
+    waves = np.array([0.84, 0.86])
+    assert spectrum.Nodes(waves, np.array([0.3, 0.7 + 0.5e-6]), 0.0).weights[1] > 0.7
+    with pytest.raises(PropagationError, match="need one of 0 or more each, sum 1"):
+        spectrum.Nodes(waves, np.array([0.3, 0.7 + more]), 0.0)
+
+
 TAILS = [(800, 5e-5), (810, 5e-5), (810.25, 2e-4), (850, 1.0), (889.75, 3e-4), (890, 9e-5), (900, 9e-5)]
 
 
