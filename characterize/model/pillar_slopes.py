@@ -25,9 +25,9 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
     """d ln t by the answering causes of :mod:`metalens.made.causes` over the diameters of a lens, or t itself.
 
     Upright round pillars whose proxy is that of the cell: t by the modal method at every diameter that a bias can
-    lead to and at five heights and three indices within the bounds of the fit (:class:`metalens.made.Solved`), to
-    3e-3. No slope is taken for a curve, and past the proxy's domain, where pillars begin to resonate, nothing is
-    extrapolated.
+    lead to and at five heights and seven indices within the bounds of the fit (:class:`metalens.made.Solved`), to 3e-3
+    there and up to 0.03 between them where a resonance moves by. No slope is taken for a curve, and past the proxy's
+    domain, where pillars begin to resonate, nothing is extrapolated.
 
     Other round ones: exact derivatives at 25 Chebyshev diameters (RCWA for films or tilted walls), as the
     polynomial of least degree whose error on diameters that it was not made from meets ``tolerance``, relative to

@@ -61,7 +61,8 @@ class Curve:
 
         The estimate adds the largest disagreement with a rival fit, the residual of the fit, a tenth of the
         tolerance, and the solver's error: mostly a small shift of the diameter, it is carried from the neighbouring
-        nodes in proportion to the slope of t. At a node the estimate is the solver's own.
+        nodes in proportion to the slope of t, no farther than any passive pillar can be. At a node the estimate is the
+        solver's own.
 
         Raises:
             DomainError: outside the nodes.
@@ -79,7 +80,7 @@ class Curve:
         for side in (right - 1, right):
             hit = x[side] == d
             value[hit], error[hit] = self.nodes.response[order[side[hit]]], solver[side[hit]]
-        return value, error
+        return value, np.minimum(error, 1 + np.maximum(1.0, np.abs(value[..., 0])))
 
     def solver_error(self, diameter_um: Array) -> Array:
         """(...) of the solver at the better of the two nodes around."""

@@ -17,24 +17,35 @@ def test_amounts_reach_beyond_the_bounds_of_a_fit():
     assert [row.name for _, row, _ in changes] == ["height_nm", "index"]
     assert [n for n, _, _ in changes] == [rows.index(row) for _, row, _ in changes]
     assert changes[0][2] == pytest.approx(np.array([-1, -0.5, 0, 0.5, 1]) * 0.02996)  # 28 nm and 7 %, in um
-    assert changes[1][2] == pytest.approx(np.array([-1, 0, 1]) * 0.08025)
+    assert changes[1][2] == pytest.approx(np.array([-1, -0.67, -0.33, 0, 0.33, 0.67, 1]) * 0.08025)
 
 
 def test_series_go_through_what_was_solved():
-    """Quartics in the height and parabolas in the index come back; a cause that is not solved has t alone."""
+    """Quartics in height and sixth powers in the index come back; a cause that is not solved has t alone."""
     changes = solving._changes(0.85)
     t = RNG.normal(size=7) + 1j * RNG.normal(size=7)
     tall = RNG.normal(size=(4, 7)) * np.array([3.0, 40.0, 500.0, 9e3])[:, None]
-    dense = RNG.normal(size=(2, 7)) * 1j
+    dense = RNG.normal(size=(6, 7)) * np.array([1j, 4j, 60.0, 900j, 1e4, 1e5j])[:, None]
     columns = [t + sum(tall[p] * a ** (p + 1) for p in range(4)) for a in changes[0][2]]
-    columns += [t + dense[0] * a + dense[1] * a**2 for a in changes[1][2]]
+    columns += [t + sum(dense[p] * a ** (p + 1) for p in range(6)) for a in changes[1][2]]
     out = solving._powers(np.array(columns).T, changes)
-    assert out.shape == (len(named(Answers)), 5, 7)
+    assert out.shape == (len(named(Answers)), 7, 7)
     assert out[:, 0] == pytest.approx(np.tile(t, (len(out), 1)), rel=1e-9)
-    assert out[0, 1:] == pytest.approx(tall, rel=1e-6)
-    assert out[1, 1:3] == pytest.approx(dense, rel=1e-9)
-    assert not out[1, 3:].any()
+    assert out[0, 1:5] == pytest.approx(tall, rel=1e-6)
+    assert not out[0, 5:].any()
+    assert out[1, 1:] == pytest.approx(dense, rel=1e-6)
     assert not out[2:, 1:].any()
+
+
+def test_series_follow_a_resonance_that_moves_with_the_index():
+    """Pillars near 0.23 um of the default cell, where t turns by a radian as n falls by a twentieth: by the solver."""
+    cell, wave = Cell(0.3, 0.7, Index(3.6)), 0.85
+    table, off = solving._solved(cell, wave, 0.229, 0.2325), []
+    for d, amount in ((0.23060831, -0.04401585), (0.23126282, -0.06865947), (0.2297, 0.031)):
+        want = modal.solve(Cell(0.3, 0.7, Index(3.6 + amount)), d, wave, tolerance=1e-3).t
+        got = np.polynomial.polynomial.polyval(amount, table.series(np.array(d))[1])
+        off.append(abs(got - want))
+    assert max(off) < 0.04  # 0.03 of the polynomials, 4e-3 of two solves; 0.29 through three indices, 0.07 through five
 
 
 def test_bending_energy_is_the_mean_of_squared_second_derivatives():

@@ -88,5 +88,5 @@ def _pair():
 def test_solved_heights_span_the_bounds_of_the_lens():
     tall, dense = (amounts for *_, amounts in solving._changes(LARGER * 0.85))
     assert tall == pytest.approx(LARGER * np.array([-1, -0.5, 0, 0.5, 1]) * 0.02996)
-    assert dense == pytest.approx(np.array([-1, 0, 1]) * 0.08025)
+    assert dense == pytest.approx(np.array([-1, -0.67, -0.33, 0, 0.33, 0.67, 1]) * 0.08025)
     assert Range.of(LARGER * 0.85).answers[:2] == pytest.approx((tall[-1], dense[-1]))

@@ -1,5 +1,7 @@
 """The error of a curve between its nodes, by its four parts, on curves that are straight lines."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,14 @@ def test_between_nodes_the_parts_of_the_error_add_up():
     beside = np.array([7e-4, 7e-4, 9e-4])  # of 0.1 and 0.2, 0.2 and 0.3, 0.3 and 0.4
     assert value == pytest.approx(BEST(at))
     assert error == pytest.approx(0.02 * at + 3e-5 + 2e-4 + beside, rel=1e-5)
+
+
+def test_no_bar_is_wider_than_a_passive_pillar_can_be_wrong():
+    """|t| and the true |t| are 1 at most: of |t| below 1 the bar ends at 2, of a t of 1.6 at 2.6."""
+    wrong = dataclasses.replace(NODES, error=np.full(4, 9.0))
+    assert Curve(wrong, BEST, RIVALS, 2e-3)(np.array([0.13, 0.27]))[1] == pytest.approx([2.0, 2.0])
+    bright = line(0.0, 1.6j)
+    assert Curve(wrong, bright, (bright, bright), 2e-3)(np.array([0.27]))[1] == pytest.approx([2.6])
 
 
 def test_at_a_node_value_and_error_are_those_of_the_solve():

@@ -71,7 +71,7 @@ def test_the_error_of_the_curve_is_stated(phase, aperture_um, sensor_um, terms):
 def test_pillars_whose_own_answers_are_wrong_are_in_the_error():
     """Answers wrong by a smooth share of up to 0.03 that the library's bars state: below the term, above a 200th."""
     wrong = 0.03 * np.exp(1j * 2.1)
-    proxy = dataclasses.replace(curve(14), entry_error=abs(wrong) / np.sqrt(2))
+    proxy = dataclasses.replace(curve(24), entry_error=abs(wrong) / np.sqrt(2))
     focus = Focus(WAVELENGTH, 400.0, np.inf)
     made, _ = design.make(bowl, focus, aperture_um=60.0, cell=Cell(0.3, 0.7, Index(3.6)), proxy=proxy)
     view = View((np.inf,), window_um=24.0, samples=48)
