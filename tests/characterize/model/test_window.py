@@ -23,6 +23,17 @@ def along(kernel, tolerance=1e-3, at=AT):
     )
 
 
+@pytest.mark.parametrize("direction", [-0.83, 0.0, 0.37, 0.91])
+def test_light_times_powers_of_its_direction_is_that_of_a_plane_wave(direction):
+    """A wave of one direction of the band, times it and its square; of odd powers the weights are imaginary."""
+    band = 0.9
+    coarse = (np.arange(60) - 27.0) * math.pi / band / window.ROOM
+    wave, want = (np.exp(1j * band * direction * place) for place in (coarse, AT))
+    for power, weights in enumerate(window.turned(AT, coarse, band, 2)):
+        found = weights @ wave * (1j if power % 2 else 1)
+        assert found == pytest.approx(direction**power * want, abs=2e-3)  # 24 samples at 1.3 times the least density
+
+
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-5])
 def test_fine_samples_are_those_of_the_path_itself(tolerance):
     """A tenth of the tolerance in the mean over the band; at its edge, which the outermost nodes are, five times."""

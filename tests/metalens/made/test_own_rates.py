@@ -1,6 +1,7 @@
 """Pillars by their own shape: derivatives of ln t against differences of the same truncation, and their error bar."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Ellipse, Rectangle
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Answers, causes, lacking, named, own, own_rates
+from metalens.made import Answers, causes, lacking, named, own, own_rates, response
 from metalens.pillars import Proxy
 from metalens.rcwa import jones, pattern
 
@@ -52,6 +53,42 @@ SEEN = {  # of the Jones matrix: light along x, the mean of both, right-handed l
     "right": ({"hand": "right"}, lambda j: (j[0, 0] - j[1, 1] + 1j * (j[0, 1] + j[1, 0])) / 2),
     "left": ({"hand": "left"}, lambda j: (j[0, 0] - j[1, 1] - 1j * (j[0, 1] + j[1, 0])) / 2),
 }
+
+
+@pytest.mark.parametrize("edged", [True, False])
+def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged):
+    """Slopes of a few Chebyshev polynomials of the size at the nodes of the ninth: up to the fifth degree they come
+    back, what the seventh has is the error, root mean square over the nodes, where sums of products of the polynomials
+    are 9 or 9/2 or nothing. A row a millionth as large as the largest errs by more and does not count."""
+    rows = {
+        0: {0: 2.0 - 0.3j, 3: 0.7j, 5: -0.2},
+        1: {0: 0.4, 1: 1.1 + 0.2j, 7: 0.09},
+        2: {0: 1e-8, 7: 3e-8},
+    }
+    edge = {2: 0.8 - 0.1j, 4: 0.3} if edged else {}
+    low, high = 0.1, 0.3  # of the proxy
+
+    def table(terms, size_um):
+        unit = (size_um - (low + high) / 2) / ((high - low) / 2)
+        return sum((c * np.cos(n * np.arccos(np.clip(unit, -1, 1))) for n, c in terms.items()), 0j * unit)
+
+    def solved(lens, size_um):
+        rates = np.array([table(rows.get(i, {}), size_um) for i in range(len(ROWS))])
+        return own.OwnRates(rates, table(edge, size_um), 0.013)
+
+    monkeypatch.setattr(response, "own_rates", solved)
+    found = response.sensitivity(lens())
+    power = [sum(abs(c) ** 2 * (1 if n == 0 else 0.5) for n, c in rows[i].items()) for i in range(3)]
+    assert found.error == pytest.approx(0.013 + 0.09 * math.sqrt(0.5) / math.sqrt(power[1]), rel=1e-9)
+    at = np.array([0.117, 0.18, 0.26])
+    for i in range(3):
+        kept = {n: c for n, c in rows[i].items() if n <= 5}
+        assert found.at(at)[i] == pytest.approx(table(kept, at), rel=1e-9)
+    if edged:
+        assert found.edges.shape == (1, 6)
+        assert found.by_edges(at) == pytest.approx(table(edge, at), rel=1e-9)
+    else:
+        assert found.by_edges(at) is None
 
 
 @pytest.mark.parametrize("light", SEEN)

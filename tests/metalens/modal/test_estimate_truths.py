@@ -105,6 +105,10 @@ def test_cells_unlike_those_of_lenses_begin_two_meshes_before_and_are_judged_by_
         found = engine.climb(hole, tolerance)
         assert (found.solution, found.error, found.converged) == (name, bars[name], tolerance > bars[name])
         assert asked == judged
+    bars["c"] = 1.4
+    monkeypatch.setattr(engine, "RUNGS", tuple(rung(name) for name in "abc"))
+    found = engine.climb(hole, 3.5e-3)  # of what two meshes say an amplitude of 1 is unknown
+    assert (found.error, found.converged) == (1.0, False)
 
 
 def test_half_spaces_admit_modes_as_plane_waves_of_their_own_kind():

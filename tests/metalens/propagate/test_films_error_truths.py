@@ -1,14 +1,17 @@
 """What films leave out of PSFs: of the light of every pillar to the window's farthest corner, rays by Snell's law."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import brentq
 
 from metalens.lens import saddle
 from metalens.lens.media import Media
 from metalens.propagate import Case, paths
+from metalens.psf import compute
 
 PITCH = 4.1
 FILMS = Media((1.0, 1.52, 2.1), (11.0, 9.0, 3.0))
@@ -42,6 +45,19 @@ def test_the_error_of_films_is_twice_the_root_mean_square_of_the_amplitude_s_ove
         assert paths.films_error(CASE, level) == pytest.approx(want, rel=1e-6)
     dark = 2 * math.sqrt((each**2).mean())
     assert paths.films_error(CASE, np.zeros((3, 4))) == pytest.approx(dark, rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_a_spectrum_the_worst_wavelength_counts_with_its_own_light(order):
+    """Of two wavelengths, the shorter one's light on the pillar that errs least: its part alone would say a third."""
+    cases = CASE, dataclasses.replace(CASE, wavelength_um=0.62)
+    levels = [np.ones((3, 4)), np.zeros((3, 4))]
+    levels[1][np.unravel_index(errors().argmin(), (3, 4))] = 0.7
+    each = [paths.films_error(case, level) for case, level in zip(cases, levels, strict=True)]
+    assert each[0] > 2 * each[1] > 0
+    maps = torch.from_numpy(np.stack([levels[i] for i in order]))
+    lit = compute.Lit(torch.zeros_like(maps), maps, [cases[i] for i in order], [0.3, 0.7])
+    assert lit.films == pytest.approx(each[0], rel=1e-12)
 
 
 def test_one_medium_leaves_nothing_out():
