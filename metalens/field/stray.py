@@ -42,7 +42,8 @@ class Disc:
         if self.places is not None:
             rows, columns = self.places
             light = rows @ light @ columns.mT
-        return torch.fft.rfft2(light, s=shape) * self.transfer
+        found: Tensor = torch.fft.rfft2(light, s=shape) * self.transfer
+        return found
 
     def to(self, device: torch.device | str) -> "Disc":
         """The same on a device."""
@@ -137,7 +138,7 @@ def _behind_stop(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[f
     x, y = np.meshgrid(place, place)
     there = np.hypot(x, y) <= wave.radius_um
     cell = float(place[1] - place[0])
-    shown = [layers.lit(tuple(t), depth_um, colour, (x, y), cell) * there for t in tangents.reshape(-1, 2).tolist()]
+    shown = [layers.lit((a, b), depth_um, colour, (x, y), cell) * there for a, b in tangents.reshape(-1, 2).tolist()]
     light = np.stack(shown).reshape(NODES, NODES, -1)
     area = light.sum(-1) * cell**2
     row, column = light[:, NODES // 2], light[NODES // 2]
@@ -155,12 +156,12 @@ def _middle(light: Array, place_um: Array) -> Array:
     if not lit.any():
         return np.zeros(len(light))
     found = light[lit] @ place_um.ravel() / given[lit]
-    return np.interp(np.arange(len(light)), np.flatnonzero(lit), found)
+    return np.asarray(np.interp(np.arange(len(light)), np.flatnonzero(lit), found))
 
 
 def _between(values: Array, count: int) -> Array:
     """(count,) values between those of directions at equal steps."""
-    return np.interp(np.linspace(0, len(values) - 1, count), np.arange(len(values)), values)
+    return np.asarray(np.interp(np.linspace(0, len(values) - 1, count), np.arange(len(values)), values))
 
 
 def _reduced(optics: Optics, depth_um: float) -> float:
