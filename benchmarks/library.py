@@ -60,7 +60,7 @@ def _sweep(case: str, sweep: Sweep) -> tuple[Row, PillarLibrary]:
     start = time.perf_counter()
     made = library.sweep(DEFAULT_CELL, sweep)
     seconds = time.perf_counter() - start
-    against = f"largest error bar; {int((made.t_error <= sweep.tolerance).sum())} of {made.t.size} within the tolerance"
+    against = f"largest error bar; {int((made.t_error <= made.sweep.bar).sum())} of {made.t.size} within the tolerance"
     method = f"{made.solves} solves, {made.engine}"
     return Row(case, method, seconds, float(made.t_error.max()), against, threads=executor.cores()), made
 
