@@ -7,12 +7,13 @@ code for the processor alone would read or write is therefore found here, withou
 
 import contextlib
 import importlib
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_map
 
 AWAY = torch.device("meta")
 MOVES = ("_to_copy", "copy_")  # what may take tensors of two devices
@@ -82,9 +83,12 @@ class _Done(TorchDispatchMode):
 
 
 def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    tensors = [a for a in tree_leaves((args, kwargs)) if isinstance(a, torch.Tensor)]
-    name, there = func.overloadpacket.__name__, [a for a in tensors if isinstance(a, There)]
+    tensors = [a for a in _leaves((*args, *kwargs.values())) if isinstance(a, torch.Tensor)]
+    there = [a for a in tensors if isinstance(a, There)]
     wanted = kwargs.get("device")
+    if not there and wanted is None:
+        return func(*args, **kwargs)
+    name = func.overloadpacket.__name__
     stays = bool(there) if wanted is None else torch.device(wanted) == AWAY
     if name == "copy_":
         stays = isinstance(args[0], There)
@@ -94,13 +98,29 @@ def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         raise RuntimeError(f"{func}: a generator of the processor")
     if wanted is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
-    plain, named = tree_map(lambda a: a.held if isinstance(a, There) else a, (args, kwargs))
-    out = func(*plain, **named)
+    held = {id(a): a.held for a in there}
+    out = func(*_mapped(held, args), **{key: _mapped(held, value) for key, value in kwargs.items()})
     if not stays:
         return out
     DONE.add(name)
     same = {id(a.held): a for a in there}
     return tree_map(lambda a: same[id(a)] if id(a) in same else _wrapped(a), out)
+
+
+def _leaves(values: Any) -> Iterator[Any]:
+    """What lists and tuples of arguments hold."""
+    for value in values:
+        if isinstance(value, list | tuple):
+            yield from _leaves(value)
+        else:
+            yield value
+
+
+def _mapped(held: dict[int, Any], value: Any) -> Any:
+    """An argument with the numbers of what lies elsewhere in its place."""
+    if isinstance(value, list | tuple):
+        return type(value)(_mapped(held, part) for part in value)
+    return held.get(id(value), value)
 
 
 def _wrapped(value: Any) -> Any:

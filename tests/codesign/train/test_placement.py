@@ -84,8 +84,10 @@ def test_what_a_run_ends_with_is_formed_where_it_trained():
         placement.place(moved.trainer, AWAY)
         (found,) = finish.finish(moved)
     assert {"convolution_backward", "_fft_r2c"} <= done  # trained on, and imaged
+    # a difference of readings, of a network that knows no depth yet: what single counts that fall the other way leave
+    near = {"depth_response_mm_per_mm": 1e-4}
     for name in want.keys() - {"architecture", "budget_mmacs"}:
-        assert found[name] == pytest.approx(want[name], rel=1e-3, abs=1e-5), name
+        assert found[name] == pytest.approx(want[name], rel=1e-3, abs=near.get(name, 1e-5)), name
 
 
 @pytest.mark.skipif(not GPU, reason="needs a GPU")

@@ -44,8 +44,9 @@ def _made(device, **about):
 
 @pytest.fixture(scope="module")
 def both():
+    here = _made("cpu")
     with elsewhere():
-        return _made("cpu"), _made(AWAY)
+        return here, _made(AWAY)
 
 
 def test_psfs_and_images_are_those_of_the_processor(both):
@@ -56,7 +57,8 @@ def test_psfs_and_images_are_those_of_the_processor(both):
         frames = _frames(GRID)
         seen = there(frames.to(AWAY))
         assert seen.device == AWAY
-        seen, want = seen.cpu(), here(frames)
+        seen = seen.cpu()
+    want = here(frames)
     assert "_fft_r2c" in done
     assert float((psfs - here.stack).abs().max()) <= 2e-6 * float(here.stack.max()) + 1e-9  # phases of single precision
     assert torch.allclose(seen, want, rtol=0, atol=1e-5 * float(want.max()))
@@ -185,7 +187,7 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
 
     with elsewhere():
         value, slope = found(AWAY)
-        want, steep = found(torch.device("cpu"))
+    want, steep = found(torch.device("cpu"))
     assert value == pytest.approx(want, rel=1e-5)
     assert slope.numpy() == pytest.approx(steep.numpy(), rel=1e-4)  # phases are single precision: 1e-5 of a turn
 
