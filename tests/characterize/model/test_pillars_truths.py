@@ -59,6 +59,18 @@ def test_the_error_is_that_of_other_random_changes(pillars):
     assert pillars.error < 2e-3
 
 
+@pytest.mark.parametrize(("missed", "laid"), [((1.9e-3,), 1), ((2.1e-3, 1.9e-3), 2), ((1.0, 0.5, 0.2), 3)])
+def test_nodes_are_laid_twice_and_thrice_as_densely_where_two_thousandths_of_t_are_missed(monkeypatch, missed, laid):
+    """The last is told in any case."""
+    left, counts = list(missed), []
+    lay = Pillars._lay
+    monkeypatch.setattr(Pillars, "_lay", lambda self, count, tolerance: counts.append(count) or lay(self, 7, 1e-2))
+    monkeypatch.setattr(Pillars, "_measure", lambda self: left.pop(0))
+    found = Pillars(b.lens(), b.RESPONSE)
+    assert counts == [counts[0] * times - (times - 1) for times in range(1, laid + 1)]
+    assert found.error == missed[-1]
+
+
 def test_slopes_by_the_answering_causes_are_differences_of_the_coefficients(pillars):
     change = some_change()
     slopes = pillars.slopes(change)
