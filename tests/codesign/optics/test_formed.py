@@ -146,7 +146,7 @@ def test_psfs_of_one_chief_ray_cannot_stand_for_the_field():
 
 
 def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole):
-    """One PSF's image is brighter than the true one, too, by 2 to 3 % in both: most of what is wrong of the round lens."""
+    """One PSF's image is brighter than the true one, too, by 2 to 3 % in both: most of what errs of the round lens."""
     assert isinstance(whole, Imager)
     far = formed.apart(SMALL, 3 * BENT, FRAME, margin=MARGIN)
     still = replace(SMALL, polynomials=0, focus_mm=22.0)
