@@ -90,10 +90,8 @@ class Reduced:
         show it there only where s is 2 n; half of what tells s from all others is enough to keep it off."""
         part = copy.copy(self)
         part._operators, part._near, part._usual = {}, True, {}
-        narrow = window_um is not None and window_um < self.window_um
-        if narrow:
-            part.window_um = window_um
-        part._directions(0.0 if narrow else self._blur)
+        part.window_um = min(window_um or self.window_um, self.window_um)
+        part._directions(0.0 if part.window_um < self.window_um else self._blur)
         if part.nodes < self.nodes:
             part._from_few = {}
             to_q, to_p = self._between(part, self)
