@@ -203,12 +203,12 @@ def pillar_rows() -> Iterator[Row]:
     for angles in ((0.0,), (0.0, 10.0, 20.0)):
         about = library.Sweep((WAVELENGTH,), angles, samples=60, tolerance=5e-3)
         proxies[angles] = timed(lambda about=about: library.proxy_of(library.sweep(cell, about)))  # type: ignore[misc]
-    focus, limits = Focus(WAVELENGTH, 240.0, DEPTH), design.Limits(90, 80)
+    (plain, seconds), (proxy, took) = proxies[(0.0,)], proxies[(0.0, 10.0, 20.0)]
+    thickest = min(plain.domain_um[1], proxy.domain_um[1])  # that both know
+    focus, limits = Focus(WAVELENGTH, 240.0, DEPTH), design.Limits(90, max(80, 1e3 * (cell.pitch_um - thickest)))
     phase = design.phase_of(None, focus, radius_um=60.0)
-    proxy, took = proxies[(0.0, 10.0, 20.0)]
     about = {"aperture_um": 120.3, "limits": limits, "accept_partial_turn": True}  # an odd number of pillars across
     lens = design.make(phase, focus, cell=cell, proxy=proxy, **about)[0]  # type: ignore[arg-type]
-    plain, seconds = proxies[(0.0,)]
     (true, _), (bare, _) = (seen(each, angle) for each in (lens, replace(lens, proxy=plain)))
     wanted = _met(lens, cell, angle)
     before, after = (seconds, off(bare, wanted)), (took, off(true, wanted))
