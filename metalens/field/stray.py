@@ -23,8 +23,6 @@ from metalens.ground.arrays import Array
 from metalens.image.scene import Frames
 
 ORDERS = (-1, 0, 2, 3)
-
-
 NODES = 17  # directions along an axis whose light on the lens behind a stop is traced
 PLACES = 64  # of the lens along an axis, of which each is lit or dark there
 
@@ -89,8 +87,9 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
     depth, source = (_reduced(optics, z) for z in (depth_um, focus.source_distance_um))
     shares = wave.orders(focus.wavelength_um, ORDERS)
     shape = (scipy.fft.next_fast_len(2 * frame[0], real=True), scipy.fft.next_fast_len(2 * frame[1], real=True))
-    lit = _all(wave.radius_um, grid, d, middle_um)
-    if optics.layers.stop is not None:
+    if optics.layers.stop is None:
+        lit = _all(wave.radius_um, grid, d, middle_um)
+    else:
         lit = _behind_stop(optics, grid, depth_um, middle_um)
     discs = []
     for m, share in shares.items():
@@ -100,8 +99,9 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
         if lit.aside_um is None:
             discs.append(Disc(transfer))
         else:
-            rows, columns = (_moved(aside * (lands / grid.step_um)) for aside in lit.aside_um)
-            discs.append(Disc(transfer, (rows, columns)))
+            down, across = lit.aside_um
+            to_step = lands / grid.step_um
+            discs.append(Disc(transfer, (_moved(down * to_step), _moved(across * to_step))))
     if lit.aside_um is None:
         discs = [Disc(torch.stack([disc.transfer for disc in discs]).sum(0))]
     return Stray(shares, discs, shape, lit.illumination)
@@ -174,9 +174,7 @@ def _reduced(optics: Optics, depth_um: float) -> float:
 def add_stray(image: Tensor, frames: Frames, stray: Stray, grid: Grid) -> Tensor:
     """The image with the discs of all sources added."""
     light = frames.radiance.sum(1) * stray.illumination.to(frames.radiance)
-    spectrum = sum(
-        (disc.spectrum(light, stray.shape) for disc in stray.discs[1:]), stray.discs[0].spectrum(light, stray.shape)
-    )
+    spectrum = torch.stack([disc.spectrum(light, stray.shape) for disc in stray.discs]).sum(0)
     edge = grid.margin + grid.spare
     rows, columns = (slice(edge, edge + n) for n in grid.samples)
     haze: Tensor = torch.fft.irfft2(spectrum, s=stray.shape)[..., rows, columns]

@@ -166,7 +166,7 @@ def load_plain(path: str | Path) -> Lens:
         turned = ", turned one by one" if made.hand else ", of two sizes" if made.pairs else ""
         raise LensError(
             f"{path}: pillars on a {made.diameters.lattice.kind} lattice{turned}; this command takes a square lattice "
-            "of pillars of one size that are not turned (psf, layout, fit and view take any)"
+            "of pillars of one size that are not turned (psf, layout and view take any)"
         )
     return made
 

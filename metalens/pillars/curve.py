@@ -68,11 +68,10 @@ class Curve:
             DomainError: outside the nodes.
         """
         d = np.asarray(diameter_um, float)
-        order = np.argsort(self.nodes.diameter_um)
+        order, right = self._around(d)
         x = self.nodes.diameter_um[order]
         if d.size and not (d.min() >= x[0] - 1e-12 and d.max() <= x[-1] + 1e-12):
             raise DomainError(f"diameters {d.min():.6g} to {d.max():.6g} um, the curve holds {x[0]:.6g} to {x[-1]:.6g}")
-        right = np.clip(np.searchsorted(x, d), 1, len(x) - 1)
         solver = self.nodes.error[order]
         shift = solver / self._steepness(x)
         value = self.best(d)
@@ -84,10 +83,15 @@ class Curve:
 
     def solver_error(self, diameter_um: Array) -> Array:
         """(...) of the solver at the better of the two nodes around."""
-        order = np.argsort(self.nodes.diameter_um)
-        x, error = self.nodes.diameter_um[order], self.nodes.error[order]
-        right = np.clip(np.searchsorted(x, diameter_um), 1, len(x) - 1)
+        order, right = self._around(diameter_um)
+        error = self.nodes.error[order]
         return np.asarray(np.minimum(error[right - 1], error[right]))
+
+    def _around(self, diameter_um: Array) -> tuple[Array, Array]:
+        """The nodes from thin to thick, and the place among them of the thicker of the two around each diameter."""
+        order = np.argsort(self.nodes.diameter_um)
+        right = np.searchsorted(self.nodes.diameter_um[order], diameter_um)
+        return order, np.clip(right, 1, len(order) - 1)
 
     def _doubt(self, d: Array) -> Array:
         value = self.best(d)
