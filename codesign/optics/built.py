@@ -22,7 +22,7 @@ from metalens.field import Optics
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 from metalens.ground.paths import path_difference
-from metalens.image import Pupil, amplitude, coordinates
+from metalens.image import Pupil, amplitude, aperture_light, coordinates
 from metalens.lens import Lens
 from metalens.made import CAUSES, Sensitivity, State, sensitivity, transmission
 
@@ -171,7 +171,9 @@ class MadeLens:
         harmonics, columns = self._samples(pupil)
         size = pupil.nodes + harmonics
         weight = amplitude(pupil)
-        scale = (self.settings.sample_um / pupil.period_um) ** 2 / (float((weight**2).sum()) * size**2)
+        s = self.settings
+        given = aperture_light(pupil, s.window_samples * s.sample_um)
+        scale = (s.sample_um / pupil.period_um) ** 2 / (given * size**2)
         out = []
         for depth in self.settings.depths_um.tolist():
             angle = torch.remainder(inward + k * path_difference(r2, depth), 2 * math.pi)

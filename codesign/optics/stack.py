@@ -28,6 +28,7 @@ from metalens.image import (
     Pupil,
     Seen,
     UniformImager,
+    aperture_light,
     basis,
     coordinates,
     radius,
@@ -291,20 +292,22 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
 
 
 def _frequencies(settings: OpticsConfig) -> int:
-    """Harmonics of the pupil's period that the grid of the samples can show."""
-    return math.floor(settings.pupil.period_um / (2 * settings.sample_um))
+    """Harmonics of the pupil's period that the grid of the samples can show, the last in part; that its nodes have."""
+    return min(math.floor(settings.pupil.period_um / (2 * settings.sample_um) + 0.5), settings.pupil.nodes)
 
 
 @functools.lru_cache(maxsize=8)
 def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
     """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to the light on each sample."""
     pupil, size = settings.pupil, settings.window_samples
-    harmonic = torch.arange(_frequencies(settings) + 1, dtype=torch.float64) / pupil.period_um
+    number = torch.arange(_frequencies(settings) + 1, dtype=torch.float64)
+    harmonic, edge = number / pupil.period_um, pupil.period_um / (2 * settings.sample_um)
+    kept = (edge - number + 0.5).clamp(0, 1)  # the last in part, so that the width of the period does not matter
     place = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * settings.sample_um
-    half = torch.exp(2j * math.pi * place[:, None] * harmonic) * torch.sinc(harmonic * settings.sample_um)
+    half = torch.exp(2j * math.pi * place[:, None] * harmonic) * (kept * torch.sinc(harmonic * settings.sample_um))
     rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
     columns = half * torch.where(harmonic == 0, 1.0, 2.0)  # the other half of the frequencies is its conjugate
-    nodes_light = float((_seen(settings).weight ** 2).sum()) * _carriers(settings)[1][0] ** 2
+    nodes_light = aperture_light(pupil, size * settings.sample_um) * _carriers(settings)[1][0] ** 2
     scale = (settings.sample_um / pupil.period_um) ** 2 / nodes_light
     return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from metalens.image.pupil import Pupil as Pupil
     from metalens.image.pupil import Seen as Seen
     from metalens.image.pupil import amplitude as amplitude
+    from metalens.image.pupil import aperture_light as aperture_light
     from metalens.image.pupil import coordinates as coordinates
     from metalens.image.pupil import radius as radius
     from metalens.image.pupil import view as view
@@ -54,6 +55,7 @@ __getattr__, __dir__, __all__ = attach(
         "Sensor": "sensor",
         "UniformImager": "scene",
         "amplitude": "pupil",
+        "aperture_light": "pupil",
         "axial_information": "information",
         "basis": "scene",
         "coordinates": "pupil",

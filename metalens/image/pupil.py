@@ -117,6 +117,19 @@ def amplitude(pupil: Pupil) -> Tensor:
     return inside / (1 - q2).clamp_min(0.5)
 
 
+def aperture_light(pupil: Pupil, window_um: float) -> float:
+    """What |U|² of all nodes is over, so that a window of this width holds the share that a sharp round rim sends it.
+
+    The area of the aperture in nodes: the squares of the weights sum to less, as a node across the rim has the mean
+    field of its width. What such nodes send to X is dimmed by sinc²(X / period); so of a rim at p, which sends
+    4√2 / (π² k p X) of the light beyond ±X, the window lacks ∫ (1 - sinc²) of that, to second order.
+    """
+    step, k = 2 * pupil.edge / pupil.nodes, 2 * math.pi / pupil.wavelength_um
+    given = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
+    dimmed = 2 * math.sqrt(2) * window_um / (3 * k * pupil.edge * pupil.period_um**2)
+    return given * (1 - dimmed)
+
+
 def psf(
     phase_rad: Tensor,
     pupil: Pupil,
@@ -157,8 +170,8 @@ def psf(
         angles.append(known + (added if seen.node is None else added.reshape(-1)[seen.node]))
         weights.append(seen.weight.float())
     image = to_window @ (torch.polar(torch.stack(weights), torch.stack(angles)) @ to_window.mT)
-    light = torch.stack([(w**2).sum() for w in weights])[:, None, None]
-    return (image.real**2 + image.imag**2) * (sample_um / pupil.period_um) ** 2 / light  # Parseval over a period
+    share = (sample_um / pupil.period_um) ** 2 / aperture_light(pupil, samples * sample_um)  # Parseval over a period
+    return (image.real**2 + image.imag**2) * share
 
 
 @functools.lru_cache(maxsize=64)

@@ -34,11 +34,17 @@ def _coefficients(scale=0.5):
 def _on_samples(fine, settings):
     """Fine intensities integrated over samples and low-passed to the grid of the samples, by two plain sums."""
     period, step = settings.pupil.period_um, settings.sample_um
-    top = math.floor(period / (2 * step))
-    frequency = torch.arange(-top, top + 1, dtype=torch.float64) / period
+    edge = period / (2 * step)
+    top = math.floor(edge + 0.5)
+    number = torch.arange(-top, top + 1, dtype=torch.float64)
+    frequency, kept = number / period, (edge - number.abs() + 0.5).clamp(0, 1)
     from_x = (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2) * step / settings.fine
     to_x = (torch.arange(settings.window_samples) - (settings.window_samples - 1) / 2) * step
-    rows = torch.sinc(frequency * step) * torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
+    rows = (
+        kept
+        * torch.sinc(frequency * step)
+        * torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
+    )
     taps = rows.sum(-1) * step / period
     return taps @ fine @ taps.mT
 

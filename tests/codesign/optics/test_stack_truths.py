@@ -85,14 +85,45 @@ def summed(settings, phase_rad):
     carriers, _ = optics._carriers(settings)
     pupil, light = settings.pupil, carriers[4].numpy() * np.exp(1j * phase_rad)
     nodes = light.shape[0]
-    most = math.floor(pupil.period_um / 14.0)
+    edge = pupil.period_um / 14.0
+    most = math.floor(edge + 0.5)
     auto = np.fft.fft2(np.abs(np.fft.fft2(light, s=(3 * nodes, 3 * nodes))) ** 2) / (3 * nodes) ** 2
     harmonic = np.arange(-most, most + 1)
-    sinc = np.sinc(harmonic / pupil.period_um * 7.0)
+    sinc = np.sinc(harmonic / pupil.period_um * 7.0) * np.clip(edge - np.abs(harmonic) + 0.5, 0, 1)
     place = (np.arange(21) - 10) * 7.0
     wave = np.exp(2j * np.pi * np.outer(place, harmonic) / pupil.period_um) * sinc
     kept = auto[np.ix_(harmonic, harmonic)]
-    return (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / (np.abs(light) ** 2).sum()
+    given = np.pi * (350.0 / 1600 / (2 * pupil.edge / nodes)) ** 2  # nodes of the aperture, as its area
+    given *= 1 - 2 * math.sqrt(2) * 147.0 / (3 * 2 * math.pi / 0.79 * pupil.edge * pupil.period_um**2)
+    return (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / given
+
+
+@pytest.mark.parametrize(
+    ("aperture_mm", "distance_mm", "samples", "sample_um", "within"),
+    [(0.3, 2.2, 33, 3.0, 1e-3), (0.5, 4.0, 31, 3.3, 1e-3), (0.5, 4.0, 15, 6.0, 1e-3), (0.3, 2.2, 21, 9.0, 2e-3)],
+)
+def test_a_window_holds_what_a_round_aperture_sends_to_its_samples(
+    aperture_mm, distance_mm, samples, sample_um, within
+):
+    """(2 / π) (acos ρ - ρ √(1 - ρ²)), ρ = λ f / 2 NA, times the samples' sinc, over frequencies to 1 / (2 samples).
+
+    0.95 to 0.99 of the light. Nodes across the rim counted by their squares it is 1e-2 too bright; with the last
+    harmonic whole, or left out, 1e-2 off where samples are coarse. The first samples are so fine that nodes have
+    fewer harmonics than they show.
+    """
+    settings = OpticsConfig(
+        aperture_mm=aperture_mm, sensor_distance_mm=distance_mm, focus_mm=20.0, depths_mm=(20.0, 40.0), depth_count=2,
+        sample_um=sample_um, window_samples=samples, polynomials=0,
+    )  # fmt: skip
+    light = float(optics.stack(settings, torch.zeros(0)).intensity[0].double().sum())
+    node, weight = np.polynomial.legendre.leggauss(200)
+    f, weight = (node + 1) / (4 * sample_um), weight / (4 * sample_um)
+    place = (np.arange(samples) - (samples - 1) / 2) * sample_um
+    row = 2 * np.cos(2 * np.pi * np.outer(place, f)).sum(0) * np.sinc(f * sample_um) * sample_um * weight
+    sine = aperture_mm / 2 / math.hypot(aperture_mm / 2, distance_mm)
+    rho = np.clip(0.85 * np.hypot(f[:, None], f) / (2 * sine), 0, 1)
+    want = float(row @ (2 / np.pi * (np.arccos(rho) - rho * np.sqrt(1 - rho**2))) @ row)
+    assert light / want == pytest.approx(1, abs=within)
 
 
 BENT = replace(OWN, polynomials=4, zones=2)
