@@ -205,7 +205,7 @@ def stack(settings: OpticsConfig, coefficients_rad: Tensor, *, error: LensError 
 
 def added_phase(settings: OpticsConfig, coefficients_rad: Tensor) -> Tensor:
     """(nodes, nodes) phase on top of the hyperbolic focus: what the lens starts from, and the polynomials."""
-    phase = _vortices(settings)
+    phase = _start(settings)
     if settings.polynomials:
         phase = phase + torch.einsum("n,nyx->yx", coefficients_rad.double(), _modes(settings))
     return phase
@@ -258,18 +258,14 @@ def _modes(settings: OpticsConfig) -> Tensor:
 
 
 @functools.lru_cache(maxsize=8)
-def _vortices(settings: OpticsConfig) -> Tensor:
+def _start(settings: OpticsConfig) -> Tensor:
     return settings.start.phase_rad(_seen(settings).x_um, _seen(settings).y_um)
-
-
-def _field(settings: OpticsConfig) -> Field:
-    return Field(math.radians(settings.angle_deg))
 
 
 @functools.lru_cache(maxsize=8)
 def _seen(settings: OpticsConfig) -> Seen:
     """The pupil from where the chief ray meets the sensor; its nodes are those of the lens on axis."""
-    return view(settings.pupil, _field(settings), settings.focus_mm * 1e3)
+    return view(settings.pupil, Field(math.radians(settings.angle_deg)), settings.focus_mm * 1e3)
 
 
 @functools.lru_cache(maxsize=8)
@@ -279,10 +275,10 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
     The size leaves the autocorrelation free of wrap-around at all frequencies that are kept. complex64.
     """
     seen, k = _seen(settings), 2 * math.pi / settings.pupil.wavelength_um
-    tangents = _field(settings).tangents
+    tangents = Field(math.radians(settings.angle_deg)).tangents
     paths = [source_path(seen.x_um, seen.y_um, tangents, 1 / float(z)) for z in settings.depths_um]
     angle = torch.remainder(seen.lens_rad + k * torch.stack(paths), 2 * math.pi)
-    size = scipy.fft.next_fast_len(settings.pupil.nodes + _frequencies(settings) + 1)
+    size = scipy.fft.next_fast_len(settings.pupil.nodes + len(_kept(settings)))
     light = torch.polar(seen.weight, angle)
     if settings.layers is not None and settings.layers.stop is not None:
         about = settings.pupil.wavelength_um, (seen.x_um.numpy(), seen.y_um.numpy()), settings.pupil.step_um
@@ -291,24 +287,26 @@ def _carriers(settings: OpticsConfig) -> tuple[Tensor, tuple[int, int]]:
     return light.to(torch.complex64), (size, size)
 
 
-def _frequencies(settings: OpticsConfig) -> int:
-    """Harmonics of the pupil's period that the grid of the samples can show, the last in part; that its nodes have."""
-    return min(math.floor(settings.pupil.period_um / (2 * settings.sample_um) + 0.5), settings.pupil.nodes)
+def _kept(settings: OpticsConfig) -> Tensor:
+    """Share of each harmonic of the pupil's period that the grid of the samples can show, of those that nodes have."""
+    edge = settings.pupil.period_um / (2 * settings.sample_um)
+    last = min(math.floor(edge + 0.5), settings.pupil.nodes)
+    number = torch.arange(last + 1, dtype=torch.float64)
+    return (edge - number + 0.5).clamp(0, 1)  # the last in part, so that the width of the period does not matter
 
 
 @functools.lru_cache(maxsize=8)
 def _sample_rows(settings: OpticsConfig) -> tuple[Tensor, Tensor]:
     """(samples, all frequencies) and (frequencies >= 0, samples): transfer function to the light on each sample."""
     pupil, size = settings.pupil, settings.window_samples
-    number = torch.arange(_frequencies(settings) + 1, dtype=torch.float64)
-    harmonic, edge = number / pupil.period_um, pupil.period_um / (2 * settings.sample_um)
-    kept = (edge - number + 0.5).clamp(0, 1)  # the last in part, so that the width of the period does not matter
+    kept = _kept(settings)
+    harmonic = torch.arange(len(kept), dtype=torch.float64) / pupil.period_um
     place = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * settings.sample_um
     half = torch.exp(2j * math.pi * place[:, None] * harmonic) * (kept * torch.sinc(harmonic * settings.sample_um))
     rows = torch.cat([half, half[:, 1:].flip(1).conj()], 1)
     columns = half * torch.where(harmonic == 0, 1.0, 2.0)  # the other half of the frequencies is its conjugate
-    nodes_light = aperture_light(pupil, size * settings.sample_um) * _carriers(settings)[1][0] ** 2
-    scale = (settings.sample_um / pupil.period_um) ** 2 / nodes_light
+    given = aperture_light(pupil, size * settings.sample_um) * _carriers(settings)[1][0] ** 2
+    scale = (settings.sample_um / pupil.period_um) ** 2 / given
     return (rows * scale).to(torch.complex64), columns.mT.contiguous().to(torch.complex64)
 
 
@@ -326,8 +324,8 @@ def phase_at(
 
 
 def _error_phase(settings: OpticsConfig, error: LensError) -> Tensor:
-    x, y = (c.double() / settings.pupil.radius_um for c in (_seen(settings).x_um, _seen(settings).y_um))
-    return _wave_front(settings, error, x, y)
+    seen, rim = _seen(settings), settings.pupil.radius_um
+    return _wave_front(settings, error, seen.x_um / rim, seen.y_um / rim)
 
 
 def _wave_front(settings: OpticsConfig, error: LensError, x: Tensor, y: Tensor) -> Tensor:

@@ -40,12 +40,8 @@ def _on_samples(fine, settings):
     frequency, kept = number / period, (edge - number.abs() + 0.5).clamp(0, 1)
     from_x = (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2) * step / settings.fine
     to_x = (torch.arange(settings.window_samples) - (settings.window_samples - 1) / 2) * step
-    rows = (
-        kept
-        * torch.sinc(frequency * step)
-        * torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
-    )
-    taps = rows.sum(-1) * step / period
+    waves = torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
+    taps = (kept * torch.sinc(frequency * step) * waves).sum(-1) * step / period
     return taps @ fine @ taps.mT
 
 
