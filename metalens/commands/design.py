@@ -130,7 +130,8 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Design the lens, check its focus, write it; exit 1 where the light does not focus where it should."""
+    """Design the lens, check its focus, write it; exit 1 where light does not focus as it should or pillars are hardly
+    known."""
     wanted = config.load(options.config, Design, empty=False)
     target, read = options.output, _read(wanted, options.config)
     if wanted.library is not None and paired.holds(options.config.parent / wanted.library):
@@ -150,7 +151,8 @@ def run(options: Options) -> int:
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
     options.console.result(values, text)
-    return 0 if all(one is None or one.passed for one in (made.check, *(b.check for b in made.beside))) else 1
+    focused = all(one is None or one.passed for one in (made.check, *(b.check for b in made.beside)))
+    return 0 if focused and not made.lens.proxy.doubt else 1
 
 
 def _head(wanted: Design, target: Path, quality: Quality) -> str:

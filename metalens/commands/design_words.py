@@ -129,17 +129,21 @@ def curve(proxy: Proxy) -> dict[str, object]:
     return {
         "proxy_phase_error_rad": proxy.max_phase_error_rad,
         "proxy_transmission_error": proxy.max_transmission_error,
+        "entry_error": proxy.entry_error,
     }
 
 
 def held(made: Lens) -> str:
-    """What is known of its pillars, in words: how close to solved ones; and for which light, where pillars of one size
+    """What is known of its pillars, in words: how close to solved ones, and whether those are known at
+    all; for which light, where pillars of one size
     answer x and y apart."""
     phase, level = made.proxy.max_phase_error_rad, made.proxy.max_transmission_error
     known = (
         f"\n  what follows takes pillars by a curve, within {phase:.1e} rad and {level:.1e} of |T| of those solved for "
         "the library"
     )
+    if made.proxy.doubt:
+        known += f"\n  FAILED: {made.proxy.doubt}"
     if not made.one_light:
         return known
     return known + (

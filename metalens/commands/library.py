@@ -16,9 +16,21 @@ from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, reading, store
 from metalens.ground.errors import DomainError
-from metalens.pillars import DEFAULT_CELL, PillarLibrary, ProxyFit, Sweep, Wanted, axes, converted, workers
+from metalens.pillars import (
+    DEFAULT_CELL,
+    MOST_ERROR,
+    PillarLibrary,
+    ProxyFit,
+    Sweep,
+    Wanted,
+    axes,
+    converted,
+    workers,
+)
 from metalens.pillars import fit as proxy_fit
 from metalens.pillars.circular import Turned
+
+MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +122,12 @@ def _failures(
                 "sweep with more samples, or loosen phase_tolerance_rad and transmission_tolerance"
             )
         failures.append(f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: {cure}")
-    if fitted is not None and fitted.shortfall:
-        failures.append(fitted.shortfall)
+    if (hardly := float((made.t_error > MOST_ERROR).mean())) > MOST_UNKNOWN:
+        failures.append(f"error bars of {hardly:.0%} of the entries are above {MOST_ERROR:g}, whatever is asked for")
+    if fitted is not None:
+        failures += filter(None, [fitted.shortfall, fitted.proxy.doubt])
+    if made.turned is not None and (bar := _circular(made.turned)["converted_error"]) > MOST_ERROR:
+        failures.append(f"the share that changes hand is known within {bar:.2g} alone, {MOST_ERROR:g} at the most")
     return failures
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from metalens.pillars import workers as workers
     from metalens.pillars.fit import ProxyFit as ProxyFit
     from metalens.pillars.fit import Wanted as Wanted
+    from metalens.pillars.proxy import MOST_ERROR as MOST_ERROR
     from metalens.pillars.proxy import Proxy as Proxy
     from metalens.pillars.record import DEFAULT_CELL as DEFAULT_CELL
     from metalens.pillars.record import PillarLibrary as PillarLibrary
@@ -31,6 +32,7 @@ __getattr__, __dir__, __all__ = attach(
         "study_plots": "",
         "DEFAULT_CELL": "record",
         "Journal": "workers",
+        "MOST_ERROR": "proxy",
         "PillarLibrary": "record",
         "Proxy": "proxy",
         "ProxyFit": "fit",

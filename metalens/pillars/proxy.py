@@ -13,6 +13,7 @@ from metalens.pillars import inverse, polynomial
 from metalens.pillars.inverse import Values
 
 AVERAGED = 65  # diameters over which |t| is averaged
+MOST_ERROR = 0.1  # of t: the largest tolerance of a library; pillars known less well (root mean square) make no lens
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,6 +111,20 @@ class Proxy:
         """What t by the curves may be wrong by, relative to its mean: deviation from entries, and the entries' own."""
         level = np.asarray(self.transmission(np.linspace(*self.domain_um, AVERAGED), wavelength_um)).mean()
         return math.hypot(self.max_phase_error_rad, self.max_transmission_error / float(level), self.entry_error)
+
+    @property
+    def doubt(self) -> str:
+        """Why no lens is to be made of these pillars, for a person: how little a solver knows of them; else empty.
+
+        Not for the curve's own deviation: that is the tolerances' of a fit.
+        """
+        if self.entry_error <= MOST_ERROR:
+            return ""
+        return (
+            f"the pillars' own error bars are {self.entry_error:.2g} of |t| (root mean square), {MOST_ERROR:g} at the "
+            "most for a lens: take lower pillars, a smaller pitch, or a shape with fewer corners and with mirrors "
+            "along x and y, which its solver knows better"
+        )
 
     def monotone(
         self, wavelength_um: float, angle_rad: float = 0.0, within_um: tuple[float, float] | None = None

@@ -17,7 +17,7 @@ from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.pillars.circular import Turned
 from metalens.pillars.circular import check as check_turned
-from metalens.pillars.proxy import Proxy
+from metalens.pillars.proxy import MOST_ERROR, Proxy
 
 # Hydrogenated amorphous silicon deposited for near-infrared optics: n of 3.5-3.7 and hardly any loss. The evaporated
 # film of Pierce and Spicer ("a-Si") absorbs so much that its pillars stay below |t| = 0.8 before half a turn.
@@ -64,8 +64,8 @@ class Sweep:
             raise ConfigError(f"angles_deg = {list(self.angles_deg)}: need 0 <= angle < 90")
         if not 20 <= self.samples <= 100_000:
             raise ConfigError(f"samples = {self.samples}: need 20 to 100000")
-        if self.tolerance is not None and not 1e-8 <= self.tolerance <= 0.1:
-            raise ConfigError(f"tolerance = {self.tolerance}: need 1e-8 to 0.1")
+        if self.tolerance is not None and not 1e-8 <= self.tolerance <= MOST_ERROR:
+            raise ConfigError(f"tolerance = {self.tolerance}: need 1e-8 to {MOST_ERROR:g}")
         if self.engine not in ("auto", "rcwa", "modal"):
             raise ConfigError(f"engine = {self.engine!r}: need auto, rcwa or modal")
         if self.light == "circular" and self.angles_deg != (0.0,):

@@ -10,6 +10,7 @@ from metalens.pillars.record import PillarLibrary
 
 LEAST_ENTRIES = 12
 REACH = 2.0  # half-widths from a narrow resonance that are cut with it
+UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,7 +37,7 @@ def stretch(
 ) -> Stretch:
     """The stretch of most phase over which, at all wavelengths, angles and polarisations, |t| stays above
     ``least_transmission``, the phase rises (of openings, which leave less film the wider they are, falls), and no
-    resonance is narrower than ``least_half_width_um``.
+    resonance is narrower than ``least_half_width_um`` and no error bar above half of |t|.
 
     Raises:
         DomainError: fewer than 12 entries in any such stretch; the message says what is in the way.
@@ -69,6 +70,9 @@ def _faults(
     level = np.abs(t)
     dark = np.asarray((level < least).any(axis=(0, 1, 2)))
     faults.append((dark, f"|t| falls to {level.min():.2f}, below {least:g}"))
+    bars = library.t_error[..., np.isin(library.diameter_um, d)]
+    unknown = np.asarray((bars > UNKNOWN * level).any(axis=(0, 1, 2)))
+    faults.append((unknown, f"error bars reach {bars.max():.2g}, above half of |t|"))
     hole = library.cell.shape.hole
     turns = (np.diff(phase, axis=-1) * (-1 if hole else 1) < 0).any(axis=(0, 1, 2))
     back = np.zeros(len(d), bool)

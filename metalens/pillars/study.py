@@ -13,8 +13,9 @@ from metalens.ground.console import Console
 from metalens.ground.errors import CellError, ConfigError
 from metalens.pillars import engines, workers
 from metalens.pillars.curve import Curve
+from metalens.pillars.proxy import MOST_ERROR
 from metalens.pillars.record import PLAIN, Sweep, check_light
-from metalens.pillars.stretch import REACH
+from metalens.pillars.stretch import REACH, UNKNOWN
 from metalens.pillars.workers import Journal
 
 TURN = 2 * math.pi
@@ -32,7 +33,7 @@ class Study:
     min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and between two.
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
-    tolerance: error of t.
+    tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end a stretch.
     others: materials that the chosen cell is tried with as well, where their sources hold all the wavelengths.
     """
 
@@ -51,6 +52,8 @@ class Study:
     def __post_init__(self) -> None:
         if self.cell is not None and self.pillar != PLAIN:
             raise ConfigError("pillar and cell are both given: a cell has its own material; give pillar inside cell")
+        if self.tolerance > MOST_ERROR:
+            raise ConfigError(f"tolerance = {self.tolerance}: need an error of t above 0 and up to {MOST_ERROR:g}")
         if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
             raise ConfigError(
                 f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
@@ -172,6 +175,7 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
     level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
     back = "the phase rises" if hole else "the phase falls"
     faults = {"|t| falls": level < study.least_transmission, back: np.diff(phase, append=np.inf) < 0}
+    faults["an error bar above half of |t|"] = error > UNKNOWN * level
     sharp = np.zeros(SAMPLES, bool)
     for centre, width in curve.resonances(study.least_half_width_um):
         sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])

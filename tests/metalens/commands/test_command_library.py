@@ -100,18 +100,24 @@ samples = 40
 """
 
 
+def known_within(d, bars):
+    """A sweep whose pillars have |t| of 0.95, a ripple of 3 mrad and these error bars."""
+    t = (0.95 * np.exp(1j * (40 * d + 3e-3 * np.sin(900 * d))))[None, None, None]
+
+    def swept(cell, settings=None, *, wavelengths_um=(0.6,), **_):
+        settings = (settings or library.Sweep(wavelengths_um)).settled(cell)
+        about = {"resonances": np.zeros((0, 5)), "engine": "rcwa", "solves": 13}
+        one = np.array([0.6]), d, t, 0 * t, bars[None, None, None], np.abs(t) ** 2
+        return library.PillarLibrary(cell, settings, ("x",), np.zeros(1), *one, **about)
+
+    return swept
+
+
 def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(cell, monkeypatch, capsys):
     """A smooth curve with bars of 0.012, wider beside one size: told, and no failure unless 1e-2 was asked for."""
     d = np.linspace(0.12, 0.2, 40)
     bars = np.where(np.abs(d - 0.13) < 3e-3, 0.05, 0.012)
-    t = (0.95 * np.exp(1j * (40 * d + 3e-3 * np.sin(900 * d))))[None, None, None]
-
-    def swept(cell, settings, **_):
-        about = {"resonances": np.zeros((0, 5)), "engine": "rcwa", "solves": 13}
-        one = np.array([0.6]), d, t, 0 * t, bars[None, None, None], np.abs(t) ** 2
-        return library.PillarLibrary(cell, settings.settled(cell), ("x",), np.zeros(1), *one, **about)
-
-    monkeypatch.setattr(library, "sweep", swept)
+    monkeypatch.setattr(library, "sweep", known_within(d, bars))
     assert cell(SQUARES, "--accept-partial-turn") == 0
     told = capsys.readouterr().out
     assert "3 of 40 error bars are above the tolerance 0.02 (largest 0.05)" in told
@@ -226,3 +232,30 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
     path.write_text(ANY_CELL.replace("[cell]", 'pillar = "Si"\n[cell]'))
     assert main(["study", str(path), "-o", str(out), "--force"]) == 2
     assert "give pillar inside cell" in capsys.readouterr().err
+
+
+def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_asked(
+    cell, tmp_path, monkeypatch, capsys
+):
+    """Bars of 0.2 of |t|: no curve, tolerance or coverage that is accepted makes them good."""
+    d = np.linspace(0.12, 0.2, 40)
+    few = np.where(np.arange(40) < 21, 0.09, 0.12)
+    loose = "[proxy]\nphase_tolerance_rad = 0.5\ntransmission_tolerance = 0.5\n"
+    told = []
+    for bars in (0.19 + 0 * d, few):
+        monkeypatch.setattr(library, "sweep", known_within(d, bars))
+        assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 1
+        told.append(capsys.readouterr().out)
+    assert "error bars of 100% of the entries are above 0.1" in told[0]
+    assert "FAILED: the pillars' own error bars are 0.2 of |t| (root mean square)" in told[0]
+    assert "of the entries are above 0.1" not in told[1]  # 48 % of them
+    assert "FAILED: the pillars' own error bars are 0.11 of |t|" in told[1]
+    config = 'library = "library.h5"\naperture_mm = 0.006\nsensor_distance_mm = 0.2\nsource_distance_mm = inf\n'
+    (tmp_path / "design.toml").write_text(config + "[limits]\nmin_diameter_nm = 80\nmin_gap_nm = 80\n")
+    words = ["design", str(tmp_path / "design.toml"), "-o", str(tmp_path / "lens.h5"), "--accept-partial-turn"]
+    assert main([*words, "--skip-focus-check"]) == 1
+    assert "FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out
+    monkeypatch.setattr(library, "sweep", known_within(d, 0.05 + 0 * d))
+    assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 0
+    assert main([*words, "--skip-focus-check", "--force"]) == 0
+    assert "FAILED" not in capsys.readouterr().out

@@ -166,6 +166,26 @@ def test_openings_in_a_film_are_the_mirror_image_of_pillars():
         proxy_fit.fit(dataclasses.replace(pillars, cell=cell))
 
 
+def test_an_entry_whose_bar_is_above_half_of_its_light_cuts_the_domain():
+    made = synthetic()
+    bars = made.t_error.copy()
+    bars[..., 130] = 0.51 * np.abs(made.t[..., 130])
+    bars[..., 20] = 0.49 * np.abs(made.t[..., 20])
+    found = smooth.stretch(dataclasses.replace(made, t_error=bars), least_transmission=0.7, least_half_width_um=0.005)
+    assert (found.diameter_um[0], found.diameter_um[-1]) == (made.diameter_um[0], made.diameter_um[129])
+    assert any(f"error bars reach {bars[..., 130].max():.2g}, above half of |t|" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(0.97, False), (1.03, True)])
+def test_pillars_whose_bars_are_a_tenth_of_their_light_are_doubted(scale, doubted):
+    """Bars of 0.02 and of sqrt(2 x 0.1² - 0.02²) in turn are a tenth of |t|, root mean square."""
+    made = synthetic(samples=160)
+    bars = scale * np.abs(made.t) * np.where(np.arange(160) % 2, 0.02, math.sqrt(2 * 0.01 - 4e-4))
+    found = proxy_fit.fit(dataclasses.replace(made, t_error=bars)).proxy
+    assert bool(found.doubt) is doubted
+    assert not doubted or "bars are 0.1 of |t| (root mean square), 0.1 at the most" in found.doubt
+
+
 def test_resonances_everywhere_are_refused():
     dense = [(0, 0.0, 0.85, c, 0.004) for c in np.arange(0.06, 0.22, 0.01)]
     with pytest.raises(DomainError, match=r"no 12 diameters in a row .* choose another pitch"):

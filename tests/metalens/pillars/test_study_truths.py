@@ -9,7 +9,7 @@ import pytest
 
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Ellipse, Rectangle
-from metalens.ground.errors import CellError
+from metalens.ground.errors import CellError, ConfigError
 from metalens.pillars import converted, study
 
 CELL = Cell(0.36, 0.6, Index(3.2), Index(1.45), Index(1.0), Index(1.0))
@@ -61,6 +61,23 @@ def test_openings_cover_what_their_mirror_image_does():
     found, other = study.judge(ABOUT, opening, 0.85, Mirrored(0.175)), study.judge(ABOUT, CELL, 0.85, Curve(0.175))
     assert dataclasses.asdict(found) == pytest.approx(dataclasses.asdict(other))
     assert study.judge(ABOUT, opening, 0.85, Curve()).turns == 0  # rises: no opening does
+
+
+def test_diameters_whose_bars_are_above_half_of_their_light_end_a_stretch():
+    """0.4 at 0.1 um, rising by 1.7 per um, is half of 0.95 - D where 0.4 + 1.7 (D - 0.1) = 0.425 - (D - 0.1) / 2."""
+
+    class Hardly(Curve):
+        def __call__(self, d):
+            return super().__call__(d)[0], 0.4 + 1.7 * (d - 0.1)
+
+    found = study.judge(ABOUT, CELL, 0.85, Hardly())
+    assert found.to_um == pytest.approx(0.1 + 0.025 / 2.2, abs=0.1 / study.SAMPLES)
+    assert found.ends == "an error bar above half of |t|"
+
+
+def test_a_study_asks_for_errors_that_a_library_may_have():
+    with pytest.raises(ConfigError, match=r"tolerance = 0\.11: need an error of t above 0 and up to 0\.1"):
+        study.Study(tolerance=0.11)
 
 
 @pytest.mark.parametrize(("at", "low", "high"), [(0.175, 0.1, 0.175 - 0.004), (0.112, 0.112 + 0.004, 0.2)])
