@@ -1,8 +1,9 @@
 """A default is a promise: who leaves a key or an argument out gets tomorrow what he gets today.
 
-``tests/defaults.txt`` is the list that was promised; whoever changes a default changes its line there too, and says so
-in the change log. What is new need not stand in it; a name that goes takes its line along. So are priors, by which the
-intervals of every fit without metrology are what they are: ``tests/priors.txt``.
+``tests/defaults.txt`` is the list that was promised, of numbers and of names that stand for one; whoever changes a
+default changes its line there too, and says so in the change log. What is new need not stand in it; a name that goes
+takes its line along. So are priors, by which the intervals of every fit without metrology are what they are:
+``tests/priors.txt``.
 """
 
 import ast
@@ -13,6 +14,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROMISED = dict(line.split(" = ", 1) for line in (Path(__file__).parent / "defaults.txt").read_text().splitlines())
+
+
+def constants(tree: ast.Module) -> dict[str, ast.expr]:
+    """Values of the names that a module gives, by which a default may stand."""
+    found = {}
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            target, value = node.targets[0], node.value
+            pairs = [(target, value)]
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs = list(zip(target.elts, value.elts, strict=True))
+            found |= {name.id: of for name, of in pairs if isinstance(name, ast.Name)}
+    return found
 
 
 def number(node: ast.expr | None) -> bool:
@@ -47,9 +61,12 @@ def found(package: str) -> dict[str, str]:
     out = {}
     for path in sorted((ROOT / package).rglob("*.py")):
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        named = constants(tree)
+        for node in tree.body:
             if not isinstance(node, ast.AnnAssign):  # a constant of the module is no default
-                out |= {name: ast.unparse(value) for name, value in given(node, module) if number(value)}
+                defaults = [(name, named.get(getattr(value, "id", ""), value)) for name, value in given(node, module)]
+                out |= {name: ast.unparse(value) for name, value in defaults if number(value)}
     return out
 
 
@@ -86,6 +103,17 @@ def test_priors_are_the_promised_ones():
     ]
     here += [f"{row.name}: 0 +- {row.sigma:g}, never fitted" for row in UNFITTED]
     assert here == (Path(__file__).parent / "priors.txt").read_text(encoding="utf-8").splitlines()
+
+
+def test_a_default_by_name_is_the_number_that_the_module_gives_it():
+    """Of a name alone and of two at once; what a call makes is no number."""
+    tree = ast.parse("LEAST = 0.03\nNODES, MOST = 17, make()\n(A, B) = pair()\ndef at(x=LEAST, n=NODES, m=MOST): ...\n")
+    named = constants(tree)
+    read = {name: named[value.id] for name, value in given(tree.body[-1], "m") if isinstance(value, ast.Name)}
+    assert {name: ast.unparse(value) for name, value in read.items() if number(value)} == {
+        "m.at(x)": "0.03",
+        "m.at(n)": "17",
+    }
 
 
 def test_defaults_are_read_from_fields_arguments_and_methods():

@@ -69,3 +69,14 @@ def test_a_bounded_fit_reaches_the_minimum_between_the_bounds():
 def test_limits_that_leave_no_room_give_no_step():
     found = constrained.step(np.eye(4), np.ones(4), np.zeros(4), low=np.zeros(4), high=np.zeros(4))
     assert not found.any()
+
+
+@pytest.mark.parametrize("far", [1e-3, 1.0, 1e5])
+def test_a_step_is_found_to_a_share_of_sigma_however_long_it_is(far):
+    """Of the default tolerance: between bounds of 0.4 sigma to 40 000, against an independent solver."""
+    jacobian, target = problem(5)
+    target, low, high = far * target, np.full(4, -0.4 * far), far * np.array([0.3, 0.2, 0.5, 0.1])
+    want = optimize.lsq_linear(jacobian, target, (low, high), tol=1e-14).x
+    found = constrained.step(jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high)
+    sigma = 1 / np.sqrt(np.diag(jacobian.T @ jacobian))
+    assert np.abs((found - want) / sigma).max() < 3e-3  # it ends where a further step is below 1e-3

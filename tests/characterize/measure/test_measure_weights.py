@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import special, stats
 
 from characterize.measure import frames, metrics, overlay, sem
 
@@ -83,3 +84,20 @@ def test_pillars_nearly_of_one_size_are_laid_by_what_little_they_differ():
     slope = np.clip(np.cov(x.ravel(), made.ravel(), bias=True)[0, 1] / x.var(), 2 / 3, 4 / 3)
     rest = made - made.mean() - slope * (x - x.mean())
     assert scatter[1, 1] == pytest.approx((rest**2).mean(), rel=1e-4)  # differences of squares of 180
+
+
+def test_the_line_of_an_edge_lies_in_the_middle_of_the_square_of_its_slope():
+    """An edge with a foot of half its height 5 pixels behind, as integrals: smoothed by one pixel (first slope), about
+    the line within 12, 8, then 6 pixels. Of the slope itself it lay 0.4 pixels farther to the foot, of its cube 0.3
+    nearer to the edge."""
+    rows, columns = np.arange(40), np.arange(90)
+    place = 37.4 + 0.11 * rows[:, None]
+    image = special.ndtr((columns - place) / 1.6) + 0.5 * special.ndtr((columns - place - 5) / 2.1)
+    fine, middle = np.linspace(-40, 45, 17001), 0.0
+    steep = sum(a * stats.norm.pdf(fine, at, math.hypot(s, 1)) for a, at, s in ((1.0, 0.0, 1.6), (0.5, 5.0, 2.1)))
+    for reach in (math.inf, 12, 8, 6):
+        weight = np.exp(-0.5 * ((fine - middle) / reach) ** 2) * steep**2
+        middle = (weight * fine).sum() / weight.sum()
+    slope, offset = metrics._edge_line(image, rows)
+    assert slope == pytest.approx(0.11, abs=1e-3)
+    assert slope * 20 + offset == pytest.approx(37.4 + 2.2 + middle, abs=0.02)  # pixels in place of integrals

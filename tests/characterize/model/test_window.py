@@ -103,3 +103,44 @@ def test_real_weights_of_complex_values_are_their_product(kind, of):
         got = window.weighted(weights, some)
         assert got.dtype == of
         assert got == pytest.approx(weights.astype(float) @ some, abs=1e-5 if kind is np.float32 else 1e-13)
+
+
+RIM_UM = 28.0
+
+
+@pytest.fixture(scope="module")
+def waves_missed():
+    """{samples taken together: (their even places, rms over the band of what they leave of a plane wave at every place
+    of a window from -31 to 30)}: the nearest ones, by least squares over 60 waves of the band."""
+    band, (t, share) = 0.9, np.polynomial.legendre.leggauss(60)
+    step, at = math.pi / band / window.ROOM, np.linspace(-31.0, 30.0, 82)
+    root = np.sqrt(np.r_[share, share] / 2)
+    missed = {}
+    for taps in range(6, 42, 2):
+        count = max(math.ceil(61.0 / step) + 1, math.ceil((61.0 - 2 * RIM_UM) / step) + taps)  # beyond but the rim
+        coarse, rms = -0.5 + (np.arange(count) - (count - 1) / 2) * step, []
+        for place in at:
+            some = np.argsort(np.abs(coarse - place), kind="stable")[:taps]
+            turn = band * t[:, None] * (coarse[some] - place)  # the wave at the place is 1
+            parts = np.concatenate([np.cos(turn), np.sin(turn)]) * root[:, None]
+            goal = np.r_[root[:60], np.zeros(60)]
+            rms.append(np.linalg.norm(parts @ np.linalg.lstsq(parts, goal, rcond=None)[0] - goal))
+        missed[taps] = coarse, np.array(rms)
+    return band, at, missed
+
+
+@pytest.mark.parametrize("tolerance", np.geomspace(5e-2, 5e-3, 24))
+def test_as_few_samples_are_taken_together_as_a_tenth_of_the_tolerance_asks_and_all_of_it_at_the_rim(
+    waves_missed, tolerance
+):
+    """In the rim of 28 um, which lies beside what is seen, ten times as much may be missed."""
+    band, at, missed = waves_missed
+    inner = np.abs(at + 0.5) <= 30.5 - RIM_UM
+    enough = min(
+        n
+        for n, (_, rms) in missed.items()
+        if rms[inner].max() < 0.1 * tolerance and rms[~inner].max() < 1.0 * tolerance
+    )
+    places, weights = window._resampled(-31.0, 30.0, 82, band, float(tolerance), RIM_UM)
+    assert places == pytest.approx(missed[enough][0], abs=1e-12)
+    assert np.count_nonzero(weights, axis=1).max() == enough

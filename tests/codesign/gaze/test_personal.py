@@ -1,6 +1,7 @@
 """Personal calibration: an eye off the mean is found from a few points, noise does not make it wild."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,3 +81,23 @@ def test_angles_between_directions():
 def test_two_points_are_refused():
     with pytest.raises(TrainingError, match="2 points"):
         personal.fit(np.zeros((2, 2)), np.zeros((2, 3)), np.zeros((2, 2)), rig=RIG)
+
+
+def test_a_person_of_few_points_is_drawn_to_the_mean_by_what_people_differ_by():
+    """The most likely person: what a step of one standard deviation (1 mm each way, 0.6 mm of radius, 5 degrees, 0.05
+    rad) changes of the squared misses is in one proportion to how many of them the person is off."""
+    pupil, slip, gaze = _person(SLIPS[:1], beside=(0.9, -0.7, 0.8), larger=-0.5)
+    some = np.random.default_rng(2).permutation(len(gaze))[:5]
+    gaze = gaze[some] + np.random.default_rng(3).normal(0, 1.5, (5, 2))
+    person = personal.fit(pupil[some], slip[some], gaze, rig=RIG, hidden=0)
+    differ = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
+
+    def missed(unit):
+        return ((replace(person, own=unit * differ).sphere(pupil[some], slip[some]) - gaze) ** 2).sum()
+
+    at = person.own / differ
+    slope = np.array([missed(at + step) - missed(at - step) for step in 1e-4 * np.eye(7)]) / 2e-4
+    left = -(slope @ at) / (at @ at)
+    assert left > 0
+    assert np.abs(slope + left * at).max() < 0.01 * left * np.abs(at).max()  # where the search ends: 1e-4 of it
+    assert np.abs(at).min() > 0.02  # none is at the mean, which would say nothing

@@ -151,7 +151,7 @@ def test_the_uncertainty_moves_nothing_but_itself():
     value.backward()
     assert slip.grad is None or not bool(slip.grad.any())
     miss = slip.detach() - torch.tensor([[0.6, 0.9 / 0.7, -2.0 / 3.0]])
-    want = losses.SPREAD_WEIGHT / 3 * (1 - miss**2 * torch.exp(-2 * spread.detach()))
+    want = 0.1 / 3 * (1 - miss**2 * torch.exp(-2 * spread.detach()))
     assert torch.allclose(spread.grad, want, rtol=1e-5)
     plain = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip)
     assert float(losses.reading(plain, torch.zeros(1, 7, 7), slip.detach(), torch.ones(3), depth_weight=0.5)) == 0

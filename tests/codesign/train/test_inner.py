@@ -255,3 +255,19 @@ def test_only_the_weights_of_the_network_decay():
     """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would shrink."""
     decay = {name: made.param_groups[0]["weight_decay"] for name, made in _trainer().optimisers.items()}
     assert decay == {"weights": 0.01, "reading": 0.01, "optics": 0.0, "pitch": 0.0}
+
+
+def test_what_has_no_rate_now_keeps_its_value_and_its_moments():
+    """A group that rests is not stepped by nothing: its optimiser knows of no gradient."""
+    trainer = _trainer()
+    for optimiser in trainer.optimisers.values():
+        for parameter in (p for group in optimiser.param_groups for p in group["params"]):
+            parameter.grad = torch.full_like(parameter, 0.3)
+    moves, *rest = trainer.optimisers
+    assert rest
+    before = {name: [p.detach().clone() for p in trainer.groups[name][1]] for name in trainer.groups}
+    trainer._apply(dict.fromkeys(trainer.groups, 0.0) | {moves: 1e-3}, finite=True)
+    for name in trainer.optimisers:
+        alike = [torch.equal(p, old) for p, old in zip(trainer.groups[name][1], before[name], strict=True)]
+        assert all(alike) if name in rest else not any(alike)
+        assert bool(trainer.optimisers[name].state) == (name == moves)
