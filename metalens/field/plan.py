@@ -23,7 +23,15 @@ FINE = 96
 ALONG = 192  # steps of an axis of the field, on which its nodes lie
 MOST = 57  # nodes along an axis
 DENSER = (0.0, 2.0)  # by how much more the nodes lie at the rim of the field than on the axis
-LONGEST = 4.0  # period of the nodes, in windows, from which on none is twice as long
+LONGEST = 4.0  # period of the nodes, in windows, from which on none is longer
+LONGER = 2**0.25  # by which one is than the next; nodes grow with its square
+OFF_AXIS = ((0.75, 0.45), (-0.3, 0.8))  # places (x, y) in half fields, well off the middle
+# an eighth of either axis each, out to the rims, where a blur is widest and the more light is folded back
+STREWN = tuple(
+    zip(
+        (-0.95, -0.7, -0.45, -0.2, 0.2, 0.45, 0.7, 0.95), (-0.3, 0.6, -0.85, 0.1, -0.55, 0.95, 0.35, -0.75), strict=True
+    )
+)
 ORDER = 2.5  # power of their distance by which the error falls; more would need PSFs without edges
 SHARES = {  # of the tolerance; together all of it
     "kernels": 0.6,
@@ -121,7 +129,7 @@ def planned(
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
     coarse = waves if isinstance(source, Nodes) else _coarse(source, 2)
     ends = depth_nodes(grid, 3)
-    window = _unfolded(optics, coarse, window, (_corner(middle_um, half), ends), tolerance * SHARES["folded"])
+    window = _unfolded(optics, coarse, window, (_places(STREWN, middle_um, half), ends), tolerance * SHARES["folded"])
 
     def across(places: Tensor) -> Tensor:
         x = torch.stack([(2 * places / ALONG - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
@@ -135,9 +143,9 @@ def planned(
 
     count, denser = _line(across, (middle_um[0], half[1]), tolerance * SHARES["field"])
     depths = 1 if grid.depths_um[0] == grid.depths_um[1] else _fewest(deep, tolerance * SHARES["depth"], "depths")
-    if neglected(optics, coarse, window, (_corner(middle_um, half), ends)) > tolerance * SHARES["transform"]:
+    if neglected(optics, coarse, window, (_places(OFF_AXIS, middle_um, half), ends)) > tolerance * SHARES["transform"]:
         window = replace(window, curved=True)
-    some = torch.cat([_corner(middle_um, half), torch.tensor([middle_um], dtype=torch.float64)]), ends
+    some = _places((*OFF_AXIS, (0.0, 0.0)), middle_um, half), ends
     within = tolerance, tolerance * SHARES["polarisation"]
     window = polarised(optics, coarse, window, some, polarisation, within=within)
     y, x = (
@@ -181,14 +189,14 @@ def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, win
 def _unfolded(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], tolerance: float) -> Window:
     """The window with nodes of the least period that folds no more light back than is tolerated, or of the longest."""
     while window.period < LONGEST and folded(optics, waves, window, at) > tolerance:
-        window = replace(window, period=2 * window.period)
+        window = replace(window, period=LONGER * window.period)
     return window
 
 
-def _corner(middle_um: tuple[float, float], half_um: list[float]) -> Tensor:
-    """(2, [x, y]) two places well off the middle of a field."""
-    unit = torch.tensor([[0.75, 0.45], [-0.3, 0.8]], dtype=torch.float64)
-    return unit * torch.tensor([half_um[1], half_um[0]]) + torch.tensor(middle_um, dtype=torch.float64)
+def _places(units: tuple[tuple[float, float], ...], middle_um: tuple[float, float], half_um: list[float]) -> Tensor:
+    """(places, [x, y]) of a field, given in its half widths."""
+    middle, half = (torch.tensor(pair, dtype=torch.float64) for pair in (middle_um, half_um[::-1]))
+    return middle + half * torch.tensor(units, dtype=torch.float64)
 
 
 def waves_of(
