@@ -145,6 +145,9 @@ def run(options: Options) -> int:
     values |= words.curve(made.lens.proxy)
     text = words.text(head, layers, made.quality, made.check, made.unlike, several=bool(made.beside))
     text += several.lines(made.beside, layers)
+    if made.quality.turns < 1 and not made.beside:
+        about = made.lens.proxy, made.lens.cell, made.wanted.limits
+        text += f"\n  for a whole turn: {design.cure(*about, made.quality.turns)}"
     if made.conversion is not None:
         values["circular"] = {"hand": made.wanted.hand, **asdict(made.conversion)}
         text = f"{text}\n{words.converted(made.conversion, made.quality, made.wanted.hand)}"

@@ -115,7 +115,12 @@ def _failures(
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
     elif fitted.turns < 1 and not accept_partial_turn:
-        cure = "take a smaller pitch, taller pillars or a material of higher index (metalens study compares cells)"
+        cure = (
+            f"take pillars of about {made.cell.height_um / max(fitted.turns, 0.05):.3g} um ({made.cell.height_um:g} um "
+            "now; phase grows with the height as long as no resonance comes in), or a material of higher index"
+        )
+        if fitted.notes:
+            cure = "it was cut (above); another pitch moves resonances: metalens study compares pitches and heights"
         if fitted.smooth_turns >= 1:
             cure = (
                 f"the pillars cover {fitted.smooth_turns:.2f}, but it cannot follow them so far within its tolerances: "

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from metalens.design.focusing import meeting_um as meeting_um
     from metalens.design.of_phase import Limits as Limits
     from metalens.design.of_phase import Quality as Quality
+    from metalens.design.of_phase import cure as cure
     from metalens.design.of_phase import make as make
     from metalens.design.of_phase import phase_of as phase_of
     from metalens.design.own_cell import Unlike as Unlike
@@ -50,6 +51,7 @@ __getattr__, __dir__, __all__ = attach(
         "Unlike": "own_cell",
         "Wanted": "several",
         "check_focus": "focus_check",
+        "cure": "of_phase",
         "focused": "focusing",
         "focuses": "focusing",
         "meeting_um": "focusing",

@@ -17,6 +17,7 @@ from metalens.lens import DiameterMap, Hand, Lens
 from metalens.pillars import Proxy
 
 PLACES, SEARCHED = 61, 121  # across what is lit of a lens, and across all of it, where that is looked for
+EDGE_UM = 2e-3  # a curve that ends so near a printable end is ended by it
 LIT = 0.5  # of the light at angle 0, below which a stop's field ends
 
 
@@ -172,8 +173,7 @@ def printable(
     Raises:
         LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
     """
-    gap_um = limits.min_gap_nm * 1e-3
-    thinnest, widest = cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
+    thinnest, widest = _printed(cell, limits)
     low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
     if low >= high:
         raise LensError(
@@ -184,20 +184,35 @@ def printable(
     if turns < 1 and not accept_partial_turn:
         raise LensError(
             f"printable diameters {low:.4f}-{high:.4f} um reach {turns:.3f} of a turn at {wavelength_um:g} um, need 1"
-            f"{_ends(proxy, thinnest, widest)}; take a smaller pitch, taller pillars or looser process limits, or "
+            f"; {cure(proxy, cell, limits, turns)}, or looser process limits, or "
             "accept the nearest pillar (accept_partial_turn) at the loss of efficiency that the design then states"
         )
     return low, high
 
 
-def _ends(proxy: Proxy, thinnest: float, widest: float) -> str:
-    """Where the library holds less than the process prints, in words."""
-    if proxy.domain_um[0] <= thinnest and proxy.domain_um[1] >= widest:
-        return ""
+def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
+    """What would cover a turn where these pillars cover less (``turns``), for a person.
+
+    Phase grows with the height as long as no resonance ends it: where the process ends the pillars, a height over the
+    turns covers one. Where the library ends them sooner, taller pillars bring the resonance nearer.
+    """
+    thinnest, widest = _printed(cell, limits)
+    if proxy.domain_um[0] <= thinnest + EDGE_UM and proxy.domain_um[1] >= widest - EDGE_UM:
+        return (
+            f"take pillars of about {cell.height_um / turns:.3g} um ({cell.height_um:g} um now; phase grows with the "
+            "height as long as no resonance comes in), or a material of higher index"
+        )
     return (
-        f" (the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
-        f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep)"
+        f"the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
+        f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep: sweep as far as is printed, and "
+        "take another pitch, where resonances lie elsewhere (metalens study compares pitches and heights)"
     )
+
+
+def _printed(cell: Cell, limits: Limits) -> tuple[float, float]:
+    """(least, largest) size in um that a process prints."""
+    gap_um = limits.min_gap_nm * 1e-3
+    return cell.size_um(limits.min_diameter_nm * 1e-3, gap_um), cell.widest_um(gap_um)
 
 
 class Sums:

@@ -1,5 +1,6 @@
 """Lenses: profiles against closed forms, pillars that make the wanted phase, refusals by name."""
 
+import dataclasses
 import math
 from functools import partial
 
@@ -34,9 +35,9 @@ def proxy():
     )
 
 
-def _make(proxy, phase=None, *, aperture_um=60.0, **options):
+def _make(proxy, phase=None, *, aperture_um=60.0, cell=CELL, **options):
     phase = phase or design.phase_of(None, FOCUS, radius_um=aperture_um / 2)
-    return design.make(phase, FOCUS, aperture_um=aperture_um, cell=CELL, proxy=proxy, **options)
+    return design.make(phase, FOCUS, aperture_um=aperture_um, cell=cell, proxy=proxy, **options)
 
 
 def test_hyperbolic_phase_makes_all_paths_equal():
@@ -153,6 +154,19 @@ def test_a_turn_that_a_resonance_cut_short_is_not_laid_to_the_process():
     short = Proxy(np.array([[0.5, 2.0, 0.1]]), np.array([[0.9]]), (0.08, 0.16), (0.85, 0.85), 0.0, 0.0)
     with pytest.raises(LensError, match=r"prints 0\.0900-0\.\d+ um, the library's curve holds 0\.0800-0\.1600"):
         _make(short, limits=Limits(min_diameter_nm=90, min_gap_nm=80))
+
+
+def test_the_height_that_is_named_covers_a_turn_of_an_index_that_is_the_pillars_own():
+    """Phase k h n(D), n from 1.41 at 0.09 um to 2.03 at 0.32 um: 0.62 h / wavelength turns, so 1.371 um at 0.85 um."""
+
+    def guides(height_um):
+        phase = 2 * np.pi / 0.85 * height_um * np.array([[1.72, 0.31]])
+        return Proxy(phase, np.array([[0.9]]), (0.09, 0.32), (0.85, 0.85), 0.0, 0.0)
+
+    printed, cell = Limits(min_diameter_nm=90, min_gap_nm=80), Cell(pitch_um=0.4, height_um=0.52, pillar=Index(3.2))
+    with pytest.raises(LensError, match=r"reach 0\.379 of a turn.*; take pillars of about 1\.37 um \(0\.52 um now"):
+        _make(guides(0.52), limits=printed, cell=cell)
+    _make(guides(1.38), limits=printed, cell=dataclasses.replace(cell, height_um=1.38))
 
 
 def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):
