@@ -13,10 +13,11 @@ from metalens.ground.errors import DomainError
 from metalens.pillars import polynomial
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary
-from metalens.pillars.stretch import Stretch, stretch
+from metalens.pillars.stretch import LEAST_ENTRIES, Stretch, stretch
 
 TURN = 2 * math.pi
 FOLLOWED, KNOWN_SHARE = 1e-3, 0.5  # deviation from entries where none is stated, and that of the entries' own bars
+EXCLUDED = 0.1  # of the phase that a domain may lose beside a resonance for its tolerances
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
@@ -148,7 +149,21 @@ def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
         other = _best(kept, wanted, fewer)
         if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
             proxy, terms = other, fewer
-    return kept, proxy, terms
+    return (_cost(proxy, wanted) > 1 and _shorter(kept, wanted, terms)) or (kept, proxy, terms)
+
+
+def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] | None:
+    """Without the last diameters, beside what bounds the domain, where the tolerances are met so; they are excluded as
+    the resonance is, up to a tenth of the phase. None where that is not enough."""
+    for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
+        some = _head(data, count)
+        if _turns(some) < (1 - EXCLUDED) * _turns(data):
+            return None
+        fewer = min(terms, count // 3)
+        other = _best(some, wanted, fewer)
+        if other is not None and _cost(other, wanted) <= 1:
+            return some, other, fewer
+    return None
 
 
 def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
