@@ -18,6 +18,8 @@ from metalens.commands import Distributed, Output
 from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
 
+MOST_ANSWERS_ERROR = 0.5  # relative error of how pillars answer, above which a study of them is none
+
 
 @dataclass(frozen=True)
 class Options(Distributed):
@@ -82,6 +84,7 @@ class Job:
 
     stages: what the time went to. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
     certified: {file name: what the file and the dose table make, by the simulator}. made_rows: the lens that comes out.
+    answers_error: of --study, by how much the solver may miss how pillars answer to the process, relative.
     undosed: {file name: layers with shapes that the dose table lacks}.
     """
 
@@ -98,6 +101,7 @@ class Job:
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     certified: dict[str, Survey] = field(default_factory=dict)
     made_rows: MadeRows | None = None
+    answers_error: float = 0.0
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -136,6 +140,16 @@ class Job:
     def ok(self) -> bool:
         """Whether the rules hold, every dose is there and every file reads back as planned."""
         return not self.failures
+
+    @property
+    def hardly_known(self) -> str:
+        """Why the study of --study is none, for a person; empty where it is one. The mask is not touched by it."""
+        if self.answers_error <= MOST_ANSWERS_ERROR:
+            return ""
+        return (
+            f"--study: how these pillars answer to height, wall and index is known within {self.answers_error:.0%} "
+            "alone, and its tolerances no better: take lower or wider pillars, or the mask without --study"
+        )
 
     @property
     def verdict(self) -> str:

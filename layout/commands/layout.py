@@ -10,7 +10,7 @@ ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 
 
 def run(options: Options) -> int:
-    """Make the mask; exit 1 where a rule is broken or a file does not read back as planned."""
+    """Make the mask; exit 1 where a rule is broken, a file does not read back as planned or a study is none."""
     if options.lens.suffix.lower() == ARRANGEMENT:
         from layout.commands import arranged
 
@@ -18,11 +18,11 @@ def run(options: Options) -> int:
     with options.claim_folder(options.output) as draft, options.shared(), noticed(options.console.say):
         job = make.make(options, draft.path)
     options.console.result(make.values_of(job), _text(job, options.output))
-    return 0 if job.ok else 1
+    return 0 if job.ok and not job.hardly_known else 1
 
 
 def _text(job: Job, target: Path) -> str:
-    lines = [job.verdict, job.drc.summary]
+    lines = [job.verdict, job.drc.summary, *filter(None, [job.hardly_known])]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
         verdict = "" if outcome is None else (", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN")

@@ -187,5 +187,6 @@ def values_of(job: Job) -> dict[str, Any]:
             for name, c in job.certified.items()
         },
         "differences": {name: list(outcome.differences) for name, outcome in job.compared.items()},
+        "answers_error": job.answers_error,
         "seconds": job.seconds,
     }

@@ -45,7 +45,9 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
     if job.options.study:
         from layout.study import page as study_page
 
-        sections[-1:-1] = study_page.sections(job.source, job.process, job.fields)
+        answers = study_page.answers_of(job.source)
+        job.answers_error = max(one.error for one in answers.values())
+        sections[-1:-1] = study_page.sections(job.source, job.process, job.fields, answers)
     report.write(
         target / "report.html",
         f"Mask {job.plan.name}",

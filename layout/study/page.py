@@ -1,5 +1,6 @@
 """Sections of a mask's report on what the process does to the light: stitching, tolerance, tolerant choice."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,38 +14,46 @@ from layout.study.tolerance import ToleranceReport
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, Section, Table
+from metalens.ground.units import deg
 from metalens.lens import Lens
 from metalens.made import Spread
 
 CHOICE_RAD = (0.1, 0.2, 0.3)
+Answers = Mapping[str, Sensitivities | PairSensitivities]  # of light along "x" and "y"; of pillars of one size under ""
 
 
-def sections(lens: Lens, process: Process, plan: FieldPlan, *, answers: Sensitivities | None = None) -> list[Section]:
+def answers_of(lens: Lens) -> Answers:
+    """How the pillars answer to height, wall, index and their kin, from the solver.
+
+    Raises:
+        CellError, MaterialError: from the solver of the pillar.
+    """
+    return {"": sensitivities(lens)} if lens.pairs is None else pair_sensitivities(lens)
+
+
+def sections(lens: Lens, process: Process, plan: FieldPlan, answers: Answers) -> list[Section]:
     """The three sections; half a minute for a 1 mm lens, most of it for the solver and the Monte Carlo.
 
     Pillars that are turned one by one have no choice of sizes: their turn gives any phase at the size that is best.
     Those of two sizes have none either, and two sections for light along x and two for light along y.
 
-    answers: of the pillars to height, wall and index; left out: from the solver.
-
-    Raises:
-        CellError, MaterialError: from the solver of the pillar.
+    answers: :func:`answers_of` the lens.
     """
     if lens.pairs is not None:
         return [
             replace(section, title=f"{section.title}, light along {light}")
-            for light, answer in pair_sensitivities(lens).items()
+            for light, answer in answers.items()
             for section in _of_light(lens.seen("x" if light == "x" else "y"), process, plan, answer)
         ]
-    answers = sensitivities(lens) if answers is None else answers
-    found = _of_light(lens, process, plan, answers)
-    return found if lens.hand else [*found, _choice(lens, process, answers)]
+    answer = answers[""]
+    found = _of_light(lens, process, plan, answer)
+    return found if lens.hand or isinstance(answer, PairSensitivities) else [*found, _choice(lens, process, answer)]
 
 
 def _of_light(
     lens: Lens, process: Process, plan: FieldPlan, answers: Sensitivities | PairSensitivities
 ) -> list[Section]:
-    return [_stitching(lens, plan, process), _tolerance(lens, process, answers)]
+    return [_stitching(lens, plan, process), tolerances(lens, process, answers)]
 
 
 def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
@@ -89,7 +98,8 @@ def _stitched(found: StitchReport) -> bytes:
     return report.png(figure)
 
 
-def _tolerance(lens: Lens, process: Process, answers: Sensitivities | PairSensitivities) -> Section:
+def tolerances(lens: Lens, process: Process, answers: Sensitivities | PairSensitivities) -> Section:
+    """Each cause alone and all together, and what the numbers are not of."""
     study = tolerance.analyse(lens, process, sens=answers)
     rows = [
         [e.cause, e.deviation, e.phase_rad, *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information))]
@@ -106,7 +116,7 @@ def _tolerance(lens: Lens, process: Process, answers: Sensitivities | PairSensit
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
         f"derivatives of the solver (known to {100 * answers.error:.0f} %), {through}; the "
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
-    )
+    ) + _beside(lens, process)
     items: list[Figure | Table] = [
         Table(head, rows, "Effect of each cause. I(z): axial information (Eq. 11), summed over the depths.", digits=3),
         Figure(
@@ -115,6 +125,23 @@ def _tolerance(lens: Lens, process: Process, answers: Sensitivities | PairSensit
         Table(("", "5 %", "50 %", "95 %", "as designed"), bands),
     ]
     return Section("Tolerance", text, items)
+
+
+def _beside(lens: Lens, process: Process) -> str:
+    """What the numbers are not of: light that keeps its hand, and walls that the process leans otherwise."""
+    told, wall, made = "", lens.cell.sidewall_rad / deg, process.etch.sidewall_deg
+    if lens.hand:
+        told += (
+            " All of it for the light that changes hand: what keeps its hand has no focus, and lies under the image "
+            "as a haze of no more than what the converted light lacks."
+        )
+    if abs(made - wall) > process.spread.sidewall_deg:
+        told += (
+            f" The pillars are studied with the walls of their cell, {wall:.3g} deg from upright; the process makes "
+            f"{made:.3g} deg, which is beyond its spread: sweep and design with sidewall_rad = {made * deg:.3g} "
+            "in [cell]."
+        )
+    return told
 
 
 def _bands(study: ToleranceReport) -> bytes:

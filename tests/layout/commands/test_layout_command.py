@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from layout.process.process import Exposure, Rules
 from layout.rules import check as drc
 from layout.rules import markers
 from layout.shapes import polygon
+from layout.study import page as study_page
 from metalens import cli, lens
 from metalens.cell.record import Cell
 from metalens.ground.errors import MaskFileError, ProcessError
@@ -63,6 +65,20 @@ def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(lens
     assert run(tmp_path / "behind.h5", "-o", tmp_path / "mask", "--study") == 2
     assert "study the same lens designed without layers.stop" in capsys.readouterr().err
     assert not (tmp_path / "mask").exists()
+
+
+@pytest.mark.parametrize(("error", "code"), [(0.49, 0), (0.52, 1)])
+def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
+    lens_file, tmp_path, monkeypatch, capsys, error, code
+):
+    """The mask is what was asked for, and says that it passes; the study beside it is no study."""
+    monkeypatch.setattr(study_page, "answers_of", lambda lens: {"": SimpleNamespace(error=error)})
+    monkeypatch.setattr(study_page, "sections", lambda *about: [])
+    assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
+    told = capsys.readouterr().out
+    assert "The mask passes its own checks." in told
+    assert ("is known within 52% alone" in told) is bool(code)
+    assert json.loads((tmp_path / "mask" / "layout.json").read_text())["answers_error"] == error
 
 
 def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(tmp_path):

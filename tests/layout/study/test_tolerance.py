@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layout.mask import fields
-from layout.process.process import Process, Rules, WriteField
+from layout.process.process import Etch, Process, Rules, WriteField
 from layout.study import focus, stitching, tolerance, tolerant
 from layout.study import page as study_page
 from layout.study.sensitivity import Sensitivities, sensitivities
@@ -231,7 +231,7 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
         monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
     lens = hyperbolic(31)
     process = Process(write_field=WriteField(size_um=6.0))
-    made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
+    made = study_page.sections(lens, process, fields.split(lens.diameters, process), {"": SENS})
     assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
     tables = [item for section in made for item in section.items if isinstance(item, Table)]
     assert [row[0] for row in tables[1].rows] == list(Spread().stated)
@@ -246,8 +246,24 @@ def test_a_turned_lens_has_its_study_without_a_choice_of_sizes(monkeypatch):
     for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
         monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
     lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
-    made = study_page.sections(lens, process, fields.split(lens.diameters, process), answers=SENS)
+    made = study_page.sections(lens, process, fields.split(lens.diameters, process), {"": SENS})
     assert [section.title for section in made] == ["Stitching", "Tolerance"]
+    assert "what keeps its hand has no focus" in made[1].text
+    assert "walls" not in made[1].text
+
+
+@pytest.mark.parametrize(("made_deg", "designed_deg", "told"), [(0.6, 0, True), (0.4, 0, False), (2, 1.7, False)])
+def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
+    made_deg, designed_deg, told, monkeypatch
+):
+    """The spread of a wall is 0.5 deg."""
+    monkeypatch.setattr(tolerance, "analyse", functools.partial(_drawn, tolerance.analyse, 10))
+    lens, process = hyperbolic(31), Process(etch=Etch(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0))
+    lens = dataclasses.replace(lens, cell=dataclasses.replace(lens.cell, sidewall_rad=math.radians(designed_deg)))
+    text = study_page.tolerances(lens, process, SENS).text
+    assert ("the process makes 0.6 deg" in text) is told
+    assert ("sidewall_rad = 0.0105 in [cell]" in text) is told
+    assert "keeps its hand" not in text
 
 
 def test_fields_of_a_turned_lens_add_up_to_its_light():

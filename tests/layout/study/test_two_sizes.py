@@ -179,7 +179,7 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
             return whole(lens, *args, draws=most, **about)
 
         monkeypatch.setattr(module, name, functools.wraps(whole)(few))
-    made = page.sections(lens, process, fields.split(lens.diameters, process))
+    made = page.sections(lens, process, fields.split(lens.diameters, process), page.answers_of(lens))
     titles = [f"{what}, light along {light}" for light in "xy" for what in ("Stitching", "Tolerance")]
     assert [section.title for section in made] == titles
     assert seen == [("x", 150.0)] * 2 + [("y", 170.0)] * 2
