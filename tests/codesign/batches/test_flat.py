@@ -119,3 +119,17 @@ def test_pools_too_small_and_fields_of_psfs_are_refused():
     with pytest.raises(SceneError, match=r"need \(n, y, x\) twice"):
         Flat(frames.light, frames.depth_um[:, :4], frames.scale)
     assert flat.samples(frames) == 80
+
+
+def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
+    """Tensors that a device would hold, against the loop of the processor: depths from before the nearest plane to
+    behind the farthest, scales of their own."""
+    random = np.random.default_rng(7)
+    light = random.integers(0, 256, (2, 80, 80)).astype(np.uint8)
+    depth = random.integers(9_000, 60_000, (2, 80, 80)).astype(np.uint16)
+    frames, imager = Flat(light, depth, np.array([1.0, 0.83])), _imager()
+    want, got = irradiance(frames, imager, margin=8), flat._elsewhere(frames, imager, margin=8)
+    contrast = (want - want.mean((1, 2), keepdim=True)).norm()
+    assert float((got - want).norm() / contrast) < 1e-3  # single precision, and a pixel between two codes of 4096
+    near = Flat(light, np.full_like(depth, 16_000), frames.scale)
+    assert float((irradiance(near, imager, margin=8) - want).norm() / contrast) > 0.05

@@ -21,6 +21,10 @@ from metalens.ground.errors import MaskFileError
 MOST_BYTES = 60e6  # of Python and numpy; the limits of the test itself are small
 
 
+LEAF = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, 9) + gds.shorts(gds.DATATYPE, 3)
+LEAF += gds.points(np.array([[0, 0], [500, 0], [0, 600], [0, 0]])) + gds.record(gds.ENDEL)
+
+
 def structure(name, *elements):
     return gds.shorts(gds.BGNSTR, *[0] * 12) + gds.text(gds.STRNAME, name) + b"".join(elements) + gds.record(gds.ENDSTR)
 
@@ -34,9 +38,7 @@ def array(child, columns, rows, step=(1000, 900)):
 def gdsii(*structures):
     head = gds.shorts(gds.HEADER, 600) + gds.shorts(gds.BGNLIB, *[0] * 12) + gds.text(gds.LIBNAME, "L")
     head += gds.record(gds.UNITS, gds.real(1e-3) + gds.real(1e-9))
-    leaf = gds.record(gds.BOUNDARY) + gds.shorts(gds.LAYER, 9) + gds.shorts(gds.DATATYPE, 3)
-    leaf += gds.points(np.array([[0, 0], [500, 0], [0, 600], [0, 0]])) + gds.record(gds.ENDEL)
-    return head + structure("A", leaf) + b"".join(structures) + gds.record(gds.ENDLIB)
+    return head + structure("A", LEAF) + b"".join(structures) + gds.record(gds.ENDLIB)
 
 
 def grid(columns, rows, step):
@@ -128,9 +130,20 @@ def test_the_number_of_shapes_is_the_product_of_the_arrays():
     content = gdsii_read.parse(
         np.frombuffer(gdsii(structure("B", array("A", 9, 8)), structure("TOP", array("B", 7, 3))), np.uint8)
     )
+    assert dict(hierarchy.shapes(content)) == {(9, 3): 9 * 8 * 7 * 3}
     hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3)
     with pytest.raises(MaskFileError, match=r"1,512 shapes.*at most 1,511"):
         hierarchy.refuse_beyond(content, 9 * 8 * 7 * 3 - 1)
+
+
+def test_every_shape_of_a_cell_is_drawn_as_often_as_the_cell():
+    """Two polygons of a leaf on one layer, drawn five times and seven; a cell that nothing places is drawn once."""
+    content = gdsii_read.parse(
+        np.frombuffer(
+            gdsii(structure("TWO", LEAF, LEAF), structure("TOP", array("TWO", 5, 1), array("TWO", 7, 1))), np.uint8
+        )
+    )
+    assert hierarchy.shapes(content)[9, 3] == 2 * (5 + 7) + 1
 
 
 def test_shapes_on_each_other_are_refused_before_they_are_paired():
