@@ -37,6 +37,11 @@ def test_a_helix_beats_the_hyperbolic_lens_and_winds():
     assert winding == pytest.approx(1, abs=0.01)
 
 
+def test_double_helices_of_one_zone_to_six_are_tried():
+    """As hard as a design: none is left out in between."""
+    assert sorted(baselines.ZONES) == list(range(1, 7))
+
+
 def test_an_impossible_scan_is_refused():
     with pytest.raises(ConfigError, match="foci_mm"):
         baselines.tuned(PUPIL, ASKED, foci_mm=(50.0, 12.0))
