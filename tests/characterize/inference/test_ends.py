@@ -176,6 +176,28 @@ def test_a_parameter_that_no_draw_moves_leaves_a_regular_covariance():
     assert got == pytest.approx(np.array([[0.31**2, 0.12 * 0.31 * 5.3], [0.12 * 0.31 * 5.3, 5.3**2]]), rel=1e-9)
 
 
+def test_draws_that_follow_the_parabola_take_nothing_from_what_it_knows():
+    """Of 96 draws of a known normal law of 23 parameters. Errors of that law weighed by the covariance give 23 in the
+    mean; by that of the draws alone 23 * 95 / 71 = 31 (of an inverse Wishart law), with a fifth of the parabola 28."""
+    rng = np.random.default_rng(8)
+    mix = rng.normal(size=(23, 23)) + 2 * np.eye(23)
+    true = mix @ mix.T
+    sigma = np.sqrt(np.diag(true))
+    valley = SimpleNamespace(covariance=true, sigma=sigma)
+    drawn = [rng.multivariate_normal(np.zeros(23), true, 96) for _ in range(20)]
+    weighed = [np.trace(np.linalg.solve(explore._covariance(one, valley, sigma), true)) for one in drawn]
+    assert np.mean(weighed) == pytest.approx(23, rel=0.02)
+
+
+def test_draws_that_leave_the_parabola_say_how_parameters_go_together():
+    """Two thousand of correlation -0.8, the parabola says 0.6: a fifth of it is left, to 4 sigma of the sample's."""
+    drawn = np.random.default_rng(9).multivariate_normal([0, 0], [[1, -1.6], [-1.6, 4]], 2000)
+    got = explore._covariance(drawn, fake((0.7, 2.1), 0.6, 0.0), np.array([0.31, 5.3]))
+    want = (0.8 * -0.8 + 0.2 * 0.6) * 0.31 * 5.3
+    assert got[0, 1] == pytest.approx(want, abs=4 * 0.8 * 0.36 / math.sqrt(2000) * 0.31 * 5.3)
+    assert np.diag(got) == pytest.approx([0.31**2, 5.3**2])
+
+
 def test_without_draws_the_predicted_error_is_that_of_the_covariance(monkeypatch):
     """Images 1 + a q of a picture at right angles, a normal about 0.7 with sigma 0.3; nothing leaves the bounds."""
     bright, picture = np.zeros((1, 2, 4)), np.zeros((1, 2, 4))
