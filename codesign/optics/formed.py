@@ -5,11 +5,12 @@
 
 While the lens moves, its PSFs over the field are formed anew every few steps; between them the gradient of the light at
 the nodes of the field goes to the phase through a few field points and wavelengths that are drawn at random, which is
-unbiased (:mod:`metalens.field.subset`).
+unbiased (:mod:`metalens.field.slopes`).
 """
 
 import functools
 import math
+from collections.abc import Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -142,7 +143,8 @@ def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
 class Live:
     """A true image whose lens moves: the imager with the light of its nodes as a leaf.
 
-    light: (rows, columns, depths, h, w), gathers the gradient of the loss. ready: the imager, differentiable in it.
+    light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes that were asked for. ready:
+    the imager, differentiable in it.
     """
 
     light: Tensor
@@ -159,14 +161,14 @@ class Live:
         value.backward()  # type: ignore[no-untyped-call]
 
 
-def live(settings: OpticsConfig, whole: Imager) -> Live:
-    """An imager with its nodes' light as a leaf; the relative illumination is held."""
+def live(settings: OpticsConfig, whole: Imager, asked: Set[int] | None = None) -> Live:
+    """An imager with its nodes' light as a leaf, of some nodes or of all; the relative illumination is held."""
     with torch.no_grad():
         unit = normalised(torch.ones_like(whole.stack[..., :1, :1]), optics_of(settings, torch.zeros(0)), whole.plan)[1]
         light = whole.stack * (whole.energy / unit)[..., None, None]
     light.requires_grad_()
     psfs = light / light.sum((-2, -1), keepdim=True)
-    return Live(light, with_psfs(whole, psfs, whole.energy))
+    return Live(light, with_psfs(replace(whole, asked=asked), psfs, whole.energy))
 
 
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from codesign.optics import LensError, OpticsConfig, Stack, formed
 from codesign.optics import stack as lens
+from metalens.field import drawn
 from metalens.image import Imager, UniformImager
 
 Draw = Callable[[int], LensError | None]
@@ -53,16 +54,21 @@ class Light:
         made = self._true(step, coefficients_rad.detach(), frame, margin, live=live)
         if not live:
             return made
-        self._live = formed.live(self.optics, made)
+        points, _ = drawn(made.plan, self.draws, self._generator(step))
+        self._live = formed.live(self.optics, made, set(points.tolist()))
         return self._live.ready
 
     def pass_on(self, step: int, coefficients_rad: Tensor) -> None:
         """After the loss went backward: its gradient from the light to the coefficients, where it stopped there."""
         if self._live is not None:
-            seed = int(np.random.SeedSequence([self.seed, step, 9]).generate_state(1, np.uint64)[0])
-            generator = torch.Generator().manual_seed(seed >> 1)
+            generator = self._generator(step)
             self._live.pass_on(self.optics, coefficients_rad, draws=self.draws, generator=generator)
             self._live = None
+
+    def _generator(self, step: int) -> torch.Generator:
+        """Of the field points and wavelengths that pass the gradient of a step on."""
+        seed = int(np.random.SeedSequence([self.seed, step, 9]).generate_state(1, np.uint64)[0])
+        return torch.Generator().manual_seed(seed >> 1)
 
     def _uniform(
         self, step: int, coefficients_rad: Tensor, frame: int, margin: int, *, live: bool

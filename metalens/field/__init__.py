@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from metalens.field.points import Optics as Optics
     from metalens.field.points import Window as Window
     from metalens.field.points import psfs as psfs
-    from metalens.field.subset import node_light as node_light
-    from metalens.field.subset import surrogate as surrogate
-    from metalens.field.subset import term as term
+    from metalens.field.slopes import drawn as drawn
+    from metalens.field.slopes import node_light as node_light
+    from metalens.field.slopes import surrogate as surrogate
+    from metalens.field.slopes import term as term
     from metalens.field.waves import PillarWave as PillarWave
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
@@ -38,13 +39,14 @@ __getattr__, __dir__, __all__ = attach(
         "Wave": "waves",
         "Window": "points",
         "blurred": "forming",
+        "drawn": "slopes",
         "imager": "engine",
-        "node_light": "subset",
+        "node_light": "slopes",
         "node_psfs": "engine",
         "normalised": "engine",
         "psfs": "points",
-        "surrogate": "subset",
-        "term": "subset",
+        "surrogate": "slopes",
+        "term": "slopes",
         "trial": "engine",
         "with_psfs": "forming",
     },

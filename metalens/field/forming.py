@@ -11,18 +11,17 @@ frames whose far sheet covers all take that sum alone, at less than half the cos
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import scipy.fft
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from metalens.field import compiled, even, products, together
 from metalens.field.patches import Patch, dense, lagrange
 from metalens.field.plan import Grid, Plan
+from metalens.field.slopes import by_nodes
 from metalens.field.stray import Stray, add_stray
 from metalens.ground.errors import SceneError
 from metalens.image import Frames
@@ -48,6 +47,7 @@ class Imager:
         Beside them ``outside``: of the light that goes through the lens (:mod:`metalens.field.through`), what
         windows leave out.
     stray: light of other diffraction orders, None where the lens tells nothing of them.
+    asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are wanted; None for all.
     """
 
     grid: Grid
@@ -59,6 +59,7 @@ class Imager:
     parts: Mapping[str, float]
     even: Tensor | None = field(default=None)
     stray: Stray | None = field(default=None)
+    asked: Set[int] | None = field(default=None)
 
     @property
     def error(self) -> float:
@@ -132,7 +133,25 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
     else:
         for patch, transfer, shape in zip(optics.patches, optics.transfer, shapes, strict=True):
             _add(patch, transfer, shape, given, out)
-    return out[..., reach : reach + grid.frame[0], reach : reach + grid.frame[1]]
+    out = out[..., reach : reach + grid.frame[0], reach : reach + grid.frame[1]]
+    if optics.stack.requires_grad and torch.is_grad_enabled():
+        out = out + _by_nodes(given, optics, kinds)
+    return out
+
+
+def _by_nodes(given: tuple[Tensor, Tensor, Tensor], optics: Imager, kinds: int) -> Tensor:
+    """Zeros for :func:`_through` to add, with the derivative by the PSFs of all nodes, which need no map of even light;
+    ``given`` as there."""
+    light, cover, place = (part.detach() for part in given)
+    between = [part.to(light) for part in between_nodes(optics.grid, optics.plan)]
+    first, taps = lagrange(place, optics.stack.shape[2])
+    level = torch.einsum("ya,xb,abz->yxz", *between, optics.energy.detach().to(light))
+    index = (first[..., None] + torch.arange(taps.shape[-1], device=first.device)).long()
+    lit = (level.expand(*place.shape, -1).gather(-1, index) * taps).sum(-1)
+    sources = [light * lit, cover][:kinds]
+    zeros = by_nodes(optics.stack, sources, (first, taps), between, optics.asked)
+    y, x = (slice(n // 2, n // 2 + whole) for n, whole in zip(optics.stack.shape[-2:], light.shape[-2:], strict=True))
+    return zeros[..., y, x] if optics.even is None else zeros[..., y, x] / optics.even
 
 
 def _add(
@@ -234,14 +253,12 @@ def _far_alone(frames: Frames) -> bool:
 def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     """The same patches with other PSFs: kernels as the first ones were mixed, differentiable in both arguments.
 
-    The gradient is that of the PSFs projected on the kept weights: changes that vary over field and depth in a way
-    that the first stack does not show need patches of their own (:func:`metalens.field.engine.patched`).
-
-    Accuracy: of slopes not stated. Of bright points through a stop and a film at 25 degrees, against plane waves, those
-    by a coma and a defocus are off by 0.16 through 8 kernels (image 0.009), 0.085 through 13, 0.03 to 0.06 through 19;
-    those of the PSFs alone by 0.03.
+    Changes that vary over field and depth in a way that the first stack does not show need patches of their own
+    (:func:`metalens.field.engine.patched`). The gradient does not: it is that of the image through the PSFs of all
+    nodes (:func:`metalens.field.slopes.by_nodes`), whatever the kernels lack.
     """
-    mixed = _Mixed.apply(stack.flatten(0, 2), optics.patches)  # type: ignore[no-untyped-call]
+    flat = stack.detach().flatten(0, 2)
+    mixed = [torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes]) for patch in optics.patches]
     transfer = [_transfer(k, _size(p, stack.shape[-1])) for k, p in zip(mixed, optics.patches, strict=True)]
     between = [part.to(energy) for part in between_nodes(optics.grid, optics.plan)]
     made = [replace(patch, energy=_illumination(patch, between, energy)) for patch in optics.patches]
@@ -249,26 +266,10 @@ def with_psfs(optics: Imager, stack: Tensor, energy: Tensor) -> Imager:
     return changed if optics.even is None else evened(changed)
 
 
-class _Mixed(torch.autograd.Function):
-    """Kernels (rank, y, x) of every patch from the nodes' PSFs (nodes, y, x): to the gradient of all nodes a patch adds
-    that of its own, where a gradient a patch of as many PSFs as there are, nearly all zeros, would be added up."""
-
-    @staticmethod
-    def forward(ctx: Any, flat: Tensor, patches: list[Patch]) -> tuple[Tensor, ...]:
-        ctx.patches, ctx.of = patches, flat.shape
-        return tuple(torch.einsum("rn,nyx->ryx", patch.mix, flat[patch.nodes]) for patch in patches)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *kernels: Tensor) -> tuple[Tensor, None]:
-        found = kernels[0].new_zeros(ctx.of)
-        for patch, kernel in zip(ctx.patches, kernels, strict=True):
-            found.index_add_(0, patch.nodes, torch.einsum("rn,ryx->nyx", patch.mix, kernel))
-        return found, None
-
-
+@torch.no_grad()
 def evened(optics: Imager) -> Imager:
-    """The patches with the map that gives even light of the middle depth as the nodes' PSFs do (:mod:`.even`)."""
+    """The patches with the map that gives even light of the middle depth as the nodes' PSFs do (:mod:`.even`); it has
+    no derivatives."""
     wanted = even_light(optics)
     one = torch.ones_like(wanted)[None, None]
     depth_um = 1 / (1 / optics.plan.depths_um[[0, -1]]).mean()

@@ -15,7 +15,7 @@ from metalens.cell import Film, Index
 from metalens.field.engine import normalised, trial
 from metalens.field.forming import with_psfs
 from metalens.field.plan import spectral
-from metalens.field.subset import term
+from metalens.field.slopes import term
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, UniformImager
 from metalens.lens import Layers, Stop

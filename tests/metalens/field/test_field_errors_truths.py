@@ -258,7 +258,7 @@ def test_only_places_that_no_node_holds_judge_an_interpolation():
 
 def test_one_draw_stands_for_all_points_and_the_whole_spectrum(monkeypatch):
     """12 points: 12 times the product with the light of that point."""
-    from metalens.field import subset
+    from metalens.field import slopes
 
     light = psf_of(1.0, (1, 3))
     asked = {}
@@ -267,11 +267,11 @@ def test_one_draw_stands_for_all_points_and_the_whole_spectrum(monkeypatch):
         asked.update(at=at, wave=wavelength_um, finest=finest_um)
         return light
 
-    monkeypatch.setattr(subset, "psfs", psfs)
+    monkeypatch.setattr(slopes, "psfs", psfs)
     gradient = torch.from_numpy(RNG.normal(size=(3, 4, 3, 7, 7)))
     waves = Nodes(np.array([0.82, 0.88]), np.array([0.3, 0.7]), 0.0)
     made = Plan(Y, X, PLAN.depths_um, waves, PLAN.window, folds=False)
-    found = subset.term(OPTICS, made, gradient, 6, 1)
+    found = slopes.term(OPTICS, made, gradient, 6, 1)
     assert float(found) == pytest.approx(12 * float((gradient[1, 2] * light[0]).sum()), rel=1e-9)
     assert asked["at"].tolist() == [[420.0, 40.0]]
     assert (asked["wave"], asked["finest"]) == (0.88, 0.82)

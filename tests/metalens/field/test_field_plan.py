@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from metalens.design import Focus
-from metalens.field import Grid, SmoothWave, engine, forming, patches, plan, subset
+from metalens.field import Grid, SmoothWave, engine, forming, patches, plan, slopes
 from metalens.field.patches import relative, shares
 from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Stop
@@ -196,12 +196,12 @@ def test_light_from_one_point_and_one_wavelength_is_drawn_evenly_and_by_weight(m
         seen.append((point, wave))
         return torch.tensor(2.5)
 
-    monkeypatch.setattr(subset, "term", term)
+    monkeypatch.setattr(slopes, "term", term)
     made = SimpleNamespace(
         y_um=torch.arange(4.0), x_um=torch.arange(3.0), waves=Nodes(np.array([0.84, 0.86]), np.array([0.25, 0.75]), 0.0)
     )
     generator = torch.Generator().manual_seed(4)
-    assert float(subset.surrogate(None, made, None, draws=3000, generator=generator)) == 2.5
+    assert float(slopes.surrogate(None, made, None, draws=3000, generator=generator)) == 2.5
     counts = np.bincount([point for point, _ in seen], minlength=12)
     assert len(counts) == 12
     assert abs(counts - 250).max() < 75

@@ -17,7 +17,7 @@ from metalens.field import (
     surrogate,
     with_psfs,
 )
-from metalens.field.subset import term
+from metalens.field.slopes import term
 from metalens.image import Frames
 from metalens.psf import Nodes
 
