@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from metalens.cell.materials import index as index
     from metalens.cell.materials import slope as slope
     from metalens.cell.orders import check_subwavelength as check_subwavelength
+    from metalens.cell.orders import no_resonance_um as no_resonance_um
     from metalens.cell.record import Blend as Blend
     from metalens.cell.record import Cell as Cell
     from metalens.cell.record import Film as Film
@@ -38,6 +39,7 @@ __getattr__, __dir__, __all__ = attach(
         "Response": "response",
         "check_direction": "light",
         "check_subwavelength": "orders",
+        "no_resonance_um": "orders",
         "check_tolerance": "light",
         "index": "materials",
         "materials": "",

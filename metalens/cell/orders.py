@@ -46,6 +46,23 @@ def propagating(
     return tuple(found)
 
 
+def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
+    """Pitch below which no diffraction order propagates even in the densest material of a cell, at normal incidence.
+
+    The layer then guides no wave that the lattice couples to light from outside, so that no resonance of the lattice
+    (guided-mode resonances, leaky modes of films with holes) is left: wavelength / index, times 2 / sqrt(3) for a
+    hexagonal lattice.
+
+    Raises:
+        MaterialError: a wavelength outside the range of a material.
+    """
+    films = [film.material for film in (*cell.under, *cell.over)]
+    layered = [m for layer in cell.layers for m in (layer.material, layer.between, layer.coat) if m is not None]
+    every = (cell.pillar, cell.between, cell.substrate, cell.cover, *films, *layered)
+    densest = max(materials.index(material, wavelength_um).real for material in every)
+    return cell.lattice.least_order * wavelength_um / densest
+
+
 def check_subwavelength(cell: Cell, wavelength_um: float, *, angle_rad: float = 0.0, azimuth_rad: float = 0.0) -> None:
     """Refuse a cell that sends light into other orders than zero.
 

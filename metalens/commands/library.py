@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from metalens import library
-from metalens.cell import Cell
+from metalens.cell import Cell, no_resonance_um
 from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, reading, store
@@ -120,7 +120,11 @@ def _failures(
             "now; phase grows with the height as long as no resonance comes in), or a material of higher index"
         )
         if fitted.notes:
-            cure = "it was cut (above); another pitch moves resonances: metalens study compares pitches and heights"
+            least = no_resonance_um(made.cell, made.sweep.wavelengths_um[0])
+            cure = (
+                "it was cut (above); another pitch moves resonances (metalens study compares pitches and heights), and "
+                f"none of the lattice's own lies below {least:.3g} um"
+            )
         if fitted.smooth_turns >= 1:
             cure = (
                 f"the pillars cover {fitted.smooth_turns:.2f}, but it cannot follow them so far within its tolerances: "

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from metalens.cell import Cell
+from metalens.cell import Cell, no_resonance_um
 from metalens.design import phase_map, profiles
 from metalens.design.profiles import Cubic, DoubleHelix, Focus, PhaseMap
 from metalens.design.sites import PhaseOf, least_period_um, sites
@@ -205,7 +205,8 @@ def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
     return (
         f"the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
         f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep: sweep as far as is printed, and "
-        "take another pitch, where resonances lie elsewhere (metalens study compares pitches and heights)"
+        "take another pitch, where resonances lie elsewhere (metalens study compares pitches and heights); none of the "
+        f"lattice's own lies below {no_resonance_um(cell, proxy.wavelengths_um[0]):.3g} um"
     )
 
 

@@ -1,12 +1,13 @@
 """Orders of lattices that are no squares, by every order's own wave vector."""
 
+import dataclasses
 import math
 
 import pytest
 
 from metalens.cell.lattice import Lattice
-from metalens.cell.orders import propagating
-from metalens.cell.record import Cell, Index
+from metalens.cell.orders import no_resonance_um, propagating
+from metalens.cell.record import Cell, Film, Index
 
 
 @pytest.mark.parametrize("lattice", [Lattice("rectangular", 1.63), Lattice("rectangular", 0.71), Lattice("hexagonal")])
@@ -27,3 +28,17 @@ def test_orders_are_those_whose_wave_vector_fits_the_medium(lattice, angle_rad, 
     found = propagating(cell, wavelength, angle_rad=angle_rad, azimuth_rad=azimuth_rad)
     assert {(one.side, one.m, one.n) for one in found} == want
     assert len(found) == len(want) > 2
+
+
+@pytest.mark.parametrize("lattice", [Lattice(), Lattice("rectangular", 1.3), Lattice("hexagonal")])
+def test_below_the_pitch_without_resonances_the_densest_material_carries_no_other_order(lattice):
+    """Were it a half-space, orders other than zero would graze in it at that pitch and none below."""
+    cell = Cell(0.3, pillar=Index(2.7), substrate=Index(1.5), lattice=lattice)
+    for above, count in ((0.999, 2), (1.001, None)):
+        pitch = above * no_resonance_um(cell, 0.62)
+        found = propagating(Cell(pitch, substrate=Index(2.7), lattice=lattice), 0.62)
+        assert (len(found) == count) if count else len(found) > 2
+    film = Film(Index(3.1), 0.05)
+    assert no_resonance_um(dataclasses.replace(cell, under=(film,)), 0.62) == pytest.approx(
+        2.7 / 3.1 * no_resonance_um(cell, 0.62)
+    )

@@ -74,7 +74,9 @@ def test_a_material_table_is_named_in_the_provenance(cell, tmp_path):
 
 def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
     assert cell(QUICK.replace("height_um = 0.7", "height_um = 0.3")) == 1
-    assert "a lens needs 1" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "a lens needs 1: it was cut (above); another pitch" in told
+    assert "none of the lattice's own lies below 0.236 um" in told  # 0.85 um / 3.6
     assert (tmp_path / "library.h5").exists()  # the result is there to look at
 
 
