@@ -203,7 +203,20 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
         lines += _turned_lines(made.turned)
     elif made.polarization == ("x",) and not made.cell.alike:
         lines.append("  all of it for light along x: these pillars answer light along y otherwise")
+        lines += _elsewhere(made)
     return "\n".join(lines + [f"  FAILED: {failure}" for failure in failures])
+
+
+def _elsewhere(made: PillarLibrary) -> list[str]:
+    """What becomes of light along x in pillars that have no mirror along x or y: a part of it leaves along y."""
+    outline = made.cell.outline(float(made.diameter_um[-1]))
+    if outline.keeps(-1, 1) or outline.keeps(1, -1):
+        return []
+    lost = float(1 - made.energy.min())
+    return [
+        f"  up to {lost:.0%} of it leaves along y, or is absorbed: no mirror of the shape lies along x or y; turn it "
+        "(angle_rad) until one does"
+    ]
 
 
 def _circular(turned: Turned) -> dict[str, Any]:

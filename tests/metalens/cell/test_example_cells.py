@@ -1,5 +1,6 @@
 """The example cells: they read, propagate no order, fit their lattice, and do what their heads say."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -52,13 +53,15 @@ def chained(folder, name, library, capsys, **sweep):
     """The commands in the head of a lens file, with some keys of the sweep changed; what ``metalens design`` says."""
     text = (FOLDER / f"{name}.toml").read_text()
     (folder / "cell.toml").write_text(coarse(text, **sweep))
-    (folder / "lens.toml").write_text((FOLDER.parent / "lenses" / f"{name}.toml").read_text())
+    lens = (FOLDER.parent / "lenses" / f"{name}.toml").read_text()
+    (folder / "lens.toml").write_text(lens)
     words = ["--accept-partial-turn", "--quiet"]
     assert main(["library", str(folder / "cell.toml"), "-o", str(folder / library), *words]) == 0
     capsys.readouterr()
     assert main(["design", str(folder / "lens.toml"), "-o", str(folder / "lens.h5"), *words[:1], "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert main(["layout", str(folder / "lens.h5"), "-o", str(folder / "mask"), "--gds", "--quiet"]) == 0
+    fine = ["--process", str(FOLDER.parent / "lenses" / "fine_process.toml")] if "fine_process" in lens else []
+    assert main(["layout", str(folder / "lens.h5"), "-o", str(folder / "mask"), "--gds", "--quiet", *fine]) == 0
     assert (folder / "mask" / "mask.gds").stat().st_size > 10_000
     return found
 
@@ -128,3 +131,29 @@ def test_two_phases_by_width_and_length_from_toml_to_mask(tmp_path, capsys):
     assert "give light" in capsys.readouterr().err
     (tmp_path / "psf.toml").write_text(view + 'light = "y"\n')
     assert main([*words, "-o", str(tmp_path / "y.h5")]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "library"),
+    [
+        ("tio2_cross_532", "cross.h5"),
+        ("si_ring_1550", "ring.h5"),
+        ("si_hook_1550", "hook.h5"),
+        ("tio2_square_holes_532", "holes.h5"),
+    ],
+)
+def test_lenses_of_other_shapes_from_toml_to_mask(tmp_path, capsys, name, library):
+    found = chained(tmp_path, name, library, capsys)
+    assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(15 / 60)), rel=0.01)
+    assert found["turns"] > 1
+    assert found["focus_passed"]
+    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+
+
+@pytest.mark.parametrize(("turned", "least", "most"), [(0, 0.5, 1), (1, 0, 1e-20)])
+def test_a_hook_along_the_lattice_sends_light_into_the_other_polarisation_and_a_turned_one_none(turned, least, most):
+    wanted = config.load(FOLDER / "si_hook_1550.toml", CellFile)
+    shape = dataclasses.replace(wanted.cell.shape, angle_rad=turned * wanted.cell.shape.angle_rad)
+    got = rcwa.jones(dataclasses.replace(wanted.cell, shape=shape), 0.32, 1.55, harmonics=4)
+    assert least <= abs(got.t[1, 0]) ** 2 <= most

@@ -261,3 +261,16 @@ def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_a
     assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 0
     assert main([*words, "--skip-focus-check", "--force"]) == 0
     assert "FAILED" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("turned", "told"), [("", True), ("angle_rad = 0.7853981633974483\n", False)])
+def test_light_that_a_shape_without_a_mirror_along_x_or_y_sends_elsewhere_is_told(
+    cell, monkeypatch, capsys, turned, told
+):
+    """|t| of 0.95 and no reflection leave 1 - 0.95² for the other polarisation."""
+    hook = "[[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]]"
+    shape = f'kind = "polygon"\ncorners = {hook}\n{turned}'
+    d = np.linspace(0.12, 0.2, 40)
+    monkeypatch.setattr(library, "sweep", known_within(d, 0.01 + 0 * d))
+    assert cell(SQUARES.replace('kind = "square"\n', shape), "--accept-partial-turn") == 0
+    assert ("up to 10% of it leaves along y, or is absorbed" in capsys.readouterr().out) is told

@@ -152,7 +152,8 @@ def test_empty_aperture_and_unprintable_cells_are_refused(proxy):
 
 def test_a_turn_that_a_resonance_cut_short_is_not_laid_to_the_process():
     short = Proxy(np.array([[0.5, 2.0, 0.1]]), np.array([[0.9]]), (0.08, 0.16), (0.85, 0.85), 0.0, 0.0)
-    with pytest.raises(LensError, match=r"prints 0\.0900-0\.\d+ um, the library's curve holds 0\.0800-0\.1600.*lies below 0\.236"):
+    ends = r"prints 0\.0900-0\.\d+ um, the library's curve holds 0\.0800-0\.1600.*lies below 0\.236"
+    with pytest.raises(LensError, match=ends):
         _make(short, limits=Limits(min_diameter_nm=90, min_gap_nm=80))
 
 
