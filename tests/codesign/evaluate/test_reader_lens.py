@@ -16,8 +16,7 @@ from codesign.network.blur import BlurBranch
 from codesign.optics import formed
 from codesign.optics.stack import OpticsConfig
 from codesign.train import Schedule
-from metalens.field.engine import normalised
-from metalens.field.forming import with_psfs
+from metalens.field.engine import normalised, patched
 from metalens.field.plan import spectral
 from metalens.ground.errors import ConfigError
 from metalens.psf.spectrum import Nodes
@@ -37,12 +36,13 @@ def learn():
 
 
 def _psfs(whole, coefficients):
+    """The image through all kernels of these PSFs: gradients are those of all nodes."""
     plane = formed.optics_of(OPTICS, coefficients)
     y, x = torch.meshgrid(whole.plan.y_um, whole.plan.x_um, indexing="ij")
     places = torch.stack([x.flatten(), y.flatten()], -1)
     light = spectral(plane, places, whole.plan.depths_um, whole.plan.waves, whole.plan.window)
     psfs, _ = normalised(light.reshape(whole.stack.shape), plane, whole.plan)
-    return with_psfs(whole, psfs, whole.energy)
+    return patched(whole.grid, whole.plan, psfs, whole.energy, tolerance=1e-5)
 
 
 @pytest.fixture(scope="module")
