@@ -16,10 +16,12 @@ from characterize.captures import capture as captures
 from characterize.commands import measure_page
 from characterize.measure import frames, metrics, overlay, sem
 from metalens import lens as lenses
+from metalens.cell.shapes import Circle
 from metalens.commands import Common, Output
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, ConfigError
+from metalens.lens import DiameterMap
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     table: overlay.Table = []
     scale = 1.0
     if options.design is not None:
-        design = lenses.load_plain(options.design).diameters
+        design = _drawn_round(options.design)
         laid, scale = overlay.overlay(found, design), overlay.scale(found, pixel, design)
         sure = laid.clearly and abs(scale - 1) < overlay.SCALE  # elsewhere, other diameters were drawn
         table = overlay.bias_table(laid) if sure else []
@@ -145,6 +147,14 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     if table and not options.edge_bias_nm:
         lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
     return values, "\n".join(lines), good
+
+
+def _drawn_round(path: Path) -> DiameterMap:
+    """What the mask of a lens draws, where its pillars are round."""
+    design = lenses.load(path)
+    if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
+        raise CaptureError(f"{path}: {design.cell.described}; --design takes round pillars, whose diameter is measured")
+    return design.diameters
 
 
 def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:

@@ -11,6 +11,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 _WEAK = 0.25  # amplitude of a lattice's wave over the strongest of all
+_LONGER = 2.5  # the longer side of a rectangular cell over the pitch, at most
 _APART_DEG = 25.0  # least angle between the two waves of a lattice
 
 
@@ -56,7 +57,7 @@ def find(flat: Array, pitch_px: float | None = None) -> Lattice:
     """The lattice of bright pillars in a levelled picture.
 
     Args:
-        pitch_px: distance of neighbours where it is known: other waves are not considered.
+        pitch_px: distance of neighbours where it is known: waves of neither it nor a longer side are not considered.
 
     Accuracy: 1e-3 of a pitch for ten pillars a side; drift of the scan goes into the vectors.
 
@@ -74,7 +75,7 @@ def find(flat: Array, pitch_px: float | None = None) -> Lattice:
 
 
 def _waves(seen: Array, pitch_px: float | None) -> tuple[Array, Array]:
-    """Two strongest waves (cycles a pixel: row, column) that are not along one line."""
+    """Two strongest waves (cycles a pixel: row, column) not along one line, the first of the known pitch."""
     size = [2 * fft.next_fast_len(n) for n in seen.shape]
     power = np.abs(fft.rfft2(seen, size))
     ky, kx = fft.fftfreq(size[0])[:, None], fft.rfftfreq(size[1])[None]
@@ -82,11 +83,12 @@ def _waves(seen: Array, pitch_px: float | None) -> tuple[Array, Array]:
     power = np.where((length > 2.5 / min(seen.shape)) & (length < 0.35), power, 0.0)
     peaks = (ndimage.maximum_filter(power, 5, mode="wrap") == power) & (power > _WEAK * power.max())
     if pitch_px is not None:
-        peaks &= (length * pitch_px > 0.9) & (length * pitch_px < 1.25)
+        peaks &= (length * pitch_px > 0.9 / _LONGER) & (length * pitch_px < 1.25)
     rows, columns = np.nonzero(peaks)
-    order = np.argsort(-power[rows, columns])
+    first = length[rows, columns] * (pitch_px or math.inf) > 0.9  # before those of a longer side
+    order = np.lexsort((-power[rows, columns], ~first))
     waves = np.stack([ky[rows[order], 0], kx[0, columns[order]]], 1)
-    for wave in waves[1:]:
+    for wave in waves[1:] if first.any() else waves[:0]:
         across = abs(waves[0, 0] * wave[1] - waves[0, 1] * wave[0])
         lengths = np.hypot(*waves[0]), np.hypot(*wave)
         if across > math.sin(math.radians(_APART_DEG)) * lengths[0] * lengths[1] and lengths[1] < 2.5 * lengths[0]:

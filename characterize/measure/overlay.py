@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from characterize.measure.lattice import Lattice
 from characterize.measure.sem import Diameters
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
@@ -23,13 +24,15 @@ class Overlay:
     """Measured pillars beside the design.
 
     designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0, 0) of the lattice on the mask.
-    clearly: whether the place on the mask is beyond doubt. outlier: (p,) error beyond ``OUTLIER`` robust sigma.
+    site: (p, 2) row and column of every pillar on the mask. clearly: whether the place on the mask is beyond doubt.
+    outlier: (p,) error beyond ``OUTLIER`` robust sigma.
     """
 
     designed_nm: Array
     error_nm: Array
     row: int
     column: int
+    site: Array
     clearly: bool
     outlier: Array
 
@@ -38,18 +41,18 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
     """Lay measured pillars on the design: the shift of whole sites where design and measurement differ most evenly.
 
     A bias that is the same everywhere, or goes with the diameter, plays no part.
-    The picture's rows and columns are taken as the mask's.
+    The picture's +x is taken as the mask's, to half the angle between two rows of the lattice.
 
     Raises:
-        CaptureError: fewer than twelve good pillars, a lattice that is not the design's, or more pillars than it has.
+        CaptureError: fewer than twelve good pillars, a lattice that is not the design's or lies across it, or more
+            pillars than it has.
     """
     good = np.isfinite(found.diameter_nm)
     if good.sum() < _LEAST:
         raise CaptureError(f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design")
-    if found.lattice.kind != "square":
-        raise CaptureError(f"the picture shows a {found.lattice.kind} lattice, the design is square")
-    first = found.site.min(0)
-    site = found.site - first
+    on_mask = found.site @ _steps(found.lattice, design)
+    first = on_mask.min(0)
+    site = on_mask - first
     patch = np.zeros(site.max(0) + 1)
     mask = np.zeros_like(patch)
     patch[tuple(site[good].T)], mask[tuple(site[good].T)] = found.diameter_nm[good], 1.0
@@ -68,7 +71,25 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
         mask[tuple(site[outlier].T)] = 0.0
     ordered = np.sort(scatter[np.isfinite(scatter)])
     sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
-    return Overlay(designed, error, row - int(first[0]), column - int(first[1]), bool(sure), outlier)
+    row, column = row - int(first[0]), column - int(first[1])
+    return Overlay(designed, error, row, column, on_mask + np.array([row, column]), bool(sure), outlier)
+
+
+def _steps(lattice: Lattice, design: DiameterMap) -> Array:
+    """(2, 2) rows and columns of the mask's map that a step along j, and one along i, of a picture's lattice goes."""
+    kind = design.lattice.kind
+    if lattice.kind != kind:
+        raise CaptureError(f"the picture shows a {lattice.kind} lattice, the design is {kind}")
+    vectors, steps_um = np.stack([lattice.b, lattice.a]), np.array(design.steps_um[::-1])
+    vectors = vectors * np.sqrt(design.site_um2 / abs(np.linalg.det(vectors)))
+    steps = np.rint(vectors / steps_um)
+    long, expected = (np.linalg.norm(v, axis=1) for v in (vectors, steps * steps_um))
+    one_cell = np.isclose(abs(np.linalg.det(steps)), 2 if design.lattice.centred else 1)
+    if not one_cell or (np.abs(long - expected) > 0.05 * long).any():
+        raise CaptureError(
+            f"rows of this {kind} lattice do not lie in the picture as on the mask (+x right, +y down); turn it"
+        )
+    return steps.astype(int)
 
 
 def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
@@ -81,7 +102,7 @@ def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
     good = np.isfinite(found.diameter_nm)
     sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
     turn = np.linalg.lstsq(sites, np.column_stack([found.row[good], found.column[good]]), rcond=None)[0][:2]
-    return float(np.sqrt(abs(np.linalg.det(turn))) * pixel_nm / (design.pitch_um * 1e3))
+    return float(np.sqrt(abs(np.linalg.det(turn)) / design.site_um2) * pixel_nm / 1e3)
 
 
 def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
@@ -104,7 +125,7 @@ def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
 
 def numbered(found: Diameters, laid: Overlay) -> Diameters:
     """The same pillars with the mask's own row and column as their site."""
-    return dataclasses.replace(found, site=found.site + np.array([laid.row, laid.column]))
+    return dataclasses.replace(found, site=laid.site)
 
 
 def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:

@@ -15,7 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
 import test_sem
 
 from metalens import lens as lenses
-from metalens.cell import Cell, Index
+from metalens.cell import Cell, Index, Lattice
+from metalens.cell.shapes import Circle, Square
 from metalens.cli import main
 from metalens.lens import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
@@ -135,3 +136,45 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
     told = json.loads((tmp_path / "again" / "measure.json").read_text())
     assert max(abs(bias) for _, bias, *_ in told["bias_nm"]) < 1.5
     assert (tmp_path / "again" / "bias.toml").is_file()
+
+
+def _lens_file(path, cell, drawn_nm):
+    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    drawn = DiameterMap(drawn_nm * 1e-3, cell.pitch_um, cell.lattice)
+    lenses.save(path, Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
+
+
+def test_a_picture_of_a_hexagonal_lens_gives_its_bias_table(tmp_path):
+    """Pillars drawn 3.3 nm wider than made; blur moves either edge by less than 0.3 of a pixel of 4 nm."""
+    pitch_nm, pixel_nm = 400.0, 4.0
+    random = np.random.default_rng(6)
+    mask = random.uniform(170, 260, (13, 16)) * (np.indices((13, 16)).sum(0) % 2 == 0)
+    _lens_file(tmp_path / "lens.h5", Cell(pitch_um=0.4, pillar=Index(3.6), lattice=Lattice("hexagonal")), mask)
+    rows, columns = np.nonzero(mask[3:9, 2:12])
+    y, x = np.mgrid[:480, :500]
+    image = np.full(y.shape, 0.25)
+    for row, column in zip(rows, columns, strict=True):
+        cy, cx = ((row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm, (column + 0.7) * 0.5 * pitch_nm / pixel_nm)
+        out_px = np.hypot(y - cy, x - cx) - (mask[3 + row, 2 + column] - 3.3) / 2 / pixel_nm
+        image = np.maximum(image, 0.25 + 0.6 * special.expit(-2 * out_px))
+    image += 0.02 * random.standard_normal(image.shape)
+    tifffile.imwrite(tmp_path / "sem.tif", (image * 4e4).astype(np.uint16))
+    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    told = json.loads((tmp_path / "out" / "measure.json").read_text())
+    assert told["lattice"] == "hexagonal"
+    assert told["pitch_over_design"] == pytest.approx(1.0, abs=1e-3)
+    assert [bias for _, bias, *_ in told["bias_nm"]] == pytest.approx([-3.3] * len(told["bias_nm"]), abs=0.6 * pixel_nm)
+    assert (tmp_path / "out" / "bias.toml").is_file()
+
+
+@pytest.mark.parametrize("shape", [Square(), Circle(hole=True)])
+def test_pillars_whose_diameter_is_not_what_is_drawn_are_refused(tmp_path, capsys, shape):
+    """A circle through the sides of a square is 1.12 times as wide as its side: a bias of 25 nm that is none."""
+    _lens_file(tmp_path / "lens.h5", Cell(pitch_um=0.4, pillar=Index(3.6), shape=shape), np.full((7, 7), 220.0))
+    image = np.clip(test_sem.render(np.full((4, 4), 220.0)) * 2e4, 0, 65535)
+    tifffile.imwrite(tmp_path / "sem.tif", image.astype(np.uint16))
+    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "--design takes round pillars" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from characterize.measure import lattice as lattices
 from characterize.measure import overlay, sem
+from metalens.cell import Lattice
 from metalens.ground.errors import CaptureError
 from metalens.lens import DiameterMap
 
@@ -95,6 +96,49 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
         assert abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL  # edges of a blurred rim: as above
         assert 0 < sigma < 1.5
         assert count > 6
+
+
+@pytest.mark.parametrize(
+    ("design", "angle_deg", "ratio", "turn_deg"),
+    [
+        (Lattice("hexagonal"), 60.0, 1.0, 4.0),
+        (Lattice("hexagonal"), 120.0, 1.0, -9.0),
+        (Lattice("rectangular", 1.3), 90.0, 1.3, 3.0),
+    ],
+)
+def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(design, angle_deg, ratio, turn_deg):
+    """Pillars are drawn by their place on the mask, in um from its first; the picture is that place turned."""
+    mask = drawn(44, 60)
+    if design.centred:
+        mask *= np.indices(mask.shape).sum(0) % 2 == 0
+    made = DiameterMap(mask * 1e-3, PITCH * 1e-3, design)
+    shape = (420, 470)
+    place = lattice(turn_deg, angle_deg, ratio, shape)
+    turn = np.radians(turn_deg)
+    back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])  # (row, column) of the mask
+    steps_px = np.array(made.steps_um[::-1]) * 1e3 / PIXEL
+    index = np.rint((place - [11.3, 17.9]) @ back.T / steps_px).astype(int) + np.array([20, 22])
+    wide = mask[tuple(index.T)] - 3.1
+    found = sem.measure(picture(place, wide, shape), sem.Micrograph(PIXEL, PITCH))
+    laid = overlay.overlay(found, made)
+    assert laid.clearly
+    apart = np.hypot(found.row[:, None] - place[:, 0], found.column[:, None] - place[:, 1])
+    assert np.array_equal(overlay.numbered(found, laid).site, index[apart.argmin(1)])
+    assert np.nanmean(laid.error_nm) == pytest.approx(-3.1, abs=0.6 * PIXEL)  # edges of a blurred rim: as below
+    assert overlay.scale(found, PIXEL, made) == pytest.approx(1.0, abs=1e-3)
+    assert np.count_nonzero(laid.outlier) < 2
+
+
+def test_a_picture_across_the_mask_is_refused():
+    """Rows of a hexagonal lattice along y, where those of a mask run along x."""
+    shape = (330, 370)
+    place = lattice(30.0, 60.0, 1.0, shape)
+    found = sem.measure(picture(place, np.full(len(place), 180.0), shape), sem.Micrograph(PIXEL, PITCH))
+    made = DiameterMap(np.where(np.indices((44, 60)).sum(0) % 2, 0, 0.18), PITCH * 1e-3, Lattice("hexagonal"))
+    with pytest.raises(CaptureError, match="rows of this hexagonal lattice do not lie in the picture as on the mask"):
+        overlay.overlay(found, made)
+    with pytest.raises(CaptureError, match="the picture shows a hexagonal lattice, the design is square"):
+        overlay.overlay(found, DiameterMap(np.full((44, 60), 0.18), PITCH * 1e-3))
 
 
 @pytest.mark.parametrize("level", [4000.0, 1e-9])

@@ -218,10 +218,14 @@ def test_two_places_that_fit_alike_are_not_clear():
 
 def test_knots_hold_six_pillars_at_least():
     drawn, none = RNG.uniform(100, 300, 17), np.zeros(17, bool)
-    table = overlay.bias_table(overlay.Overlay(drawn, drawn * 0.01, 0, 0, clearly=True, outlier=none))
+    table = overlay.bias_table(
+        overlay.Overlay(drawn, drawn * 0.01, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=none)
+    )
     assert [row[3] for row in table] == [9, 8]  # 17 // 6 = 2, though seven are asked for
     many = np.sort(RNG.uniform(100, 300, 84))
-    table = overlay.bias_table(overlay.Overlay(many, many, 0, 0, clearly=True, outlier=np.zeros(84, bool)))
+    table = overlay.bias_table(
+        overlay.Overlay(many, many, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=np.zeros(84, bool))
+    )
     assert [row[3] for row in table] == [12] * 7
 
 

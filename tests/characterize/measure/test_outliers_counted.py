@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from characterize.measure import overlay
+from characterize.measure.lattice import Lattice
+from metalens.lens import DiameterMap
 
 RNG = np.random.default_rng(19)
 
@@ -16,8 +18,9 @@ def laid(scatter_nm, fallen=(), by=0.0, side=36):
     site = np.argwhere(np.ones((side, side), bool))
     made = drawn[site[:, 0] + 3, site[:, 1] + 2] - 7.5 + RNG.normal(0, scatter_nm, len(site))
     made[list(fallen)] += by
-    found = SimpleNamespace(diameter_nm=made, site=site, lattice=SimpleNamespace(kind="square"))
-    return overlay.overlay(found, SimpleNamespace(diameter_um=drawn * 1e-3))
+    lattice = Lattice(np.zeros(2), np.r_[0.3, 9.0], np.r_[9.0, -0.3])
+    found = SimpleNamespace(diameter_nm=made, site=site, lattice=lattice)
+    return overlay.overlay(found, DiameterMap(drawn * 1e-3, 0.35))
 
 
 def test_hardly_any_sound_pillar_is_an_outlier():

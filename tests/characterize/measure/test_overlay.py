@@ -31,7 +31,7 @@ def test_knots_of_a_bias_table_carry_mean_and_standard_error():
     error = RNG.normal(0, 3.0, 20) + designed * 0.02
     outlier = np.zeros(20, bool)
     outlier[3] = True
-    laid = overlay.Overlay(designed, error, 0, 0, clearly=True, outlier=outlier)
+    laid = overlay.Overlay(designed, error, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=outlier)
     table = overlay.bias_table(laid, knots=3)
     kept_drawn, kept_error = designed[~outlier], error[~outlier]
     for (drawn, made, sigma, count), part in zip(table, np.array_split(np.arange(19), 3), strict=True):
@@ -42,6 +42,8 @@ def test_knots_of_a_bias_table_carry_mean_and_standard_error():
     covered = 0
     for _ in range(300):  # each of the three within 2.2 of its sigma: 5 or 6 degrees of freedom, 93 %
         drawn = RNG.normal(0, 3.0, 20)
-        rows = overlay.bias_table(overlay.Overlay(designed, drawn, 0, 0, clearly=True, outlier=outlier), knots=3)
+        rows = overlay.bias_table(
+            overlay.Overlay(designed, drawn, 0, 0, site=np.zeros((0, 2)), clearly=True, outlier=outlier), knots=3
+        )
         covered += sum(abs(row[1]) < 2.2 * row[2] for row in rows)
     assert 0.88 < covered / 900 < 0.97
