@@ -89,7 +89,7 @@ def _steps(lattice: Lattice, design: DiameterMap) -> Array:
         raise CaptureError(
             f"rows of this {kind} lattice do not lie in the picture as on the mask (+x right, +y down); turn it"
         )
-    return steps.astype(int)
+    return np.asarray(steps, int)
 
 
 def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
