@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from layout.certify import background
 from layout.certify.background import Raster
 from layout.certify.places import OnLattices, strip_of
 from layout.mask import Lattice
@@ -69,3 +70,13 @@ def test_lattices_and_lists_hold_the_same_pillars_each_in_one_strip():
         )
     middle = lattices.part(1, 2)
     assert (strip_of(lattices, middle[1] - centre[middle[2], 1] + 1e-7) == 1).all()
+
+
+def test_at_the_rim_of_an_image_its_last_nine_pixels_go_on():
+    """Quadratic splines hold any plane, in the middle of pixels, on the rim and half a pixel beyond it."""
+    y, x = np.mgrid[:7, :9]
+    image = 2.0 + 0.3 * x - 0.7 * y
+    u, v = (a.ravel() for a in np.meshgrid([-0.5, 0.0, 0.4, 3.2, 7.6, 8.0, 8.5], [-0.5, 0.1, 2.7, 5.5, 6.0, 6.5]))
+    found = np.empty(len(u))
+    background._take(1.7 + 0.25 * u, -3.1 + 0.25 * v, 1.7, -3.1, 0.25, image, found)
+    assert found == pytest.approx(2.0 + 0.3 * u - 0.7 * v, abs=1e-12)

@@ -1,5 +1,6 @@
 """Configs: unknown keys name the nearest, wrong values name their place, and records survive the round trip."""
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -120,3 +121,35 @@ def test_a_material_is_a_name_or_plain_numbers():
 )
 def test_a_record_written_as_toml_reads_back_the_same(cell):
     assert config.loads(config.dumps(cell), Cell) == cell
+
+
+@dataclass(frozen=True)
+class Part:
+    size_um: float = 0.3
+    at_um: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Whole:
+    depths_um: tuple[float, ...] = ()
+    names: tuple[str, ...] = ()
+    one: Part = Part()
+    parts: tuple[Part, ...] = ()
+    none: tuple[Part, ...] = ()
+    left_out: float | None = None
+    free: bool = False
+
+
+def test_numbers_stay_lists_and_records_become_tables():
+    """What is written is TOML that another reader takes for the same; what is empty or left out makes no table."""
+    made = Whole((2.5, 9.0), ("a", "b"), Part(0.7, (1.0, 2.0)), (Part(0.1), Part(0.2, (3.0,))), (), None, True)
+    read = tomllib.loads(config.dumps(made))
+    assert read.pop("none", []) == []
+    assert read == {
+        "depths_um": [2.5, 9.0],
+        "names": ["a", "b"],
+        "free": True,
+        "one": {"size_um": 0.7, "at_um": [1.0, 2.0]},
+        "parts": [{"size_um": 0.1, "at_um": []}, {"size_um": 0.2, "at_um": [3.0]}],
+    }
+    assert config.loads(config.dumps(made), Whole) == made
