@@ -15,24 +15,32 @@ import made_lens as m
 from codesign.commands import view
 from codesign.evaluate import imaged
 from codesign.eye import Camera, Rig, dataset, render
-from metalens import cli, lens
+from metalens import cli, design, lens
 from metalens.cell import Film, Index
+from metalens.design import Focus
 from metalens.ground.store import Provenance
 from metalens.lens import Layers
 
 CAMERA = Camera(24, 3.0)
 RIG = replace(Rig(), elevation_rad=0.6)
+LENS = design.make(
+    design.phase_of(None, Focus(0.85, 300.0, 3000.0), radius_um=25.0),
+    Focus(0.85, 300.0, 3000.0),
+    aperture_um=50.0,
+    cell=m.CELL,
+    proxy=m.PROXY,
+)[0]
 
 
 @pytest.fixture(scope="module")
 def found():
     states = dataset.states_at(torch.arange(2), 5)
-    return imaged.imaged(m.small(), CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera))
+    return imaged.imaged(LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera))
 
 
 def test_the_scene_is_what_a_pinhole_at_the_lens_sees(found):
     """Without the margin that is blurred in: the rays of a camera of that size alone."""
-    rig = replace(RIG, sensor_distance_um=m.small().sensor_distance_um)
+    rig = replace(RIG, sensor_distance_um=LENS.sensor_distance_um)
     plain = render(dataset.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA).pinhole().numpy()
     # samples of wider frames have the same rays; a tenth of a per cent of them lie on edges that round otherwise
     assert np.mean(np.abs(found.scene - plain) > 1e-4) < 2e-3
@@ -60,7 +68,7 @@ def test_psfs_are_those_of_the_middle_and_the_rim(found):
 
 def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
     """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field angles alike."""
-    behind = replace(m.small(), layers=Layers(behind=(Film(Index(1.5), 60.0),)))
+    behind = replace(LENS, layers=Layers(behind=(Film(Index(1.5), 60.0),)))
     states, seen = dataset.states_at(torch.arange(1), 5), []
 
     def rendered(camera, rig):
@@ -88,7 +96,7 @@ def test_what_is_written_is_what_is_shown(found, tmp_path):
 
 
 def test_the_command_images_through_a_lens_file(tmp_path, capsys):
-    lens.save(tmp_path / "lens.h5", m.small())
+    lens.save(tmp_path / "lens.h5", LENS)
     (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 4.0\n")
     words = ["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]
     assert cli.main([*words, "--fwhm-nm", "20"]) == 2
