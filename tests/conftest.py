@@ -18,7 +18,7 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("house")
 
 
-DEAR = Path(__file__).parent / "dear.txt"  # files of ten seconds of processor time or more, the dearest first
+DEAR = Path(__file__).parent / "dear.txt"  # files of about ten seconds of processor time or more, the dearest first
 
 
 def pytest_configure(config: pytest.Config) -> None:
