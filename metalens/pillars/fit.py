@@ -149,7 +149,8 @@ def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
         other = _best(kept, wanted, fewer)
         if other is not None and _cost(other, wanted) < _cost(proxy, wanted):
             proxy, terms = other, fewer
-    return (_cost(proxy, wanted) > 1 and _shorter(kept, wanted, terms)) or (kept, proxy, terms)
+    shorter = _shorter(kept, wanted, terms) if _cost(proxy, wanted) > 1 else None
+    return shorter or (kept, proxy, terms)
 
 
 def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] | None:

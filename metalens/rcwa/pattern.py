@@ -3,6 +3,11 @@
 As in :mod:`metalens.rcwa.layer`, E = [eps] - (Delta N + N Delta) / 2 with Delta = [eps] - [1/eps]^-1. Here N = w n n^T,
 n the normal of the nearest point of the boundary (over all neighbouring pillars) and w a weight that falls from 1 at
 the boundary to 0 far from it; the truncated result converges to the same limit for any N.
+
+Li's rule for edges along x and y (1997: inverses strip by strip) was measured beside it on 20 L-shaped polygons of
+index 2 to 3.6: against 9 orders of both its errors are 2.3, 1.6 and 1.4 times smaller in the median at 5, 6 and 7
+orders, in 17, 15 and 11 of the cells. It is not taken: the gain fades towards the 9 orders where such cells end, so
+that their bars would hardly change, and it knows no other edges, no near field and no derivatives.
 """
 
 import math
