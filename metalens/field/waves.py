@@ -21,6 +21,7 @@ from metalens.lens import Lens, Media, answers, media, smooth
 from metalens.psf import among
 
 CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
+LOBES = 2.0  # of the mean of cells over the nodes that read them, in widths of a node
 
 
 class Wave(Protocol):
@@ -115,6 +116,9 @@ class PillarWave:
             if not cells.requires_grad:
                 self._cells = {**dict(list(self._cells.items())[-15:]), key: cells}
         pitch = self.lens.diameters.pitch_um
+        if cells.requires_grad:  # nodes read some of the cells; how the light changes, their means over a node tell
+            near = _over(cells, float(x_um.max() - x_um.min()) / (x_um.shape[-1] - 1) / (self._block * pitch))
+            cells = near + (cells - near).detach()
         half = [n * self._block * pitch / 2 for n in cells.shape[-2:]]
         # the cells are half a pitch past the lens's middle where one row or column more is added behind it
         past = [(n - own) % 2 * pitch / 2 for n, own in zip(self._padded, self.diameter_um.shape, strict=True)]
@@ -192,6 +196,21 @@ class PillarWave:
         layers = torch.cat([rest, open_[None]])
         pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
         return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
+
+
+def _over(cells: Tensor, width: float) -> Tensor:
+    """(2, y, x) mean about each of the cells that hold pillars, of waves longer than twice so many cells (Lanczos)."""
+    if width <= 1:
+        return cells
+    reach = math.ceil(LOBES * width) - 1
+    away = torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64) / width
+    row = (torch.sinc(away) * torch.sinc(away / LOBES) / width).to(cells)
+    there = (cells.detach() != 0).any(0, keepdim=True).to(cells)
+    both = torch.cat([cells, there])[:, None]
+    for shape, pad in (((1, 1, -1, 1), (reach, 0)), ((1, 1, 1, -1), (0, reach))):
+        both = torch.nn.functional.conv2d(both, row.reshape(shape), padding=pad)
+    mean: Tensor = both[:2, 0] / both[2, 0].clamp_min(0.2)
+    return mean
 
 
 def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:

