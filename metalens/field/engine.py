@@ -228,7 +228,7 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
     found["folded"] = left_out.folded(*seen) * share
     found["polarisation"] = left_out.unpolarised(*seen) * share
-    found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths))
+    found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
     if optics.layers.stop is not None:
         shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]
         found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um) * dimmer

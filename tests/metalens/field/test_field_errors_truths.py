@@ -180,7 +180,7 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert parts["transform"] == pytest.approx(0.017 * share, rel=1e-9)
     assert parts["polarisation"] == pytest.approx(0.0031 * share, rel=1e-9)
     assert parts["folded"] == pytest.approx(5 * 0.0047 * share, rel=1e-9)
-    assert parts["pillars"] == 0.0023
+    assert parts["pillars"] == pytest.approx(1.3 * 0.0023)
     assert seen["wave"] == 0.82
     assert seen["every"][0].numpy() == pytest.approx(seen["at"].numpy()[:2])
     assert seen["every"][1] is seen["depths"]
