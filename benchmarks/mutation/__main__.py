@@ -8,6 +8,7 @@ import json
 import multiprocessing
 import os
 import random
+import subprocess
 import sys
 from collections import defaultdict
 from dataclasses import asdict
@@ -249,13 +250,13 @@ def _say(done: int, total: int, row: dict[str, object]) -> None:
 def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) -> int:
     """The result as JSON and as a table; with --again the judged ones replace their old lines, open ones of source
     that is no longer there go, and what was said of the draw stays."""
-    drawn = ""
+    drawn, commit = "", _commit()
     if asked.again:
         kept = json.loads(asked.result.read_text(encoding="utf-8"))
         judged = {_identity(row): row for row in rows}
         stay = [r for r in kept["mutants"] if _identity(r) in judged or r["outcome"] != "survived" or _reason(r)]
         rows, words = [judged.get(_identity(row), row) for row in stay], kept["command"]
-        drawn = kept.get("drawn") or table.summary(kept["mutants"])
+        drawn, commit = kept.get("drawn") or table.summary(kept["mutants"]), kept.get("commit", "")
     else:
         words = f"python -m benchmarks.mutation {words}".strip()
     for row in rows:
@@ -263,11 +264,19 @@ def _keep(rows: list[dict[str, object]], asked: argparse.Namespace, words: str) 
         reason = _reason(row)
         if reason and row["outcome"] != "killed":
             row["reason"] = reason
-    about = {"command": words} | ({"drawn": drawn} if drawn else {})
+    about = {"command": words, "commit": commit} | ({"drawn": drawn} if drawn else {})
     asked.result.write_text(json.dumps(about | {"mutants": rows}, indent=1) + "\n", encoding="utf-8")
-    asked.result.with_suffix(".md").write_text(table.markdown(rows, words, drawn), encoding="utf-8")
+    asked.result.with_suffix(".md").write_text(table.markdown(rows, words, drawn, commit), encoding="utf-8")
     print(table.summary(rows))
     return int(any(row["outcome"] in ("survived", "no test") and "reason" not in row for row in rows))
+
+
+def _commit() -> str:
+    """Of the source as it stands; "" where there is no repository."""
+    asked = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return asked.stdout.strip()
 
 
 def _reason(row: dict[str, object]) -> str:

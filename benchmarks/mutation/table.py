@@ -6,9 +6,11 @@ Row = dict[str, object]
 LEFT = ("survived", "no test")
 
 
-def markdown(rows: list[Row], command: str, drawn: str = "") -> str:
-    """A page for readers of the repository. drawn: the summary before the survivors were judged once more."""
-    out = ["# One-line mutants of the numeric code", "", f"Made by `{command}`.", ""]
+def markdown(rows: list[Row], command: str, drawn: str = "", commit: str = "") -> str:
+    """A page for readers of the repository. drawn: the summary before the survivors were judged once more; commit: of
+    the source that the mutants were drawn from."""
+    of = f" on {commit}" if commit else ""
+    out = ["# One-line mutants of the numeric code", "", f"Made by `{command}`{of}.", ""]
     if drawn:
         out += [
             f"As drawn: {drawn}",

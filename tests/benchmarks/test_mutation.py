@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import json
 import multiprocessing
 
 import pytest
@@ -189,7 +190,8 @@ def test_what_was_drawn_is_told_beside_what_was_judged_once_more(tmp_path):
     for again in ([rows[1] | {"outcome": "killed"}], []):
         assert main._keep(again, asked, "--again") == 0
         page = result.with_suffix(".md").read_text()
-        assert "Made by `python -m benchmarks.mutation --count 3`." in page
+        assert "Made by `python -m benchmarks.mutation --count 3`" in page  # and of which source
+        assert json.loads(result.read_text())["commit"] == main._commit()
         first, then = (line for line in page.splitlines() if "of" in line and "killed (" in line)
         assert first.startswith("As drawn: all: 1 of 3 killed (33.3%), 0 more are equivalent; on lines that make an")
         assert first.endswith("0 of 2 killed (0.0%), 0 more are equivalent.")
