@@ -227,3 +227,23 @@ def test_a_parameter_whose_draws_all_agree_keeps_a_covariance():
 def test_less_misfit_than_noise_narrows_no_covariance():
     mode, valley = lens(BEST, spread=0.3)
     assert explore._joined(about(), [mode], [valley], {}, {}).covariance == pytest.approx(OWN + COMMON)
+
+
+def test_few_draws_share_their_correlation_with_the_parabola_s():
+    """Term by term after Schäfer and Strimmer: what 30 draws scatter by chance over how far they are from the parabola,
+    a fifth at the least, all of it where they are the parabola's."""
+    rng = np.random.default_rng(6)
+    parabola, sigma = np.array([[4.0, 1.1, 0.2], [1.1, 0.9, -0.3], [0.2, -0.3, 2.5]]), np.array([2.2, 1.0, 1.7])
+    valley = SimpleNamespace(covariance=parabola, sigma=np.sqrt(np.diag(parabola)))
+    told = []
+    for bend in (0.6, 40.0, 0.0):
+        draws = rng.multivariate_normal(np.zeros(3), parabola, 30)
+        draws[:, 2] += bend * draws[:, 0]
+        r = np.corrcoef(draws.T)
+        other = parabola / np.outer(valley.sigma, valley.sigma)
+        chance = sum((1 - r[i, j] ** 2) ** 2 / 30 for i in range(3) for j in range(3))
+        apart = sum((r[i, j] - other[i, j]) ** 2 for i in range(3) for j in range(3))
+        told.append(min(max(chance / apart, 0.2), 1.0))
+        want = ((1 - told[-1]) * r + told[-1] * other) * np.outer(sigma, sigma)
+        assert explore._covariance(draws, valley, sigma) == pytest.approx(want, rel=1e-6)
+    assert any(0.21 < share < 0.45 for share in told)  # none of these is at a limit where it is halved
