@@ -124,7 +124,9 @@ def library(level=None, phase=None, poles=()):
         t[1, 0, 1] *= level
     if phase is not None:
         t[0, 1, 0] *= np.exp(1j * phase)
-    return SimpleNamespace(cell=DEFAULT_CELL, diameter_um=D, t=t, resonances=np.array(poles, float).reshape(-1, 5))
+    bars = np.full(shape, 1e-4)
+    narrow = np.array(poles, float).reshape(-1, 5)
+    return SimpleNamespace(cell=DEFAULT_CELL, diameter_um=D, t=t, t_error=bars, resonances=narrow)
 
 
 def cut(**about):
