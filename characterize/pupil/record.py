@@ -127,7 +127,8 @@ class PupilModel:
     """Images of one bead at given stage positions as a function of the parameters of :class:`Layout`.
 
     Accuracy: the pupil is sampled finely enough that images of ``window`` pixels do not wrap around at the farthest
-    defocus; the rim of the disc is weighted by the covered share of its cells.
+    defocus; the rim of the disc is weighted by the covered share of its cells. Pixels of wavelength / 4 NA and less are
+    sampled at their middle: their width is part of the blur, 0.29 of them, to 0.025 of the finest detail's contrast.
     """
 
     def __init__(
