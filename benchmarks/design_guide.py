@@ -45,7 +45,7 @@ RADIALS = ("quadratic", "stop")  # lenses that are radial terms to begin with
 FREE, RADIAL = 63, 6  # terms of a free form and of an asphere
 TRAINING = LensTraining()
 LOOKS = (1.0,)  # shares of the training after which a lens is read, as its start is; the best is kept
-IMAGE, TRAINED = 0.05, 0.2  # tolerances of the image that is read, and of the one that lenses are trained on
+IMAGE, TRAINED = 0.05, 0.05  # tolerances of the image that is read, and of the one that lenses are trained on
 
 
 def optics_of(cell: Cell) -> OpticsConfig:
@@ -108,7 +108,8 @@ def designed(work: Path, cell: Cell) -> Tensor:
 def trained_line(cell: Cell) -> dict[str, Any]:
     """The best lens of a training by axial error on frames that it has not seen, never worse there than its start.
 
-    axial_mm: by turn, 0 the start. apart_rad: root-mean-square phase between the lens and its start.
+    image: its tolerance in training. axial_mm: by turn, 0 the start. apart_rad: root-mean-square phase between the
+    lens and its start.
     """
     config, begun = replace(cell.config, seed=DESIGN), time.process_time()
     seen, form = scenery(config), forms(FIELDS[cell.field].share)
@@ -120,7 +121,8 @@ def trained_line(cell: Cell) -> dict[str, Any]:
 
     turn, told = kept(path, [round(share * TRAINING.turns) for share in LOOKS], error_mm)
     return {
-        "loss": round(sum(loss[-last:]) / last, 4), "turn": turn, "axial_mm": {k: round(v, 4) for k, v in told.items()},
+        "image": TRAINED, "loss": round(sum(loss[-last:]) / last, 4), "turn": turn,
+        "axial_mm": {k: round(v, 4) for k, v in told.items()},
         "apart_rad": round(float((path[turn] - path[0]).norm()), 3), "cpu_s": round(time.process_time() - begun, 1),
         "coefficients_rad": path[turn].tolist(),
     }  # fmt: skip

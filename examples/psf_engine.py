@@ -18,11 +18,14 @@
 # small enough for the referee to finish.
 
 # %%
+import sys
 import time
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+
+sys.path.insert(0, "..")  # the rivals that this page measures lie beside the folder of examples
 
 from benchmarks.rivals import lowrank
 from benchmarks.rivals.radial import Radial, field_radial

@@ -5,11 +5,13 @@ behind a lens that stands, while the light at the nodes of the field gathers the
 step along the exact gradient of all field points, depths and wavelengths. A few drawn points a step would cost as much
 and leave a gradient of mostly noise: of 81 points four are drawn, and differ from the mean by as much as it is long.
 
-Frames leave noise in it too. At one angle two gradients of 640 frames each agree by a cosine of 0.4; over a field of
-3 to 29 degrees by 0.0, and a step of 1 rad rms along their mean moves the branch's loss by 0.001. A step of fixed
-length for every term, as Adam has it, is then a walk at random, whose aberrations cost more than the gradient could
-win. So the lens moves along the part of the running mean that is longer than noise alone would leave
-(:class:`Descent`), and stands where there is none.
+Frames leave noise in it too. A step of fixed length for every term, as Adam has it, is then in part a walk at random,
+whose aberrations cost more than the gradient wins. So the lens moves along the part of the running mean that is longer
+than noise alone would leave (:class:`Descent`), and stands where there is none.
+
+On an image to 0.2 of the contrast the lens learns the errors of that image: its loss falls and what it is worth on
+another image does too. On one to 0.05, 63 terms, 3 to 29 degrees and 30 nm, windows are read 3 % better after 24 turns
+with a step of 0.15 rad, and 5 % with 0.6 rad (one seed).
 
 The branch is thrown away: what the lens is worth says a reader that begins anew
 (:func:`codesign.evaluate.reader.read`), and of the lenses passed, the start among them, the best is kept
@@ -48,7 +50,7 @@ class LensTraining:
     turns: int = 24
     hold: int = 20
     batch: int = 32
-    phase: Schedule = field(default_factory=lambda: Schedule(0.15, 0.25, 1.0))
+    phase: Schedule = field(default_factory=lambda: Schedule(0.6, 0.25, 1.0))
     anew: int = 8
     rate: float = 3e-3
     seed: int = 0
