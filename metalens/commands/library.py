@@ -25,6 +25,7 @@ from metalens.pillars import (
     Wanted,
     axes,
     converted,
+    taller,
     workers,
 )
 from metalens.pillars import fit as proxy_fit
@@ -115,10 +116,7 @@ def _failures(
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
     elif fitted.turns < 1 and not accept_partial_turn:
-        cure = (
-            f"take pillars of about {made.cell.height_um / max(fitted.turns, 0.05):.3g} um ({made.cell.height_um:g} um "
-            "now; phase grows with the height as long as no resonance comes in), or a material of higher index"
-        )
+        cure = taller(made.cell.height_um, fitted.turns)
         if fitted.notes:
             least = no_resonance_um(made.cell, made.sweep.wavelengths_um[0])
             cure = (

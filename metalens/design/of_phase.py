@@ -14,7 +14,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, LensError
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Hand, Lens
-from metalens.pillars import Proxy
+from metalens.pillars import Proxy, taller
 
 PLACES, SEARCHED = 61, 121  # across what is lit of a lens, and across all of it, where that is looked for
 EDGE_UM = 2e-3  # a curve that ends so near a printable end is ended by it
@@ -198,10 +198,7 @@ def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
     """
     thinnest, widest = _printed(cell, limits)
     if proxy.domain_um[0] <= thinnest + EDGE_UM and proxy.domain_um[1] >= widest - EDGE_UM:
-        return (
-            f"take pillars of about {cell.height_um / turns:.3g} um ({cell.height_um:g} um now; phase grows with the "
-            "height as long as no resonance comes in), or a material of higher index"
-        )
+        return taller(cell.height_um, turns)
     return (
         f"the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
         f"{proxy.domain_um[1]:.4f} um, to the next resonance or the ends of its sweep: sweep as far as is printed, and "

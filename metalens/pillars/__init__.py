@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from metalens.pillars.fit import Wanted as Wanted
     from metalens.pillars.proxy import MOST_ERROR as MOST_ERROR
     from metalens.pillars.proxy import Proxy as Proxy
+    from metalens.pillars.proxy import taller as taller
     from metalens.pillars.record import DEFAULT_CELL as DEFAULT_CELL
     from metalens.pillars.record import PillarLibrary as PillarLibrary
     from metalens.pillars.record import Sweep as Sweep
@@ -48,6 +49,7 @@ __getattr__, __dir__, __all__ = attach(
         "rational": "",
         "record": "",
         "study": "",
+        "taller": "proxy",
         "workers": "",
     },
 )

@@ -16,6 +16,14 @@ AVERAGED = 65  # diameters over which |t| is averaged
 MOST_ERROR = 0.1  # of t: the largest tolerance of a library; pillars known less well (root mean square) make no lens
 
 
+def taller(height_um: float, turns: float) -> str:
+    """What would cover a turn of phase where pillars of this height cover less (``turns``), for a person."""
+    return (
+        f"take pillars of about {height_um / max(turns, 0.05):.3g} um ({height_um:g} um now; phase grows with the "
+        "height as long as no resonance comes in), or a material of higher index"
+    )
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Proxy:
     """Phase and |T| as polynomials of diameter, wavelength and angle, with the error seen on held-out entries.
