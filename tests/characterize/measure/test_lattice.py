@@ -151,3 +151,26 @@ def test_a_wave_is_refined_to_a_thousandth_of_a_fringe(wave, level):
     seen = level * hann * np.cos(2 * np.pi * (wave[0] * y[:, None] + wave[1] * x) + 0.7)
     found = lattices._refined(seen, np.array([wave[0] + 0.25 / 120, wave[1] - 0.2 / 120]))
     assert found * 120 == pytest.approx(np.array(wave) * 120, abs=2e-3)
+
+
+@pytest.mark.parametrize(("stretch", "fits"), [(1.045, True), (1.055, False), (1 / 1.045, True), (1 / 1.055, False)])
+def test_a_picture_whose_sides_differ_by_a_twentieth_from_the_design_is_not_laid_on_it(stretch, fits):
+    """Of a rectangle of 0.31 x 0.434 um; the scale of the picture is free."""
+    seen = lattices.Lattice(np.zeros(2), np.array([0.0, 71.0 * stretch]), np.array([1.4 * 71.0 / stretch, 0.0]))
+    design = DiameterMap(np.full((9, 9), 0.18), PITCH * 1e-3, lattice=Lattice("rectangular", 1.4))
+    if fits:
+        assert overlay._steps(seen, design).tolist() == [[1, 0], [0, 1]]
+    else:
+        with pytest.raises(CaptureError, match="do not lie in the picture as on the mask"):
+            overlay._steps(seen, design)
+
+
+def test_a_longer_side_is_sought_up_to_two_and_a_half_pitches_and_no_wave_beyond():
+    """A row in three that is brighter is no lattice of its own."""
+    rows, columns = np.indices((330, 370))
+    for ratio in (2.4, 1.4):
+        wave = np.cos(2 * np.pi * columns / 20.0) + np.cos(2 * np.pi * rows / (20.0 * ratio))
+        wave = wave + (0.0 if ratio == 2.4 else 3.0) * np.cos(2 * np.pi * rows / 60.0)
+        made = lattices.find(wave, 20.0)
+        assert np.abs(made.a) == pytest.approx([0.0, 20.0], abs=0.05)
+        assert np.abs(made.b) == pytest.approx([20.0 * ratio, 0.0], abs=0.1)

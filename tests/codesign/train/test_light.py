@@ -9,6 +9,7 @@ from codesign.optics import formed, stack
 from codesign.optics.stack import OpticsConfig
 from codesign.train import run
 from codesign.train.light import Light
+from metalens.field import drawn
 from metalens.ground.errors import TrainingError
 from metalens.image import Imager
 
@@ -87,6 +88,33 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
     other.restore(light.state())
     other.at(8, place + 4.0, 30, 5, live=False)
     assert made == [0.0, 2.0, 4.0, 4.0]
+    _passes_on_what_it_asked_for(monkeypatch, other, place, formed_once)
+
+
+def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
+    """The nodes whose light is asked for are those that the gradient is passed on from; others at every step."""
+    asked, passed, steps = [], [], (9, 10, 11, 9)
+
+    def live(settings, imaged, nodes):
+        asked.append(nodes)
+        leaf = torch.zeros(1, requires_grad=True)
+        leaf.grad = torch.ones(1)
+        return formed.Live(leaf, imaged)
+
+    def surrogate(optics, plan, gradient, *, draws, generator):
+        passed.append((draws, set(drawn(plan, draws, generator)[0].tolist())))
+        return torch.zeros((), requires_grad=True)
+
+    monkeypatch.setattr(formed, "live", live)
+    monkeypatch.setattr(formed, "surrogate", surrogate)
+    for step in steps:
+        light.at(step, place, 30, 5, live=True)
+        light.pass_on(step, place)
+        light.pass_on(step, place)  # nothing is left of it
+    assert passed == [(2, nodes) for nodes in asked]
+    assert asked[0] == asked[3]
+    assert len({frozenset(nodes) for nodes in asked}) == 3
+    assert whole.plan.y_um.numel() * whole.plan.x_um.numel() > 6
 
 
 def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 
 from metalens import library
 from metalens.cli import main
+from metalens.commands import library as command
 from metalens.commands.library import CellFile
 from metalens.ground import config
 from metalens.pillars.record import DEFAULT_CELL
@@ -251,6 +252,9 @@ def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_a
     assert "error bars of 100% of the entries are above 0.1" in told[0]
     assert "FAILED: the pillars' own error bars are 0.2 of |t| (root mean square)" in told[0]
     assert "of the entries are above 0.1" not in told[1]  # 48 % of them
+    many = known_within(d, np.where(np.arange(40) < 19, 0.09, 0.12))(DEFAULT_CELL)
+    failures = command._failures(many, None, "", stated=False)
+    assert "error bars of 52% of the entries are above 0.1, whatever is asked for" in failures
     assert "FAILED: the pillars' own error bars are 0.11 of |t|" in told[1]
     config = 'library = "library.h5"\naperture_mm = 0.006\nsensor_distance_mm = 0.2\nsource_distance_mm = inf\n'
     (tmp_path / "design.toml").write_text(config + "[limits]\nmin_diameter_nm = 80\nmin_gap_nm = 80\n")

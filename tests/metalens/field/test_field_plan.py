@@ -266,3 +266,18 @@ def test_a_lens_behind_a_hole_beside_the_axis_is_not_round(monkeypatch, middle, 
     with pytest.raises(SceneError, match="asked"):
         engine.imager(wave, Grid((9, 9), 3.0, (3e3, 9e3), 0, 9), layers=layers, tolerance=0.1)
     assert seen == [folds]
+
+
+def test_errors_within_their_shares_are_together_within_the_tolerance():
+    """Of independent signs, so by squares; next to nothing of it is given away."""
+    assert 0.995 < sum(share**2 for share in plan.SHARES.values()) <= 1
+
+
+def test_folded_light_is_looked_for_all_over_a_field_and_near_its_rims():
+    """Two of eight places in each quarter; along either axis no stretch of more than a fifth of it without one."""
+    x, y = np.array(plan.STREWN).T
+    assert np.unique(2 * (x > 0) + (y > 0), return_counts=True)[1].tolist() == [2, 2, 2, 2]
+    for axis in (np.sort(x), np.sort(y)):
+        assert np.diff(axis).max() <= 0.4 + 1e-12
+        assert axis[0] == pytest.approx(-0.9, abs=0.051)
+        assert axis[-1] == pytest.approx(0.95)

@@ -34,6 +34,7 @@ def test_iterations_are_shared_by_the_size_of_the_grids():
     """Nodes count as a grid of 160; what division leaves goes to the last stage."""
     assert search._shares(Fisher(grids=(6, 10, 20), iterations=100)) == [16, 27, 57]
     assert search._shares(Fisher(grids=(8, 32, 0), iterations=500)) == [20, 80, 400]
+    assert search._shares(Fisher(grids=(39, 0), iterations=500)) == [97, 403]  # 97.99
     assert search._shares(Fisher(grids=(4, 60, 60), iterations=30)) == [1, 14, 15]
     assert search._shares(Fisher(grids=(6, 6, 6), iterations=2)) == [1, 1, 1]
 
