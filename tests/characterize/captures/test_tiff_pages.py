@@ -5,7 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from characterize.captures import tiff_pages
+from characterize.captures import capture, tiff_pages
+from characterize.captures.colour import Colours
 from metalens.ground.errors import CaptureError
 
 tifffile = pytest.importorskip("tifffile")
@@ -19,6 +20,14 @@ def written(tmp_path, frames=FRAMES, **about):
 
 def test_plain_frames_are_read_as_they_are(tmp_path):
     assert np.array_equal(tiff_pages.read(written(tmp_path)), FRAMES)
+
+
+def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(tmp_path):
+    stack = written(tmp_path)
+    tifffile.imwrite(tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None)
+    names, frames = capture._all_frames([stack, tmp_path / "b.tif"], tmp_path, Colours())
+    assert names == ("a.tif[0]", "a.tif[1]", "a.tif[2]", "b.tif")
+    assert np.array_equal(frames, np.stack([*FRAMES, FRAMES[1]]))
 
 
 @pytest.mark.parametrize(
