@@ -32,6 +32,7 @@ from codesign.eye import Camera
 from codesign.network import blur, losses
 from codesign.network.blur import BlurBranch
 from codesign.train import Scenes, read_out
+from metalens.ground import threads
 from metalens.ground.errors import ConfigError
 from metalens.ground.report import Table
 from metalens.image import Imager, Sensor, UniformImager
@@ -187,6 +188,7 @@ def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
 
 def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) -> Read:
     """Train the reader on images through ``optics`` and judge it; the same seed gives the same numbers."""
+    threads.keep_memory()
     state = torch.get_rng_state()
     torch.manual_seed(config.seed)
     try:

@@ -33,6 +33,7 @@ from codesign.network.blur import BlurBranch
 from codesign.optics import OpticsConfig, formed
 from codesign.train import Schedule, read_out
 from metalens.field import node_light, normalised, term, with_psfs
+from metalens.ground import threads
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Imager, UniformImager
 
@@ -126,6 +127,7 @@ def trained(
             f"optics: sample_um = {optics.sample_um}, polynomials = {optics.polynomials}, image = {optics.image!r}; "
             f"reader: pitch_um = {config.pitch_um}: need samples of the pitch, 1 polynomial or more, and 'true'"
         )
+    threads.keep_memory()
     state = torch.get_rng_state()
     torch.manual_seed(training.seed)
     try:

@@ -25,6 +25,7 @@ from codesign.train.evolution import Count, sandwich
 from codesign.train.formation import depth_loss, frame_wide, network_macs, read_out
 from codesign.train.light import Light
 from codesign.train.moving import Model, Schedule, model
+from metalens.ground import threads
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, Sensor, UniformImager
 
@@ -162,6 +163,7 @@ class Trainer:
         Raises:
             TrainingError: no finite gradient for ``patience`` steps, with the cause.
         """
+        threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
         work: Callable[[int], Given | Batch] = self._standing if self._still else self._batch

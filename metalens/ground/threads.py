@@ -1,6 +1,10 @@
-"""Threads for compiled loops that release the interpreter lock: torch's number where it runs; safe after a fork."""
+"""Threads for compiled loops that release the interpreter lock: torch's number where it runs; safe after a fork.
+
+And memory that a process keeps between the steps of a long run.
+"""
 
 import contextlib
+import ctypes
 import functools
 import importlib
 import itertools
@@ -120,6 +124,18 @@ def one_blas_thread() -> contextlib.AbstractContextManager[object]:
     """Run numpy's and scipy's BLAS on one thread: its idle threads spin for a while and take torch's cores."""
     limit: contextlib.AbstractContextManager[object] = _blas().limit(limits=1)
     return limit
+
+
+@functools.lru_cache(maxsize=1)
+def keep_memory() -> bool:
+    """From here on what is freed stays with the process, for arrays to come; False where the C library is not glibc.
+
+    For runs whose steps all make arrays of the same sizes. Left to itself glibc gives blocks of over 32 MB, and the end
+    of its heap, back to the system after every step, and gets them as new pages, which the system clears one by one.
+    """
+    tune = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    own_pages, trimmed = -3, -1  # M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h; either one alone makes it worse
+    return tune is not None and bool(tune(own_pages, 1 << 30) and tune(trimmed, (1 << 31) - 1))
 
 
 @functools.lru_cache(maxsize=1)

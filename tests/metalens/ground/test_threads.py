@@ -1,6 +1,7 @@
 """Compiled loops use the threads that are theirs, with torch and without it."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -145,3 +146,31 @@ def test_one_thread_does_one_item_after_another():
         assert threads.each(lambda _: threading.current_thread(), range(2)) == [threading.current_thread()] * 2
     finally:
         torch.set_num_threads(before)
+
+
+# MiB that the process holds after an array of 48 was made and let go
+HELD = """
+import resource
+import sys
+from pathlib import Path
+import numpy as np
+from metalens.ground.threads import keep_memory
+
+def held():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() >> 20
+
+told = keep_memory() if sys.argv[1] == "kept" else None
+before = held()
+np.ones(6 << 20)
+print(told, held() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="what is tuned is glibc's")
+@pytest.mark.parametrize(("word", "told", "least", "most"), [("kept", "True", 47, 56), ("given back", "None", -8, 8)])
+def test_memory_that_is_kept_is_there_for_the_next_array(word, told, least, most):
+    done = subprocess.run([sys.executable, "-c", HELD, word], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said, held = done.stdout.split()
+    assert said == told
+    assert least <= int(held) <= most  # MiB; 8 for what Python itself takes or gives meanwhile
