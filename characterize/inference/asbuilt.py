@@ -34,7 +34,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Sensitivity, Solved
+from metalens.made import PairSensitivities, Sensitivity, Solved
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -258,16 +258,9 @@ def spread(rng: np.random.Generator, count: int, covariance: Array) -> Array:
 
 
 _ARRAYS = (
-    "value",
-    "covariance",
-    "information",
-    "depth_um",
-    "angle_rad",
-    "measured",
-    "predicted",
-    "nominal",
-    "residual_sigma",
-)
+    "value", "covariance", "information", "depth_um", "angle_rad", "measured", "predicted", "nominal", "residual_sigma",
+)  # fmt: skip
+_PAIRS = "width_um", "length_um", "rates"
 _OPTIONAL, _WITHIN = ("low", "high", "draws", "by_cause", "bench"), ("covariance", "low", "high", "draws")
 _WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts", "causes")
 
@@ -286,8 +279,9 @@ def save(path: str | Path, result: AsBuilt) -> None:
     arrays |= {"response/coefficients": result.response.coefficients}
     if result.response.edges is not None:
         arrays["response/edges"] = result.response.edges
-    if result.response.solved is not None:
-        solved = result.response.solved
+    if (pairs := result.response.pairs) is not None:
+        arrays |= {f"response/{name}": getattr(pairs, name) for name in _PAIRS}
+    if (solved := result.response.solved) is not None:
         arrays |= {"response/diameter_um": solved.diameter_um, "response/powers": solved.powers}
         arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
@@ -337,6 +331,9 @@ def load(path: str | Path) -> AsBuilt:
 
 def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
     ends = about.get("response_low_um", -math.inf), about.get("response_high_um", math.inf)
+    if "response/rates" in arrays:
+        pairs = (arrays[f"response/{name}"] for name in _PAIRS)
+        return Sensitivity.of_pairs(PairSensitivities(*pairs, about["response_error"]))
     solved = None
     if "response/powers" in arrays:
         wave = float(arrays["response/wavelength_um"])

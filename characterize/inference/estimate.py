@@ -19,6 +19,7 @@ from characterize.inference.prepare import (
     data_of,
     merged,
     quick_enough,
+    roughly_known,
     setting_of,
     stated,
     unrounded,
@@ -97,8 +98,7 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     whole = Task(model, data, start, known, found, options.free, unfitted)
     task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
     cautions = [*frames.corrections, *laid_words(task.found or found), *verdict.colours(lens, known)]
-    if model.response.error > 0.1:
-        cautions.append(f"slopes of the pillars by height and index are known to {model.response.error:.0%} only")
+    cautions += roughly_known(lens, model.response)
     unbiased = search.starts(task, biases_nm=(0.0,))[0]
     task = dataclasses.replace(task, model=quick_enough(task.model, task.data, unbiased))
     task, ends = _unrounded(*search.placed(*_ends(task, frames.gain, cautions)), frames.gain)

@@ -14,10 +14,12 @@ from characterize.model import ForwardModel, Known, Setting, background, usual
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
+from metalens.made import Kinds, Sensitivity
 
 MOST_OF_ONE_FRAME = 8
 _DARK = 3e-5  # share of what light tells that may lie where a quick model knows nothing of it
 _STILL = 0.05  # counts of noise at least that levels of pixels add, whatever is stated
+_FEW_BEYOND, _ROUGH = 0.01, 0.1  # share of the pillars, of slopes
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 
 
@@ -239,3 +241,26 @@ def _number(capture: Capture, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise CaptureError(f"capture.toml: {name} = {value!r}; need a finite number")
     return float(value)
+
+
+def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
+    """What is known of the pillars to a tenth of it at best, or to a bias less than is reckoned with, in words."""
+    rough = f"slopes of the pillars by height and index are known to {response.error:.0%} only"
+    return [*_beyond_table(lens), *([rough] if response.error > _ROUGH else [])]
+
+
+def _beyond_table(lens: Lens) -> list[str]:
+    """Whether the bias to be reckoned with leads pillars of two sizes beyond the table of their lens, in words."""
+    if lens.pairs is None:
+        return []
+    kinds, reach_um = Kinds.of(lens.diameters), usual(("bias_nm",), lens)[0].sigma * 1e-3
+    near = np.zeros(len(kinds.count), bool)
+    for size, axis in ((kinds.width_um, lens.pairs.x_um), (kinds.length_um, lens.pairs.y_um)):
+        near |= (size < axis[0] + reach_um) | (size > axis[-1] - reach_um)
+    share = float(kinds.count[near].sum() / kinds.count.sum())
+    if share < _FEW_BEYOND:
+        return []
+    return [
+        f"{share:.0%} of the pillars are within {reach_um * 1e3:.0f} nm of the ends of their table, beyond which t is "
+        "followed along its tangents: sweep the library that much wider than the sizes the design may use"
+    ]

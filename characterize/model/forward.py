@@ -14,7 +14,7 @@ from characterize.model.glass import source_paths
 from characterize.model.kernel import real_of, turns
 from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
-from characterize.model.pillars import Pillars, Range, change, incidence_rad
+from characterize.model.pillars import Pillars, Range, change, incidence_rad, of_lens
 from characterize.model.reduced import Bench, Reduced
 from characterize.model.setting import (
     BENDING,
@@ -88,7 +88,7 @@ class ForwardModel:
         depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
-            self._pillars[incidence] = Pillars(self.lens, self.response, span=self._span, angle_rad=incidence)
+            self._pillars[incidence] = of_lens(self.lens, self.response, span=self._span, angle_rad=incidence)
         pillars = self._pillars[incidence]
         reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
         return Group.of(index, pillars, reduced)

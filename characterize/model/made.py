@@ -11,8 +11,9 @@ from characterize.model.parameters import PLACE, state
 from characterize.model.pillars import incidence_rad
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Bends, Sensitivity, Widens, biased, causes, transmission
+from metalens.made import Bends, Kinds, PairTable, Sensitivity, Widens, biased, causes, transmission
 
 _TABLE = 1 << 16
 _NODES = max(causes.polynomials(kind).shape[-1] for kind in (Widens, Bends))
@@ -40,21 +41,41 @@ def pillars(
     Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
     """
     d, made = lens.diameters, state(x)
-    bias = _on_pillars(d, made.bias_um)
+    bias = _on_pillars(d, made.bias_um) + noise_um
+    if lens.pairs is not None:
+        t = _of_two_sizes(lens, response, bias, made.answers())
+    else:
+        t = _of_one_size(lens, response, x, bias, angle_rad)
+    if made.bends():
+        t = t * np.exp(1j * _on_pillars(d, made.phase_rad))
+    if modes is not None and len(modes):
+        t = t * np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
+    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))), 0))
+
+
+def _of_two_sizes(lens: Lens, response: Sensitivity, bias_um: Array, answers: Array) -> Array:
+    """(y, x) t by the table of the lens; what is no pillar is that of some."""
+    d, kinds, pairs = lens.diameters, Kinds.of(lens.diameters), response.pairs
+    if pairs is None:
+        raise FitError("pillars of two sizes: slopes of such pillars are needed")
+    index = np.minimum(kinds.index(d), len(kinds.count) - 1)
+    change = np.exp(np.tensordot(answers, pairs.at(kinds.width_um, kinds.length_um), 1))
+    width, length = (size[index] + bias_um for size in (kinds.width_um, kinds.length_um))
+    return np.asarray(PairTable.of(lens).t(width, length) * change[index])
+
+
+def _of_one_size(lens: Lens, response: Sensitivity, x: Array, bias_um: Array, angle_rad: float) -> Array:
+    """(y, x) t by the proxy of the lens; what is no pillar is that of some."""
+    d, made = lens.diameters, state(x)
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
-    grown = np.where(d.diameter_um > 0, d.diameter_um + bias + noise_um, np.nan)
+    grown = np.where(d.diameter_um > 0, d.diameter_um + bias_um, np.nan)
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
     place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
     diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
     t = transmission(lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad)
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]
-    t = t * biased(response, np.nan_to_num(grown, nan=low), bias + noise_um)
-    if made.bends():
-        t *= np.exp(1j * _on_pillars(d, made.phase_rad))
-    if modes is not None and len(modes):
-        t *= np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
-    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))), 0))
+    return np.asarray(t * biased(response, np.nan_to_num(grown, nan=low), bias_um))
 
 
 def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Array]) -> Array:
@@ -74,9 +95,10 @@ def built_lens(design: Lens, x: Array) -> Lens:
     bias = _on_pillars(d, state(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
+    longer = None if d.length_um is None else np.where(d.diameter_um > 0, np.maximum(d.length_um + bias, 0.0), 0.0)
     return dataclasses.replace(
         design,
-        diameters=dataclasses.replace(d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0)),
+        diameters=dataclasses.replace(d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0), length_um=longer),
         wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
         sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
         profile="as-built",

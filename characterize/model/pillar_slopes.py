@@ -12,7 +12,18 @@ from metalens.cell import Cell, index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, FitError, MaterialError
 from metalens.lens import Lens
-from metalens.made import Answers, Cause, Sensitivity, Solved, lacking, of_kind, sensitivity
+from metalens.made import (
+    Answers,
+    Cause,
+    Kinds,
+    PairSensitivities,
+    Sensitivity,
+    Solved,
+    lacking,
+    of_kind,
+    pair_sensitivities,
+    sensitivity,
+)
 
 _NODES, _MOST = 25, 14
 _SOURCES = (
@@ -33,7 +44,8 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
     polynomial of least degree whose error on diameters that it was not made from meets ``tolerance``, relative to
     the largest change of the slope across the lens; the best one below degree 15 where none does. The error reached
     is in ``error``. Cells that no solver takes get the effective-index slopes of :func:`metalens.made.sensitivity`, and
-    pillars that are not round on a square lattice, those of their own shape that it has.
+    pillars that are not round on a square lattice, those of their own shape that it has; pillars of two sizes those of
+    up to 24 pairs of them, for the light of the lens.
 
     What was solved once is kept in the user's cache folder (:mod:`characterize.model.kept`).
 
@@ -45,13 +57,11 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
         FitError: a cause is wanted that pillars of this shape cannot have. CellError, MaterialError: pillars that are
             not round, and that no solver takes.
     """
-    if lens.pairs is not None:
-        raise FitError(
-            "pillars of two sizes: captures tell one bias of pillars of one size; such lenses are not fitted"
-        )
     for name in lacking(lens.cell):
         if name in wanted:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
+    if lens.pairs is not None:
+        return _of_pairs(lens)
     if not lens.cell.round:
         about = _about(lens, tolerance, ["own shape"])
         return _unpacked(kept.kept("pillars", about, _SOURCES, lambda: _packed(sensitivity(lens))))
@@ -60,6 +70,17 @@ def slopes(lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()) 
         return _unpacked(kept.kept("pillars", about, _SOURCES, lambda: _packed(_solve(lens, tolerance, wanted))))
     except (CellError, MaterialError):
         return sensitivity(lens)
+
+
+def _of_pairs(lens: Lens) -> Sensitivity:
+    """Of pillars of two sizes, for the light of the lens."""
+    kinds = Kinds.of(lens.diameters)
+    about = _about(lens, 0.0, ["two sizes", lens.light, repr(kinds.width_um.tolist()), repr(kinds.length_um.tolist())])
+
+    def solve() -> dict[str, Array]:
+        return _packed(Sensitivity.of_pairs(pair_sensitivities(lens)[lens.light]))
+
+    return _unpacked(kept.kept("pillars", about, _SOURCES, solve))
 
 
 def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
@@ -82,15 +103,19 @@ def _packed(found: Sensitivity) -> dict[str, Array]:
         out |= {"wavelength": np.array(table.wavelength_um), "diameter": table.diameter_um, "powers": table.powers}
     if found.edges is not None:
         out["edges"] = found.edges
+    if found.pairs is not None:
+        out |= {"width": found.pairs.width_um, "length": found.pairs.length_um, "rates": found.pairs.rates}
     return out
 
 
 def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
     """From named arrays."""
+    center, error, low, high = arrays["numbers"].tolist()
+    if "rates" in arrays:
+        return Sensitivity.of_pairs(PairSensitivities(arrays["width"], arrays["length"], arrays["rates"], error))
     table = None
     if "powers" in arrays:
         table = Solved(float(arrays["wavelength"]), arrays["diameter"], arrays["powers"])
-    center, error, low, high = arrays["numbers"].tolist()
     return Sensitivity(arrays["coefficients"], center, error, low, high, table, arrays.get("edges"))
 
 

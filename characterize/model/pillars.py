@@ -16,9 +16,13 @@ from characterize.model.parameters import PLACE, state
 from metalens.cell import Cell
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
-from metalens.lens import Lens
+from metalens.ground.errors import FitError
+from metalens.lens import DiameterMap, Lens
 from metalens.made import (
+    Answer,
     Answers,
+    Kinds,
+    PairTable,
     Sensitivity,
     answer,
     biased,
@@ -81,6 +85,8 @@ class Pillars:
     formed. error: largest |t - low-rank| met on random changes inside the range, that the basis was not made from.
     """
 
+    _laid: tuple[int, ...] = (1, 2, 3)  # times the usual intervals between bias nodes that are tried
+
     def __init__(
         self,
         lens: Lens,
@@ -92,14 +98,18 @@ class Pillars:
     ) -> None:
         span = (span or Range.of(lens.wavelength_um)).within(lens.cell)
         self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
-        built = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-        self.diameter_um = np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
+        self.diameter_um = self._kinds()
         b = max(7, 2 * math.ceil(span.bias_um / (0.006 * coarser(lens.wavelength_um))) + 1)
-        for count in (b, 2 * b - 1, 3 * b - 2):  # resonances want more
-            self._lay(count, tolerance)
+        for times in self._laid:  # resonances want more
+            self._lay(times * (b - 1) + 1, tolerance)
             self.error = self._measure()
             if self.error < _MISSED:
                 break
+
+    def _kinds(self) -> Array:
+        """(grid,) designed diameters that the functions are known at."""
+        built = self.lens.diameters.diameter_um[self.lens.diameters.diameter_um > 0]
+        return np.linspace(float(built.min()), float(built.max()) + 1e-9, 193)
 
     def _lay(self, count: int, tolerance: float) -> None:
         """Bias nodes, and the basis of what happens there."""
@@ -107,15 +117,18 @@ class Pillars:
         self.nodes_um = unit * self.span.bias_um
         share = np.where(np.arange(count) > 0, 2.0, 1.0) / count
         self._to_series = (chebyshev.chebvander(unit, count - 1) * share).T
-        nodes = self.nodes_um[:, None]
-        self._answer = answer(self.lens.proxy, self.response, self.diameter_um + nodes)
-        self._biased = biased(self.response, self.diameter_um + nodes, nodes)
+        self._answer, self._biased = self._answers(self.nodes_um[:, None])
         self._designed: dict[float, Array] = {}
         self._colours = self._through_colours()
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
         self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
+
+    def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
+        """Of the pillars at (b, 1) bias nodes: under the answering causes, and what the edges add to the size."""
+        d = self.diameter_um + nodes
+        return answer(self.lens.proxy, self.response, d), biased(self.response, d, nodes)
 
     def exact(self, bias_um: Array | float, change: Change) -> Array:
         """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
@@ -175,6 +188,10 @@ class Pillars:
         rows = [_cubic(row.conj(), place) for row in self.basis]
         return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1)
 
+    def entries(self, diameters: DiameterMap, rows: slice, columns: slice) -> Array:
+        """(y, x) entries of :meth:`table` of the pillars of some rows and columns."""
+        return self.place(diameters.diameter_um[rows, columns])
+
     def place(self, diameter_um: Array) -> Array:
         """Entry of :meth:`table` nearest to designed diameters (any shape)."""
         low, high = self.diameter_um[0], self.diameter_um[-1]
@@ -216,6 +233,56 @@ class Pillars:
             c = self.weights(np.array(bias)) @ self.coefficients(change)
             worst = max(worst, float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()))
         return worst
+
+
+class PairedPillars(Pillars):
+    """As :class:`Pillars`, of two sizes: functions of the kinds of pillars that the lens has, one after the other.
+
+    A bias moves all edges, so both sizes alike, along the table of the lens; the answers are those of the designed
+    sizes. t is taken to be that of the design's wavelength: the table knows single ones. ``diameter_um``: width of
+    every kind.
+    """
+
+    _laid = 3, 6  # rectangles have more resonances than rounds
+
+    def _kinds(self) -> Array:
+        pairs = self.response.pairs
+        if pairs is None:
+            raise FitError("pillars of two sizes: slopes of such pillars are needed")
+        self._table, self._own = PairTable.of(self.lens), Kinds.of(self.lens.diameters)
+        self._rates = pairs.at(self._own.width_um, self._own.length_um)
+        return self._own.width_um
+
+    def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
+        return Answer(self._rates[:, None], None, np.ones(1)), 1.0
+
+    def exact(self, bias_um: Array | float, change: Change) -> Array:
+        """(..., kinds) complex t of both sizes + bias under a change."""
+        t = self._table.t(self._own.width_um + bias_um, self._own.length_um + bias_um)
+        return np.asarray(t * np.exp(np.tensordot(np.array(change.answers), self._rates, 1)))
+
+    def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
+        return self.exact(self.nodes_um[:, None], Change())
+
+    def _through_colours(self) -> Array:
+        return np.empty(0)
+
+    def _waves(self) -> bool:
+        return False
+
+    def table(self) -> Array:
+        """(r, kinds + 1): the conjugate basis; the last entry is no pillar."""
+        return np.concatenate([self.basis.conj(), np.zeros((len(self.basis), 1))], axis=1)
+
+    def entries(self, diameters: DiameterMap, rows: slice, columns: slice) -> Array:
+        """(y, x) kinds of the pillars of some rows and columns."""
+        return self._own.index(diameters, rows, columns)
+
+
+def of_lens(lens: Lens, response: Sensitivity, *, span: Range | None = None, angle_rad: float = 0.0) -> Pillars:
+    """The pillars of a lens, of one size or of two."""
+    kind = Pillars if lens.pairs is None else PairedPillars
+    return kind(lens, response, span=span, angle_rad=angle_rad)
 
 
 def change(x: Array) -> Change:

@@ -169,7 +169,7 @@ class Reduced:
                 some = np.flatnonzero((d.diameter_um[rows] > 0).any(0))
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
                 path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
-                place = pillars.place(d.diameter_um[rows, built])
+                place = pillars.entries(d, rows, built)
                 turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[:, built]
                 light = gather.lit(table, place, turns(self.k * path + turn, self.kind))
                 halves = across[built].T @ light.reshape(len(light), -1)

@@ -8,7 +8,7 @@ import numpy as np
 from layout.mask import FieldPlan
 from layout.process import Process
 from layout.study import stitching, tolerance, tolerant
-from layout.study.sensitivity import PairSensitivities, Sensitivities, pair_sensitivities, sensitivities
+from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
 from metalens.ground import report
@@ -16,7 +16,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, Section, Table
 from metalens.ground.units import deg
 from metalens.lens import Lens
-from metalens.made import Spread
+from metalens.made import PairSensitivities, Spread, pair_sensitivities
 
 CHOICE_RAD = (0.1, 0.2, 0.3)
 Answers = Mapping[str, Sensitivities | PairSensitivities]  # of light along "x" and "y"; of pillars of one size under ""

@@ -9,10 +9,9 @@ from metalens.cell import Cell
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, of_kind, own_rates, pair_rates, with_missing
+from metalens.made import Answers, of_kind, own_rates, with_missing
 
 Solver = Callable[[Cell, Array, float, bool], Array]
-_PAIRS = 24  # of pillars of two sizes that are solved
 _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
 
 
@@ -40,74 +39,6 @@ class Sensitivities:
         if self.edges is None or not self.edges.any():
             return None
         return np.asarray(np.interp(diameter_um, self.diameter_um, self.edges))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PairSensitivities:
-    """As :class:`Sensitivities`, of pillars of two sizes and one polarisation.
-
-    width_um, length_um: (n,) pairs that were solved. rates: (answering causes, n). error: also what the rates of the
-        second half of the pairs differ from those of the first half, carried there.
-    """
-
-    width_um: Array
-    length_um: Array
-    rates: Array
-    error: float
-
-    def at(self, width_um: Array, length_um: Array) -> Array:
-        """(answering causes, n) derivatives of ln t."""
-        found = _carried((self.width_um, self.length_um), self.rates, (width_um, length_um))
-        return with_missing(list(found))
-
-
-def pair_sensitivities(lens: Lens, *, count: int = _PAIRS) -> dict[str, PairSensitivities]:
-    """For light along "x" and along "y": derivatives of ln t at up to ``count`` pairs of the lens, far from each other.
-
-    Exact ones of RCWA at a fixed truncation; between the pairs by radial functions |r - r_j| of both sizes.
-
-    Raises:
-        CellError, MaterialError: from the solver.
-    """
-    d = lens.diameters
-    there = np.asarray(d.diameter_um) > 0
-    pairs, often = np.unique(
-        np.stack([d.diameter_um[there], np.asarray(d.length_um)[there]], 1), axis=0, return_counts=True
-    )
-    width, length = pairs[_apart(pairs, int(often.argmax()), count)].T
-    found = pair_rates(lens, width, length)
-    return {
-        light: PairSensitivities(width, length, each.rates, each.error + _unseen(width, length, each.rates))
-        for light, each in found.items()
-    }
-
-
-def _apart(points: Array, first: int, count: int) -> list[int]:
-    """The first, then always the point that is farthest from all before it."""
-    chosen, away = [first], np.linalg.norm(points - points[first], axis=1)
-    while len(chosen) < count and away.max() > 0:
-        chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return chosen
-
-
-def _carried(nodes: tuple[Array, Array], rates: Array, places: tuple[Array, Array]) -> Array:
-    """(causes, places) rates between the nodes."""
-    from scipy.interpolate import RBFInterpolator
-
-    return np.asarray(RBFInterpolator(np.stack(nodes, 1), rates.T, kernel="linear", degree=0)(np.stack(places, 1)).T)
-
-
-def _unseen(width_um: Array, length_um: Array, rates: Array) -> float:
-    """Largest rms error over causes, relative, of the second half of the pairs from the first."""
-    half = (len(width_um) + 1) // 2
-    if half == len(width_um):
-        return 0.0
-    seen, rest = slice(half), slice(half, None)
-    told = _carried((width_um[seen], length_um[seen]), rates[:, seen], (width_um[rest], length_um[rest]))
-    off = np.linalg.norm(told - rates[:, rest], axis=1) / np.maximum(np.linalg.norm(rates[:, rest], axis=1), 1e-9)
-    known = np.abs(rates).max(1) > 1e-6 * np.abs(rates).max()
-    return float((off * known).max())
 
 
 def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) -> Sensitivities:

@@ -16,11 +16,11 @@ import numpy as np
 
 from layout.study.focus import Focus
 from layout.study.pillars import Pillars, kinds
-from layout.study.sensitivity import PairSensitivities, Sensitivities
+from layout.study.sensitivity import Sensitivities
 from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Draw, Spread, State, draws
+from metalens.made import Draw, PairSensitivities, Spread, State, draws
 
 _BAND, _PARTS = 16, 16  # rows that are summed at once, by any one worker; parts of a lens that workers take
 _LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss

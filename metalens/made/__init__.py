@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from metalens.made.printed import Printed as Printed
     from metalens.made.printed import of_process as of_process
     from metalens.made.printed import with_table as with_table
+    from metalens.made.response import Answer as Answer
     from metalens.made.response import Sensitivity as Sensitivity
     from metalens.made.response import Slopes as Slopes
     from metalens.made.response import answer as answer
@@ -44,10 +45,15 @@ if TYPE_CHECKING:
     from metalens.made.spread import Spread as Spread
     from metalens.made.spread import draws as draws
     from metalens.made.state import State as State
+    from metalens.made.two_sizes import Kinds as Kinds
+    from metalens.made.two_sizes import PairSensitivities as PairSensitivities
+    from metalens.made.two_sizes import PairTable as PairTable
+    from metalens.made.two_sizes import pair_sensitivities as pair_sensitivities
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Answer": "response",
         "Answers": "causes",
         "Bends": "causes",
         "Bias": "bias",
@@ -57,7 +63,10 @@ __getattr__, __dir__, __all__ = attach(
         "Draw": "spread",
         "Drawn": "causes",
         "Guide": "causes",
+        "Kinds": "two_sizes",
         "OwnRates": "own",
+        "PairSensitivities": "two_sizes",
+        "PairTable": "two_sizes",
         "Printed": "printed",
         "STEEPEST": "bias",
         "Sensitivity": "response",
@@ -81,6 +90,7 @@ __getattr__, __dir__, __all__ = attach(
         "of_process": "printed",
         "own_rates": "own",
         "pair_rates": "own",
+        "pair_sensitivities": "two_sizes",
         "read_csv": "bias",
         "sensitivity": "response",
         "spread": "",

@@ -9,10 +9,12 @@ from numpy.polynomial import chebyshev, polynomial
 
 from metalens.cell import Cell, Index
 from metalens.ground.arrays import Array
+from metalens.ground.errors import LensError
 from metalens.lens import Lens
 from metalens.made.causes import Answers, Guide, of_kind, with_missing
 from metalens.made.own import own_rates
 from metalens.made.solved import Solved
+from metalens.made.two_sizes import PairSensitivities
 from metalens.pillars import Proxy
 
 _END = 64  # steps in the wavelengths of a proxy, of which the last one gives the tangent at its end
@@ -31,6 +33,7 @@ class Sensitivity:
     solved: t itself under large changes, where a solver was asked; it stands for the proxy then.
     edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size, per um: a proxy knows pillars
         that keep their form as they grow, which a biased rectangle does not; None for those that do.
+    pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
     """
 
     coefficients: Array
@@ -40,9 +43,21 @@ class Sensitivity:
     high_um: float = math.inf
     solved: Solved | None = None
     edges: Array | None = None
+    pairs: PairSensitivities | None = None
+
+    @classmethod
+    def of_pairs(cls, pairs: PairSensitivities) -> "Sensitivity":
+        """Of pillars of two sizes."""
+        return cls(np.zeros((0, 1)), 0.0, pairs.error, pairs=pairs)
 
     def at(self, diameter_um: Array) -> Array:
-        """(answering causes, *shape) derivatives of ln t."""
+        """(answering causes, *shape) derivatives of ln t.
+
+        Raises:
+            LensError: of pillars of two sizes.
+        """
+        if self.pairs is not None:
+            raise LensError("pillars of two sizes: their derivatives are no function of one size")
         return with_missing(self._series(self.coefficients, diameter_um))
 
     def by_edges(self, diameter_um: Array) -> Array | None:

@@ -1,14 +1,16 @@
 """Causes that a fit leaves out: what each does to images linear in everything, and how much of it is likely."""
 
 import math
+import re
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from characterize.inference import causes
-from characterize.model import MODES, PLACE, Known, Setting, prior_rad, vector
+from characterize.model import MODES, PLACE, Known, Setting, prior_rad, unstated, vector
 from metalens.made import Bends, named
 
 SHAPE = (4, 5, 7)
@@ -191,3 +193,24 @@ def test_counts_of_a_gamma_differ_from_the_light_as_their_logarithm():
     light = RNG.uniform(0.02, 1.0, SHAPE) * 730.0
     share = light / light.max()
     assert causes._of_gamma(light)[0] == pytest.approx((share**1.0001 - share**0.9999) / 2e-4, abs=1e-6)
+
+
+def test_the_page_says_the_sizes_that_are_reckoned_with():
+    """Numbers of the row on spectrum, tilt, index and saddles, and of others that are of one parameter each."""
+    page = (Path(__file__).parents[3] / "docs" / "characterize.md").read_text(encoding="utf-8")
+
+    def numbers(head):
+        (row,) = (line for line in page.splitlines() if line.startswith(f"| {head} |"))
+        return [float(n) for n in re.findall(r"[0-9.]*[0-9]", row.split("|")[2])]
+
+    def sizes(*names):
+        return [unstated(name, LENS) for name in names]
+
+    four = sizes("bandwidth_nm", "tilt_x_deg", "index", "bias_a_nm")
+    assert numbers("spectrum, tilt of the lens, index, saddles of the bias") == pytest.approx(four)
+    assert numbers("plane glass between source and lens") == sizes("glass_um")
+    assert numbers("diameter of the source") == sizes("pinhole_um")
+    assert numbers("pixel pitch") == sizes("pixel_percent")
+    assert numbers("turn of the camera against the lens") == sizes("camera_turn_deg")
+    assert numbers("write fields of the mask out of place") == sizes("stitching_nm")
+    assert numbers("side wall")[0] == unstated("sidewall_deg", LENS)

@@ -1,6 +1,5 @@
 """Frames of lenses on a hexagonal lattice, and of pillars turned one by one, are sums over their pillars."""
 
-import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -12,11 +11,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
 
 from characterize.bench import bench
-from characterize.model import ForwardModel, Setting, slopes, vector
+from characterize.model import ForwardModel, Setting, vector
 from characterize.model import made as as_built
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Rectangle
-from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
 
 PITCH, PIXEL, PIXELS, DEPTHS = 0.43, 1.5, 12, (310.0, 420.0, 640.0)
@@ -104,11 +102,3 @@ def test_the_lens_as_built_lies_on_the_lattice_of_its_design_and_keeps_its_turns
     on = lens.diameters.diameter_um > 0
     assert grown.diameters.diameter_um[on] == pytest.approx(0.174)
     assert not grown.diameters.diameter_um[~on].any()
-
-
-def test_pillars_of_two_sizes_are_refused():
-    lens, _ = made(False)
-    pair = dataclasses.replace(lens)
-    object.__setattr__(pair, "pairs", "a table")
-    with pytest.raises(FitError, match="two sizes"):
-        slopes(pair)

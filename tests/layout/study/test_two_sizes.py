@@ -10,14 +10,27 @@ from scipy import interpolate
 
 from layout.mask import fields
 from layout.process.process import Process, WriteField
-from layout.study import focus, page, pillars, sensitivity, stitching, tolerance
-from layout.study.sensitivity import PairSensitivities, pair_sensitivities
+from layout.study import focus, page, pillars, stitching, tolerance
 from layout.study.spread_model import missed, reduce
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Ellipse, Rectangle
 from metalens.ground.report import Table
 from metalens.lens import DiameterMap, Lens, Pairs
-from metalens.made import Answers, Spread, State, draws, named, own, pair_rates
+from metalens.made import (
+    Answers,
+    PairSensitivities,
+    PairTable,
+    Spread,
+    State,
+    draws,
+    named,
+    own,
+    pair_rates,
+    pair_sensitivities,
+)
+from metalens.made import (
+    two_sizes as by_pairs,
+)
 from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum
 
@@ -107,7 +120,7 @@ def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
     x, y = np.meshgrid(X_UM, Y_UM, indexing="ij")
     level = 0.9 - 3 * (x - 0.1) - 0.3 * (y - 0.12)
     spline = [interpolate.RectBivariateSpline(X_UM, Y_UM, level * part) for part in (math.cos(0.7), math.sin(0.7))]
-    made = pillars.TwoSizes(np.ones(1), np.ones(1), np.zeros((0, 1)), X_UM, Y_UM, tuple(spline))
+    made = PairTable(X_UM, Y_UM, tuple(spline))
     found = made.t(np.array([0.6, 0.32, 0.02]), np.array([0.2, 0.2, 0.2]))
     assert found == pytest.approx(np.array([1e-3, 0.216, 1.0]) * np.exp(0.7j), rel=1e-9)
 
@@ -141,7 +154,7 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(mo
         made = own.OwnRates(rates(width_um, length_um), np.zeros(len(width_um)), 0.03)
         return {"x": made, "y": dataclasses.replace(made, rates=2 * made.rates)}
 
-    monkeypatch.setattr(sensitivity, "pair_rates", solved)
+    monkeypatch.setattr(by_pairs, "pair_rates", solved)
     found = pair_sensitivities(lens, count=30)
     every = told(lens)
     assert asked[0].shape == (30, 2)
