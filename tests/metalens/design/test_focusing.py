@@ -5,7 +5,7 @@ import pytest
 
 from metalens import design
 from metalens.cell.record import Cell, Film, Index
-from metalens.design import Focus, meeting_um
+from metalens.design import Focus, focusing, meeting_um
 from metalens.lens import Layers
 from metalens.pillars.proxy import Proxy
 
@@ -30,6 +30,17 @@ def test_rays_of_an_ideal_lens_meet_in_its_focus(focal_um, source_um, aside_um, 
     found = meeting_um(lens(focal_um, source_um, aside_um), Focus(1.31, told_um, source_um), **ABOUT)
     # the difference over one pitch p misses the slope by p² / 24 of its second derivative: 0.015 um² / (900 um)²
     assert found == pytest.approx(focal_um, rel=1e-6)
+
+
+@pytest.mark.parametrize(("inner_um", "outer_um", "brings"), [(900.0, 300.0, False), (300.0, 900.0, True)])
+def test_rays_from_all_over_a_lens_say_whether_it_focuses(inner_um, outer_um, brings):
+    """A fifth of the radius, 4 % of the light, has a third of the focal length, or all but that."""
+
+    def phase(x, y):
+        middle = np.hypot(*np.meshgrid(x, y)) < 0.2 * ABOUT["radius_um"]
+        return np.where(middle, lens(inner_um, np.inf)(x, y), lens(outer_um, np.inf)(x, y))
+
+    assert focusing.focuses(phase, Focus(1.31, 900.0, np.inf), **ABOUT) is brings
 
 
 def test_no_meeting_of_rays_that_spread_or_part():
