@@ -1,5 +1,6 @@
 """Shares of a tolerance and rows of results, by stand-ins: half to the solver, 0.4 to the fit, rows in their places."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -77,3 +78,19 @@ def test_elements_of_a_jones_matrix_are_rows_and_take_the_energy_of_what_comes(m
 def test_a_diameter_takes_the_coarse_mesh_where_it_serves_and_else_the_better_one(coarse, fine, kept):
     made = [lambda at, one=one: SimpleNamespace(t_error=one[0], converged=one[1]) for one in (coarse, fine)]
     assert engines._met(*made, 0.17).t_error == kept
+
+
+def test_a_line_of_a_journal_counts_where_its_columns_are_as_long_as_one_another():
+    """And t and r have a real and an imaginary part; any other line is of a task that is done again."""
+    whole = {
+        "diameter_um": [0.1, 0.12, 0.17], "t": [[0.9, 0.1], [0.8, 0.2], [0.7, -0.1]], "r": [[0.1, 0.0]] * 3,
+        "error": [1e-3, 2e-3, 3e-3], "energy": [1.0, 0.99, 0.98],
+    }  # fmt: skip
+    assert workers._entry(json.dumps(["a task", whole])) == ("a task", whole)
+    for name, value in {
+        "error": [1e-3, 2e-3], "energy": [1.0], "diameter_um": [0.1] * 4, "t": [[0.9, 0.1, 0.0]] * 3, "r": [[0.1, 0]],
+    }.items():  # fmt: skip
+        assert workers._entry(json.dumps(["a task", whole | {name: value}])) is None, name
+    without = {name: value for name, value in whole.items() if name != "error"}
+    for line in (json.dumps(["a task", without]), '["a task"', json.dumps(["a task", whole])[:-4], "7"):
+        assert workers._entry(line) is None

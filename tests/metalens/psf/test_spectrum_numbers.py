@@ -266,3 +266,13 @@ def test_error_of_the_nodes_is_the_worst_over_the_paths():
     fewer = spectrum.gauss(um, share, len(found.weights) - 1)
     missed = np.exp(2j * np.pi * paths / fewer[0]) @ fewer[1] - np.exp(2j * np.pi * paths / um) @ share
     assert np.abs(missed).max() > 3e-3  # no wavelength more than needed
+
+
+def test_a_spectrum_that_ends_where_the_pillars_are_known_is_kept_whole():
+    """To a picometre, which files in nm round to; a point beyond that holds no light is left out."""
+    nm = np.array([799.9994, 830.0, 870.0, 900.0007, 905.0])
+    value = np.array([0.4, 1.0, 0.7, 0.2, 0.0])
+    assert spectrum._kept(nm, value, (0.8, 0.9)) == (0, 4)
+    assert spectrum._kept(nm[:4], value[:4], (0.8, 0.9)) == (0, 4)
+    with pytest.raises(PropagationError, match="the pillars are known from 800 to 899.9"):
+        spectrum._kept(nm, value, (0.8, 0.8999))
