@@ -274,5 +274,5 @@ def test_a_spectrum_that_ends_where_the_pillars_are_known_is_kept_whole():
     value = np.array([0.4, 1.0, 0.7, 0.2, 0.0])
     assert spectrum._kept(nm, value, (0.8, 0.9)) == (0, 4)
     assert spectrum._kept(nm[:4], value[:4], (0.8, 0.9)) == (0, 4)
-    with pytest.raises(PropagationError, match="the pillars are known from 800 to 899.9"):
+    with pytest.raises(PropagationError, match=r"the pillars are known from 800 to 899\.9"):
         spectrum._kept(nm, value, (0.8, 0.8999))
