@@ -23,8 +23,8 @@ from metalens.field.forming import (
     trimmed,
     with_psfs,
 )
-from metalens.field.plan import SHARES, Grid, Plan, planned, spectral
-from metalens.field.points import Optics, sampling
+from metalens.field.plan import SHARES, Grid, Plan, depth_nodes, planned, spectral
+from metalens.field.points import SPARE, Optics, Window, sampling
 from metalens.field.stray import stray_of
 from metalens.field.through import through
 from metalens.field.waves import SmoothWave, Wave, wave_of
@@ -35,11 +35,15 @@ from metalens.psf import Nodes, Polarisation, Source, blur_um
 from metalens.psf import spectrum as spectra
 
 PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
-LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0)  # tolerances tried for the worst PSF of a patch
+# tolerances tried for the worst PSF of a patch; below 1 where what is returned is darker than the frame
+LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0, 0.5, 0.25, 0.12)
 OVERLAP = 4  # samples that two patches share
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
 NEGLECTED = 5  # of them at which the transform and the components of the field are judged
 ALL = 2  # of them at which pillars taken together are
+SHADED = 8  # field points along an axis that tell how deep an image lies in the shadow of a stop
+DEEPEST = 8.0  # by how much an image may be dimmer than its frame and still be prepared to its own light: what a
+# shadow's ripples leave out is more than the rest there
 
 
 def imager(
@@ -87,9 +91,14 @@ def imager(
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
     round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
     round_ = round_ and (layers.stop is None or layers.stop.centred)
-    plan = planned(optics, scene_grid, source, middle, tolerance=tolerance, folds=round_, polarisation=polarisation)
+    own = tolerance / _shaded(optics, scene_grid, focus.wavelength_um, middle)  # of the frame's light
+    try:
+        plan = planned(optics, scene_grid, source, middle, tolerance=own, folds=round_, polarisation=polarisation)
+    except SceneError:  # said in the user's own terms, or an image that errs by more of its light
+        own = tolerance
+        plan = planned(optics, scene_grid, source, middle, tolerance=own, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, plan, device)
-    whole = patched(scene_grid, plan, stack, energy, tolerance=tolerance)
+    whole = patched(scene_grid, plan, stack, energy, tolerance=own)
     made = evened(thinned(whole, tolerance=tolerance))
     parts = {**made.parts, **_held_out(optics, whole)}
     stray = stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
@@ -102,6 +111,22 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
         raise SceneError(f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2")
     if polarisation not in get_args(Polarisation):
         raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
+
+
+def _shaded(optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]) -> float:
+    """:func:`_dimmer` of the middle depth by a few field points, before there is a plan; 1 without a stop."""
+    if optics.layers.stop is None:
+        return 1.0
+    y, x = (
+        m + h * torch.linspace(-1, 1, SHADED, dtype=torch.float64)
+        for m, h in zip(middle_um[::-1], grid.half_um, strict=True)
+    )
+    depth = 1 / (1 / depth_nodes(grid, 2)).mean(0, keepdim=True)
+    window = Window(grid.window, grid.step_um, period=2 * SPARE)
+    coarse = Plan(y, x, depth, Nodes(np.array([wavelength_um]), np.ones(1), 0.0), window, folds=False)
+    with torch.no_grad():
+        stack, energy = node_psfs(optics, coarse)
+    return min(_dimmer(Imager(grid, coarse, stack.nan_to_num(), energy, [], [], {})), DEEPEST)
 
 
 def node_psfs(optics: Optics, plan: Plan, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
