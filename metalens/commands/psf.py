@@ -7,7 +7,7 @@ import importlib
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import tyro
@@ -63,6 +63,7 @@ class Options(Common):
         wavelengths_nm: wavelengths whose intensities add.
         weights: of those wavelengths; left out: equal.
         polarisation: scalar, flux, vector or auto.
+        light: of pillars of two sizes: polarised along x, along y, or both together.
         tolerance: relative L2 error.
         far_field: in place of PSFs, the light far behind the lens over direction cosines, with the share of every beam
             (deflectors, holograms, axicons): far_field.h5, NAME_far.png. Takes sources_mm (one; left out, a plane
@@ -89,6 +90,7 @@ class Options(Common):
     wavelengths_nm: tuple[float, ...] | None = None
     weights: tuple[float, ...] | None = None
     polarisation: psf.Polarisation | None = None
+    light: Literal["both", "x", "y"] | None = None
     tolerance: float | None = None
     far_field: bool = False
     report: bool = False
@@ -106,7 +108,7 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Compute, write, draw; exit 1 where the error estimate stays above the tolerance."""
+    """Compute, write, draw; exit 1 where the error estimate stays above the tolerance or pillars are hardly known."""
     if options.far_field:
         return _far(options)
     target, settings = options.output or Path("psf.h5"), options.settings
@@ -123,8 +125,10 @@ def run(options: Options) -> int:
     shape = " x ".join(f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts)
     state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
-    options.console.result(_summary(stack), text)
-    return 0 if stack.converged else 1
+    if made.proxy.doubt:
+        text += f"\n  FAILED: {made.proxy.doubt}"
+    options.console.result(_summary(stack) | {"doubt": made.proxy.doubt}, text)
+    return 0 if stack.converged and not made.proxy.doubt else 1
 
 
 def _far(options: Options) -> int:

@@ -89,7 +89,7 @@ def make_paired(
     made = Lens(
         place.map(size, length_um=length),
         library.cell,
-        (table := _table(library, focuses[1])).proxy,
+        (table := _table(library, focuses[1], stock.entry_error(used))).proxy,
         focuses[0].wavelength_um,
         focuses[0].sensor_distance_um,
         focuses[0].source_distance_um,
@@ -115,6 +115,12 @@ class _Stock:
         """Places of the pairs by (1)."""
         wanted = np.stack([np.cos(x_rad), np.sin(x_rad), np.cos(y_rad), np.sin(y_rad)], axis=-1)
         return np.asarray(self.tree.query(wanted)[1])
+
+    def entry_error(self, used: Array) -> float:
+        """Root mean square over the pillars of the bars relative to |t|, of the light that has the less; used: (n,) how
+        often each pair stands in the lens."""
+        relative = self.error / np.abs(self.t).min(axis=1).clip(1e-6)
+        return math.sqrt(float((used * relative**2).sum() / used.sum()))
 
     def pistons(self, wanted: tuple[Array, Array], *, alike: bool) -> tuple[float, float]:
         """(a, b) of (1)."""
@@ -168,10 +174,10 @@ def _sampled(place: Sites, wanted: tuple[PhaseOf, PhaseOf]) -> tuple[Array, Arra
     return x[pick], y[pick]
 
 
-def _table(library: AxesLibrary, focus_y: Focus) -> Pairs:
+def _table(library: AxesLibrary, focus_y: Focus, entry_error: float) -> Pairs:
     t = np.stack([library.t[..., 0, 0], library.t[..., 1, 1]], axis=-1)
     distances = focus_y.sensor_distance_um, focus_y.source_distance_um
-    return Pairs(library.wavelength_um, library.x_um, library.y_um, t, distances)
+    return Pairs(library.wavelength_um, library.x_um, library.y_um, t, distances, entry_error)
 
 
 def _split(

@@ -1,5 +1,6 @@
 """Pillars of two sizes in a lens: a table of t in place of a proxy, and the distances of light polarised along y."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -20,6 +21,8 @@ class Pairs:
     wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2) power-normalised amplitudes that
         keep the polarisation, exp(-iwt).
     focus_y_um: (sensor, source) distance of the light polarised along y; that of the lens is of light along x.
+    entry_error: root mean square of the error bars of the pillars that stand in the lens, relative to |t|; nan where
+        it is not known (older files).
     """
 
     wavelength_um: Array
@@ -27,6 +30,7 @@ class Pairs:
     y_um: Array
     t: Array
     focus_y_um: tuple[float, float]
+    entry_error: float = math.nan
 
     def __post_init__(self) -> None:
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um), 2)
@@ -52,18 +56,20 @@ class Pairs:
         """What stands where a lens has a proxy: its domain and wavelengths, and a refusal of the rest."""
         domain = float(self.x_um[0]), float(self.x_um[-1]) + 1e-9
         ends = float(self.wavelength_um[0]), float(self.wavelength_um[-1])
-        return NoProxy(np.zeros((1, 1)), np.zeros((1, 1)), domain, ends, 0.0, 0.0)
+        known = 0.0 if math.isnan(self.entry_error) else self.entry_error
+        return NoProxy(np.zeros((1, 1)), np.zeros((1, 1)), domain, ends, 0.0, 0.0, entry_error=known)
 
     def to_arrays(self) -> dict[str, Array]:
         """Everything as arrays, for a store file."""
-        return {name: getattr(self, name) for name in NAMES} | {"focus_y_um": np.array(self.focus_y_um)}
+        alone = {name: np.array(getattr(self, name)) for name in ("focus_y_um", "entry_error")}
+        return {name: getattr(self, name) for name in NAMES} | alone
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "Pairs":
         """Inverse of :meth:`to_arrays`."""
         sensor, source = arrays["focus_y_um"].tolist()
         wavelength, x, y, t = (arrays[name] for name in NAMES)
-        return cls(wavelength, x, y, t, (sensor, source))
+        return cls(wavelength, x, y, t, (sensor, source), float(arrays.get("entry_error", math.nan)))
 
 
 class NoProxy(Proxy):

@@ -63,7 +63,8 @@ class Budget:
         through unlike, measured on the light); of both, of rays whose fields are those on their way to the window's
         middle. neighbours: of pillars taken as if each stood among its like, or of the factor of solved rows where the
         lens holds them. angle: of pillars that answer as at normal incidence. glass: of light that goes twice between
-        two faces. proxy: of pillars that answer by a curve, which follows those of their library to some error.
+        two faces. proxy: of pillars that answer by a curve, which follows those of their library to some error, and of
+        what their solver knows of them; of two sizes that alone.
     outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
         show it, so it is in no total.
     """

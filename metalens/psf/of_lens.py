@@ -277,7 +277,7 @@ def _budget(
         left_out=left_out,
         light=(nodes.wavelengths_um, nodes.weights),
         lit=lens.diameters.pillars * lens.diameters.site_um2 / lens.wavelength_um**2,
-        proxy=math.nan if lens.pairs is not None else lens.proxy.error(lens.wavelength_um),
+        proxy=lens.proxy.error(lens.wavelength_um) if lens.pairs is None else lens.pairs.entry_error,
     )
 
 

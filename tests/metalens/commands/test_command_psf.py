@@ -2,6 +2,8 @@
 
 import json
 import math
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy import integrate, special
 from metalens import lens, propagate, psf
 from metalens.cell.record import Cell
 from metalens.cli import main
-from metalens.commands.psf import Settings
+from metalens.commands.psf import Options, Settings
 from metalens.ground.errors import ConfigError
 from metalens.lens import Neighbours
 from metalens.pillars.proxy import Proxy
@@ -224,3 +226,25 @@ def test_settings_that_wait_for_a_lens_say_so():
         _ = Settings(depths_mm=(1.0, 2.0, 1.0)).view
     with pytest.raises(ConfigError, match="need window_um"):
         Settings(height_um=10.0)
+
+
+def test_every_setting_but_two_is_an_option():
+    """As the page on lenses says; the light of two sizes was one of the file alone, where refusals name the option."""
+    names = {one.name for one in fields(Settings)} - {"layers", "own_cell"}
+    assert names <= {one.name for one in fields(Options)}
+    assert Options(Path("lens.h5"), light="y").settings.light == "y"
+
+
+def test_light_along_x_is_refused_of_round_pillars(folder, capsys):
+    assert command(folder, "--light", "x") == 2
+    assert "light = 'x' is for pillars of two sizes; these treat x and y alike" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("bars", "code"), [(0.09, 0), (0.11, 1)])
+def test_psfs_of_hardly_known_pillars_end_1_with_the_word_that_design_gives(folder, bars, code, capsys):
+    """Error bars above 0.1 of |t|, the largest tolerance of a library."""
+    made = small_lens()
+    lens.save(folder / "lens.h5", replace(made, proxy=replace(made.proxy, entry_error=bars)))
+    assert command(folder) == code
+    assert ("FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out) == bool(code)
+    assert (folder / "psf.h5").exists()

@@ -66,6 +66,26 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
     assert split.covered > 0.98
 
 
+def test_what_is_known_of_the_pillars_goes_with_the_lens_into_the_budget_of_its_psfs(tmp_path):
+    """Bars that grow with the width: their root mean square over the pillars of the map, over the lesser |t|. Light of
+    a focus of NA 0.26 that goes astray lies beside it or upon it: 0.1 to 2 of the bars, and twice for twice as long."""
+    given, told = library(), []
+    for times in (1, 2):
+        bars = np.minimum(times * (0.01 + 0.1 * (X - 0.1)), 0.05)[:, None] + 0 * given.t_error
+        bars[0, 30:33] = 0.5
+        lens.save(tmp_path / f"{times}.h5", made(library=dataclasses.replace(given, t_error=bars))[0])
+        back = lens.load(tmp_path / f"{times}.h5")
+        width = back.diameters.diameter_um[back.diameters.diameter_um > 0].astype(float)
+        rms = math.sqrt(np.mean(np.minimum(times * (0.01 + 0.1 * (width - 0.1)), 0.05) ** 2)) / LEVELS[1]
+        assert back.pairs.entry_error == pytest.approx(rms, rel=1e-6)
+        assert back.proxy.entry_error == back.pairs.entry_error
+        budget = psf.from_lens(back, psf.View((math.inf,), window_um=12.0, samples=12), tolerance=1e-3).budget
+        assert 0.1 * rms < budget.proxy <= 2 * rms
+        assert budget.total > budget.proxy
+        told.append(budget.proxy / rms)
+    assert told[1] == pytest.approx(told[0], rel=1e-6)
+
+
 def test_bands_of_long_bars_are_not_used(two):
     made_lens, split = two
     d = made_lens.diameters
