@@ -11,7 +11,7 @@ from benchmarks import Row, fastest
 from metalens.cell import Cell, Index
 from metalens.design import Focus, profiles
 from metalens.field import Grid, Imager, Layers, Optics, PillarWave, SmoothWave, Window, imager
-from metalens.field.left_out import neglected, unpolarised
+from metalens.field.left_out import Judged, neglected, unpolarised
 from metalens.field.plan import spectral
 from metalens.image import Frames
 from metalens.lens import DiameterMap, Lens
@@ -56,7 +56,7 @@ def points_row(wave: SmoothWave) -> Row:
     optics, window = Optics(wave, Layers(), 2e3), Window(GRID.window, GRID.step_um)
     depths = 1 / torch.linspace(1 / 15e3, 1 / 28e3, 21, dtype=torch.float64)
     seconds = fastest(lambda: spectral(optics, at.flatten(0, 1), depths, waves, window), repeats=1)
-    error = neglected(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
+    error = neglected(Judged(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10])))
     method = "25 field points x 9 wavelengths x 21 depths"
     judge, count = "rays seen from beside", torch.get_num_threads()
     return Row("PSFs of a smooth phase", method, seconds, error, judge, threads=count, goal="3 s on two threads")
@@ -72,7 +72,7 @@ def polarised_rows(wave: SmoothWave) -> Iterator[Row]:
         window = Window(GRID.window, GRID.step_um, components=count)
         optics = Optics(PillarWave(pillars), Layers(), 2e3)  # nothing kept of the last row
         seconds = fastest(lambda o=optics, w=window: spectral(o, at.flatten(0, 1), depths, waves, w), repeats=1)  # type: ignore[misc]
-        error = unpolarised(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10]))
+        error = unpolarised(Judged(optics, waves, window, (at.flatten(0, 1)[::6], depths[::10])))
         name = f"flux of both polarisations, {count} of {window.whole} components" if count else "one scalar"
         method = f"{name}; 25 field points x 9 wavelengths x 21 depths"
         judge, threads = "all components", torch.get_num_threads()

@@ -1,9 +1,10 @@
 """From a lens to an imager: field points, PSFs, patches, and the error that it says."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -91,12 +92,9 @@ def imager(
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
     round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
     round_ = round_ and (layers.stop is None or layers.stop.centred)
-    own = tolerance / _shaded(optics, scene_grid, focus.wavelength_um, middle)  # of the frame's light
-    try:
-        plan = planned(optics, scene_grid, source, middle, tolerance=own, folds=round_, polarisation=polarisation)
-    except SceneError:  # said in the user's own terms, or an image that errs by more of its light
-        own = tolerance
-        plan = planned(optics, scene_grid, source, middle, tolerance=own, folds=round_, polarisation=polarisation)
+    shaded = _shaded(optics, scene_grid, focus.wavelength_um, middle)
+    given = optics, scene_grid, source, middle
+    plan, own = _planned(given, tolerance, shaded, folds=round_, polarisation=polarisation)
     stack, energy = node_psfs(optics, plan, device)
     whole = patched(scene_grid, plan, stack, energy, tolerance=own)
     made = evened(thinned(whole, tolerance=tolerance))
@@ -111,6 +109,15 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
         raise SceneError(f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2")
     if polarisation not in get_args(Polarisation):
         raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
+
+
+def _planned(given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any) -> tuple[Plan, float]:
+    """A plan, and its tolerance over the frame's light: to that of an image that is so many times dimmer, or where no
+    number of nodes meets it to the frame's."""
+    if shaded > 1 and tolerance < 1:
+        with contextlib.suppress(SceneError):
+            return planned(*given, tolerance=tolerance / shaded, **about), tolerance / shaded
+    return planned(*given, tolerance=tolerance, **about), tolerance
 
 
 def _shaded(optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]) -> float:
@@ -247,12 +254,12 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     few = at[:NEGLECTED], depths
     # of the brightest of few places in the image
     share = float(light[:NEGLECTED].max() / (light**2).mean().sqrt()) * dimmer
-    seen = optics, plan.waves, plan.window, few, left_out.lit(optics, plan.waves, plan.window, few)
-    transform = left_out.neglected(*seen) * share
+    seen = left_out.Judged(optics, plan.waves, plan.window, few)
+    transform = left_out.neglected(seen) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
     found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
-    found["folded"] = left_out.folded(*seen) * share
-    found["polarisation"] = left_out.unpolarised(*seen) * share
+    found["folded"] = left_out.folded(seen) * share
+    found["polarisation"] = left_out.unpolarised(seen) * share
     found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
     if optics.layers.stop is not None:
         shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]

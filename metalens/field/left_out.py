@@ -3,8 +3,9 @@
 Errors are of the image: those of PSFs count by their light, so that places in the shadow of a stop count little.
 """
 
+import functools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,78 +22,63 @@ JUDGE = 3e-4  # tolerance of the PSFs of every pillar
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
 
-def neglected(
-    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], shown: Tensor | None = None
-) -> float:
-    """What the transform neglects: PSFs of the first wavelength at (field points, depths), with the rays seen from
-    their own width beside the field point, against themselves (``shown``: :func:`lit`, where it is known)."""
-    shown = lit(optics, waves, window, at) if shown is None else shown
-    wide = width(shown / shown.sum((-1, -2), keepdim=True)) * window.step_um
-    aside = lit(optics, waves, window, at, shift_um=(wide * 0.6, wide * 0.8))
-    return in_light(relative(aside, shown), shown.sum((-1, -2)))
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """PSFs by which errors are judged: of the first wavelength, at (field points, depths)."""
+
+    optics: Optics
+    waves: Nodes
+    window: Window
+    at: tuple[Tensor, Tensor]
+
+    @functools.cached_property
+    def shown(self) -> Tensor:
+        """(field points, depths, h, w) as the window shows them, with their light; computed once."""
+        return self.lit()
+
+    def lit(self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any) -> Tensor:
+        """The same through a window with other settings, its rays seen from beside."""
+        about: dict[str, Any] = {"wavelength_um": float(self.waves.wavelengths_um[0]), "shift_um": shift_um}
+        with torch.no_grad():
+            return psfs(self.optics, self.at[0], depths_um=self.at[1], window=replace(self.window, **other), **about)
 
 
-def folded(
-    optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], shown: Tensor | None = None
-) -> float:
-    """What the transform folds back from beyond the period of the nodes: PSFs of the first wavelength at (field points,
-    depths), with their light (``shown``: :func:`lit`, where it is known), against those of twice the period."""
-    want = lit(optics, waves, replace(window, period=2 * window.period), at)
-    shown = lit(optics, waves, window, at) if shown is None else shown
-    return in_light(relative(shown, want), want.sum((-1, -2)))
+def neglected(judged: Judged) -> float:
+    """What the transform neglects: PSFs with the rays seen from their own width beside the field point, against
+    themselves."""
+    light = judged.shown.sum((-1, -2))
+    wide = width(judged.shown / light[..., None, None]) * judged.window.step_um
+    return in_light(relative(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown), light)
 
 
-def polarised(
-    optics: Optics,
-    waves: Nodes,
-    window: Window,
-    at: tuple[Tensor, Tensor],
-    polarisation: Polarisation,
-    *,
-    within: tuple[float, float],
-) -> Window:
+def folded(judged: Judged) -> float:
+    """What the transform folds back from beyond the period of the nodes: PSFs, with their light, against those of twice
+    the period."""
+    want = judged.lit(period=2 * judged.window.period)
+    return in_light(relative(judged.shown, want), want.sum((-1, -2)))
+
+
+def polarised(judged: Judged, polarisation: Polarisation, *, within: tuple[float, float]) -> Window:
     """The window with one scalar where that images within the first tolerance (``auto``), else with as few components
     of the fields of both polarisations as image within the second."""
-    window = replace(window, flux=polarisation != "vector")
-    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(optics, waves, window, at) <= within[0]):
+    judged = replace(judged, window=replace(judged.window, flux=polarisation != "vector"))
+    window = judged.window
+    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(judged) <= within[0]):
         return window
-    tried = [replace(window, components=count) for count in range(1, window.whole + 1)]
-    whole = lit(optics, waves, tried[-1], at)
-    return next(one for one in tried if unpolarised(optics, waves, one, at, whole=whole) <= within[1])
+    whole = judged.lit(components=window.whole)
+    tried = (replace(window, components=count) for count in range(1, window.whole + 1))
+    return next(one for one in tried if unpolarised(replace(judged, window=one), whole) <= within[1])
 
 
-def unpolarised(
-    optics: Optics,
-    waves: Nodes,
-    window: Window,
-    at: tuple[Tensor, Tensor],
-    shown: Tensor | None = None,
-    *,
-    whole: Tensor | None = None,
-) -> float:
-    """What the components of the field that a window leaves out change: PSFs of sum 1 of the first wavelength at
-    (field points, depths) against those of all components; ``shown`` and ``whole``: :func:`lit` of both, where they
-    are known."""
+def unpolarised(judged: Judged, whole: Tensor | None = None) -> float:
+    """What the components of the field that a window leaves out change: PSFs of sum 1 against those of all components
+    (``whole``, where they are known)."""
+    window = judged.window
     if window.components == window.whole:
         return 0.0
-    few = lit(optics, waves, window, at) if shown is None else shown
-    whole = lit(optics, waves, replace(window, components=window.whole), at) if whole is None else whole
-    light = whole.sum((-1, -2))
+    whole = judged.lit(components=window.whole) if whole is None else whole
+    few, light = judged.shown, whole.sum((-1, -2))
     return in_light(relative(few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]), light)
-
-
-def lit(
-    optics: Optics,
-    waves: Nodes,
-    window: Window,
-    at: tuple[Tensor, Tensor],
-    *,
-    shift_um: tuple[float, float] = (0.0, 0.0),
-) -> Tensor:
-    """PSFs of the first wavelength at (field points, depths), with their light, which all of these judge."""
-    about: dict[str, Any] = {"wavelength_um": float(waves.wavelengths_um[0]), "window": window, "shift_um": shift_um}
-    with torch.no_grad():
-        return psfs(optics, at[0], depths_um=at[1], **about)
 
 
 def width(psfs: Tensor) -> float:

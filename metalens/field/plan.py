@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled
-from metalens.field.left_out import folded, neglected, polarised
+from metalens.field.left_out import Judged, folded, neglected, polarised
 from metalens.field.patches import dense, relative, together
 from metalens.field.points import Optics, Window, psfs
 from metalens.ground.errors import SceneError
@@ -132,22 +132,22 @@ def planned(
     window = _unfolded(optics, coarse, window, (_places(STREWN, middle_um, half), ends), tolerance * SHARES["folded"])
 
     def across(places: Tensor) -> Tensor:
-        x = torch.stack([(2 * places / ALONG - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
-        return spectral(optics, x + torch.tensor(middle_um, dtype=torch.float64), ends, coarse, window)
+        at = torch.stack([(2 * places / ALONG - 1) * half[1], torch.full_like(places, 0.6 * half[0])], -1)
+        return spectral(optics, at + torch.tensor(middle_um, dtype=torch.float64), ends, coarse, window)
 
     def deep(places: Tensor) -> Tensor:
-        at = torch.tensor([[0.0, 0.0], [0.7 * half[1], -0.4 * half[0]]], dtype=torch.float64)
-        at = at + torch.tensor(middle_um, dtype=torch.float64)
+        at = _places(((0.0, 0.0), (0.7, -0.4)), middle_um, half)
         near, far = (1 / d for d in grid.depths_um)
         return spectral(optics, at, 1 / (near + (far - near) * places / FINE), coarse, window).transpose(0, 1)
 
     count, denser = _line(across, (middle_um[0], half[1]), tolerance * SHARES["field"])
     depths = 1 if grid.depths_um[0] == grid.depths_um[1] else _fewest(deep, tolerance * SHARES["depth"], "depths")
-    if neglected(optics, coarse, window, (_places(OFF_AXIS, middle_um, half), ends)) > tolerance * SHARES["transform"]:
+    aside = _places(OFF_AXIS, middle_um, half), ends
+    if neglected(Judged(optics, coarse, window, aside)) > tolerance * SHARES["transform"]:
         window = replace(window, curved=True)
     some = _places((*OFF_AXIS, (0.0, 0.0)), middle_um, half), ends
-    within = tolerance, tolerance * SHARES["polarisation"]
-    window = polarised(optics, coarse, window, some, polarisation, within=within)
+    most = tolerance * SHARES["polarisation"]
+    window = polarised(Judged(optics, coarse, window, some), polarisation, within=(tolerance, most))
     y, x = (
         m + (2 * placed(max(2, math.ceil((count - 1) * h / half[1]) + 1), denser, (m, h)) / ALONG - 1) * h
         for m, h in zip(middle_um[::-1], half, strict=True)
@@ -188,7 +188,7 @@ def spectral(optics: Optics, at_um: Tensor, depths_um: Tensor, waves: Nodes, win
 
 def _unfolded(optics: Optics, waves: Nodes, window: Window, at: tuple[Tensor, Tensor], tolerance: float) -> Window:
     """The window with nodes of the least period that folds no more light back than is tolerated, or of the longest."""
-    while window.period < LONGEST and folded(optics, waves, window, at) > tolerance:
+    while window.period < LONGEST and folded(Judged(optics, waves, window, at)) > tolerance:
         window = replace(window, period=LONGER * window.period)
     return window
 

@@ -12,6 +12,7 @@ from metalens.field import Grid, engine, left_out, patches, plan
 from metalens.field.forming import Imager
 from metalens.field.plan import Plan
 from metalens.field.points import Window
+from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Stop
 from metalens.psf import Nodes
 
@@ -88,7 +89,7 @@ def test_the_transform_is_judged_by_rays_seen_from_a_width_aside(monkeypatch):
 
     monkeypatch.setattr(left_out, "psfs", psfs)
     at, depths = torch.zeros(2, 2), torch.ones(3)
-    found = left_out.neglected(OPTICS, WAVES, PLAN.window, (at, depths))
+    found = left_out.neglected(left_out.Judged(OPTICS, WAVES, PLAN.window, (at, depths)))
     wide = left_out.width(plain) * 2.0
     assert [wave for _, _, wave, _ in asked] == [0.82, 0.82]
     assert asked[1][3] == pytest.approx((0.6 * wide, 0.8 * wide))
@@ -133,23 +134,23 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     def lights_used(made, pixels, depths):
         return told.float()
 
-    def neglected(optics, waves, window, at, shown):
-        seen.update(few=at, plain=shown)
+    def neglected(judged):
+        seen.update(few=judged.at, plain=judged.shown)
         return 0.017
 
     monkeypatch.setattr(engine, "spectral", spectral)
     monkeypatch.setattr(engine, "psfs_used", psfs_used)
     monkeypatch.setattr(engine, "lights_used", lights_used)
 
-    def unpolarised(optics, waves, window, at, shown):
-        assert shown is plain
-        seen.update(turned=at)
+    def unpolarised(judged):
+        assert judged.shown is plain
+        seen.update(turned=judged.at)
         return 0.0031
 
     monkeypatch.setattr(engine.left_out, "neglected", neglected)
     monkeypatch.setattr(engine.left_out, "unpolarised", unpolarised)
-    monkeypatch.setattr(engine.left_out, "folded", lambda *given: 0.0047 * len(given[3][0]) * (given[4] is plain))
-    monkeypatch.setattr(engine.left_out, "lit", lambda *given: asked.append(given) or plain)
+    monkeypatch.setattr(engine.left_out, "folded", lambda judged: 0.0047 * len(judged.at[0]) * (judged.shown is plain))
+    monkeypatch.setattr(engine.left_out.Judged, "lit", lambda judged: asked.append(judged) or plain)
 
     def missing(optics, wave, window, at):
         seen.update(wave=wave, every=at)
@@ -186,7 +187,7 @@ def test_pixels_that_no_node_holds_judge_what_is_used(monkeypatch):
     assert seen["every"][1] is seen["depths"]
     assert seen["plain"] is plain
     assert len(asked) == 1
-    assert asked[0][1:3] == (WAVES, PLAN.window)
+    assert (asked[0].waves, asked[0].window) == (WAVES, PLAN.window)
     for name in ("turned", "few"):
         assert seen[name][0].numpy() == pytest.approx(seen["at"].numpy()[:5])
     assert parts["edge"] == pytest.approx(0.05 * 0.82 / 2)
@@ -368,3 +369,26 @@ def test_four_nodes_interpolate_cubics_at_places_of_any_shape():
 
     found = (weights * cubic(nodes)[first[..., None] + torch.arange(4)]).sum(-1)
     assert found.numpy() == pytest.approx(cubic(place).numpy(), rel=1e-9)
+
+
+def test_an_image_is_planned_to_its_own_light_where_nodes_allow_it(monkeypatch):
+    """3 times dimmer: a third of the tolerance; where that is refused the tolerance itself, whose refusals are told."""
+    asked, least = [], 0.0
+
+    def planned(*given, tolerance, folds):
+        asked.append(tolerance)
+        if tolerance < least:
+            raise SceneError(f"above {tolerance:.2g}")
+        return given, folds
+
+    monkeypatch.setattr(engine, "planned", planned)
+    assert engine._planned((1, 2), 0.06, 3.0, folds=True) == (((1, 2), True), pytest.approx(0.02))
+    least = 0.03
+    assert engine._planned((1, 2), 0.06, 3.0, folds=False) == (((1, 2), False), 0.06)
+    least = 0.1
+    with pytest.raises(SceneError, match=r"above 0\.06"):
+        engine._planned((1,), 0.06, 3.0, folds=True)
+    assert asked == pytest.approx([0.02, 0.02, 0.06, 0.02, 0.06])
+    engine._planned((1,), 0.2, 1.0, folds=True)
+    engine._planned((1,), 1.5, 8.0, folds=True)  # refused by its own number
+    assert asked[5:] == [0.2, 1.5]

@@ -95,7 +95,7 @@ def test_a_field_off_the_axis_is_tried_where_it_lies(monkeypatch):
     monkeypatch.setattr(plan, "spectral", spectral)
     monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
     monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
-    monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
+    monkeypatch.setattr(plan, "polarised", lambda judged, *_, **__: judged.window)
     grid, waves = Grid((10, 32), 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
     plan.planned(None, grid, waves, (70.0, -40.0), tolerance=0.01, folds=False)
     off = torch.cat(seen) - torch.tensor([70.0, -40.0])
@@ -157,7 +157,7 @@ def test_a_field_folds_only_where_it_is_square(monkeypatch, samples, middle, fol
     monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
     monkeypatch.setattr(plan, "neglected", lambda *_: 0.0)
     monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
-    monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
+    monkeypatch.setattr(plan, "polarised", lambda judged, *_, **__: judged.window)
     grid = Grid(samples, 2.0, (3e3, 9e3), window=7)
     round_lens = folds or samples[0] != samples[1]
     waves = Nodes(np.array([0.85]), np.array([1.0]), 0.0)
@@ -176,7 +176,7 @@ def test_nodes_lie_as_densely_along_y_as_a_line_along_x_asks_for(monkeypatch, sa
     0.36 of the tolerance are seen from every place."""
     monkeypatch.setattr(plan, "spectral", lambda o, at, z, w, win: BASE.expand(len(at), len(z), 7, 7))
     monkeypatch.setattr(plan, "folded", lambda *_: 0.0)
-    monkeypatch.setattr(plan, "polarised", lambda optics, waves, window, *_, **__: window)
+    monkeypatch.setattr(plan, "polarised", lambda judged, *_, **__: judged.window)
     grid, waves = Grid(samples, 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
     for left in (0.0035, 0.0037):
         monkeypatch.setattr(plan, "neglected", lambda *_, left=left: left)

@@ -7,7 +7,7 @@ import torch
 
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, plan
-from metalens.field.left_out import folded
+from metalens.field.left_out import Judged, folded
 from metalens.field.patches import relative
 from metalens.field.points import SPARE, psfs
 from metalens.ground.errors import PropagationError
@@ -55,7 +55,7 @@ def test_what_is_folded_back_is_the_error_that_plane_waves_find(true):
     window = Window(SAMPLES, STEP_UM)
     at = tuple(torch.tensor(a, dtype=torch.float64) for a in ([PLACE], [DEPTH_UM]))
     waves = Nodes(torch.tensor([0.85]).numpy(), torch.ones(1).numpy(), 0.0)
-    told, error = folded(OPTICS, waves, window, at), float(relative(_psf(window), true))
+    told, error = folded(Judged(OPTICS, waves, window, at)), float(relative(_psf(window), true))
     assert told == pytest.approx(error, abs=0.03)
 
 

@@ -12,7 +12,7 @@ from scipy import special
 
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.field.left_out import polarised, unpolarised
+from metalens.field.left_out import Judged, polarised, unpolarised
 from metalens.field.patches import relative
 from metalens.field.polarised import factors
 from metalens.field.rays import Rays
@@ -152,12 +152,12 @@ def test_the_scalar_stays_where_its_error_is_below_the_tolerance_and_the_image_s
         Optics(SmoothWave(Focus(WAVE, 33.0, FOCUS), RADIUS), Layers(), 33.0),
         (torch.tensor([[3.0, -4.0]], dtype=torch.float64), torch.tensor([4000.0])),
     )
-    window = Window(WINDOW, STEP, True)
-    said = unpolarised(fast, WAVES, window, at)
+    judged = Judged(fast, WAVES, Window(WINDOW, STEP, True), at)
+    said = unpolarised(judged)
     for tolerance, components in ((1.01 * said, 0), (0.99 * said, 4)):  # three leave more than a fifth of that
-        assert polarised(fast, WAVES, window, at, "auto", within=(tolerance, 0.2 * tolerance)).components == components
-    assert polarised(fast, WAVES, window, at, "scalar", within=(1e-9, 1e-9)).components == 0
-    energy = polarised(fast, WAVES, window, at, "vector", within=(1.01 * said, 0.2 * 1.01 * said))
+        assert polarised(judged, "auto", within=(tolerance, 0.2 * tolerance)).components == components
+    assert polarised(judged, "scalar", within=(1e-9, 1e-9)).components == 0
+    energy = polarised(judged, "vector", within=(1.01 * said, 0.2 * 1.01 * said))
     assert (energy.flux, energy.whole) == (False, 6)
     assert energy.components > 0
 
