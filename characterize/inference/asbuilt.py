@@ -332,8 +332,8 @@ def load(path: str | Path) -> AsBuilt:
 def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
     ends = about.get("response_low_um", -math.inf), about.get("response_high_um", math.inf)
     if "response/rates" in arrays:
-        pairs = (arrays[f"response/{name}"] for name in _PAIRS)
-        return Sensitivity.of_pairs(PairSensitivities(*pairs, about["response_error"]))
+        width, length, rates = (arrays[f"response/{name}"] for name in _PAIRS)
+        return Sensitivity.of_pairs(PairSensitivities(width, length, rates, about["response_error"]))
     solved = None
     if "response/powers" in arrays:
         wave = float(arrays["response/wavelength_um"])
