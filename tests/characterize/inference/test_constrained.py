@@ -80,3 +80,15 @@ def test_a_step_is_found_to_a_share_of_sigma_however_long_it_is(far):
     found = constrained.step(jacobian.T @ jacobian, -jacobian.T @ target, np.zeros(4), low=low, high=high)
     sigma = 1 / np.sqrt(np.diag(jacobian.T @ jacobian))
     assert np.abs((found - want) / sigma).max() < 3e-3  # it ends where a further step is below 1e-3
+
+
+def test_derivatives_of_the_ball_are_differences():
+    """Steps in units of unlike sizes, two of three parameters in the ball; of a parabola differences are exact."""
+    x, size, s = np.array([0.3, -0.8, 1.1]), np.array([2.3, 0.7, 4.1]), np.array([0.9, -0.4, 1.7])
+    excess = constrained._limit(Ball(np.array([0, 2]), 1.3), x, size)
+    slope, h = np.full(3, 9.0), 1e-3
+    value = excess(s, slope)
+    assert value == pytest.approx(((0.3 + 0.9 / 2.3) ** 2 + (1.1 + 1.7 / 4.1) ** 2) / 1.3**2 - 1, rel=1e-12)
+    none = np.zeros(0)
+    want = [(excess(s + h * unit, none) - excess(s - h * unit, none)) / (2 * h) for unit in np.eye(3)]
+    assert slope == pytest.approx(want, abs=1e-9)

@@ -56,6 +56,30 @@ def test_three_lamps_and_more_light_from_above():
     assert float(model.ambient(p, *below)) == pytest.approx(0.3 * 0.2)
 
 
+def test_a_wet_surface_and_the_iris_behind_it_have_the_light_of_three_lamps_and_two_mirror_images():
+    """Wraps of 0.3 and 0.15, taken off again: as bright as without them where a lamp is straight on."""
+    lamps = [[9e3, -5e3, 1e3], [-7e3, -4e3, 2e3], [1e3, -12e3, 3e3]]
+    axis, normal = (0.2, -0.1, -math.sqrt(0.95)), (0.1, -0.3, -math.sqrt(0.9))
+    p = parameters(LED=lamps, AMBIENT=0.3, FACE_Y=[0.0, 0.6, -0.8], AXIS=axis)
+    point = (500.0, 800.0, 19e3)
+    sums, lobes = [0.0, 0.0], []
+    for lamp in lamps:
+        v = [a - b for a, b in zip(lamp, point, strict=True)]
+        square = sum(x * x for x in v) + 1e6
+        for k, (n, wrap) in enumerate(((normal, 0.3), (axis, 0.15))):
+            cosine = sum(x * y for x, y in zip(v, n, strict=True)) / math.sqrt(square)
+            sums[k] += max(cosine + wrap, 0) * 4e8 / square
+        half = [x / math.sqrt(square) - d for x, d in zip(v, (0.0, 0.0, 1.0), strict=True)]
+        along = max(sum(h * n for h, n in zip(half, normal, strict=True)), 0)
+        lobes.append((1 + 50 / 2 * (1 - along**2 / (sum(h * h for h in half) + 1e-3))) ** -2)
+    ambient = [0.3 * (0.6 - 0.4 * (0.6 * n[1] - 0.8 * n[2])) for n in (normal, axis)]
+    ways = [[number(x) for x in part] for part in (point, normal, (0.0, 0.0, 1.0))]
+    outer, inner, mirrored = model.wet_lamps(p, *ways[0], *ways[1], *ways[2], 50.0)
+    assert float(outer) == pytest.approx(sums[0] / 1.3 + ambient[0], rel=1e-12)
+    assert float(inner) == pytest.approx(sums[1] / 1.15 + ambient[1], rel=1e-12)
+    assert float(mirrored) == pytest.approx(lobes[0] + lobes[1], rel=1e-12)
+
+
 @pytest.mark.parametrize("off", [0.0, 0.04, -0.11])
 def test_the_mirror_lobe_peaks_where_the_half_vector_is_the_normal(off):
     """1 / (1 + s/2 sin² a)²: a between normal and the half vector h of lamp and eye; |h|² + 0.001 keeps it finite."""
