@@ -108,7 +108,8 @@ def steps(frames: Tensor) -> Tensor:
     coarse = F.avg_pool2d(F.pad(fine, (0, 1, 0, 1), mode="replicate"), 2, 1)
     square = torch.cat([_steps(of, reach) for of, reach in zip((fine, coarse), REACHES, strict=True)], 1) ** 2
     told = torch.log1p(square / STEP_FLOOR)
-    mean, second, steepest = (window_content(part) for part in (told, told**2, square**4))
+    # squares twice: a power of four is a function call a number
+    mean, second, steepest = (window_content(part) for part in (told, told**2, (square**2) ** 2))
     spread = torch.sqrt((second - mean**2).clamp_min(0) + 1e-4)
     return torch.cat([mean, spread, torch.log1p(steepest / STEP_FLOOR**4) / 4], 1)
 

@@ -82,14 +82,21 @@ def terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
 
     free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n. radial: rho^2, rho^4, …
     """
-    rho = torch.hypot(x, y)
+    square = x**2 + y**2
+    rings = [square]  # rho^2, rho^4, …; products of x and y cost a tenth of powers and cosines
+    cosine, sine = [torch.ones_like(square), x], [torch.zeros_like(square), y]  # rho^m cos(m theta), rho^m sin(m theta)
     if family == "radial":
-        return [rho ** (2 * n + 2) for n in range(count)]
-    theta = torch.atan2(y, x)
+        while len(rings) < count:
+            rings.append(rings[-1] * square)
+        return rings[:count]
     found: list[Tensor] = []
     order = 2
     while len(found) < count:
+        cosine.append(cosine[-1] * x - sine[-1] * y)
+        sine.append(sine[-1] * x + cosine[-2] * y)
+        rings.append(rings[-1] * square)
         for m in range(-order, order + 1, 2):
-            found.append(rho**order * (torch.cos(m * theta) if m >= 0 else torch.sin(-m * theta)))
+            wave, ring = (cosine if m >= 0 else sine)[abs(m)], (order - abs(m)) // 2
+            found.append(rings[ring - 1] * wave if ring else wave)
         order += 1
     return found[:count]

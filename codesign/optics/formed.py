@@ -10,7 +10,6 @@ unbiased (:mod:`metalens.field.slopes`).
 
 import functools
 import math
-from collections.abc import Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -144,31 +143,32 @@ class Live:
     """A true image whose lens moves: the imager with the light of its nodes as a leaf.
 
     light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes that were asked for. ready:
-    the imager, differentiable in it.
+    the imager, differentiable in it. pairs: what was drawn of :func:`metalens.field.drawn`; None for all nodes.
     """
 
     light: Tensor
     ready: Imager
+    pairs: tuple[Tensor, Tensor] | None = None
 
-    def pass_on(
-        self, settings: OpticsConfig, coefficients_rad: Tensor, *, draws: int, generator: torch.Generator
-    ) -> None:
-        """Add to the gradient of the coefficients what the light gathered, from ``draws`` points and wavelengths."""
-        if self.light.grad is None:
+    def pass_on(self, settings: OpticsConfig, coefficients_rad: Tensor) -> None:
+        """Add to the gradient of the coefficients what the light gathered, from the points and wavelengths drawn."""
+        if self.light.grad is None or self.pairs is None:
             return
         optics = optics_of(settings, coefficients_rad)
-        value = surrogate(optics, self.ready.plan, self.light.grad, draws=draws, generator=generator)
+        value = surrogate(optics, self.ready.plan, self.light.grad, self.pairs)
         value.backward()  # type: ignore[no-untyped-call]
 
 
-def live(settings: OpticsConfig, whole: Imager, asked: Set[int] | None = None) -> Live:
-    """An imager with its nodes' light as a leaf, of some nodes or of all; the relative illumination is held."""
+def live(settings: OpticsConfig, whole: Imager, pairs: tuple[Tensor, Tensor] | None = None) -> Live:
+    """An imager with its nodes' light as a leaf, of the nodes that were drawn or of all; the relative illumination is
+    held, and the image is that of the kernels that there are."""
     with torch.no_grad():
         unit = normalised(torch.ones_like(whole.stack[..., :1, :1]), optics_of(settings, torch.zeros(0)), whole.plan)[1]
         light = whole.stack * (whole.energy / unit)[..., None, None]
     light.requires_grad_()
     psfs = light / light.sum((-2, -1), keepdim=True)
-    return Live(light, with_psfs(replace(whole, asked=asked), psfs, whole.energy))
+    asked = None if pairs is None else set(pairs[0].tolist())
+    return Live(light, replace(whole, stack=psfs, asked=asked), pairs)
 
 
 def optics_of(settings: OpticsConfig, coefficients_rad: Tensor) -> Optics:

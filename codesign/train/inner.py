@@ -220,7 +220,7 @@ class Trainer:
             over = losses.over_budget(each, self._budget).mean()
             total = total + self.inner.budget_weight * over.to(self.light.device)
         total.backward()  # type: ignore[no-untyped-call]
-        self.light.pass_on(self.step, self.model.coefficients_rad)
+        self.light.pass_on(self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
         finite = finite and moving.finite(p for _, ps in self.groups.values() for p in ps)

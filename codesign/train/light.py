@@ -54,15 +54,13 @@ class Light:
         made = self._true(step, coefficients_rad.detach(), frame, margin, live=live)
         if not live:
             return made
-        points, _ = drawn(made.plan, self.draws, self._generator(step))
-        self._live = formed.live(self.optics, made, set(points.tolist()))
+        self._live = formed.live(self.optics, made, drawn(made.plan, self.draws, self._generator(step)))
         return self._live.ready
 
-    def pass_on(self, step: int, coefficients_rad: Tensor) -> None:
+    def pass_on(self, coefficients_rad: Tensor) -> None:
         """After the loss went backward: its gradient from the light to the coefficients, where it stopped there."""
         if self._live is not None:
-            generator = self._generator(step)
-            self._live.pass_on(self.optics, coefficients_rad, draws=self.draws, generator=generator)
+            self._live.pass_on(self.optics, coefficients_rad)
             self._live = None
 
     def _generator(self, step: int) -> torch.Generator:

@@ -111,19 +111,15 @@ def node_light(optics: Optics, plan: Plan) -> Tensor:
     return light.reshape(len(plan.y_um), len(plan.x_um), *light.shape[1:]).requires_grad_()
 
 
-def surrogate(
-    optics: Optics, plan: Plan, gradient: Tensor, *, draws: int, generator: torch.Generator | None = None
-) -> Tensor:
+def surrogate(optics: Optics, plan: Plan, gradient: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
     """A scalar whose gradient to the phase is, in the mean over the draws, that of the loss.
 
     Args:
-        gradient: (rows, columns, depths, h, w) of the loss with respect to :func:`node_light`.
-        draws: pairs of a field point and a wavelength, drawn with replacement.
+        gradient: (rows, columns, depths, h, w) of the loss with respect to :func:`node_light`, of the field points that
+            were drawn.
+        pairs: a field point and a wavelength each, of :func:`drawn`.
     """
-    points, waves = drawn(plan, draws, generator)
-    return torch.stack(
-        [term(optics, plan, gradient, int(p), int(w)) for p, w in zip(points, waves, strict=True)]
-    ).mean()
+    return torch.stack([term(optics, plan, gradient, int(p), int(w)) for p, w in zip(*pairs, strict=True)]).mean()
 
 
 def drawn(plan: Plan, draws: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:

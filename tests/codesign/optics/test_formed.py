@@ -15,7 +15,7 @@ from metalens.cell import Film, Index
 from metalens.field.engine import normalised, trial
 from metalens.field.forming import with_psfs
 from metalens.field.plan import spectral
-from metalens.field.slopes import term
+from metalens.field.slopes import drawn, term
 from metalens.ground.errors import ConfigError, TrainingError
 from metalens.image import Frames, Imager, UniformImager
 from metalens.lens import Layers, Stop
@@ -80,10 +80,22 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
         want = float(image(BENT + 2e-3 * way) - image(BENT - 2e-3 * way)) / 4e-3
     assert float(moving.grad @ way) == pytest.approx(want, rel=0.02)  # float32 images: 1e-3 of a difference of 4e-3
 
-    drawn = BENT.clone().requires_grad_()
-    draws = torch.Generator().manual_seed(1)
-    ready.pass_on(SMALL, drawn, draws=60, generator=draws)
-    assert float((drawn.grad - moving.grad).norm()) < 0.6 * float(moving.grad.norm())  # 60 draws of 25 points
+    few = BENT.clone().requires_grad_()
+    pairs = drawn(whole.plan, 60, torch.Generator().manual_seed(1))
+    replace(ready, pairs=pairs).pass_on(SMALL, few)
+    assert float((few.grad - moving.grad).norm()) < 0.6 * float(moving.grad.norm())  # 60 draws of 25 points
+
+
+def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_were_drawn(whole):
+    pairs = drawn(whole.plan, 3, torch.Generator().manual_seed(4))
+    ready = formed.live(SMALL, whole, pairs)
+    assert ready.ready.asked == set(pairs[0].tolist())
+    frames = _frames(whole)
+    seen = ready.ready(frames)
+    assert torch.equal(seen, whole(frames))  # the same kernels, bit for bit
+    seen.square().sum().backward()
+    light = ready.light.grad.flatten(0, 1).abs().sum((1, 2, 3))
+    assert set(torch.nonzero(light)[:, 0].tolist()) == set(pairs[0].tolist())
 
 
 def _frames(made):

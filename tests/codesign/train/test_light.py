@@ -76,7 +76,7 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
     formed_once = formed.imager(settings, place, 30, margin=5)
     assert isinstance(formed_once, Imager)
     monkeypatch.setattr(formed, "imager", imaged)
-    monkeypatch.setattr(formed, "live", lambda settings, whole, asked: formed.Live(place, whole))
+    monkeypatch.setattr(formed, "live", lambda settings, whole, pairs: formed.Live(place, whole, pairs))
     light = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
     for step, moved in enumerate((0.0, 0.0, 1.0, 2.0, 3.0, 4.0)):
         light.at(step, place + moved, 30, 5, live=step > 0)

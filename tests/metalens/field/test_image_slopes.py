@@ -10,6 +10,7 @@ from metalens.field import (
     Layers,
     Optics,
     SmoothWave,
+    drawn,
     imager,
     node_light,
     node_psfs,
@@ -74,7 +75,7 @@ def test_a_draw_is_one_of_the_terms(case):
     made, frames = case
     _, optics, gradient = _pulled(made, frames)
     draw = torch.Generator().manual_seed(5)
-    got = float(surrogate(optics, made.plan, gradient, draws=1, generator=draw).detach())
+    got = float(surrogate(optics, made.plan, gradient, drawn(made.plan, 1, draw)).detach())
     points = len(made.plan.y_um) * len(made.plan.x_um)
     every = [float(term(optics, made.plan, gradient, p, w).detach()) for p in range(points) for w in range(2)]
     assert min(abs(got - one) for one in every) <= 1e-5 * max(map(abs, every))

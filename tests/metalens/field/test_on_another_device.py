@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import Grid, Layers, SmoothWave, forming, imager, patches, surrogate, together
+from metalens.field import Grid, Layers, SmoothWave, drawn, forming, imager, patches, surrogate, together
 from metalens.field.points import Optics
 from metalens.image import Frames, basis, image, uniform_imager
 from tests.elsewhere import AWAY, elsewhere
@@ -181,7 +181,7 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
 
         optics = Optics(SmoothWave(FOCUS, 200.0, added), LAYERS, FOCUS.sensor_distance_um)
         weights = torch.linspace(-1, 2, here.stack.numel()).reshape(here.stack.shape).to(device)
-        value = surrogate(optics, here.plan, weights, draws=2, generator=torch.Generator().manual_seed(3))
+        value = surrogate(optics, here.plan, weights, drawn(here.plan, 2, torch.Generator().manual_seed(3)))
         value.backward()
         return float(value.detach()), bends.grad
 
