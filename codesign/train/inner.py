@@ -6,16 +6,15 @@ gradients of phase coefficients are a hundred times smaller than those of weight
 The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`), on the schedule of the weights.
 """
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Batch, Flat, PoolScenes, Pose, Scenes, depth_um, irradiance, parallel, samples
+from codesign.batches import Batch, Flat, Pose, Scenes, depth_um, irradiance, parallel, samples
 from codesign.network import Architecture, Baseline, Prediction, blur, cost, losses, running, smallest, soap
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
@@ -166,13 +165,11 @@ class Trainer:
         threads.keep_memory()
         self.model.net.train()
         end = min(until or self.inner.steps, self.inner.steps)
-        work: Callable[[int], Given | Batch] = self._standing if self._still else self._batch
-        aside = self._still or self.light.device.type != "cpu"  # the processor is free there, and renders meanwhile
-        with Ahead(work, end=end, workers=1 if self._still else renderers(self.light.device)) as ahead:
+        with Ahead(self._batch, end=end, workers=renderers(self.light.device)) as ahead:
             while self.step < end:
-                made = ahead.take(self.step) if aside else work(self.step)
-                with ahead.beside() if aside else contextlib.nullcontext():
-                    record = self._advance(made)
+                batch = ahead.take(self.step)
+                with ahead.beside():
+                    record = self._advance(batch)
                 yield record
 
     def state(self) -> dict[str, object]:
@@ -200,15 +197,13 @@ class Trainer:
         self.light.restore(state["light"])  # type: ignore[arg-type]
         self.pitch_held_um = state["pitch_held_um"]  # type: ignore[assignment]
 
-    def _advance(self, made: Given | Batch) -> Record:
+    def _advance(self, batch: Batch) -> Record:
         progress = self.step / self.inner.steps
         rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        if isinstance(made, Given):
-            return self._stepped(made, rates)
         moves, live = rates["pitch"] > 0, rates["optics"] > 0 and "optics" in self.optimisers
-        return self._stepped(self._given(self.step, made, live=live, seen=not moves), rates)
+        return self._stepped(self._given(self.step, batch, live=live, seen=not moves), rates)
 
     def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
         """A step of every optimiser on what is given."""
@@ -232,20 +227,9 @@ class Trainer:
         loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of([float(v.detach()) for v in values])
         return Record(self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped)
 
-    @property
-    def _still(self) -> bool:
-        """Whether what a step is given depends on its number alone, and comes from a pool."""
-        fixed = self.inner.optics.rate == 0 or "optics" not in self.optimisers
-        drawn = not self.light.stacks and self._lens_error(0) is not None
-        return fixed and self.inner.pitch.rate == 0 and not drawn and isinstance(self.scenes, PoolScenes)
-
     def _batch(self, step: int) -> Batch:
         """The frames of a step, by its number alone."""
         return parallel.part_of(self.scenes.batch(step, self.inner.batch))
-
-    def _standing(self, step: int) -> Given:
-        """What a step trains on where neither lens nor pitch move."""
-        return self._given(step, self._batch(step), live=False, seen=True)
 
     def _given(self, step: int, batch: Batch, *, live: bool, seen: bool) -> Given:
         """What a step trains on; ``seen``: as the pixels give it, which takes a pitch that does not move."""

@@ -45,6 +45,14 @@ def test_one_thread_of_torch_stays_one_thread(threads):
         assert going.take(2) is threading.main_thread()
 
 
+def test_without_workers_a_step_has_all_threads_and_does_its_own_work(threads):
+    threads(2)
+    with Ahead(lambda step: (step, threading.current_thread(), torch.get_num_threads()), end=9, workers=0) as going:
+        assert going.take(4) == (4, threading.main_thread(), 2)
+        with going.beside():
+            assert torch.get_num_threads() == 2
+
+
 def test_what_goes_wrong_beside_the_step_is_raised_in_it(threads):
     threads(2)
     with Ahead(lambda step: 1 // (step - 4), end=9) as going:
@@ -75,7 +83,7 @@ def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
 def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(monkeypatch):
     monkeypatch.setattr(ahead, "cores", lambda: 12)
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
-    assert ahead.renderers(torch.device("cpu")) == 1
+    assert ahead.renderers(torch.device("cpu")) == 0
     assert ahead.renderers(torch.device("cuda")) == 6
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     assert ahead.renderers(torch.device("cuda")) == 1
