@@ -9,7 +9,6 @@ from codesign.optics import formed, stack
 from codesign.optics.stack import OpticsConfig
 from codesign.train import run
 from codesign.train.light import Light
-from metalens.field import drawn
 from metalens.ground.errors import TrainingError
 from metalens.image import Imager
 
@@ -57,6 +56,9 @@ window_samples = 11
 """
 
 
+LIVE = formed.live
+
+
 def _never(step):
     return None
 
@@ -95,22 +97,22 @@ def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
     """The nodes whose light is asked for are those that the gradient is passed on from; others at every step."""
     asked, passed, steps = [], [], (9, 10, 11, 9)
 
-    def live(settings, imaged, nodes):
-        asked.append(nodes)
-        leaf = torch.zeros(1, requires_grad=True)
-        leaf.grad = torch.ones(1)
-        return formed.Live(leaf, imaged)
+    def live(settings, imaged, pairs):
+        made = LIVE(settings, imaged, pairs)
+        asked.append(made.ready.asked)
+        made.light.grad = torch.ones_like(made.light)
+        return made
 
-    def surrogate(optics, plan, gradient, *, draws, generator):
-        passed.append((draws, set(drawn(plan, draws, generator)[0].tolist())))
+    def surrogate(optics, plan, gradient, pairs):
+        passed.append((len(pairs[0]), set(pairs[0].tolist())))
         return torch.zeros((), requires_grad=True)
 
     monkeypatch.setattr(formed, "live", live)
     monkeypatch.setattr(formed, "surrogate", surrogate)
     for step in steps:
         light.at(step, place, 30, 5, live=True)
-        light.pass_on(step, place)
-        light.pass_on(step, place)  # nothing is left of it
+        light.pass_on(place)
+        light.pass_on(place)  # nothing is left of it
     assert passed == [(2, nodes) for nodes in asked]
     assert asked[0] == asked[3]
     assert len({frozenset(nodes) for nodes in asked}) == 3

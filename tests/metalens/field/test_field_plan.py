@@ -201,7 +201,7 @@ def test_light_from_one_point_and_one_wavelength_is_drawn_evenly_and_by_weight(m
         y_um=torch.arange(4.0), x_um=torch.arange(3.0), waves=Nodes(np.array([0.84, 0.86]), np.array([0.25, 0.75]), 0.0)
     )
     generator = torch.Generator().manual_seed(4)
-    assert float(slopes.surrogate(None, made, None, draws=3000, generator=generator)) == 2.5
+    assert float(slopes.surrogate(None, made, None, slopes.drawn(made, 3000, generator))) == 2.5
     counts = np.bincount([point for point, _ in seen], minlength=12)
     assert len(counts) == 12
     assert abs(counts - 250).max() < 75
