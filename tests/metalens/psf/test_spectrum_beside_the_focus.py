@@ -5,6 +5,7 @@ pillars delay it by up to some micrometres more. Two wavelengths that serve a fo
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens, answers
 from metalens.pillars import Proxy
 from metalens.psf import Nodes, View, from_lens, spectrum
-from metalens.psf.of_lens import PILOT, lit
+from metalens.psf.of_lens import PILOT, lit, paths_um
 
 PHASE = np.array([[0.0, 1.15 * math.pi], [-0.4, -1.9]])  # of diameter and wavelength: delays of 0.9 to 4.3 um
 PROXY = Proxy(PHASE, np.array([[0.85, 0.05]]), (0.08, 0.22), (0.80, 0.90), 0.0, 0.0)
@@ -102,3 +103,19 @@ def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light
     fine = Nodes(um, source.share, 0.0)
     want = from_lens(made, View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15), tolerance=1e-5, spectrum=fine)
     assert np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(want.intensity) <= found.error
+
+
+@pytest.mark.parametrize("offset", [(3.0, 21.0), (-17.0, 5.0)])
+def test_paths_to_a_window_differ_as_those_from_the_nearest_and_the_farthest_pillar(offset):
+    """Collimated light on axis, through air and pillars of one wavelength: rims of the lens on the line from its
+    middle, by spokes that miss it by up to 3 %."""
+    one = Proxy(PHASE[:1], np.array([[0.85, 0.05]]), (0.08, 0.22), (0.85, 0.85), 0.0, 0.0)
+    made = replace(lens(61, 55.0), proxy=one)
+    radius = made.diameters.radius_um
+    found = paths_um(made, View((math.inf,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset), (0.0, 0.0), None)[0]
+    middle = math.hypot(*offset)
+    near = max(middle - radius, 0.0)
+    want = math.hypot(middle + radius, 55.0) - math.hypot(near, 55.0)
+    assert found[found.shape[0] // 2, found.shape[1] // 2] == pytest.approx(want, rel=0.03)
+    down, across = np.ptp(found, axis=0).mean(), np.ptp(found, axis=1).mean()
+    assert bool(down > across) is (abs(offset[1]) > abs(offset[0]))
