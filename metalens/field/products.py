@@ -119,12 +119,33 @@ def _add(
     tables = patch.weights.numpy(), patch.energy.numpy()
     axes = bases(below - top, size[0]), bases(right - left, size[1])
     for kind, content in enumerate(frames[: out.shape[1]]):
-        inside = content[..., top:below, left:right]
-        held = [at for at in np.ndindex(inside.shape[:2]) if _largest(inside[at]) > least[kind]]
-        if held:
+        window = patch.rows, patch.columns
+        held = _held(content, window, least[kind])
+        if len(held):
             some = kernels[: patch.coverage] if kind else kernels
-            window = patch.rows, patch.columns
-            _convolved(content, frames[2], np.array(held), tables, kind, some, axes, room, out, window)
+            _convolved(content, frames[2], held, tables, kind, some, axes, room, out, window)
+
+
+@numba.njit(cache=True, nogil=True)
+def _held(content, window, least):  # type: ignore[no-untyped-def]
+    """(held, [frame, sheet]) of the sheets that have more than ``least`` anywhere in a window."""
+    (top, below), (left, right) = window
+    found, count = np.empty((content.shape[0] * content.shape[1], 2), np.int64), 0
+    for frame in range(content.shape[0]):
+        for sheet in range(content.shape[1]):
+            if _any_above(content[frame, sheet, top:below, left:right], least):
+                found[count] = frame, sheet
+                count += 1
+    return found[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _any_above(content, least):  # type: ignore[no-untyped-def]
+    for row in content:
+        for value in row:
+            if abs(value) > least:
+                return True
+    return False
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
