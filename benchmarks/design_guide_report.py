@@ -23,6 +23,7 @@ from benchmarks.design_guide import (
     KNOBS,
     LADDER,
     LOOKS,
+    MANY,
     NETWORK_FRAMES,
     RESULT,
     STOPS,
@@ -30,11 +31,13 @@ from benchmarks.design_guide import (
     TRAINING,
     compared,
     done,
+    long_read,
     plan,
     watched,
 )
 from benchmarks.design_guide_cells import FIELDS, cell_of
 from benchmarks.design_guide_network import EACH, PEOPLE
+from benchmarks.design_guide_words import FIELD, HEAD, LONG, NETWORK, RUNGS
 from codesign.evaluate.reader import ReferenceReader
 from codesign.network import blur
 from metalens.ground import store
@@ -149,61 +152,6 @@ def network_rows() -> list[dict[str, Any]]:
     return found
 
 
-HEAD = """# What brings how much
-
-Errors of the slippage and of the depth of windows (a quarter of the frame wide) by the reference reader of
-`metalens evaluate optics --reader`, trained anew behind every lens on its true image: whole field, depth, spectrum. In
-every row one knob differs from the base: hyperbolic lens in focus at 40 mm, 1 mm wide, 2 mm before the sensor; ±14°
-about the axis; one wavelength; pixels of 18 µm; 2000 e from white in 9 µm; {frames} frames to learn from. Scenes, noise
-and weights come from the seed. Brackets are 95 % intervals over the seeds (Student's), of ratios those of the
-logarithms paired by seed: they hold what differs from seed to seed and nothing else. `trusted`: the half of the windows
-of which the reader is surest. Images hold to 0.05 of a texture's contrast; where the spectrum's own share is below that
-one wavelength stands for it (10 nm: 0.006, 30 nm: up to 0.017 of the contrast). Gaze is
-that of the elastic network, further down.
-
-Made by `python -m benchmarks.design_guide run --work DIR`, and `report`; `--only CELL/SEED` reruns one. All numbers,
-and the coefficients of the trained lenses, are in `benchmarks/results/design_guide.json`.
-
-The lenses of the oblique field at 30 nm (`focus150`, `oblique40`, the one trained from it, `stop150`) are read by the
-reader of today, whose branch sees how steps of brightness are spread; all other rows, and the runs that chose, are of
-the one before, and due again.
-"""
-FIELD = """
-## Field and light of the device
-
-`oblique`: a camera that looks from one side, {oblique} along x and ±14° along y. `ring`: {ring} about the axis, both
-ways. Frames are those of a camera that faces the eye; their images are those of that part of the field. Every lens of a
-family was chosen by axial error with a seed of its own, for that field and light. `focus`: hyperbolic, in focus at
-{foci} mm. `designer`: r² alone (blur of all angles alike) or, in the oblique field, free of aberrations at its
-middle, in focus at {designers} mm. `trained`: 63 free-form terms moved from the best of all of these along the exact
-gradient of the likelihood of the windows' depths, as far as its running mean is longer than noise would leave it
-({turns} turns, {hold} steps of the reader's branch to each, 32 frames a step; the lens stands for the first
-{still:.0f} %), trained once, on an image to {coarse:g} of the contrast. The start and the lenses after {looks} % of the
-turns are read on frames that trained nothing, the one of least axial error is kept, and every seed reads it. `asphere`:
-six radial terms, from the best focus, likewise. `stop`: six radial terms behind a hole of 1 mm on the other face of
-0.5 mm of fused silica, of least wave-front error over the field, in focus at {stops} mm, as it stands. `bound`: what
-the blur of one window alone can tell, the least standard deviation of its depth, mean over the windows of the field
-and the depths, for a patch of unknown 1/f texture of contrast 0.2, its contrast and fall unknown too, in the photons'
-noise, where depths spread by 3 mm beforehand; that less light falls towards the rim is left out.
-Readers see edges and neighbouring windows as well, and may do better.
-"""
-RUNGS = """\
-## Where the gain is lost
-
-Scenes, pixels and light of the oblique field at 30 nm; PSFs held over the field. `angle`: every window through the PSFs
-of the middle, 17°. `line`: PSFs that vary along x as in the oblique field, and along y not at all. `oblique`: the true
-image. Every rung has its own best focus, designer's lens and trained lens, chosen and trained as above.
-"""
-NETWORK = """\
-## Another reader
-
-The elastic network of the co-design study, trained anew behind each of the lenses of the oblique field at 30 nm that
-stand, on the same true image: {frames} frames, each seen once, the same for all lenses of a seed; judged on the
-test frames of the reference reader ({macs:.2f} MMACs), and by gaze: {people} people, a personal calibration on a fifth
-of {each} frames each.
-"""
-
-
 def page(
     lines: dict[str, dict[str, Any]],
     bounds: dict[str, float] | None = None,
@@ -221,6 +169,8 @@ def page(
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():
         parts += device_table(device, rows, lines, bounds or {})
+    if long := role_rows(runs, long_read(lines)):
+        parts += [LONG.format(many=_count(MANY), frames=_count(cell_of("base").frames)), *lens_table(long, {}), ""]
     parts += [RUNGS, *ladder_table(device_rows(lines, LADDER), bounds or {}), "", *(told_of(one) for one in designs)]
     parts += [*watched_table(role_rows(runs, watched(lines)), runs), "", *network_table(network_rows()), ""]
     absent = missing(lines)
@@ -256,8 +206,17 @@ def device_table(
 ) -> list[str]:
     """A row a role, and the runs that chose below."""
     cell = cell_of(device)
-    out = [f"### {cell.field}, {cell.fwhm:g} nm", "",
-           "| lens | seeds | axial / mm | to best focus | windows / mm | to best focus | trusted / mm | lateral / mm "
+    scan = {
+        n: v for n, v in lines.items() if n.endswith(f"/{CHOICE}") and replace(cell_of(n[:-2]), lens="focus40") == cell
+    }
+    told = (f"`{cell_of(n[:-2]).lens}` {v['axial_mm']:.2f} ({v['window_mm']:.2f})" for n, v in scan.items())
+    chose = "Axial error and that of the windows in the runs that chose, mm: " + ", ".join(told) + "."
+    return [f"### {cell.field}, {cell.fwhm:g} nm", "", *lens_table(rows, bounds), "", chose, ""]
+
+
+def lens_table(rows: list[dict[str, Any]], bounds: dict[str, float]) -> list[str]:
+    """A row a lens, its errors also as a share of the best focus's."""
+    out = ["| lens | seeds | axial / mm | to best focus | windows / mm | to best focus | trusted / mm | lateral / mm "
            "| bound / mm |", "|---" * 9 + "|"]  # fmt: skip
     for row in rows:
         ratios = [str(row.get(f"{m}_ratio", 1)) for m in ("axial_mm", "window_mm")]
@@ -268,11 +227,11 @@ def device_table(
     for row in rows:
         if "to_designer" in row:
             out += ["", f"Trained to the best designer's lens, axial: {row['to_designer']}."]
-    scan = {
-        n: v for n, v in lines.items() if n.endswith(f"/{CHOICE}") and replace(cell_of(n[:-2]), lens="focus40") == cell
-    }
-    told = (f"`{cell_of(n[:-2]).lens}` {v['axial_mm']:.2f} ({v['window_mm']:.2f})" for n, v in scan.items())
-    return [*out, "", "Axial error and that of the windows in the runs that chose, mm: " + ", ".join(told) + ".", ""]
+    return out
+
+
+def _count(number: int) -> str:
+    return f"{number:,}".replace(",", " ")
 
 
 def _told(value: float | None) -> str:
@@ -314,7 +273,7 @@ def ladder_table(rungs: dict[str, list[dict[str, Any]]], bounds: dict[str, float
 
 def watched_table(rows: list[dict[str, Any]], runs: dict[str, dict[int, dict[str, Any]]]) -> list[str]:
     """The network's rows in the oblique field, gaze with its interval."""
-    told = {"frames": f"{NETWORK_FRAMES:,}".replace(",", " "), "people": PEOPLE, "each": EACH}
+    told = {"frames": _count(NETWORK_FRAMES), "people": PEOPLE, "each": EACH}
     out = [NETWORK.format(macs=reference_macs(cell_of("base").config.pixels) / 1e6, **told)]
     head = ("lens", "MMACs", "seeds", "axial / mm", "to best focus", "windows / mm", "to best focus", "lateral / mm",
             "pupil IoU", "gaze / °", "to best focus")  # fmt: skip
