@@ -90,7 +90,8 @@ def test_a_period_grows_no_further_than_beyond_four_windows():
     at = torch.tensor([PLACE], dtype=torch.float64), torch.tensor([DEPTH_UM], dtype=torch.float64)
     assert plan._unfolded(OPTICS, waves, window, at, 0.0).period == pytest.approx(4 * SPARE)
     assert plan._unfolded(OPTICS, waves, window, at, 1.0).period == SPARE
-    left = [folded(OPTICS, waves, Window(SAMPLES, STEP_UM, period=SPARE * more), at) for more in (1, 2**0.25, 2**0.5)]
+    tried = (Window(SAMPLES, STEP_UM, period=SPARE * more) for more in (1, 2**0.25, 2**0.5))
+    left = [folded(Judged(OPTICS, waves, one, at)) for one in tried]
     for tolerance, more in ((0.5 * (left[0] + left[1]), 2**0.25), (0.5 * (left[1] + left[2]), 2**0.5)):
         made = plan._unfolded(OPTICS, waves, window, at, tolerance)  # quarters of an octave
         assert made.period == pytest.approx(SPARE * more, rel=1e-12)
