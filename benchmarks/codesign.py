@@ -108,12 +108,13 @@ def _slow_stack(phase: torch.Tensor) -> torch.Tensor:
         focus_um=OPTICS.focus_mm * 1e3, sample_um=step / fine, samples=size * fine,
     )  # fmt: skip
     period = OPTICS.pupil.period_um
-    top = math.floor(period / (2 * step))
-    frequency = torch.arange(-top, top + 1, dtype=torch.float64) / period
+    edge = period / (2 * step)  # the harmonic there counts by the part of it that lies below
+    number = torch.arange(-math.floor(edge + 0.5), math.floor(edge + 0.5) + 1, dtype=torch.float64)
+    frequency, share = number / period, (edge + 0.5 - number.abs()).clamp(0, 1)
     from_x = (torch.arange(size * fine, dtype=torch.float64) - (size * fine - 1) / 2) * step / fine
     to_x = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
     waves = torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
-    taps = (torch.sinc(frequency * step) * waves).sum(-1) * step / period
+    taps = (share * torch.sinc(frequency * step) * waves).sum(-1) * step / period
     return (taps @ bright.double() @ taps.mT).float()
 
 
