@@ -119,12 +119,9 @@ def pair_sensitivities(lens: Lens, *, count: int = _PAIRS) -> dict[str, PairSens
     Raises:
         CellError, MaterialError: from the solver.
     """
-    d = lens.diameters
-    there = np.asarray(d.diameter_um) > 0
-    pairs, often = np.unique(
-        np.stack([d.diameter_um[there], np.asarray(d.length_um)[there]], 1), axis=0, return_counts=True
-    )
-    width, length = pairs[_apart(pairs, int(often.argmax()), count)].T
+    kinds = Kinds.of(lens.diameters)
+    pairs = np.stack([kinds.width_um, kinds.length_um], 1)
+    width, length = pairs[_apart(pairs, int(kinds.count.argmax()), count)].T
     found = pair_rates(lens, width, length)
     return {
         light: PairSensitivities(width, length, each.rates, each.error + _unseen(width, length, each.rates))
