@@ -26,7 +26,8 @@ DENSER = (0.0, 2.0)  # by how much more the nodes lie at the rim of the field th
 LONGEST = 4.0  # period of the nodes, in windows, from which on none is longer
 LONGER = 2**0.25  # by which one is than the next; nodes grow with its square
 OFF_AXIS = ((0.75, 0.45), (-0.3, 0.8))  # places (x, y) in half fields, well off the middle
-# an eighth of either axis each, out to the rims, where a blur is widest and the more light is folded back
+# two in each quarter, a fifth of either axis apart at most, out to the rims, where a blur is widest and the more light
+# is folded back
 STREWN = tuple(
     zip(
         (-0.95, -0.7, -0.45, -0.2, 0.2, 0.45, 0.7, 0.95), (-0.3, 0.6, -0.85, 0.1, -0.55, 0.95, 0.35, -0.75), strict=True

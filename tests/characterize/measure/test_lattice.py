@@ -174,3 +174,17 @@ def test_a_longer_side_is_sought_up_to_two_and_a_half_pitches_and_no_wave_beyond
         made = lattices.find(wave, 20.0)
         assert np.abs(made.a) == pytest.approx([0.0, 20.0], abs=0.05)
         assert np.abs(made.b) == pytest.approx([20.0 * ratio, 0.0], abs=0.1)
+
+
+@pytest.mark.parametrize(("longer", "found"), [(2.4, True), (2.7, True), (2.85, False), (4.0, False)])
+def test_the_longer_side_of_a_cell_is_two_and_a_half_pitches_at_most(longer, found):
+    """A tenth of a stated pitch is left to doubt about it: 2.5 over 0.9 is 2.78."""
+    row, column = np.mgrid[:400, :300]
+    seen = np.cos(2 * np.pi * column / 12.0 + 0.3) + 0.8 * np.cos(2 * np.pi * row / (12.0 * longer) - 1.1)
+    if not found:
+        with pytest.raises(CaptureError, match=r"no lattice of pitch 12\.00 pixels"):
+            lattices.find(seen, 12.0)
+        return
+    made = lattices.find(seen, 12.0)
+    assert np.abs(made.a - [0.0, 12.0]).max() < 0.05  # peaks of waves of 25 and of 13 turns, a hundredth of one
+    assert np.abs(made.b - [12.0 * longer, 0.0]).max() < 0.3

@@ -220,5 +220,8 @@ def test_pillars_that_a_bias_leads_beyond_their_table_are_told_of():
         width[0, 0] = 0.07
         some = DiameterMap(width, 0.4, length_um=np.full((n, n), 0.2))
         assert len(prepare.roughly_known(dataclasses.replace(lens, diameters=some), told)) == many
+    assert prepare.roughly_known(lens, dataclasses.replace(told, error=0.098)) == []
+    (words,) = prepare.roughly_known(lens, dataclasses.replace(told, error=0.102))
+    assert words == "slopes of the pillars by height and index are known to 10% only"
     rough = dataclasses.replace(told, error=0.24)
     assert prepare.roughly_known(lens, rough) == ["slopes of the pillars by height and index are known to 24% only"]

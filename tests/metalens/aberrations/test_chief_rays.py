@@ -112,3 +112,10 @@ def test_the_middle_of_a_lens_is_that_of_its_pillars():
     found = chief_ray(half)
     assert found.at_um == pytest.approx([4 * 62.0 / (3 * math.pi), 0.0], abs=0.3)  # centroid of half a disc
     assert found.meets_um == pytest.approx([0.0, 0.0], abs=2e-3)
+
+
+def test_phases_that_scatter_by_more_than_three_fifths_of_a_radian_are_no_wave_front():
+    """rms about the polynomial, of hundreds of pillars: 3 % of it; 11 terms of it are fitted."""
+    chief_ray(made("plain", scatter_rad=0.54), (0.1, 0.0))
+    with pytest.raises(PropagationError, match=r"no wave front: phases scatter by 0\.6\d rad rms"):
+        chief_ray(made("plain", scatter_rad=0.66), (0.1, 0.0))

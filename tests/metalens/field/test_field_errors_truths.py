@@ -392,3 +392,38 @@ def test_an_image_is_planned_to_its_own_light_where_nodes_allow_it(monkeypatch):
     engine._planned((1,), 0.2, 1.0, folds=True)
     engine._planned((1,), 1.5, 8.0, folds=True)  # refused by its own number
     assert asked[5:] == [0.2, 1.5]
+
+
+@pytest.mark.parametrize("floor", [0.4, 0.04, 0.0])
+def test_how_deep_an_image_lies_in_the_shadow_is_told_by_six_points_an_axis(monkeypatch, floor):
+    """From rim to rim, at the middle of 1/z: cubics through them hold light that is (x / half)² and a floor. Of an
+    image that is 2.0, 6.7 and 13 times dimmer than its frame, the last counts as one of 8 times."""
+    grid, seen = Grid((1, 3), 2.0, (3e3, 9e3), margin=3, window=3), []
+
+    def node_psfs(optics, made):
+        seen.append(made)
+        point = torch.zeros(3, 3)
+        point[1, 1] = 1.0
+        light = ((made.x_um - 210.0) / 8) ** 2 + floor + 0 * made.y_um[:, None]
+        return point.expand(6, 6, 1, 3, 3), light.float()[..., None]
+
+    monkeypatch.setattr(engine, "node_psfs", node_psfs)
+    optics = SimpleNamespace(layers=Layers(stop=Stop(30.0, 100.0, (0.0, 0.0))))
+    found = engine._shaded(optics, grid, 0.85, (210.0, -90.0))
+    (made,) = seen
+    assert made.x_um.tolist() == pytest.approx([210 + 8 * s for s in (-1, -0.6, -0.2, 0.2, 0.6, 1)])
+    assert made.y_um.tolist() == pytest.approx([-90 + 6 * s for s in (-1, -0.6, -0.2, 0.2, 0.6, 1)])
+    assert made.depths_um.tolist() == pytest.approx([4.5e3])
+    assert made.waves.wavelengths_um.tolist() == [0.85]
+    lit = np.linspace(-1, 1, 9) ** 2 + floor
+    assert found == pytest.approx(min(math.sqrt(np.mean(lit**2) / np.mean(lit[3:6] ** 2)), 8.0), rel=1e-5)
+    assert engine._shaded(SimpleNamespace(layers=Layers()), grid, 0.85, (210.0, -90.0)) == 1.0
+
+
+def test_tolerances_of_kernels_go_down_to_the_dimmest_image_in_steps_of_two_at_most():
+    """An image that is eight times dimmer than its frame asks for an eighth: no more than twice as fine is taken."""
+    steps = np.array(engine.LOOSER)
+    assert (steps[1:] < steps[:-1]).all()
+    assert (steps[:-1] / steps[1:]).max() < 2.1
+    assert steps[-1] <= 1 / engine.DEEPEST < steps[-2]
+    assert steps[0] == 8.0  # of the worst PSF of a patch, when all others do better

@@ -274,10 +274,18 @@ def test_errors_within_their_shares_are_together_within_the_tolerance():
 
 
 def test_folded_light_is_looked_for_all_over_a_field_and_near_its_rims():
-    """Two of eight places in each quarter; along either axis no stretch of more than a fifth of it without one."""
+    """Two of eight places in each quarter; along either axis no stretch of more than a fifth of it without one. None
+    lies within 0.65 half fields of another, and no place of the field farther than that from the next; x to both sides
+    alike."""
     x, y = np.array(plan.STREWN).T
     assert np.unique(2 * (x > 0) + (y > 0), return_counts=True)[1].tolist() == [2, 2, 2, 2]
     for axis in (np.sort(x), np.sort(y)):
         assert np.diff(axis).max() <= 0.4 + 1e-12
         assert axis[0] == pytest.approx(-0.9, abs=0.051)
         assert axis[-1] == pytest.approx(0.95)
+    assert np.sort(x) == pytest.approx(np.sort(-x))
+    apart = np.hypot(x - x[:, None], y - y[:, None])[~np.eye(8, dtype=bool)]
+    assert apart.min() > 0.65 - 1e-12
+    across = np.linspace(-1, 1, 101)
+    away = np.hypot(across - x[:, None, None], across[:, None] - y[:, None, None]).min(0)
+    assert away.max() < 0.65

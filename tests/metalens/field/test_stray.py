@@ -114,3 +114,12 @@ def test_light_through_a_hole_on_the_axis_has_the_mirrors_of_the_field():
     assert there.aside_um[1] == pytest.approx(-back.aside_um[1][::-1], abs=1e-9)
     assert np.ptp(there.aside_um[1]) > 1
     assert there.illumination.numpy() == pytest.approx(back.illumination.numpy()[:, ::-1], abs=1e-6)
+
+
+def test_a_lens_that_is_lit_all_over_is_as_large_as_its_64_places_across():
+    """Middles of squares that lie on the lens: pairs of odd numbers whose squares add up to 64² or less."""
+    found = _lit((310.0, -240.0), Stop(300.0, THICK, MIDDLE))
+    odd = np.arange(-63, 64, 2)
+    count = np.count_nonzero(odd**2 + odd[:, None] ** 2 <= 64**2)
+    assert found.radius_um == pytest.approx(2 * RADIUS / 64 * math.sqrt(count / math.pi), rel=1e-9)
+    assert found.radius_um == pytest.approx(RADIUS, rel=2e-3)  # (1 / 64)^(4/3) or so, by the circle's lattice points

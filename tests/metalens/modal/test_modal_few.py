@@ -8,12 +8,12 @@ from metalens.cell.record import Cell, Index
 from metalens.modal.assembly import assemble
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate
-from metalens.modal.few_modes import few_modes, root, squared
+from metalens.modal.few_modes import carrying, few_modes, root, squared
 from metalens.modal.homogeneous import corrected, modes
 from metalens.modal.ladder import RUNGS
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import few_scattering, half_space, scattering
-from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
+from metalens.modal.pencil import Pencil, Turn, electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space
 
 COARSE = RUNGS[0].choice(0.5).plan
@@ -170,3 +170,28 @@ def test_a_rung_leaves_out_less_than_a_hundredth_of_its_estimate():
         quick, exact = evaluate(case, plan, weak=rung.weak), evaluate(case, plan)
         error = rung.error(exact, case.rho)
         assert np.abs(quick.matrix - exact.matrix).max() < 1e-2 * error
+
+
+@pytest.mark.parametrize(("ranks", "held"), [((3, 4), True), ((4, 4), False)])
+def test_modes_are_few_as_long_as_four_fifths_of_all_directions_hold_them(ranks, held):
+    """Nine low levels of twenty and no coupling among the others, which are alike in either block: the directions that
+    the low ones pull at, as many as the ranks of the coupling, close the space. 16 of 20 are few, 17 are not."""
+    random = np.random.default_rng(8)
+    te = np.concatenate([np.linspace(3.0, 7.0, 5), np.full(5, 1200.0)])
+    tm = np.concatenate([np.linspace(4.0, 9.0, 4), np.full(6, 1500.0)])
+    coupling = np.zeros((10, 10))
+    for rows, columns, rank in ((slice(5, 10), slice(4), ranks[0]), (slice(5), slice(4, 10), ranks[1])):
+        part = coupling[rows, columns]
+        left, right = (np.linalg.qr(random.normal(size=(n, rank)))[0] for n in part.shape)
+        part += left * np.linspace(40.0, 60.0, rank) @ right.T
+    turn = Turn(np.eye(10), 10)
+    pencil = Pencil(te, tm, np.ones(10), -np.ones(10), coupling, turn, turn, None, None, dual=False)
+    found = carrying(pencil, 2.0, 1e-6, 1e-10)  # (ln 1e-6 / 2)² = 48: levels to that carry, to 203 are low
+    if not held:
+        assert found is None
+        return
+    whole = np.diag(np.concatenate([te, tm]))
+    whole[:10, 10:], whole[10:, :10] = coupling, -coupling.T
+    level, vectors = found[0], np.concatenate(found[1:])
+    assert np.abs(whole @ vectors - level * vectors).max() < 1e-9 * 1500  # ten times the accuracy asked, of the largest
+    assert np.count_nonzero(np.linalg.eigvals(whole).real < 48) == len(level) == 9

@@ -140,3 +140,12 @@ def test_inverse_of_a_curve_that_is_nearly_flat_at_one_end(end):
     found = inverse.diameter(p, phase[phase < 6], within_um=(LOW, LOW + 0.62 * (HIGH - LOW)), gap="nearest")
     got = (found - LOW) * 2 / (HIGH - LOW)
     assert np.abs(4 * got**2 + end * got - phase[phase < 6]).max() < 1e-10  # as promised
+
+
+def test_a_millionth_of_a_micrometre_beyond_the_domain_is_rounding():
+    p = polynomial.curve(COEFFICIENTS, (LOW, HIGH), 2)
+    middle = (LOW + HIGH) / 2
+    for end, beyond in ((LOW, -1e-6), (HIGH, 1e-6)):
+        polynomial.check(p, np.array([middle, end + 0.9 * beyond]))
+        with pytest.raises(DomainError, match="keep the diameters inside"):
+            polynomial.check(p, np.array([middle, end + 1.1 * beyond]))

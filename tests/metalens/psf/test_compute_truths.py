@@ -1,5 +1,6 @@
 """How a tolerance is met: the settings that are tried, and every part of the error that is told, with typed results."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -243,3 +244,15 @@ def test_components_of_both_polarisations_are_asked_for_at_the_pillars_rows_and_
     ((y, x),) = asked
     assert np.ravel(y) == pytest.approx((np.arange(rows) - (rows - 1) / 2) * 0.37, abs=1e-12)
     assert np.ravel(x) == pytest.approx((np.arange(columns) - (columns - 1) / 2) * 0.37, abs=1e-12)
+
+
+def test_windows_above_eight_thousand_samples_are_looked_at_in_few(monkeypatch):
+    """64 x 128 samples are all looked at; of 3 x 2731, one more, what may be missed is added."""
+    (phase, level), as_it_is = maps(SINGLE), compute.MANY
+    for shape, more in (((64, 128), False), ((3, 2731), True)):
+        case = dataclasses.replace(CASE, step_um=0.02, samples=shape)
+        found = []
+        for many in (as_it_is, 10**9):
+            monkeypatch.setattr(compute, "MANY", many)
+            found.append(compute._windowed(compute.Lit(phase, level, [case], [1.0]), SINGLE, 4e-3, None).error)
+        assert (found[0] > found[1]) is more
