@@ -151,8 +151,14 @@ class Live:
     pairs: tuple[Tensor, Tensor] | None = None
 
     def pass_on(self, settings: OpticsConfig, coefficients_rad: Tensor) -> None:
-        """Add to the gradient of the coefficients what the light gathered, from the points and wavelengths drawn."""
-        if self.light.grad is None or self.pairs is None:
+        """Add to the gradient of the coefficients what the light gathered, from the points and wavelengths drawn.
+
+        Raises:
+            ValueError: none were drawn: the light's own gradient is that of all nodes.
+        """
+        if self.pairs is None:
+            raise ValueError("no field points were drawn: need live(..., pairs) to pass a gradient on")
+        if self.light.grad is None:
             return
         optics = optics_of(settings, coefficients_rad)
         value = surrogate(optics, self.ready.plan, self.light.grad, self.pairs)

@@ -81,6 +81,8 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     assert float(moving.grad @ way) == pytest.approx(want, rel=0.02)  # float32 images: 1e-3 of a difference of 4e-3
 
     few = BENT.clone().requires_grad_()
+    with pytest.raises(ValueError, match="no field points were drawn"):
+        ready.pass_on(SMALL, few)
     pairs = drawn(whole.plan, 60, torch.Generator().manual_seed(1))
     replace(ready, pairs=pairs).pass_on(SMALL, few)
     assert float((few.grad - moving.grad).norm()) < 0.6 * float(moving.grad.norm())  # 60 draws of 25 points
