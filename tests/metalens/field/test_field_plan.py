@@ -289,3 +289,86 @@ def test_folded_light_is_looked_for_all_over_a_field_and_near_its_rims():
     across = np.linspace(-1, 1, 101)
     away = np.hypot(across - x[:, None, None], across[:, None] - y[:, None, None]).min(0)
     assert away.max() < 0.65
+
+
+def test_each_question_about_a_field_is_asked_at_its_own_places(monkeypatch):
+    """In half fields about the middle: a line at 0.6 of the height, depths in the middle and well off it, rays and
+    fields at two places off it. Errors are those of their shares of the tolerance."""
+    seen, judged = [], {}
+
+    def spectral(optics, at, depths, waves, window):
+        seen.append((at, depths))
+        return BASE.expand(len(at), len(depths), 7, 7)
+
+    def told(name, value):
+        return lambda one, *given, **more: judged.update({name: (one, given, more)}) or value or one.window
+
+    monkeypatch.setattr(plan, "spectral", spectral)
+    monkeypatch.setattr(plan, "_unfolded", lambda o, w, window, at, most: judged.update(folded=(at, most)) or window)
+    monkeypatch.setattr(plan, "neglected", told("rays", 1e-9))
+    monkeypatch.setattr(plan, "polarised", told("fields", None))
+    grid, waves = Grid((10, 32), 2.0, (3e3, 9e3), window=7), Nodes(np.array([0.85]), np.array([1.0]), 0.0)
+    plan.planned(None, grid, waves, (70.0, -40.0), tolerance=0.01, folds=False, polarisation="flux")
+    half = torch.tensor(grid.half_um[::-1])
+
+    def units(at):
+        return ((at - torch.tensor([70.0, -40.0])) / half).numpy()
+
+    line = np.concatenate([units(at) for at, depths in seen if len(depths) == 3])
+    assert line[:, 1] == pytest.approx(np.full(len(line), 0.6))
+    deep = [(at, depths) for at, depths in seen if len(depths) != 3]
+    assert all(units(at) == pytest.approx(np.array([[0.0, 0.0], [0.7, -0.4]])) for at, _ in deep)
+    ends = 1 / torch.cat([depths for _, depths in deep])
+    assert [float(ends.max()), float(ends.min())] == pytest.approx([1 / 3e3, 1 / 9e3])
+    (places, depths), most = judged["folded"]
+    assert units(places) == pytest.approx(np.array(plan.STREWN))
+    assert depths.tolist() == pytest.approx([3e3, 4.5e3, 9e3])
+    assert most == pytest.approx(0.01 * 0.24)
+    assert units(judged["rays"][0].at[0]) == pytest.approx(np.array([[0.75, 0.45], [-0.3, 0.8]]))
+    one, (kind,), more = judged["fields"]
+    assert units(one.at[0]) == pytest.approx(np.array([[0.75, 0.45], [-0.3, 0.8], [0.0, 0.0]]))
+    assert (kind, more["within"]) == ("flux", pytest.approx((0.01, 0.01 * 0.2)))
+
+
+@pytest.mark.parametrize(
+    ("first", "counts"),
+    [
+        (1.1, [5, 7]),  # 4.2 steps are asked for: two more at least
+        (5.0, [5, 9]),  # 7.6 of them
+        (40.0, [5, 9, 17, 19]),  # 17.5, but no more than nine tenths of twice as many at once
+        (300.0, [5, 9, 17, 31, 37, 39, 41]),  # 39.2, and nine tenths of it
+    ],
+)
+def test_the_next_count_of_field_points_is_what_the_error_asks_for(monkeypatch, first, counts):
+    """An error that falls as the 2.5th power of the steps, ``first`` tolerances of four: odd counts until it is met."""
+    tried = []
+
+    class Known:
+        def __init__(self, at):
+            pass
+
+        def error(self, nodes):
+            tried.append(len(nodes))
+            return 0.001 * first * (4 / (len(nodes) - 1)) ** 2.5
+
+    monkeypatch.setattr(plan, "_Known", Known)
+    assert plan._line(None, (0.0, 300.0), 0.001)[0] == counts[-1]
+    assert tried[::2] == counts
+    assert tried[1::2] == counts
+
+
+def test_where_nothing_is_right_two_field_points_more_are_tried(monkeypatch):
+    """An error above 0.3 tells no power; one below, as many as may be."""
+    tried = []
+
+    class Known:
+        def __init__(self, at):
+            pass
+
+        def error(self, nodes):
+            tried.append(len(nodes))
+            return {5: 0.31, 7: 0.31, 9: 0.29, 17: 0.31}.get(len(nodes), 0.0)
+
+    monkeypatch.setattr(plan, "_Known", Known)
+    assert plan._line(None, (0.0, 300.0), 1e-3)[0] == 19
+    assert tried[::2] == [5, 7, 9, 17, 19]
