@@ -23,7 +23,7 @@ CPU = torch.device("cpu")
 @pytest.mark.parametrize("finest", [math.inf, 0.81])
 @pytest.mark.parametrize(("samples", "period"), [(31, 1.3), (9, 2.7)])
 def test_nodes_fill_the_aperture_and_harmonics_the_samples(samples, period, finest):
-    """Steps of wavelength over period; a sample's second zero is 2 / step. Beyond h falls c / h, c = 4√2 / (π² k p): the
+    """Steps of wavelength over period; a second zero at 2 / sample. Beyond h falls c / h, c = 4√2 / (π² k p): the
     window lacks ∫ (1 - sinc²(X / period)) c dX / X² to h = half its width, at first π² c h / 3 period²."""
     found = points.sampling(LENS, Window(samples, 2.0, period=period), WAVE, finest)
     edge, wide = R / math.hypot(R, D), samples * 2.0
