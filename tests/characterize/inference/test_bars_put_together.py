@@ -2,7 +2,7 @@
 
 import math
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -214,6 +214,20 @@ def test_the_lens_as_designed_is_seen_through_the_bench_that_was_fitted():
     assert asked[0] == pytest.approx(want)
 
 
+@dataclass(frozen=True)
+class Freed:
+    """A task by what it frees."""
+
+    free: tuple[str, ...]
+
+    @property
+    def names(self):
+        return *FITTED, *self.free
+
+    def all_of(self, value):
+        return f"all of {value}"
+
+
 @pytest.mark.parametrize(("ratio", "taken"), [(0.96, True), (0.98, False)])
 def test_more_is_fitted_where_it_explains_the_frames_better_by_three_hundredths(monkeypatch, ratio, taken):
     """Of chi-square a pixel: 3 % are beyond chance (2 % of 5000 pixels)."""
@@ -222,15 +236,10 @@ def test_more_is_fitted_where_it_explains_the_frames_better_by_three_hundredths(
     monkeypatch.setattr(estimate.search, "wider", lambda task, at: (task, [wide]) if at == "all of usual" else None)
     monkeypatch.setattr(verdict, "explained", lambda end, gain: False)
 
-    def task(free):
-        of = SimpleNamespace(names=(*FITTED, *free), free=free, all_of=lambda value: f"all of {value}")
-        return of
-
-    monkeypatch.setattr(estimate.dataclasses, "replace", lambda task_, free: task(free))
     cautions = []
-    found, ends = estimate._ends(task(("index",)), GAIN, cautions)
+    found, ends = estimate._ends(Freed(("index",)), GAIN, cautions)
     assert ends == ([wide] if taken else [usual])
     assert found.free == (("index", *estimate.MORE) if taken else ("index",))
     assert len(cautions) == taken
-    every = task(("index", *estimate.MORE))
+    every = Freed(("index", *estimate.MORE))
     assert estimate._ends(every, GAIN, cautions) == (every, [usual])

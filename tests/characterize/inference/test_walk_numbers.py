@@ -1,13 +1,14 @@
 """How far a parameter is walked, and what is read off a walk: Gaussians whose walk is a straight line."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from characterize.inference import walk
-from characterize.inference.leastsquares import Prior
+from characterize.inference.leastsquares import Prior, Solution
 from characterize.inference.walk import Walk
 
 
@@ -23,8 +24,10 @@ def prior(mean=3.0, sigma=4.0, low=-5.0, high=99.0):
 
 def mode(value=1.0, sigma=0.7, merit=20.0, **more):
     covariance = np.array([[0.5, 0.2, 0.0], [0.2, sigma**2, -0.3], [0.0, -0.3, 0.9]])
-    known = {"value": np.array([2.0, value, 0.4]), "covariance": covariance, "merit": merit, "image": None}
-    return SimpleNamespace(**known | more)
+    known = {"value": np.array([2.0, value, 0.4]), "covariance": covariance, "merit": merit, "information": np.eye(3)}
+    nothing = dict.fromkeys(("image", "residual_sigma", "slopes"), np.zeros(0)) | {"beyond": np.zeros(3)}
+    ended = {"chi2_per_dof": 1.0, "converged": True, "reason": "made", "iterations": 1}
+    return Solution(**nothing | ended | known | more)
 
 
 def test_a_walk_goes_two_and_a_half_prior_sigma_to_either_side_within_the_bounds():
@@ -44,20 +47,16 @@ def test_valleys_are_walked_in_steps_of_their_sigma_up_to_fourteen_variances_abo
 
     def side(task, part, one, i, end, *, step, settings, most):
         sides.append((one.value[1], end, step, most))
-        return [mode(value=end, merit=60.0, information=np.eye(3))]
+        return [mode(value=end, merit=60.0)]
 
     monkeypatch.setattr(walk, "_side", side)
     monkeypatch.setattr(walk, "_measured", lambda task, data, x, image: 30.0 + abs(x[1] - 1))
-    monkeypatch.setattr(walk.dataclasses, "replace", lambda one, **new: SimpleNamespace(**vars(one) | new))
-    about = SimpleNamespace(
-        prior=SimpleNamespace(**{n: getattr(prior(low=-99.0), n) for n in ("mean", "sigma", "low", "high")}),
-        names=("a", "bias_nm", "c"), problem=lambda: None, data=None,
-    )  # fmt: skip
+    about = SimpleNamespace(prior=prior(low=-99.0), names=("a", "bias_nm", "c"), problem=lambda: None, data=None)
     for passes in (False, True):
         monkeypatch.setattr(Walk, "passes", lambda self, value, passes=passes: passes)
         for sigma, step in ((0.7, 0.7), (2.0, 1.4)):
             sides.clear()
-            modes = [mode(1.0, 0.3, information=np.eye(3)), mode(6.0, sigma, information=np.eye(3))]
+            modes = [mode(1.0, 0.3), mode(6.0, sigma)]
             made = walk.walk(about, modes, "bias_nm", widened=1.5)
             assert [s[0] for s in sides] == [1.0, 1.0, 6.0, 6.0]
             assert [s[1] for s in sides[:2]] == [-7.0, 13.0]
@@ -316,8 +315,7 @@ def test_a_stop_begins_where_the_parabola_or_the_place_itself_misses_less(monkey
     monkeypatch.setattr(
         walk, "_measured", lambda task, data, x, image: thought if image == [5.3 + 0.8 * 1.7] else math.nan
     )
-    here = mode(1.0, slopes=np.array([[9.0], [1.7], [9.0]]))
-    here.image = np.array([5.3])
+    here = mode(1.0, slopes=np.array([[9.0], [1.7], [9.0]]), image=np.array([5.3]))
     walk._stop(about, part, here, 1, 1.8, None)
     assert len(asked) == (1 if thought == 7.2 else 2)
     ((begin, known, slopes),) = told
@@ -331,8 +329,7 @@ def test_between_two_stops_all_goes_straight(monkeypatch):
     """At 2.2 from 1 to 4: two fifths of the way; the third parameter is held at its bound of 9."""
     told, about = _begun(monkeypatch), SimpleNamespace(prior=prior())
     slopes = np.random.default_rng(2).normal(size=(2, 3, 1, 4, 5))
-    ends = mode(1.0, slopes=slopes[0]), mode(4.0, slopes=slopes[1])
-    ends[1].value = np.array([-3.0, 4.0, 99.0])
+    ends = mode(1.0, slopes=slopes[0]), replace(mode(4.0, slopes=slopes[1]), value=np.array([-3.0, 4.0, 99.0]))
     walk._amid(about, None, ends, 1, 2.2, None)
     ((begin, known, mixed),) = told
     assert begin == pytest.approx([2 - 0.4 * 5, 2.2, 9.0], rel=1e-12, abs=1e-12)
@@ -344,7 +341,7 @@ def test_valleys_are_sought_on_few_frames_from_the_lowest_places_and_again_from_
     """The three lowest places of the walk but the best's own; a fit that is lower by more than 1 begins it anew."""
     asked, followed = [], []
     heights = {-6.0: 6.0, -5.0: 30.0, -3.0: 4.0, -2.0: 50.0, 3.0: 12.0, 4.0: 7.0, 5.0: 15.0, 6.0: 5.0}
-    free = {"information": np.eye(3), "slopes": np.arange(15.0).reshape(3, 5), "image": np.arange(5.0)}
+    free = {"slopes": np.arange(15.0).reshape(3, 5), "image": np.arange(5.0)}
 
     def side(task, part, here, i, end, *, step, settings):
         asked.append((part, here.value[i], here.merit, here.slopes.tolist(), end, step))
@@ -361,10 +358,8 @@ def test_valleys_are_sought_on_few_frames_from_the_lowest_places_and_again_from_
     monkeypatch.setattr(walk, "_misfit", lambda task, part, x: 2.0)
     monkeypatch.setattr(walk, "followed", follow)
     monkeypatch.setattr(walk, "distinct", lambda ends: sorted(ends, key=lambda e: e.merit))
-    monkeypatch.setattr(walk.dataclasses, "replace", lambda one, **new: SimpleNamespace(**vars(one) | new))
-    limits = {n: getattr(prior(low=-99.0), n) for n in ("mean", "sigma", "low", "high")}
     about = SimpleNamespace(
-        prior=SimpleNamespace(**limits), names=("a", "bias_nm", "c"), model=SimpleNamespace(setting=None),
+        prior=prior(low=-99.0), names=("a", "bias_nm", "c"), model=SimpleNamespace(setting=None),
         problem=lambda few: few.tolist(), data=SimpleNamespace(planes=lambda few: few.tolist()),
     )  # fmt: skip
     kept = walk.valleys(about, [mode(1.0, merit=20.0, **free)], "bias_nm")
