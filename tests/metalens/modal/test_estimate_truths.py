@@ -6,8 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from metalens.cell.light import Light
+from metalens.cell.record import Cell, Index
 from metalens.modal import engine, match
-from metalens.modal.engine import Form
+from metalens.modal.case import case_of
+from metalens.modal.ladder import RUNGS
 
 RNG = np.random.default_rng(77)
 LAYER = {"disc": 9.0 + 0.2j, "around": 1.44, "below": 2.2, "above": 1.21}
@@ -18,31 +21,46 @@ def matrix(scale=1.0):
     return scale * (RNG.normal(size=(2, 2)) + 1j * RNG.normal(size=(2, 2)))
 
 
-def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_neither_hides_the_other(monkeypatch):
-    """Two travelling modes, in another order in the other form: what their wavenumbers explain, element by element of
-    absolute sizes, and what is left; drift by how far each wavenumber squared lies below the densest medium's."""
-    q = np.array([4.9 + 0.01j, 2.2 + 0.03j])
+def test_modes_belong_together_by_their_wavenumbers_and_not_by_their_order():
+    """The nearest pair first; one that is left over belongs to none."""
+    q = np.array([4.9 + 0.01j, 2.2 + 0.03j, 1.1])
     other = np.array([2.2 + 0.05j, 4.93 + 0.01j])
-    by_q = np.stack([matrix(), matrix()])
-    first = Form(matrix(), 0.93, 210, q, by_q, 0.011, 0.35)
-    second = Form(first.matrix + matrix(0.02), 0.97, 230, other, by_q[:0], 0.004, 0.21)
-    monkeypatch.setattr(engine, "solve_form", lambda case, plan, *, magnetic, weak: second if magnetic else first)
-    found = engine.evaluate(CASE, None)
-    explained = [by_q[0] * (q[0] - other[1]), by_q[1] * (q[1] - other[0])]
-    rest = first.matrix - second.matrix - explained[0] - explained[1]
-    waves = (np.abs(explained[0]) + np.abs(explained[1])).max()
-    assert found.waves == pytest.approx(waves / 2, rel=1e-12)
-    assert found.rim == pytest.approx(np.abs(rest).max() / 2, rel=1e-12)
+    assert engine.nearest_pairs(q, other).tolist() == [[1, 0], [0, 1]]
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_halves_of_the_difference_are_told_by_wavenumber_and_the_rest_so_that_neither_hides_the_other(hole):
+    """Both forms of an absorbing cell on a coarse mesh: what the wavenumbers of pairs explain, element by element of
+    absolute sizes, and what is left; drift by how far each wavenumber squared lies below the densest medium's."""
+    inside, around = Index(3.3, 0.02), Index(1.2)
+    inside, around = (around, inside) if hole else (inside, around)
+    case = case_of(Cell(0.4, 0.5, inside, Index(1.45), Index(1.1), around), 0.21, Light(0.85, 0.2, "p"))
+    assert bool(case.strange) is hole
+    plan, weak = RUNGS[0].choice(case.rho).plan, RUNGS[0].weak
+    first, second = (engine.solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
+    found = engine.evaluate(case, plan, weak=weak)
+    pairs, left = [], set(range(len(second.q)))
+    for k in range(len(first.q)):  # no two lie near each other here
+        near = min(left, key=lambda n, k=k: abs(first.q[k] - second.q[n]), default=None)
+        if near is not None:
+            left.discard(near)
+            pairs.append((k, near))
+    assert len(pairs) >= 2
+    explained = [first.by_q[k] * (first.q[k] - second.q[n]) for k, n in pairs]
+    assert found.waves == pytest.approx(sum(np.abs(part) for part in explained).max() / 2, rel=1e-9)
+    assert found.rim == pytest.approx(np.abs(first.matrix - second.matrix - sum(explained)).max() / 2, rel=1e-6)
     assert found.spread == pytest.approx(found.waves + found.rim, rel=1e-12)
-    dense = 1.7**2 * (9.0 + 0.2j)
-    drift = sum(np.abs(by_q[k]) * abs(dense - q[k] ** 2) / (2 * abs(q[k])) for k in (0, 1))
-    assert found.drift == pytest.approx(drift.max(), rel=1e-12)
-    assert found.energy == pytest.approx(0.95)
-    assert (found.unknowns, found.grazing, found.bloch, found.strange) == (440, 0.011, 0.31, 2.5)
-    assert found.damping == 0.21
-    apart = (math.pi - 0.31) ** 2 / (1.7**2 * 2.2) - 1  # the nearer one, of the substrate
-    assert found.beside == pytest.approx((0.4 / apart - 1) / 3, rel=1e-9)
-    assert found.size == pytest.approx(1.7 * math.sqrt(abs(9.0 + 0.2j)) / math.pi, rel=1e-12)
+    dense = case.k0**2 * (3.3 + 0.02j) ** 2
+    drift = sum(np.abs(by) * abs(dense - q**2) / (2 * abs(q)) for by, q in zip(first.by_q, first.q, strict=True))
+    assert found.drift == pytest.approx(drift.max(), rel=1e-9)
+    assert found.energy == pytest.approx((first.energy + second.energy) / 2)
+    assert found.unknowns == first.unknowns + second.unknowns
+    assert (found.bloch, found.strange) == (case.bloch, case.strange)
+    assert found.grazing == max(first.grazing, second.grazing)
+    assert found.damping == min(first.damping, second.damping)
+    assert (first.damping != second.damping) is hole
+    assert found.beside == max(match.nearness(case.k0**2 * n**2, case.bloch) for n in (1.45, 1.1))
+    assert found.size == pytest.approx(case.k0 * abs(3.3 + 0.02j) / math.pi, rel=1e-12)
     mean = (first.matrix + second.matrix) / 2
     assert np.abs(found.matrix - mean).max() < 0.05 * np.abs(first.matrix - second.matrix).max()  # second order
 
