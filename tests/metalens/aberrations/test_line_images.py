@@ -1,12 +1,15 @@
 """Line images and transfer functions: against squared plane-wave fields, the sum over pillars, and a closed form."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from metalens.aberrations import over_field
-from metalens.aberrations.waves import line_image, sharpness_per_um, transfer, waves
+from metalens.aberrations.waves import _directions, line_image, sharpness_per_um, transfer, waves
+from metalens.cell import Lattice
+from metalens.lens import DiameterMap
 from metalens.psf import View, from_lens, passed_um2
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, WAVE, made
 
@@ -99,3 +102,32 @@ def test_the_sharpest_line_is_where_squared_fields_are_sharpest(case, angle):
         everywhere = [_squared(case, angle, z, ())[1][axis] for z in np.linspace(250.0, 330.0, 9)]
         assert max(everywhere) <= around[0] * 1.001
     assert found.sharpest_um[0, 0] < found.sharpest_um[0, 1] < 0  # astigmatism and field curvature of a flat lens
+
+
+@pytest.mark.parametrize(
+    ("lattice", "rows", "hop", "first"),
+    [
+        (Lattice(), 5, 1, [0, 1, 2, 3]),
+        (Lattice("hexagonal"), 5, 2, [0, 1, 2]),
+        (Lattice(), 1, 1, [0]),
+        (Lattice(), 191, 1, None),
+    ],
+)
+def test_directions_of_light_are_slopes_between_rows_and_pillars_that_are_there(lattice, rows, hop, first):
+    """A plane wave: one direction along each axis; 48 rows from the first to the last that has one beyond it."""
+    asked, slopes = [], (0.21, -0.34)
+    odd = (np.arange(rows)[:, None] + np.arange(70)) % 2  # where a centred lattice has no site
+    d = DiameterMap(np.where(odd & lattice.centred, 0.0, 0.2), 0.4, lattice)
+    dx, dy = d.steps_um
+
+    def lit(some):
+        asked.append(some.tolist())
+        return np.exp(2j * np.pi / WAVE * (slopes[0] * dx * np.arange(70) + slopes[1] * dy * some[:, None]))
+
+    low, high = _directions(SimpleNamespace(diameters=d, wavelength_um=WAVE), lit)
+    want = slopes if rows > 1 else (slopes[0], 0.0)  # one row has none beside it
+    assert low == pytest.approx(want, abs=1e-9)
+    assert high == pytest.approx(want, abs=1e-9)
+    near, far = asked
+    assert far == [min(row + hop, rows - 1) for row in near]
+    assert near == first if first else (len(near), near[0], near[-1]) == (48, 0, rows - 2)

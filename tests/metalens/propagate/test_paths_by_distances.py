@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from metalens import propagate
 from metalens.cell import Film, Index
 from metalens.lens import Layers
-from metalens.propagate import paths
+from metalens.propagate import nodes, paths
 
 D, WAVELENGTH, PITCH = 47.0, 0.79, 0.36
 GIVEN = dict(
@@ -140,3 +140,41 @@ def test_slopes_are_those_of_the_logarithm_of_the_field(cases):
             step = h * np.eye(3)[axis]
             ratio = field(case, x, y, at + step, 900.0) / field(case, x, y, at - step, 900.0)
             assert slope == pytest.approx(np.log(ratio) / (2 * h), abs=1e-5 * case.wavenumber)
+
+
+def test_what_nodes_are_counted_by_is_the_kernel_along_a_line_at_the_ends_and_the_middle_of_all_else(cases):
+    """Direct distances: d / (2π r²) (1/r - ik) exp(ik (r - r_w)) from (x, e) to a place of the window, where p is the
+    cosine along x towards the window's middle; less plane waves exp(-ik (pX + qY)) of it where that is asked."""
+    case, k = cases["air"], 2 * math.pi / WAVELENGTH
+    (hy, hx), (wy, wx), (cx, cy) = case.half_size_um, case.half_window_um, case.centre_um
+    ends = np.array([-1.0, 0.0, 1.0])
+
+    def field(x, y, X, Y):
+        away, middle = (math.dist((x, y, 0.0), (cx + s * X, cy + s * Y, D)) for s in (1, 0))
+        return D / (2 * math.pi * away**2) * (1 / away - 1j * k) * np.exp(1j * k * (away - middle))
+
+    p = np.array([[-0.08, 0.05, 0.11]])
+    found = nodes._over_directions(case, p)
+    places = [(e, X, Y) for e in 0.9 * ends * hy for X in ends * wx for Y in ends * wy]
+    want = np.empty((27, 3), complex)
+    for i, (e, X, Y) in enumerate(places):
+        for j, sine in enumerate(p[0]):
+            across = math.hypot(e - cy, D) * sine / math.sqrt(1 - sine**2)
+            want[i, j] = field(cx + across, e, X, Y)
+    assert np.abs(found - want).max() < 1e-7 * np.abs(want).max()  # 2 pi 1e-9 / 0.8
+    low, high = -0.08, 0.14
+    line = nodes._over_window(case, (low, high), Y=np.array([[-0.7, 1.3]]))
+    rows = [(X, sine, e) for X in ends * wx for sine in 0.03 + 0.11 * ends for e in ends * hy]
+    for i, (X, sine, e) in enumerate(rows):
+        for j, Y in enumerate((-0.7, 1.3)):
+            across = math.hypot(e - cy, D) * sine / math.sqrt(1 - sine**2)
+            q = (e - cy) / math.hypot(across, e - cy, D)
+            wave = field(cx + across, e, X, Y) * np.exp(1j * k * (sine * X + q * Y))
+            assert abs(line[i, j] - wave) < 1e-7 * abs(wave)
+    columns = nodes._over_lens(case, np.array([[-3.1, 2.4]]), None)
+    inverse = (min(case.inverse_depths_per_um), max(case.inverse_depths_per_um))
+    at = [(o, X, Y, v) for o in 0.9 * ends * hy for X in ends * wx for Y in ends * wy for v in inverse]
+    for i, (o, X, Y, v) in enumerate(at):
+        for j, x in enumerate((-3.1, 2.4)):
+            assert columns[i, j] == pytest.approx(complex(paths.kernel(case, x, o, X, Y, v)), rel=1e-9)
+    assert hx > 3.1
