@@ -116,3 +116,24 @@ def test_frames_are_as_bright_as_asked_for_and_flats_half_full(monkeypatch):
     assert made.dark.mean() == pytest.approx(31, abs=1.0)
     assert made.flat.mean() == pytest.approx(31 + 0.5 * (4096 - 31), rel=0.01)
     assert made.frames[2, 5, 5] == pytest.approx(3112 / 2.6 + 31, abs=5 * math.sqrt(3129) / 2.6)
+
+
+def test_as_many_frames_are_formed_at_once_as_a_million_fine_samples_hold():
+    """Of 6 pixels and 4 about them, nine samples each: (14 x 9)² a frame, 62 of them. Through glass one by one."""
+    lens = SimpleNamespace(sensor_distance_um=1900.0, proxy=SimpleNamespace(max_angle_rad=0.5))
+    depth, angle = np.linspace(2e4, 3e4, 70), np.zeros((70, 2))
+    index = [index for _, index in bench._alike(lens, truth(), truth().vector(), depth, angle)]
+    assert [len(some) for some in index] == [62, 8]
+    assert np.concatenate(index).tolist() == list(range(70))
+
+
+def test_hot_pixels_are_hot_in_every_frame_and_a_flat_is_taken_twice_at_least(monkeypatch):
+    """A fifth of 900 pixels, sigma 12; 0.97 of 4095, where light and darkness lie far below."""
+    monkeypatch.setattr(bench, "irradiance", lambda *_: np.full((2, 30, 30), 0.7))
+    camera = Camera(pixels=30, pixel_um=1.7, bits=12, gain_e=2.6, offset=31, read_noise_e=4.1, hot_share=0.2)
+    made = bench.shoot(None, truth(camera=camera, peak_e=900.0, dark_frames=1, flat_frames=1), None)
+    assert (len(made.frames), len(made.dark), len(made.flat)) == (2, 1, 2)
+    hot = made.dark[0] == 3972
+    assert hot.sum() == pytest.approx(180, abs=48)
+    for frame in (*made.frames, *made.flat):
+        assert np.array_equal(frame == 3972, hot)

@@ -215,3 +215,34 @@ def test_what_is_known_of_the_bench_is_information_and_what_is_certain_is_not_fi
     assert prior[names.index("height_nm")][names.index("height_nm")] == pytest.approx(2.5**-2)
     wide = protocol.PARAMETERS[protocol.PLACE["tilt_x_deg"]].sigma
     assert prior[names.index("tilt_x_deg")][names.index("tilt_x_deg")] == pytest.approx(wide**-2)
+
+
+def test_what_nobody_states_is_judged_on_frames_as_bright_as_asked_for(monkeypatch):
+    """At exposure 1 the brightest pixel has 7000 electrons; what is stated without doubt is not free."""
+    monkeypatch.setattr(missing, "expected", lambda task: task)
+    unfitted = protocol.UNFITTED[0].name
+    stated = (("height_nm", 3.0, 2.5), ("distance_um", 4.0, 0.0), (unfitted, 0.0, 0.37))
+    known = tuple(protocol.Known(*one) for one in stated)
+    wanted = Protocol(
+        (380.0, 1150.0), pixel_um=1.5, pixels=16, peak_e=7000.0, full_well_e=3100.0, read_noise_e=3.3, known=known,
+        free=("height_nm", "distance_um", "tilt_x_deg"),
+    )  # fmt: skip
+    frames = np.array([[420.0, 0.0, 0.5], [600.0, 2.0, 1.0], [900.0, 0.0, 2.0]])
+    task = protocol._unstated(b.lens(), wanted, b.RESPONSE, frames)
+    setting = task.model.setting
+    assert setting.depth_um.tolist() == [420.0, 600.0, 900.0]
+    assert setting.angle_rad == pytest.approx(np.array([[0, 0], [math.radians(2), 0], [0, 0]]))
+    image = task.data.electrons
+    plain = protocol.ForwardModel(
+        b.lens(), protocol.Setting(frames[:, 0], setting.angle_rad, np.ones(3), 1.5, 16, 16), b.RESPONSE
+    ).images(protocol.vector({"height_nm": 3.0, "distance_um": 4.0}))[0]
+    want = 7000 * plain / plain.max() * frames[:, 2, None, None]
+    assert image == pytest.approx(want, rel=1e-4, abs=1e-3 * 7000)  # a quick model of as many frames as there are
+    assert (image / frames[:, 2, None, None]).max() == pytest.approx(7000, rel=1e-6)
+    assert np.array_equal(task.data.saturated, image >= 3100)
+    assert 0 < task.data.saturated.sum() < image.size
+    assert task.data.usable.all()
+    assert task.data.variance_e2 == pytest.approx(np.full(image.shape, 3.3**2))
+    assert task.free == ("height_nm", "tilt_x_deg")
+    assert task.unfitted == {unfitted: 0.37}
+    assert set(task.known) == {"height_nm", "distance_um"}
