@@ -94,7 +94,7 @@ def the_psfs_are_those_of_the_made_lens(bench):
         .psf_stack(psf.View((500.0, 700.0), ((0.0, 0.0),), 24.0, 32), tolerance=1e-3)
         .intensity
     )
-    assert np.array_equal(built, want)
+    assert np.abs(built - want).max() < 1e-9 * want.max()  # rounding
     assert np.abs(design / design.max() - want / want.max()).max() > 0.02
 
 

@@ -87,7 +87,8 @@ def test_frames_of_a_camera_on_its_side_that_are_not_square_lie_as_if_never_turn
     laid, stays = (estimate._as_laid(task, task.found) for task in (turned, plain))
     assert np.array_equal(laid.data.electrons, stays.data.electrons)
     x = vector(b.VALUES)
-    assert np.array_equal(laid.model.images(x)[0], stays.model.images(x)[0])
+    got, want = (task.model.images(x)[0] for task in (laid, stays))
+    assert np.abs(got - want).max() < 1e-9 * want.max()  # sums of 1e3 terms, in an order of their own
 
 
 def test_half_a_turn_that_noise_hides_is_said():

@@ -43,7 +43,7 @@ def test_a_subnet_equals_its_slice_of_the_supernet(net):
     with torch.no_grad():
         whole, cut = net(_frames(), chosen), Subnet(net, chosen)(_frames())
     for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
-        assert torch.equal(a, b)
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)  # single precision, laid out otherwise in memory
     assert sum(p.numel() for p in Subnet(net, chosen).parameters()) < sum(p.numel() for p in net.parameters())
 
 

@@ -186,7 +186,7 @@ def test_the_optics_loss_falls_along_its_own_gradient():
     assert float(slope.norm()) > 0
     step = (0.05 / float(slope.norm())) * slope
     after = formation.depth_loss(lens.stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4)
-    assert float(after) < float(start)
+    assert float(after) < float(start.detach())
 
 
 def test_impossible_schedules_are_refused():

@@ -53,9 +53,9 @@ def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
     light = Light(0.83, np.radians(12.0), "y")
     grid = {"x_um": held["x_um"], "y_um": held["y_um"], "z_um": [0.1, 0.3]}
     same = rcwa.near_field(cell, 0.2, light, **grid, tolerance=0.5)
-    assert np.array_equal(held["xy/h"], same.h)
+    assert np.abs(held["xy/h"] - same.h).max() < 1e-9 * np.abs(same.h).max()  # products of other widths: three planes
     assert np.array_equal(held["xy/index"], same.index)
-    assert stored.attributes["error_xy"] == same.error
+    assert stored.attributes["error_xy"] == pytest.approx(same.error, rel=1e-6)
     assert stored.attributes["wavelength_um"] == 0.83
     assert (here / "field.png").read_bytes()[:4] == b"\x89PNG"
     assert "angle_deg = 12.0" in stored.provenance.config

@@ -189,7 +189,8 @@ def test_blocks_of_rows_do_not_show(proxy, monkeypatch):
     whole, one = _make(proxy)
     monkeypatch.setattr("metalens.design.sites._BLOCK_SITES", 500)
     parts, other = _make(proxy)
-    np.testing.assert_array_equal(whole.diameters.diameter_um, parts.diameters.diameter_um)
+    # single precision of 0.3 um: where a block ends, lanes of a loop round otherwise
+    np.testing.assert_allclose(whole.diameters.diameter_um, parts.diameters.diameter_um, rtol=0, atol=6e-8)
     assert one.efficiency == pytest.approx(other.efficiency, rel=1e-12)
 
 

@@ -139,7 +139,8 @@ def test_nodes_that_are_not_asked_for_have_no_gradient_and_the_others_their_own(
         found.append(stack.grad.flatten(0, 1))
     whole, some = found
     wanted = torch.tensor([5, 40, 211])
-    assert torch.equal(some[wanted], whole[wanted])
+    near = 1e-5 * float(whole[wanted].abs().max())  # single precision, in products of other widths
+    assert float((some[wanted] - whole[wanted]).abs().max()) < near
     assert int((some.flatten(1).abs().amax(1) > 0).sum()) == 3
 
 

@@ -79,7 +79,8 @@ def test_images_do_not_depend_on_the_number_of_threads(optics):
             images.append(optics(frames))
     finally:
         torch.set_num_threads(before)
-    assert torch.equal(*images)
+    one, other = images
+    assert float((one - other).abs().max()) < 1e-6 * float(other.max())  # float32: parts of a sum may end elsewhere
 
 
 def test_sheets_that_hold_nothing_in_a_patch_are_left_out(optics, monkeypatch):

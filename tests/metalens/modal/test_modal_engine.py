@@ -332,7 +332,7 @@ def test_angle_and_azimuth_have_the_symmetry_of_the_square():
     three = modal.solve(
         cell(), 0.2, WAVELENGTH, angle_rad=0.2, azimuth_rad=math.pi / 2, polarization="y", tolerance=1e-2
     ).t
-    assert one == two == three
+    assert max(abs(two - one), abs(three - one)) < 1e-12  # cos(π/2) is 6e-17; sums of 1e2 to 1e3 terms of order 1
 
 
 def test_hard_float32_numbers_are_taken_in_double_precision():

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 
+import numpy as np
 import pytest
 
 from metalens import rcwa
@@ -158,8 +159,8 @@ def test_lights_of_one_direction_take_the_mesh_that_both_need(monkeypatch):
 
 
 def test_curves_of_one_task_are_those_of_tasks_of_their_own():
-    """Both polarisations share modes and are told one after the other: the same bits as each by itself, as both need
-    the same mesh here."""
+    """Both polarisations share modes and are told one after the other: as each by itself, since both need the same
+    mesh here."""
     span, about = (0.1, 0.14), {"tolerance": 2e-2, "engine": "modal"}
     both = [Light(0.85, 0.2, "s"), Light(0.85, 0.2, "p")]
     joined = workers.work(workers.curves_task(CELL, both, span, **about))
@@ -168,8 +169,8 @@ def test_curves_of_one_task_are_those_of_tasks_of_their_own():
     for made, one in zip(workers.curves(joined, tolerance=2e-2), alone, strict=True):
         (same,) = workers.curves(one, tolerance=2e-2)
         assert (made.nodes.diameter_um == same.nodes.diameter_um).all()
-        assert (made.nodes.response == same.nodes.response).all()
-        assert (made.nodes.error == same.nodes.error).all()
+        assert np.abs(made.nodes.response - same.nodes.response).max() < 1e-9  # products of other widths
+        assert made.nodes.error == pytest.approx(same.nodes.error, rel=1e-5, abs=1e-9)
         assert made.nodes.reason == same.nodes.reason
     s, p = (made.nodes.response[0, 0] for made in workers.curves(joined, tolerance=2e-2))
     assert abs(s - p) > 0.01  # and not one of them twice

@@ -71,7 +71,7 @@ def test_slopes_of_a_lens_are_those_of_its_paths_and_shares_of_rows_make_no_diff
         assert error[level > 0].max() < 0.02 * 0.51
     whole = among.mean(light, ROWS, PITCH)
     monkeypatch.setattr(among, "ROWS", 7)
-    assert torch.equal(among.mean(light, ROWS, PITCH), whole)
+    assert float((among.mean(light, ROWS, PITCH) - whole).abs().max()) < 1e-13  # of 1: a few roundings of other lanes
     far = torch.tensor(np.hypot(*np.indices((100, 100)) - 2.0) > 130)  # where no pair stands: as it was
     assert far.any()
     assert (whole[far] == 1).all()
@@ -168,7 +168,7 @@ def test_factors_made_once_serve_as_the_rows_do():
     given = about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12, polarisation="flux")
     fields = among.jones(torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH)
     got, want = (psf.psf_stack(phase, level, **given, neighbours=of) for of in (fields, ROWS))
-    assert np.array_equal(got.intensity, want.intensity)
+    assert got.intensity == pytest.approx(want.intensity, abs=1e-12)  # of sum 1
     with pytest.raises(PropagationError, match="factors on both fields, but one scalar"):
         psf.psf_stack(phase, level, **given | dict(polarisation="scalar"), neighbours=fields)
 

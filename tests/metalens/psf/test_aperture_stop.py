@@ -240,8 +240,9 @@ def test_depths_behind_a_stop_are_each_as_alone() -> None:
     all_ = psf_stack(PHASE, LEVEL, depths_um=[900.0, 2500.0], angle_rad=[[0.1, -0.05], [0.0, 0.2]], **about)
     for i, depth in enumerate((900.0, 2500.0)):
         one = psf_stack(PHASE, LEVEL, depths_um=[depth], angle_rad=(0.0, 0.2), **about)
-        np.testing.assert_array_equal(all_.intensity[1, i], one.intensity[0])
-        assert all_.energy_um2[1, i] == one.energy_um2[0]
+        # of sum 1; depths side by side round otherwise, and phases of 1e3 rad to 1e-13
+        np.testing.assert_allclose(all_.intensity[1, i], one.intensity[0], rtol=0, atol=1e-12)
+        assert all_.energy_um2[1, i] == pytest.approx(one.energy_um2[0], rel=1e-10)
 
 
 def test_rays_cross_the_stop_where_snell_has_them() -> None:

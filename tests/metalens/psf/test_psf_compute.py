@@ -41,7 +41,7 @@ def test_noise_of_the_pillars_adds_up_as_random_phases_do(monkeypatch, tilt_rad)
 
 
 def test_single_maps_are_summed_in_double_a_few_rows_at_a_time_as_if_they_were_double():
-    """No second copy of a map of gigabytes: the same bits as from maps that are double all over."""
+    """No second copy of a map of gigabytes: sums as of maps that are double all over, not as of single ones, 1e-7."""
     rng = np.random.default_rng(8)
     phase, level = (torch.from_numpy(rng.uniform(0, 1, (300, 211)).astype("f4")) for _ in range(2))
     case = propagate.case(phase.shape, pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=150.0,
@@ -50,5 +50,5 @@ def test_single_maps_are_summed_in_double_a_few_rows_at_a_time_as_if_they_were_d
     one, _, light = propagate.field_windowed(phase, level, made)
     other, _, same = propagate.field_windowed(phase.double(), level.double(), made)
     assert one.dtype == torch.complex128
-    assert torch.equal(one, other)
+    assert float((one - other).abs().max()) < 1e-12 * float(other.abs().max())  # blocks of rows, summed in any order
     assert light == pytest.approx(same, rel=1e-6)

@@ -147,7 +147,8 @@ def test_solve_gives_the_diagonal_and_refuses_what_touches():
     cell = Cell(0.35, **ABOUT, shape=Rectangle(0.5))
     got = rcwa.jones(cell, 0.25, WAVE, harmonics=5)
     for polarization, place in (("x", 0), ("y", 1), ("p", 0), ("s", 1)):
-        assert rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t == got.t[place, place]
+        one = rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t
+        assert abs(one - got.t[place, place]) < 1e-12  # one light of the two: other sums, the same orders
     with pytest.raises(CellError, match="touches its neighbour"):
         rcwa.solve(cell, 0.36, WAVE)
 
