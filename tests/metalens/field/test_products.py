@@ -94,3 +94,15 @@ def test_sheets_that_hold_nothing_in_a_patch_are_left_out(optics, monkeypatch):
     assert sum([0, 0] in some for some in held) == 2 * upper  # light and coverage
     assert sum([1, 0] in some for some in held) == 0
     assert sum([1, 1] in some for some in held) == 2 * len(optics.patches)
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.8e-7, False), (1.3e-7, True)])
+def test_what_is_below_a_ten_millionth_of_the_most_is_nothing(optics, share, seen):
+    """Below the rounding of the rest: a patch that holds no more is left out, one point of a frame that is lit in
+    another patch."""
+    light = torch.zeros(1, 2, *optics.grid.frame)
+    light[0, 1, 2, 2], light[0, 1, -3, -3] = 3.0, 3.0 * share
+    depth = torch.full_like(light, 3e3)
+    image = forming.blur(Frames(light, torch.zeros_like(light), depth), optics)[0, 0, 1]
+    far = image[-5:, -5:].abs().max()
+    assert (float(far) > 0) is seen

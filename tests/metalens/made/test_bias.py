@@ -124,3 +124,11 @@ def test_csv_with_head_comments_and_a_bad_line(tmp_path):
         read_csv(empty)
     with pytest.raises(ProcessError, match="cannot be read"):
         read_csv(tmp_path / "absent.csv")
+
+
+def test_a_curve_is_held_beyond_10_and_2000_nm():
+    """A straight one of 3 nm per 100 nm: -7.7 and 52 nm at its ends."""
+    bias = Bias(curve_nm=(-8.0, 3.0))
+    assert bias.at(np.array([4.0, 10.0, 11.0, 1999.0, 2000.0, 2600.0])) == pytest.approx(
+        [-7.7, -7.7, -7.67, 51.97, 52.0, 52.0]
+    )

@@ -34,3 +34,23 @@ def test_it_is_held_from_the_width_of_the_library_on(wavelength_um, v):
 
 def test_a_library_at_one_wavelength_says_the_same_at_all():
     assert designed(proxy(0.85, 0.85), D, 0.861) == pytest.approx(designed(proxy(0.85, 0.85), D, 0.85))
+
+
+@pytest.mark.parametrize("end", [-1, 1])
+def test_a_bent_dependence_goes_on_along_its_last_64th(end):
+    """Phase 2 - 0.3 v + 0.4 (2 v² - 1) of the unit wavelength, |T| 0.8 - 0.05 v + 0.02 (2 v² - 1): secants of 1/32
+    of the half range."""
+    phase, level = np.zeros((3, 1)), np.zeros((3, 1))
+    phase[:, 0], level[:, 0] = (2.0, -0.3, 0.4), (0.8, -0.05, 0.02)
+    made = Proxy(phase, level, (0.10, 0.26), (0.845, 0.855), 1e-3, 1e-3)
+
+    def straight(first, bent, v):
+        return first * v + bent * (2 * v * v - 1)
+
+    def gone_on(first, bent, v):
+        return straight(first, bent, end) + (straight(first, bent, end) - straight(first, bent, end * 31 / 32)) * 32 * v
+
+    beyond = 0.7
+    got = designed(made, D, 0.85 + end * 0.005 * (1 + beyond))
+    want = (0.8 + gone_on(-0.05, 0.02, beyond)) * np.exp(1j * (2 + gone_on(-0.3, 0.4, beyond)))
+    assert got == pytest.approx(np.full(3, want), abs=1e-9)
