@@ -111,6 +111,19 @@ def read_images(path: Path, colours: Colours = _PLAIN, *, grey: bool = False) ->
     Raises:
         CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or a channel without colour.
     """
+    images = colours.pick(read_all(path, colours), path, grey=grey)
+    if images.size == 0:
+        raise CaptureError(f"{path}: images of shape {images.shape} are empty")
+    _check_values(images, path)
+    return images
+
+
+def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
+    """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they lie there.
+
+    Raises:
+        CaptureError: unknown, lossy or truncated.
+    """
     suffix = path.suffix.lower()
     if suffix in LOSSY:
         raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
@@ -120,11 +133,7 @@ def read_images(path: Path, colours: Colours = _PLAIN, *, grey: bool = False) ->
     if reader is None:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
     images = reader(path)
-    images = colours.pick(images[None] if images.ndim == 2 else images, path, grey=grey)
-    if images.size == 0:
-        raise CaptureError(f"{path}: images of shape {images.shape} are empty")
-    _check_values(images, path)
-    return images
+    return images[None] if images.ndim == 2 else images
 
 
 def _load_file(path: Path) -> Capture:

@@ -32,7 +32,8 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
 
     Raises:
         CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, pages of different size;
-            values where more is less light, places in a table, a raw mosaic of which nothing is known.
+            values where more is less light, places in a table of colours (a table of greys in order gives light), a
+            raw mosaic of which nothing is known.
     """
     import tifffile
 
@@ -79,7 +80,7 @@ def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
     """Refuse what values are not light, or not the same light in each pixel."""
     for number, page in enumerate(file.pages):
         meaning = int(getattr(page, "photometric", 1))
-        if meaning in _MEANING:
+        if meaning in _MEANING and not _grey_table(page):
             raise CaptureError(
                 f"{path}: frame {number} {_MEANING[meaning]}, so that its values are not light; save grey frames in "
                 "which black is 0"
@@ -89,6 +90,15 @@ def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
                 f"{path}: frame {number} is a raw mosaic of colours (CFA); say which is lit and how its pixels lie: "
                 'channel = "green" and mosaic = "RGGB" in capture.toml'
             )
+
+
+def _grey_table(page: Any) -> bool:
+    """Whether a table of colours gives every value the grey in proportion to it, as some microscopes write theirs."""
+    table = getattr(page, "colormap", None)
+    if table is None:
+        return False
+    grey = np.arange(table.shape[1]) * (65_535 / (table.shape[1] - 1))
+    return bool((np.abs(table - grey) <= grey[1]).all())  # 257 or 256 a step of 8 bits
 
 
 def _alike(pages: Sequence[Array], path: Path) -> Sequence[Array]:

@@ -14,7 +14,7 @@ import tyro
 
 from characterize.captures import capture as captures
 from characterize.commands import measure_page
-from characterize.measure import frames, metrics, overlay, sem
+from characterize.measure import frames, metrics, overlay, picture, sem
 from metalens import lens as lenses
 from metalens.cell.shapes import Circle
 from metalens.commands import Common, Output
@@ -100,7 +100,7 @@ def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, fl
 
 def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
     """Measure the modulation across an edge into the folder: numbers, text, and that all is well."""
-    image, pixel = _cropped(_one_picture(options.source), options.crop), float(options.edge_um or 0)
+    image, pixel = _cropped(picture.read(options.source), options.crop), float(options.edge_um or 0)
     found = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([found.frequency_per_um, found.modulation], 1)
     keep = found.frequency_per_um <= 1 / pixel
@@ -113,16 +113,9 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]
     return values, text, True
 
 
-def _one_picture(source: Path) -> Array:
-    pictures = captures.read_images(source)
-    if len(pictures) != 1:
-        raise CaptureError(f"{source}: {len(pictures)} pictures; need one")
-    return np.asarray(pictures[0])
-
-
 def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
     """Measure a picture of pillars into the folder: numbers, text, and whether any pillar was measured."""
-    whole = _one_picture(options.source)
+    whole = picture.read(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = _cropped(whole, options.crop)
     found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))

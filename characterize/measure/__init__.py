@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from characterize.measure import frames as frames
     from characterize.measure import metrics as metrics
     from characterize.measure import overlay as overlay
+    from characterize.measure import picture as picture
     from characterize.measure import register as register
     from characterize.measure import sem as sem
 
@@ -17,6 +18,7 @@ __getattr__, __dir__, __all__ = attach(
         "frames": "",
         "metrics": "",
         "overlay": "",
+        "picture": "",
         "register": "",
         "sem": "",
     },

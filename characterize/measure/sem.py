@@ -142,7 +142,8 @@ def _rays(flat: Array, row: float, column: float, pitch: float) -> tuple[Array, 
 
 def _step(flat: Array, row: float, column: float, pitch: float) -> float:
     """Height of the fall from a pillar's rim to the gap, in the mean over all rays."""
-    inner, outer, _ = _plateaus(_rays(flat, row, column, pitch)[2])
+    reach, _, rays = _rays(flat, row, column, pitch)
+    inner, outer, _ = _plateaus(reach, rays)
     return inner - outer
 
 
@@ -172,7 +173,7 @@ def _pillar(
 def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float, float, float, float, float] | None:
     """Circle through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges."""
     reach, angle, rays = _rays(flat, row, column, pitch)
-    inner, outer, rim = _plateaus(rays)
+    inner, outer, rim = _plateaus(reach, rays)
     found = np.full(RAYS, math.nan)
     half = (inner + outer) / 2
     for j in range(RAYS):
@@ -190,17 +191,33 @@ def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float,
     (radius, dy, dx), *_ = np.linalg.lstsq(design, found[good], rcond=None)
     rest = found[good] - design @ np.array([radius, dy, dx])
     scatter = float(rest.std())
-    return float(dy), float(dx), float(radius), scatter / math.sqrt(good.sum() / 4), scatter
+    own = max(_independent(radius) * good.mean() - 3, 1.0)
+    shared = 0.25 / _independent(float(reach[rim]))  # half of the rim's level, as noisy as edges, is in every edge
+    error = scatter * math.sqrt(1 / own + shared)
+    return float(dy), float(dx), float(radius), error, scatter
 
 
-def _plateaus(rays: Array) -> tuple[float, float, int]:
+def _independent(radius: float) -> float:
+    """How many of the rays at a radius in pixels tell something of their own, the circle's three numbers among them.
+
+    Noise of single pixels, smoothed over rays (a Gaussian of one ray) and between pixels (a variance of 1/6 across).
+    """
+    step = 2 * math.pi * max(radius, 0.5) / RAYS
+    return RAYS / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / (6 * step**2)))
+
+
+def _plateaus(reach: Array, rays: Array) -> tuple[float, float, int]:
     """(level of the rim, of the gap, where the rim is brightest) about the steepest fall of the mean over the rays.
 
-    The rim is looked for just inside the fall, within a fifth of its radius: tops may be dark.
+    A fall counts by its steepness over its noise: where rays are less than a pixel apart they cross the same pixels.
+    The rim is looked for just inside the fall, within a fifth of its radius or 16 samples: tops may be dark. The gap is
+    the darkest third beyond the fall: of crowded pillars it is a few pixels wide.
     """
     mean = rays.mean(1)
-    outer = float(np.sort(mean)[: max(len(mean) // 8, 2)].mean())
-    fall = int(np.argmin(np.diff(mean)))
-    first = max(fall - max(16, fall // 5), 0)
+    apart = reach[:-1] * 2 * math.pi / RAYS
+    fall = int(np.argmin(np.diff(mean) * np.sqrt(np.minimum(apart, 1.0))))
+    beyond = np.sort(mean[fall + 1 :])
+    outer = float(beyond[: max(len(beyond) // 3, 2)].mean())
+    first = max(fall - max(16, fall // 5), fall // 2)
     rim = first + int(np.argmax(mean[first : fall + 1]))
     return float(mean[rim]), outer, rim

@@ -63,14 +63,17 @@ def test_a_pillar_is_as_wide_from_wherever_its_site_is_guessed():
 
 
 def test_the_error_of_a_radius_is_the_scatter_of_its_rays_over_the_root_of_their_number():
-    """Rays are smoothed along the rim, so that four are one: scatter / sqrt(rays / 4)."""
+    """Smoothed by a Gaussian of one ray and between pixels, less the circle's three numbers; half the rim's too."""
     y, x = np.mgrid[:61, :61]
     rough = 12.4 + 0.4 * np.cos(2 * np.arctan2(y - 30.2, x - 29.7))
     disc = np.clip(rough - np.hypot(y - 30.2, x - 29.7) + 0.5, 0, 1)
     _, _, radius, sigma, scatter = sem._edges(disc, 30.2, 29.7, 40.0)
     assert radius == pytest.approx(12.4, abs=0.05)
     assert scatter == pytest.approx(0.4 / math.sqrt(2), rel=0.05)  # smoothing over rays takes 1 %
-    assert sigma == pytest.approx(scatter / math.sqrt(sem.RAYS / 4), rel=1e-12)
+    edge, rim = (
+        sem.RAYS / math.sqrt(4 * math.pi * (1 + 1 / 6 / (2 * math.pi * r / sem.RAYS) ** 2)) for r in (radius, 9.4)
+    )
+    assert sigma == pytest.approx(scatter * math.sqrt(1 / (edge - 3) + 0.25 / rim), rel=0.02)  # the rim to 2 pixels
 
 
 def test_pillars_nearly_of_one_size_are_laid_by_what_little_they_differ():

@@ -79,6 +79,10 @@ def test_a_site_without_edges_has_collapsed_and_one_without_a_pillar_is_missing_
         flat[:] = 0
 
 
+# of rays smoothed by a Gaussian of one: 72 / (2 sqrt pi), and between pixels (1/6) of steps of 1.25
+INDEPENDENT = 72 / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / 6 / (2 * math.pi * 14.3 / 72) ** 2))
+
+
 def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
     """From a place 1.3 beside and 0.8 below the middle: the step there, the radius, and the scatter of 72 rays."""
     y, x = np.indices((81, 85))
@@ -95,7 +99,8 @@ def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
     *_, sigma, scatter = sem._edges(wavy, 40.8, 43.3, 50.0)
     across = math.exp(-(math.radians(5 * 5) ** 2) / 2)  # smoothed over rays 5 degrees apart
     assert scatter == pytest.approx(0.6 / math.sqrt(2) * across, rel=0.03)
-    assert sigma == pytest.approx(scatter / math.sqrt(72 / 4), rel=1e-9)
+    shared = 0.25 / (0.95 * INDEPENDENT)  # of the rim, two to four pixels nearer to the middle
+    assert sigma == pytest.approx(scatter * math.sqrt(1 / (INDEPENDENT - 3) + shared), rel=0.01)
     assert sem._edges(0.19 * flat, 40.8, 43.3, 50.0) is None  # too faint a step
 
 
@@ -108,24 +113,60 @@ def test_edges_far_from_the_middle_one_are_left_out():
     _, _, radius, sigma, scatter = sem._edges(flat, 40.0, 42.0, 50.0)
     assert radius == pytest.approx(12.0, abs=0.1)
     assert scatter < 0.4
-    assert sigma > scatter / math.sqrt(72 / 4)  # of fewer rays
+    assert sigma > scatter * math.sqrt(1 / (INDEPENDENT - 3) + 0.25 / INDEPENDENT)  # of fewer rays
 
 
-def test_plateaus_are_the_brightest_rim_and_the_darkest_eighth():
+@pytest.mark.parametrize("radius", [5.3, 17.1])
+def test_diameters_of_noisy_discs_scatter_as_their_errors_say(radius):
+    """Blurred discs with a bright rim in white noise: 250 radii about their mean, in units of the errors told."""
+    random = np.random.default_rng(31)
+    y, x = np.indices((61, 61))
+    away = np.hypot(y - 30.2, x - 29.7) - radius
+    top = 0.7 + 0.4 * np.exp(np.minimum(away, 0) / 2.5)
+    disc = 0.1 + ndimage.gaussian_filter(top * np.clip(0.5 - away, 0, 1), 1.2)
+    noisy = (disc + 0.07 * random.standard_normal(disc.shape) for _ in range(250))
+    radii, errors = np.array([sem._edges(image, 30.2, 29.7, 56.0)[2:4] for image in noisy]).T
+    told = (radii - radii.mean()) / errors
+    assert 0.85 < told.std() < 1.15  # of 250: 4.5 % from chance, three times that
+    assert np.abs(told).max() < 4.5
+
+
+def test_noise_about_the_middle_is_not_taken_for_an_edge():
+    """There all rays cross the same few pixels: a bright one falls more steeply than a blurred, noisy rim."""
+    y, x = np.indices((81, 85))
+    away = np.hypot(y - 40.0, x - 42.0)
+    flat = np.clip(0.5 + (21.0 - away) / 4, 0, 1)
+    flat[40, 42] = 3.1
+    assert sem._edges(flat, 40.0, 42.0, 60.0)[2] == pytest.approx(21.0, abs=0.1)
+
+
+def test_the_gap_of_crowded_pillars_is_dark_where_it_is_narrow():
+    """Rows of discs 6 pixels apart: half of the step lies where it lies for a disc alone."""
+    y, x = np.indices((121, 121))
+    near, alone = (np.hypot((y - 60 + h) % p - h, (x - 60 + h) % p - h) for p, h in ((50, 25), (400, 200)))
+    crowded, lonely = (ndimage.gaussian_filter((a < 22.0).astype(float), 1.2) for a in (near, alone))
+    radius = [sem._edges(flat, 60.0, 60.0, 50.0)[2] for flat in (crowded, lonely)]
+    assert radius[0] == pytest.approx(radius[1], abs=0.03)  # the neighbours' blur is 3e-3 of the step half-way
+
+
+REACH = 12.0 + 0.25 * np.arange(200)  # rays a pixel apart and more
+
+
+def test_plateaus_are_the_brightest_rim_and_the_darkest_third_beyond_it():
     """A dark top of 0.5, a rim of 0.9 at 30, gaps of 0.1 with one darker ring: by the mean over rays."""
     mean = np.concatenate([np.full(28, 0.5), [0.6, 0.8, 0.9, 0.85], [0.3], np.full(40, 0.1)])
     mean[60] = 0.02
     rays = mean[:, None] + np.array([0.03, -0.03, 0.0])
-    inner, outer, rim = sem._plateaus(rays)
+    inner, outer, rim = sem._plateaus(REACH[: len(rays)], rays)
     assert rim == 30
     assert inner == pytest.approx(0.9)
-    assert outer == pytest.approx(np.sort(mean)[: len(mean) // 8].mean())
+    assert outer == pytest.approx((12 * 0.1 + 0.02) / 13)  # of 41 beyond the fall, its foot among them
     far = np.concatenate(
         [[0.65], np.full(29, 0.5), [0.7], np.full(30, 0.5), [0.6], np.full(40, 0.1)]
     )  # bright beyond 16 samples of the fall
-    assert sem._plateaus(far[:, None])[2] == 61
+    assert sem._plateaus(REACH[: len(far)], far[:, None])[2] == 61
     wide = np.concatenate([np.full(70, 0.5), [0.9], np.full(17, 0.6), np.full(40, 0.1)])
-    assert sem._plateaus(wide[:, None])[2] == 70  # a fifth of 87: 17 samples
+    assert sem._plateaus(REACH[: len(wide)], wide[:, None])[2] == 70  # a fifth of 87: 17 samples
 
 
 def test_rays_run_from_a_place_in_all_directions():
