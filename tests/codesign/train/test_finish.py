@@ -74,3 +74,49 @@ def test_depths_of_windows_err_in_millimetres():
     row = finish.told("", answers, SimpleNamespace(vergence=truth), None)
     want = (abs(1e3 / 49 - 1e3 / 45) + abs(1e3 / 37 - 1e3 / 43)) / 2
     assert row["window_depth_mm"] == pytest.approx(want, rel=1e-5)
+
+
+@pytest.mark.parametrize(("tests", "pairs"), [(33, 41), (3, 0)])
+def test_an_end_is_read_on_as_many_frames_as_are_asked_for_and_on_none_that_it_learned_from(monkeypatch, tests, pairs):
+    """Batch statistics from eight batches of training at most; the response to depth from a quarter of the tests."""
+    asked, told = [], {}
+
+    def frames(trainer, scenes, batches):
+        asked.append((scenes, batches))
+        return SimpleNamespace(of=scenes, slip_mm=torch.zeros(2, 3), vergence=None)
+
+    def predict(net, architecture, seen, inner):
+        return SimpleNamespace(slip_mm=torch.ones(2, 3), slip_sd_mm=None, depth=None, iou=torch.tensor([0.4, 0.6]))
+
+    def response(trainer, scenes, net, architecture, *, batches):
+        told.update(scenes=scenes, batches=batches)
+        return SimpleNamespace(mean=0.71, standard_error=0.05)
+
+    net = torch.nn.Linear(1, 1)
+    trainer = SimpleNamespace(
+        scenes="training", model=SimpleNamespace(net=net, pitch_um=torch.tensor(7.2)), inner=SimpleNamespace(batch=8)
+    )
+    best = SimpleNamespace(architecture=SimpleNamespace(resolution=0.75))
+    monkeypatch.setattr(finish, "_chosen", lambda run: [(None, best)])
+    monkeypatch.setattr(finish, "_tuned", lambda run, architecture, i: trainer)
+    monkeypatch.setattr(finish, "recalibrate", lambda net, architecture, parts: told.update(learned=parts))
+    monkeypatch.setattr(finish.assess, "frames", frames)
+    monkeypatch.setattr(finish.assess, "parts", lambda seen: seen.of)
+    monkeypatch.setattr(finish.assess, "predict", predict)
+    monkeypatch.setattr(finish.ambiguity, "ambiguous", lambda scenes, count, seed: [scenes, seed] * count)
+    monkeypatch.setattr(finish, "depth_response", response)
+    settings = SimpleNamespace(
+        test_batches=tests, validation_batches=5, ambiguity_pairs=pairs, inner=SimpleNamespace(seed=17, batch=8)
+    )
+    run = SimpleNamespace(
+        settings=settings, trainer=trainer, scenes=lambda stream: f"stream {stream}", macs=lambda architecture: 2.5e6
+    )
+    (row,) = finish.finish(run)
+    test, apart = (f"stream {stream}" for stream in (finish.TEST, finish.VALIDATION))
+    ambiguous = [([test, 17] * pairs, 2 * pairs // 8)] if pairs else []
+    assert asked == [(test, tests), *ambiguous, ("training", min(8, tests)), (apart, 5)]
+    assert told == {"learned": "training", "scenes": [test, 17] * pairs or test, "batches": max(1, tests // 4)}
+    assert (row["mmacs"], row["effective_pitch_um"]) == pytest.approx((2.5, 9.6))
+    assert (row["depth_response_mm_per_mm"], row["depth_response_error"]) == (0.71, 0.05)
+    assert row["axial_slip_mm"] == row["lateral_slip_mm"] == 1.0
+    assert ("ambiguous_iou" in row) is (pairs > 0)

@@ -10,12 +10,13 @@ import torch
 
 from codesign.network.architecture import Space, largest, sample, smallest
 from codesign.optics import formed
+from codesign.optics.lens_errors import LensErrors
 from codesign.optics.stack import OpticsConfig
 from codesign.train import evolution, finish, formation, inner
 from codesign.train.evolution import Candidate, Plan, Search
 from codesign.train.inner import InnerConfig, Schedule, Trainer
 from codesign.train.light import Light
-from metalens.image import Imager, Sensor
+from metalens.image import Imager, Sensor, UniformImager
 
 OPTICS = OpticsConfig(
     aperture_mm=0.3, sensor_distance_mm=1.0, polynomials=6, depth_count=4, window_samples=9, depths_mm=(14.0, 30.0),
@@ -186,14 +187,19 @@ def test_quiet_frames_stop_at_the_full_well_of_their_pixels():
 
 
 def test_one_psf_a_depth_is_kept_while_the_lens_stands_without_errors():
-    errors = {4: "drawn"}
-    light = Light(OPTICS, (), refresh=3, draws=2, seed=0, draw=errors.get)
+    off = LensErrors(focus_um=5.0, tilt_waves=0.1).draw(torch.Generator().manual_seed(3))
+    light = Light(OPTICS, (), refresh=3, draws=2, seed=0, draw={4: off, 5: off}.get)
     still = torch.zeros(6, dtype=torch.float64)
     first = light.at(0, still, 20, 4, live=False)
+    assert isinstance(first, UniformImager)
     assert light.at(1, still, 20, 4, live=False) is first
     moved = light.at(2, still, 20, 4, live=True)
     assert moved is not first
-    assert light.at(3, still, 20, 4, live=False) is not moved
+    rested = light.at(3, still, 20, 4, live=False)
+    assert rested is not moved
+    with_error = [light.at(step, still, 20, 4, live=False) for step in (4, 5)]
+    assert with_error[0] is not with_error[1]
+    assert rested not in with_error
 
 
 def test_a_still_lens_with_errors_is_formed_anew_with_those_of_its_time(monkeypatch):
