@@ -83,3 +83,19 @@ def test_information_on_depth_is_that_of_the_whole_spectrum_at_unequal_steps():
     made = SimpleNamespace(intensity=torch.tensor(psf), depths_um=torch.tensor(1e3 * depths_mm))
     found = formation.depth_information(made)
     assert found.tolist() == pytest.approx(wanted.tolist(), rel=1e-6)  # the texture is made in single precision
+
+
+def test_pixels_without_light_and_read_noise_have_hardly_any_noise_and_finite_slopes():
+    """A variance of 1e-6 is left, so that the root has a slope: 500 of them times one draw."""
+    mean = torch.zeros(2, 30, 30, dtype=torch.float64, requires_grad=True)
+    sensor = Sensor(6.0, 4.0, 1.0, 0.0, 900.0, 0.0)
+    made = formation._normal(mean, sensor, torch.Generator().manual_seed(5), torch.tensor(1.7, dtype=torch.float64))
+    assert float(made.detach().std()) == pytest.approx(1e-3, rel=0.1)  # of 1800 draws: 1.7 %
+    made.sum().backward()
+    assert (mean.grad - 1).numpy() == pytest.approx(500 * 1e3 * made.detach().numpy(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("pitch_um", "wide"), [(9.0, 1.0), (10.0, 370 / 369), (12.3, 1.0), (9.36, 374.4 / 369)])
+def test_a_frame_is_as_wide_as_its_whole_pixels(pitch_um, wide):
+    """369 um: 41, 36.9, 30 and 39.4 pixels, the last one of them whole."""
+    assert formation.frame_wide(41, 9.0, pitch_um) == pytest.approx(wide, abs=1e-12)

@@ -9,7 +9,7 @@ import scipy.fft
 import torch
 
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, Window, engine, points
+from metalens.field import Grid, Layers, Optics, SmoothWave, Window, engine, patches, points
 from metalens.field.rays import bending, rays, source_paths
 from metalens.ground.errors import PropagationError
 from metalens.lens import Media
@@ -139,3 +139,37 @@ def test_a_field_is_cut_into_patches_of_28_samples_that_share_four(monkeypatch, 
     )
     assert asked == {"patches": count, "overlap": 4, "tolerance": pytest.approx(0.02 * 0.6 / 4)}
     assert made.parts == {"kernels": pytest.approx(0.003)}
+
+
+def test_a_patch_knows_its_nodes_and_the_places_that_its_kernels_are_made_of():
+    """Five from its first pixel to its last, and as many as it has nodes whose weights are interpolated; all of few."""
+    nodes = torch.linspace(0, 40, 9, dtype=torch.float64)
+    grid = patches.dense(torch.arange(41, dtype=torch.float64), nodes)
+    line = patches._line(grid, 11, 34, torch.ones(23))
+    assert line.nodes.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]  # two beyond the patch at either side, five pixels apart
+    assert line.at.tolist() == np.round(np.linspace(0, 22, 8)).tolist()
+    assert torch.equal(line.few, grid[11:34][[0, 6, 11, 16, 22]][:, 1:])
+    assert torch.equal(line.many, grid[11:34][line.at][:, 1:])
+    few = patches._line(grid, 11, 14, torch.ones(3))
+    assert len(few.few) == len(few.at) == 3
+
+
+def test_errors_of_a_dark_patch_count_by_the_light_of_its_brightest_pixel():
+    """Light falls along x from 5 to 0.5; over 30 pixels a straight line is interpolated exactly."""
+    draw = np.random.default_rng(3)
+    stack = torch.from_numpy(draw.random((4, 5, 2, 3, 3)))
+    stack /= stack.sum((-1, -2), keepdim=True)
+    between = [
+        patches.dense(torch.linspace(0, 1, n, dtype=torch.float64), torch.linspace(0, 1, k, dtype=torch.float64))
+        for n, k in ((20, 4), (30, 5))
+    ]
+    fall = torch.linspace(5.0, 0.5, 5).double()[None, :, None].expand(4, 5, 2)
+    made = [
+        patches.cut(stack, light, between, patches=2, overlap=2, tolerance=1e-12)
+        for light in (torch.ones_like(fall), fall)
+    ]
+    lit = np.linspace(5.0, 0.5, 30)
+    for even, dark in zip(*made, strict=True):
+        share = lit[slice(*dark.columns)].max() / 5
+        assert dark.missing[:-1].numpy() == pytest.approx(even.missing[:-1].numpy() * share, rel=1e-9)
+    assert len({dark.columns for dark in made[1]}) == 2
