@@ -307,6 +307,8 @@ def _frames_of(path: Path, file: h5py.File) -> Array:
 def _check_values(images: Array, path: Path) -> None:
     if images.dtype.kind not in "uif" or images.dtype.itemsize > 8:
         raise CaptureError(f"{path}: values of type {images.dtype}; need whole or real numbers")
+    if images.dtype.kind == "f" and images.dtype.itemsize < 4:
+        raise CaptureError(f"{path}: values of type {images.dtype} round counts above 2048; save whole numbers")
     if images.dtype.kind == "f" and not np.isfinite(images).all():
         frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
         raise CaptureError(f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}")

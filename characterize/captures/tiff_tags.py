@@ -36,16 +36,35 @@ def read(path: Path) -> Tags:
         if file.is_imagej and file.imagej_metadata:
             return _imagej(path, file.imagej_metadata, _resolution(file.pages[0]), len(file.pages))
         if file.is_ome and file.ome_metadata:
-            found = re.search(r'PhysicalSizeX="([^"]+)"(?:[^>]*PhysicalSizeXUnit="([^"]+)")?', file.ome_metadata)
-            pixel = float(found[1]) * _UNITS.get(found[2] or "um", math.nan) if found else math.nan
-            return Tags(stage.ome_positions(file.ome_metadata), pixel, _words(pixel))
+            return _ome(path, file.ome_metadata, len(file.pages))
     return Tags()
+
+
+def _ome(path: Path, xml: str, pages: int) -> Tags:
+    """Positions of the planes, else steps of the voxel's height."""
+    channels, samples = (re.search(rf'{name}="(\d+)"', xml) for name in ("SizeC", "SamplesPerPixel"))
+    _one_channel(path, (int(channels[1]) if channels else 1) // (int(samples[1]) if samples else 1))
+    pixel, step, position = _ome_size(xml, "X"), _ome_size(xml, "Z"), stage.ome_positions(xml)
+    if len(position) or not math.isfinite(step) or step == 0:
+        return Tags(position, pixel, _words(pixel))
+    note = f"stage step of {step:.4g} um from the OME tags"
+    return Tags(np.arange(pages) * step, pixel, (note, *_words(pixel)))
+
+
+def _ome_size(xml: str, axis: str) -> float:
+    name = f"PhysicalSize{axis}"
+    found = re.search(rf'{name}="([^"]+)"(?:[^>]*{name}Unit="([^"]+)")?', xml)
+    return float(found[1]) * _UNITS.get(found[2] or "um", math.nan) if found else math.nan
+
+
+def _one_channel(path: Path, channels: int) -> None:
+    if channels > 1:
+        raise CaptureError(f"{path}: {channels} channels in one file; save the one that is to be fitted")
 
 
 def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) -> Tags:
     """Steps without a unit are in um; of a unit that is no length (pixels) neither steps nor a pixel are told."""
-    if int(str(about.get("channels", 1))) > 1:
-        raise CaptureError(f"{path}: {about['channels']} channels in one file; save the one that is to be fitted")
+    _one_channel(path, int(str(about.get("channels", 1))))
     unit = str(about.get("unit", "")).lower()
     scale = _UNITS.get(unit, math.nan)
     step = float(str(about.get("spacing", "nan"))) * (scale if unit else 1.0)

@@ -23,6 +23,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, ConfigError
 from metalens.lens import DiameterMap
 
+_FALLEN = 0.5  # share of collapsed pillars beyond which the lattice is doubted
+
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -55,7 +57,7 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Measure and write; exit 0, or 1 where no pillar could be measured."""
+    """Measure and write; exit 0, or 1 where no pillar could be measured or most sites hold what is no round one."""
     of_pillars = options.pixel_nm is not None or options.bar_nm is not None
     if of_pillars and options.edge_um is not None:
         raise ConfigError("give --edge-um (a slanted edge), or --pixel-nm or --bar-nm (pillars), not both")
@@ -135,10 +137,14 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
-    good = bool(np.isfinite(found.diameter_nm).any())
+    fallen = float(found.collapsed.mean())
+    good = bool(np.isfinite(found.diameter_nm).any()) and fallen <= _FALLEN
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
     if table and not options.edge_bias_nm:
         lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
+    if fallen > _FALLEN:
+        pitch = values["pitch_nm"]
+        lines.append(f"  most sites hold no round pillar: is the lattice of {pitch:.4g} nm right? --pitch-nm states it")
     return values, "\n".join(lines), good
 
 

@@ -17,6 +17,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 RAYS = 72
+_ROUND = 2 / 3  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,10 @@ def _pillar(
 
 
 def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float, float, float, float, float] | None:
-    """Circle through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges."""
+    """Circle through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges.
+
+    The scatter is infinite where too many rays have their edges elsewhere.
+    """
     reach, angle, rays = _rays(flat, row, column, pitch)
     inner, outer, rim = _plateaus(reach, rays)
     found = np.full(RAYS, math.nan)
@@ -194,7 +198,7 @@ def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float,
     own = max(_independent(radius) * good.mean() - 3, 1.0)
     shared = 0.25 / _independent(float(reach[rim]))  # half of the rim's level, as noisy as edges, is in every edge
     error = scatter * math.sqrt(1 / own + shared)
-    return float(dy), float(dx), float(radius), error, scatter
+    return float(dy), float(dx), float(radius), error, scatter if good.mean() > _ROUND else math.inf
 
 
 def _independent(radius: float) -> float:

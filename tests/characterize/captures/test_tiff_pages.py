@@ -64,3 +64,11 @@ def test_planes_are_images_or_the_colours_of_one(tmp_path):
     assert np.array_equal(tiff_pages.read(path), FRAMES)
     assert np.array_equal(tiff_pages.read(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None])
     assert np.array_equal(tiff_pages.read(written(tmp_path), coloured=True), FRAMES)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("f2", "float16 round counts above 2048"), ("c8", "complex64; need whole")]
+)
+def test_kinds_of_numbers_that_hold_no_counts_are_refused_by_name(tmp_path, kind, words):
+    with pytest.raises(CaptureError, match=words):
+        capture.load(written(tmp_path, FRAMES.astype(kind)))

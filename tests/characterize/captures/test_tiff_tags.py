@@ -60,6 +60,25 @@ def test_ome_gives_positions_and_the_pixel_along_x(tmp_path, unit, um):
     assert found.notes == (f"pixel of {0.37 * um:.4g} um from the tags of the file",)
 
 
+@pytest.mark.parametrize(("unit", "um"), [("nm", 1e-3), ("mm", 1e3), (None, 1.0)])
+def test_ome_without_positions_gives_steps_of_the_height_of_a_voxel(tmp_path, unit, um):
+    about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeZ": 2.5}
+    about |= {} if unit is None else {"PhysicalSizeZUnit": unit}
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about)
+    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    assert found.position_um == pytest.approx(2.5 * um * np.arange(4), rel=1e-12)
+    assert found.notes[0] == f"stage step of {2.5 * um:.4g} um from the OME tags"
+
+
+def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tmp_path):
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES.reshape(2, 2, 6, 5), ome=True, metadata={"axes": "ZCYX"})
+    with pytest.raises(CaptureError, match="2 channels in one file"):
+        tiff_tags.read(tmp_path / "a.ome.tif")
+    colours = np.repeat(FRAMES[..., None], 3, -1)
+    tifffile.imwrite(tmp_path / "b.ome.tif", colours, ome=True, photometric="rgb", metadata={"axes": "ZYXS"})
+    assert len(tiff_tags.read(tmp_path / "b.ome.tif").position_um) == 0
+
+
 def test_a_plain_file_tells_nothing(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", metadata=None)
     found = tiff_tags.read(tmp_path / "a.tif")

@@ -178,3 +178,16 @@ def test_pillars_whose_diameter_is_not_what_is_drawn_are_refused(tmp_path, capsy
     assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 2
     assert "--design takes round pillars" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(tmp_path, capsys):
+    """Bars of 60 x 28 pixels at 100: their edges lie 14 to 33 pixels from the middle, on no circle."""
+    y, x = np.indices((400, 400)) % 100 - 49.5
+    bar = (np.abs(x) < 30) & (np.abs(y) < 14)
+    picture = 40 + 120 * bar + 3 * np.random.default_rng(3).standard_normal(bar.shape)
+    tifffile.imwrite(tmp_path / "a.tif", picture.astype(np.uint8))
+    assert main(["measure", str(tmp_path / "a.tif"), "--pixel-nm", "4", "-o", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().out
+    assert "most sites hold no round pillar: is the lattice of" in told
+    assert "--pitch-nm states it" in told
+    assert (tmp_path / "out" / "pillars.csv").is_file()
