@@ -122,7 +122,8 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
     reach = size // 2
     whole = grid.frame[0] + 2 * reach, grid.frame[1] + 2 * reach
     out = light.new_zeros(len(light), kinds, light.shape[1], *whole)
-    given = light, cover, vergence(depth_um, optics.plan.depths_um)
+    place = vergence(depth_um, optics.plan.depths_um)
+    given = light, cover, place.detach()
     shapes = [_size(patch, size) for patch in optics.patches]
     if all(compiled.plain(a) for a in (*given, *optics.transfer, *(p.energy for p in optics.patches))):
         seen = given[0].numpy(), given[1].numpy(), given[2].numpy()
@@ -134,15 +135,15 @@ def _through(light: Tensor, cover: Tensor, depth_um: Tensor, optics: Imager, *, 
         for patch, transfer, shape in zip(optics.patches, optics.transfer, shapes, strict=True):
             _add(patch, transfer, shape, given, out)
     out = out[..., reach : reach + grid.frame[0], reach : reach + grid.frame[1]]
-    if optics.stack.requires_grad and torch.is_grad_enabled():
-        out = out + _by_nodes(given, optics, kinds)
+    if (optics.stack.requires_grad or place.requires_grad) and torch.is_grad_enabled():
+        out = out + _by_nodes((light.detach(), cover.detach(), place), optics, kinds)
     return out
 
 
 def _by_nodes(given: tuple[Tensor, Tensor, Tensor], optics: Imager, kinds: int) -> Tensor:
-    """Zeros for :func:`_through` to add, with the derivative by the PSFs of all nodes, which need no map of even light;
-    ``given`` as there."""
-    light, cover, place = (part.detach() for part in given)
+    """Zeros for :func:`_through` to add, with the derivatives by the PSFs of all nodes, and by depths through them,
+    which need no map of even light; ``given`` as there."""
+    light, cover, place = given
     between = [part.to(light) for part in between_nodes(optics.grid, optics.plan)]
     first, taps = lagrange(place, optics.stack.shape[2])
     level = torch.einsum("ya,xb,abz->yxz", *between, optics.energy.detach().to(light))

@@ -6,7 +6,8 @@ is off by half. So an image is formed through kernels, and its derivative is tha
     image(X) = Σ_nodes Σ_x to_node(x) source(x) P_node(X - x)
     d loss / d P_node(k) = Σ_x to_node(x) source(x) G(x + k)
 
-with G = d loss / d image: correlations of the source near a node with G, one a node, by transforms.
+with G = d loss / d image: correlations of the source near a node with G, one a node, by transforms. The derivative by
+the depth of a source is that of the same sum, through the weights of the depth nodes (4-point polynomials in 1/z).
 
 The image is linear in the light of the nodes. So a step goes in two halves: with the light of all nodes as a leaf
 (no graph through the pupils), the loss gives G' = d loss / d light; then for any set of (point, wavelength) drawn with
@@ -37,7 +38,8 @@ def by_nodes(
     asked: Set[int] | None = None,
 ) -> Tensor:
     """Zeros as large as an image of sources (frames, kinds, sheets, y, x) and half a window at each side, whose
-    derivative by the PSFs of the nodes is that of the image through all of them.
+    derivatives by the PSFs of the nodes, by the sources and by the weights of the depths are those of the image through
+    all nodes.
 
     Args:
         stack: (rows, columns, depths, h, w) of the nodes. sources: (frames, sheets, y, x) of each kind.
@@ -45,7 +47,8 @@ def by_nodes(
         between: (pixel rows, node rows) and (pixel columns, node columns).
         asked: numbers of the nodes whose derivatives are wanted, the others' being 0; None for all.
     """
-    zeros: Tensor = _ByNodes.apply(stack, sources, deep, between, asked)  # type: ignore[no-untyped-call]
+    first, taps = deep
+    zeros: Tensor = _ByNodes.apply(stack, taps, first, between, asked, *sources)  # type: ignore[no-untyped-call]
     return zeros
 
 
@@ -56,30 +59,42 @@ class _ByNodes(torch.autograd.Function):
     def forward(
         ctx: Any,
         stack: Tensor,
-        sources: list[Tensor],
-        deep: tuple[Tensor, Tensor],
+        taps: Tensor,
+        first: Tensor,
         between: list[Tensor],
         asked: Set[int] | None,
+        *sources: Tensor,
     ) -> Tensor:
-        ctx.save_for_backward(*sources, *deep, *between)
-        ctx.of, ctx.asked = stack.shape, asked
-        first, size = sources[0], stack.shape[-1] - 1
-        shape = len(first), len(sources), *first.shape[1:-2], first.shape[-2] + size, first.shape[-1] + size
-        return first.new_zeros(shape)
+        ctx.save_for_backward(stack, taps, first, *between, *sources)
+        ctx.asked = asked
+        one, size = sources[0], stack.shape[-1] - 1
+        shape = len(one), len(sources), *one.shape[1:-2], one.shape[-2] + size, one.shape[-1] + size
+        return one.new_zeros(shape)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        *sources, first, taps, rows, columns = ctx.saved_tensors
-        light, out = torch.stack(sources, 1), gradient.new_zeros(ctx.of)
-        for node in range(ctx.of[0] * ctx.of[1]) if ctx.asked is None else ctx.asked:
-            place = divmod(node, ctx.of[1])
+        stack, taps, first, rows, columns, *sources = ctx.saved_tensors
+        of_stack, of_taps, *_ = ctx.needs_input_grad
+        of_sources = of_taps or any(ctx.needs_input_grad[5:])
+        light, high, wide = torch.stack(sources, 1), *stack.shape[-2:]
+        out = gradient.new_zeros(stack.shape)
+        back = torch.zeros_like(light), torch.zeros_like(taps)
+        every = range(stack.shape[0] * stack.shape[1])
+        for node in every if of_sources or ctx.asked is None else ctx.asked:
+            place = divmod(node, stack.shape[1])
             to_row, to_column = (part[:, i].to(light) for part, i in zip((rows, columns), place, strict=True))
             y, x = _reach(to_row), _reach(to_column)
-            near = light[..., y, x] * (to_row[y, None] * to_column[x])
-            seen = gradient[..., y.start : y.stop + ctx.of[-2] - 1, x.start : x.stop + ctx.of[-1] - 1]
-            out[place] = _correlated(near, (first[..., y, x], taps[..., y, x, :]), seen, ctx.of[2:])
-        return out, None, None, None, None
+            to = to_row[y, None] * to_column[x]
+            near, deep = light[..., y, x] * to, (first[..., y, x], taps[..., y, x, :])
+            seen = gradient[..., y.start : y.stop + high - 1, x.start : x.stop + wide - 1]
+            if of_stack and (ctx.asked is None or node in ctx.asked):
+                out[place] = _correlated(near, deep, seen, stack.shape[2:])
+            if of_sources:
+                by_light, by_taps = _returned(stack[place], near, deep, seen)
+                back[0][..., y, x] += by_light * to
+                back[1][..., y, x, :] += by_taps
+        return out if of_stack else None, back[1] if of_taps else None, None, None, None, *back[0].unbind(1)
 
 
 def _reach(weights: Tensor) -> slice:
@@ -102,6 +117,21 @@ def _correlated(light: Tensor, deep: tuple[Tensor, Tensor], gradient: Tensor, of
         found = torch.fft.irfft2((part.conj() * spectrum).sum((0, 1, 2)), s=shape)
         total.append(found[: window[0], : window[1]])
     return torch.stack(total)
+
+
+def _returned(psfs: Tensor, light: Tensor, deep: tuple[Tensor, Tensor], gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives by the light near a node (before its share of it) and by the weights of the depths: of each depth's
+    PSF, Σ_k P(k) gradient(x + k) at the places of the light."""
+    shape = [int(scipy.fft.next_fast_len(n, real=True)) for n in gradient.shape[-2:]]
+    spectrum, (high, wide) = torch.fft.rfft2(gradient, s=shape), light.shape[-2:]
+    first, taps = deep
+    by_light, by_taps = torch.zeros_like(light), torch.zeros_like(taps)
+    for depth, psf in enumerate(psfs.to(gradient)):
+        at = first[..., None] + torch.arange(taps.shape[-1], device=first.device) == depth
+        seen = torch.fft.irfft2(torch.fft.rfft2(psf, s=shape).conj() * spectrum, s=shape)[..., :high, :wide]
+        by_light += (taps * at).sum(-1)[:, None] * seen
+        by_taps += at * (light * seen).sum(1)[..., None]
+    return by_light, by_taps
 
 
 def node_light(optics: Optics, plan: Plan) -> Tensor:
