@@ -165,18 +165,36 @@ def _curve(file: Path) -> Array:
         raise PropagationError(f"{file}: cannot be read as a table of wavelength and value: {error}") from None
     for number, line in enumerate(lines, 1):
         words = reading.columns(line)
-        if not words or words[0][0] in "#\"'" or words[0][0].isalpha():
+        if not words or words[0][0] in "#\"'" or (words[0][0].isalpha() and not _number(words[0])):
             continue
         try:
-            rows.append([float(words[0]), float(words[1])])
+            nm, value = float(words[0]), float(words[1])
         except (ValueError, IndexError):
             raise PropagationError(f"{file}: line {number} is {line[:60]!r}, need wavelength in nm and value") from None
+        if not (100 <= nm < np.inf and 0 <= value < np.inf):
+            raise PropagationError(
+                f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 or more) and a value of 0 or "
+                "more: convert micrometres, and set what noise left below 0 to 0"
+            )
+        rows.append([nm, value])
+    if len(rows) < 2:
+        raise PropagationError(
+            f"{file}: {len(rows)} rows, need two or more of wavelength in nm and value; a single line is wavelengths_nm"
+        )
     table = np.array(sorted(rows))
-    if len(rows) < 2 or not np.isfinite(table).all() or table[0, 0] < 100 or (table[:, 1] < 0).any():
-        raise PropagationError(f"{file}: need two rows or more of wavelength in nm (100 or more) and value (0 or more)")
-    if (np.diff(table[:, 0]) <= 0).any():
-        raise PropagationError(f"{file}: a wavelength stands twice; need one value for each")
+    twice = np.flatnonzero(np.diff(table[:, 0]) == 0)
+    if len(twice):
+        raise PropagationError(f"{file}: {table[twice[0], 0]:g} nm stands twice; need one value for each wavelength")
     return table
+
+
+def _number(word: str) -> bool:
+    """Whether it is one, be it nan or inf: a row, not a name of columns."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def nodes(source: Source | Measured, *, path_um: float | Array, tolerance: float, light: Array | None = None) -> Nodes:

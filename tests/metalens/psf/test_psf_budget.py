@@ -198,6 +198,34 @@ def test_a_measured_spectrum_is_the_product_of_its_curves(tmp_path):
         spectrum.measured([tmp_path / "none.csv"], within_um=(0.8, 0.9))
 
 
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [
+        ("840,0\nnan,0.5\n850,1\n860,0\n", "line 3 is 'nan,0.5'"),
+        ("840,0\n845,nan\n860,0\n", "line 3 is '845,nan'"),
+        ("840,0\n850,1\n860,-0.001\n", "line 4 is '860,-0.001'.* set what noise"),
+        ("0.84,0\n0.85,1\n0.86,0\n", "line 2 is '0.84,0'.* convert micrometres"),
+        ("840,0\n850,1\n850,2\n", "850 nm stands twice"),
+        ("850,1\n", "1 rows, need two or more.* wavelengths_nm"),
+    ],
+)
+def test_rows_of_a_spectrum_that_are_none_are_named(tmp_path, rows, named):
+    (tmp_path / "led.csv").write_text("nm,power\n" + rows)
+    with pytest.raises(PropagationError, match=rf"led\.csv: {named}"):
+        spectrum.measured([tmp_path / "led.csv"], within_um=(0.8, 0.9))
+
+
+def test_rows_of_a_spectrum_may_come_in_any_order_with_gaps_and_dark_between(tmp_path):
+    """Straight from 846 to 858 nm across the gap; dark at 842 and 844: the mean of three pieces, by hand."""
+    (tmp_path / "led.csv").write_text("858,1\n842,0\n838,2\n862,0\n846,3\n844,0\n834,0\n")
+    found = spectrum.measured([tmp_path / "led.csv"], within_um=(0.8, 0.9))
+    areas = np.array([4.0, 4.0, 3.0, 24.0, 2.0])  # 834-838-842, 844-846-858-862
+    middles = np.array(
+        [836 + 2 / 3, 839 + 1 / 3, 845 + 1 / 3, 851.0, 859 + 1 / 3]
+    )  # centroids of triangles and a trapezium
+    assert found.share @ found.wavelengths_um * 1e3 == pytest.approx(areas @ middles / areas.sum(), rel=1e-12)  # exact
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_estimate_holds_in_single_precision_where_windows_are_dim_or_tiny(seed):
     """Random phases, windows of 1 to 20 samples beside the light, tolerances down to 1e-6: never below the truth."""
