@@ -226,3 +226,29 @@ def test_no_search_takes_the_sensor_into_the_lens():
     assert (prior.low[0], prior.high[0]) == (-2.5, 2.5)
     far = prior_of(("distance_um",), {}, dataclasses.replace(b.lens(), sensor_distance_um=1e4))
     assert (far.low[0], far.high[0]) == (-400.0, 400.0)
+
+
+@pytest.mark.parametrize("name", ["millimetre", "oblique", "wide and oblique", "of a low lens"])
+def test_a_path_rises_over_the_window_by_the_cosines_of_its_ray(name):
+    """Against differences of the path over 1e-3 um: of third order, 1e-6 / d² of 1, and rounding of 60 um over them."""
+    kernel, half = case(name)
+    p, q, X, Y = places(kernel, half, 40)
+    step = 1e-3
+    by_x = (kernel.path(p, q, X + step, Y)[0] - kernel.path(p, q, X - step, Y)[0]) / (2 * step)
+    by_y = (kernel.path(p, q, X, Y + step)[0] - kernel.path(p, q, X, Y - step)[0]) / (2 * step)
+    found = kernel._steep(p, q, X, Y)
+    assert np.abs(found[0] - by_x).max() < 1e-8
+    assert np.abs(found[1] - by_y).max() < 1e-8
+    a, b_ = (sum(span) / 2 for span in (kernel.p, kernel.q))
+    off = kernel.turning(p, q, X, Y)
+    for axis, (rise, middle) in enumerate(zip((by_x, by_y), ((X, 0.0), (0.0, Y)), strict=True)):
+        moved = [(middle[0] + s * step * (axis == 0), middle[1] + s * step * (axis == 1)) for s in (1, -1)]
+        own = (kernel.path(a, b_, *moved[0])[0] - kernel.path(a, b_, *moved[1])[0]) / (2 * step)
+        assert np.abs(off[axis] - (rise - own)).max() < 2e-8
+    high, wide = kernel.bands(half, 0.6 * half)
+    t = np.linspace(-1, 1, 9)
+    Y, X, q, p = np.meshgrid(
+        half * t, 0.6 * half * t, *((sum(s) / 2 + (s[1] - s[0]) / 2 * t) for s in (kernel.q, kernel.p)), indexing="ij"
+    )
+    most = [float(np.abs(part).max()) for part in kernel.turning(p, q, X, Y)]
+    assert (wide, high) == pytest.approx((K * most[0], K * most[1]), rel=1e-9)
