@@ -12,6 +12,7 @@ from metalens.field import Grid, engine, left_out, patches, plan
 from metalens.field.forming import Imager
 from metalens.field.plan import Plan
 from metalens.field.points import Window
+from metalens.field.waves import PillarWave
 from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Stop
 from metalens.psf import Nodes
@@ -427,3 +428,38 @@ def test_tolerances_of_kernels_go_down_to_the_dimmest_image_in_steps_of_two_at_m
     assert (steps[:-1] / steps[1:]).max() < 2.1
     assert steps[-1] <= 1 / engine.DEEPEST < steps[-2]
     assert steps[0] == 8.0  # of the worst PSF of a patch, when all others do better
+
+
+@pytest.mark.parametrize(("samples", "nodes", "finer", "count"), [(7, 80, 4, 7), (201, 80, 2, 127), (61, 180, 5, 49)])
+def test_pillars_taken_together_are_judged_by_every_pillar_on_finer_points(monkeypatch, samples, nodes, finer, count):
+    """Points half of Nyquist's step apart, half of that where no more than 256 are, of the middle of wide windows; each
+    sample the mean over two squares, a triangle; PSFs of sum 1 by the light of those that are used."""
+    asked, every, got = [], torch.from_numpy(RNG.uniform(0.1, 1, (2, 3, (count + 1) * finer, (count + 1) * finer))), []
+
+    def of_pillars(optics, wave, wavelength_um, at, sampled):
+        asked.append((at[0].tolist(), at[1].tolist(), sampled))
+        return every[len(asked) - 1]
+
+    def psfs(optics, at, *, depths_um, wavelength_um, window):
+        got.append(torch.from_numpy(RNG.uniform(0.1, 1, (1, 3, samples, samples))) * (0.3 if got else 0.8))
+        return got[-1]
+
+    monkeypatch.setattr(left_out, "_of_pillars", of_pillars)
+    monkeypatch.setattr(left_out, "psfs", psfs)
+    monkeypatch.setattr(left_out, "sampling", lambda *_: SimpleNamespace(nodes=nodes, step=0.005))
+    optics = SimpleNamespace(wave=object.__new__(PillarWave))
+    places, depths = torch.tensor([[20.0, -31.0], [3.0, 8.0]]), torch.tensor([4e2, 9e2, 21e2])
+    found = left_out.missing(optics, 0.85, Window(samples, 2.0), (places, depths))
+    assert asked == [(place, depths.tolist(), (2.0, count + 1, finer)) for place in places.tolist()]
+    points = (np.arange((count + 1) * finer) + 0.5) / finer - (count + 1) / 2
+    share = torch.from_numpy(np.maximum(1 - np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None]), 0))
+    edge = (samples - count) // 2
+    errors, light = torch.empty(2, 3), torch.empty(2, 3)
+    for n, k in np.ndindex(2, 3):
+        want = share @ every[n, k] @ share.T
+        one = got[n][0, k, edge : edge + count, edge : edge + count]
+        errors[n, k] = float(plan.relative(one / one.sum(), want / want.sum()))
+        light[n, k] = one.sum()
+    level = light / light.amax(0)
+    assert found == pytest.approx(float(torch.sqrt((errors * level).square().mean())), rel=1e-5)
+    assert left_out.missing(SimpleNamespace(wave=object()), 0.85, Window(samples, 2.0), (places, depths)) == 0.0
