@@ -75,12 +75,21 @@ def imaged(
             light; 0 for one wavelength.
 
     Raises:
-        SceneError: the lens cannot be imaged over this field to 3 %; see :func:`metalens.image.imager`.
+        SceneError: a frame that reaches so far aside that part of the face lies behind the lens; a lens that cannot be
+            imaged over this field to 3 %, see :func:`metalens.image.imager`.
     """
     margin = margin_of(camera.pitch_um)
     wide = Camera(camera.pixels + 2 * margin, camera.pitch_um)
     made = rendered(wide, replace(rig, sensor_distance_um=lens.reduced_um))
     seen = made.frames.depth_um[made.frames.coverage > 0]
+    if float(seen.min()) <= 0:
+        half_um = wide.pixels * wide.pitch_um / 2
+        raise SceneError(
+            f"a frame of {camera.pixels} samples of {camera.pitch_um:g} um with {BLUR_UM:g} um about it reaches to "
+            f"{math.degrees(math.atan(half_um / lens.reduced_um)):.0f} degrees through a lens {lens.reduced_um:.4g} um "
+            "before its sensor, where part of the face lies behind it: take fewer or smaller samples, or a lens "
+            "farther from its sensor"
+        )
     reach = 0.98 * float(seen.min()), 1.02 * float(seen.max())
     optics = lens_imager(lens, camera, reach, fwhm_nm=fwhm_nm)
     inside = slice(margin, margin + camera.pixels)

@@ -18,6 +18,7 @@ from codesign.eye import Camera, Rig, dataset, render
 from metalens import cli, design, lens
 from metalens.cell import Film, Index
 from metalens.design import Focus
+from metalens.ground.errors import SceneError
 from metalens.ground.store import Provenance
 from metalens.lens import Layers
 
@@ -103,3 +104,11 @@ def test_the_command_images_through_a_lens_file(tmp_path, capsys):
     assert "need 0 or more, and --lens" in capsys.readouterr().err
     assert cli.main([*words, "--lens", str(tmp_path / "lens.h5"), "--quiet"]) == 0
     assert {"image.h5", "image.png", "scene.h5"} <= {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
+    """12 samples of 9 um and 16 at each side: 198 um from the axis, 77 degrees at 46 um, past the face's edge."""
+    near = replace(LENS, sensor_distance_um=46.0)
+    states = dataset.states_at(torch.arange(1), 0)
+    with pytest.raises(SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"):
+        imaged.imaged(near, Camera(12, 9.0), Rig(), lambda camera, rig: render(states, rig=rig, camera=camera))
