@@ -41,7 +41,8 @@ class Options(Common):
         pixel_nm: size of a micrograph's pixel; bar_nm: length of its white scale bar, where the pixel is unknown.
         pitch_nm: distance of neighbouring pillars; found in the picture without it.
         edge_bias_nm: by which edges appear outside the true ones, from a calibration sample.
-        crop: rows and columns of the picture to look at (top, bottom, left, right), to leave out bars of text.
+        crop: rows and columns of the picture to look at (top, bottom, left, right), to leave out what is no pillar
+            (a strip of writing below the picture is left out by itself).
     """
 
     source: tyro.conf.Positional[Path]
@@ -119,7 +120,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     """Measure a picture of pillars into the folder: numbers, text, and whether any pillar was measured."""
     whole = picture.read(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
-    image = _cropped(whole, options.crop)
+    image = _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
     found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))
     laid: overlay.Overlay | None = None
     table: overlay.Table = []
@@ -140,6 +141,8 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
     fallen = float(found.collapsed.mean())
     good = bool(np.isfinite(found.diameter_nm).any()) and fallen <= _FALLEN
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
+    if not options.crop and len(image) < len(whole):
+        lines.append(f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise")
     if table and not options.edge_bias_nm:
         lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
     if fallen > _FALLEN:

@@ -9,6 +9,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 _ALIKE = 0.9  # share of pixels whose colours are one grey: the rest is writing in the picture
+_FLAT, _NOISY = 0.5, 0.25  # share of a row's pixels of one value: of a strip, from; of a picture, to
 
 
 def read(path: Path) -> Array:
@@ -29,3 +30,15 @@ def read(path: Path) -> Array:
     if grey < _ALIKE:
         raise CaptureError(f"{path}: in colours ({1 - grey:.0%} of the pixels are not grey); save it in grey")
     return np.asarray(colours[..., 0])
+
+
+def without_strip(image: Array) -> Array:
+    """The picture without the strip of writing that a microscope adds below it.
+
+    Rows of it are of one value but for letters and a bar, where noise gives a picture's rows many. A picture whose own
+    rows are of few values stays as it is.
+    """
+    share = (image == np.median(image, axis=1, keepdims=True)).mean(1)
+    pictured = np.flatnonzero(share < _FLAT)
+    last = int(pictured[-1]) + 1 if len(pictured) else len(image)
+    return image[:last] if np.median(share[:last]) <= _NOISY else image

@@ -191,3 +191,18 @@ def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(tmp_pat
     assert "most sites hold no round pillar: is the lattice of" in told
     assert "--pitch-nm states it" in told
     assert (tmp_path / "out" / "pillars.csv").is_file()
+
+
+def test_writing_below_a_micrograph_changes_no_pillar(tmp_path, capsys):
+    """A strip of 120 rows, high enough for a row of sites, with a bar of 125 pixels: 500 nm, of pixels of 4 nm."""
+    picture = test_sem.render(np.random.default_rng(8).uniform(150, 250, (4, 4)))
+    grey = np.clip(60 + 120 * picture, 0, 254).astype(np.uint8)
+    strip = np.zeros((120, grey.shape[1]), np.uint8)
+    strip[50:56, 20:145] = 255
+    for name, image in (("bare", grey), ("written", np.concatenate([grey, strip]))):
+        tifffile.imwrite(tmp_path / f"{name}.tif", image)
+        scale = ["--pixel-nm", "4"] if name == "bare" else ["--bar-nm", "500"]
+        assert main(["measure", str(tmp_path / f"{name}.tif"), *scale, "-o", str(tmp_path / name)]) == 0
+        assert ("120 rows of writing below" in capsys.readouterr().out) == (name == "written")
+    bare, written = ((tmp_path / name / "pillars.csv").read_text() for name in ("bare", "written"))
+    assert bare == written

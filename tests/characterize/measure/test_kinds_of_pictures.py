@@ -52,6 +52,21 @@ def test_writing_in_a_grey_picture_of_colours_leaves_the_rest(tmp_path):
     assert (found[2:6, 3:15] == 255).all()
 
 
+def test_a_strip_of_writing_below_is_left_out():
+    strip = np.full((9, 31), 12, np.uint8)
+    strip[3:5, 4:17] = 255
+    strip[6, 20:29:2] = 200
+    assert np.array_equal(picture.without_strip(np.concatenate([GREY, strip])), GREY)
+    assert np.array_equal(picture.without_strip(GREY), GREY)
+
+
+def test_dark_gaps_of_a_clean_picture_are_no_strip():
+    """Gaps of nothing, six rows high, between rows of pillars that leave most of a row dark: all of it stays."""
+    y, x = np.indices((60, 70))
+    clean = np.where(np.hypot(y % 20 - 9.5, x % 20 - 9.5) < 7, 200, 0).astype(np.uint8)
+    assert np.array_equal(picture.without_strip(clean), clean)
+
+
 def test_a_coloured_picture_and_a_stack_are_refused_by_name(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", COLOURS * np.array([1, 2, 3], np.uint8), photometric="rgb")
     with pytest.raises(CaptureError, match=r"a.tif: in colours \(\d+% of the pixels are not grey\); save it in grey"):
