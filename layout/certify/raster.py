@@ -80,15 +80,14 @@ def _areas(value: Array, level: Array) -> Array:
     Exact for straight edges of any turn.
     """
     count = len(level)
-    area, whole, corner = np.zeros(count), np.zeros(count + 1), np.empty(3)
+    area, whole, rising = np.zeros(count), np.zeros(count + 1), level[::-1].copy()
     for row in range(value.shape[0] - 1):
         for column in range(value.shape[1] - 1):
             for half in range(2):
-                corner[0], corner[1] = value[row, column + 1], value[row + 1, column]
-                corner[2] = value[row + half, column + half]
-                corner.sort()
-                low, middle, high = corner
-                for k in range(count):
+                a, b, c = value[row, column + 1], value[row + 1, column], value[row + half, column + half]
+                low, high = min(a, b, c), max(a, b, c)
+                middle = max(min(a, b), min(max(a, b), c))
+                for k in range(count - np.searchsorted(rising, high, side="right"), count):  # levels above are none's
                     v = level[k]
                     if v <= low:
                         whole[k] += 0.5
