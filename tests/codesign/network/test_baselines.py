@@ -35,7 +35,7 @@ def test_nvgaze_is_the_stack_of_its_paper():
 
 
 def test_the_nominal_eye_of_the_eyeball_regressor_is_that_of_the_renderer():
-    scenes = EyeScenes(SceneConfig(pixels=48, margin=0, scale=0.0), 24.0, 2000.0, 0)
+    scenes = EyeScenes(SceneConfig(pixels=32, margin=0, scale=0.0), 36.0, 2000.0, 0)
     labels = scenes.rendered(0, 128).labels
     centre = ((labels.centre_um - labels.slip_um) * 1e-3).mean(0)
     torch.testing.assert_close(centre, torch.tensor(NOMINAL_MM, dtype=torch.float64), rtol=0, atol=0.15)  # 5 sigma

@@ -1,5 +1,6 @@
 """An exported graph against the network it was made of: the same numbers in the units that it says, for any batch."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -33,14 +34,30 @@ def _angles_deg(axis, elevation):
     return np.degrees(np.stack([np.arctan2(x, out), np.arcsin(down)], 1))
 
 
-@pytest.mark.parametrize(("resolution", "size"), [(1.0, 61), (0.6, 100)])
-def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(net, tmp_path, resolution, size):
+CASES = [(1.0, 61), (0.6, 100)]  # resolution, size
+
+
+@pytest.fixture(scope="module")
+def graphs(net, tmp_path_factory):
+    """Of each case its architecture, its network and its file."""
+    pytest.importorskip("onnx")
+    made = {}
+    for resolution, size in CASES:
+        chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
+        recalibrate(net, chosen, [_frames(4, size)])
+        path = tmp_path_factory.mktemp("graph") / "n.onnx"
+        exported.write(path, Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
+        made[resolution, size] = chosen, copy.deepcopy(net), path
+    return made
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(graphs, case):
     """Levels of a sensor, 512 with a spread of 90, in place of standardised frames; batches of one and three."""
     onnxruntime = pytest.importorskip("onnxruntime")
-    chosen = dataclasses.replace(arch.smallest(SPACE), resolution=resolution)
-    recalibrate(net, chosen, [_frames(4, size)])
-    exported.write(tmp_path / "n.onnx", Subnet(net, chosen), SCALE, size=size, pitch_um=30.0)
-    session = onnxruntime.InferenceSession(tmp_path / "n.onnx")
+    _, size = case
+    chosen, net, path = graphs[case]
+    session = onnxruntime.InferenceSession(path)
     for count in (1, 3):
         plain = _frames(count, size, seed=count)
         plain = (plain - plain.mean((2, 3), keepdim=True)) / plain.std((2, 3), keepdim=True)
@@ -63,13 +80,13 @@ def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(net, tmp_path
     assert session.get_outputs()[5].shape == ["batch", 2]
 
 
-def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(net, tmp_path):
-    onnx = pytest.importorskip("onnx")
-    chosen = arch.smallest(SPACE)
+def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(graphs, tmp_path):
+    import onnx
+
+    chosen, net, path = graphs[CASES[0]]
     bare = dataclasses.replace(SCALE, axis=False, points=False)
-    for name, scale in (("a", SCALE), ("b", bare)):
-        exported.write(tmp_path / name, Subnet(net, chosen), scale, size=64, pitch_um=30.0)
-    whole, cut = (onnx.load(tmp_path / name) for name in "ab")
+    exported.write(tmp_path / "bare", Subnet(net, chosen), bare, size=61, pitch_um=30.0)
+    whole, cut = (onnx.load(name) for name in (path, tmp_path / "bare"))
     onnx.checker.check_model(whole, full_check=True)
     assert [v.name for v in cut.graph.output] == ["mask_logits", "pupil_mm", "slip_mm", "slip_sd_mm"]
     assert {v.name: v.doc_string[-2:] for v in whole.graph.output if v.name.endswith("_mm")} == dict.fromkeys(
@@ -77,4 +94,4 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(net, tmp_
     ) | {"points_mm": "mm"}
     assert whole.graph.output[5].doc_string.endswith("deg")
     about = {p.key: float(p.value) for p in whole.metadata_props}
-    assert about == {"pixels": 64, "pitch_um": 30.0, "frame_mm": 1.87, "elevation_rad": 0.6}
+    assert about == {"pixels": 61, "pitch_um": 30.0, "frame_mm": 1.87, "elevation_rad": 0.6}

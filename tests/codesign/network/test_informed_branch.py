@@ -43,7 +43,8 @@ def test_what_a_corner_shows_is_told_to_the_windows_around_it_alone():
     with torch.no_grad():
         for block in branch.together[1::2]:
             block.give.weight.zero_()  # what is told of the whole frame
-        moved = (branch(frames, changed)[0] - branch(frames, content)[0]).abs().amax((0, 1)) > 0
+        moved = (branch(frames, changed)[0] - branch(frames, content)[0]).abs().amax((0, 1)) > 3e-7
+    # ten roundings of single precision at answers of 0.4; the least that is told moves one by 3e-6
     reach = 1 + blur.BLOCKS * (blur.REACH // 2)
     wanted = torch.zeros(blur.GRID, blur.GRID, dtype=torch.bool)
     wanted[:reach, -reach:] = True

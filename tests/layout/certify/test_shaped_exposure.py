@@ -38,7 +38,7 @@ NAMES = ("alpha_um", "beta_um", "eta", "gamma_um", "nu")
 def lens(shape, lattice, sizes, turned, empty=0.25):
     """Sizes at random on a round aperture off the centre, a share of the sites empty."""
     pitch, rng = 0.4, np.random.default_rng(23)
-    rows, columns = (21, 33) if lattice.centred else (13, 11) if turned else (19, 17)  # each turn has its own polygon
+    rows, columns = (21, 33) if lattice.centred else (9, 11) if turned else (19, 17)  # each turn has its own polygon
     row_um = 0.346 if lattice.centred else None
     d = np.rint(1e3 * rng.uniform(*sizes, (rows, columns))) * 1e-3
     y, x = np.arange(rows)[:, None] - (rows - 1) / 2, np.arange(columns) - (columns - 1) / 2
