@@ -125,7 +125,7 @@ def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance
         if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
             break
         nodes = _asked(source, spans, stack, tolerance / 2)
-    return stack
+    return dataclasses.replace(stack, reason=stack.reason + spectra.beyond(source, lens.proxy.wavelengths_um))
 
 
 def _asked(source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float) -> Nodes:

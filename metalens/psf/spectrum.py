@@ -235,6 +235,20 @@ def points(source: Source | Measured) -> tuple[Array, Array]:
     return (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
 
 
+def beyond(source: Source | Measured, within_um: tuple[float, float]) -> str:
+    """Words for light of a diode outside of what pillars are known for, which its wavelengths within stand for; empty
+    where that is less than 1e-4 of it, or the pillars are known at one wavelength."""
+    low, high = within_um
+    um, share = points(source)
+    outside = float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
+    if not high > low or outside < 1e-4:
+        return ""
+    return (
+        f"; {outside:.2g} of the light lies beyond {low * 1e3:g} to {high * 1e3:g} nm, where the pillars are not "
+        "known, and is taken by the wavelengths within: sweep a library over the spectrum"
+    )
+
+
 class _Judge:
     """Means of exp(2πi·path/λ) over a spectrum, of paths from 0 to the largest."""
 

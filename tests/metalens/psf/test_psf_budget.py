@@ -226,6 +226,21 @@ def test_rows_of_a_spectrum_may_come_in_any_order_with_gaps_and_dark_between(tmp
     assert found.share @ found.wavelengths_um * 1e3 == pytest.approx(areas @ middles / areas.sum(), rel=1e-12)  # exact
 
 
+def test_light_of_a_diode_beyond_the_library_is_told():
+    """A line of 20 nm at 850 nm, known to 12 nm below and 17 nm above: two tails of a normal distribution."""
+    diode = spectrum.Source(850.0, 20.0)
+    told = spectrum.beyond(diode, (0.838, 0.867))
+    deviation = 20.0 / math.sqrt(8 * math.log(2))
+    tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (12, 17))
+    share, words = told[2:].split(" of the light lies beyond ")
+    assert float(share) == pytest.approx(
+        tails, rel=0.05
+    )  # two digits; silicon weighs the blue by 4 % more, the red less
+    assert words.startswith("838 to 867 nm, where the pillars are not known")
+    assert spectrum.beyond(diode, (0.8, 0.9)) == ""
+    assert spectrum.beyond(diode, (0.85, 0.85)) == ""
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_estimate_holds_in_single_precision_where_windows_are_dim_or_tiny(seed):
     """Random phases, windows of 1 to 20 samples beside the light, tolerances down to 1e-6: never below the truth."""
