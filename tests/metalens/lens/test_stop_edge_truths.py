@@ -50,7 +50,7 @@ def test_places_behind_an_edge_have_the_mean_of_fresnels_integrals_over_their_wi
     assert np.abs(got - want).max() < 2e-5  # table and series, 1e-7, times w of up to 9 over half widths of 0.02
     some = edge.behind((x[6:8, None], y[6]), width[6], ray, (along, across), radius, WAVE)
     assert some.shape == (2, 1)
-    assert abs(some[0, 0] - got[6]) < 1e-12  # rounding of phases of up to 130 rad, lane by lane
+    assert abs(some[0, 0] - got[6]) < 1e-12  # rounding of phases of up to 130 rad
 
 
 def test_the_wave_of_an_edge_and_its_integral():
