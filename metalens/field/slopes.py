@@ -74,10 +74,10 @@ class _ByNodes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        stack, taps, first, rows, columns, *sources = ctx.saved_tensors
+        stack, taps, first, rows, columns, *sources = tuple[Tensor, ...](ctx.saved_tensors)
         of_stack, of_taps, *_ = ctx.needs_input_grad
         of_sources = of_taps or any(ctx.needs_input_grad[5:])
-        light, high, wide = torch.stack(sources, 1), *stack.shape[-2:]
+        light, (high, wide) = torch.stack(sources, 1), stack.shape[-2:]
         out = gradient.new_zeros(stack.shape)
         back = torch.zeros_like(light), torch.zeros_like(taps)
         every = range(stack.shape[0] * stack.shape[1])
