@@ -208,10 +208,9 @@ def shortfall(proxy: Proxy, wanted: Wanted) -> str:
         return ""
     phase, level = wanted.tolerances
     return (
-        f"the proxy follows the phase within {proxy.max_phase_error_rad:.1e} rad and |T| within "
-        f"{proxy.max_transmission_error:.1e}, where {phase:.2g} and "
-        f"{level:.2g} are wanted: sweep with more samples, or loosen phase_tolerance_rad and "
-        "transmission_tolerance"
+        f"the proxy follows the phase within {proxy.max_phase_error_rad:.3g} rad and |T| within "
+        f"{proxy.max_transmission_error:.3g}, where {phase:.3g} and {level:.3g} are wanted: sweep with more samples, "
+        "or loosen phase_tolerance_rad and transmission_tolerance"
     )
 
 

@@ -17,7 +17,7 @@ from metalens.pillars import axes
 
 FOLDER = Path(__file__).parents[3] / "examples" / "cells"
 FILES = sorted(FOLDER.glob("*.toml"))
-COARSE = {"samples": 40, "tolerance": 5e-2}  # the hexagonal cell needs its 200 samples: its proxy has 28 coefficients
+COARSE = {"samples": 80, "tolerance": 1e-2}  # of 40, more than half of the error would be the proxy's, and be refused
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
@@ -68,7 +68,7 @@ def chained(folder, name, library, capsys, **sweep):
 
 @pytest.mark.slow
 def test_silicon_on_sapphire_from_toml_to_mask(tmp_path, capsys):
-    found = chained(tmp_path, "si_on_sapphire_1550", "si.h5", capsys, **COARSE)
+    found = chained(tmp_path, "si_on_sapphire_1550", "si.h5", capsys)
     assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(15 / 50)), rel=0.01)
     assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
     assert found["focus_passed"]
@@ -84,7 +84,7 @@ def test_titania_lens_from_toml_to_mask(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_rectangles_with_geometric_phase_from_toml_to_mask(tmp_path, capsys):
-    found = chained(tmp_path, "a_si_rectangle_940", "rectangle.h5", capsys, **COARSE)
+    found = chained(tmp_path, "a_si_rectangle_940", "rectangle.h5", capsys)
     assert found["numerical_aperture"] == pytest.approx(math.sin(math.atan(30 / 100)), rel=0.01)
     assert found["focus_passed"]
     light = found["circular"]
