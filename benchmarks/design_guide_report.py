@@ -244,10 +244,7 @@ def told_of(design: dict[str, Any]) -> str:
     end = f"kept after {design['turn']}, {design['apart_rad']:.2f} rad rms from the start" if design["turn"] else (
         "kept the start: its runs are those of that lens"
     )  # fmt: skip
-    before = "" if "image" in design else (  # of lines made before the derivative of an image was that of all its nodes
-        " On an image to 0.2, along a gradient through few kernels, which is off by half and more: due again."
-    )  # fmt: skip
-    return f"Training of `{design['design']}`: axial {read}, on the frames that choose; {end}.{before}\n"
+    return f"Training of `{design['design']}`: axial {read}, on the frames that choose; {end}.\n"
 
 
 def ladder_table(rungs: dict[str, list[dict[str, Any]]], bounds: dict[str, float]) -> list[str]:

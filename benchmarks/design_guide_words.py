@@ -15,9 +15,10 @@ that of the elastic network, further down.
 Made by `python -m benchmarks.design_guide run --work DIR`, and `report`; `--only CELL/SEED` reruns one. All numbers,
 and the coefficients of the trained lenses, are in `benchmarks/results/design_guide.json`.
 
-The lenses of the oblique field at 30 nm (`focus150`, `oblique40`, the one trained from it, `stop150`) are read by the
-reader of today, whose branch sees how steps of brightness are spread; all other rows, and the runs that chose, are of
-the one before, and due again.
+The lenses of `angle`, of `line` and of the oblique field are read by the reader of today, whose branch sees how steps
+of brightness are spread. The rows of one knob, the ring, the elastic network's, and the runs that chose for the oblique
+field at 30 nm are of the one before, and due again. Today's reader would choose `focus1000` there (0.98 mm, `focus150`
+1.00) and `oblique150` (0.97, `oblique40` 1.00); such a run alone is known to ±0.09 mm.
 """
 FIELD = """
 ## Field and light of the device
