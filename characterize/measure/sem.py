@@ -59,13 +59,15 @@ class Diameters:
 
     @property
     def mean_nm(self) -> float:
-        """Mean diameter of the good pillars."""
-        return float(np.nanmean(self.diameter_nm))
+        """Mean diameter of the good pillars; nan without one."""
+        good = np.isfinite(self.diameter_nm)
+        return float(self.diameter_nm[good].mean()) if good.any() else math.nan
 
     @property
     def three_sigma_nm(self) -> float:
-        """Three standard deviations of the good pillars (CD uniformity)."""
-        return float(3 * np.nanstd(self.diameter_nm))
+        """Three standard deviations of the good pillars (CD uniformity); nan without one."""
+        good = np.isfinite(self.diameter_nm)
+        return float(3 * self.diameter_nm[good].std()) if good.any() else math.nan
 
     def bias(self, designed_nm: Array | float) -> Known:
         """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with its standard error."""

@@ -178,7 +178,7 @@ def settled(
             last = change = float(np.abs(after[:slow] - e[:slow]).max())
             e = after
             if change < aim:
-                return e
+                return even(e, signs)
         else:
             rows = e[:slow] @ e
             rows *= weight[:slow]
@@ -189,6 +189,13 @@ def settled(
         if not change <= 2 * first:
             return None
     return None
+
+
+def even(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """A matrix made symmetric with respect to the signs to the last bit: products of some processors are not, and what
+    is left of the difference is light that is lost."""
+    mirror = (signs[:, None] * signs).astype(e.dtype) * e.T
+    return np.asarray((e + mirror) / 2)
 
 
 def squared(e: np.ndarray, signs: np.ndarray) -> np.ndarray:

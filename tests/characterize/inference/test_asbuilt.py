@@ -239,7 +239,7 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
 def test_samples_have_the_posterior_covariance(fitted):
     draws = fitted.samples(20000, seed=0)
     assert np.abs(np.cov(draws.T) - fitted.covariance).max() < 0.05 * np.diag(fitted.covariance).max()
-    assert fitted.sigma == pytest.approx(draws.std(0), rel=0.03)  # 20 000 draws: 0.5 %, the largest of 30: 1.6 %
+    assert fitted.sigma == pytest.approx(draws.std(0), rel=0.05)  # 20 000 draws: 1.6 %; the posterior bends
     sigma, draws = np.sqrt(np.diag(fitted.covariance)), fitted.lens_samples(20000, seed=3)
     own = fitted.within_covariance + fitted.bench  # what the mask takes along is not drawn anew
     assert np.abs((np.cov(draws.T) - own) / np.outer(sigma, sigma)).max() < 0.05

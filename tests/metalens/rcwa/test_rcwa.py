@@ -301,7 +301,7 @@ def test_many_diameters_are_what_each_one_is_alone():
     many = rcwa.solve_many(CELL, [0.0, 0.1, 0.25], WAVELENGTH, tolerance=0.1)
     for diameter, got in zip([0.0, 0.1, 0.25], many, strict=True):
         alone = rcwa.solve(CELL, diameter, WAVELENGTH, tolerance=0.1)
-        assert abs(alone.t - got.t) < ROUNDING
+        assert abs(alone.t - got.t) < 1e-10  # eigenvalues of matrices side by side: 2e-12 on one processor
         assert alone.orders == got.orders
 
 
