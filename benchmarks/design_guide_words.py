@@ -17,8 +17,7 @@ and the coefficients of the trained lenses, are in `benchmarks/results/design_gu
 
 The lenses of `angle`, of `line` and of the oblique field are read by the reader of today, whose branch sees how steps
 of brightness are spread. The rows of one knob, the ring, the elastic network's, and the runs that chose for the oblique
-field at 30 nm are of the one before, and due again. Today's reader would choose `focus1000` there (0.98 mm, `focus150`
-1.00) and `oblique150` (0.97, `oblique40` 1.00); such a run alone is known to ±0.09 mm.
+field at 30 nm are of the one before, and due again.
 """
 FIELD = """
 ## Field and light of the device

@@ -111,7 +111,15 @@ def read_images(path: Path, colours: Colours = _PLAIN, *, grey: bool = False) ->
     Raises:
         CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or a channel without colour.
     """
-    images = colours.pick(read_all(path, colours), path, grey=grey)
+    return sound(colours.pick(read_all(path, colours), path, grey=grey), path)
+
+
+def sound(images: Array, path: Path) -> Array:
+    """Images as they are.
+
+    Raises:
+        CaptureError: empty, of numbers that hold no counts, or non-finite.
+    """
     if images.size == 0:
         raise CaptureError(f"{path}: images of shape {images.shape} are empty")
     _check_values(images, path)

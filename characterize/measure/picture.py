@@ -24,7 +24,7 @@ def read(path: Path) -> Array:
     if len(images) != 1:
         raise CaptureError(f"{path}: {len(images)} pictures; need one")
     if images.ndim == 3:
-        return np.asarray(capture.read_images(path)[0])
+        return np.asarray(capture.sound(images, path)[0])
     colours = images[0, ..., :3]
     grey = (colours == colours[..., :1]).all(-1).mean()
     if grey < _ALIKE:

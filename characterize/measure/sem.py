@@ -58,16 +58,18 @@ class Diameters:
     lattice: Lattice
 
     @property
+    def _good_nm(self) -> Array:
+        return np.asarray(self.diameter_nm[np.isfinite(self.diameter_nm)])
+
+    @property
     def mean_nm(self) -> float:
         """Mean diameter of the good pillars; nan without one."""
-        good = np.isfinite(self.diameter_nm)
-        return float(self.diameter_nm[good].mean()) if good.any() else math.nan
+        return float(self._good_nm.mean()) if self._good_nm.size else math.nan
 
     @property
     def three_sigma_nm(self) -> float:
         """Three standard deviations of the good pillars (CD uniformity); nan without one."""
-        good = np.isfinite(self.diameter_nm)
-        return float(3 * self.diameter_nm[good].std()) if good.any() else math.nan
+        return float(3 * self._good_nm.std()) if self._good_nm.size else math.nan
 
     def bias(self, designed_nm: Array | float) -> Known:
         """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with its standard error."""
