@@ -74,11 +74,12 @@ class Solver:
 
 
 def test_entries_share_the_step_of_the_longer_range():
+    rounding = 1e-14  # a step, its multiple and a sum below 1: 1e-16 each
     x, y = solving.entries(swept((0.1, 0.4), (0.2, 0.27), 25))  # 0.3 in 24 steps of 0.0125: 0.07 holds 5 of them
-    assert x == pytest.approx(0.1 + 0.0125 * np.arange(25), abs=1e-15)
-    assert y == pytest.approx([0.2, 0.2125, 0.225, 0.2375, 0.25, 0.2625], abs=1e-15)
+    assert x == pytest.approx(0.1 + 0.0125 * np.arange(25), abs=rounding)
+    assert y == pytest.approx([0.2, 0.2125, 0.225, 0.2375, 0.25, 0.2625], abs=rounding)
     x, y = solving.entries(swept((0.3, 0.41), (0.1, 0.32), 21))
-    assert x == pytest.approx(np.linspace(0.3, 0.41, 11), abs=1e-15)
+    assert x == pytest.approx(np.linspace(0.3, 0.41, 11), abs=rounding)
     assert x[-1] <= 0.41
     assert len(y) == 21
 
