@@ -26,8 +26,7 @@ from metalens.ground.arrays import Array
 
 _CLOSE = 0.25  # sigma of a last step, which is not tried: slopes that hold are right to a tenth of it
 _SHORT = 0.15  # of the way from the mode, that such a step may go: on a flat tail a quarter of a sigma goes far
-_NEAR = 0.6  # sigma of a step from which on slopes must hold
-_STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell, in all, while these are said to hold
+_STRAIGHT = 0.6  # sigma by which images may miss what slopes foretell while these hold; for shorter steps they must
 _FAR = 1.25  # times the goal: a step at most
 _TURNS, _MOST_TURNS = 20, 40  # where steps go to and fro, and where they still go on
 _ALIKE = 0.05  # sigma within which a mode and a walk foretell the same end
@@ -128,7 +127,7 @@ def end(
             way.seen[float(here.x[i])] = max(least - way.lowest, 0.0)
         close = size < _CLOSE and _short(step[i], here.x[i] + step[i] - valley.mode[i], most)
         held = missed <= _STRAIGHT and not (close and missed > 0 and here.misfit > way.lowest + (goal + _CLOSE) ** 2)
-        again = not held and (size < _NEAR or back)
+        again = not held and (size < _STRAIGHT or back)
         given_up = not again and _at_most(sign * here.x[i], sign * step[i] * max(1.0, size / far)) < beyond
         if way.steps and ((held and close) or given_up):
             return way.ended(float(here.x[i] + step[i]))

@@ -309,6 +309,30 @@ def test_a_place_above_the_level_is_no_end_while_slopes_do_not_hold():
     assert found.place == pytest.approx(1.96, rel=1e-6)
 
 
+@pytest.mark.parametrize(("missed", "left", "onward"), [(0.65, 0.55, 0), (0.55, 0.55, 1), (0.65, 0.65, 1)])
+def test_slopes_that_missed_more_than_is_left_to_go_are_asked_for_anew(missed, left, onward):
+    """r = (x, d) but (0, 0) at the mode, a parameter of steps of 1 at most: the first misses d of the images, and by
+    the least change that explains it lengthens r = (1, d) with x. What is left to go is then goal - √(1 + d²): where
+    it is less than 0.6, slopes that missed by more say nothing of it; else a step is worth its image."""
+    asked = []
+
+    class Torn:
+        mode, bottom, least, above, slopes = np.zeros(1), np.zeros(2), 0.0, 0.0, np.array([[1.0], [0.0]])
+        prior = Prior(np.zeros(1), np.full(1, np.inf), np.full(1, -9.0), np.full(1, 9.0))
+
+        def residual(self, x):
+            return np.array([x[0], missed * (x[0] > 0)])
+
+        def slopes_at(self, x, rest):
+            asked.append(float(x[0]))
+            return self.slopes
+
+    length = math.hypot(1, missed)
+    found = ends.end(Torn(), 0, 1, length + left, most=1.0)
+    assert found.place == pytest.approx(math.sqrt((length + left) ** 2 - missed**2), rel=1e-6)
+    assert asked[0] == pytest.approx(1 + onward * left / length)
+
+
 def test_a_mode_begins_first_where_it_foretells_what_the_walk_does_and_begins_count_by_a_tenth_of_a_sigma(monkeypatch):
     """It reaches 2 + 2 · 1: within a twentieth of its sigma of 4.04, not of 4.06; the other mode, 3 above, 2.5 + 1 · 2.
     A begin that reaches 0.09 sigma beyond the first one's end is not worth it."""

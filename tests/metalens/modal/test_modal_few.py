@@ -102,6 +102,22 @@ def test_a_root_that_single_precision_holds_takes_no_steps_in_double():
     assert np.abs(signs[:, None] * quick - (signs[:, None] * quick).T).max() == 0  # so the matrix stays unitary
 
 
+@pytest.mark.parametrize(("square", "change", "ends"), [(0.89, 2.7e-7, True), (0.88, 4.2e-7, False)])
+def test_single_precision_ends_at_the_first_step_below_a_few_of_its_roundings(square, change, ends):
+    """Of one level 1, E = (square - 1 - E²) / 2: each step leaves E times the change of the one before. 3e-7 is asked,
+    five halves of the rounding of 1: a fourth step that changes less is the last, and 0.06 of it is left; after one
+    that changes more there is another, which leaves no more than rounding."""
+    e = [(square - 1) / 2]
+    for _ in range(4):
+        e.append((square - 1 - e[-1] ** 2) / 2)
+    assert e[3] - e[4] == pytest.approx(change, rel=0.02)  # two digits
+    exact = np.sqrt(square) - 1
+    found = root(np.array([[square]]), np.ones(1), 1.0, 4e-8)[0, 0] - 1
+    close = 4e-9  # 0.06 is told to 1.9e-9, and a step that begins with that rounding ends with one of its own
+    assert abs(found - (e[4] if ends else exact)) < close
+    assert e[4] - exact > 3 * close
+
+
 def test_root_of_levels_wider_apart_than_single_precision_counts():
     random = np.random.default_rng(5)
     level = np.geomspace(10.0, 1e12, 24)  # the roots of single precision are 0.1 off at the upper end
