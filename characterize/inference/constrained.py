@@ -1,4 +1,4 @@
-"""The least of a quadratic inside limits: between bounds by BVLS (SciPy), inside a ball by SLSQP (NLopt); one led."""
+"""The least of a quadratic inside limits: between bounds by active sets, inside a ball by SLSQP (NLopt); one led."""
 
 import contextlib
 import math
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import nlopt
 import numpy as np
-from scipy import optimize
 
 from metalens.ground.arrays import Array
 
-_KNOWN = 1e-14  # of the largest eigenvalue
+_KNOWN, _PLAIN = 1e-14, 1e-12  # of the largest eigenvalue: what is known, and where elimination solves as it stands
+_ROUNDING = 2 * float(np.finfo(float).eps)  # of each term of a sum
+_RELEASES = 3  # of each parameter: each is lower than the last, so that no active set comes back but by rounding
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,7 +35,10 @@ class Ball:
 
 
 def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those that stop it (Stark, Parker 1995).
+    """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those that stop it.
+
+    By active sets (Lawson and Hanson 1974, ch. 23; both sides: Stark and Parker 1995): the least over what is free,
+    until no held one is drawn inside, to rounding.
 
     Clipping the free minimum to the bounds is not it where parameters go together: what one may not do, others do. Nor
     is what stays when all that the free minimum violates are held at once: some of them leave for others alone.
@@ -44,17 +48,72 @@ def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array
         gradient, low, high: (p,); bounds may be infinite, and touch.
     """
     own = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-    values, vectors = np.linalg.eigh(curvature / np.outer(own, own))
-    some = values > _KNOWN * values[-1]
-    root = np.sqrt(values[some])
-    matrix, wanted = (vectors[:, some] * root).T, -(vectors[:, some].T @ (gradient / own)) / root
-    out, loose = np.clip(np.zeros(len(own)), low, high), high > low
-    limits = low[loose] * own[loose], high[loose] * own[loose]
-    rest = wanted - matrix[:, ~loose] @ (out[~loose] * own[~loose])
-    found = optimize.lsq_linear(matrix[:, loose], rest, limits, method="bvls", tol=1e-12, max_iter=20 * len(own))
-    held = np.where(found.active_mask < 0, low[loose], high[loose])
-    out[loose] = np.where(found.active_mask == 0, np.clip(found.x / own[loose], low[loose], high[loose]), held)
-    return out
+    equal, slope = curvature / np.outer(own, own), gradient / own
+    values, vectors = np.linalg.eigh(equal)
+    unknown = vectors[:, values <= _KNOWN * values[-1]]
+    plain = values[0] > _PLAIN * values[-1]
+    x = _Bounded(equal, slope - unknown @ (unknown.T @ slope), low * own, high * own, plain).least()
+    return np.where(x == low * own, low, np.where(x == high * own, high, np.clip(x / own, low, high)))
+
+
+class _Bounded:
+    """The least xᵀKx / 2 + qᵀx between bounds, K of unit diagonal: where x (p,) is, and which of it are free."""
+
+    def __init__(self, curvature: Array, gradient: Array, low: Array, high: Array, plain: bool) -> None:
+        self._curvature, self._gradient, self._low, self._high, self._plain = curvature, gradient, low, high, plain
+        self._x, self._free = np.clip(np.zeros(len(low)), low, high), high > low
+
+    def least(self) -> Array:
+        """Begun with all held that would leave; one at a time is released, the one that is drawn inside the most."""
+        leave = self._free
+        while leave.any():
+            goal = self._x + self._move()
+            leave = self._free & ((goal < self._low) | (goal > self._high))
+            self._x, self._free = np.clip(goal, self._low, self._high), self._free & ~leave
+        tried, settled = np.zeros(len(self._x), bool), False
+        for _ in range(_RELEASES * len(tried)):
+            inward = np.where(tried, 0, self._inward())
+            i = int(np.argmax(inward))
+            release = inward[i] > 0
+            if settled and not release:
+                break
+            before, pull, settled = self._x, self._pull(), not release  # once more: the rounding of a long way
+            self._free[i] |= release
+            self._settle()
+            way = self._x - before
+            lower = way @ (pull - self._curvature @ way / 2) > 0
+            tried &= not lower
+            tried[i] |= release and not lower
+        return self._x
+
+    def _pull(self) -> Array:
+        return np.asarray(-self._gradient - self._curvature @ self._x)
+
+    def _inward(self) -> Array:
+        """(p,) pull towards the inside, beyond its rounding, of those on one of their two bounds."""
+        held, terms = ~self._free & (self._high > self._low), np.abs(self._curvature) @ np.abs(self._x)
+        rounding = (np.abs(self._gradient) + terms) * _ROUNDING * len(terms)
+        return np.where(held, np.where(self._x == self._low, 1, -1) * self._pull() - rounding, 0)
+
+    def _move(self) -> Array:
+        """(p,) to the least over what is free, with no regard to bounds."""
+        move, free = np.zeros(len(self._x)), self._free
+        inner, pull = self._curvature[np.ix_(free, free)], self._pull()[free]
+        move[free] = np.linalg.solve(inner, pull) if self._plain else np.linalg.lstsq(inner, pull, rcond=_KNOWN)[0]
+        return move
+
+    def _settle(self) -> None:
+        """To the least over what is free; what meets a bound on the way is held there."""
+        while self._free.any():
+            move = self._move()
+            room = np.where(move > 0, self._high, self._low) - self._x
+            share = np.divide(room, move, out=np.full(len(move), np.inf), where=move != 0)
+            first = int(np.argmin(share))
+            self._x = np.clip(self._x + min(share[first], 1.0) * move, self._low, self._high)
+            if share[first] >= 1:
+                return
+            self._x[first] = (self._high if move[first] > 0 else self._low)[first]
+            self._free[first] = False
 
 
 class Led:

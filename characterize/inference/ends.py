@@ -18,7 +18,7 @@ import numpy as np
 
 from characterize.inference import constrained
 from characterize.inference.leastsquares import Prior, Solution
-from characterize.inference.posterior import PARABOLIC, REACH, Spot, Valley
+from characterize.inference.posterior import PARABOLIC, REACH, Spot, Valley, secant
 from characterize.inference.search import Task
 from characterize.inference.walk import Walk
 from metalens.ground import threads
@@ -208,10 +208,7 @@ def _moved(valley: Valley, here: Spot, step: Array) -> tuple[Spot, float]:
     """After a step, slopes changed by the least that explains it (Broyden 1965), and by how many sigma it missed."""
     after = valley.residual(here.x + step)
     missed = after - here.rest - here.slopes @ step
-    measure = here.slopes.T @ (here.slopes @ step)
-    along = max(float(step @ measure), 1e-300)
-    slopes = here.slopes + np.multiply.outer(missed, measure / along)
-    return Spot(here.x + step, after, slopes), float(np.linalg.norm(missed))
+    return Spot(here.x + step, after, secant(here.slopes, step, missed)), float(np.linalg.norm(missed))
 
 
 def _there(valley: Valley, x: Array) -> Spot:

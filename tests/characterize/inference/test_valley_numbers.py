@@ -95,6 +95,19 @@ def test_slopes_that_are_wrong_by_a_factor_are_right_after_one_step(factor, left
     assert got[0] == pytest.approx(4.0 * left, abs=2e-5)
 
 
+@pytest.mark.parametrize("sigma", [0.0099, 0.0101, 1.7])
+def test_slopes_explain_what_a_step_missed_by_the_least_change_and_stay_after_one_that_tells_nothing(sigma):
+    """By the secant, and not at all for steps that no information has in common with this one (Broyden 1965)."""
+    rng = np.random.default_rng(9)
+    missed, step, other = rng.normal(size=70), rng.normal(size=3), rng.normal(size=3)
+    step *= sigma / np.linalg.norm(COLUMNS @ step)
+    metric = COLUMNS.T @ COLUMNS
+    other -= (other @ metric @ step) / (step @ metric @ step) * step
+    got = posterior.secant(COLUMNS, step, missed) - COLUMNS
+    assert got @ other == pytest.approx(0, abs=1e-12 / sigma)
+    assert got @ step == pytest.approx(missed * (sigma > 0.01), abs=1e-12)
+
+
 CURVES = RNG.normal(size=(3, *SHAPE))
 BENT = 0.11
 
