@@ -18,7 +18,6 @@ from metalens.field.points import Optics, Window, psfs, sampling
 from metalens.field.waves import PillarWave
 from metalens.psf import Nodes, Polarisation, psf_stack
 
-JUDGE = 3e-4  # tolerance of the PSFs of every pillar
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
 
 
@@ -143,5 +142,5 @@ def _of_pillars(
     }
     chief = propagate.case(tuple(t.shape), **about | {"layers": optics.layers.open}).centre_um
     offset = [float(a) - b for a, b in zip(place, chief, strict=True)]
-    made = psf_stack(torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False, tolerance=JUDGE)
+    made = psf_stack(torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False)
     return torch.as_tensor(made.intensity).double()

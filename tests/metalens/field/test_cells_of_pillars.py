@@ -71,7 +71,7 @@ def missing(made):
 
 @pytest.mark.parametrize("levels", [None, 8])
 def test_what_cells_of_pillars_leave_out_is_what_sums_over_all_pillars_have(levels):
-    """Eight diameters scatter a third of the light about the spot. The judge's own parts: 3e-4 of the sums, 5e-4 of
+    """Eight diameters scatter a third of the light about the spot. The judge's own parts: 1e-4 of the sums, 5e-4 of
     triangles on points of half Nyquist's step."""
     stated, true = missing(lens(levels=levels))
     assert true == pytest.approx(2.8e-2 if levels else 3.6e-3, rel=0.1)
