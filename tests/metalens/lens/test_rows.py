@@ -7,7 +7,7 @@ import pytest
 from metalens import lens as lenses
 from metalens.cell import Cell
 from metalens.ground.errors import LensError, MetalensError
-from metalens.lens import record
+from metalens.lens import Layers, Stop, record
 from metalens.lens.record import DiameterMap, Lens
 from metalens.lens.rows import RowsOnDisk
 from metalens.pillars import Proxy
@@ -41,9 +41,13 @@ def test_ends_and_all_of_it(stored):
     assert (len(rows), rows.shape, rows.dtype) == (53, values.shape, values.dtype)
 
 
+IRIS = Layers(stop=Stop(7.5, 13.0, (0.7, -1.1)))  # and no film
+
+
 def write(path, d):
     proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
-    lenses.save(path, Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"))
+    about = (0.85, 500.0, float("inf"), "hyperbolic")
+    lenses.save(path, Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, *about, layers=IRIS))
 
 
 def test_a_large_lens_stays_in_its_file(tmp_path, monkeypatch):
@@ -55,6 +59,7 @@ def test_a_large_lens_stays_in_its_file(tmp_path, monkeypatch):
     assert isinstance(large.diameters.diameter_um, RowsOnDisk)
     assert large.diameters.radius_um == small.diameters.radius_um
     assert (large.profile, large.wavelength_um) == (small.profile, small.wavelength_um)
+    assert large.layers.stop == small.layers.stop == IRIS.stop
 
 
 def test_a_bad_diameter_and_a_damaged_file_are_refused(tmp_path, monkeypatch):
