@@ -26,7 +26,7 @@ def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-unt
         out: (y, kernels, few, x).
     """
     few, wide = out.shape[1], out.shape[3]
-    weights, energy = tables[0][:, :, first : first + few], tables[1]
+    weights, energy = tables[0][:, :, first:], tables[1]
     depths = weights.shape[1]
     n = min(4, depths)
     last = n - 1
