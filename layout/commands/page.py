@@ -17,6 +17,7 @@ from metalens.ground.report import Figure, KeyFigure, Section, Table
 from metalens.ground.units import nm
 
 _LISTED = 40  # write fields in the report
+_ROWS = 1024  # of the lens that are counted at once
 
 
 def drawn(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
@@ -58,11 +59,13 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
 
 
 def _lead(job: Job) -> str:
-    source = job.source
+    source, lattice = job.source, job.plan.lattices[0]
+    own = sum(int(np.count_nonzero(block)) for _, block in lattice.blocks(_ROWS))
+    die = f" ({job.drc.pillars:,} on the die, with its test arrays)" if job.drc.pillars != own else ""
     return (
         f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
         f"{2 * job.made.radius_um / 1e3:.4g} mm "
-        f"across, as {job.drc.pillars:,} pillars in {len(job.plan.classes)} cells; process “{job.process.name}”."
+        f"across, as {own:,} pillars{die} in {len(job.plan.classes)} cells; process “{job.process.name}”."
     )
 
 

@@ -196,7 +196,10 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
             *_proxy_lines(fitted),
         ]
     if not (made.converged or any(failure.startswith(_above(made)) for failure in failures)):
-        lines.append(f"  {_above(made)}, which is what the solver reaches elsewhere: beside resonances as a rule")
+        lines.append(
+            f"  {_above(made)}, which the file does not state: beside resonances as a rule, "
+            "of narrow walls and shapes without mirrors in more places"
+        )
     if made.turned is not None:
         lines += _turned_lines(made.turned)
     elif made.polarization == ("x",) and not made.cell.alike:

@@ -55,6 +55,8 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
         assert sum(content.counts("LENS").values()) == planned
     page = (target / "report.html").read_text()
     assert "violations" in page
+    assert f"as {planned:,} pillars ({values['pillars']:,} on the die" in page
+    assert values["pillars"] > planned
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
