@@ -80,7 +80,7 @@ def _areas(value: Array, level: Array) -> Array:
     Exact for straight edges of any turn.
     """
     count = len(level)
-    area, whole, rising = np.zeros(count), np.zeros(count + 1), level[::-1].copy()
+    area, whole, rising = np.zeros(count), np.zeros(count), level[::-1].copy()
     for row in range(value.shape[0] - 1):
         for column in range(value.shape[1] - 1):
             for half in range(2):
@@ -98,4 +98,4 @@ def _areas(value: Array, level: Array) -> Array:
                         area[k] += 0.5 * (high - v) ** 2 / ((high - low) * (high - middle))
                     else:
                         area[k] += 0.5 - 0.5 * (v - low) ** 2 / ((high - low) * (middle - low))
-    return area + np.cumsum(whole[:count])
+    return area + np.cumsum(whole)

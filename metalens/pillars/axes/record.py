@@ -98,11 +98,10 @@ def check(cell: Cell, sweep: Sweep) -> None:
         ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one with a ratio of its own, pillars
             that touch; and as :func:`metalens.pillars.record.check`.
     """
-    if sweep.lengths_um is None or sweep.diameters_um is None:
-        raise ConfigError("a library over two sizes needs diameters_um (along x) and lengths_um (along y)")
+    spans = ranges(sweep)
     if getattr(sized(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(cell.shape, "ratio", 1.0):
         raise CellError("cell.shape.ratio: both sizes are swept (diameters_um, lengths_um); leave ratio out")
-    for x, y in itertools.product(sweep.diameters_um, sweep.lengths_um):
+    for x, y in itertools.product(*spans):
         if not 0.01 <= y / x <= 100:
             raise CellError(f"sizes {x:g} by {y:g} um: need sides within a factor of 100")
         if sized(cell, x, y).gap_um(x) <= 0:
@@ -111,6 +110,17 @@ def check(cell: Cell, sweep: Sweep) -> None:
                 "keep diameters_um and lengths_um smaller"
             )
     check_light(cell, sweep)
+
+
+def ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(least, largest) size along x and along y.
+
+    Raises:
+        ConfigError: not both are given.
+    """
+    if sweep.diameters_um is None or sweep.lengths_um is None:
+        raise ConfigError("a library over two sizes needs diameters_um (along x) and lengths_um (along y)")
+    return sweep.diameters_um, sweep.lengths_um
 
 
 def swaps(cell: Cell, sweep: Sweep) -> bool:

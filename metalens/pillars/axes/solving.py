@@ -14,7 +14,7 @@ from metalens.ground.console import Console
 from metalens.ground.store import Provenance
 from metalens.pillars import workers
 from metalens.pillars.axes.between import surface
-from metalens.pillars.axes.record import AxesLibrary, check, sized, swaps
+from metalens.pillars.axes.record import AxesLibrary, check, ranges, sized, swaps
 from metalens.pillars.record import Sweep
 from metalens.pillars.workers import Journal
 
@@ -123,23 +123,17 @@ def sweep(
 
 def entries(sweep: Sweep) -> tuple[Array, Array]:
     """Evenly spaced sizes along x and y, with one step; the shorter range may end before its largest size."""
-    spans = _spans(sweep)
+    spans = ranges(sweep)
     step = max(high - low for low, high in spans) / (sweep.samples - 1)
     x, y = (low + step * np.arange(int((high - low) / step + 1e-9) + 1) for low, high in spans)
     return np.minimum(x, spans[0][1]), np.minimum(y, spans[1][1])  # the last one, to rounding
-
-
-def _spans(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
-    """(least, largest) size along x and y."""
-    nothing = (0.0, 0.0)
-    return sweep.diameters_um or nothing, sweep.lengths_um or nothing
 
 
 def _reach(cell: Cell, sweep: Sweep) -> int:
     """The least truncation whose bars meet the solver's share at four probes, or the largest there is."""
     from metalens.rcwa import jones, most_harmonics
 
-    (x0, x1), (y0, y1) = _spans(sweep)
+    (x0, x1), (y0, y1) = ranges(sweep)
     shares = ((0.31, 0.74), (0.66, 0.36), (0.87, 0.93), (0.52, 0.11))
     sizes = [(x0 + a * (x1 - x0), y0 + b * (y1 - y0)) for a, b in shares]
     most = most_harmonics(sized(cell, *sizes[0]), sizes[0][0])
@@ -157,7 +151,7 @@ def _reach(cell: Cell, sweep: Sweep) -> int:
 
 def _lines(nodes: _Nodes, sweep: Sweep, console: Console) -> tuple[Array, Array]:
     """Nodes along x and y: Chebyshev's, and lines between them where the interpolations disagree most."""
-    spans = _spans(sweep)
+    spans = ranges(sweep)
     angle = np.pi * np.arange(FIRST) / (FIRST - 1)
     lines = [(low + high) / 2 - (high - low) / 2 * np.cos(angle) for low, high in spans]
     look = np.linspace(*spans[0], LOOK), np.linspace(*spans[1], LOOK)
