@@ -14,7 +14,7 @@ Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it 
 
 TABLE = 4096
 SOLVED_RAD = 1e-12  # what is left of the phase: far below the 1e-10 that is promised, above rounding of 100 rad
-MOST_STEPS = 8  # each squares the error; only where a curve is nearly flat at one end are more than two needed
+HALVINGS = 54  # leave nothing of a double; so does as many of Newton's steps, where a curve is flat at one end
 TURN = 2 * math.pi
 
 
@@ -60,17 +60,21 @@ def _solve(p: Curve, phase: Array, within: tuple[float, float], gap: str) -> Arr
 
 
 def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -> Array:
-    """Diameters whose phase is start + target: linear in the table, then steps of Newton, one as a rule."""
+    """Diameters whose phase is start + target: linear in the table, then steps of Newton, one as a rule.
+
+    Each squares what is left, but where the slope ends in 0: there it halves it, and leaves what has no slope.
+    """
     place = target * ((TABLE - 1) / cover)
     index = np.minimum(place.astype(np.int64), TABLE - 2)
     place -= index
     d = table[index]
     d += place * np.diff(table)[index]
-    for _ in range(MOST_STEPS):
+    for _ in range(HALVINGS):
         missed = polynomial.horner(p.monomials, polynomial.unit(p, d)) - start - target
         if np.abs(missed).max(initial=0.0) < SOLVED_RAD:
             break
-        d -= missed / polynomial.slope_of(p, d)
+        rise = polynomial.slope_of(p, d)
+        d -= np.divide(missed, rise, out=np.zeros_like(d), where=rise != 0)
         np.clip(d, table.min(), table.max(), out=d)
     return d
 
@@ -80,7 +84,7 @@ def _table(p: Curve, within: tuple[float, float]) -> Array:
     ends = polynomial.value(p, np.array(within))
     target = np.linspace(ends.min(), ends.max(), TABLE)
     left, right = (np.full(TABLE, within[i]) for i in np.argsort(ends))
-    for _ in range(54):
+    for _ in range(HALVINGS):
         middle = (left + right) / 2
         below = polynomial.value(p, middle) < target
         left, right = np.where(below, middle, left), np.where(below, right, middle)

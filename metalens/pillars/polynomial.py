@@ -152,7 +152,7 @@ def over_chunks(work: Callable[..., Array], values: Array, *, places: bool = Fal
 
     places: ``work`` also takes, first, where the chunk starts.
     """
-    flat = np.ascontiguousarray(values).reshape(-1)
+    flat = np.ascontiguousarray(values).ravel()
 
     def made(start: int) -> Array:
         chunk = flat[start : start + CHUNK]
