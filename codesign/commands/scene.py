@@ -80,7 +80,7 @@ class Scene:
 
 
 def run(options: Options) -> int:
-    """Render, write and show."""
+    """Render, write and show; exit 1 where the image's error is above what it aims at."""
     settings = Scene() if options.config is None else config.load(options.config, Scene)
     if options.fwhm_nm < 0 or (options.fwhm_nm and options.lens is None):
         raise ConfigError(f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is")
@@ -97,10 +97,11 @@ def run(options: Options) -> int:
             about = Provenance(config.dumps(settings), {options.lens.name: reading.sha256(options.lens)}, settings.seed)
             found = _imaged(settings, lens, options.fwhm_nm)
             imaged.write(draft.path, found, about)
-            values["image_error"] = found.error
-            words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png"
+            values |= {"image_error": found.error, "light": found.light, "problem": found.problem}
+            words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png{found.light}"
+            words += f"\nFAILED: {found.problem}" if found.problem else ""
     options.console.result(values, words)
-    return 0
+    return 1 if values.get("problem") else 0
 
 
 def _make(settings: Scene, folder: Path, *, referee: bool) -> int:

@@ -15,7 +15,7 @@ from metalens.ground.errors import SceneError
 from metalens.ground.store import Provenance
 from metalens.image import Grid, Imager, imager
 from metalens.lens import Lens
-from metalens.psf import Source
+from metalens.psf import Source, spectrum
 
 FRAMES = 6  # that are imaged
 BLUR_UM = 144.0  # of the scene around a frame that is blurred into it: half a window of the PSFs
@@ -29,7 +29,8 @@ class Imaged:
 
     scene, image: (frames, y, x), the image scaled to the light of the scenes. psf: (depth, row, column, y, x) of sum
     1, at depth_um, and at the field angles y_deg and x_deg of the rows and columns; the outermost are those of the
-    samples around the frame that are blurred into it. parts: of the error by cause.
+    samples around the frame that are blurred into it. parts: of the error by cause. light: words for what of it the
+    pillars are not known for; problem: why the error is above :data:`TOLERANCE`. Empty where there are none.
     """
 
     scene: Array
@@ -41,6 +42,8 @@ class Imaged:
     pitch_um: float
     error: float
     parts: dict[str, float]
+    light: str = ""
+    problem: str = ""
 
 
 def margin_of(pitch_um: float) -> int:
@@ -59,8 +62,12 @@ def lens_imager(
     """
     margin = margin_of(camera.pitch_um)
     grid = Grid((camera.pixels, camera.pixels), camera.pitch_um, depths_um, margin, 2 * margin + 1)
-    source = Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
-    return imager(lens, grid, spectrum=source, tolerance=tolerance)
+    return imager(lens, grid, spectrum=source_of(lens, fwhm_nm), tolerance=tolerance)
+
+
+def source_of(lens: Lens, fwhm_nm: float) -> Source | None:
+    """A diode about the design wavelength; None for one wavelength, a width of 0."""
+    return Source(lens.wavelength_um * 1e3, fwhm_nm) if fwhm_nm else None
 
 
 @torch.no_grad()
@@ -109,6 +116,8 @@ def imaged(
         camera.pitch_um,
         optics.error,
         {name: float(value) for name, value in optics.parts.items()},
+        spectrum.beyond(source_of(lens, fwhm_nm), lens.proxy.wavelengths_um),
+        optics.above(TOLERANCE),
     )
 
 

@@ -28,7 +28,7 @@ from metalens.field.plan import SHARES, Grid, Plan, depth_nodes, planned, spectr
 from metalens.field.points import SPARE, Optics, Window, sampling
 from metalens.field.stray import stray_of
 from metalens.field.through import through
-from metalens.field.waves import SmoothWave, Wave, wave_of
+from metalens.field.waves import PillarWave, SmoothWave, Wave, wave_of
 from metalens.ground.errors import SceneError
 from metalens.image import Frames
 from metalens.lens import Layers, Lens
@@ -82,10 +82,10 @@ def imager(
         tolerance (``edge``: light that a small aperture's rim bends beyond the window).
     """
     _check(field, polarisation)
-    wave = wave_of(lens)
-    focus = wave.focus  # type: ignore[attr-defined]
     if layers is None:
         layers = lens.layers if isinstance(lens, Lens) else Layers()
+    wave = wave_of(lens, layers, scene_grid.window * scene_grid.step_um, distance_um)
+    focus = wave.focus  # type: ignore[attr-defined]
     optics = Optics(wave, layers, focus.sensor_distance_um if distance_um is None else distance_um)
     source = spectrum or Nodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
@@ -99,6 +99,8 @@ def imager(
     whole = patched(scene_grid, plan, stack, energy, tolerance=own)
     made = evened(thinned(whole, tolerance=tolerance))
     parts = {**made.parts, **_held_out(optics, whole)}
+    if isinstance(wave, PillarWave):
+        parts["unknown"] = spectra.unknown(source, wave.lens.proxy.wavelengths_um)
     stray = stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
     return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
 

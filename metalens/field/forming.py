@@ -29,6 +29,7 @@ from metalens.image import Frames
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
 CHUNK, AT_ONCE = 8, 128  # frames that are imaged together: on the processor, on another device
 COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
+LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,8 +45,9 @@ class Imager:
         scalar where that is within the tolerance), edge (of light that the rim bends about
         the window and beyond it), pillars (taken together a few micrometres at a time; 0 of a smooth phase), stop (of
         its shadow, where there is one).
-        Beside them ``outside``: of the light that goes through the lens (:mod:`metalens.field.through`), what
-        windows leave out.
+        Beside them shares of light: ``outside``, of what goes through the lens (:mod:`metalens.field.through`), what
+        windows leave out; and, of pillars, ``unknown``: of the spectrum, what lies beyond their library's wavelengths
+        and is taken by those within (:func:`metalens.psf.spectrum.unknown`).
     stray: light of other diffraction orders, None where the lens tells nothing of them.
     asked: numbers of the nodes (row * columns + column) whose PSFs' derivatives are wanted; None for all.
     """
@@ -64,7 +66,14 @@ class Imager:
     @property
     def error(self) -> float:
         """Relative L2 error to expect of the image of a 1/f texture."""
-        return math.hypot(*(value for name, value in self.parts.items() if name != "outside"))
+        return math.hypot(*(value for name, value in self.parts.items() if name not in LIGHT))
+
+    def above(self, tolerance: float) -> str:
+        """Words for an error above the tolerance, with the cause that weighs most; empty where it is not."""
+        if self.error <= tolerance:
+            return ""
+        cause, most = max(((k, v) for k, v in self.parts.items() if k not in LIGHT), key=lambda part: part[1])
+        return f"the image's error {self.error:.2g} is above the {tolerance:g} asked for ({cause}: {most:.2g})"
 
     def __call__(self, frames: Frames) -> Tensor:
         """(frames, y, x) irradiance; see the module.

@@ -17,10 +17,11 @@ from torch import Tensor
 from metalens.design import Focus
 from metalens.field import compiled
 from metalens.ground.errors import SceneError
-from metalens.lens import Lens, Media, answers, media, smooth
+from metalens.lens import Layers, Lens, Media, answers, media, smooth
 from metalens.psf import among
 
-CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
+CELL_UM = 2.5  # over which pillars are averaged at most: below a zone of the lens, far above the pitch
+CELLS = 3  # in λ z / window: mean and interpolation leave light at a window's rim sinc³(1/6) = 0.87 of its amplitude
 LOBES = 2.0  # of the mean of cells over the nodes that read them, in widths of a node
 
 
@@ -66,7 +67,8 @@ class SmoothWave:
 class PillarWave:
     """The pillars of a lens through its proxy: mean of t exp(-i carrier) over cells of a few micrometres.
 
-    diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in.
+    diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in. cell_um: width of
+    the cells, a whole number of pitches, one at least.
 
     Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`, the mean of both polarisations).
     Light that single pillars scatter out of their cell's mean is lost to the image; what of it lands in the window is
@@ -77,7 +79,7 @@ class PillarWave:
             apart.
     """
 
-    def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None) -> None:
+    def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None, cell_um: float = CELL_UM) -> None:
         if lens.pairs is not None:
             raise SceneError(
                 "pillars of two sizes answer x and y apart: the image of the whole field is of unpolarised light and "
@@ -99,7 +101,7 @@ class PillarWave:
         d = lens.diameters
         self.radius_um = d.radius_um + d.pitch_um / 2
         self.diameter_um = torch.as_tensor(np.ascontiguousarray(d.diameter_um)) if diameter_um is None else diameter_um
-        self._block = max(1, round(CELL_UM / d.pitch_um))
+        self._block = max(1, round(cell_um / d.pitch_um))
         self._cells: dict[tuple[float, float], Tensor] = {}
 
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
@@ -235,10 +237,13 @@ def _longer(between: Media, r2: Tensor) -> Tensor:
     return n * r2 / (torch.sqrt(r2 + d * d) + d)
 
 
-def wave_of(lens: Lens | Wave) -> Wave:
-    """The lens plane of a lens file, or the one that was given."""
+def wave_of(lens: Lens | Wave, layers: Layers, window_um: float, distance_um: float | None = None) -> Wave:
+    """The lens plane of a lens file, in cells that leave a window of this width what pillars scatter into it; or the
+    one that was given."""
     if isinstance(lens, Lens):
-        return PillarWave(lens)
+        distance = lens.sensor_distance_um if distance_um is None else distance_um
+        node_um = lens.wavelength_um * layers.after(distance, lens.wavelength_um).reduced_um / window_um
+        return PillarWave(lens, cell_um=min(CELL_UM, node_um / CELLS))
     if not hasattr(lens, "carrier_rad"):
         raise SceneError(f"{type(lens).__name__} is no lens: need a Lens, a SmoothWave or a PillarWave")
     return lens

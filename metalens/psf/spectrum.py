@@ -235,16 +235,27 @@ def points(source: Source | Measured) -> tuple[Array, Array]:
     return (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
 
 
-def beyond(source: Source | Measured, within_um: tuple[float, float]) -> str:
-    """Words for light of a diode outside of what pillars are known for, which its wavelengths within stand for; empty
-    where that is less than 1e-4 of it, or the pillars are known at one wavelength."""
+def unknown(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> float:
+    """Share of the light of a spectrum outside of the wavelengths that pillars are known for, which those within stand
+    for; 0 of wavelengths as such and of pillars that are known at one, where others are refused.
+
+    It is no error of that size: pillars that answer smoothly beyond are off by what the quadrature is.
+    """
     low, high = within_um
+    if not high > low or not isinstance(source, Source | Measured):
+        return 0.0
     um, share = points(source)
-    outside = float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
-    if not high > low or outside < 1e-4:
+    return float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
+
+
+def beyond(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> str:
+    """Words for :func:`unknown` light; empty where that is less than 1e-4 of it."""
+    share = unknown(source, within_um)
+    if share < 1e-4:
         return ""
+    low, high = within_um
     return (
-        f"; {outside:.2g} of the light lies beyond {low * 1e3:g} to {high * 1e3:g} nm, where the pillars are not "
+        f"; {share:.2g} of the light lies beyond {low * 1e3:g} to {high * 1e3:g} nm, where the pillars are not "
         "known, and is taken by the wavelengths within: sweep a library over the spectrum"
     )
 

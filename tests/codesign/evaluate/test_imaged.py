@@ -106,6 +106,33 @@ def test_the_command_images_through_a_lens_file(tmp_path, capsys):
     assert {"image.h5", "image.png", "scene.h5"} <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
+def test_light_that_the_pillars_are_not_known_for_is_told_and_no_error():
+    """A diode of 20 nm, pillars known to 9.5 nm below its middle and 12 nm above: two tails of a normal distribution,
+    in points 0.25 nm apart, of which silicon weighs the blue by 4 % more. The image's wavelengths lie within."""
+    known = replace(LENS, proxy=replace(m.PROXY, wavelengths_um=(0.8405, 0.862)))
+    deviation = 20.0 / math.sqrt(8 * math.log(2))
+    tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (9.5, 12))
+    states = dataset.states_at(torch.arange(1), 5)
+    made = imaged.imaged(known, Camera(16, 9.0), RIG, lambda c, rig: render(states, rig=rig, camera=c), fwhm_nm=20.0)
+    assert made.parts["unknown"] == pytest.approx(tails, rel=0.05)
+    assert made.light.startswith(f"; {made.parts['unknown']:.2g} of the light lies beyond 840.5 to 862 nm")
+    assert made.error < made.parts["unknown"] / 3
+
+
+def test_an_image_above_its_aim_ends_1_and_says_what_does_it(tmp_path, capsys):
+    """A lens of 4 um at 300 um: its rim bends a tenth of the light further than the windows reach."""
+    focus = Focus(0.85, 300.0, 3000.0)
+    phase = design.phase_of(None, focus, radius_um=2.0)
+    tiny, _ = design.make(phase, focus, aperture_um=4.0, cell=m.CELL, proxy=m.PROXY)
+    lens.save(tmp_path / "lens.h5", tiny)
+    (tmp_path / "scene.toml").write_text("frames = 1\npixels = 16\npitch_um = 9.0\n")
+    words = ["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out")]
+    assert cli.main([*words, "--lens", str(tmp_path / "lens.h5")]) == 1
+    told = capsys.readouterr().out
+    assert "is above the 0.03 asked for (" in told
+    assert (tmp_path / "out" / "image.h5").is_file()
+
+
 def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
     """12 samples of 9 um and 16 at each side: 198 um from the axis, 77 degrees at 46 um, past the face's edge."""
     near = replace(LENS, sensor_distance_um=46.0)

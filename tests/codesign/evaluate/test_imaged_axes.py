@@ -10,7 +10,8 @@ import torch
 from codesign.evaluate import imaged
 from codesign.eye import Camera, Rig
 
-LENS = SimpleNamespace(reduced_um=310.0, sensor_distance_um=340.0)
+KNOWN = SimpleNamespace(wavelengths_um=(0.85, 0.85))
+LENS = SimpleNamespace(reduced_um=310.0, sensor_distance_um=340.0, proxy=KNOWN)
 
 
 class Optics:
@@ -23,6 +24,9 @@ class Optics:
         depths_um=torch.tensor([20e3, 30e3, 45e3]),
     )
     error, parts = 0.02, {"field": 0.01}
+
+    def above(self, tolerance):
+        return f"{self.error} and {tolerance}"
 
     def __call__(self, frames):
         return 2 * frames.light.roll(1, -1)
@@ -45,6 +49,7 @@ def test_rows_columns_and_depths_keep_their_places(monkeypatch):
         return SimpleNamespace(frames=frames, pinhole=lambda: whole)
 
     found = imaged.imaged(LENS, Camera(8, 3.0), Rig(), rendered)
+    assert found.problem == "0.02 and 0.03"
     assert asked["reach"] == pytest.approx((0.98 * 24e3, 1.02 * 41e3))
     assert (asked["pixels"], asked["distance"]) == (8 + 2 * 48, 310.0)
     assert found.scene == pytest.approx(light.numpy(), rel=1e-6)

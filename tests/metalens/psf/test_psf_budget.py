@@ -239,6 +239,8 @@ def test_light_of_a_diode_beyond_the_library_is_told():
     assert words.startswith("838 to 867 nm, where the pillars are not known")
     assert spectrum.beyond(diode, (0.8, 0.9)) == ""
     assert spectrum.beyond(diode, (0.85, 0.85)) == ""
+    assert spectrum.unknown(diode, (0.838, 0.867)) == pytest.approx(tails, rel=0.05)  # as above
+    assert spectrum.unknown(spectrum.Nodes(np.array([0.81]), np.ones(1), 0.0), (0.838, 0.867)) == 0.0  # refused later
 
 
 @pytest.mark.parametrize("seed", range(6))
