@@ -23,8 +23,6 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, ConfigError
 from metalens.lens import DiameterMap
 
-_FALLEN = 0.5  # share of collapsed pillars beyond which the lattice is doubted
-
 
 @dataclass(frozen=True)
 class Options(Common):
@@ -138,16 +136,17 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
-    fallen = float(found.collapsed.mean())
-    good = bool(np.isfinite(found.diameter_nm).any()) and fallen <= _FALLEN
+    strange = float((found.collapsed | found.oval).mean()) > 0.5
+    good = bool(np.isfinite(found.diameter_nm).any()) and not strange
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
     if not options.crop and len(image) < len(whole):
         lines.append(f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise")
     if table and not options.edge_bias_nm:
         lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
-    if fallen > _FALLEN:
+    if strange:
         pitch = values["pitch_nm"]
         lines.append(f"  most sites hold no round pillar: is the lattice of {pitch:.4g} nm right? --pitch-nm states it")
+        lines.append("  (tops may be dark, but rims must stand out from the ground by more than noise and blur leave)")
     return values, "\n".join(lines), good
 
 
@@ -176,6 +175,7 @@ def _summary(
         "pillars": len(found.diameter_nm),
         "missing": int(found.missing.sum()),
         "collapsed": int(found.collapsed.sum()),
+        "oval": int(found.oval.sum()),
         "lattice": found.lattice.kind,
         "pixel_nm": pixel,
         "pitch_nm": found.lattice.pitch_px * pixel,
@@ -196,7 +196,8 @@ def _summary(
 def _pillars(found: sem.Diameters, laid: overlay.Overlay | None) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     for k in range(len(found.diameter_nm)):
-        state = "missing" if found.missing[k] else "collapsed" if found.collapsed[k] else "good"
+        of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
+        state = next((word for word, which in of.items() if which.any() and which[k]), "good")
         row: dict[str, object] = {
             "site_row": int(found.site[k, 0]),
             "site_column": int(found.site[k, 1]),
@@ -222,6 +223,8 @@ def _words(found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Ta
         f"{target}: {len(found.diameter_nm)} sites of a {found.lattice.kind} lattice, {gone} missing, {fallen} "
         f"collapsed; mean {found.mean_nm:.2f} nm, 3 sigma {found.three_sigma_nm:.2f} nm"
     ]
+    if found.oval.any():
+        lines.append(f"  {int(found.oval.sum())} are oval, longer than wide by more than 15 %: not measured")
     if laid is not None:
         unsure = " (not clear: other places fit nearly as well; no bias table; take a wider picture)"
         lines.append(f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}")

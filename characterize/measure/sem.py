@@ -1,10 +1,11 @@
 """Electron micrographs to pillar diameters: radial edges to a fraction of a pixel, missing and collapsed pillars.
 
 Edges are found along many rays from each pillar's centre, as the place where the smoothed profile falls through half of
-the step from the pillar's rim to the dark gap, whether its top is bright or dark; a circle goes through them. Charging
+the step from the pillar's rim to the gap, whether its top is bright or dark; a circle goes through them. Charging
 (slow shades), noise and drift of the scan are taken off or averaged over the rays. The lattice may be of any kind.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -18,6 +19,8 @@ from metalens.ground.errors import CaptureError
 
 RAYS = 72
 _ROUND = 2 / 3  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
+_TRIED = 25  # sites of a lattice that is only tried
+_OVAL = 1.15  # length over width from which on a pillar is none of round ones: a circle's radius is off by 0.4 % there
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,7 @@ class Diameters:
     row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is missing or collapsed.
     sigma_nm: (p,) standard error of each diameter from the scatter of its edges.
     missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far from round.
+    oval: (p,) longer than wide by more than 15 %, beyond noise; not measured.
     site: (p, 2) lattice index j and i of each; lattice: where the sites are, in pixels.
     """
 
@@ -56,10 +60,21 @@ class Diameters:
     collapsed: Array
     site: Array
     lattice: Lattice
+    oval: Array = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
 
     @property
     def _good_nm(self) -> Array:
         return np.asarray(self.diameter_nm[np.isfinite(self.diameter_nm)])
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether most sites hold what is no round pillar: then the lattice may be another."""
+        return bool(self.collapsed.mean() > 0.5)
+
+    @property
+    def whole(self) -> float:
+        """Share of sites that hold a pillar, round or oval."""
+        return float(1 - (self.missing | self.collapsed).mean())
 
     @property
     def mean_nm(self) -> float:
@@ -93,7 +108,23 @@ def measure(image: Array, about: Micrograph) -> Diameters:
     rough = _flattened(picture, pitch or min(picture.shape) / 4)
     lattice = find(rough, pitch)
     flat = _flattened(picture, lattice.pitch_px) if pitch is None else rough
-    place, site = lattice.sites(flat.shape)
+    found = _on(flat, lattice, about)
+    if not found.doubtful:  # the brightest places of a cell are its pillars, but for dark tops
+        return found
+    others = [one for one in _others(lattice) if len(one.sites(flat.shape)[0])]
+    tried = [_on(flat, one, about, most=_TRIED).whole for one in others]
+    return _on(flat, others[int(np.argmax(tried))], about) if max(tried, default=0.0) > 0.5 else found
+
+
+def _others(lattice: Lattice) -> list[Lattice]:
+    """The same lattice with pillars where its gaps are."""
+    a, b = lattice.a / 2, lattice.b / 2
+    return [dataclasses.replace(lattice, origin=lattice.origin + step) for step in (a + b, a, b)]
+
+
+def _on(flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0) -> Diameters:
+    """Pillars on a lattice that is known, in a levelled picture; of some ``most`` sites, evenly from all, if stated."""
+    place, site = (v[:: max(len(v) // most, 1) if most else 1] for v in lattice.sites(flat.shape))
     steps = [_step(flat, row, column, lattice.pitch_px) for row, column in place]
     usual = float(np.median(steps)) if steps else 0.0
     results = [
@@ -105,8 +136,11 @@ def measure(image: Array, about: Micrograph) -> Diameters:
     row, column, radius, sigma, missing, collapsed = (np.array(v) for v in zip(*results, strict=True))
     diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
     missing, collapsed = missing.astype(bool), collapsed.astype(bool)
-    diameter = np.where(missing | collapsed, np.nan, diameter)
-    return Diameters(row, column, diameter, 2 * sigma * about.pixel_nm, missing, collapsed, site, lattice)
+    near = ~missing & (np.hypot(*(np.stack([row, column], 1) - place).T) < 0.2 * lattice.pitch_px)
+    oval = np.array([n and _is_oval(flat, y, x, lattice.pitch_px) for n, y, x in zip(near, row, column, strict=True)])
+    collapsed = collapsed & ~oval
+    diameter = np.where(missing | collapsed | oval, np.nan, diameter)
+    return Diameters(row, column, diameter, 2 * sigma * about.pixel_nm, missing, collapsed, site, lattice, oval)
 
 
 def _flattened(image: Array, pitch: float) -> Array:
@@ -203,6 +237,30 @@ def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float,
     shared = 0.25 / _independent(float(reach[rim]))  # half of the rim's level, as noisy as edges, is in every edge
     error = scatter * math.sqrt(1 / own + shared)
     return float(dy), float(dx), float(radius), error, scatter if good.mean() > _ROUND else math.inf
+
+
+def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
+    """Whether a pillar is longer than wide by more than ``_OVAL``, and by four sigma of its edges' scatter.
+
+    About its middle an ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t, of a² / b² = (A + D) / (A - D),
+    D² = B² + C². Edges are where each ray falls the most: levels of the mean over all rays are of no ray's own.
+    """
+    reach, angle, rays = _rays(flat, row, column, pitch)
+    first = int(np.searchsorted(reach, 0.1 * pitch))
+    edge = reach[first + np.argmin(np.diff(rays[first:], axis=0), axis=0)]
+    design = np.stack([np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], 1)
+    good = np.ones(RAYS, bool)
+    for _ in range(4):
+        powers = np.linalg.lstsq(design[good], edge[good] ** -2, rcond=None)[0]
+        fitted = np.maximum(design @ powers, 1e-12) ** -0.5
+        rest = edge - fitted
+        good = np.abs(rest) < max(0.2 * float(np.median(edge)), 2.0)
+        if good.sum() < _ROUND * RAYS or powers[0] <= 0:
+            return False
+    level, along = float(powers[0]), math.hypot(*powers[3:])
+    own = max(_independent(level**-0.5) * good.mean() - 5, 1.0)
+    noise = float((rest[good] * 2 * fitted[good] ** -3).std()) * math.sqrt(2 / own)
+    return along > 4 * noise and level + along > _OVAL**2 * (level - along)
 
 
 def _independent(radius: float) -> float:
