@@ -38,9 +38,11 @@ def _records():
     from codesign.commands.evaluate_optics import Settings as Optics
     from layout.arrange import Arrangement
     from layout.process.process import Process
+    from metalens.pillars.study import Study
 
     return {
         "CELL.toml": CellFile,
+        "STUDY.toml": Study,
         "DESIGN.toml": Design,
         "PSF.toml": Settings,
         "PROCESS.toml": Process,

@@ -34,7 +34,8 @@ class Study:
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
     tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end a stretch.
-    others: materials that the chosen cell is tried with as well, where their sources hold all the wavelengths.
+    others: materials that the chosen cell is tried with as well, where their sources hold all the wavelengths; [] for
+        none.
     """
 
     pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
@@ -46,7 +47,7 @@ class Study:
     least_transmission: float = 0.8
     least_half_width_um: float = 0.005
     tolerance: float = field(default=3e-3, metadata={"above": 0})
-    others: tuple[str, ...] = ("a-Si",)
+    others: tuple[str, ...] = field(default=("a-Si",), metadata={"may_be_empty": True})
     cell: Cell | None = None
 
     def __post_init__(self) -> None:
@@ -252,7 +253,7 @@ def _subject(study: Study) -> str:
 
 def _limits(study: Study) -> str:
     """What is printed, in words."""
-    least, gap = f"{1e3 * study.min_diameter_um:g} nm", f"{1e3 * study.min_gap_um:g} nm"
+    least, gap = f"{1e3 * study.min_diameter_um:.4g} nm", f"{1e3 * study.min_gap_um:.4g} nm"
     if study.made(study.pitches_um[0], study.heights_um[0]).round:
         return f"diameter from {least} to the pitch less {gap}"
     return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"

@@ -181,6 +181,7 @@ pitches_um = [0.30]
 heights_um = [0.7]
 wavelengths_um = [0.85]
 tolerance = 2e-2
+others = []
 """
 
 
@@ -189,7 +190,8 @@ def test_study(tmp_path, capsys):
     path.write_text(STUDY)
     out = tmp_path / "study"
     assert main(["study", str(path), "-o", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["pitch_um"] == 0.3
+    told = json.loads(capsys.readouterr().out)
+    assert (told["pitch_um"], told["cells"]) == (0.3, 1)  # no other material is tried
     assert files(out) == ["README.md", "cell_study.json", "cell_study.png", "manifest.json"]
     assert main(["study", str(path), "-o", str(out)]) == 2
     assert "give --force" in capsys.readouterr().err
