@@ -68,16 +68,6 @@ def depth_um(frames: Frames | Flat, *, margin: int = 0, device: torch.device | s
     return made[:, inside, inside].clamp_min(1.0)
 
 
-def sheets(frames: Frames | Flat, device: torch.device | str = "cpu") -> Frames:
-    """Flat frames as a far sheet that covers all, frames of two sheets as they are; on a device."""
-    if isinstance(frames, Frames):
-        return frames.to(device)
-    light, depth = _radiance(frames, device)[:, None], depth_um(frames, device=device)[:, None]
-    cover = torch.zeros(len(light), 2, *light.shape[-2:], device=light.device)
-    cover[:, 1] = 1
-    return Frames(light * cover, cover, depth.expand_as(cover).contiguous())
-
-
 def _radiance(frames: Flat, device: torch.device | str) -> Tensor:
     return torch.from_numpy(frames.light).to(device).float() * (1 / 255)
 
@@ -86,7 +76,9 @@ def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin:
     """(n, y - 2 margin, x - 2 margin) light on the sensor grid; differentiable in the kernels of ``optics``."""
     device = optics.transfer[0].device
     if isinstance(optics, Imager):
-        return optics(sheets(frames, device))
+        if isinstance(frames, Frames):
+            return optics(frames.to(device))
+        return optics.surface(_radiance(frames, device), depth_um(frames, device=device))
     if isinstance(frames, Frames):
         return image(frames.to(device), optics, margin=margin)
     if device.type != "cpu":

@@ -50,7 +50,9 @@ def read_out(
         electrons = camera.expose(mean, sensor=pixel, generator=generator, reads=reads)
     frames = camera.digitise(electrons, sensor=pixel)
     centred = frames - frames.mean((-2, -1), keepdim=True)
-    return (centred / centred.std((-2, -1), keepdim=True).clamp_min(1e-6))[:, None].to(torch.float32)
+    count = centred.shape[-2] * centred.shape[-1]
+    deviation = ((centred * centred).sum((-2, -1), keepdim=True) / max(count - 1, 1)).clamp_min(1e-12).sqrt()
+    return (centred / deviation)[:, None].to(torch.float32)
 
 
 def _normal(mean: Tensor, sensor: Sensor, generator: torch.Generator | None, reads: Tensor) -> Tensor:

@@ -18,12 +18,11 @@ from metalens.field.forming import (
     blurred,
     even_light,
     evened,
-    lights_used,
-    psfs_used,
     returned,
-    trimmed,
+    vergence,
     with_psfs,
 )
+from metalens.field.patches import dense
 from metalens.field.plan import SHARES, Grid, Plan, depth_nodes, planned, spectral
 from metalens.field.points import SPARE, Optics, Window, sampling
 from metalens.field.stray import stray_of
@@ -39,6 +38,7 @@ PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so th
 # tolerances tried for the worst PSF of a patch; below 1 where what is returned is darker than the frame
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0, 0.5, 0.25, 0.12)
 OVERLAP = 4  # samples that two patches share
+COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
 HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
 NEGLECTED = 5  # of them at which the transform and the components of the field are judged
 ALL = 2  # of them at which pillars taken together are
@@ -211,6 +211,13 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
     return replace(few, parts={"kernels": math.hypot(error, whole.parts["kernels"])})
 
 
+def trimmed(optics: Imager, tolerance: float) -> Imager:
+    """The first kernels of every patch, as many as its own account of the tolerance needs."""
+    made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]
+    transfer = [t[: len(p.mix)] for t, p in zip(optics.transfer, made, strict=True)]
+    return replace(optics, patches=made, transfer=transfer)
+
+
 def trial(grid: Grid) -> Frames:
     """One frame of two sheets over all depths with 1/f texture of mean 1 and contrast about 0.3."""
     draw = torch.Generator().manual_seed(11)
@@ -250,7 +257,8 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     light = true.sum((-1, -2))
     level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[..., None, None]
     with torch.no_grad():
-        got = (psfs_used(made, pixels, depths) * lights_used(made, pixels, depths)[..., None, None]).cpu()
+        used, lit = psfs_used(made, pixels, depths), lights_used(made, pixels, depths)
+        got = (used * lit[..., None, None]).cpu()
     dimmer = _dimmer(made)
     nodes = cutting.together(got, true * level) * dimmer
     few = at[:NEGLECTED], depths
@@ -294,3 +302,27 @@ def _ripples(
             error = optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad, part)
             found.append(float(error * bright))
     return max(found)
+
+
+def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
+    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row, column]) of the frame."""
+    flat, position = optics.stack.flatten(0, 2), vergence(depths_um, optics.plan.depths_um)
+    deep = dense(position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)).to(flat)
+    out = flat.new_zeros(len(pixels), len(depths_um), *flat.shape[1:])
+    for patch in optics.patches:
+        (top, below), (left, right) = patch.rows, patch.columns
+        for i, (row, column) in enumerate(pixels.tolist()):
+            if top <= row < below and left <= column < right:
+                weights = deep @ patch.weights[(row - top) * (right - left) + column - left]
+                out[i] += (weights @ (patch.mix @ flat[patch.nodes].flatten(1))).view_as(out[i])
+    return out
+
+
+def lights_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
+    """(n, depths) E of sources at (n, [row, column]) of the frame."""
+    depths, energy = optics.plan.depths_um, optics.energy
+    position = vergence(depths_um, depths)
+    deep = dense(position, torch.arange(len(depths), dtype=position.dtype))
+    ends = [part[at] for part, at in zip(between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True)]
+    light: Tensor = torch.einsum("na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy)
+    return light

@@ -11,7 +11,7 @@ frames whose far sheet covers all take that sum alone, at less than half the cos
 """
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field, replace
 
 import scipy.fft
@@ -28,7 +28,6 @@ from metalens.image import Frames
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
 CHUNK, AT_ONCE = 8, 128  # frames that are imaged together: on the processor, on another device
-COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
 LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 
 
@@ -83,6 +82,14 @@ class Imager:
         """
         return image(frames, self)
 
+    def surface(self, light: Tensor, depth_um: Tensor) -> Tensor:
+        """(frames, y, x) irradiance of one opaque surface in place of two sheets; see :func:`surface`.
+
+        Raises:
+            SceneError: as above.
+        """
+        return surface(light, depth_um, self)
+
     def to(self, device: torch.device | str) -> "Imager":
         """The same on a device, for frames there; grid and plan stay where they are."""
         return replace(
@@ -99,17 +106,37 @@ class Imager:
 def image(frames: Frames, optics: Imager, *, chunk: int | None = None) -> Tensor:
     """(frames, y, x) irradiance of the frames; ``chunk`` of them at a time share the reading of a patch's tables, by
     default as many as a processor's cache holds, or as keep a GPU busy."""
+
+    def few(*parts: Tensor) -> tuple[Tensor, Tensor]:
+        return blurred(Frames(*parts), optics), parts[0].sum(1)
+
+    return _imaged([getattr(frames, name) for name in Frames.__slots__], optics, few, chunk)
+
+
+def surface(light: Tensor, depth_um: Tensor, optics: Imager, *, chunk: int | None = None) -> Tensor:
+    """(frames, y, x) irradiance of one opaque surface, (frames, y, x) radiance and depth: as :func:`image` of frames
+    whose far sheet is this and covers all."""
+
+    def few(lit: Tensor, deep: Tensor) -> tuple[Tensor, Tensor]:
+        return _one_sheet(lit[:, None], deep[:, None], optics), lit
+
+    return _imaged([light, depth_um], optics, few, chunk)
+
+
+def _imaged(
+    given: list[Tensor], optics: Imager, work: Callable[..., tuple[Tensor, Tensor]], chunk: int | None
+) -> Tensor:
+    """(frames, y, x) of what ``work`` makes of some frames at a time: the image on the whole frame, and all light."""
     grid = optics.grid
     chunk = chunk or (CHUNK if optics.stack.device.type == "cpu" else AT_ONCE)
     size = tuple(n + 2 * grid.margin for n in grid.samples)
-    if tuple(frames.radiance.shape[-2:]) != size:
-        raise SceneError(f"frames of {tuple(frames.radiance.shape[-2:])} samples, need {size}: grid and margin")
+    if tuple(given[0].shape[-2:]) != size:
+        raise SceneError(f"frames of {tuple(given[0].shape[-2:])} samples, need {size}: grid and margin")
     out = []
-    for start in range(0, len(frames.radiance), chunk):
-        part = [_continued(getattr(frames, n)[start : start + chunk], grid.spare) for n in Frames.__slots__]
-        few = Frames(*part)
-        total = returned(blurred(few, optics), grid)
-        out.append(total if optics.stray is None else add_stray(total, few, optics.stray, grid))
+    for start in range(0, len(given[0]), chunk):
+        whole, light = work(*(_continued(part[start : start + chunk], grid.spare) for part in given))
+        total = returned(whole, grid)
+        out.append(total if optics.stray is None else add_stray(total, light, optics.stray, grid))
     return torch.cat(out)
 
 
@@ -231,7 +258,7 @@ def _over(light: Tensor, cover: Tensor) -> Tensor:
 
 def _size(patch: Patch, window: int) -> tuple[int, int]:
     high, wide = patch.rows[1] - patch.rows[0], patch.columns[1] - patch.columns[0]
-    y, x = (scipy.fft.next_fast_len(n + window - 1, real=True) for n in (high, wide))
+    y, x = (scipy.fft.next_fast_len(n + window - 1) for n in (high, wide))
     return int(y), int(x)
 
 
@@ -244,11 +271,15 @@ def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
 def blurred(frames: Frames, optics: Imager) -> Tensor:
     """(frames, y, x) image on the whole frame, without stray light."""
     if _far_alone(frames):
-        light, cover, depth_um = (getattr(frames, name)[:, 1:] for name in Frames.__slots__)
-        total = _through(light, cover, depth_um, optics, kinds=1)[:, 0, 0]
-    else:
-        both = blur(frames, optics)
-        total = _over(both[:, 0], both[:, 1])
+        return _one_sheet(frames.radiance[:, 1:], frames.depth_um[:, 1:], optics)
+    both = blur(frames, optics)
+    total = _over(both[:, 0], both[:, 1])
+    return total if optics.even is None else total * optics.even
+
+
+def _one_sheet(light: Tensor, depth_um: Tensor, optics: Imager) -> Tensor:
+    """(frames, y, x) image on the whole frame of (frames, 1, y, x) light of a sheet that hides nothing."""
+    total = _through(light, light, depth_um, optics, kinds=1)[:, 0, 0]
     return total if optics.even is None else total * optics.even
 
 
@@ -283,7 +314,7 @@ def evened(optics: Imager) -> Imager:
     wanted = even_light(optics)
     one = torch.ones_like(wanted)[None, None]
     depth_um = 1 / (1 / optics.plan.depths_um[[0, -1]]).mean()
-    found = _through(one, one, torch.full_like(one, float(depth_um)), optics, kinds=1)[0, 0, 0]
+    found = _one_sheet(one, torch.full_like(one, float(depth_um)), replace(optics, even=None))[0]
     return replace(optics, even=even.ratio(wanted, found))
 
 
@@ -314,34 +345,3 @@ def between_nodes(grid: Grid, plan: Plan) -> list[Tensor]:
         dense(torch.linspace(float(nodes[0]), float(nodes[-1]), n, dtype=torch.float64), nodes)
         for n, nodes in zip(grid.frame, (plan.y_um, plan.x_um), strict=True)
     ]
-
-
-def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row, column]) of the frame."""
-    flat, position = optics.stack.flatten(0, 2), vergence(depths_um, optics.plan.depths_um)
-    deep = dense(position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)).to(flat)
-    out = flat.new_zeros(len(pixels), len(depths_um), *flat.shape[1:])
-    for patch in optics.patches:
-        (top, below), (left, right) = patch.rows, patch.columns
-        for i, (row, column) in enumerate(pixels.tolist()):
-            if top <= row < below and left <= column < right:
-                weights = deep @ patch.weights[(row - top) * (right - left) + column - left]
-                out[i] += (weights @ (patch.mix @ flat[patch.nodes].flatten(1))).view_as(out[i])
-    return out
-
-
-def lights_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths) E of sources at (n, [row, column]) of the frame."""
-    depths, energy = optics.plan.depths_um, optics.energy
-    position = vergence(depths_um, depths)
-    deep = dense(position, torch.arange(len(depths), dtype=position.dtype))
-    ends = [part[at] for part, at in zip(between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True)]
-    light: Tensor = torch.einsum("na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy)
-    return light
-
-
-def trimmed(optics: Imager, tolerance: float) -> Imager:
-    """The first kernels of every patch, as many as its own account of the tolerance needs."""
-    made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]
-    transfer = [t[: len(p.mix)] for t, p in zip(optics.transfer, made, strict=True)]
-    return replace(optics, patches=made, transfer=transfer)

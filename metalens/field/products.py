@@ -1,9 +1,11 @@
 """Frames through the patches of a field by compiled loops and matrix products: what ``forming`` does by FFT, quicker.
 
-A patch is less than half as wide as its transform, which therefore is two products with cosines and sines that never
-touch the zeros beside it. As many kernels are taken at once as a processor's cache holds, and sheets that hold nothing
-in a patch are left out. Frames and patches are grouped the same way on any number of threads: so are the sums. What the
-loop calls is put into it (``forceinline``), or it would round otherwise where it comes from numba's cache.
+A patch is less than half as wide as its transform, which therefore is products with cosines and sines that never touch
+the zeros beside it. Samples are counted from the middle of what they are of, so that the sum of a sample and its mirror
+image meets the cosines and their difference the sines: products of half the size. As many kernels are taken at once as
+a processor's cache holds, and sheets that hold nothing in a patch are left out. Frames and patches are grouped the same
+way on any number of threads: so are the sums. What the loop calls is put into it (``forceinline``), or it would round
+otherwise where it comes from numba's cache.
 """
 
 import functools
@@ -18,9 +20,9 @@ from metalens.field.patches import Patch
 from metalens.ground.arrays import Array
 from metalens.ground.threads import one_blas_thread, split
 
-TOGETHER = 2  # frames that share a reading of the tables
+TOGETHER = 4  # frames that share a reading of the tables
 SETS = 2  # of patches, summed apart
-LANES = 20  # frequencies of a block: 37 are those of most transforms
+LANES = 16  # what the frequencies along a row are filled up to a multiple of
 HELD = 48  # weighted sheets that are transformed at once: 1 MB of them
 NOTHING = 1e-7  # of the most light or coverage: below the rounding of the rest
 
@@ -28,38 +30,44 @@ NOTHING = 1e-7  # of the most light or coverage: below the rounding of the rest
 class Bases(NamedTuple):
     """Of an axis of n samples and its transform at N points, F = N // 2 + 1 frequencies of angles θ; float32.
 
-    along: (n, 2 G) by blocks of ``LANES`` frequencies: cos θ, then -sin θ; zero beyond F. across: (2 F, n) cos, sin.
-    back_along: (2 G, N) and back_across: (N, 2 F), of the inverse.
+    G: F filled up to lanes. m: samples of the patch's image, n and all but one of a PSF's. h(n): samples of a half with
+    the middle one, (n + 1) // 2. u, v: places of the first halves of samples and image from their middles.
+
+    cos, sin: (h(n), G) cos θ u, then -sin, along a row; zero beyond F.
+    back_cos, back_sin: (G, h(m)) cos θ v, then -sin, with 1/N, and 2 for frequencies that stand for their opposites.
+    across_cos, across_sin: (F, h(n)), down a column.
+    up_cos, up_sin: (h(m), F), back, with 1/N, and 1/2 for frequencies that are their own opposites.
+    turn: (F,) complex64 exp(iθ (m - n) / 2), by which a transform moves that is counted from the middles.
     """
 
-    along: Array
-    across: Array
-    back_along: Array
-    back_across: Array
+    cos: Array
+    sin: Array
+    back_cos: Array
+    back_sin: Array
+    across_cos: Array
+    across_sin: Array
+    up_cos: Array
+    up_sin: Array
+    turn: Array
 
 
 @functools.lru_cache(maxsize=64)
-def bases(count: int, size: int) -> Bases:
-    """See :class:`Bases`."""
+def bases(count: int, size: int, window: int) -> Bases:
+    """See :class:`Bases`; m = count + window - 1 <= size."""
     frequency = np.arange(size // 2 + 1)
-    angle = 2 * np.pi / size * (np.arange(size)[:, None] * frequency % size)
-    cos, sin = np.cos(angle), np.sin(angle)
+    angle = 2 * np.pi / size * frequency
+    u, v = (angle * ((np.arange((n + 1) // 2) - (n - 1) / 2)[:, None]) for n in (count, count + window - 1))
+    once = np.ones((len(u), 1))
+    once[count // 2 :] = 0.5  # the middle sample is its own mirror image, and added to itself
     alone = (frequency == 0) | (2 * frequency == size)  # without a partner of the opposite sign
-    twice = np.where(alone, 1, 2) / size
-    made = (
-        _in_blocks(cos[:count], -sin[:count]),
-        np.concatenate([cos, sin], 1)[:count].T,
-        _in_blocks(cos * twice, -sin * twice).T,
-        np.tile(np.where(alone, 0.5, 1), 2) / size * np.concatenate([cos, sin], 1),
-    )
-    return Bases(*(np.ascontiguousarray(part, np.float32) for part in made))
-
-
-def _in_blocks(real: Array, imaginary: Array) -> Array:
-    """(n, 2 G) of two (n, F): blocks of the one and of the other in turn."""
-    spare = [(0, 0), (0, -real.shape[1] % LANES)]
-    blocks = [np.pad(part, spare).reshape(len(part), -1, LANES) for part in (real, imaginary)]
-    return np.stack(blocks, 2).reshape(len(real), -1)
+    twice, half = np.where(alone, 1, 2) / size, np.where(alone, 0.5, 1) / size
+    spare = [(0, 0), (0, -len(frequency) % LANES)]
+    along = [np.pad(part, spare) for part in (once * np.cos(u), -np.sin(u))]
+    back = [np.pad(part * twice, spare).T for part in (np.cos(v), -np.sin(v))]
+    across = (once * np.cos(u)).T, np.sin(u).T
+    made = *along, *back, *across, np.cos(v) * half, np.sin(v) * half
+    turn = np.exp(1j * angle * (window - 1) / 2).astype(np.complex64)
+    return Bases(*(np.ascontiguousarray(part, np.float32) for part in made), turn)
 
 
 def through(
@@ -78,7 +86,7 @@ def through(
     """
     sets = [out, *(np.zeros_like(out) for _ in range(SETS - 1))]
     tasks = list(itertools.product(range(0, len(out), TOGETHER), range(SETS)))
-    least = tuple(NOTHING * _largest(part) for part in frames[:2])
+    least = tuple(NOTHING * _largest(part) for part in frames[: out.shape[1]])
     jobs = list(zip(patches, transfer, sizes, strict=True))
 
     def work(start: int, stop: int) -> None:
@@ -99,9 +107,9 @@ def _largest(content: Array) -> float:
 
 
 def _room(sizes: list[tuple[int, int]]) -> tuple[Array, ...]:
-    """Flat arrays for the largest patch: sources, half and whole transforms, kernels, sums, the way back."""
+    """Flat arrays for the largest patch: samples and transforms, what is folded, kernels, sums, the way back."""
     y, x = (max(size[axis] for size in sizes) + 2 * LANES + 2 for axis in (0, 1))
-    counts = HELD, HELD, HELD, 2 * HELD, 2 * TOGETHER, 1, 1
+    counts = HELD, HELD, HELD, 2 * TOGETHER, 2 * TOGETHER, 2 * TOGETHER
     return tuple(np.empty(count * y * x, np.float32) for count in counts)
 
 
@@ -117,13 +125,13 @@ def _add(
     (top, below), (left, right) = patch.rows, patch.columns
     kernels, size = given
     tables = patch.weights.numpy(), patch.energy.numpy()
-    axes = bases(below - top, size[0]), bases(right - left, size[1])
+    window = out.shape[-1] - frames[0].shape[-1] + 1
+    axes = bases(below - top, size[0], window), bases(right - left, size[1], window)
     for kind, content in enumerate(frames[: out.shape[1]]):
-        window = patch.rows, patch.columns
-        held = _held(content, window, least[kind])
+        held = _held(content, (patch.rows, patch.columns), least[kind])
         if len(held):
             some = kernels[: patch.coverage] if kind else kernels
-            _convolved(content, frames[2], held, tables, kind, some, axes, room, out, window)
+            _convolved(content, frames[2], held, tables, kind, some, axes, room, out, (patch.rows, patch.columns))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,75 +165,136 @@ def _convolved(content, place, held, tables, kind, kernels, axes, room, out, win
     (top, below), (left, right) = window
     high, wide = below - top, right - left
     part, depth = content[:, :, top:below, left:right], place[:, :, top:below, left:right]
-    beyond = out.shape[3] - content.shape[2]  # the window of a PSF less one
     y, x = axes
-    count, rows, columns = len(held), y.across.shape[0], x.along.shape[1]
-    mixed = room[4][: count * rows * columns].reshape(count, rows, columns)
+    count, lanes, frequencies = len(held), x.cos.shape[1], len(y.across_cos)
+    mixed = room[3][: 4 * frequencies * count * lanes].reshape(2, frequencies, count, 2, lanes)
     mixed[:] = 0
     step = max(1, HELD // count)
     for first in range(0, len(kernels), step):
         few = min(step, len(kernels) - first)
         source = room[0][: high * few * count * wide].reshape(high, few, count, wide)
         weigh(part, depth, held, tables, kind == 0, first, source)
-        half = room[1][: high * few * count * columns].reshape(high * few * count, columns)
-        np.dot(source.reshape(high * few * count, wide), x.along, half)
-        whole = room[2][: rows * few * count * columns].reshape(rows, few * count * columns)
-        np.dot(y.across, half.reshape(high, few * count * columns), whole)
-        halves = room[3][: few * rows * columns].reshape(few, rows // 2, 2, columns)
-        _halve(kernels[first : first + few], halves)
-        _mix(whole.reshape(rows, few, count, columns), halves, mixed)
-    back = room[5][: len(y.back_across) * columns].reshape(len(y.back_across), columns)
-    image = room[6][: len(y.back_across) * x.back_along.shape[1]].reshape(len(y.back_across), x.back_along.shape[1])
+        cosines, sines = _transformed(source.reshape(high, few * count, wide), axes, room)
+        halves = room[2][: 4 * few * frequencies * lanes].reshape(few, frequencies, 4, lanes)
+        _halve(kernels[first : first + few], y.turn, x.turn, halves)
+        shape = frequencies, 2, few, count, lanes
+        _mix(cosines.reshape(shape), sines.reshape(shape), halves, mixed)
+    beyond = out.shape[3] - content.shape[2]  # the window of a PSF less one
+    image = _led_back(mixed, axes, (high + beyond, wide + beyond), room)
     for job in range(count):
-        np.dot(y.back_across, mixed[job], back)
-        np.dot(back, x.back_along, image)
-        seen = out[held[job, 0], kind, held[job, 1], top : below + beyond, left : right + beyond]
-        for row in range(high + beyond):
-            for column in range(wide + beyond):
-                seen[row, column] += image[row, column]
+        _add_folded(image, job, out[held[job, 0], kind, held[job, 1], top : below + beyond, left : right + beyond])
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
-def _halve(kernels, out):  # type: ignore[no-untyped-def]
-    """Of spectra T (kernels, Y, X // 2 + 1): (kernels, F, [E, D], 2 G) of E = T(f) + T(-f) and D = i (T(f) - T(-f))."""
+def _transformed(source, axes, room):  # type: ignore[no-untyped-def]
+    """Of sources (y, sheets, x): (F, [real, imaginary], sheets G) times cosines along y, and times sines."""
+    high, sheets, wide = source.shape
+    y, x = axes
+    count, lanes, half = high * sheets, x.cos.shape[1], (wide + 1) // 2
+    given, folded = source.reshape(count, wide), room[1][: 2 * count * half].reshape(2, count, half)
+    for row in range(count):
+        for i in range(half):
+            one, other = given[row, i], given[row, wide - 1 - i]
+            folded[0, row, i], folded[1, row, i] = one + other, one - other
+    parts = room[0][: 2 * count * lanes].reshape(2, count, lanes)
+    np.dot(folded[0], x.cos, parts[0])
+    np.dot(folded[1], x.sin, parts[1])
+    half, rows = (high + 1) // 2, parts.reshape(2, high, sheets * lanes)
+    pairs = room[1][: 4 * half * sheets * lanes].reshape(2, half, 2, sheets * lanes)
+    for i in range(half):
+        for part in range(2):
+            for column in range(sheets * lanes):
+                one, other = rows[part, i, column], rows[part, high - 1 - i, column]
+                pairs[0, i, part, column], pairs[1, i, part, column] = one + other, one - other
+    folds = pairs.reshape(2, half, 2 * sheets * lanes)
+    frequencies = len(y.across_cos)
+    whole = room[0][: 4 * frequencies * sheets * lanes].reshape(2, frequencies, 2 * sheets * lanes)
+    np.dot(y.across_cos, folds[0], whole[0])
+    np.dot(y.across_sin, folds[1], whole[1])
+    return whole[0], whole[1]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
+def _led_back(mixed, axes, size, room):  # type: ignore[no-untyped-def]
+    """([sum, difference], sheets, rows, columns of a half) images of spectra (2, F, sheets, [real, imaginary], G)."""
+    y, x = axes
+    high, wide = size
+    _, frequencies, count, _, lanes = mixed.shape
+    half, columns = (high + 1) // 2, count * 2 * lanes
+    spectra = mixed.reshape(2, frequencies, columns)
+    folded = room[4][: 2 * half * columns].reshape(2, half, columns)
+    np.dot(y.up_cos, spectra[0], folded[0])
+    np.dot(y.up_sin, spectra[1], folded[1])
+    pairs = folded.reshape(2, half, count, 2, lanes)
+    parts = room[5][: 2 * count * high * lanes].reshape(2, count, high, lanes)
+    for i in range(half):
+        for job in range(count):
+            for part in range(2):
+                for g in range(lanes):
+                    one, other = pairs[0, i, job, part, g], pairs[1, i, job, part, g]
+                    parts[part, job, i, g] = one + other
+                    parts[part, job, high - 1 - i, g] = one - other
+    half = (wide + 1) // 2
+    image = room[4][: 2 * count * high * half].reshape(2, count * high, half)
+    rows = parts.reshape(2, count * high, lanes)
+    np.dot(rows[0], x.back_cos, image[0])
+    np.dot(rows[1], x.back_sin, image[1])
+    return image.reshape(2, count, high, half)
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
+def _add_folded(image, job, seen):  # type: ignore[no-untyped-def]
+    """Add a sheet's image to where it is seen; a middle column is its own mirror image."""
+    high, wide = seen.shape
+    for row in range(high):
+        for i in range(wide // 2):
+            one, other = image[0, job, row, i], image[1, job, row, i]
+            seen[row, i] += one + other
+            seen[row, wide - 1 - i] += one - other
+        if wide % 2:
+            seen[row, wide // 2] += image[0, job, row, wide // 2]
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
+def _halve(kernels, down, along, out):  # type: ignore[no-untyped-def]
+    """Of spectra T (kernels, Y, X // 2 + 1), counted from the middle by their turns: (kernels, F, 4, G) real and
+    imaginary parts of E = T(f) + T(-f) and of D = i (T(f) - T(-f))."""
     out[:] = 0
     for k in range(out.shape[0]):
         for f in range(out.shape[1]):
             for g in range(kernels.shape[2]):
-                plus, minus = kernels[k, f, g], kernels[k, -f, g]
-                real = g + g // LANES * LANES
-                imaginary = real + LANES
-                out[k, f, 0, real], out[k, f, 0, imaginary] = plus.real + minus.real, plus.imag + minus.imag
-                out[k, f, 1, real], out[k, f, 1, imaginary] = minus.imag - plus.imag, plus.real - minus.real
+                plus, minus = kernels[k, f, g] * (along[g] * down[f]), kernels[k, -f, g] * (along[g] * np.conj(down[f]))
+                out[k, f, 0, g], out[k, f, 1, g] = plus.real + minus.real, plus.imag + minus.imag
+                out[k, f, 2, g], out[k, f, 3, g] = minus.imag - plus.imag, plus.real - minus.real
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
-def _mix(whole, halves, mixed):  # type: ignore[no-untyped-def]
+def _mix(cosines, sines, halves, mixed):  # type: ignore[no-untyped-def]
     """Add sheets times kernels: what multiplies the cosines along y is C E - S D, and the sines C D + S E.
 
     From (C - iS) T(f) exp(iθ) + (C + iS) T(-f) exp(-iθ), the transform at f and -f led back.
 
-    whole: (2 F, kernels, sheets, 2 G) products with the cosines along y, C, then with the sines, S.
-    halves: see :func:`_halve`. mixed: (sheets, 2 F, 2 G). The last axis of all is in blocks, as of :class:`Bases`.
+    cosines, sines: (F, [real, imaginary], kernels, sheets, G) products with the cosines along y, C, and the sines, S.
+    halves: see :func:`_halve`. mixed: ([cosines, sines], F, sheets, [real, imaginary], G).
     """
     part = np.empty((4, LANES), np.float32)
-    frequencies = halves.shape[1]
+    _, frequencies, count, _, lanes = mixed.shape
     for f in range(frequencies):
-        for job in range(len(mixed)):
-            for start in range(0, mixed.shape[2], 2 * LANES):
-                block = slice(start, start + 2 * LANES)
+        for job in range(count):
+            for start in range(0, lanes, LANES):
                 part[:] = 0
                 for k in range(len(halves)):
-                    c, s = whole[f, k, job, block], whole[frequencies + f, k, job, block]
-                    e, d = halves[k, f, 0, block], halves[k, f, 1, block]
-                    for g in range(LANES):
-                        i = g + LANES
-                        part[0, g] += c[g] * e[g] - c[i] * e[i] - s[g] * d[g] + s[i] * d[i]
-                        part[1, g] += c[g] * e[i] + c[i] * e[g] - s[g] * d[i] - s[i] * d[g]
-                        part[2, g] += c[g] * d[g] - c[i] * d[i] + s[g] * e[g] - s[i] * e[i]
-                        part[3, g] += c[g] * d[i] + c[i] * d[g] + s[g] * e[i] + s[i] * e[g]
-                even, odd = mixed[job, f, block], mixed[job, frequencies + f, block]
-                even[:LANES] += part[0]
-                even[LANES:] += part[1]
-                odd[:LANES] += part[2]
-                odd[LANES:] += part[3]
+                    for lane in range(LANES):
+                        g = start + lane
+                        c, d = cosines[f, 0, k, job, g], cosines[f, 1, k, job, g]
+                        s, t = sines[f, 0, k, job, g], sines[f, 1, k, job, g]
+                        p, q, u, v = halves[k, f, 0, g], halves[k, f, 1, g], halves[k, f, 2, g], halves[k, f, 3, g]
+                        part[0, lane] += c * p - d * q - s * u + t * v
+                        part[1, lane] += c * q + d * p - s * v - t * u
+                        part[2, lane] += c * u - d * v + s * p - t * q
+                        part[3, lane] += c * v + d * u + s * q + t * p
+                for lane in range(LANES):
+                    mixed[0, f, job, 0, start + lane] += part[0, lane]
+                    mixed[0, f, job, 1, start + lane] += part[1, lane]
+                    mixed[1, f, job, 0, start + lane] += part[2, lane]
+                    mixed[1, f, job, 1, start + lane] += part[3, lane]

@@ -20,7 +20,6 @@ from metalens.field.plan import Grid
 from metalens.field.points import Optics
 from metalens.field.waves import PillarWave
 from metalens.ground.arrays import Array
-from metalens.image.scene import Frames
 
 ORDERS = (-1, 0, 2, 3)
 NODES = 17  # directions along an axis whose light on the lens behind a stop is traced
@@ -171,9 +170,9 @@ def _reduced(optics: Optics, depth_um: float) -> float:
     return optics.layers.before(depth_um, optics.wave.focus.wavelength_um).reduced_um  # type: ignore[attr-defined]
 
 
-def add_stray(image: Tensor, frames: Frames, stray: Stray, grid: Grid) -> Tensor:
-    """The image with the discs of all sources added."""
-    light = frames.radiance.sum(1) * stray.illumination.to(frames.radiance)
+def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
+    """The image with the discs of all sources added; ``light`` (frames, y, x) of all sheets."""
+    light = light * stray.illumination.to(light)
     spectrum = torch.stack([disc.spectrum(light, stray.shape) for disc in stray.discs]).sum(0)
     edge = grid.margin + grid.spare
     rows, columns = (slice(edge, edge + n) for n in grid.samples)

@@ -122,10 +122,19 @@ def integrate(
     """
     sizes = (None, None) if shape is None else shape
     rows, columns = (
-        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um).to(image)
+        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um)
         for n, count, shift in zip(image.shape[-2:], sizes, shift_um, strict=True)
     )
-    return rows @ image @ columns.mT
+    if not (rows.requires_grad or columns.requires_grad) and _whole(rows) and _whole(columns):
+        return image
+    return rows.to(image) @ image @ columns.to(image).mT
+
+
+def _whole(weights: Tensor) -> bool:
+    """Whether every pixel is one sample, to the rounding of its edges' places (double precision)."""
+    if weights.shape[0] != weights.shape[1]:
+        return False
+    return float((weights - torch.eye(len(weights)).to(weights)).abs().max()) < 1e-11
 
 
 def mean_electrons(

@@ -100,3 +100,15 @@ def test_frames_for_a_coarser_grid_are_the_same_and_know_only_the_reads():
     torch.testing.assert_close(found[True][0], found[False][0], rtol=1e-5, atol=1e-5)
     assert found[True][1] == 0.0  # no read noise, so nothing that a coarser grid would see
     assert found[False][1] != 0.0
+
+
+def test_a_network_sees_frames_of_mean_0_and_deviation_1_and_dark_ones_as_nothing():
+    """Numpy's deviation of a sample; a frame without any contrast is not blown up by its rounding."""
+    light = torch.rand(2, 24, 31, generator=torch.Generator().manual_seed(4)) + 0.5
+    light[1] = 0.0
+    sensor = Sensor(3.0, 3.0, 500.0, 0.0, 4000.0, 0.0, 12)
+    seen = read_out(light, 3.0, torch.tensor(3.0, dtype=torch.float64), sensor, generator=None, quiet=True)[:, 0]
+    bright = seen[0].double().numpy()
+    assert abs(bright.mean()) < 1e-6  # float32
+    assert bright.std(ddof=1) == pytest.approx(1.0, abs=1e-6)
+    assert float(seen[1].abs().max()) == 0.0

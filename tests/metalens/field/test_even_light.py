@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from metalens.design import Focus
-from metalens.field import Grid, Layers, Optics, SmoothWave, even, forming, imager, patches, psfs
+from metalens.field import Grid, Layers, Optics, SmoothWave, engine, even, forming, imager, patches, psfs
 from metalens.image import Frames
 
 WINDOW, STEP = 13, 2.0
@@ -41,7 +41,7 @@ def _imager(stretch, level=0.37):
     energy = torch.full(stack.shape[:3], level)
     made = patches.cut(stack, energy, forming.between_nodes(GRID, plan), patches=2, overlap=4, tolerance=1e-3)
     whole = forming.with_psfs(forming.Imager(GRID, plan, stack, energy, made, [], {}), stack, energy)
-    few = forming.trimmed(whole, 2.0)
+    few = engine.trimmed(whole, 2.0)
     assert [len(patch.mix) for patch in few.patches] == [1] * 4
     return few
 

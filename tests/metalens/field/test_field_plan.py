@@ -240,7 +240,7 @@ def test_patches_off_the_corner_give_the_psfs_of_their_own_pixels():
     optics = SimpleNamespace(stack=stack.float(), plan=made, patches=cut)
     wanted = [(0, 0), (rows - 1, 3), (5, columns - 1), (rows - 2, columns - 3), (rows // 2, columns // 2)]
     depth = 1 / (0.3 / 3e3 + 0.7 / 9e3)
-    got = forming.psfs_used(optics, torch.tensor(wanted), torch.tensor([depth], dtype=torch.float64))[:, 0]
+    got = engine.psfs_used(optics, torch.tensor(wanted), torch.tensor([depth], dtype=torch.float64))[:, 0]
 
     def through(nodes, n, at):
         place = np.linspace(-(n - 1), n - 1, n)[at]

@@ -8,27 +8,40 @@ import pytest
 import torch
 
 from metalens.field import Grid, forming, patches, products
+from metalens.ground.errors import SceneError
 from metalens.image import Frames
 
 
-@pytest.mark.parametrize("size", [9, 10, 45])
-def test_products_transform_and_lead_back(size):
-    """Seven samples in 9, 10 and 45 points, one of the three with more frequencies than a block holds."""
-    given = np.random.default_rng(3).normal(size=(7, 5)).astype(np.float32)
-    y, x = products.bases(7, size), products.bases(5, 12)
-    whole = y.across @ (given @ x.along)
-    want = np.fft.rfft2(given, s=(size, 12))
-    real, imaginary = (_unblocked(whole, which)[:, : want.shape[1]] for which in (0, 1))
-    frequencies = size // 2 + 1
-    plus = real[:frequencies] + imaginary[frequencies:] + 1j * (imaginary[:frequencies] - real[frequencies:])
-    assert np.abs(plus - want[:frequencies]).max() < 1e-5  # float32 of values up to 12
-    back = y.back_across @ np.concatenate([2 * whole[:frequencies], 2 * whole[frequencies:]]) @ x.back_along
-    assert np.abs(back[:7, :5] - given).max() < 1e-6
-    assert np.abs(back[7:]).max() < 1e-6
+@pytest.mark.parametrize(("count", "size"), [(7, 9), (6, 10), (5, 9), (4, 8), (7, 45)])
+def test_products_transform_and_lead_back(count, size):
+    """Even and odd numbers of samples and of points, one with more frequencies than a block holds. Counted from the
+    middle, a transform is numpy's turned by (count - 1) / 2 samples; back it is the samples again, with a dark one on
+    either side for a window of 3."""
+    given = np.random.default_rng(3).normal(size=(4, count)).astype(np.float32)
+    made, frequencies = products.bases(count, size, 3), size // 2 + 1
+    angle = 2 * np.pi / size * np.arange(frequencies)
+    want = np.fft.rfft(given, n=size) * np.exp(1j * angle * (count - 1) / 2)
+    one, other = _folded(given)
+    real, imaginary = one @ made.cos, other @ made.sin
+    assert np.abs(real[:, :frequencies] + 1j * imaginary[:, :frequencies] - want).max() < 1e-5  # float32 of up to 12
+    assert np.abs(real[:, frequencies:]).max(initial=0) == 0  # lanes that are filled up
+    cosines, sines = made.across_cos @ one.T, made.across_sin @ other.T
+    assert np.abs(cosines - 1j * sines - want.T).max() < 1e-5
+    dark = np.pad(given, ((0, 0), (1, 1)))
+    assert np.abs(_unfolded(real @ made.back_cos, imaginary @ made.back_sin, count + 2) - dark).max() < 1e-6
+    up, down = made.up_cos @ (2 * cosines), made.up_sin @ (2 * sines)
+    assert np.abs(_unfolded(up.T, down.T, count + 2) - dark).max() < 1e-6
+    assert made.turn == pytest.approx(np.exp(1j * angle), abs=1e-6)  # a window's middle is its second sample
 
 
-def _unblocked(rows, which):
-    return rows.reshape(len(rows), -1, 2, products.LANES)[:, :, which].reshape(len(rows), -1)
+def _folded(given):
+    """Sums and differences of samples and their mirror images, up to the middle one."""
+    half = (given.shape[1] + 1) // 2
+    return (given + given[:, ::-1])[:, :half], (given - given[:, ::-1])[:, :half]
+
+
+def _unfolded(one, other, count):
+    return np.concatenate([one + other, (one - other)[:, : count // 2][:, ::-1]], 1)
 
 
 @pytest.fixture(scope="module", params=[(5, 1), (7, 3), (9, 6)])
@@ -94,6 +107,16 @@ def test_sheets_that_hold_nothing_in_a_patch_are_left_out(optics, monkeypatch):
     assert sum([0, 0] in some for some in held) == 2 * upper  # light and coverage
     assert sum([1, 0] in some for some in held) == 0
     assert sum([1, 1] in some for some in held) == 2 * len(optics.patches)
+
+
+def test_one_surface_is_a_far_sheet_that_covers_all(optics):
+    both = _frames(optics, 3)
+    light, depth_um = both.radiance[:, 1], both.depth_um[:, 1]
+    cover = torch.stack([torch.zeros_like(light), torch.ones_like(light)], 1)
+    want = optics(Frames(torch.stack([torch.zeros_like(light), light], 1), cover, both.depth_um))
+    assert float((optics.surface(light, depth_um) - want).abs().max()) < 1e-6 * float(want.max())  # float32
+    with pytest.raises(SceneError, match="samples, need"):
+        optics.surface(light[:, 1:], depth_um[:, 1:])
 
 
 @pytest.mark.parametrize(("share", "seen"), [(0.8e-7, False), (1.3e-7, True)])

@@ -9,7 +9,6 @@ import torch
 
 from metalens.cell import Film, Index
 from metalens.field import Grid, Layers, stray
-from metalens.image.scene import Frames
 from metalens.lens import Stop
 
 GRID = Grid((76, 106), 7.0, (20e3, 90e3), margin=4, window=15)  # a frame of 90 x 120
@@ -41,8 +40,7 @@ def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch,
     light = torch.zeros(1, 2, 90, 120)
     row, column = 40, 66
     light[0, 1, row, column] = 5.0
-    frames = Frames(light, torch.ones_like(light), torch.full_like(light, DEPTH))
-    image = stray.add_stray(torch.full((1, 76, 106), 0.25), frames, made, GRID)[0].numpy() - 0.25
+    image = stray.add_stray(torch.full((1, 76, 106), 0.25), light.sum(1), made, GRID)[0].numpy() - 0.25
     x = (column - 59.5) * 7 + middle[0]
     y = (row - 44.5) * 7 + middle[1]
     cosine4 = (D**2 / (D**2 + x**2 + y**2)) ** 2
@@ -84,8 +82,7 @@ def test_behind_a_stop_a_disc_is_what_rays_through_the_hole_light(monkeypatch, o
     made = stray.stray_of(SimpleNamespace(wave=Wave(), distance_um=D, layers=layers), GRID, DEPTH, field_um)
     light = torch.zeros(1, 2, 90, 120)
     light[0, 1, 44:46, 59:61] = 1.25  # about the middle
-    frames = Frames(light, torch.ones_like(light), torch.full_like(light, DEPTH))
-    image = stray.add_stray(torch.zeros(1, 76, 106), frames, made, GRID)[0].double().numpy()
+    image = stray.add_stray(torch.zeros(1, 76, 106), light.sum(1), made, GRID)[0].double().numpy()
     (x, y), taken = _traced(field_um, order, np.random.default_rng(3))
     slope2 = sum((a * DEPTH / D + m) ** 2 for a, m in zip(field_um, MIDDLE, strict=True)) / (DEPTH - THICK) ** 2
     assert image.sum() == pytest.approx(5 * 0.04 * taken / (1 + slope2) ** 2, rel=0.02, abs=2e-4)  # rims in steps
