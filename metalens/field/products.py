@@ -67,7 +67,7 @@ def bases(count: int, size: int, window: int) -> Bases:
     across = (once * np.cos(u)).T, np.sin(u).T
     made = *along, *back, *across, np.cos(v) * half, np.sin(v) * half
     turn = np.exp(1j * angle * (window - 1) / 2).astype(np.complex64)
-    return Bases(*(np.ascontiguousarray(part, np.float32) for part in made), turn)
+    return Bases(*[*(np.ascontiguousarray(part, np.float32) for part in made), turn])
 
 
 def through(
