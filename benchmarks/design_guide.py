@@ -190,6 +190,7 @@ STOPS = ("stop150",)
 DEVICE = tuple(f"field={place},fwhm={width}" for width in (30, 10) for place in ("oblique", "ring"))
 LADDER = ("field=angle,fwhm=30", "field=line,fwhm=30", DEVICE[0])  # from one field angle to the whole field
 ASPHERES = DEVICE[:2]  # where six radial terms are trained too, and stand behind a stop
+LONG_READ = (DEVICE[0], LADDER[0])  # read after many frames too
 WATCHED, NETWORK_FRAMES = DEVICE[0], 6400  # where the network reads too, and the frames that it sees once each
 MANY = 25_600  # frames after which the reader no longer tells lenses apart by how soon their blur is learned
 KNOBS = ("base", "lens=focus20", "lens=focus70", "fwhm=10", "fwhm=30", "field=oblique", "field=ring", "electrons=500",
@@ -233,9 +234,10 @@ def watched(lines: dict[str, dict[str, Any]]) -> dict[str, str]:
     return {r: replace(cell_of(c), frames=NETWORK_FRAMES, reader="network").name for r, c in roles.items()}
 
 
-def long_read(lines: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """{role: cell} that the reader reads after ``MANY`` frames too."""
-    roles = {role: cell for role, cell in compared(lines, WATCHED).items() if role != "asphere"}
+def long_read(lines: dict[str, dict[str, Any]], device: str) -> dict[str, str]:
+    """{role: cell} of a device that the reader reads after ``MANY`` frames too; none of a device that is not."""
+    compare = compared(lines, device) if device in LONG_READ else {}
+    roles = {role: cell for role, cell in compare.items() if role != "asphere"}
     return {role: replace(cell_of(cell), frames=MANY).name for role, cell in roles.items()}
 
 
@@ -246,7 +248,8 @@ def plan(lines: dict[str, dict[str, Any]]) -> list[str]:
         found += [f"{cell}/{CHOICE}" for family in ("focus", "designer") for cell in candidates(device, family)]
         found += [f"{cell}/{CHOICE}" for cell in candidates(device, "stop") if device in ASPHERES]
         found += [f"{cell}/{seed}" for seed in SEEDS for cell in compared(lines, device).values()]
-    found += [f"{cell}/{seed}" for seed in SEEDS for roles in (watched, long_read) for cell in roles(lines).values()]
+    found += [f"{cell}/{seed}" for seed in SEEDS for cell in watched(lines).values()]
+    found += [f"{cell}/{seed}" for device in LONG_READ for seed in SEEDS for cell in long_read(lines, device).values()]
     return found + [f"{cell_of(knob).name}/{seed}" for seed in SEEDS for knob in KNOBS]
 
 

@@ -22,6 +22,7 @@ from benchmarks.design_guide import (
     FOCI,
     KNOBS,
     LADDER,
+    LONG_READ,
     LOOKS,
     MANY,
     NETWORK_FRAMES,
@@ -169,15 +170,23 @@ def page(
     parts += [FIELD.format(oblique=reach("oblique"), ring=reach("ring"), **told)]
     for device, rows in devices.items():
         parts += device_table(device, rows, lines, bounds or {})
-    if long := role_rows(runs, long_read(lines)):
-        parts += [LONG.format(many=_count(MANY), frames=_count(cell_of("base").frames)), *lens_table(long, {}), ""]
+    parts += long_tables(lines, LONG_READ[0])
     parts += [RUNGS, *ladder_table(device_rows(lines, LADDER), bounds or {}), "", *(told_of(one) for one in designs)]
+    for device in LONG_READ[1:]:
+        parts += long_tables(lines, device)
     parts += [*watched_table(role_rows(runs, watched(lines)), runs), "", *network_table(network_rows()), ""]
     absent = missing(lines)
     if absent:
         cells = ", ".join(f"`{c}`" for c in absent)
         parts += ["## Planned and not measured", "", f"Cells without a run: {cells}.", ""]
     return "\n".join(parts)
+
+
+def long_tables(lines: dict[str, dict[str, Any]], device: str) -> list[str]:
+    """The lenses of a device after more frames, where they were read."""
+    long, of = role_rows(by_cell(lines), long_read(lines, device)), cell_of(device)
+    told = {"field": of.field, "fwhm": of.fwhm, "many": _count(MANY), "frames": _count(cell_of("base").frames)}
+    return [LONG.format(**told), *lens_table(long, {}), ""] if long else []
 
 
 def reach(field: str) -> str:

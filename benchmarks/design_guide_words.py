@@ -46,7 +46,7 @@ of the middle, 17°. `line`: PSFs that vary along x as in the oblique field, and
 image. Every rung has its own best focus, designer's lens and trained lens, chosen and trained as above.
 """
 LONG = """\
-### oblique, 30 nm, after more frames
+### {field}, {fwhm:g} nm, after more frames
 
 The same lenses, read by a reader that has learned from {many} frames in place of {frames}. Lenses that differ above and
 not here differ in how soon their blur is learned, not in what is told by it.
