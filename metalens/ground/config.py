@@ -34,9 +34,8 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
         empty: whether a file without a word stands for the defaults; long work refuses it.
 
     A number is from 0 to 1e9, an angle or offset from -1e9, unless the metadata of its field says more: ``signed`` (or
-    not), ``above`` (more than that), ``most``, ``may_be_inf``; a list or name whose default is not empty has entries,
-    but for ``may_be_empty``. A seed is any whole number from 0. What a record itself
-    refuses comes with file and key.
+    not), ``above`` (more than that), ``most``, ``may_be_inf``; a list or name has entries unless its default is empty
+    or ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses comes with file and key.
 
     Raises:
         ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
@@ -188,8 +187,7 @@ def _content(record: Any, values: dict[str, Any]) -> bool:
 
 def _check_range(field: dataclasses.Field[Any], value: Any, where: str, key: str) -> None:
     """Numbers finite, at most 1e9 in size; no empty list or name, but where these say something; see :func:`load`."""
-    told = field.metadata
-    empty = told.get("may_be_empty") or field.default in ("", ()) or _made(field) == ()
+    told, empty = field.metadata, field.metadata.get("may_be_empty") or field.default in ("", ()) or _made(field) == ()
     if (value in ((), "") and not empty) or (isinstance(value, Path) and not value.name):
         raise ConfigError(f"{where}: {key} is empty, need {'entries' if value == () else 'a name'}")
     largest = _MOST if field.name == "seed" else told.get("most", _LARGE)
