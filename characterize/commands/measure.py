@@ -195,9 +195,9 @@ def _summary(
 
 def _pillars(found: sem.Diameters, laid: overlay.Overlay | None) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
+    of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
     for k in range(len(found.diameter_nm)):
-        of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
-        state = next((word for word, which in of.items() if which.any() and which[k]), "good")
+        state = next((word for word, which in of.items() if which[k]), "good")
         row: dict[str, object] = {
             "site_row": int(found.site[k, 0]),
             "site_column": int(found.site[k, 1]),

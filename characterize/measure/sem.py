@@ -60,7 +60,7 @@ class Diameters:
     collapsed: Array
     site: Array
     lattice: Lattice
-    oval: Array = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    oval: Array
 
     @property
     def _good_nm(self) -> Array:

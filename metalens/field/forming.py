@@ -113,18 +113,18 @@ def image(frames: Frames, optics: Imager, *, chunk: int | None = None) -> Tensor
     return _imaged([getattr(frames, name) for name in Frames.__slots__], optics, few, chunk)
 
 
-def surface(light: Tensor, depth_um: Tensor, optics: Imager, *, chunk: int | None = None) -> Tensor:
+def surface(light: Tensor, depth_um: Tensor, optics: Imager) -> Tensor:
     """(frames, y, x) irradiance of one opaque surface, (frames, y, x) radiance and depth: as :func:`image` of frames
     whose far sheet is this and covers all."""
 
     def few(lit: Tensor, deep: Tensor) -> tuple[Tensor, Tensor]:
         return _one_sheet(lit[:, None], deep[:, None], optics), lit
 
-    return _imaged([light, depth_um], optics, few, chunk)
+    return _imaged([light, depth_um], optics, few)
 
 
 def _imaged(
-    given: list[Tensor], optics: Imager, work: Callable[..., tuple[Tensor, Tensor]], chunk: int | None
+    given: list[Tensor], optics: Imager, work: Callable[..., tuple[Tensor, Tensor]], chunk: int | None = None
 ) -> Tensor:
     """(frames, y, x) of what ``work`` makes of some frames at a time: the image on the whole frame, and all light."""
     grid = optics.grid

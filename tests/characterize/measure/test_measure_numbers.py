@@ -18,7 +18,8 @@ RNG = np.random.default_rng(8)
 
 def found(diameter, site):
     zero, no = np.zeros(len(site)), np.zeros(len(site), bool)
-    return sem.Diameters(zero, zero, diameter, zero, no, no, site, Lattice(np.zeros(2), np.r_[0, 9.0], np.r_[9.0, 0]))
+    lattice = Lattice(np.zeros(2), np.r_[0, 9.0], np.r_[9.0, 0])
+    return sem.Diameters(zero, zero, diameter, zero, no, no, site, lattice, no)
 
 
 def test_a_micrograph_lies_where_its_pillars_follow_the_design():

@@ -103,12 +103,12 @@ def test_summaries_of_the_diameters():
     zero, no = np.zeros(5), np.zeros(5, bool)
     site = np.stack([np.arange(5), np.arange(5)[::-1]], axis=1)
     where = (site, Lattice(np.zeros(2), np.array([0.0, 7.0]), np.array([6.0, 0.0])))
-    found = sem.Diameters(zero, zero, four, zero, no, no, *where)
+    found = sem.Diameters(zero, zero, four, zero, no, no, *where, no)
     assert found.mean_nm == pytest.approx(204.0)
     assert found.three_sigma_nm == pytest.approx(3 * np.sqrt((9 + 4 + 0 + 25) / 4))
     known = found.bias(np.array([200.0, 200.0, 200.0, 200.0, 200.0]))
     assert known.value == pytest.approx(4.0)
     assert known.sigma == pytest.approx(np.sqrt((9 + 4 + 0 + 25) / 3) / 2)
     assert (
-        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where).bias(3.0).sigma == 0.05
+        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where, no).bias(3.0).sigma == 0.05
     )  # never surer than this
