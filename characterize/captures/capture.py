@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import stage, tiff_pages, tiff_tags
+from characterize.captures import axes, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
 from characterize.captures.colour import Colours
 from metalens.ground import manifest, reading, store
@@ -24,6 +24,7 @@ from metalens.ground.errors import CaptureError, MetalensError
 
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = Colours()
+Stack = tuple[Array, str]
 _LEAST_PNG = 33  # bytes of a PNG's mark and head
 
 
@@ -101,17 +102,25 @@ def load(path: str | Path) -> Capture:
         raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
 
 
-def read_images(path: Path, colours: Colours = _PLAIN, *, grey: bool = False) -> Array:
-    """(n, y, x) images of one file, in its own number type.
-
-    Args:
-        colours: which colour is lit, and how a raw mosaic holds it.
-        grey: whether images without colours are taken beside a channel (dark, flat).
+def read_images(path: Path) -> Array:
+    """(n, y, x) grey images of one file, in its own number type.
 
     Raises:
-        CaptureError: unknown, lossy, truncated or non-finite; colour without a channel, or a channel without colour.
+        CaptureError: unknown, lossy, truncated or non-finite; colour.
     """
-    return sound(colours.pick(read_all(path, colours), path, grey=grey), path)
+    return sound(_PLAIN.pick(read_all(path), path), path)
+
+
+def _stack(path: Path, colours: Colours, order: str | None, *, count: int | None = None, pages: int = 0) -> Stack:
+    """Frames of one file and what to say of their axes."""
+    images, note = axes.frames_first(read_all(path, colours), path, order, count=count, pages=pages)
+    return sound(colours.pick(images, path, grey=False), path), note
+
+
+def _beside(path: Path, colours: Colours, size: tuple[int, ...]) -> Stack:
+    """Dark or flat of frames of a size, and what to say of its axes."""
+    images, note = axes.as_large(read_all(path, colours), path, size, pitch=colours.pitch)
+    return sound(colours.pick(images, path, grey=True), path), note
 
 
 def sound(images: Array, path: Path) -> Array:
@@ -147,13 +156,13 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
 def _load_file(path: Path) -> Capture:
     about = stage.read_beside(path)
     colours = Colours.of(about, str(path))
-    images = read_images(path, colours)
+    images, said = _stack(path, colours, axes.stated(about, str(path)))
     tags = tiff_tags.read(path) if path.suffix.lower() in TIFF else tiff_tags.Tags()
     images, bits, note, _ = right_align(images, about.pop("bits", None), str(path))
     n = len(images)
     step = about.get("step_um", math.nan)
     position = np.arange(n) * step if math.isfinite(step) else tags.position_um
-    notes = [note, *tags.notes, *colours.notes()]
+    notes = [note, *([said] if said else []), *tags.notes, *colours.notes()]
     return Capture(
         images,
         position if len(position) == n else np.full(n, np.nan),
@@ -176,14 +185,16 @@ def _load_folder(folder: Path) -> Capture:
     files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
-    colours = Colours.of(about, str(folder))
-    said = (*stage.left_out(files, rows), *stage.unread(about)) if rows else stage.unread(about)
+    colours, order = Colours.of(about, str(folder)), axes.stated(about, str(folder))
+    said = [*(stage.left_out(files, rows) if rows else ()), *stage.unread(about)]
     if rows is None:
-        names, frames = _all_frames(files, folder, colours)
+        names, frames, notes = _all_frames(files, folder, colours, order)
         rows = stage.Rows.unknown(names)
     else:
-        frames = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, colours)
-    stacks = {name: read_images(p, colours, grey=True) for name, p in special.items()}
+        frames, notes = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, colours, order)
+    beside = {name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()}
+    stacks = {name: images for name, (images, _) in beside.items()}
+    said += [words for words in (*notes, *(words for _, words in beside.values())) if words]
     bits = about.pop("bits", None)
     frames, depth, note, aligned = right_align(frames, bits, str(folder), beside=tuple(stacks.values()))
     extra = dict(zip(stacks, aligned, strict=True))
@@ -206,40 +217,52 @@ def _load_folder(folder: Path) -> Capture:
     )
 
 
-def _all_frames(files: Sequence[Path], folder: Path, colours: Colours) -> tuple[tuple[str, ...], Array]:
+def _all_frames(
+    files: Sequence[Path], folder: Path, colours: Colours, order: str | None
+) -> tuple[tuple[str, ...], Array, list[str]]:
+    """Names, frames, and what to say of their axes."""
     if not files:
         raise CaptureError(f"{folder}: no frames; need TIFF, PNG or HDF5 images in it")
     names: list[str] = []
-    stacks = []
+    stacks, notes = [], []
     for path in files:
-        images = read_images(path, colours)
+        images, note = _stack(path, colours, order)
+        notes.append(note)
         names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
         stacks.append(images)
-    return tuple(map(reading.shown, names)), _join(stacks, files)
+    return tuple(map(reading.shown, names)), _join(stacks, files), notes
 
 
-def _listed_frames(there: Mapping[str, Path], folder: Path, rows: stage.Rows, colours: Colours) -> Array:
-    """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn."""
-    stacks: dict[str, Array] = {}
+def _listed_frames(
+    there: Mapping[str, Path], folder: Path, rows: stage.Rows, colours: Colours, order: str | None
+) -> tuple[Array, list[str]]:
+    """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn.
+
+    With them what to say of their axes.
+    """
+    stacks: dict[str, Stack] = {}
     images = []
     rows_of, met = Counter(rows.files), Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
         path = there.get(stage.spelt(name), folder / name)
         if not path.is_file():
             raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
-        stack = stacks[name] if name in stacks else read_images(path, colours)
-        stacks[name] = stack
+        if name not in stacks:
+            count = rows_of[name] if stated is None else None
+            stacks[name] = _stack(path, colours, order, count=count, pages=rows.pages(name))
+        stack = stacks[name][0]
         page = min(met[name], len(stack) - 1) if stated is None else stated
         met[name] += 1
         if stated is None and len(stack) not in (1, rows_of[name]):
             raise CaptureError(
                 f"{rows.source}, row {row}: {name!r} holds {len(stack)} pages and stands in {rows_of[name]} rows; say "
-                "with a column page (from 0) which one each row means"
+                f"with a column page (from 0) which one each row means, or, if its {stack.shape} are not (n, y, x) but "
+                '(y, x, n), axes = "yxn" in capture.toml'
             )
         if not 0 <= page < len(stack):
             raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
         images.append(stack[page][None])
-    return _join(images, [folder / name for name in rows.files])
+    return _join(images, [folder / name for name in rows.files]), [note for _, note in stacks.values()]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

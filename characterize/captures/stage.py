@@ -47,7 +47,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     "glass_tilt_y_deg": _TILT,
     **dict.fromkeys(("read_noise_e", "wavelength_sigma_nm", "pixel_sigma_um", "pinhole_um", "glass_um"), _FROM_0),
 }
-_KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "window")
+_KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
 _COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_ANGLES)
 
@@ -66,6 +66,11 @@ class Rows:
     angle_rad: Array
     exposure_s: Array
     source: str
+
+    def pages(self, name: str) -> int:
+        """How many pages of a file are listed, from the first on without a gap; 0 where they are not."""
+        listed = {page for file, page in zip(self.files, self.page, strict=True) if file == name and page is not None}
+        return len(listed) if listed == set(range(len(listed))) else 0
 
     @classmethod
     def unknown(cls, names: tuple[str, ...]) -> "Rows":

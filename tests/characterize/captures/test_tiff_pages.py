@@ -25,7 +25,7 @@ def test_plain_frames_are_read_as_they_are(tmp_path):
 def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(tmp_path):
     stack = written(tmp_path)
     tifffile.imwrite(tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None)
-    names, frames = capture._all_frames([stack, tmp_path / "b.tif"], tmp_path, Colours())
+    names, frames, _ = capture._all_frames([stack, tmp_path / "b.tif"], tmp_path, Colours(), None)
     assert names == ("a.tif[0]", "a.tif[1]", "a.tif[2]", "b.tif")
     assert np.array_equal(frames, np.stack([*FRAMES, FRAMES[1]]))
 
