@@ -69,6 +69,11 @@ class Bench:
     reader: Linear
     reading: Reading | None
 
+    @property
+    def above(self) -> list[str]:
+        """Why the errors of the images are above their tolerance: of the pillars, and of the run's smooth phase."""
+        return [self.device.above, *([] if self.reading is None else [self.reading.true.above])]
+
     def basis(self, numerics: Numerics) -> PsfBasis:
         """One-PSF kernels of the designed lens."""
         maps = self.aperture.maps(self.aperture.designed())

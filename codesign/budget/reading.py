@@ -79,7 +79,7 @@ class Reading:
         if not isinstance(whole, Imager):
             raise TypeError("a device is imaged truly")
         plane = formed.optics_of(settings, coefficients)
-        return Device(plane.wave, plane.layers, plane.distance_um, whole)
+        return Device(plane.wave, plane.layers, plane.distance_um, whole, settings.image_tolerance)
 
     def stands(self, wave: object, layers: Layers, distance_um: float) -> Device:
         """The device of another lens plane behind films, on the frames of this run."""

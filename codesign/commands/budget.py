@@ -25,24 +25,24 @@ from metalens.made import of_process
 
 
 def run(options: Options) -> int:
-    """Compute, write, report; exit 0."""
+    """Compute, write, report; exit 1 where the error of the device's image is above its tolerance."""
     target = options.output
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
     made, given = lens.load_plain(options.lens), _given(options)
     with options.claim(target, beside=(".html", ".png")) as draft:
-        about = _provenance(options, given)
-        title = f"{__version__}\n{about.config}{about.inputs}{given.frames}"
+        origin = _provenance(options, given)
+        title = f"{__version__}\n{origin.config}{origin.inputs}{given.frames}"
         journal = Journal(target.with_name(target.name + ".resume"), title)
-        links = budget.entries(bench(made, given), journal)
+        about = bench(made, given)
+        links = budget.entries(about, journal)
         rows = list(options.console.track(links, total=18, label="links"))
-        save(draft.path, rows, about)
+        save(draft.path, rows, origin)
         budget_page.write(draft.path.with_suffix(".html"), rows)
         store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
     journal.finish()
     values = {"rows": [dataclasses.asdict(row) for row in rows], **summary(rows)}
-    options.console.result(_plain(values), text(rows))
-    return 0
+    return options.console.judged(_plain(values), text(rows), about.above)
 
 
 def summary(rows: list[Entry]) -> dict[str, float]:

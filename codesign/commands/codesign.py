@@ -41,7 +41,7 @@ SHOWN = 8  # test frames that are kept with the answers
 
 
 def run(options: Options) -> int:
-    """Train, search, finish; exit 0."""
+    """Train, search, finish; exit 1 where the error of the true image is above what the run asks for."""
     settings = _frozen(runs.load(options.config), options.freeze)
     if options.export and settings.network != "supernet":
         raise ConfigError(f"--export writes elastic networks; network = {settings.network!r} has no such export")
@@ -56,8 +56,7 @@ def run(options: Options) -> int:
     words = (
         f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
     )
-    options.console.result(values, f"{_table(rows)}\n{formed.words(said)}\n{words}")
-    return 0
+    return options.console.judged(values, f"{_table(rows)}\n{formed.words(said)}\n{words}", [said["above"]])
 
 
 def _work(

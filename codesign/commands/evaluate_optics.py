@@ -42,7 +42,7 @@ class Settings:
 
 
 def run(options: Options) -> int:
-    """Measure, print, draw, write."""
+    """Measure, print, draw, write; exit 1 where an error of PSFs or images is above what is aimed at."""
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
     settings = Settings() if options.config is None else config.load(options.config, Settings, empty=False)
@@ -53,8 +53,8 @@ def run(options: Options) -> int:
     folder = options.output
     with options.claim_folder(folder) as draft:
         values, text = _measure(options, settings, made, names, draft.path)
-    options.console.result(values, f"{text}\n\n{folder}: tables.txt, optics.json, five pictures, report.html")
-    return 0
+    words = f"{text}\n\n{folder}: tables.txt, optics.json, five pictures, report.html"
+    return options.console.judged(values, words, values["failures"])
 
 
 def _measure(
@@ -79,6 +79,7 @@ def _measure(
         raise ConfigError("; ".join([str(error), *told])) from error
     tables = [*evaluate_tables.tables(axial, scenes, measured, spread=told), *field_page.tables(seen)]
     values = evaluate_tables.values(axial, scenes, measured)
+    values["failures"] = evaluate_tables.failures(axial, scenes, measured)
     for name, one in seen.items():
         values["lenses"][name] |= {"focuses": name not in spread, "field": field_page.values(one)}
     if options.reader:

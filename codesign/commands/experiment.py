@@ -22,7 +22,7 @@ GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-ra
 
 
 def run(options: Options) -> int:
-    """Show, read, calibrate, draw; exit 0."""
+    """Show, read, calibrate, draw; exit 1 where the error of a run's images is above what the run asks for."""
     if not options.runs:
         raise ConfigError("no run to evaluate; give one run folder or more")
     names = options.names or distinct(options.runs)
@@ -39,6 +39,7 @@ def run(options: Options) -> int:
             results = found
         shown = {name: retrained.lens_of(path) for name, path in zip(names, options.runs, strict=True)}
         values = summary(results, config) | {"images": images(options.runs, names), "lenses": shown}
+        values["failures"] = [f"{one.name}: {one.above}" for one in results if one.above]
         pictures = {
             "samples.png": experiment_plots.samples(sources[0], config),
             "ambiguity.png": experiment_plots.ambiguity(results[0]),
@@ -48,8 +49,7 @@ def run(options: Options) -> int:
         for number, (result, source) in enumerate(zip(results, sources, strict=True), 1):
             if isinstance(result.how, People):
                 people_file.save(draft.path / f"people_{number}.h5", result.how, provenance=_made(source, config))
-    options.console.result(values, f"{table(values)}\nopen {folder / PAGE}")
-    return 0
+    return options.console.judged(values, f"{table(values)}\nopen {folder / PAGE}", values["failures"])
 
 
 def _made(source: Source, config: ExperimentConfig) -> store.Provenance:

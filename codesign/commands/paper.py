@@ -20,7 +20,7 @@ DIM_DB = 15.0
 
 
 def run(options: Options) -> int:
-    """Measure what is missing, compare, write; exit 0."""
+    """Measure what is missing, compare, write; exit 1 where a measurement's own check failed."""
     if len(options.runs) > len(ROLES):
         raise ConfigError(f"{len(options.runs)} runs; give at most {len(ROLES)}: {', '.join(ROLES)}")
     folder = options.output
@@ -36,8 +36,15 @@ def run(options: Options) -> int:
         _write(draft.path, told)
         values = [{**asdict(t.claim), "ours": asdict(t.ours) if t.ours else None, "picture": t.picture} for t in told]
         store.write_text(draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n")
-    options.console.result({"lines": values, "folder": str(folder)}, f"{table(told)}\nopen {folder / PAGE}")
-    return 0
+    text = f"{table(told)}\nopen {folder / PAGE}"
+    return options.console.judged({"lines": values, "folder": str(folder)}, text, failures(folder))
+
+
+def failures(folder: Path) -> list[str]:
+    """The checks that the measurements in ``folder`` failed, each with which it is of."""
+    files = [folder / name for name in ("experiment/experiment.json", "dim/experiment.json", "optics/optics.json")]
+    read = {file.parent.name: json.loads(file.read_text("utf-8")) for file in files if file.is_file()}
+    return [f"{name}: {words}" for name, values in read.items() for words in values.get("failures", [])]
 
 
 def collect(folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()) -> dict[str, Measured]:

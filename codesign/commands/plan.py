@@ -40,7 +40,7 @@ def angle_rad(text: str) -> float:
 
 
 def run(options: Options) -> int:
-    """Measure, choose, write; exit 1 where even the finest settings miss the goal.
+    """Measure, choose, write; exit 1 where even the finest settings miss the goal, or the image its tolerance.
 
     Raises:
         ConfigError: the goal is below what no setting changes.
@@ -61,8 +61,15 @@ def run(options: Options) -> int:
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)
     journal.finish()
-    options.console.result(values(best, measured), text(best, measured, target))
-    return 0 if best.met else 1
+    return options.console.judged(values(best, measured), text(best, measured, target), failures(best, chain))
+
+
+def failures(best: Plan, chain: Chain) -> list[str]:
+    """Why a plan does not do: the goal is missed, or the image of the chosen tolerance is not within it."""
+    missed = [] if best.met else ["the goal is not met by the finest settings on offer"]
+    if isinstance(best.choice, plan.TrueChoice):
+        missed.append(chain.device(best.choice.image_tolerance).above)
+    return missed
 
 
 def values(best: Plan, measured: Pilot) -> dict[str, object]:
@@ -177,14 +184,13 @@ def _page(path: Path, best: Plan, measured: Pilot) -> None:
 def text(best: Plan, measured: Pilot, folder: Path) -> str:
     """The plan for a terminal."""
     rows = [f"  {name.replace('_', ' '):<20} {value:g}" for name, value in asdict(best.choice).items()]
-    verdict = "" if best.met else "  THE GOAL IS NOT MET by the finest settings on offer\n"
     nodes = chosen_nodes(best, measured)
     field_of = f"  {'of the true image':<20} {', '.join(f'{v} {k}' for k, v in nodes.items())}\n" if nodes else ""
     return (
         f"{folder}: gaze error {math.degrees(best.predicted_rad):.2g} deg predicted, "
         f"{math.degrees(best.goal_rad):.2g} allowed\n"
         + "\n".join(rows)
-        + f"\n{field_of}{verdict}  run {best.seconds:.0f} s, everything at its finest {best.finest_seconds:.0f} s; "
+        + f"\n{field_of}  run {best.seconds:.0f} s, everything at its finest {best.finest_seconds:.0f} s; "
         f"the pilot took {measured.spent_seconds:.0f} s\n"
         f"  floor, whatever the settings: {floor_words(measured)}"
     )

@@ -87,7 +87,7 @@ def run(options: Options) -> int:
     if options.referee:
         pathtraced.start()
     lens = None if options.lens is None else lenses.load(options.lens)
-    folder = options.output
+    folder, failures = options.output, list[str]()
     with options.claim_folder(folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2) as draft:
         count = _make(settings, draft.path, referee=options.referee)
         values: dict[str, object] = {"frames": settings.frames, "layers": count, "folder": str(folder)}
@@ -97,11 +97,10 @@ def run(options: Options) -> int:
             about = Provenance(config.dumps(settings), {options.lens.name: reading.sha256(options.lens)}, settings.seed)
             found = _imaged(settings, lens, options.fwhm_nm)
             imaged.write(draft.path, found, about)
-            values |= {"image_error": found.error, "light": found.light, "problem": found.problem}
+            values |= {"image_error": found.error, "light": found.light}
+            failures.append(found.problem)
             words += f"\n{found.error:.2g} of a texture is the error of the image: {folder}/image.png{found.light}"
-            words += f"\nFAILED: {found.problem}" if found.problem else ""
-    options.console.result(values, words)
-    return 1 if values.get("problem") else 0
+    return options.console.judged(values, words, failures)
 
 
 def _make(settings: Scene, folder: Path, *, referee: bool) -> int:

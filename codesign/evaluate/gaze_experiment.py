@@ -140,11 +140,12 @@ def experiment(
             yield subject + 1, []
     whole = joined(trials)
     labels = names or [f"run {i + 1}" for i in range(len(sources))]
+    above = [formed.above(source.run.trainer.optics, one) for source, one in zip(sources, prepared, strict=True)]
     yield (
         config.subjects,
         [
-            replace(_result(label, source, kept, whole, config, one), visible_mm=np.concatenate(visible))
-            for label, source, kept, one in zip(labels, sources, answers, how, strict=True)
+            replace(_result(label, source, kept, whole, config, one), visible_mm=np.concatenate(visible), above=told)
+            for label, source, kept, one, told in zip(labels, sources, answers, how, above, strict=True)
         ],
     )
 

@@ -194,6 +194,7 @@ class SceneEnergy:
     image_error: of the images, relative L2 of a texture: the true image's own estimate, or how far the uniform image is
     from it; nan where it is not known.
     maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared difference of gaze and slip (Fig. 5).
+    above: why the error of the true image is above what it aims at; empty where it is not.
     """
 
     gaze: Tensor
@@ -202,6 +203,7 @@ class SceneEnergy:
     light: float
     image_error: float
     maps: Tensor
+    above: str = ""
 
     @property
     def angle_rad(self) -> Tensor:
@@ -236,7 +238,8 @@ def scene_energies(lenses: Sequence[Lens], states: States, settings: Scenes | No
         true = lens_imager(lens, rendered, settings)
         if settings.image == "true":
             light = 1 - true.parts["outside"]
-            out.append(energies_of(true, views, light=light, image_error=true.error))
+            found = energies_of(true, views, light=light, image_error=true.error)
+            out.append(replace(found, above=true.above(settings.image_tolerance)))
             continue
         basis, light = lens_basis(lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um)
         one = scene.uniform_imager(basis, (settings.pixels, settings.pixels))

@@ -110,7 +110,8 @@ class Result:
     calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
     and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
     slippage along x, y, z that the run's training saw. how: subjects were calibrated. visible_mm: (n, 3) displacement
-    of the head as the camera sees it, its own turn on the mount included: all that can be read.
+    of the head as the camera sees it, its own turn on the mount included: all that can be read. above: why the error
+    of the images is above what the run asks for; empty where it is not.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Result:
     reach_mm: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     how: "Calibrator | None" = None
     visible_mm: Array | None = None
+    above: str = ""
 
     @property
     def within(self) -> Array:

@@ -63,6 +63,17 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
     return out
 
 
+def failures(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> list[str]:
+    """What of the numbers misses its tolerance, in words."""
+    asked = setting.tolerance
+    above = [
+        f"{name}: the PSFs' error {one.psf_error:.2g} is above axial.tolerance = {asked:g}"
+        for name, one in axial.items()
+        if one.psf_error > asked
+    ]
+    return above + [f"{name}: {one.above}" for name, one in scenes.items() if one.above]
+
+
 def tables(
     axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled, *, spread: Sequence[str] = ()
 ) -> list[Table]:

@@ -213,18 +213,30 @@ def difference(one: UniformImager, true: Imager) -> float:
     return float((got - want).norm() / (want - want.mean()).norm())
 
 
+def above(settings: OpticsConfig, found: UniformImager | Imager) -> str:
+    """Why the error of the true image is above ``optics.image_tolerance``; empty where it is not, or the image is
+    uniform, whose distance from the true one is told instead."""
+    return found.above(settings.image_tolerance) if isinstance(found, Imager) else ""
+
+
 def described(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> dict[str, Any]:
     """What the images are and how wrong, for a report: kind, error, and the source's width and filter.
 
     error: of the uniform image, :func:`apart`; of the true image, its own estimate; None where the true image of this
-    lens cannot be formed, for the reason under ``problem``.
+    lens cannot be formed, for the reason under ``problem``. above: why the true image's own estimate is above
+    ``optics.image_tolerance``; empty where it is not.
     """
-    found: dict[str, Any] = {"kind": settings.image, "fwhm_nm": settings.fwhm_nm, "passed": settings.passed}
+    found: dict[str, Any] = {
+        "kind": settings.image,
+        "fwhm_nm": settings.fwhm_nm,
+        "passed": settings.passed,
+        "above": "",
+    }
     try:
         if settings.image == "uniform":
             return found | {"error": apart(settings, coefficients_rad, frame, margin=margin)}
         made = imager(settings, coefficients_rad, frame, margin=margin)
-        return found | {"error": float(getattr(made, "error", math.nan))}
+        return found | {"error": float(getattr(made, "error", math.nan)), "above": above(settings, made)}
     except (SceneError, PropagationError) as problem:
         return found | {"error": None, "problem": str(problem)}
 

@@ -103,6 +103,12 @@ class Device:
     layers: Layers
     distance_um: float
     whole: Imager = field(repr=False)
+    tolerance: float
+
+    @property
+    def above(self) -> str:
+        """Why the error of the image is above its tolerance; empty where it is not."""
+        return self.whole.above(self.tolerance)
 
     def image(self, *, wave: Wave | None = None, layers: Layers | None = None, shift_um: float = 0.0) -> Imager:
         """The image with another lens plane, other films, or the sensor moved away by ``shift_um``."""
@@ -171,7 +177,7 @@ def device(
             wave, grid, spectrum=spectrum, layers=layers, field=(field_rad, 0.0), tolerance=tolerance,
             distance_um=distance_um,
         )  # fmt: skip
-    return Device(wave, layers, distance_um, whole)
+    return Device(wave, layers, distance_um, whole, tolerance)
 
 
 def _few(axis: Tensor) -> Tensor:

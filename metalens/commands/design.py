@@ -153,9 +153,8 @@ def run(options: Options) -> int:
         text = f"{text}\n{words.converted(made.conversion, made.quality, made.wanted.hand)}"
     if made.judged is not None:
         values["fisher"], text = made.judged.values, f"{text}\n\n{made.judged.text}"
-    options.console.result(values, text)
-    focused = all(one is None or one.passed for one in (made.check, *(b.check for b in made.beside)))
-    return 0 if focused and not made.lens.proxy.doubt else 1
+    checks = (made.check, *(one.check for one in made.beside))
+    return options.console.judged(values, text, [*words.unfocused(checks), made.lens.proxy.doubt])
 
 
 def _head(wanted: Design, target: Path, quality: Quality) -> str:
@@ -201,8 +200,8 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         lens.save(draft.path, made)
         write_bytes(draft.path.with_suffix(".png"), lens_plot.picture(made))
     head = _head(wanted, options.output, split.x)
-    options.console.result(paired.values(split, checks), paired.text(head, wanted.layers, split, checks))
-    return 0 if all(check.passed for check in checks if check is not None) else 1
+    told = paired.values(split, checks), paired.text(head, wanted.layers, split, checks)
+    return options.console.judged(*told, words.unfocused(checks))
 
 
 def _read(wanted: Design, where: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 """What ``metalens design`` says of a lens: numbers for programs, lines for people."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 from metalens import design
@@ -72,6 +73,16 @@ def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = N
     return values
 
 
+def unfocused(checks: Sequence[FocusCheck | None]) -> list[str]:
+    """Of every focus that is not as it should be, what is wrong with it."""
+    return [
+        f"{'the focus is dim' if check.placed else 'no focus where it should be'}: a Strehl ratio of "
+        f"{check.strehl:.3f}, expected {check.expected:.3f}"
+        for check in checks
+        if check is not None and not check.passed
+    ]
+
+
 def _cone(quality: Quality) -> list[str]:
     """Aperture and field of a lens that has a focus."""
     if not quality.focuses:
@@ -134,16 +145,13 @@ def curve(proxy: Proxy) -> dict[str, object]:
 
 
 def held(made: Lens) -> str:
-    """What is known of its pillars, in words: how close to solved ones, and whether those are known at
-    all; for which light, where pillars of one size
-    answer x and y apart."""
+    """What is known of its pillars, in words: how close to solved ones; for which light, where pillars of one
+    size answer x and y apart."""
     phase, level = made.proxy.max_phase_error_rad, made.proxy.max_transmission_error
     known = (
         f"\n  what follows takes pillars by a curve, within {phase:.1e} rad and {level:.1e} of |T| of those solved for "
         "the library"
     )
-    if made.proxy.doubt:
-        known += f"\n  FAILED: {made.proxy.doubt}"
     if not made.one_light:
         return known
     return known + (

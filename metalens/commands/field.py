@@ -143,6 +143,7 @@ def run(options: Options) -> int:
     values: dict[str, Any] = {
         name: {"error": one.error, "largest_e": _largest(one)} for name, one in zip(names, found, strict=True)
     }
+    failures: list[str] = []
     missed = [name for name, one in zip(names, found, strict=True) if not one.converged]
     words = [
         f"  {name}: |E| up to {_largest(one):.2f} of the light that comes, within {one.error:.1g} (rms)"
@@ -152,11 +153,14 @@ def run(options: Options) -> int:
     if missed:
         above = f"{', '.join(missed)} above the tolerance {wanted.tolerance:g} at {found[0].orders} orders: "
         cure = "allow a larger one; " if failed and all(one.error <= UNKNOWN for one in found) else ""
-        words.append(f"  {'FAILED: ' * failed}{above}{cure}fields at edges converge slowly")
+        told = f"{above}{cure}fields at edges converge slowly"
+        if failed:
+            failures.append(told)
+        else:
+            words.append(f"  {told}")
     title = f"{options.output}: field of {wanted.cell.described}, {NM * wanted.wavelength_um:g} nm"
-    told = {"orders": found[0].orders, "tolerance": wanted.tolerance, "cuts": values}
-    options.console.result(told, "\n".join([title, *words]))
-    return 1 if failed else 0
+    numbers = {"orders": found[0].orders, "tolerance": wanted.tolerance, "cuts": values}
+    return options.console.judged(numbers, "\n".join([title, *words]), failures)
 
 
 def _largest(one: NearField) -> float:

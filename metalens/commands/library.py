@@ -85,8 +85,8 @@ def run(options: Options) -> int:
         _draw(draft.path, made, fitted)
     stated = wanted.sweep.tolerance is not None
     failures = _failures(made, fitted, refusal, stated=stated, accept_partial_turn=options.accept_partial_turn)
-    options.console.result(_values(made, fitted, seconds, failures), _text(target, made, fitted, seconds, failures))
-    return 1 if failures else 0
+    values, text = _values(made, fitted, seconds), _text(target, made, fitted, seconds, failures)
+    return options.console.judged(values, text, failures)
 
 
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
@@ -147,7 +147,7 @@ def _above(made: PillarLibrary) -> str:
     )
 
 
-def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failures: list[str]) -> dict[str, Any]:
+def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float) -> dict[str, Any]:
     values: dict[str, Any] = {
         "engine": made.engine,
         "entries": made.t.size,
@@ -156,7 +156,6 @@ def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failur
         "max_error": float(made.t_error.max()),
         "median_error": float(np.median(made.t_error)),
         "polarizations": list(made.polarization),
-        "failures": failures,
     }
     if made.turned is not None:
         values["circular"] = _circular(made.turned)
@@ -205,7 +204,7 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
     elif made.polarization == ("x",) and not made.cell.alike:
         lines.append("  all of it for light along x: these pillars answer light along y otherwise")
         lines += _elsewhere(made)
-    return "\n".join(lines + [f"  FAILED: {failure}" for failure in failures])
+    return "\n".join(lines)
 
 
 def _elsewhere(made: PillarLibrary) -> list[str]:

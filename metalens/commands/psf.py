@@ -123,12 +123,10 @@ def run(options: Options) -> int:
         stack = _make(options, settings, made, built, draft.path)
     counts = (("angle", stack.angles_rad), ("depth", stack.depths_um), ("wavelength", stack.weights))
     shape = " x ".join(f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts)
-    state = "" if stack.converged else f"; above the tolerance {stack.tolerance:g}: raise it or widen the window"
-    text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason}){state}\n  {_budget(stack).text}"
-    if made.proxy.doubt:
-        text += f"\n  FAILED: {made.proxy.doubt}"
-    options.console.result(_summary(stack) | {"doubt": made.proxy.doubt}, text)
-    return 0 if stack.converged and not made.proxy.doubt else 1
+    text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})\n  {_budget(stack).text}"
+    above = f"the relative error {stack.error:.2g} is above the tolerance {stack.tolerance:g}: {_budget(stack).cure}"
+    failures = ["" if stack.converged else above, made.proxy.doubt]
+    return options.console.judged(_summary(stack) | {"doubt": made.proxy.doubt}, text, failures)
 
 
 def _far(options: Options) -> int:

@@ -51,11 +51,10 @@ def run(options: Options) -> int:
     journal.finish()
     best = cell_study.choice(study, verdicts)
     values = {"pitch_um": best and best[0], "height_um": best and best[1], "cells": len(verdicts)}
-    text = "no cell covers a full turn at all wavelengths"
+    text = f"{options.output}: {len(verdicts)} cells"
     if best is not None:
-        text = f"{len(verdicts)} cells; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
-    options.console.result(values, f"{options.output}: {text}")
-    return 0 if best else 1
+        text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
+    return options.console.judged(values, text, [] if best else ["no cell covers a full turn at all wavelengths"])
 
 
 def _printable(path: Path, study: Study) -> Study:

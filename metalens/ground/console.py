@@ -61,6 +61,13 @@ class Console:
         else:
             self.say(text)
 
+    def judged(self, values: dict[str, Any], text: str, failures: Iterable[str]) -> int:
+        """The outcome with the checks that it failed, in words (``failures`` of the values, a line each of the text);
+        the status that the command ends with: 1 where any is told, else 0. Empty words are no failure."""
+        told = [failure for failure in failures if failure]
+        self.result(values | {"failures": told}, "\n".join([text, *(f"  FAILED: {failure}" for failure in told)]))
+        return 1 if told else 0
+
     def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
         """Pass ``items`` through, showing how far it is, the rate and the time left."""
         if self.quiet or self.json:

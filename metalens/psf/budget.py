@@ -26,6 +26,14 @@ RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rou
 HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
+CURES = {  # of an error above the tolerance, by its largest part
+    "numerical": "raise it or widen the window",
+    "sampling": "give the window more samples",
+    "spectrum": "raise it or narrow the spectrum",
+    "source": "raise it or give a smaller source",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class LeftOut:
     """What is known of pillars that the model of a lens leaves out; by default rough, of another cell.
@@ -85,6 +93,11 @@ class Budget:
     def computed(self) -> float:
         """What the tolerance is about: numerical, sampling, spectrum and source together."""
         return math.hypot(self.numerical, self.sampling, self.spectrum, self.source)
+
+    @property
+    def cure(self) -> str:
+        """What to do about the largest part of what is computed."""
+        return CURES[max(CURES, key=lambda cause: getattr(self, cause))]
 
     @property
     def model(self) -> float:

@@ -76,6 +76,19 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 
 
+def test_an_error_above_what_is_aimed_at_ends_1_and_is_told_in_both_outputs(tmp_path, capsys):
+    """No sum in floating point keeps 1e-17; the files are there all the same."""
+    made(tmp_path / "a.h5", 20000.0)
+    small = TOML.replace("[axial]", "[axial]\ntolerance = 1e-17").replace("pixels = 64", "pixels = 24")
+    (tmp_path / "o.toml").write_text(small.replace("count = 3", "count = 1"))
+    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "-o", str(tmp_path / "out")]
+    assert cli.main(["evaluate", "optics", *words]) == 1
+    assert "\n  FAILED: a: the PSFs' error " in (shown := capsys.readouterr().out)
+    (told,) = json.loads((tmp_path / "out" / "optics.json").read_text())["failures"]
+    assert told.endswith("is above axial.tolerance = 1e-17")
+    assert told in shown
+
+
 def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 2000.0, distance_um=700.0)

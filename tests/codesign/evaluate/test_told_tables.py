@@ -1,6 +1,7 @@
 """What the paper's tables say of typed measurements, worked out by hand: means over depths, least light, intervals."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,3 +76,12 @@ def test_numbers_for_machines_are_those_of_the_record():
     assert mine["span_angle_deg"] == pytest.approx(float(torch.rad2deg(shown["mine"].angle_rad).mean()))
     unknown = {"mine": energy([1.0, 2.0], [1.0, 3.0], [1.0, 2.5], image_error=math.nan)}
     assert tables.values({"mine": FOUND}, unknown, SETTING)["lenses"]["mine"]["image_error"] is None
+
+
+def test_errors_of_psfs_and_images_above_what_is_aimed_at_are_failures_of_that_lens():
+    shown = {"plain": energy([1.0], [2.0], [3.0]), "mine": energy([1.0], [2.0], [3.0], above="0.2 is too much")}
+    assert tables.failures({"plain": FOUND, "mine": FOUND}, shown, replace(SETTING, tolerance=0.013)) == [
+        "mine: 0.2 is too much"
+    ]
+    told = tables.failures({"mine": FOUND}, {"plain": shown["plain"]}, replace(SETTING, tolerance=0.0129))
+    assert told == ["mine: the PSFs' error 0.013 is above axial.tolerance = 0.0129"]

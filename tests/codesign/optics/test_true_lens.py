@@ -84,7 +84,7 @@ def test_one_psf_is_that_of_the_middle_and_even_light_that_of_the_mean(monkeypat
         true_lens, "with_psfs", lambda whole, stack, energy: SimpleNamespace(stack=stack, energy=energy)
     )
     whole = SimpleNamespace(stack=torch.rand(3, 5, 2, 4, 4, generator=DRAW), energy=torch.rand(3, 5, generator=DRAW))
-    made = Device(None, None, 210.0, whole)
+    made = Device(None, None, 210.0, whole, 0.03)
     one, even = made.one_psf(), made.evenly_lit()
     assert torch.equal(one.energy, whole.energy)
     assert torch.equal(even.stack, whole.stack)

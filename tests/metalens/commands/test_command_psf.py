@@ -248,3 +248,11 @@ def test_psfs_of_hardly_known_pillars_end_1_with_the_word_that_design_gives(fold
     assert command(folder) == code
     assert ("FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out) == bool(code)
     assert (folder / "psf.h5").exists()
+
+
+def test_a_source_too_wide_for_the_tolerance_is_told_with_its_own_cure(folder, capsys):
+    """30 um at 2 mm are 0.86 deg: the PSF of this lens at 15 deg changes over them by more than 1e-6."""
+    assert command(folder, "--source-um", "30", "--tolerance", "1e-6") == 1
+    told = capsys.readouterr().out
+    assert "is above the tolerance 1e-06: raise it or give a smaller source" in told
+    assert "widen" not in told

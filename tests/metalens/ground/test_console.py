@@ -27,6 +27,19 @@ def test_quiet_says_nothing(capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_a_failed_check_is_told_and_ends_with_1(capsys):
+    assert Console().judged({"a": 1}, "a is 1", ["", "b is 3, need 2"]) == 1
+    assert capsys.readouterr().out == "a is 1\n  FAILED: b is 3, need 2\n"
+    assert Console(json=True).judged({"a": 1}, "a is 1", ["b is 3"]) == 1
+    assert json.loads(capsys.readouterr().out) == {"a": 1, "failures": ["b is 3"]}
+    assert Console(quiet=True).judged({}, "a is 1", ["b is 3"]) == 1
+
+
+def test_empty_words_are_no_failure(capsys):
+    assert Console().judged({"a": 1}, "a is 1", ["", ""]) == 0
+    assert capsys.readouterr().out == "a is 1\n"
+
+
 def test_progress_without_a_terminal_is_plain_lines_with_rate_and_time_left(capsys, monkeypatch):
     import time
 

@@ -268,3 +268,11 @@ def test_words_of_what_is_left_out_say_whose_numbers_they_are():
     )
     assert budget.LeftOut(rows, of="this cell").words.endswith("at 0.94 um and normal incidence")
     assert "beside the window" not in Budget(0.02).text
+
+
+@pytest.mark.parametrize("cause", ["numerical", "sampling", "spectrum", "source"])
+def test_the_cure_is_that_of_the_largest_part_that_is_computed(cause):
+    """What the model leaves out is larger here, and no setting of a computation cures it."""
+    parts = {"numerical": 0.02, "sampling": 0.03, "spectrum": 0.025, "source": 0.01} | {cause: 0.05}
+    words = {"numerical": "widen the window", "sampling": "more samples", "spectrum": "narrow the spectrum"}
+    assert words.get(cause, "smaller source") in Budget(**parts, angle=0.4, outside=0.5).cure
