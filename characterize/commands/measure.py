@@ -136,7 +136,7 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
-    strange = float((found.collapsed | found.oval).mean()) > 0.5
+    strange = float((found.collapsed | found.oval).mean()) > sem.MOST
     good = bool(np.isfinite(found.diameter_nm).any()) and not strange
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
     if not options.crop and len(image) < len(whole):

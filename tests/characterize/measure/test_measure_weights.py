@@ -63,17 +63,35 @@ def test_a_pillar_is_as_wide_from_wherever_its_site_is_guessed():
 
 
 def test_the_error_of_a_radius_is_the_scatter_of_its_rays_over_the_root_of_their_number():
-    """Smoothed by a Gaussian of one ray and between pixels, less the circle's three numbers; half the rim's too."""
+    """Smoothed by a Gaussian of one ray and between pixels, less the oval's five numbers; half of rim and gap too."""
     y, x = np.mgrid[:61, :61]
-    rough = 12.4 + 0.4 * np.cos(2 * np.arctan2(y - 30.2, x - 29.7))
+    rough = 12.4 + 0.4 * np.cos(3 * np.arctan2(y - 30.2, x - 29.7))
     disc = np.clip(rough - np.hypot(y - 30.2, x - 29.7) + 0.5, 0, 1)
     _, _, radius, sigma, scatter = sem._edges(disc, 30.2, 29.7, 40.0)
     assert radius == pytest.approx(12.4, abs=0.05)
-    assert scatter == pytest.approx(0.4 / math.sqrt(2), rel=0.05)  # smoothing over rays takes 1 %
-    edge, rim = (
-        sem.RAYS / math.sqrt(4 * math.pi * (1 + 1 / 6 / (2 * math.pi * r / sem.RAYS) ** 2)) for r in (radius, 9.4)
+    assert scatter == pytest.approx(0.4 / math.sqrt(2), rel=0.05)  # smoothing over rays takes 3 %
+    edge, rim, gap = (
+        sem.RAYS / math.sqrt(4 * math.pi * (1 + 1 / 6 / (2 * math.pi * r / sem.RAYS) ** 2))
+        for r in (radius, 9.4, (radius + 20) / 2)
     )
-    assert sigma == pytest.approx(scatter * math.sqrt(1 / (edge - 3) + 0.25 / rim), rel=0.02)  # the rim to 2 pixels
+    noise = scatter**2 / (1 - 5 / edge)
+    assert sigma == pytest.approx(math.sqrt(noise * (1 / edge + 0.25 / rim + 0.25 / gap)), rel=0.02)  # rim to 2 pixels
+
+
+@pytest.mark.parametrize("long", [1.05, 1.14])
+def test_what_is_a_little_oval_has_the_circle_of_its_area_and_is_no_noise(long):
+    """Half axes of 12.4 times and over the root of their ratio, turned by 25 degrees; of r(t) the fourth wave is left.
+
+    It is 3 / 16 of the square of half the ratio less one: 0.02 pixels at 1.14, over the root of 20 rays and 2.
+    """
+    y, x = np.mgrid[:61, :61]
+    dy, dx, turn = y - 30.2, x - 29.7, math.radians(25)
+    one, other = dx * math.cos(turn) + dy * math.sin(turn), dy * math.cos(turn) - dx * math.sin(turn)
+    away = np.hypot(one / math.sqrt(long), other * math.sqrt(long))
+    _, _, radius, sigma, scatter = sem._edges(np.clip(12.4 - away + 0.5, 0, 1), 30.2, 29.7, 40.0)
+    assert radius == pytest.approx(12.4, abs=0.03)  # of which the ramp, no blur but taken for one, is 0.01
+    assert sigma < 0.01
+    assert scatter == pytest.approx(12.4 * (long - 1) / 2 / math.sqrt(2), rel=0.1)  # smoothing over rays: 2 %
 
 
 def test_pillars_nearly_of_one_size_are_laid_by_what_little_they_differ():

@@ -92,15 +92,17 @@ def test_a_circle_goes_through_the_half_rise_places_and_knows_its_error():
     assert (dy, dx) == pytest.approx((0.8, 1.3), abs=0.05)  # first order of the offset; its square over 4 R: 0.04
     assert radius == pytest.approx(14.3, abs=0.1)
     dy, dx, radius, sigma, scatter = sem._edges(flat, 40.8, 43.3, 50.0)
-    assert (dy, dx, radius) == pytest.approx((0, 0, 14.3), abs=0.03)  # linear interpolation of a cone
+    bent = 3**2 / 12 / (2 * 14.3)  # a ramp of 3 pixels is as wide as a blur, which would have drawn a disc in by this
+    assert (dy, dx, radius) == pytest.approx((0, 0, 14.3 + bent), abs=0.03)  # linear interpolation of a cone
     assert scatter < 0.05
     assert sem._edges(0.2 + 0.7 * flat, 40.8, 43.3, 50.0)[2] == pytest.approx(radius, abs=1e-6)  # half of the step
     wavy = np.clip(0.5 + (14.3 + 0.6 * np.cos(5 * np.arctan2(y - 40.8, x - 43.3)) - away) / 3, 0, 1)
     *_, sigma, scatter = sem._edges(wavy, 40.8, 43.3, 50.0)
     across = math.exp(-(math.radians(5 * 5) ** 2) / 2)  # smoothed over rays 5 degrees apart
     assert scatter == pytest.approx(0.6 / math.sqrt(2) * across, rel=0.03)
-    shared = 0.25 / (0.95 * INDEPENDENT)  # of the rim, two to four pixels nearer to the middle
-    assert sigma == pytest.approx(scatter * math.sqrt(1 / (INDEPENDENT - 3) + shared), rel=0.01)
+    noise = scatter**2 / (1 - 5 / INDEPENDENT)
+    shared = 0.25 / (0.95 * INDEPENDENT) + 0.25 / (1.02 * INDEPENDENT)  # of rim and gap, nearer and farther than edges
+    assert sigma == pytest.approx(math.sqrt(noise * (1 / INDEPENDENT + shared)), rel=0.02)
     assert sem._edges(0.19 * flat, 40.8, 43.3, 50.0) is None  # too faint a step
 
 
