@@ -36,7 +36,8 @@ class Options(Common):
         design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a micrograph.
         reference_e: electrons of the beam through an empty aperture of the lens's size, for the focusing efficiency.
         edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation transfer across it (ISO 12233).
-        pixel_nm: size of a micrograph's pixel; bar_nm: length of its white scale bar, where the pixel is unknown.
+        pixel_nm: size of a micrograph's pixel.
+        bar_nm: length of a micrograph's white scale bar, where the pixel is unknown.
         pitch_nm: distance of neighbouring pillars; found in the picture without it.
         edge_bias_nm: by which edges appear outside the true ones, from a calibration sample.
         crop: rows and columns of the picture to look at (top, bottom, left, right), to leave out what is no pillar
@@ -92,6 +93,7 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, boo
     ]
     lines += [f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um" for (x, y), z in found.best_depth_um.items()]
     lines += [f"  distortion at {x:g}, {y:g} deg: {d:+.3%}" for (x, y), d in found.distortion.items()]
+    lines += [f"  note: {words}" for words in found.notes]
     return values, "\n".join(lines), True
 
 

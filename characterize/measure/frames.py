@@ -21,6 +21,7 @@ from metalens.lens import Lens
 _FINE = 15  # samples a pixel side under the ideal spot
 _CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6  # to a pixel from its second and first neighbours
 _CORE = 5  # pixels on each side of the brightest one, over which the ideal spot is laid on a frame's
+_SAME = 1e-9  # of a depth, which went through its inverse
 Field = tuple[float, float]  # angle along x and y, degrees
 
 
@@ -89,29 +90,32 @@ def measure(capture: Capture, *, design: Lens | None = None, reference_e: float 
     notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
         notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
-    rows = []
-    for i, image in enumerate(light):
-        spot = metrics.spot(image, step_um=step)
-        circle = 3 * spot.fwhm_um
-        share = math.nan
-        if math.isfinite(reference_e) and math.isfinite(circle):
-            share = metrics.focusing_efficiency(image, reference_e, step_um=step, aperture_um=circle)
-        rows.append(
-            Frame(
-                capture.names[i],
-                float(capture.position_um[i]),
-                float(np.degrees(capture.angle_rad[i, 0])),
-                float(np.degrees(capture.angle_rad[i, 1])),
-                spot,
-                metrics.mtf_of_psf(image, step_um=step, axis="x").mtf50_per_um,
-                metrics.mtf_of_psf(image, step_um=step, axis="y").mtf50_per_um,
-                math.nan if design is None else _strehl(image, design, capture),
-                circle,
-                share,
-                float(image.max()),
-            )
-        )
-    return Quality(tuple(rows), _best(rows), _distortion(rows, capture, design), light, step, tuple(notes))
+    rows = [_row(capture, i, image, design, reference_e) for i, image in enumerate(light)]
+    best = _best(rows)
+    notes += [_open_end(field, depth) for field, depth in best.items() if _at_an_end(rows, field, depth)]
+    return Quality(tuple(rows), best, _distortion(rows, capture, design), light, step, tuple(notes))
+
+
+def _row(capture: Capture, i: int, image: Array, design: Lens | None, reference_e: float) -> Frame:
+    step = capture.pixel_um
+    spot = metrics.spot(image, step_um=step)
+    circle = 3 * spot.fwhm_um
+    share = math.nan
+    if math.isfinite(reference_e) and math.isfinite(circle):
+        share = metrics.focusing_efficiency(image, reference_e, step_um=step, aperture_um=circle)
+    return Frame(
+        capture.names[i],
+        float(capture.position_um[i]),
+        float(np.degrees(capture.angle_rad[i, 0])),
+        float(np.degrees(capture.angle_rad[i, 1])),
+        spot,
+        metrics.mtf_of_psf(image, step_um=step, axis="x").mtf50_per_um,
+        metrics.mtf_of_psf(image, step_um=step, axis="y").mtf50_per_um,
+        math.nan if design is None else _strehl(image, design, capture),
+        circle,
+        share,
+        float(image.max()),
+    )
 
 
 def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Field = (0.0, 0.0)) -> Array:
@@ -221,6 +225,17 @@ def _best(rows: list[Frame]) -> dict[Field, float]:
         top = -b / (2 * a) if a < 0 else place[int(np.argmax(sharp))]
         out[field] = float(1 / np.clip(top, place.min(), place.max()))
     return out
+
+
+def _at_an_end(rows: list[Frame], field: Field, depth_um: float) -> bool:
+    """Whether the sharpest depth of an angle is the first or last of its frames."""
+    depths = [r.depth_um for r in rows if r.field == field]
+    return min(abs(depth_um / end - 1) for end in (min(depths), max(depths))) < _SAME
+
+
+def _open_end(field: Field, depth_um: float) -> str:
+    x, y = field
+    return f"sharpest at {x:g}, {y:g} deg at an end of the captured depths, {depth_um:.5g} um: focus may lie beyond it"
 
 
 def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dict[Field, float]:

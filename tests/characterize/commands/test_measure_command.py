@@ -57,6 +57,28 @@ def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
     assert (tmp_path / "out" / "measure.html").is_file()
 
 
+@pytest.mark.parametrize(
+    ("sigmas", "end"), [((2.7, 3.0, 3.9, 4.1), 500), ((4.1, 3.4, 3.0), 700), ((3.9, 3.0, 3.6), None)]
+)
+def test_a_sharpest_depth_that_is_the_first_or_last_is_told(tmp_path, capsys, sigmas, end):
+    spots(tmp_path / "shots", sigmas)
+    assert main(["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    words = f"note: sharpest at 0, 0 deg at an end of the captured depths, {end} um: focus may lie beyond it"
+    assert (words in said) == (end is not None)
+    assert ("focus may lie beyond" in said) == (end is not None)
+
+
+def test_light_beside_that_of_an_empty_aperture_is_the_efficiency(tmp_path):
+    """A circle of three widths at half height holds 1 - exp(-(3 x 2.3548 / 2)² / 2) = 0.998 of a Gaussian's light."""
+    spots(tmp_path / "shots", (3.0, 2.5, 2.8))
+    light = 9000 * 2 * math.pi * (2.5 / 0.9) ** 2
+    words = ["--reference-e", str(1.25 * light), "-o", str(tmp_path / "out"), "--quiet"]
+    assert main(["measure", str(tmp_path / "shots"), *words]) == 0
+    row = json.loads((tmp_path / "out" / "measure.json").read_text())["frames"][1]
+    assert row["efficiency"] == pytest.approx(0.998 / 1.25, rel=0.02)  # pixels cut by the circle, the border's median
+
+
 def test_an_edge_gives_the_modulation_across_it(tmp_path):
     """An edge blurred by a Gaussian of 1.7 pixels and by the pixels: MTF sinc(f) exp(-2 (pi f 1.7)²), f a pixel."""
     y, x = np.mgrid[:90, :80]
