@@ -165,7 +165,8 @@ class Chain:
         maps = self.aperture.maps(table)
         if isinstance(imaging, Numerics):
             return kernels(self.lens, maps, imaging, self.window, fwhm_nm=self.config.led_fwhm_nm)
-        return self.device(imaging).image(wave=gathered(self.lens, *maps))
+        seen = self.device(imaging)
+        return seen.image(wave=gathered(self.lens, *maps, window_um=seen.window_um))
 
     def _device(self, tolerance: float) -> Device:
         """The designed lens as a true image, whose field points, depths, wavelengths and patches all pillars share."""
@@ -174,8 +175,9 @@ class Chain:
             (setting.pixels,) * 2, setting.pitch_um, self.eyes.depths_um, setting.margin, 2 * setting.margin + 1
         )
         width = self.config.led_fwhm_nm
+        maps = self.aperture.maps(self.aperture.designed())
         return device(
-            gathered(lens, *self.aperture.maps(self.aperture.designed())), grid, layers=lens.layers,
+            gathered(lens, *maps, window_um=grid.window * grid.step_um), grid, layers=lens.layers,
             distance_um=lens.sensor_distance_um, tolerance=tolerance,
             spectrum=Source(self.config.wavelength_nm, width) if width else None,
         )  # fmt: skip

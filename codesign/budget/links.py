@@ -21,7 +21,7 @@ from codesign.budget.person import person
 from codesign.budget.prepared import Bench
 from codesign.budget.response import between, put_right, scatter_rad
 from codesign.evaluate import AXIAL
-from codesign.optics import gathered, psf_difference
+from codesign.optics import psf_difference
 from metalens.cell import Light
 from metalens.design import neighbours as supercell
 from metalens.ground.arrays import Array
@@ -103,7 +103,7 @@ def measured(about: Bench) -> Iterator[Entry]:
 def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
     """The entry of other pillars: a table t(D) against the designed one."""
     turn = np.angle(table / about.aperture.designed())
-    optics = about.device.image(wave=gathered(about.lens, *about.aperture.maps(table)))
+    optics = about.device.image(wave=about.gathered(*about.aperture.maps(table)))
     return about.entry(link, optics, method, phase_rad=scatter_rad(turn, about.aperture.share))
 
 
@@ -166,7 +166,7 @@ def among(about: Bench, rows: Neighbours, said: str) -> Entry:
     if about.lens.neighbours is not None:
         turn = turn - np.angle(about.lens.neighbours.mean(sine[built]))
     maps = about.aperture.maps(about.aperture.designed())
-    optics = about.device.image(wave=gathered(replace(about.lens, neighbours=rows), *maps))
+    optics = about.device.image(wave=about.gathered(*maps, lens=replace(about.lens, neighbours=rows)))
     return about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
@@ -216,7 +216,7 @@ def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
         if made.state.bends():
             phase = phase + torch.from_numpy(made.state.phase_rad(u, v).astype(np.float32) * built)
         turn = phase[torch.from_numpy(built)].numpy() - base
-        optics = about.device.image(wave=gathered(about.lens, phase, level), shift_um=made.shift_um)
+        optics = about.device.image(wave=about.gathered(phase, level), shift_um=made.shift_um)
         found = about.entry(link, optics, method, phase_rad=scatter_rad(turn, np.full(turn.size, 1 / turn.size)))
         rows.append((found.phase_rad, found.psf, found.gaze_rad))
     rms = [math.sqrt(sum(v * v for v in column) / len(rows)) for column in zip(*rows, strict=True)]

@@ -16,6 +16,7 @@ from codesign.optics import (
     Device,
     Numerics,
     OpticsConfig,
+    PillarCells,
     Window,
     device,
     gathered,
@@ -74,6 +75,10 @@ class Bench:
         """Why the errors of the images are above their tolerance: of the pillars, and of the run's smooth phase."""
         return [self.device.above, *([] if self.reading is None else [self.reading.true.above])]
 
+    def gathered(self, phase: torch.Tensor, level: torch.Tensor, *, lens: Lens | None = None) -> PillarCells:
+        """The lens plane of other pillars, over cells as the device's."""
+        return gathered(lens or self.lens, phase, level, window_um=self.device.window_um)
+
     def basis(self, numerics: Numerics) -> PsfBasis:
         """One-PSF kernels of the designed lens."""
         maps = self.aperture.maps(self.aperture.designed())
@@ -105,14 +110,15 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     window = Window(*eyes.depths_um, setting.pitch_um)
     if given.run is not None:
         same_lens(lens, given.run.settings.optics)
-    wave = gathered(lens, *aperture.maps(aperture.designed()))
-    reading, known = None, None
+    maps, reading, known = aperture.maps(aperture.designed()), None, None
     if given.run is not None:
         reading = Reading(given.run, given.frames, fwhm_nm=given.fwhm_nm)
+        wave = gathered(lens, *maps, window_um=reading.true.window_um)
         seen = reading.stands(wave, lens.layers, lens.sensor_distance_um)
-        known = kernels(lens, aperture.maps(aperture.designed()), finest, window, fwhm_nm=given.fwhm_nm)
+        known = kernels(lens, maps, finest, window, fwhm_nm=given.fwhm_nm)
     else:
         grid = Grid((setting.pixels,) * 2, setting.pitch_um, eyes.depths_um, setting.margin, 2 * setting.margin + 1)
+        wave = gathered(lens, *maps, window_um=grid.window * grid.step_um)
         line = Source(lens.wavelength_um * 1e3, given.fwhm_nm) if given.fwhm_nm else None
         seen = device(wave, grid, layers=lens.layers, distance_um=lens.sensor_distance_um, spectrum=line)
     reader = task.linear(eyes, known or seen.whole, setting)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from codesign.optics.stack import OpticsConfig as OpticsConfig
     from codesign.optics.stack import Stack as Stack
     from codesign.optics.true_lens import Device as Device
+    from codesign.optics.true_lens import PillarCells as PillarCells
     from codesign.optics.true_lens import device as device
     from codesign.optics.true_lens import gathered as gathered
     from codesign.optics.true_lens import image_difference as image_difference
@@ -35,6 +36,7 @@ __getattr__, __dir__, __all__ = attach(
         "MadeLens": "built",
         "Numerics": "numerics",
         "OpticsConfig": "stack",
+        "PillarCells": "true_lens",
         "Stack": "stack",
         "Window": "numerics",
         "built": "",

@@ -18,7 +18,7 @@ from characterize.model import PLACE, state, vector
 from codesign.optics.stack import OpticsConfig, Stack
 from codesign.optics.true_lens import PillarCells
 from metalens.design import Focus, profiles
-from metalens.field import Optics
+from metalens.field import Optics, cell_um
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 from metalens.ground.paths import path_difference
@@ -28,7 +28,6 @@ from metalens.made import CAUSES, Sensitivity, State, sensitivity, transmission
 
 OF_LENS = (*(row.name for row in CAUSES), "distance_um")
 TABLE_STEP_UM = 1e-5  # of the table of t over the diameter
-CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 SPARE = 4  # samples around the window, so that what wraps around does not reach it
 
 
@@ -67,7 +66,9 @@ class MadeLens:
         self.design, self.settings, self.response = design, settings, response or sensitivity(design)
         d = design.diameters
         self.focus = Focus(design.wavelength_um, design.sensor_distance_um, design.source_distance_um)
-        self._block = max(1, round(CELL_UM / d.pitch_um))
+        window = settings.window_samples * settings.sample_um
+        width = cell_um(design.layers, design.wavelength_um, window, design.sensor_distance_um)
+        self._block = max(1, round(width / d.pitch_um))
         self._rim_um = d.radius_um  # looks through all pillars
         self._diameter_um = np.ascontiguousarray(d.diameter_um, np.float32)
         self._carrier = np.empty(d.diameter_um.shape, np.complex64)
@@ -122,7 +123,12 @@ class MadeLens:
 
         parts = torch.from_numpy(np.stack([filled.real, filled.imag])).float()
         bent = added if made.bends() else None
-        return PillarCells(self.focus, self._rim_um + d.pitch_um / 2, parts, half, (centre[0], centre[1]), bent)
+        plane = self.focus, self._rim_um + d.pitch_um / 2, parts, half, d.pitch_um
+        return PillarCells(*plane, lambda: self._pillars(made), (centre[0], centre[1]), bent)
+
+    def _pillars(self, known: State) -> Tensor:
+        """(y, x) complex t of every pillar, 0 where there is none."""
+        return torch.from_numpy(self._gathered(known, 1) * self._carrier.conj())
 
     def _aberration(self, known: State, nodes_x: Array, nodes_y: Array) -> Array:
         rim = self._rim_um
@@ -136,8 +142,9 @@ class MadeLens:
             rough.radius_um, distance_um, d.wavelength_um, max(64, math.ceil(width * rough.edge / d.wavelength_um) * 2)
         )
 
-    def _gathered(self, known: State) -> Array:
-        """(cells, cells) mean of t exp(-i phase of the focus) over the pillars of each cell, 0 where there is none."""
+    def _gathered(self, known: State, block: int | None = None) -> Array:
+        """(cells, cells) mean of t exp(-i phase of the focus) over the pillars of each cell, 0 where there is none;
+        block: pillars along a cell in place of the window's own."""
         d = self.design.diameters
         bias = known.bias_polynomial_um()
         reach = float(np.abs(bias).sum()) + TABLE_STEP_UM
@@ -148,7 +155,7 @@ class MadeLens:
         edges = self.response.by_edges(grid)
         u, v = d.x_um / self._rim_um, d.y_um / self._rim_um
         table = t.astype(np.complex64), np.empty(0, complex) if edges is None else edges, low, TABLE_STEP_UM
-        return np.asarray(_gather(self._diameter_um, self._carrier, *table, u, v, bias, self._block))
+        return np.asarray(_gather(self._diameter_um, self._carrier, *table, u, v, bias, block or self._block))
 
     def _on_nodes(self, cells: Array, nodes_x: Array, nodes_y: Array) -> Array:
         """The field of the cells at the pupil's nodes; beyond the rim it goes on as at the rim."""

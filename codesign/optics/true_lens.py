@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from metalens.design import Focus
-from metalens.field import Layers, Optics, Plan, SmoothWave, Wave, node_light, normalised, with_psfs
+from metalens.field import Layers, Optics, Plan, SmoothWave, Wave, cell_um, node_light, normalised, with_psfs
 from metalens.image import Grid, Imager
 from metalens.image import imager as field_imager
 from metalens.lens import Lens
 from metalens.psf import Nodes, Source, among
 
-CELL_UM = 2.5  # over which pillars are averaged: below a zone of the lens, far above the pitch
 ROWS = 256  # of pillars at a time
 
 
@@ -28,6 +27,7 @@ class PillarCells:
     """A lens plane of given pillars: mean of t exp(-i focus) over cells of a few micrometres, interpolated to the rays.
 
     cells: (2, y, x) real and imaginary part. half_um, centre_um: (x, y) half width of the cells, and their middle.
+    pillars: gives (y, x) the complex t of each, 0 where there is none, pitch_um apart about the axis.
     added_rad: (x_um, y_um) to a phase that bends the wave front as a whole; None for none.
     """
 
@@ -35,6 +35,8 @@ class PillarCells:
     radius_um: float
     cells: Tensor
     half_um: tuple[float, float]
+    pitch_um: float
+    pillars: Callable[[], Tensor]
     centre_um: tuple[float, float] = (0.0, 0.0)
     added_rad: Callable[[Tensor, Tensor], Tensor] | None = None
 
@@ -49,24 +51,35 @@ class PillarCells:
         found = torch.nn.functional.grid_sample(
             self.cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
         )
-        mean = torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+        return self._bent(torch.complex(*found.reshape(2, *x_um.shape).unbind(0)), x_um, y_um)
+
+    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex t of every pillar, by which the error of gathering them is told."""
+        t = self.pillars()
+        y, x = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * self.pitch_um for n in t.shape)
+        return self._bent(t, *torch.meshgrid(x, y, indexing="xy"))
+
+    def _bent(self, t: Tensor, x_um: Tensor, y_um: Tensor) -> Tensor:
+        """With the added phase at these places."""
         if self.added_rad is None:
-            return mean
+            return t
         added = torch.remainder(self.added_rad(x_um, y_um), 2 * math.pi).to(torch.float32)
-        return mean * torch.polar(torch.ones_like(added), added)
+        return t * torch.polar(torch.ones_like(added), added)
 
 
-def gathered(lens: Lens, phase: Tensor, level: Tensor) -> PillarCells:
+def gathered(lens: Lens, phase: Tensor, level: Tensor, *, window_um: float) -> PillarCells:
     """The lens plane of pillars of these phases and amplitudes.
 
     Args:
         phase, level: (y, x) of every site, float32; level 0 where there is no pillar. Taken one by one: unlike
             neighbours are put on here, where the lens holds their rows.
+        window_um: of the PSFs, which says over how many pillars the mean may be (:func:`metalens.field.cell_um`).
     """
     d = lens.diameters
     radius = d.radius_um + d.pitch_um / 2
     focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
-    smooth, block = SmoothWave(focus, radius), max(1, round(CELL_UM / d.pitch_um))
+    width = cell_um(lens.layers, lens.wavelength_um, window_um, lens.sensor_distance_um)
+    smooth, block = SmoothWave(focus, radius), max(1, round(width / d.pitch_um))
     x = torch.as_tensor(d.x_um, dtype=torch.float64)
     factor = None
     if lens.neighbours is not None:
@@ -82,7 +95,14 @@ def gathered(lens: Lens, phase: Tensor, level: Tensor) -> PillarCells:
         parts.append(torch.stack([whole.real, whole.imag, (level[part] > 0).float()]))
     cells = _averaged(torch.cat(parts, 1), block)
     half_y, half_x = (n * block * d.pitch_um / 2 for n in cells.shape[-2:])
-    return PillarCells(focus, radius, cells, (half_x, half_y))
+    # half a pitch past the lens's middle where one row or column more is added behind it
+    past_y, past_x = ((-n) % block % 2 * d.pitch_um / 2 for n in phase.shape)
+
+    def pillars() -> Tensor:
+        t = torch.polar(level, phase)
+        return t if factor is None else t * factor
+
+    return PillarCells(focus, radius, cells, (half_x, half_y), d.pitch_um, pillars, (past_x, past_y))
 
 
 def _averaged(layers: Tensor, block: int) -> Tensor:
@@ -104,6 +124,11 @@ class Device:
     distance_um: float
     whole: Imager = field(repr=False)
     tolerance: float
+
+    @property
+    def window_um(self) -> float:
+        """Width of the PSFs."""
+        return self.whole.grid.window * self.whole.grid.step_um
 
     @property
     def above(self) -> str:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from metalens.field.waves import PillarWave as PillarWave
     from metalens.field.waves import SmoothWave as SmoothWave
     from metalens.field.waves import Wave as Wave
+    from metalens.field.waves import cell_um as cell_um
     from metalens.lens import Layers as Layers
 
 __getattr__, __dir__, __all__ = attach(
@@ -39,6 +40,7 @@ __getattr__, __dir__, __all__ = attach(
         "Wave": "waves",
         "Window": "points",
         "blurred": "forming",
+        "cell_um": "waves",
         "drawn": "slopes",
         "imager": "engine",
         "node_light": "slopes",

@@ -76,7 +76,8 @@ def imager(
 
     Raises:
         SceneError: a field that is not within 90 degrees, a polarisation that is none, wavelengths, depths or field
-            points that no number of meets the tolerance; PropagationError: films thicker than the gap.
+            points that no number of meets the tolerance; PropagationError: films thicker than the gap, or a spectrum of
+            which a wavelength that stands for it lies beyond the library of the pillars.
 
     Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may leave it above the
         tolerance (``edge``: light that a small aperture's rim bends beyond the window).

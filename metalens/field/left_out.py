@@ -15,7 +15,7 @@ from torch import Tensor
 from metalens import propagate
 from metalens.field.patches import in_light, relative
 from metalens.field.points import Optics, Window, psfs, sampling
-from metalens.field.waves import PillarWave
+from metalens.field.waves import Pillars
 from metalens.psf import Nodes, Polarisation, psf_stack
 
 MOST = 256  # of their samples along an axis; of a wider window the middle is looked at
@@ -94,7 +94,7 @@ def missing(optics: Optics, wavelength_um: float, window: Window, at: tuple[Tens
     """What gathering pillars over cells changes: PSFs of sum 1 at (field points, depths) against those of every pillar,
     to the same samples; 0 of a wave that is no lens of pillars. Light of other orders in the window is in it."""
     wave = optics.wave
-    if not isinstance(wave, PillarWave):
+    if not isinstance(wave, Pillars):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
     # points of a sample, half of Nyquist's step apart: triangles of a sample are then summed to 2e-3 of fine detail. At
@@ -123,7 +123,7 @@ def _triangles(count: int, finer: int) -> Tensor:
 
 
 def _of_pillars(
-    optics: Optics, wave: PillarWave, wavelength_um: float, at: tuple[Tensor, Tensor], sampled: tuple[float, int, int]
+    optics: Optics, wave: Pillars, wavelength_um: float, at: tuple[Tensor, Tensor], sampled: tuple[float, int, int]
 ) -> Tensor:
     """(depths, y, x) light of point sources, from every pillar; sampled: step of a sample, samples, points of each."""
     (place, depths_um), (step_um, count, finer) = at, sampled
@@ -131,7 +131,7 @@ def _of_pillars(
     angle = torch.atan(tangents).tolist()
     t = wave.answer(wavelength_um, math.atan(math.hypot(*tangents.tolist()))).cpu()
     about: dict[str, Any] = {
-        "pitch_um": wave.lens.diameters.pitch_um,
+        "pitch_um": wave.pitch_um,
         "wavelength_um": wavelength_um,
         "sensor_distance_um": optics.distance_um,
         "depths_um": depths_um.tolist(),

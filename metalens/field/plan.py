@@ -13,6 +13,7 @@ from metalens.field import compiled
 from metalens.field.left_out import Judged, folded, neglected, polarised
 from metalens.field.patches import dense, relative, together
 from metalens.field.points import Optics, Window, psfs
+from metalens.field.waves import PillarWave
 from metalens.ground.errors import SceneError
 from metalens.ground.threads import apart
 from metalens.psf import Nodes, Polarisation, Source
@@ -128,7 +129,7 @@ def planned(
         raise SceneError(f"tolerance {tolerance}: need 0 < tolerance < 1")
     window, half = Window(grid.window, grid.step_um), grid.half_um
     waves = waves_of(optics, grid, source, middle_um, half, tolerance * SHARES["spectrum"])
-    coarse = waves if isinstance(source, Nodes) else _coarse(source, 2)
+    coarse = waves if isinstance(source, Nodes) else _coarse(optics, source, 2)
     ends = depth_nodes(grid, 3)
     window = _unfolded(optics, coarse, window, (_places(STREWN, middle_um, half), ends), tolerance * SHARES["folded"])
 
@@ -214,21 +215,25 @@ def waves_of(
     at = torch.tensor([[0.0, 0.0], [0.5, 0.3], [0.9, 0.8]], dtype=torch.float64)
     at = at * torch.tensor([half_um[1], half_um[0]], dtype=torch.float64) + torch.tensor(middle_um, dtype=torch.float64)
     ends, window = depth_nodes(grid, 2), Window(grid.window, grid.step_um)
-    last = spectral(optics, at, ends, _coarse(source, 1), window)
+    last = spectral(optics, at, ends, _coarse(optics, source, 1), window)
     beside = source.beside if isinstance(source, spectra.Measured) else 0.0
     for count in range(2, 17):
-        made = _coarse(source, count)
+        made = _coarse(optics, source, count)
         found = spectral(optics, at, ends, made, window)
         light = found.sum((-1, -2))
         error = float((relative(last, found) * light / light.amax(0)).max())  # of the image, where that is dark too
         if error + beside <= tolerance:  # of the rule before; this one is finer
-            return replace(_coarse(source, count - 1), error=error + beside)
+            return replace(_coarse(optics, source, count - 1), error=error + beside)
         last = found
     raise SceneError(f"16 wavelengths leave {error:.2g} of the image, above {tolerance:.2g}: raise the tolerance")
 
 
-def _coarse(source: Source | spectra.Measured, count: int) -> Nodes:
-    return Nodes(*spectra.gauss(*spectra.points(source), count), np.nan)
+def _coarse(optics: Optics, source: Source | spectra.Measured, count: int) -> Nodes:
+    """So many wavelengths of a spectrum, which the lens's pillars are known for."""
+    made = Nodes(*spectra.gauss(*spectra.points(source), count), np.nan)
+    if not isinstance(optics.wave, PillarWave):
+        return made
+    return spectra.known(made, source, optics.wave.lens.proxy.wavelengths_um)
 
 
 def placed(count: int, denser: float, span: tuple[float, float]) -> Tensor:

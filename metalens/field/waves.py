@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -37,6 +37,18 @@ class Wave(Protocol):
 
     def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
         """Complex transmission less the carrier, differentiable; None where it is 1."""
+
+
+@runtime_checkable
+class Pillars(Protocol):
+    """A lens plane whose factor is gathered from pillars, which can be asked one by one."""
+
+    @property
+    def pitch_um(self) -> float:
+        """Of their square lattice."""
+
+    def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
+        """(y, x) complex t of every pillar, 0 where there is none, as the factor takes them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,6 +141,11 @@ class PillarWave:
             cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
         )
         return torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
+
+    @property
+    def pitch_um(self) -> float:
+        """Of the pillars."""
+        return self.lens.diameters.pitch_um
 
     @property
     def _padded(self) -> tuple[int, int]:
@@ -237,13 +254,18 @@ def _longer(between: Media, r2: Tensor) -> Tensor:
     return n * r2 / (torch.sqrt(r2 + d * d) + d)
 
 
+def cell_um(layers: Layers, wavelength_um: float, window_um: float, distance_um: float) -> float:
+    """Width of the cells that leave a window of this width, so far behind the lens, what pillars scatter into it."""
+    node_um = wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
+    return min(CELL_UM, node_um / CELLS)
+
+
 def wave_of(lens: Lens | Wave, layers: Layers, window_um: float, distance_um: float | None = None) -> Wave:
     """The lens plane of a lens file, in cells that leave a window of this width what pillars scatter into it; or the
     one that was given."""
     if isinstance(lens, Lens):
         distance = lens.sensor_distance_um if distance_um is None else distance_um
-        node_um = lens.wavelength_um * layers.after(distance, lens.wavelength_um).reduced_um / window_um
-        return PillarWave(lens, cell_um=min(CELL_UM, node_um / CELLS))
+        return PillarWave(lens, cell_um=cell_um(layers, lens.wavelength_um, window_um, distance))
     if not hasattr(lens, "carrier_rad"):
         raise SceneError(f"{type(lens).__name__} is no lens: need a Lens, a SmoothWave or a PillarWave")
     return lens

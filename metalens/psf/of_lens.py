@@ -95,7 +95,8 @@ def from_lens(
             numbers.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: as :func:`psf_stack`, no angle, and ``flux`` or
+        DomainError: a wavelength outside the proxy; PropagationError: a spectrum of which a wavelength that stands for
+            it is, as :func:`psf_stack`, no angle, and ``flux`` or
             ``vector`` for turned pillars, those of two sizes and those that answer x and y apart (``auto`` takes the
             scalar there; its error is in the budget).
     """
@@ -113,19 +114,20 @@ def from_lens(
 def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any) -> PsfStack:
     """PSFs of a spectrum: wavelengths for the paths to where few of them say that its light falls, in the window; more
     where the light of all of them says so."""
+    within = lens.proxy.wavelengths_um
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
     middle = max(float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans)
-    nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
+    nodes = spectra.known(spectra.nodes(source, path_um=middle, tolerance=tolerance / 2), source, within)
     if len(nodes.weights) > 2 * PILOT:
-        few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
+        few = spectra.known(Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0), source, within)
         pilot = _of_nodes(lens, view, few, tolerance=max(tolerance, PILOT_ERROR), **how | {"polarisation": "scalar"})
-        nodes = _asked(source, spans, pilot, tolerance / 2 * SPARE)
+        nodes = spectra.known(_asked(source, spans, pilot, tolerance / 2 * SPARE), source, within)
     for last in range(TRIES):
         stack = _of_nodes(lens, view, nodes, tolerance=tolerance, **how)
         if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
             break
-        nodes = _asked(source, spans, stack, tolerance / 2)
-    return dataclasses.replace(stack, reason=stack.reason + spectra.beyond(source, lens.proxy.wavelengths_um))
+        nodes = spectra.known(_asked(source, spans, stack, tolerance / 2), source, within)
+    return dataclasses.replace(stack, reason=stack.reason + spectra.beyond(source, within))
 
 
 def _asked(source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float) -> Nodes:

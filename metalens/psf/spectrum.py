@@ -1,5 +1,6 @@
 """LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,10 +149,8 @@ def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int,
     if not high > low:
         return int(lit[0]), int(lit[-1]) + 1
     if not (low - 1e-3 <= nm[lit[0]] and nm[lit[-1]] <= high + 1e-3):
-        raise PropagationError(
-            f"spectrum: light from {nm[lit[0]]:g} to {nm[lit[-1]]:g} nm, the pillars are known from {low:g} to "
-            f"{high:g} nm: sweep a library over the spectrum"
-        )
+        few = slice(int(lit[0]), int(lit[-1]) + 1)
+        raise _refusal((nm[few], value[few] / value[few].sum()), within_um, "narrow it (a filter among the files)")
     inside = np.flatnonzero((nm >= low - 1e-3) & (nm <= high + 1e-3) & (value > 0))
     return int(inside[0]), int(inside[-1]) + 1
 
@@ -246,6 +245,37 @@ def unknown(source: Source | Measured | Nodes | None, within_um: tuple[float, fl
         return 0.0
     um, share = points(source)
     return float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
+
+
+def known(nodes: Nodes, source: Source | Measured, within_um: tuple[float, float]) -> Nodes:
+    """The wavelengths that stand for a spectrum, all of which lie within those that pillars are known for.
+
+    Raises:
+        PropagationError: one lies beyond; with the share of the light that does, and what serves.
+    """
+    low, high = within_um
+    um = np.asarray(nodes.wavelengths_um)
+    if ((low - 1e-9 <= um) & (um <= high + 1e-9)).all():
+        return nodes
+    narrow = "narrow it (a filter among the files)"
+    if isinstance(source, Source):  # no wavelength that stands for it lies beyond 2.5 widths
+        width = min(source.peak_nm - low * 1e3, high * 1e3 - source.peak_nm) / 2.5
+        narrow = f"narrow it to a width of {math.floor(width * 10) / 10:g} nm" if width >= LEAST_FWHM_NM else ""
+    um, share = points(source)
+    raise _refusal((um * 1e3, share), within_um, narrow)
+
+
+def _refusal(light: tuple[Array, Array], within_um: tuple[float, float], narrow: str) -> PropagationError:
+    """What to say of light (nm ascending, shares of sum 1) that the pillars are not known for, and of what serves."""
+    (nm, share), (low, high) = light, (edge * 1e3 for edge in within_um)
+    told = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
+    part = float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum()) if high > low else 1.0
+    ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
+    sweep = f"[sweep] wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
+    return PropagationError(
+        f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {told}, and {part:.2g} of it lies "
+        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ({sweep})"
+    )
 
 
 def beyond(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> str:

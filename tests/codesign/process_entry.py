@@ -13,7 +13,7 @@ def process_entry(lens, spread, draws):
     """The one entry of a mask of this spread."""
     about = SimpleNamespace(
         aperture=Aperture(lens), lens=lens, given=Given(mask=Printed(spread=spread), draws=draws),
-        device=SimpleNamespace(image=lambda **moved: None),
+        device=SimpleNamespace(image=lambda **moved: None), gathered=lambda phase, level: None,
         entry=lambda link, optics, method, phase_rad: Entry(link, phase_rad, 0.0, 0.0, method),
     )  # fmt: skip
     (entry,) = links.process(about)

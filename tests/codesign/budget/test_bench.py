@@ -33,7 +33,7 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
     near, far = bench.eyes.depths_um
     assert (bench.window.near_um, bench.window.far_um, bench.window.pitch_um) == (near, far, 4.1)
     lens, source = bench.lens, Source(850.0, 24.0) if line else None
-    wave = gathered(lens, *bench.aperture.maps(bench.aperture.designed()))
+    wave = gathered(lens, *bench.aperture.maps(bench.aperture.designed()), window_um=7 * 4.1)
     want = device(
         wave, Grid((16, 16), 4.1, (near, far), 3, 7), layers=lens.layers, distance_um=300.0, spectrum=source
     ).whole  # fmt: skip

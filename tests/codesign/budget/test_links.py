@@ -20,7 +20,7 @@ from codesign.budget import links, task
 from codesign.budget.entry import NONE, TOTAL, Entry
 from codesign.budget.journal import Journal
 from codesign.budget.links import Made
-from codesign.optics import Aperture, Window, gathered, image_difference, kernels, psf_difference
+from codesign.optics import Aperture, Window, image_difference, kernels, psf_difference
 from metalens.cell import Light
 from metalens.ground.errors import LensError
 from metalens.made import Printed, Spread, State, draws, sensitivity
@@ -76,7 +76,7 @@ def test_a_rounded_mask_turns_every_pillar_by_its_own_rounding():
     assert got.phase_rad == pytest.approx(np.std(turn), abs=ROUNDING_RAD)
     other = replace(bench.lens, diameters=replace(bench.lens.diameters, diameter_um=rounded))
     aperture = Aperture(other)
-    psf, gaze = of_wave(bench, gathered(other, *aperture.maps(aperture.designed())))
+    psf, gaze = of_wave(bench, bench.gathered(*aperture.maps(aperture.designed()), lens=other))
     assert got.psf == pytest.approx(psf, rel=0.05)  # both tables round by 1 mrad of 64
     assert got.gaze_rad == pytest.approx(gaze, rel=0.05)
     assert "4 nm" in got.method
@@ -120,7 +120,7 @@ def test_a_library_errs_by_what_is_wrong_with_it_and_the_proxy_by_what_it_leaves
     assert proxy.phase_rad == pytest.approx(np.std(7 * d), abs=ROUNDING_RAD)
     aperture = bench.aperture
     turned = aperture.designed() * (1.2 - aperture.diameter_um) * np.exp(-7j * aperture.diameter_um)
-    psf, gaze = of_wave(bench, gathered(bench.lens, *aperture.maps(turned)))
+    psf, gaze = of_wave(bench, bench.gathered(*aperture.maps(turned)))
     assert (proxy.psf, proxy.gaze_rad) == (pytest.approx(psf, rel=1e-3), pytest.approx(gaze, rel=1e-3))
 
 
@@ -153,7 +153,7 @@ def test_rows_of_unlike_pillars_turn_the_pillars_by_the_sine_there():
     assert got.phase_rad > 0.02
     holding = replace(bench.lens, neighbours=small.ROWS)
     aperture = Aperture(holding)
-    psf, gaze = of_wave(bench, gathered(holding, *aperture.maps(aperture.designed())))
+    psf, gaze = of_wave(bench, bench.gathered(*aperture.maps(aperture.designed()), lens=holding))
     assert (got.psf, got.gaze_rad) == (pytest.approx(psf, rel=1e-6), pytest.approx(gaze, rel=1e-6))
     # 0.85 um turned by 0.05 and 0.11 over pillars 0.3 um apart: 56.7 and 25.8 of them; the diagonal is not told
     assert links.lengths(small.ROWS, 0.3) == [57, 26]
@@ -197,7 +197,7 @@ def test_a_made_lens_turns_its_pillars_by_their_bias_and_its_wave_front_by_its_b
     wider = np.where(d.diameter_um > 0, d.diameter_um + made.bias_um(u, v), 0.0)
     aperture = Aperture(replace(bench.lens, diameters=replace(d, diameter_um=wider)))
     phase, level = aperture.maps(aperture.designed())
-    wave = gathered(bench.lens, phase + torch.from_numpy(made.phase_rad(u, v).astype(np.float32)), level)
+    wave = bench.gathered(phase + torch.from_numpy(made.phase_rad(u, v).astype(np.float32)), level)
     psf, gaze = of_wave(bench, wave)
     assert (got.psf, got.gaze_rad) == (pytest.approx(psf, rel=0.02), pytest.approx(gaze, rel=0.03))  # 1 mrad of 80
 

@@ -125,7 +125,9 @@ def test_optics_are_of_these_pillars_at_this_setting(uniform, true, exact):
     assert psf_difference(got, want, uniform.window) == 0
     assert psf_difference(got, kernels(uniform.lens, maps, numerics, uniform.window), uniform.window) > 1e-5
     lens, grid = true.lens, Grid((8, 8), 4.1, true.eyes.depths_um, 2, 5)
-    waves = [gathered(lens, *true.aperture.maps(table)) for table in (true.aperture.designed(), exact)]
+    waves = [
+        gathered(lens, *true.aperture.maps(table), window_um=5 * 4.1) for table in (true.aperture.designed(), exact)
+    ]
     plain = device(
         waves[0], grid, layers=lens.layers, distance_um=300.0, tolerance=0.5, spectrum=Source(845.0, 24.0)
     )  # fmt: skip

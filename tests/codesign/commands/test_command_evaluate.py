@@ -115,7 +115,10 @@ def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(tmp
     (tmp_path / "o.toml").write_text(TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0"))
     words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "--reader", "-o", str(tmp_path / "out")]
     assert cli.main(["evaluate", "optics", *words]) == 2
-    assert "the proxy holds from 0.85 to 0.85 um" in capsys.readouterr().err
+    assert (
+        "the pillars are known at 850 nm alone, and 1 of it lies beyond: sweep a library over it"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()
 
 

@@ -9,8 +9,11 @@ import torch
 
 from codesign.optics import true_lens
 from codesign.optics.true_lens import Device, PillarCells
-from metalens.design import Focus
-from metalens.field import SmoothWave
+from metalens.cell import Cell
+from metalens.design import Focus, profiles
+from metalens.field import Grid, SmoothWave, imager
+from metalens.lens import DiameterMap, Lens
+from metalens.pillars import Proxy
 
 DRAW = torch.Generator().manual_seed(12)
 FOCUS = Focus(0.85, 210.0, 900.0)
@@ -56,7 +59,7 @@ def test_pillars_of_the_ideal_phase_and_a_ramp_are_the_ramp(monkeypatch, rows):
     y, x = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * 0.4 for n in (36, 30))
     ideal = SmoothWave(FOCUS, 7.2).carrier_rad(x, y[:, None])
     phase = torch.remainder(ideal + 0.013 * x - 0.02 * y[:, None], 2 * math.pi).float()
-    made = true_lens.gathered(lens(phase, None), phase, torch.full((36, 30), 0.7))
+    made = true_lens.gathered(lens(phase, None), phase, torch.full((36, 30), 0.7), window_um=20.0)
     assert (made.radius_um, made.half_um) == (7.2, pytest.approx((6.0, 7.2)))
     at_x, at_y = (
         torch.tensor([[2.4, -2.4, 0.0]], dtype=torch.float64),
@@ -69,14 +72,37 @@ def test_pillars_of_the_ideal_phase_and_a_ramp_are_the_ramp(monkeypatch, rows):
 
 def test_a_bent_wave_front_turns_the_cells_about_their_middle():
     cells = torch.rand(2, 4, 6, generator=DRAW)
-    plain = PillarCells(FOCUS, 9.0, cells, (9.0, 6.0), centre_um=(1.5, -0.5))
+    sites = torch.polar(torch.full((4, 5), 0.9), 6.28 * torch.rand(4, 5, generator=DRAW))
+    about = FOCUS, 9.0, cells, (9.0, 6.0), 0.4, lambda: sites
+    plain = PillarCells(*about, centre_um=(1.5, -0.5))
     x = torch.tensor([[-7.5, 4.5]], dtype=torch.float64) + 1.5  # middles of cells 3 um apart
     y = torch.tensor([[-4.5, 1.5]], dtype=torch.float64) - 0.5
     want = torch.complex(cells[0, [0, 2], [0, 4]], cells[1, [0, 2], [0, 4]])
     assert torch.allclose(plain.factor(x, y, 0.85, 0.0)[0], want, atol=1e-5)
-    bent = PillarCells(FOCUS, 9.0, cells, (9.0, 6.0), (1.5, -0.5), added_rad=lambda x, y: 0.3 * x - 0.11 * x * y)
+    bent = PillarCells(*about, (1.5, -0.5), added_rad=lambda x, y: 0.3 * x - 0.11 * x * y)
     turned = want * torch.exp(1j * (0.3 * x - 0.11 * x * y)[0])
     assert torch.allclose(bent.factor(x, y, 0.85, 0.0)[0], turned.to(torch.complex64), atol=1e-5)
+    assert torch.equal(plain.answer(0.85, 0.0), sites)
+    at = (np.arange(5) - 2) * 0.4, (np.arange(4)[:, None] - 1.5) * 0.4  # pillars stand about the axis
+    bend = np.exp(1j * (0.3 * at[0] - 0.11 * at[0] * at[1]))
+    assert np.allclose(bent.answer(0.85, 0.0), sites.numpy() * bend, atol=1e-5)  # single precision
+
+
+@pytest.mark.parametrize("count", [48, 51])
+def test_what_cells_leave_out_is_told_of_given_pillars_as_of_a_lens_file(count):
+    """Eight sizes of pillars, whose cells 51 of them do not fill; over cells that the window asks for, not 2.5 um."""
+    x = (np.arange(count) - (count - 1) / 2) * 0.4
+    wanted = np.remainder(profiles.hyperbolic(x, x[:, None], FOCUS) + 1.0, 2 * math.pi)
+    size = np.where(np.hypot(x, x[:, None]) < 9.7, 0.12 + 0.2 * np.round(wanted / 6.2832 * 8) / 8, 0)
+    proxy = Proxy(np.array([[3.0, math.pi]]), np.array([[0.9, -0.05]]), (0.12, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+    made = Lens(DiameterMap(size, 0.4), Cell(pitch_um=0.4), proxy, 0.85, 210.0, 900.0, "hyperbolic")
+    grid = Grid((4, 5), 4.8, (8e2, 1e3), window=21)
+    maps = (torch.from_numpy(part).float() for part in (made.phase_rad(), made.transmission()))
+    wave = true_lens.gathered(made, *maps, window_um=21 * 4.8)
+    want = imager(made, grid, tolerance=0.2).parts["pillars"]
+    assert want > 1e-3
+    found = imager(wave, grid, distance_um=210.0, tolerance=0.2).parts["pillars"]
+    assert found == pytest.approx(want, rel=1e-3)  # the same sums, of phases in single precision
 
 
 def test_one_psf_is_that_of_the_middle_and_even_light_that_of_the_mean(monkeypatch):

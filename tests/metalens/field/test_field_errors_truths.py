@@ -12,7 +12,6 @@ from metalens.field import Grid, engine, left_out, patches, plan
 from metalens.field.forming import Imager
 from metalens.field.plan import Plan
 from metalens.field.points import Window
-from metalens.field.waves import PillarWave
 from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Stop
 from metalens.psf import Nodes
@@ -447,7 +446,7 @@ def test_pillars_taken_together_are_judged_by_every_pillar_on_finer_points(monke
     monkeypatch.setattr(left_out, "_of_pillars", of_pillars)
     monkeypatch.setattr(left_out, "psfs", psfs)
     monkeypatch.setattr(left_out, "sampling", lambda *_: SimpleNamespace(nodes=nodes, step=0.005))
-    optics = SimpleNamespace(wave=object.__new__(PillarWave))
+    optics = SimpleNamespace(wave=SimpleNamespace(pitch_um=0.4, answer=len))  # whose pillars are asked by _of_pillars
     places, depths = torch.tensor([[20.0, -31.0], [3.0, 8.0]]), torch.tensor([4e2, 9e2, 21e2])
     found = left_out.missing(optics, 0.85, Window(samples, 2.0), (places, depths))
     assert asked == [(place, depths.tolist(), (2.0, count + 1, finer)) for place in places.tolist()]
