@@ -71,8 +71,8 @@ class PlanConfig:
     def __post_init__(self) -> None:
         if not (0.02 <= self.aperture_mm <= 4 and self.stacks >= 1 and self.frames >= 1 and self.led_fwhm_nm >= 0):
             raise ConfigError(
-                f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}: need 0.02 to 4 mm, "
-                "and 1 or more of both"
+                f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}, led_fwhm_nm = "
+                f"{self.led_fwhm_nm}: need 0.02 to 4 mm, 1 or more of both, and a width of 0 or more"
             )
 
     @property
