@@ -54,7 +54,7 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
     """The frames to predict, and the window (rows, columns) of at most ``largest`` pixels that is fitted.
 
     Raises:
-        CaptureError: depths, pixel or wavelength missing.
+        CaptureError: depths, pixel or wavelength missing; windows at field angles that stand still on the sensor.
     """
     if not np.isfinite(capture.position_um).all():
         raise CaptureError("source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)")
@@ -62,6 +62,11 @@ def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, sl
         raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
     if math.isnan(capture.wavelength_um):
         raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
+    if capture.about.get("window") == "fixed" and capture.angle_rad.any():
+        raise CaptureError(
+            'window = "fixed" in capture.toml: at a field angle the middle pixel stands for the chief ray; cut the '
+            "frames there (distance times tan(angle) off the axis) and leave window out, or fit those of angle 0 alone"
+        )
     window = _window(capture, largest)
     exposure = capture.exposure_s / capture.exposure_s.max() if _timed(capture) else 1.0
     n = len(capture.frames)

@@ -1,5 +1,6 @@
 """From a capture to what is fitted: brackets as one frame, the window about the light's centre, refusals at limits."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,6 +96,19 @@ def test_a_small_frame_is_the_window_and_frames_of_unknown_times_are_alike():
     assert window == (slice(0, 40), slice(0, 45))
     assert (setting.rows, setting.columns) == (40, 45)
     assert setting.exposure.tolist() == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("angle", [[0.0, 0.0], [0.0, -0.02], [0.03, 0.0]])
+def test_frames_cut_at_one_place_of_the_sensor_are_refused_at_field_angles(angle):
+    angles = np.array([[0.0, 0.0], [0.0, 0.0], angle])
+    shots = capture(pictured({(10, 12): 100.0}), [3e4, 2e4, 1e4], [2.0, 0.5, 1.0], angle_rad=angles)
+    prepare.setting_of(shots, 16)
+    fixed = dataclasses.replace(shots, about={**shots.about, "window": "fixed"})
+    if any(angle):
+        with pytest.raises(CaptureError, match=r'window = "fixed".*cut the frames there'):
+            prepare.setting_of(fixed, 16)
+    else:
+        prepare.setting_of(fixed, 16)
 
 
 def test_what_is_fitted_is_cut_to_rows_and_columns():
