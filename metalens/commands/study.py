@@ -54,6 +54,8 @@ def run(options: Options) -> int:
     text = f"{options.output}: {len(verdicts)} cells"
     if best is not None:
         text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
+    missed = cell_study.unsure(study, verdicts)
+    text += f"\n  {missed}" if missed else ""
     return options.console.judged(values, text, [] if best else ["no cell covers a full turn at all wavelengths"])
 
 

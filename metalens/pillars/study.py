@@ -240,7 +240,23 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
             "",
             *_table(study, [v for v in _own(study, verdicts) if v.wavelength_um == wavelength]),
         ]
+    missed = unsure(study, verdicts)
+    lines += ["", missed[0].upper() + missed[1:] + "."] if missed else []
     return "\n".join([*lines, "", *_choice(study, verdicts)]) + "\n"
+
+
+def unsure(study: Study, verdicts: Iterable[Verdict]) -> str:
+    """On how many stretches an error bar of t lies above the tolerance, in words; empty where on none."""
+    every = [v for v in verdicts if v.turns > 0]
+    missed = [v for v in every if v.error > study.tolerance]
+    if not missed:
+        return ""
+    worst = max(missed, key=lambda v: v.error)
+    place = f"pitch {1e3 * worst.pitch_um:g} nm, {1e3 * worst.height_um:g} nm high, {1e3 * worst.wavelength_um:g} nm"
+    return (
+        f"on {len(missed)} of {len(every)} stretches error bars of t lie above the tolerance {study.tolerance:g}, the "
+        f"largest of {worst.error:.2g} ({worst.pillar}, {place})"
+    )
 
 
 def _subject(study: Study) -> str:

@@ -75,6 +75,21 @@ def test_diameters_whose_bars_are_above_half_of_their_light_end_a_stretch():
     assert found.ends == "an error bar above half of |t|"
 
 
+def test_a_page_tells_of_stretches_whose_bars_lie_above_the_tolerance():
+    """Bars of 3e-3 at most, so by a tolerance of 4e-3 none, by one of 2e-3 all, the first of both the largest."""
+    first = dataclasses.replace(study.judge(ABOUT, CELL, 0.85, Curve()), error=3e-3)
+    other = dataclasses.replace(first, wavelength_um=0.94, error=2.5e-3)
+    none = dataclasses.replace(first, turns=0.0, error=0.7)
+    asked = {"pitches_um": (0.36,), "heights_um": (0.6,), "wavelengths_um": (0.85, 0.94), "pillar": CELL.pillar}
+    loose, close = study.Study(**asked, tolerance=4e-3), study.Study(**asked, tolerance=2e-3)
+    assert study.unsure(loose, [first, other, none]) == ""
+    told = study.unsure(close, [other, first, none])
+    assert told.startswith("on 2 of 2 stretches error bars of t lie above the tolerance 0.002, the largest of 0.003 (")
+    assert told.endswith("pitch 360 nm, 600 nm high, 850 nm)")
+    assert "On 2 of 2 stretches" in study.markdown(close, [first, other], command="metalens study")
+    assert "stretches error" not in study.markdown(loose, [first, other], command="metalens study")
+
+
 def test_a_study_asks_for_errors_that_a_library_may_have():
     with pytest.raises(ConfigError, match=r"tolerance = 0\.11: need an error of t above 0 and up to 0\.1"):
         study.Study(tolerance=0.11)
