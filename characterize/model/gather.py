@@ -7,6 +7,7 @@ import numpy as np
 
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
+from metalens.lens import DiameterMap
 
 
 def even(count: int, pull: float, low: float, high: float) -> Array:
@@ -34,6 +35,23 @@ def density(count: int, tolerance: float) -> float:
     """Of :func:`even` places in the middle over that of Gauss-Legendre nodes."""
     pulled = pull(count, tolerance)
     return math.asin(pulled) / pulled
+
+
+def mirrored(diameters: DiameterMap, tangents: tuple[float, float]) -> bool:
+    """Whether pillars and the path of a chief ray are alike to both sides of both axes: a quarter of them tells all."""
+    d = diameters.diameter_um
+    plain = diameters.angle_rad is None and diameters.length_um is None and not any(tangents)
+    return plain and np.array_equal(d, d[::-1]) and np.array_equal(d, d[:, ::-1])
+
+
+def folded(weights: Array, first: int) -> Array:
+    """(n, m) weights of places of which those from ``first``, the middle one, on are asked for: each with its mirror
+    image's. As they are where that is 0."""
+    if not first:
+        return weights
+    out = weights.copy()
+    out[first + len(weights) % 2 :] += weights[:first][::-1]
+    return out
 
 
 def lit(table: Array, place: Array, turns: Array) -> Array:

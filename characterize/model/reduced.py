@@ -157,16 +157,20 @@ class Reduced:
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = real_of(self.kind)
         pull = gather.pull(n, self.tolerance)
-        across, along = (gather.at(n, pull, (-h, h), t).astype(real_kind) for h, t in ((hx, x), (hy, y)))
+        y0, x0 = (len(y) // 2, len(x) // 2) if gather.mirrored(d, self.bench.tangents) else (0, 0)
+        across, along = (
+            gather.folded(gather.at(n, pull, (-h, h), t), first).astype(real_kind)
+            for h, t, first in ((hx, x, x0), (hy, y, y0))
+        )
         table = np.ascontiguousarray(pillars.table().astype(self.kind).T)
-        block = max(1, 100_000 // len(x))
-        parts = [slice(start, start + block) for start in range(0, len(y), block)]
+        block = max(1, 100_000 // (len(x) - x0))
+        parts = [slice(start, start + block) for start in range(y0, len(y), block)]
         sums = np.zeros((len(parts), n, n, 2 * r), real_kind)
 
         def some(first: int, last: int) -> None:
             for i in range(first, last):
                 rows = parts[i]
-                some = np.flatnonzero((d.diameter_um[rows] > 0).any(0))
+                some = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
                 path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
                 place = pillars.entries(d, rows, built)
