@@ -66,12 +66,13 @@ def answer(about: Bench) -> Iterator[Entry]:
     yield Entry("sensor noise", NONE, NONE, noise, "one frame: Cramér-Rao bound of the linear estimator")
     said = "known to the estimator, switched off; not in the sum"
     here = about.device
-    cases = [("field", here.one_psf()), ("radiometry", here.evenly_lit())]
-    if about.given.fwhm_nm:
-        cases.append(("spectrum", here.one_wavelength(about.lens.wavelength_um)))
-    for link, optics in cases:
+    for link, optics in (("field", here.one_psf()), ("radiometry", here.evenly_lit())):
         yield replace(about.entry(link, optics, said), counted=False)
-    if not about.given.fwhm_nm:
+    if about.given.fwhm_nm:
+        one, design_nm = here.one_wavelength(about.lens.wavelength_um), 1e3 * about.lens.wavelength_um
+        said += f"; pillars answer as at {design_nm:g} nm, whatever their library holds"
+        yield replace(about.entry("spectrum", one, said), counted=False)
+    else:
         yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
 
 

@@ -238,7 +238,7 @@ def _parse(text: str, *, name: str, where: str) -> Material:
 
 def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> tuple[complex, complex]:
     if not (math.isfinite(wavelength_um) and wavelength_um > 0):
-        raise MaterialError(f"wavelength {wavelength_um} um: need a finite length above 0")
+        raise MaterialError(f"wavelength {wavelength_um:.7g} um: need a finite length above 0")
     if isinstance(wanted, cell.Index):
         return complex(wanted.n, wanted.k), 0j
     if isinstance(wanted, cell.Blend):
