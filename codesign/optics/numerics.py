@@ -37,7 +37,7 @@ class Numerics:
     def __post_init__(self) -> None:
         if self.depth_count < 2 or self.wavelength_count < 1:
             raise LensError(
-                f"{self.depth_count} depths, {self.wavelength_count} wavelengths: need 2 depths and 1 wavelength or more"
+                f"{self.depth_count} depths, {self.wavelength_count} wavelengths: need 2 depths, 1 wavelength or more"
             )
 
 

@@ -4,7 +4,7 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -95,14 +95,14 @@ def imager(
     round_ = round_ and (layers.stop is None or layers.stop.centred)
     shaded = _shaded(optics, scene_grid, focus.wavelength_um, middle)
     given = optics, scene_grid, source, middle
-    plan, own = _planned(given, tolerance, shaded, folds=round_, polarisation=polarisation)
-    stack, energy = node_psfs(optics, plan, device)
-    whole = patched(scene_grid, plan, stack, energy, tolerance=own)
+    found = _planned(given, tolerance, shaded, folds=round_, polarisation=polarisation)
+    stack, energy = node_psfs(optics, found.plan, device)
+    whole = patched(scene_grid, found.plan, stack, energy, tolerance=found.tolerance)
     made = evened(thinned(whole, tolerance=tolerance))
     parts = {**made.parts, **_held_out(optics, whole)}
     if isinstance(wave, PillarWave):
         parts["unknown"] = spectra.unknown(source, wave.lens.proxy.wavelengths_um)
-    stray = stray_of(optics, scene_grid, float(1 / (1 / plan.depths_um).mean()), middle)
+    stray = stray_of(optics, scene_grid, float(1 / (1 / found.plan.depths_um).mean()), middle)
     return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
 
 
@@ -114,13 +114,20 @@ def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
         raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
 
 
-def _planned(given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any) -> tuple[Plan, float]:
-    """A plan, and its tolerance over the frame's light: to that of an image that is so many times dimmer, or where no
-    number of nodes meets it to the frame's."""
+class _Planned(NamedTuple):
+    """A plan, and the tolerance that it keeps over the frame's light."""
+
+    plan: Plan
+    tolerance: float
+
+
+def _planned(given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any) -> _Planned:
+    """To the light of an image that is so many times dimmer than the frame, or where no number of nodes meets that to
+    the frame's."""
     if shaded > 1 and tolerance < 1:
         with contextlib.suppress(SceneError):
-            return planned(*given, tolerance=tolerance / shaded, **about), tolerance / shaded
-    return planned(*given, tolerance=tolerance, **about), tolerance
+            return _Planned(planned(*given, tolerance=tolerance / shaded, **about), tolerance / shaded)
+    return _Planned(planned(*given, tolerance=tolerance, **about), tolerance)
 
 
 def _shaded(optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]) -> float:

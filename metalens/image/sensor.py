@@ -1,6 +1,7 @@
 """The sensor: continuous pixel pitch, photon and read noise, full well, quantisation (paper Sec. 3.1)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -120,21 +121,27 @@ def integrate(
     Returns:
         (..., rows, columns) in the dtype of ``image``; differentiable in image and pitch.
     """
-    sizes = (None, None) if shape is None else shape
+    axes = list(zip(image.shape[-2:], (None, None) if shape is None else shape, shift_um, strict=True))
+    if not (isinstance(pitch_um, Tensor) and pitch_um.requires_grad and torch.is_grad_enabled()):
+        width = float(pitch_um.detach()) if isinstance(pitch_um, Tensor) else pitch_um
+        lengths = [length / sample_um for length in (width, width if grid_um is None else grid_um)]
+        if all(_samples(n, count, shift / sample_um, lengths) for n, count, shift in axes):
+            return image
     rows, columns = (
         pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um)
-        for n, count, shift in zip(image.shape[-2:], sizes, shift_um, strict=True)
+        for n, count, shift in axes
     )
-    if not (rows.requires_grad or columns.requires_grad) and _whole(rows) and _whole(columns):
-        return image
     return rows.to(image) @ image @ columns.to(image).mT
 
 
-def _whole(weights: Tensor) -> bool:
-    """Whether every pixel is one sample, to the rounding of its edges' places (double precision)."""
-    if weights.shape[0] != weights.shape[1]:
+def _samples(samples: int, count: int | None, shift: float, lengths: Sequence[float]) -> bool:
+    """Whether every pixel is one sample, to the rounding of its edges' places (double precision).
+
+    count: of pixels. shift: of the grid. lengths: width and distance of the pixels, all in samples.
+    """
+    if (pixel_count(samples, 1.0, lengths[1]) if count is None else count) != samples:
         return False
-    return float((weights - torch.eye(len(weights)).to(weights)).abs().max()) < 1e-11
+    return max(abs(length - 1) for length in lengths) * samples / 2 + abs(shift) < 5e-12
 
 
 def mean_electrons(
