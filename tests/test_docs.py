@@ -125,6 +125,35 @@ def test_settings_of_a_page_are_accepted(page, tmp_path):
         config.loads(text, _records()[name], where=f"{page.name}: {name}")
 
 
+NAMED = [*TEXTS, ROOT / "docs" / "fisher" / "README.md"]
+OURS = r"(?:metalens|layout|characterize|codesign)"
+
+
+@pytest.mark.parametrize("page", NAMED, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_files_modules_and_benchmarks_that_a_page_names_exist(page):
+    text = page.read_text(encoding="utf-8")
+    files = set(re.findall(rf"`((?:{OURS}|benchmarks|tests|docs|examples)/[\w/.\-]+)`", text))
+    assert not [name for name in files if not (ROOT / name).exists()]
+    parts = set(re.findall(r"python -m benchmarks(?:\.| )([a-z]\w*)", text))
+    assert not [name for name in parts if not list((ROOT / "benchmarks").glob(f"{name}*"))]
+    assert not [name for name in re.findall(rf"`({OURS}(?:\.\w+)+)", text) if not _there(name)]
+
+
+def _there(name):
+    """Whether a dotted name is a module of ours, or something in one; a file such as ``layout.json`` is none."""
+    found, *rest = name.split(".")
+    if rest[-1] == "json":
+        return True
+    made = importlib.import_module(found)
+    for part in rest:
+        if not hasattr(made, part) and importlib.util.find_spec(f"{found}.{part}") is not None:
+            importlib.import_module(f"{found}.{part}")
+        made, found = getattr(made, part, None), f"{found}.{part}"
+        if made is None:
+            return False
+    return True
+
+
 @pytest.mark.parametrize("page", TEXTS, ids=lambda p: p.stem)
 def test_links_and_commands_of_a_page_exist(page):
     text = page.read_text(encoding="utf-8")
