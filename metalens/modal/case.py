@@ -1,4 +1,5 @@
-"""From a cell, a size and a plane wave to the numbers of one modal case; refuses what the elements cannot follow."""
+"""From a cell, a size and a plane wave to the numbers of one modal case, and those of its solution; refuses what the
+elements cannot follow."""
 
 import math
 from dataclasses import dataclass
@@ -64,6 +65,37 @@ class Case:
             and around <= GUIDING * max(self.below, self.above)
         )
         return 0.0 if usual else 1.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solution:
+    """One rung's answer.
+
+    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of how far the forms are apart,
+    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per relative error of the transverse
+    wavenumbers squared of the layer modes, which both forms share. grazing: change of the matrix for what the mesh
+    misplaces cutoffs. beside: how near an order is to its cutoff, see ``match.nearness``. bloch: half the Bloch phase.
+    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where it is, damping of round trips
+    in the layer. energy: mean of both forms. unknowns: of both forms.
+    """
+
+    matrix: np.ndarray
+    waves: float
+    rim: float
+    drift: float
+    energy: float
+    unknowns: int
+    grazing: float = 0.0
+    beside: float = 0.0
+    bloch: float = 0.0
+    size: float = 0.0
+    strange: float = 0.0
+    damping: float = 1.0
+
+    @property
+    def spread(self) -> float:
+        """Half of how far the forms are apart, waves and rim together."""
+        return self.waves + self.rim
 
 
 def film(case: Case) -> np.ndarray:

@@ -12,7 +12,7 @@ from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.ground.threads import one_blas_thread
 from metalens.modal.assembly import Geometry, assemble
-from metalens.modal.case import Case, case_of, film
+from metalens.modal.case import Case, Solution, case_of, film
 from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
@@ -27,37 +27,6 @@ QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
 MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimate follows: the next move it by 1e-4
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Solution:
-    """One rung's answer.
-
-    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of how far the forms are apart,
-    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per relative error of the transverse
-    wavenumbers squared of the layer modes, which both forms share. grazing: change of the matrix for what the mesh
-    misplaces cutoffs. beside: how near an order is to its cutoff, see ``match.nearness``. bloch: half the Bloch phase.
-    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where it is, damping of round trips
-    in the layer. energy: mean of both forms. unknowns: of both forms.
-    """
-
-    matrix: np.ndarray
-    waves: float
-    rim: float
-    drift: float
-    energy: float
-    unknowns: int
-    grazing: float = 0.0
-    beside: float = 0.0
-    bloch: float = 0.0
-    size: float = 0.0
-    strange: float = 0.0
-    damping: float = 1.0
-
-    @property
-    def spread(self) -> float:
-        """Half of how far the forms are apart, waves and rim together."""
-        return self.waves + self.rim
 
 
 @lru_cache(maxsize=4)

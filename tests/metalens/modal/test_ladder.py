@@ -1,6 +1,7 @@
 """The error estimate of a mesh as its parts say, for discs of every width, at a cutoff and after other meshes."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from metalens import modal
 from metalens.cell import Cell, Index, Light
 from metalens.modal import case_of, evaluate, ladder
-from metalens.modal.ladder import Choice, Factors, Rung
+from metalens.modal.ladder import Choice, Factors, Rung, Settling
 
 THIN_PLAN, WIDE_PLAN = object(), object()
 THIN = Factors(0.3, 1.4, flat=2e-4, steep=7e-4, oblique=3e-4)
@@ -103,6 +104,33 @@ def test_near_a_resonance_a_change_counts_by_as_much_as_waves_in_the_layer_go_un
     for damping, factor in ((0.25, 4.0), (1.0, 1.0), (1.3, 1.0), (0.01, 6.0)):
         now = found(strange=1.0, damping=damping)
         assert ladder.settled(now, before) == pytest.approx(0.3 * factor, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("now", "before", "applies"),
+    [
+        ({}, {}, True),
+        ({"damping": 0.1}, {"damping": 0.1}, True),
+        ({"damping": 0.09}, {}, False),
+        ({}, {"damping": 0.09}, False),
+        ({"bloch": 0.2}, {}, False),
+        ({"strange": 3.0}, {}, False),
+        ({"size": 2.6}, {}, False),
+    ],
+    ids=["damped", "just damped", "not on this mesh", "not on one before", "oblique", "a rarer disc", "waves"],
+)
+def test_damped_cells_at_normal_incidence_are_judged_by_how_they_settle_where_that_is_less(now, before, applies):
+    """0.2 of the farther change (0.5, of forms drawn together to a quarter), 0.3 of half the difference, 1e-3 drift."""
+    found_ = found(**{"strange": 1.0} | now)
+    meshes = found(rim=0.08, waves=0.2, t=0.1 + 0.1j), found(rim=0.08, waves=0.2, t=0.6 + 0.3j, **before)
+    settling = Settling(moved=0.2, forms=0.3, shared=1e-3)
+    want = 0.2 * 0.25 + 0.3 * 0.07 + 1e-3 * 1.7
+    assert settling.bound(found_, meshes) == pytest.approx(want if applies else math.inf, rel=1e-9)
+    assert settling.bound(found_, meshes[1:]) == math.inf  # one mesh before tells nothing of how an answer settles
+    rung, wide = replace(RUNG, settling=settling), replace(RUNG, settling=Settling(9.0, 9.0, 9.0))
+    usual = RUNG.error(found_, 0.5, meshes)
+    assert want < usual == wide.error(found_, 0.5, meshes)
+    assert rung.error(found_, 0.5, meshes) == pytest.approx(want if applies else usual, rel=1e-9)
 
 
 def test_modes_far_below_the_error_are_left_out():

@@ -159,6 +159,37 @@ def test_forms_that_err_alike_at_a_cutoff_are_told_by_every_mesh(drawn, t, rung)
     assert abs(found.matrix[1, 0] - t) < 0.5 * rung.error(found, case.rho)  # of other cells at cutoffs errors scatter
 
 
+MANY_WAVES = (
+    cell(0.55042954205541, 1.53029894103568, 3.51819048263958, 1.3393922268467, 1.0360996419115, 1.16126448325698),
+    0.18680812157690393,
+    Light(0.9255815809035152),
+)
+LOWER = (
+    cell(0.53452483009903, 0.64028033386564, 2.46307144719115, 1.74956478318425, 1.28268146737654, 1.28469392918809),
+    0.3523400660475739,
+    Light(0.6859730438764974),
+)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "t", "r"),
+    [
+        (MANY_WAVES, -0.103976730 - 0.945579631j, -0.305278606 + 0.043278874j),
+        (LOWER, 0.797248598 + 0.180769351j, 0.369868697 - 0.051521402j),
+    ],
+    ids=["of many waves", "at a cutoff"],
+)
+def test_cells_of_damped_waves_have_bars_of_three_errors_from_how_the_answer_settles(drawn, t, r):
+    """Of 257 cells those whose bars are nearest to their errors, of their kinds; values of the mesh "finest". By the
+    forms' difference and the change over the damping the bars are 6 and 13 times the error."""
+    case = case_of(*drawn)
+    coarse, fair, found = (evaluate(case, rung.choice(case.rho).plan, weak=rung.weak) for rung in RUNGS[:3])
+    error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
+    bar, usual = EVEN.error(found, case.rho, (coarse, fair)), EVEN.choice(case.rho).after.bound(found, (coarse, fair))
+    assert 2 * error < bar < 3.7 * error
+    assert usual > 2 * bar
+
+
 def test_a_sharp_resonance_of_a_hole_is_told_by_the_meshes_before():
     """Both forms of the mesh "good" lie six times as near to each other as to the finest mesh. How the answer settles
     over the damping of the layer's waves tells it, on the mesh before too, and so does the climb."""
