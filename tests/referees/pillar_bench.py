@@ -41,7 +41,8 @@ class Faults:
     vibration_px: standard deviation of the blur of every second frame. ghost: its share of the light, (5, -4) px off.
     pixel_error: true pixel over stated, less 1. full_well_e: where pixels saturate.
     stage_um: standard deviation of the depth of single frames. gradient: light at the +x rim over the axis, less 1.
-    source_um: diameter of an evenly lit source.
+    light_y, light_r: ln of the irradiance there over that at the axis: at the +y rim, at the rim all round.
+    source_um: diameter of an evenly lit source. saddle_nm, oblique_nm: diameters x² - y² and 2xy over R².
     """
 
     glass_um: float = 0.0
@@ -58,7 +59,11 @@ class Faults:
     full_well_e: float = math.inf
     stage_um: float = 0.0
     gradient: float = 0.0
+    light_y: float = 0.0
+    light_r: float = 0.0
     source_um: float = 0.0
+    saddle_nm: float = 0.0
+    oblique_nm: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -156,8 +161,10 @@ def _pillars(lens, session, rng):
     u, v = x / radius, y / radius
     bias = session.of("bias_nm") + session.of("bias_x_nm") * u + session.of("bias_y_nm") * v
     bias = bias + session.of("bias_r_nm") * (u * u + v * v - 0.5)
+    bias = bias + faults.saddle_nm * (u * u - v * v) + faults.oblique_nm * 2 * u * v
     phase = sum(session.of(f"{name}_rad") * shape(u, v) for name, shape in ZERNIKE.items())
-    light = there * (1 + faults.gradient * u) * np.exp(1j * phase)
+    uneven = (1 + faults.gradient * u) * np.exp((faults.light_y * v + faults.light_r * (u * u + v * v)) / 2)
+    light = there * uneven * np.exp(1j * phase)
     fields = [(slice(0, ny), slice(0, nx), 0.0, 0.0)]
     if faults.stitch_nm:
         step = max(1, round(faults.field_um / lens.diameters.pitch_um))
@@ -187,7 +194,7 @@ def _frames(lens, session, pillars, wave, depth, index):
     k = 2 * math.pi / wave
     made = np.where(light != 0, _transmission(lens, session, diameter, wave), 0) * light
     sources = _sources(session)
-    kernels = [_kernel(lens, session, made.shape, k, shift) for *_, shift in _by_shift(fields)]
+    kernels = [_kernel(lens, session, made.shape, k, one) for one in fields]
     frames = []
     for z, i in zip(depth, index, strict=True):
         fine = 0.0
@@ -197,10 +204,6 @@ def _frames(lens, session, pillars, wave, depth, index):
             fine = fine + _intensity(lit, kernels, fields) / len(sources)
         frames.append(_pixels(fine, lens.diameters.pitch_um, session, int(i)))
     return np.stack(frames)
-
-
-def _by_shift(fields):
-    return [(rows, columns, (dx, dy)) for rows, columns, dx, dy in fields]
 
 
 def _sources(session):
@@ -243,29 +246,34 @@ def _fine_side(session, pitch_um):
     return 2 * math.ceil((session.pixels / 2 * session.pixel_um * 1.05 + MARGIN_UM) / pitch_um) + 1
 
 
-def _kernel(lens, session, shape, k, shift):
-    """FFT of the kernel from every pillar to every sample, as a function of their difference; side lengths."""
-    pitch, (ny, nx) = lens.diameters.pitch_um, shape
+def _kernel(lens, session, shape, k, field):
+    """FFT of the kernel from the pillars of a write field to every sample, by their difference; side lengths.
+
+    Samples are those of a circular convolution that no wrapped light reaches: one less than pillars and samples a side.
+    """
+    pitch, d = lens.diameters.pitch_um, lens.sensor_distance_um + session.of("distance_um")
     side = _fine_side(session, pitch)
-    d = lens.sensor_distance_um + session.of("distance_um")
-    rows, columns = (np.arange(side + n - 1) - (side - 1) / 2 - (n - 1) / 2 for n in (ny, nx))
-    X = columns * pitch + session.of("decentre_x_um") - shift[0]
-    Y = rows * pitch + session.of("decentre_y_um") - shift[1]
+    *slices, dx, dy = field
+    counts = [one.stop - one.start for one in slices]
+    rows, columns = (
+        np.arange(1 - m, side) - (side - 1) / 2 - one.start + (n - 1) / 2
+        for m, one, n in zip(counts, slices, shape, strict=True)
+    )
+    X = columns * pitch + session.of("decentre_x_um") - dx
+    Y = rows * pitch + session.of("decentre_y_um") - dy
     r = np.sqrt(X[None] ** 2 + Y[:, None] ** 2 + d * d)
     kernel = np.exp(1j * k * (r - d)) * (d / (2 * math.pi * r * r)) * (1 / r - 1j * k)
-    size = fft.next_fast_len(side + 2 * ny - 2), fft.next_fast_len(side + 2 * nx - 2)
+    size = tuple(fft.next_fast_len(side + m - 1) for m in counts)
     return fft.fft2(kernel, size), side, size
 
 
 def _intensity(lit, kernels, fields):
-    """(Y, X) |E|² on the fine samples of the sensor: the sum over all pillars."""
-    ny, nx = lit.shape
-    total = 0.0
-    for (spectrum, side, size), (rows, columns, *_) in zip(kernels, fields, strict=True):
-        part = np.zeros_like(lit)
-        part[rows, columns] = lit[rows, columns]
-        total = total + fft.ifft2(spectrum * fft.fft2(part, size))[ny - 1 : ny - 1 + side, nx - 1 : nx - 1 + side]
-    return np.abs(total) ** 2
+    """(Y, X) |E|² on the fine samples of the sensor: the sum over all pillars, field by field (all are as large)."""
+    (_, side, size), total = kernels[0], 0.0
+    for (spectrum, *_), (rows, columns, *_) in zip(kernels, fields, strict=True):
+        total = total + spectrum * fft.fft2(lit[rows, columns], size)
+    y, x = (one.stop - one.start - 1 for one in fields[0][:2])
+    return np.abs(fft.ifft2(total)[y : y + side, x : x + side]) ** 2
 
 
 def _pixels(fine, pitch_um, session, frame):

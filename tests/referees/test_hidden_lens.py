@@ -14,7 +14,7 @@ import pillar_table
 
 import characterize
 from characterize.inference.estimate import Options
-from characterize.model import slopes
+from characterize.model import NAMES, UNFITTED, slopes
 from metalens import modal
 from metalens.ground.errors import CaptureError, FitError
 from metalens.pillars.record import DEFAULT_CELL
@@ -36,13 +36,20 @@ def test_the_table_is_what_the_solver_says_between_its_entries():
         )  # quartic over the height, 1e-3 of bars
 
 
-def test_the_convolution_is_the_sum_over_all_pillars():
+@pytest.mark.parametrize("stitch_nm", [0.0, 900.0])
+def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
+    """The same sum in another order, of one write field or of sixteen out of place (the last ones narrower)."""
     lens, session = hidden.lens(12.0, 40.0, 200.0), hidden.session(4, depths_um=(200.0,))
+    session = bench.with_faults(session, stitch_nm=stitch_nm, field_um=3.1)
     x, y, d, light, fields = bench._pillars(lens, session, np.random.default_rng(0))
     k, z = 2 * np.pi / 0.85, 211.0
     path = bench._source_path(session.faults, x - 3.1, y + 1.7, z)
     lit = bench._transmission(lens, session, d, 0.85) * light * np.exp(1j * k * (path - path.min())) / z
-    found = bench._intensity(lit, [bench._kernel(lens, session, lit.shape, k, (0.0, 0.0))], fields)
+    found = bench._intensity(lit, [bench._kernel(lens, session, lit.shape, k, field) for field in fields], fields)
+    assert len(fields) == (16 if stitch_nm else 1)
+    for rows, columns, dx, dy in fields:
+        x[rows, columns] += dx
+        y[rows, columns] += dy
     middle, at = (len(found) - 1) / 2, (len(found) // 2 + 7, len(found) // 2 - 4)
     X = (at[1] - middle) * lens.diameters.pitch_um + session.of("decentre_x_um")
     Y = (at[0] - middle) * lens.diameters.pitch_um + session.of("decentre_y_um")
@@ -50,6 +57,33 @@ def test_the_convolution_is_the_sum_over_all_pillars():
     r = np.sqrt((X - x) ** 2 + (Y - y) ** 2 + distance**2)
     field = (lit * np.exp(1j * k * (r - distance)) * distance / (2 * np.pi * r * r) * (1 / r - 1j * k)).sum()
     assert abs(field) ** 2 == pytest.approx(found[at], rel=1e-10)
+
+
+def test_saddles_widen_one_way_and_thin_the_other_and_light_fades_as_stated():
+    """At three places without symmetry, against the lens without: rounding."""
+    session = hidden.session(4, values={})
+    faults = {"saddle_nm": 7.0, "oblique_nm": 11.0, "light_y": 0.3, "light_r": -0.4}
+    lens, rng = hidden.lens(12.0, 40.0, 200.0), np.random.default_rng
+    (x, y, d, light, _), (_, _, plain, one, _) = (
+        bench._pillars(lens, bench.with_faults(session, **some), rng(0)) for some in (faults, {})
+    )
+    radius = np.hypot(x, y)[plain > 0].max()
+    for place in ((20, 31), (33, 20), (9, 12)):
+        u, v = x[place] / radius, y[place] / radius
+        assert d[place] - plain[place] == pytest.approx(7e-3 * (u * u - v * v) + 11e-3 * 2 * u * v, abs=1e-12)
+        irradiance = abs(light[place] / one[place]) ** 2
+        assert irradiance == pytest.approx(np.exp(0.3 * v - 0.4 * (u * u + v * v)), rel=1e-12)
+
+
+def test_a_cause_that_nobody_states_is_the_only_one_left_open():
+    """By names that the fit knows: each kind in turn, every other one stated."""
+    every = {name for names in hidden.UNSTATED.values() for name in names} | set(hidden.LEFT_OUT)
+    kinds = [hidden.unstated(seed) for seed in range(len(hidden.UNSTATED))]
+    assert [kind for kind, *_ in kinds] == list(hidden.UNSTATED)
+    assert every <= {*NAMES, *(row.name for row in UNFITTED)}
+    for kind, faults, absent in kinds:
+        assert every - set(absent) == set(hidden.UNSTATED[kind])
+        bench.with_faults(hidden.session(1), **faults)
 
 
 def test_a_plate_of_glass_bends_by_snell():
