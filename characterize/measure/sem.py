@@ -266,7 +266,7 @@ def _blur(reach: Array, rays: Array, edge: Array, step: float, pitch: float) -> 
     near = np.clip((edge + np.array([[-1.0], [1.0]])) / reach[1], 0, len(reach) - 1)
     inside, outside = (ndimage.map_coordinates(rays, (places, np.arange(RAYS)), order=1) for places in near)
     share = float(np.clip((inside - outside).mean() / step, 0.05, 0.99))
-    return max(0.5 / special.erfinv(share) ** 2 - max(1.0, pitch / 150) ** 2, 0.0)
+    return max(0.5 / float(special.erfinv(share)) ** 2 - max(1.0, pitch / 150) ** 2, 0.0)
 
 
 def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
