@@ -9,6 +9,7 @@ import pytest
 
 from metalens.cell import Cell, Index, Light
 from metalens.modal import RUNGS, case_of, evaluate, ladder
+from metalens.modal.case import RARER
 from metalens.modal.engine import basis
 from metalens.modal.match import NEAR, lattice, nearness
 
@@ -42,6 +43,22 @@ def test_bars_hold_beside_a_cutoff_with_a_quarter_to_spare(drawn, t, r, near, ru
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     assert found.beside == pytest.approx(near, abs=0.01)
     assert 1.25 * (error - DOUBT) < rung.error(found, case.rho)
+
+
+def test_bars_of_a_disc_of_the_rarer_medium_hold_at_a_cutoff_after_meshes_before():
+    """Both forms of "good" err alike, by 30 times half their difference and as far as it moved since "even": 0.7 of the
+    error was told. Values of the mesh "reference", which moved by 7e-4 since "finest"."""
+    rarer = cell(0.75366427, 1.60735719, 1.87764143, 1.6191322, 1.4536532, 3.62984323)
+    case = case_of(rarer, 0.14232514, Light(1.09271256))
+    assert case.strange == RARER
+    before: list = []
+    for rung in RUNGS[:4]:
+        found = evaluate(case, rung.choice(case.rho).plan, weak=rung.weak)
+        error = abs(found.matrix[:, 0] - [-0.63707138 - 0.1831032j, -0.19628568 + 0.7121097j]).max()
+        assert 1.25 * (error - 7e-4) < rung.error(found, case.rho, before)
+        before.append(found)
+    assert found.beside == pytest.approx(1.0, abs=1e-3)
+    assert 30 * found.spread > error > 20 * found.spread
 
 
 def test_an_order_beyond_a_tenth_of_its_cutoff_takes_its_exact_wavenumber():

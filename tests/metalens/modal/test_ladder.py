@@ -106,6 +106,20 @@ def test_near_a_resonance_a_change_counts_by_as_much_as_waves_in_the_layer_go_un
         assert ladder.settled(now, before) == pytest.approx(0.3 * factor, rel=1e-9)
 
 
+def test_at_a_cutoff_the_last_change_of_a_disc_of_the_rarer_medium_counts_in_full_and_half_as_much_again():
+    """0.3 since the last mesh, 0.5 since the one before; forms at a hundredth of what they were, and a lens's disc."""
+    first, last = found(rim=2.0, waves=5.0, t=0.1 + 0.1j), found(rim=2.0, waves=5.0, t=0.6 + 0.4j)
+    parts = 0.4 * 0.02 + 0.6 * 0.05
+    for beside, counts in ((1.0, 0.45), (0.5, 0.225), (0.0, 0.8 * 0.05)):
+        now = found(strange=3.0, beside=beside)
+        near = beside * AFTER.at_cutoff
+        whole_ = max(0.4, near) * 0.02 + max(0.6, near) * 0.05 + counts
+        assert AFTER.bound(now, (first, last)) == pytest.approx(whole_, rel=1e-9)
+    other = AFTER.bound(found(strange=1.0, beside=1.0), (first, last))
+    assert other == pytest.approx(2.6 * 0.07 + 0.8 * 0.05, rel=1e-9)
+    assert AFTER.bound(found(strange=3.0), (first, last)) == pytest.approx(parts + 0.8 * 0.05, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("now", "before", "applies"),
     [
@@ -116,8 +130,20 @@ def test_near_a_resonance_a_change_counts_by_as_much_as_waves_in_the_layer_go_un
         ({"bloch": 0.2}, {}, False),
         ({"strange": 3.0}, {}, False),
         ({"size": 2.6}, {}, False),
+        ({"beside": 0.5}, {"beside": 0.6}, True),
+        ({"beside": 0.51}, {}, False),
     ],
-    ids=["damped", "just damped", "not on this mesh", "not on one before", "oblique", "a rarer disc", "waves"],
+    ids=[
+        "damped",
+        "just damped",
+        "not on this mesh",
+        "not before",
+        "oblique",
+        "rarer",
+        "waves",
+        "not at",
+        "at a cutoff",
+    ],
 )
 def test_damped_cells_at_normal_incidence_are_judged_by_how_they_settle_where_that_is_less(now, before, applies):
     """0.2 of the farther change (0.5, of forms drawn together to a quarter), 0.3 of half the difference, 1e-3 drift."""
