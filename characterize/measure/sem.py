@@ -22,9 +22,7 @@ RAYS = 72
 _ROUND = 2 / 3  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
 _TRIED = 25  # sites of a lattice that is only tried
 MOST = 0.5  # share of sites above which what is there decides of a lattice, or of a picture
-_UNSURE = (
-    0.1  # share of what blur takes of a radius by which clean discs of 9 to 30 pixels, blurred by 0.8 to 2, are off
-)
+_UNSURE = 0.1  # share of what blur takes of a radius by which clean discs (9 to 30 pixels, blur 0.8 to 2) are off
 _OVAL = 1.15  # length over width from which on a pillar is none of round ones: a circle's radius is off by 0.4 % there
 
 
