@@ -14,6 +14,7 @@ from metalens.cell import Cell, Index, Light
 from metalens.cell.shapes import Ellipse
 from metalens.modal import RUNGS, case_of, evaluate
 from metalens.modal.case import Case
+from metalens.modal.ladder import NEAREST
 
 COARSE, FAIR, EVEN = RUNGS[0], RUNGS[1], RUNGS[2]
 
@@ -172,22 +173,26 @@ LOWER = (
 
 
 @pytest.mark.parametrize(
-    ("drawn", "t", "r"),
+    ("drawn", "t", "r", "settles"),
     [
-        (MANY_WAVES, -0.103976730 - 0.945579631j, -0.305278606 + 0.043278874j),
-        (LOWER, 0.797248598 + 0.180769351j, 0.369868697 - 0.051521402j),
+        (MANY_WAVES, -0.103976730 - 0.945579631j, -0.305278606 + 0.043278874j, True),
+        (LOWER, 0.797248598 + 0.180769351j, 0.369868697 - 0.051521402j, False),
     ],
     ids=["of many waves", "at a cutoff"],
 )
-def test_cells_of_damped_waves_have_bars_of_three_errors_from_how_the_answer_settles(drawn, t, r):
+def test_cells_of_damped_waves_have_bars_of_three_errors_from_how_the_answer_settles(drawn, t, r, settles):
     """Of 257 cells those whose bars are nearest to their errors, of their kinds; values of the mesh "finest". By the
-    forms' difference and the change over the damping the bars are 6 and 13 times the error."""
+    forms' difference and the change over the damping the bars are 6 and 13 times the error, and stay so at a cutoff."""
     case = case_of(*drawn)
     coarse, fair, found = (evaluate(case, rung.choice(case.rho).plan, weak=rung.weak) for rung in RUNGS[:3])
     error = max(abs(found.matrix[1, 0] - t), abs(found.matrix[0, 0] - r))
     bar, usual = EVEN.error(found, case.rho, (coarse, fair)), EVEN.choice(case.rho).after.bound(found, (coarse, fair))
-    assert 2 * error < bar < 3.7 * error
-    assert usual > 2 * bar
+    assert usual > 5 * error
+    if settles:
+        assert 2 * error < bar < 3.7 * error
+    else:
+        assert found.beside > NEAREST
+        assert bar == pytest.approx(usual, rel=1e-9)  # but for what no mesh tells, 1e-12
 
 
 def test_a_sharp_resonance_of_a_hole_is_told_by_the_meshes_before():
