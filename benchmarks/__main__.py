@@ -1,13 +1,13 @@
 """``python -m benchmarks [TOPIC ...] [--peers]``: print the tables, keep them in benchmarks/results and in the README.
 
+Beneath each table stand its times and errors over those that were stored before.
+
 Without a topic all are run but those that take a quarter of an hour, or need an extra package or a GPU (``LONG``).
 """
 
 import argparse
 import importlib
 import json
-import os
-import platform
 import re
 import sys
 import traceback
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import benchmarks
 from benchmarks import Row, figures
+from benchmarks._stored import compared, machine
 
 LONG = (
     "closure", "engines", "gpu", "gpu_training", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee",
@@ -68,10 +69,10 @@ def _done(topic: str, peers: bool) -> bool:
         traceback.print_exc()
         return False
     print(f"\n{topic}\n{table(rows)}", flush=True)
-    about = {"python": platform.python_version(), "cores": len(os.sched_getaffinity(0))}
-    result = {"machine": about, "rows": [asdict(row) for row in rows]}
-    name = f"{topic}_peers.json" if peers else f"{topic}.json"
-    (Path(__file__).parent / "results" / name).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    path = figures.RESULTS / (f"{topic}_peers.json" if peers else f"{topic}.json")
+    print(f"\n{compared(path, rows)}", flush=True)
+    result = {"machine": machine(), "rows": [asdict(row) for row in rows]}
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return True
 
 

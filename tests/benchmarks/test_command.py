@@ -1,11 +1,14 @@
 """``python -m benchmarks``: what it is asked is what it runs."""
 
 import importlib
+import json
+from dataclasses import asdict, replace
 
 import pytest
 
 from benchmarks import Row
 from benchmarks.__main__ import LONG, main, table
+from benchmarks._stored import compared, machine
 
 
 def test_topics_that_are_not_there_are_refused_before_any_work(capsys):
@@ -41,3 +44,27 @@ def test_rows_are_told_with_their_error():
         "0.00025",
     ]
     assert other[head.index("error") :].split() == ["-", "-"]
+
+
+def test_rows_made_anew_are_told_beside_the_stored_ones_of_their_case_and_method(tmp_path):
+    old = [
+        Row("lens", "fast", 2.0, 1e-3, "sum"),
+        Row("lens", "fast", 4.0, float("nan"), "-"),
+        Row("gone", "x", 1.0, 0.0, "-"),
+    ]
+    path = tmp_path / "topic.json"
+    path.write_text(json.dumps({"rows": [asdict(row) for row in old]}))
+    new = [replace(old[0], seconds=5.0, error=1.5e-3), replace(old[1], seconds=3.0), replace(old[0], method="slow")]
+    assert compared(path, new).splitlines() == [
+        "lens, fast: time x2.5, error x1.5",
+        "lens, fast: time x0.75, error -",
+        "lens, slow: not stored",
+        "gone, x: stored only",
+    ]
+    assert compared(tmp_path / "none.json", new[:1]) == "lens, fast: not stored"
+
+
+def test_a_machine_tells_its_speed_by_jobs_of_their_own():
+    speed = machine()["speed"]
+    assert set(speed) == {"products_gflops", "transform_ms", "loop_ms"}
+    assert all(value > 0 for value in speed.values())
