@@ -7,10 +7,11 @@ import math
 import re
 import tomllib
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -154,10 +155,32 @@ def _checked(about: dict[str, Any], path: Path) -> dict[str, Any]:
     return about | ({"bits": int(about["bits"])} if "bits" in about else {})
 
 
+def ome_entries(xml: str, name: str) -> Iterator[dict[str, str]]:
+    """Attributes of each element of a name in OME-XML, of whatever namespace.
+
+    Raises:
+        ElementTree.ParseError: no XML.
+    """
+    every = ElementTree.fromstring(xml).iter()
+    return (entry.attrib for entry in every if str(entry.tag).rpartition("}")[2] == name)
+
+
 def ome_positions(xml: str) -> Array:
-    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default um)."""
-    planes = re.findall(r'PositionZ="([^"]+)"(?:[^>]*PositionZUnit="([^"]+)")?', xml)
-    return np.array([float(z) * _LENGTHS.get(unit.replace("µ", "u"), 1.0) for z, unit in planes])
+    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default um), in the order of the pages.
+
+    Planes carry their place in the stack (TheZ, TheT), which need not be the order in which they are written down;
+    empty where one has no position or one in a unit that is no length ("reference frame").
+
+    Raises:
+        ElementTree.ParseError: no XML.
+    """
+    order = next(ome_entries(xml, "Pixels"), {}).get("DimensionOrder", "XYZCT")
+    slow, fast = ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
+    planes = sorted(ome_entries(xml, "Plane"), key=lambda plane: (int(plane.get(slow, 0)), int(plane.get(fast, 0))))
+    units = [plane.get("PositionZUnit", "um").replace("\u00b5", "u").replace("\u03bc", "u") for plane in planes]
+    if not all("PositionZ" in plane and unit in _LENGTHS for plane, unit in zip(planes, units, strict=True)):
+        return np.empty(0)
+    return np.array([float(plane["PositionZ"]) * _LENGTHS[unit] for plane, unit in zip(planes, units, strict=True)])
 
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:

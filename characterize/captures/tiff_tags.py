@@ -1,9 +1,9 @@
 """What the tags of a TIFF file say of stage and pixel: ImageJ (spacing, resolution) and OME-XML."""
 
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from characterize.captures import stage
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-_MICRON = dict.fromkeys(("um", "µm", "\\u00b5m", "micron", "microns"), 1.0)
-_UNITS = {"nm": 1e-3, **_MICRON, "mm": 1e3, "cm": 1e4, "inch": 25400.0}
+_MICRONS = ("um", "\u00b5m", "\u03bcm", "\\u00b5m", "\\u03bcm", "micron", "microns")  # a micro sign or a Greek letter
+_UNITS = {"nm": 1e-3, **dict.fromkeys(_MICRONS, 1.0), "mm": 1e3, "cm": 1e4, "inch": 25400.0}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -41,20 +41,26 @@ def read(path: Path) -> Tags:
 
 
 def _ome(path: Path, xml: str, pages: int) -> Tags:
-    """Positions of the planes, else steps of the voxel's height."""
-    channels, samples = (re.search(rf'{name}="(\d+)"', xml) for name in ("SizeC", "SamplesPerPixel"))
-    _one_channel(path, (int(channels[1]) if channels else 1) // (int(samples[1]) if samples else 1))
-    pixel, step, position = _ome_size(xml, "X"), _ome_size(xml, "Z"), stage.ome_positions(xml)
-    if len(position) or not math.isfinite(step) or step == 0:
+    """Positions of the planes, else steps of the voxel's height; nothing of a text that is no XML."""
+    try:
+        pixels = next(stage.ome_entries(xml, "Pixels"), {})
+    except ElementTree.ParseError:
+        return Tags(notes=("the OME tags are no XML: what they say of stage and pixel is not read",))
+    samples = next(stage.ome_entries(xml, "Channel"), {}).get("SamplesPerPixel", "1")
+    _one_channel(path, int(pixels.get("SizeC", 1)) // int(samples))
+    pixel, step, position = _ome_size(pixels, "X"), _ome_size(pixels, "Z"), stage.ome_positions(xml)
+    planes, times = (max(int(pixels.get(f"Size{axis}", 1)), 1) for axis in "ZT")
+    if len(position) or not math.isfinite(step) or step == 0 or planes == 1 < pages:
         return Tags(position, pixel, _words(pixel))
+    order, page = pixels.get("DimensionOrder", "XYZCT"), np.arange(pages)
+    place = page % planes if order.index("Z") < order.index("T") else page // times
     note = f"stage step of {step:.4g} um from the OME tags"
-    return Tags(np.arange(pages) * step, pixel, (note, *_words(pixel)))
+    return Tags(place * step, pixel, (note, *_words(pixel)))
 
 
-def _ome_size(xml: str, axis: str) -> float:
+def _ome_size(pixels: dict[str, str], axis: str) -> float:
     name = f"PhysicalSize{axis}"
-    found = re.search(rf'{name}="([^"]+)"(?:[^>]*{name}Unit="([^"]+)")?', xml)
-    return float(found[1]) * _UNITS.get(found[2] or "um", math.nan) if found else math.nan
+    return float(pixels.get(name, "nan")) * _UNITS.get(pixels.get(f"{name}Unit", "um"), math.nan)
 
 
 def _one_channel(path: Path, channels: int) -> None:
@@ -63,13 +69,19 @@ def _one_channel(path: Path, channels: int) -> None:
 
 
 def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) -> Tags:
-    """Steps without a unit are in um; of a unit that is no length (pixels) neither steps nor a pixel are told."""
+    """Steps without a unit are in um; of a unit that is no length (pixels) neither steps nor a pixel are told.
+
+    A stack that is seen several times steps through its slices each time; times alone tell no step.
+    """
     _one_channel(path, int(str(about.get("channels", 1))))
     unit = str(about.get("unit", "")).lower()
     scale = _UNITS.get(unit, math.nan)
     step = float(str(about.get("spacing", "nan"))) * (scale if unit else 1.0)
     pixel = per_pixel * scale
-    position = np.arange(pages) * step if math.isfinite(step) and step != 0 else np.empty(0)
+    times = int(str(about.get("frames", 1)))
+    slices = max(int(str(about.get("slices", pages if times == 1 else 1))), 1)
+    stepped = math.isfinite(step) and step != 0 and (slices > 1 or pages == 1)
+    position = np.arange(pages) % slices * step if stepped else np.empty(0)
     notes = (f"stage step of {step:.4g} um from the ImageJ tags",) if len(position) else ()
     return Tags(position, pixel, notes + _words(pixel))
 

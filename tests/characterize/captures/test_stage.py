@@ -107,10 +107,26 @@ def test_frames_of_which_only_names_are_known():
     assert np.isnan(rows.position_um).tolist() == np.isnan(rows.exposure_s).tolist() == [True] * 3
 
 
+def pixels(planes, about=""):
+    return f'<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://ome"><Pixels {about}>{planes}</Pixels></OME>'
+
+
 def test_planes_of_ome_xml_carry_their_unit():
-    xml = '<Plane PositionZ="1.5" PositionZUnit="mm"/><Plane PositionZ="-2"/><Plane PositionZ="7" PositionZUnit="µm"/>'
-    assert stage.ome_positions(xml).tolist() == [1500.0, -2.0, 7.0]
-    assert stage.ome_positions('<Plane PositionZ="30" PositionZUnit="nm"/>') == pytest.approx([0.03])
+    units = {"mm": 1e3, "um": 1.0, "&#181;m": 1.0, "\u00b5m": 1.0, "\u03bcm": 1.0, "nm": 1e-3, "m": 1e6}
+    planes = '<Plane PositionZ="-2"/>' + "".join(f"<Plane PositionZUnit='{u}' PositionZ='1.5'/>" for u in units)
+    assert stage.ome_positions(pixels(planes)) == pytest.approx([-2.0, *(1.5 * um for um in units.values())])
+    for strange in ('<Plane PositionZ="3" PositionZUnit="reference frame"/>', '<Plane DeltaT="0.1"/>'):
+        assert len(stage.ome_positions(pixels(planes + strange))) == 0
+
+
+@pytest.mark.parametrize(("order", "found"), [("XYZCT", [7, 5, 9, 11]), ("XYCTZ", [7, 9, 5, 11])])
+def test_planes_of_ome_xml_stand_where_they_say(order, found):
+    """Two depths, two times: the first depth at both times, then the second; pages by the order that is stated."""
+    planes = "".join(
+        f'<Plane TheZ="{z}" TheT="{t}" TheC="0" PositionZ="{at}"/>'
+        for z, t, at in ((0, 0, 7), (0, 1, 9), (1, 0, 5), (1, 1, 11))
+    )
+    assert stage.ome_positions(pixels(planes, f'DimensionOrder="{order}"')).tolist() == found
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,48 @@ def test_ome_without_positions_gives_steps_of_the_height_of_a_voxel(tmp_path, un
     assert found.notes[0] == f"stage step of {2.5 * um:.4g} um from the OME tags"
 
 
+def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
+    """The unit first, in single quotes, a micro sign as an entity or a Greek letter: all mean 0.37 and 2.5 um."""
+    about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeZ": 2.5}
+    about |= {"PhysicalSizeXUnit": "um", "PhysicalSizeZUnit": "um"}
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about)
+    written = tifffile.tiffcomment(tmp_path / "a.ome.tif")
+    turned = written
+    for axis, nm in (("X", 370), ("Z", 2500)):
+        name, um = f"PhysicalSize{axis}", nm / 1000
+        turned = turned.replace(f'{name}="{um}" {name}Unit="um"', f'{name}Unit="nm" {name}="{nm}"')
+    spelt = (written.replace('"um"', f'"{unit}"') for unit in ("&#181;m", "\u00b5m", "&#x3bc;m"))
+    for words in (turned, written.replace('"', "'"), *spelt):
+        assert words != written
+        tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
+        found = tiff_tags.read(tmp_path / "a.ome.tif")
+        assert found.pixel_um == pytest.approx(0.37, rel=1e-12)
+        assert found.position_um == pytest.approx(2.5 * np.arange(4), rel=1e-12)
+
+
+def test_ome_tags_that_are_no_xml_are_told(tmp_path):
+    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 2.5})
+    words = tifffile.tiffcomment(tmp_path / "a.ome.tif").replace("<Pixels", "<Pixels<")
+    tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
+    found = tiff_tags.read(tmp_path / "a.ome.tif")
+    assert (len(found.position_um), "are no XML" in found.notes[0]) == (0, True)
+
+
+@pytest.mark.parametrize("kind", ["imagej", "ome"])
+def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(tmp_path, kind):
+    sizes = {"spacing": 0.3, "unit": "um"} if kind == "imagej" else {"PhysicalSizeZ": 300.0, "PhysicalSizeZUnit": "nm"}
+    frames = np.arange(12 * 6 * 5, dtype=np.uint16).reshape(3, 4, 6, 5)
+    for axes, stack, steps in (
+        ("TZYX", frames, [0, 1, 2, 3] * 3),
+        ("ZTYX", frames, [0] * 4 + [1] * 4 + [2] * 4),
+        ("TYX", frames[0], []),
+    ):
+        if kind == "imagej" and axes == "ZTYX":  # it has an order of its own
+            continue
+        tifffile.imwrite(tmp_path / "a.tif", stack, metadata={"axes": axes, **sizes}, **{kind: True})
+        assert tiff_tags.read(tmp_path / "a.tif").position_um == pytest.approx(0.3 * np.array(steps), rel=1e-12)
+
+
 def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tmp_path):
     tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES.reshape(2, 2, 6, 5), ome=True, metadata={"axes": "ZCYX"})
     with pytest.raises(CaptureError, match="2 channels in one file"):
