@@ -30,7 +30,7 @@ class View:
 
     @classmethod
     def over(cls, box: Array, most: int) -> "View":
-        """Around left, bottom, right, top, at most ``most`` points each way."""
+        """Around left, bottom, right, top: ``most`` points along the longer side, and one for what is left over."""
         wide, high = float(box[2] - box[0]), float(box[3] - box[1])
         side = max(wide, high, 1.0) / most
         return cls(float(box[0]), float(box[1]), side, int(high / side) + 1, int(wide / side) + 1)
@@ -102,7 +102,7 @@ def _of_sites(part: Part, sites: Sites, side: float) -> Iterator[Spots]:
 
 
 def _sampled(outline: Array, step: float) -> Spots:
-    """Points within an outline ``step`` apart, which share its area; its centroid where it is no larger."""
+    """Points within an outline ``step`` apart, which share its area; the middle of its box where it is no larger."""
     area = abs(polygon.twice_area(np.rint(outline).astype(np.int64))) / 2
     low, high = outline.min(0), outline.max(0)
     if (high - low).max() > step:

@@ -407,3 +407,27 @@ def test_a_step_outwards_is_as_long_as_asked_and_no_longer_than_its_limits(most,
     step, least, size = ends._outwards(here, 0, 1, 25.0, Prior.none(np.zeros(2)), most)
     assert step == pytest.approx([reach, reach])
     assert (least, size) == pytest.approx((0.0, 0.7 if most[1] < 1 else 5.0))
+
+
+def test_two_ends_make_a_profile_whose_sides_are_not_confused():
+    """By hand: points of both sides in order, about the mode; the high end was not found."""
+    low = ends.End(-1.9, [(-1.2, 2.6), (-0.4, 0.7)], [], steps=5)
+    high = ends.End(3.7, [(1.4, 1.1)], [], steps=2, done=False)
+    found = ends.joined([low, high], 0.3, 0.8, 2.5)
+    assert (found.low, found.high, found.found) == (-1.9, 3.7, (True, False))
+    assert found.value.tolist() == [-1.2, -0.4, 0.3, 1.4]
+    assert found.rise.tolist() == [2.6, 0.7, 0.0, 1.1]
+    assert not found.parabolic  # 3.4 / 2 and 2.2 / 2 = 1.1
+    assert ends.plain(-1.9, 2.1, 0.3, 2.0)  # 0.9 and 1.1
+    assert not ends.plain(-1.9, 1.9, 0.3, 2.0)  # 0.8
+    assert not ends.plain(-2.1, 2.1, 0.3, 2.0)  # 1.2
+
+
+def test_ends_met_at_once_have_the_curve_of_the_parabola():
+    """(x - mode)² / sigma² at its 2.5, 1.96 and 1 sigma, whatever was seen on the way of one step."""
+    met = [ends.End(0.3 + side * 1.96 * 0.8, [(9.0, 9.0)], [], steps=1, done=side > 0) for side in (-1, 1)]
+    found = ends.joined(met, 0.3, 0.8, 1.96)
+    assert found.value == pytest.approx([-1.7, -1.268, -0.5, 0.3, 1.1, 1.868, 2.3])
+    assert found.rise == pytest.approx(((found.value - 0.3) / 0.8) ** 2)
+    assert found.parabolic
+    assert found.found == (False, True)

@@ -51,3 +51,52 @@ def test_every_area_is_seen_once_and_where_it_stands():
     want_y = np.mean([-15_000 + u.mean(), 12_000 + v.mean(), 12_000 + v.mean()])
     assert np.average(x, weights=share) == pytest.approx(want_x, abs=60)  # the triangle's own middle
     assert np.average(y, weights=share) == pytest.approx(want_y, abs=60)
+
+
+@pytest.mark.parametrize(
+    ("box", "side", "shape"),
+    [((-7, -31, 13, 69), 4.0, (26, 6)), ((-31, -7, 69, 13), 4.0, (6, 26)), ((5, 7, 5, 7), 1 / 25, (1, 1))],
+)
+def test_a_picture_has_the_points_of_its_longer_side_and_one_for_the_rest(box, side, shape):
+    """100 by 20 units by 25 points of 4; a box of nothing has the point at its corner."""
+    view = seen.View.over(np.array(box), 25)
+    assert (view.left, view.bottom, view.side) == (box[0], box[1], side)
+    assert (view.rows, view.columns) == shape
+
+
+def test_area_on_four_points_keeps_its_sum_and_its_middle_of_mass():
+    """Linear shares: the sums of area, area x and area y over the points' middles are those of the spots."""
+    view = seen.View(-7.0, 3.0, 2.5, 9, 13)
+    rng = np.random.default_rng(5)
+    area = rng.uniform(0.1, 2.0, 40)
+    x, y = rng.uniform(-5.5, 23.5, 40), rng.uniform(4.5, 23.5, 40)  # half a point and more from the edges
+    image = np.zeros((9, 13))
+    view.add((x, y, area), image)
+    held = image * 2.5**2
+    across, up = -7 + 2.5 * (np.arange(13) + 0.5), 3 + 2.5 * (np.arange(9) + 0.5)
+    assert held.sum() == pytest.approx(area.sum(), rel=1e-12)
+    assert held.sum(0) @ across == pytest.approx(area @ x, rel=1e-12)
+    assert held.sum(1) @ up == pytest.approx(area @ y, rel=1e-12)
+    edge = np.zeros((9, 13))
+    view.add((np.array([-7.0]), np.array([26.0]), np.array([5.0])), edge)
+    assert edge[8, 0] * 2.5**2 == pytest.approx(5.0)  # beyond the last middles: of the last
+
+
+def test_a_large_shape_is_points_of_one_share_within_it_and_a_small_one_its_middle():
+    """A bar of 100 by 10 at 20: five points on its middle line; an L has no point where it has no area."""
+    x, y, area = seen._sampled(np.array([[3.0, 7], [103, 7], [103, 17], [3, 17]]), 20.0)
+    assert (x.tolist(), y.tolist(), area.tolist()) == ([13.0, 33, 53, 73, 93], [12.0] * 5, [200.0] * 5)
+    x, y, area = seen._sampled(np.array([[0.0, 0], [60, 0], [60, 20], [20, 20], [20, 40], [0, 40]]), 20.0)
+    assert set(zip(x, y, strict=True)) == {(10, 10), (30, 10), (50, 10), (10, 30)}
+    assert area.tolist() == [400.0] * 4
+    x, y, area = seen._sampled(np.array([[3.0, 7], [23, 7], [23, 13], [3, 13]]), 20.0)
+    assert (x.tolist(), y.tolist(), area.tolist()) == ([13.0], [10.0], [120.0])
+
+
+def test_spots_within_a_third_of_a_point_are_one_in_their_middle_of_mass():
+    """Cells of 2 from the least x and y: (10, 20) and (11, 21) weigh 3 and 1; the others stand alone, none has none."""
+    spots = [(10.0, 20.0, 3.0), (11.0, 21.0, 1.0), (12.5, 20.0, 7.0), (10.5, 22.5, 2.0), (15.0, 25.0, 0.0)]
+    x, y, area = seen._merged(tuple(np.array(spots).T), 6.0)
+    assert x == pytest.approx([10.25, 12.5, 10.5], rel=1e-12)
+    assert y == pytest.approx([20.25, 20.0, 22.5], rel=1e-12)
+    assert area.tolist() == [4.0, 7.0, 2.0]

@@ -70,6 +70,19 @@ def test_a_folder_that_is_replaced_while_it_is_read_is_refused_before_what_it_ma
         pass
 
 
+def test_a_swap_of_two_names_says_whether_it_was_done(tmp_path):
+    """Both folders under the other's name, or both as they were; of a name that is not there nothing."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"of {name}").touch()
+    done = lock.exchange(tmp_path / "a", tmp_path / "b")
+    assert type(done) is bool
+    for name, other in ("ab", "ba"):
+        assert [p.name for p in (tmp_path / name).iterdir()] == [f"of {other if done else name}"]
+    assert lock.exchange(tmp_path / "a", tmp_path / "c") is False
+    assert not (tmp_path / "c").exists()
+
+
 def test_the_hash_of_an_input_is_that_of_what_was_read(tmp_path):
     """Settings that are edited while a command works are hashed as they were; another input is refused."""
     path, before = tmp_path / "c.toml", b"[cell]\npitch_um = 0.31\n"
