@@ -33,7 +33,7 @@ def frames_first(
     """A stack as (n, y, x), and what to say where it lay otherwise; a single frame as it is.
 
     What is stated decides; else the number of frames, the first axis where both fit; a number that fits neither is
-    left to the caller.
+    left to the caller. Where nothing tells and the other way is as likely, how it was taken is said.
 
     Args:
         stack: (n, y, x) or (y, x, n), of colour images with these behind.
@@ -49,7 +49,7 @@ def frames_first(
         return stack, ""
     first, second, last = stack.shape[:3]
     if order == "yxn":
-        return _moved(stack, path, "as the capture's description says")
+        return _moved(stack, path, "as stated")
     if count is not None:
         fits = count == last and count != first
         return _moved(stack, path, f"since {count} frames of it are listed") if fits else (stack, "")
@@ -61,6 +61,9 @@ def frames_first(
             f'but reads like {last} frames of {first} x {second} as (y, x, n); say which: axes = "nyx" or '
             'axes = "yxn" in capture.toml (of a single file, in the TOML of its name beside it)'
         )
+    if last < min(first, second) or second == first:
+        name, taken = reading.shown(path.name), f"taken as (n, y, x), {first} frames of {second} x {last} pixels"
+        return stack, f'{name} {taken}; if it is {last} frames of {first} x {second}, say axes = "yxn"'
     return stack, ""
 
 

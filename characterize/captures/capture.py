@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import axes, stage, tiff_pages, tiff_tags
+from characterize.captures import axes, png, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
 from characterize.captures.colour import Colours
 from metalens.ground import manifest, reading, store
@@ -25,7 +25,6 @@ from metalens.ground.errors import CaptureError, MetalensError
 TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = Colours()
 Stack = tuple[Array, str]
-_LEAST_PNG = 33  # bytes of a PNG's mark and head
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,7 +112,10 @@ def read_images(path: Path) -> Array:
 
 def _stack(path: Path, colours: Colours, order: str | None, *, count: int | None = None, pages: int = 0) -> Stack:
     """Frames of one file and what to say of their axes."""
-    images, note = axes.frames_first(read_all(path, colours), path, order, count=count, pages=pages)
+    images = read_all(path, colours)
+    if order is None and path.suffix.lower() in TIFF:
+        order = tiff_pages.order(path)
+    images, note = axes.frames_first(images, path, order, count=count, pages=pages)
     return sound(colours.pick(images, path, grey=False), path), note
 
 
@@ -145,7 +147,7 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
     if suffix in LOSSY:
         raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
     read_tiff = partial(tiff_pages.read, coloured=colours.channel is not None, mosaic=bool(colours.mosaic))
-    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: _read_png, HDF5: _read_hdf5}
+    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: png.read, HDF5: _read_hdf5}
     reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
     if reader is None:
         raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
@@ -279,40 +281,6 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
     return np.concatenate(stacks)
 
 
-def _read_png(path: Path) -> Array:
-    import cv2
-
-    _check_png(path)
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise CaptureError(f"{path}: not a readable PNG file ({error.err})") from None
-    if image is None:
-        raise CaptureError(f"{path}: truncated or not a PNG file")
-    if image.ndim == 3:  # blue comes first
-        return np.asarray(image[None][..., [2, 1, 0, 3][: image.shape[-1]]])
-    return np.asarray(image)
-
-
-def _check_png(path: Path) -> None:
-    """Refuse what claims more than the file holds: its pixels, or a block that the library would make room for."""
-    size, ends, begun = path.stat().st_size, 8, b""
-    with open(path, "rb") as file:
-        while size >= _LEAST_PNG and ends + 8 <= size and begun != b"IEND":
-            file.seek(ends)
-            head = file.read(24 if not begun else 8)
-            length, name = int.from_bytes(head[:4], "big"), head[4:8]
-            if not begun and (
-                name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > tiff_pages.DENSEST * 8 * size
-            ):
-                raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)")
-            if begun and name == b"IHDR":
-                raise CaptureError(f"{path}: not a PNG file (a second head)")
-            ends, begun = ends + 12 + length, name
-    if begun != b"IEND" or ends > size:
-        raise CaptureError(f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})")
-
-
 def _read_hdf5(path: Path) -> Array:
     try:
         return reading.survived(path, lambda file: _frames_of(path, file))
@@ -332,7 +300,7 @@ def _frames_of(path: Path, file: h5py.File) -> Array:
     if not isinstance(frames, h5py.Dataset):
         raise CaptureError(f"{path}: 'frames' is a group, need a data set (n, y, x)")
     store.check_claim(path, frames, "frames")
-    return np.asarray(frames[...])
+    return np.asarray(frames[...]).astype(frames.dtype.newbyteorder("="), copy=False)
 
 
 def _check_values(images: Array, path: Path) -> None:

@@ -1,6 +1,7 @@
 """The images of a TIFF file, refused where it is damaged, lossy or claims more than it holds."""
 
 import importlib.util
+import math
 import struct
 import warnings
 import zlib
@@ -31,9 +32,9 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
         mosaic: whether it is known how a raw mosaic of colours lies.
 
     Raises:
-        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, pages of different size;
-            values where more is less light, places in a table of colours (a table of greys in order gives light), a
-            raw mosaic of which nothing is known.
+        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, values packed without
+            gaps, pages of different size or type; values where more is less light, places in a table of colours (a
+            table of greys in order gives light), a raw mosaic of which nothing is known.
     """
     import tifffile
 
@@ -42,7 +43,7 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
             warnings.simplefilter("ignore")
             _check(path, file)
             _check_meaning(path, file, mosaic=mosaic)
-            images = np.stack(_alike([page.asarray() for page in file.pages], path))
+            images = _images(path, file)
             planar = file.pages.first.planarconfig == 2
             if planar and coloured and images.ndim == 4:
                 return np.moveaxis(images, 1, -1)
@@ -51,6 +52,42 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
         raise
     except (tifffile.TiffFileError, *store.DAMAGE, IndexError, ArithmeticError, struct.error, zlib.error) as error:
         raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
+
+
+def stacked(file: Any) -> int:
+    """How many images a file holds: its pages, or what ImageJ laid behind the head of one (stacks above 4 GB)."""
+    told = (file.imagej_metadata or {}) if file.is_imagej else {}
+    return max(int(str(told.get("images", 1))), 1) if len(file.pages) == 1 else len(file.pages)
+
+
+def order(path: Path) -> str | None:
+    """How the images of a file lie where that is sure: "nyx" of pages written one by one, as cameras and image programs
+    do; None of an array that was written at once (tifffile), whose axes may be any, unless it says them.
+    """
+    import tifffile
+
+    with tifffile.TiffFile(path) as file:
+        about = file.shaped_metadata or ({},)
+        at_once = str(file.pages.first.tags.valueof(305, "")).startswith("tifffile") or file.is_shaped
+        axes = str(about[0].get("axes", ""))
+        if not at_once or (len(axes) > 2 and axes.endswith("YX")):
+            return "nyx"
+        return "yxn" if axes[:2] == "YX" and len(axes) == 3 else None
+
+
+def _images(path: Path, file: Any) -> Array:
+    count, first = stacked(file), file.pages.first
+    if count == len(file.pages):
+        return np.stack(_alike([page.asarray() for page in file.pages], path))
+    begins, size = first.dataoffsets[0], path.stat().st_size
+    if int(first.compression) != 1 or begins + count * first.nbytes > size:
+        raise CaptureError(
+            f"{path}: says {count} images, as ImageJ writes large stacks, and has room for "
+            f"{max((size - begins) // first.nbytes, 1)} ({size} bytes): truncated, or cut out of a stack; save it anew"
+        )
+    kind = first.dtype.newbyteorder(file.byteorder)
+    values = np.fromfile(path, kind, count * math.prod(first.shape), offset=begins)
+    return values.astype(first.dtype, copy=False).reshape(count, *first.shape)
 
 
 def _check(path: Path, file: Any) -> None:
@@ -73,6 +110,11 @@ def _check(path: Path, file: Any) -> None:
             raise CaptureError(
                 f"{path}: frame {number} is compressed ({_ELSEWHERE[packed]}); save it plain or deflated, or install "
                 "imagecodecs"
+            )
+        if page.bitspersample not in (8, 16, 32, 64) and importlib.util.find_spec("imagecodecs") is None:
+            raise CaptureError(
+                f"{path}: values of frame {number} are {page.bitspersample} bits wide, packed without gaps; save them "
+                "in words of 16 bits, or install imagecodecs"
             )
 
 
@@ -106,5 +148,9 @@ def _alike(pages: Sequence[Array], path: Path) -> Sequence[Array]:
         if page.shape != pages[0].shape:
             raise CaptureError(
                 f"{path}: frame {number} is {page.shape}, frame 0 {pages[0].shape}; keep one size a file"
+            )
+        if page.dtype != pages[0].dtype:
+            raise CaptureError(
+                f"{path}: frame {number} is {page.dtype}, frame 0 {pages[0].dtype}; keep one type a file"
             )
     return pages

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from characterize.captures import stage
+from characterize.captures import stage, tiff_pages
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
@@ -34,7 +34,7 @@ def read(path: Path) -> Tags:
 
     with tifffile.TiffFile(path) as file:
         if file.is_imagej and file.imagej_metadata:
-            return _imagej(path, file.imagej_metadata, _resolution(file.pages[0]), len(file.pages))
+            return _imagej(path, file.imagej_metadata, _resolution(file.pages[0]), tiff_pages.stacked(file))
         if file.is_ome and file.ome_metadata:
             return _ome(path, file.ome_metadata, len(file.pages))
     return Tags()

@@ -1,5 +1,6 @@
 """Stacks whose frames run along the last axis: taken so where that is known, refused where it only reads so."""
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -120,3 +121,34 @@ def test_a_raw_mosaic_lies_otherwise_too(tmp_path):
 def test_other_axes_are_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"axes = 'nxy'; need \"nyx\""):
         capture.load(folder(tmp_path, "s.h5", FRAMES, rows("s.h5", 5), ABOUT + 'axes = "nxy"\n'))
+
+
+@pytest.mark.parametrize(("shape", "told"), [((64, 48, 40), True), ((12, 12, 19), True), ((9, 26, 19), False)])
+def test_how_a_stack_was_taken_is_told_where_the_other_way_is_as_likely(tmp_path, shape, told):
+    """64 frames of 48 x 40 pixels or 40 of 64 x 48; 12 of 12 x 19 or 19 of 12 x 12."""
+    first, second, last = shape
+    stack(tmp_path / "s.h5", RNG.integers(37, 4096, shape).astype(np.uint16))
+    taken = f"s.h5 taken as (n, y, x), {first} frames of {second} x {last} pixels; if it is {last} frames of {first} x "
+    assert any(words.startswith(taken) for words in capture.load(tmp_path / "s.h5").corrections) == told
+    (tmp_path / "s.toml").write_text('axes = "nyx"\n')
+    assert not any("(n, y, x)" in words for words in capture.load(tmp_path / "s.h5").corrections)
+
+
+def test_pages_that_were_written_one_by_one_are_frames_however_narrow(tmp_path):
+    """As OpenCV writes them; listed by another number they are not taken the other way round."""
+    narrow = np.moveaxis(FRAMES, 0, 2)  # 26 frames of 19 x 5
+    cv2.imwritemulti(str(tmp_path / "s.tif"), list(narrow), [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    found = capture.load(tmp_path / "s.tif")
+    assert np.array_equal(found.frames, narrow)
+    assert len(found.corrections) == 1  # of bits, not of axes
+    (tmp_path / "stage.csv").write_text(rows("s.tif", 5))
+    with pytest.raises(CaptureError, match="holds 26 pages and stands in 5 rows"):
+        capture.load(tmp_path)
+
+
+@pytest.mark.parametrize(("letters", "lying"), [("YXZ", (1, 2, 0)), ("TYX", (0, 1, 2)), ("ZYX", (0, 1, 2))])
+def test_axes_that_an_array_was_written_with_are_its_axes(tmp_path, letters, lying):
+    frames = FRAMES if letters == "YXZ" else np.moveaxis(FRAMES, 0, 2)
+    metadata = {"axes": letters}
+    tifffile.imwrite(tmp_path / "s.tif", frames.transpose(lying), photometric="minisblack", metadata=metadata)
+    assert np.array_equal(capture.load(tmp_path / "s.tif").frames, frames)

@@ -45,7 +45,8 @@ def test_stack_png_and_hdf5_hold_the_same_frames(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES)
     cv2.imwrite(str(tmp_path / "b.png"), FRAMES[1])
     with h5py.File(tmp_path / "c.h5", "w") as file:
-        file["frames"] = FRAMES
+        file.create_dataset("frames", data=FRAMES.astype(">u2"), chunks=(2, 12, 5), compression="gzip", shuffle=True)
+    assert capture.load(tmp_path / "c.h5").frames.dtype.isnative
     assert np.array_equal(capture.load(tmp_path / "a.tif").frames, FRAMES)
     assert np.array_equal(capture.load(tmp_path / "b.png").frames[0], FRAMES[1])
     assert np.array_equal(capture.load(tmp_path / "c.h5").frames, FRAMES)

@@ -1,6 +1,7 @@
 """Images of TIFF files: what is compressed with loss, claims too much or holds colours in planes of their own."""
 
 import importlib.util
+import struct
 
 import numpy as np
 import pytest
@@ -72,3 +73,52 @@ def test_planes_are_images_or_the_colours_of_one(tmp_path):
 def test_kinds_of_numbers_that_hold_no_counts_are_refused_by_name(tmp_path, kind, words):
     with pytest.raises(CaptureError, match=words):
         capture.load(written(tmp_path, FRAMES.astype(kind)))
+
+
+@pytest.mark.parametrize(("mark", "order"), [(b"MM", ">"), (b"II", "<")])
+def test_what_imagej_lays_behind_the_head_of_one_image_is_a_stack(tmp_path, mark, order):
+    """Stacks above 4 GB have one head and say images=N. A file that has no room for them is refused."""
+    words, (_, height, width) = b"ImageJ=1.53t\nimages=3\nslices=3\nunit=um\nspacing=0.3\n\0\0", FRAMES.shape
+    begins = 8 + 2 + 9 * 12 + 4
+    plain = (lambda v: v << 16) if order == ">" else int  # a short lies at the start of its word
+    tags = ((256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, plain(16)), (259, 3, 1, plain(1)))
+    tags += ((262, 3, 1, plain(1)), (270, 2, len(words), begins), (273, 4, 1, begins + len(words)))
+    tags += ((278, 4, 1, height), (279, 4, 1, 2 * height * width))
+    head = mark + struct.pack(order + "HI", 42, 8) + struct.pack(order + "H", len(tags))
+    head += b"".join(struct.pack(order + "HHII", *tag) for tag in tags) + bytes(4) + words
+    path = tmp_path / "a.tif"
+    path.write_bytes(head + FRAMES.astype(order + "u2").tobytes())
+    assert np.array_equal(tiff_pages.read(path), FRAMES)
+    found = capture.load(path)
+    assert found.position_um == pytest.approx([0.0, 0.3, 0.6])
+    assert found.frames.dtype.isnative
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(CaptureError, match=r"says 3 images, .* has room for 2"):
+        capture.load(path)
+
+
+def test_pages_of_unlike_types_are_refused(tmp_path):
+    """They were joined in the wider type: counts of 8 and 16 bits in one stack."""
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for frame in (FRAMES[0], FRAMES[1].astype(np.uint8)):
+            file.write(frame, photometric="minisblack", metadata=None)
+    with pytest.raises(CaptureError, match="frame 1 is uint8, frame 0 uint16; keep one type a file"):
+        tiff_pages.read(tmp_path / "a.tif")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imagecodecs") is not None, reason="reads packed values")
+def test_packed_values_are_refused_by_their_width(tmp_path):
+    """Two values of 12 bits in three bytes."""
+    packed = np.zeros((6, 9), np.uint8).tobytes()
+    about = {"shape": (6, 6), "dtype": "uint16", "bitspersample": 12, "rowsperstrip": 6, "metadata": None}
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(iter([packed]), photometric="minisblack", **about)
+    with pytest.raises(CaptureError, match="values of frame 0 are 12 bits wide, packed"):
+        tiff_pages.read(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("about", [{"byteorder": ">"}, {"bigtiff": True}, {"compression": "zlib", "predictor": True}])
+def test_other_ways_to_lay_counts_are_read_as_the_counts_they_are(tmp_path, about):
+    found = capture.load(written(tmp_path, **about))
+    assert np.array_equal(found.frames, FRAMES)
+    assert found.frames.dtype.isnative

@@ -1,0 +1,50 @@
+"""The image of a PNG file, refused where it is damaged or claims more than it holds."""
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from characterize.captures.tiff_pages import DENSEST
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CaptureError
+
+_LEAST = 33  # bytes of a PNG's mark and head
+
+
+def read(path: Path) -> Array:
+    """(y, x) image of a file, or (1, y, x, red green blue [alpha]).
+
+    Raises:
+        CaptureError: truncated, no PNG file, or its head claims more than the file holds.
+    """
+    import cv2
+
+    _check(path)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise CaptureError(f"{path}: not a readable PNG file ({error.err})") from None
+    if image is None:
+        raise CaptureError(f"{path}: truncated or not a PNG file")
+    if image.ndim == 3:  # blue comes first
+        return np.asarray(image[None][..., [2, 1, 0, 3][: image.shape[-1]]])
+    return np.asarray(image)
+
+
+def _check(path: Path) -> None:
+    """Refuse what claims more than the file holds: its pixels, or a block that the library would make room for."""
+    size, ends, begun = path.stat().st_size, 8, b""
+    with open(path, "rb") as file:
+        while size >= _LEAST and ends + 8 <= size and begun != b"IEND":
+            file.seek(ends)
+            head = file.read(24 if not begun else 8)
+            length, name = int.from_bytes(head[:4], "big"), head[4:8]
+            if not begun and (name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size):
+                raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)")
+            if begun and name == b"IHDR":
+                raise CaptureError(f"{path}: not a PNG file (a second head)")
+            ends, begun = ends + 12 + length, name
+    if begun != b"IEND" or ends > size:
+        raise CaptureError(f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})")
