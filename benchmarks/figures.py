@@ -14,11 +14,13 @@ HERE = Path(__file__).parent
 README, TEMPLATE, RESULTS = HERE.parent / "README.md", HERE / "figures.md", HERE / "results"
 SENTENCES = (  # of the README's text, beside its table
     "{characterize_study; peak 8000 e & Cramér-Rao; error; 3} times the\nCramér-Rao bound",
-    "the fit of a 1 mm lens in 8 s ({characterize; fit & rms; seconds; 2} s)",
-    "as fast as the angular spectrum ({psf; 1 mm free-form & windowed 1e-4; (\\d+)x textbook; 3} times)",
-    "as wide as a sensor a hundred times ({psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2})",
-    "training on the true image at 150 frames/s\n({codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} "
-    "at 9.7 MMACs, {codesign; 9.7 MMACs, true image & lens and pitch moving; seconds; rate} where the lens moves);",
+    "| the fit of a 1 mm lens in 8 s | {characterize; fit & rms; seconds; 2} s |",
+    "as fast as the angular spectrum | {psf; 1 mm free-form & windowed 1e-4; (\\d+)x textbook; 3} times |",
+    "as wide as a sensor, a hundred times | {psf_wide; 384 um & windowed 1e-4; (\\S+)x textbook; 2} times |",
+    "| a round pillar by the modal method to 1e-4 in 50 ms | {modal; tolerance 0.0001; seconds; ms} ms,",
+    "of 22 000 entries in 60 s | {library; 200 x 11; seconds; 2} s (",
+    "150 frames/s | {codesign; 9.7 MMACs, true image & lens fixed; seconds; rate} at 9.7 MMACs, "
+    "{codesign; 9.7 MMACs, true image & lens and pitch moving; seconds; rate} where the lens moves |",
 )
 REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
 
