@@ -12,13 +12,12 @@ from scipy import special
 
 from metalens.design import Focus
 from metalens.field import Grid, Layers, Optics, SmoothWave, Window, imager, psfs
-from metalens.field.left_out import Judged, polarised, unpolarised
 from metalens.field.patches import relative
 from metalens.field.polarised import factors
 from metalens.field.rays import Rays
 from metalens.ground.errors import PropagationError
 from metalens.image import Frames
-from metalens.psf import Mixed, Nodes, of_flux, strongest, turned
+from metalens.psf import Mixed, of_flux, strongest, turned
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
@@ -27,7 +26,6 @@ RADIUS, DISTANCE, FOCUS, STEP, WINDOW, WAVE = 25.0, 60.0, 5000.0, 1.2, 21, 0.85 
 LENS = SmoothWave(Focus(WAVE, DISTANCE, FOCUS), RADIUS)
 OPTICS = Optics(LENS, Layers(), DISTANCE)
 REFEREE = Referee(radius=RADIUS, distance=DISTANCE, focus=FOCUS, design_wavelength=WAVE, fine=0.3, count=320)
-WAVES = Nodes(np.array([WAVE]), np.ones(1), 0.0)
 GRID = Grid((5, 7), STEP, (2000.0, 4000.0), window=WINDOW)
 MIDDLE = (8.0, -4.5)
 
@@ -145,21 +143,6 @@ def test_a_pixel_counts_flux_and_an_image_says_what_one_scalar_misses_of_it():
     apart = energy - flux  # 1e-2 of the image: what a choice of one for the other would miss
     assert np.linalg.norm(images["vector"] - images["flux"] - apart) < 0.4 * np.linalg.norm(apart)
     assert images["flux"].sum() == pytest.approx(flux.sum(), rel=1e-2)
-
-
-def test_the_scalar_stays_where_its_error_is_below_the_tolerance_and_the_image_says_it():
-    fast, at = (
-        Optics(SmoothWave(Focus(WAVE, 33.0, FOCUS), RADIUS), Layers(), 33.0),
-        (torch.tensor([[3.0, -4.0]], dtype=torch.float64), torch.tensor([4000.0])),
-    )
-    judged = Judged(fast, WAVES, Window(WINDOW, STEP, True), at)
-    said = unpolarised(judged)
-    for tolerance, components in ((1.01 * said, 0), (0.99 * said, 4)):  # three leave more than a fifth of that
-        assert polarised(judged, "auto", within=(tolerance, 0.2 * tolerance)).components == components
-    assert polarised(judged, "scalar", within=(1e-9, 1e-9)).components == 0
-    energy = polarised(judged, "vector", within=(1.01 * said, 0.2 * 1.01 * said))
-    assert (energy.flux, energy.whole) == (False, 6)
-    assert energy.components > 0
 
 
 def test_mixtures_of_the_components_image_as_the_components_do():
