@@ -1,4 +1,4 @@
-"""What PSFs are said to leave out, by PSFs of two windows each; how many components of the field the tolerances keep."""
+"""What PSFs are said to leave out, by PSFs of two windows each; how many components the tolerances keep."""
 
 from dataclasses import replace
 
