@@ -146,3 +146,50 @@ def test_counts_beside_shares_of_full_scale_are_left_and_shares_are_multiplied()
     assert beside[0].tolist() == dark.tolist()
     assert beside[1] == pytest.approx(dark)
     assert beside[2] == pytest.approx(np.array([[0.25, 1.0]]) * 4095)
+
+
+def stretched(count, bits, how):
+    if how == "scaled":
+        return np.rint(count * (65_535 / ((1 << bits) - 1))).astype(np.uint16)
+    text = np.char.mod("%s", [[f"{c:0{bits}b}" * 3 for c in row] for row in count])  # digits again until there are 16
+    return np.array([[int(word[:16], 2) for word in row] for row in text], np.uint16)
+
+
+@pytest.mark.parametrize("how", ["scaled", "repeated"])
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+def test_counts_that_were_stretched_over_16_bits_are_taken_back(bits, how):
+    """With a dim dark frame and an average of it; stated or not. One other level between them is no stretch."""
+    rng = np.random.default_rng(bits)
+    given, dark = rng.integers(0, 1 << bits, (31, 37)), rng.integers(3, 9, (31, 37))
+    words, dim = (stretched(a, bits, how) for a in (given, dark))
+    for stated in (None, bits):
+        found, depth, note, beside = right_align(words, stated, "a.tif", beside=[dim, dim.mean(0)])
+        assert (found.tolist(), depth) == (given.tolist(), bits)
+        assert note == f"{bits}-bit counts were stretched over 16 bits: taken back"
+        assert beside[0].tolist() == dark.tolist()
+        assert beside[1] == pytest.approx(
+            dark.mean(0), abs=0.6 / 2 ** (16 - bits)
+        )  # each word rounded, by half at most
+    other = words.copy()
+    other[3, 5] += 1
+    assert right_align(other, None, "a.tif")[1] == 16
+
+
+def test_few_levels_are_no_stretch():
+    """31 of 16 bits that lie as those of 14 do, by chance once in 4**31: too few to tell."""
+    words = stretched(np.arange(5000, 5031)[None], 14, "repeated")
+    assert right_align(words, None, "a.tif")[0] is words
+    more = stretched(np.arange(5000, 5032)[None], 14, "repeated")
+    assert right_align(more, None, "a.tif")[1] == 14
+
+
+def test_unsigned_words_that_were_saved_as_signed_are_refused():
+    """Counts of 40000 lie at -25536, or all are moved by 32768; what a dark frame was taken off is small below 0."""
+    given = frames(40_000)
+    moved = (given.astype(np.int32) - 32_768).astype(np.int16)
+    for words in (given.view(np.int16), moved):
+        with pytest.raises(CaptureError, match=r"signed counts down to -.*save them as unsigned"):
+            right_align(words, None, "a.tif")
+    with pytest.raises(CaptureError, match="save them as unsigned"):
+        right_align(frames(900), None, "a.tif", beside=[moved])
+    assert right_align(frames(900, np.int16, least=-37), None, "a.tif")[2].startswith("counts are real numbers")
