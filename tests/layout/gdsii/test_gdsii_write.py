@@ -29,9 +29,9 @@ def test_a_buffer_is_filled_to_its_end_and_tells_where_it_left_off():
         (10 * SITES[r, c], 10 * SITES[r, c] + 1, 100 + c, 200 + r, 10 * SITES[r, c] + 4) for r, c in np.argwhere(SITES)
     ]
     few, rest = np.zeros((3, 5), np.uint32), np.zeros((8, 5), np.uint32)
-    assert write._fill(few, SITES, 0, 0, templates, xs, ys) == (0, 4, 3)
+    assert write._fill(few, SITES, 0, 0, templates, xs, ys) == (1, 0, 3)  # the next that finds no room
     assert few.tolist() == [list(row) for row in want[:3]]
-    assert write._fill(rest, SITES, 0, 4, templates, xs, ys) == (4, 0, 6)
+    assert write._fill(rest, SITES, 1, 0, templates, xs, ys) == (4, 0, 6)
     assert rest.tolist() == [list(row) for row in want[3:]] + [[0] * 5] * 2
 
 
