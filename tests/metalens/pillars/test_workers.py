@@ -1,9 +1,11 @@
 """Workers: what comes back is what was computed, refusals keep their class, a death is an error with its cause."""
 
+import os
 import signal
 import subprocess
 import sys
 import textwrap
+import time
 
 import numpy as np
 import pytest
@@ -47,6 +49,22 @@ def test_refusals_keep_their_class():
 def test_a_worker_that_dies_is_told_with_its_cause():
     with pytest.raises(WorkerError, match=r"ended early.*SIGKILL"):
         list(executor.run(signal.raise_signal, [signal.SIGKILL]))
+
+
+def test_a_worker_looks_after_whoever_started_it_and_ends_with_him():
+    """In a process of its own, whose third look is its last: with its parent alive it comes to that, else it ends."""
+
+    def ended(parent):
+        child = os.fork()
+        if child == 0:
+            looks = iter(range(2))
+            time.sleep = lambda _: next(looks, None) is None and os._exit(7)
+            executor._watch(parent)
+            os._exit(9)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+    assert ended(os.getpid()) == 7
+    assert ended(os.getppid()) == 1  # who started it is no longer its parent
 
 
 def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(tmp_path):
