@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 import math
-import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -15,14 +14,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from characterize.captures import axes, png, stage, tiff_pages, tiff_tags
+from characterize.captures import axes, folder, png, stage, tiff_pages, tiff_tags
 from characterize.captures.bits import right_align
 from characterize.captures.colour import Colours
 from metalens.ground import manifest, reading, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, MetalensError
 
-TIFF, PNG, HDF5, LOSSY = (".tif", ".tiff"), (".png",), (".h5", ".hdf5"), (".jpg", ".jpeg", ".jp2", ".webp")
+TIFF, PNG, HDF5 = (".tif", ".tiff", ".tf8", ".btf"), (".png",), (".h5", ".hdf5")
+LOSSY = (".jpg", ".jpeg", ".jp2", ".webp")
 _PLAIN = Colours()
 Stack = tuple[Array, str]
 
@@ -150,7 +150,8 @@ def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
     readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: png.read, HDF5: _read_hdf5}
     reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
     if reader is None:
-        raise CaptureError(f"{path}: cannot read {suffix or 'a file without suffix'}; need TIFF, PNG or HDF5")
+        kind = suffix or "a file without suffix"
+        raise CaptureError(f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.cure(suffix)}")
     images = reader(path)
     return images[None] if images.ndim == 2 else images
 
@@ -180,27 +181,28 @@ def _load_file(path: Path) -> Capture:
     )
 
 
-def _load_folder(folder: Path) -> Capture:
-    manifest.check(folder)
-    about = stage.read_about(folder)
-    rows = stage.read_stage(folder)
-    files = [p for p in sorted(folder.iterdir(), key=_natural) if p.suffix.lower() in TIFF + PNG + HDF5 + LOSSY]
+def _load_folder(at: Path) -> Capture:
+    manifest.check(at)
+    about = stage.read_about(at)
+    rows = stage.read_stage(at)
+    files = folder.images(at, TIFF + PNG + HDF5 + LOSSY)
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
-    colours, order = Colours.of(about, str(folder)), axes.stated(about, str(folder))
-    said = [*(stage.left_out(files, rows) if rows else ()), *stage.unread(about)]
+    colours, order = Colours.of(about, str(at)), axes.stated(about, str(at))
+    said = [*(stage.left_out(files, rows) if rows else ()), *stage.unread(about), *folder.unread(at, special)]
     if rows is None:
-        names, frames, notes = _all_frames(files, folder, colours, order)
+        names, frames, notes = _all_frames(files, at, colours, order)
         rows = stage.Rows.unknown(names)
     else:
-        frames, notes = _listed_frames({stage.spelt(p.name): p for p in files}, folder, rows, colours, order)
+        frames, notes = _listed_frames({stage.spelt(p.name): p for p in files}, at, rows, colours, order)
     beside = {name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()}
     stacks = {name: images for name, (images, _) in beside.items()}
     said += [words for words in (*notes, *(words for _, words in beside.values())) if words]
     bits = about.pop("bits", None)
-    frames, depth, note, aligned = right_align(frames, bits, str(folder), beside=tuple(stacks.values()))
+    frames, depth, note, aligned = right_align(frames, bits, str(at), beside=tuple(stacks.values()))
     extra = dict(zip(stacks, aligned, strict=True))
     if "step_um" in about and not np.isfinite(rows.position_um).any():
+        folder.check_steps(files if not rows.source else (), at)
         rows = dataclasses.replace(rows, position_um=np.arange(len(frames)) * float(about["step_um"]))
     return Capture(
         frames,
@@ -220,11 +222,11 @@ def _load_folder(folder: Path) -> Capture:
 
 
 def _all_frames(
-    files: Sequence[Path], folder: Path, colours: Colours, order: str | None
+    files: Sequence[Path], at: Path, colours: Colours, order: str | None
 ) -> tuple[tuple[str, ...], Array, list[str]]:
     """Names, frames, and what to say of their axes."""
     if not files:
-        raise CaptureError(f"{folder}: no frames; need TIFF, PNG or HDF5 images in it")
+        raise CaptureError(f"{at}: no frames; need TIFF, PNG or HDF5 images in it")
     names: list[str] = []
     stacks, notes = [], []
     for path in files:
@@ -236,7 +238,7 @@ def _all_frames(
 
 
 def _listed_frames(
-    there: Mapping[str, Path], folder: Path, rows: stage.Rows, colours: Colours, order: str | None
+    there: Mapping[str, Path], at: Path, rows: stage.Rows, colours: Colours, order: str | None
 ) -> tuple[Array, list[str]]:
     """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn.
 
@@ -246,9 +248,9 @@ def _listed_frames(
     images = []
     rows_of, met = Counter(rows.files), Counter[str]()
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
-        path = there.get(stage.spelt(name), folder / name)
+        path = there.get(stage.spelt(name), at / name)
         if not path.is_file():
-            raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {folder}; a frame is missing")
+            raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.like(name, there)}")
         if name not in stacks:
             count = rows_of[name] if stated is None else None
             stacks[name] = _stack(path, colours, order, count=count, pages=rows.pages(name))
@@ -262,14 +264,9 @@ def _listed_frames(
                 '(y, x, n), axes = "yxn" in capture.toml'
             )
         if not 0 <= page < len(stack):
-            raise CaptureError(f"{rows.source}, row {row}: page {page} of {name!r}, which holds {len(stack)}")
+            raise CaptureError(f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which holds {len(stack)}")
         images.append(stack[page][None])
-    return _join(images, [folder / name for name in rows.files]), [note for _, note in stacks.values()]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key that counts: frame_2 before frame_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower())]
+    return _join(images, [at / name for name in rows.files]), [note for _, note in stacks.values()]
 
 
 def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:

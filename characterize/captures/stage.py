@@ -15,12 +15,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from characterize.captures import folder as naming
 from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, nearest
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
-_POSITIONS = {f"{name}_{unit}": scale for name in ("depth", "z", "position") for unit, scale in _LENGTHS.items()}
+_BARE = ("depth", "z", "position")
+_POSITIONS = {f"{name}_{unit}": scale for name in _BARE for unit, scale in _LENGTHS.items()}
 _ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
 _ANGLES_Y = ("angle_y_deg", "angle_y_rad")
 _ALIASES = {
@@ -49,6 +51,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     **dict.fromkeys(("read_noise_e", "wavelength_sigma_nm", "pixel_sigma_um", "pinhole_um", "glass_um"), _FROM_0),
 }
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
+_MICRO = str.maketrans("\u00b5\u03bc", "uu")
 _MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
 _COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_ANGLES)
 
@@ -91,10 +94,8 @@ def read_stage(folder: Path) -> Rows | None:
         CaptureError: unknown column, two of depth or of one angle, no column ``file``, columns not parted by commas, a
             value that is no number, a page that is not whole; file and row are named.
     """
-    for path in (folder / "stage.csv", folder / "stage.json"):
-        if path.is_file():
-            table = _read_csv(path) if path.suffix == ".csv" else _read_json(path)
-            return _rows(table, path)
+    if path := naming.table(folder, "stage"):
+        return _rows(_read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path)
     return None
 
 
@@ -104,8 +105,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     Raises:
         CaptureError: not TOML or JSON, a misspelt name, or an impossible number.
     """
-    paths = [folder / "capture.toml", folder / "capture.json"]
-    return _about(next((path for path in paths if path.is_file()), None))
+    return _about(naming.table(folder, "capture"))
 
 
 def read_beside(path: Path) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def _about(path: Path | None) -> dict[str, Any]:
         return {}
     try:
         text = path.read_text(encoding="utf-8-sig")
-        about = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        about = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
     except (ValueError, RecursionError) as error:  # of the format, of the text, or an integer of thousands of digits
         raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
     if not isinstance(about, dict):
@@ -177,7 +177,7 @@ def ome_positions(xml: str) -> Array:
     order = next(ome_entries(xml, "Pixels"), {}).get("DimensionOrder", "XYZCT")
     slow, fast = ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
     planes = sorted(ome_entries(xml, "Plane"), key=lambda plane: (int(plane.get(slow, 0)), int(plane.get(fast, 0))))
-    units = [plane.get("PositionZUnit", "um").replace("\u00b5", "u").replace("\u03bc", "u") for plane in planes]
+    units = [plane.get("PositionZUnit", "um").translate(_MICRO) for plane in planes]
     if not all("PositionZ" in plane and unit in _LENGTHS for plane, unit in zip(planes, units, strict=True)):
         return np.empty(0)
     return np.array([float(plane["PositionZ"]) * _LENGTHS[unit] for plane, unit in zip(planes, units, strict=True)])
@@ -186,9 +186,12 @@ def ome_positions(xml: str) -> Array:
 def _read_csv(path: Path) -> list[dict[str, Any]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            return list(csv.DictReader(file, skipinitialspace=True))
+            table: list[dict[str, Any]] = list(csv.DictReader(file, skipinitialspace=True))
     except (csv.Error, UnicodeDecodeError) as error:
         raise CaptureError(f"{path}: not a table in UTF-8 text: {error}") from None
+    while table and not any(table[-1].values()):  # as spreadsheets leave below theirs
+        table.pop()
+    return table
 
 
 def _read_json(path: Path) -> list[dict[str, Any]]:
@@ -207,8 +210,11 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
     parted = next((mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None)
     if parted:
         raise CaptureError(f"{path}: columns parted by {parted!r}; save it with commas, and points in the numbers")
+    table = [_plain_keys(entries, path, row) for row, entries in enumerate(table, 2)]
     for row, entries in enumerate(table, 2):
         for key in entries:
+            if key in _BARE:
+                raise CaptureError(f"{path}: column {key!r} without a unit; name it {key}_um (or _nm, _mm, _cm, _m)")
             if key not in _COLUMNS:
                 raise CaptureError(f"{path}, row {row}: unknown column {key!r}{nearest(str(key), _COLUMNS)}")
         if not entries.get("file"):
@@ -229,6 +235,18 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
         exposure_s=_exposures(table, path) if "exposure_s" in head else np.full(len(table), np.nan),
         source=str(path),
     )
+
+
+def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
+    """A row by column names in small letters, without blanks about them, the micro sign or a Greek letter as u."""
+    if None in entries:
+        raise CaptureError(
+            f"{path}, row {row}: more values than columns; a comma inside a number? write it with a point (0.73)"
+        )
+    plain = {str(key).strip().lower().translate(_MICRO): value for key, value in entries.items()}
+    if len(plain) < len(entries):
+        raise CaptureError(f"{path}: columns {', '.join(entries)} are not all different; leave the ones that hold")
+    return plain
 
 
 def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
@@ -285,7 +303,9 @@ def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: f
         try:
             value = float(entries[key])
         except (TypeError, ValueError, KeyError):
-            raise CaptureError(f"{path}, row {row}: {key} is {entries.get(key)!r}, need a number") from None
+            found = entries.get(key)
+            hint = " with a point, as 0.73" if isinstance(found, str) and "," in found else ""
+            raise CaptureError(f"{path}, row {row}: {key} is {found!r}, need a number{hint}") from None
         if not math.isfinite(value):
             raise CaptureError(f"{path}, row {row}: {key} is {value}, need a finite number")
         values.append(value)
