@@ -53,6 +53,17 @@ def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch,
         assert image[row - 7 + off[0], column - 7 + off[1]] == pytest.approx(want, rel=1e-3, abs=1e-6)
 
 
+def test_a_lens_without_a_stop_is_lit_by_the_fourth_power_of_the_cosine_at_every_pixel():
+    """Of the angle from the middle of the lens to a pixel's, whose field point is the middle of the frame."""
+    found = stray._all(RADIUS, GRID, 1700.0, (310.0, -240.0))
+    assert (found.radius_um, found.aside_um) == (RADIUS, None)
+    assert found.illumination.shape == (90, 120)
+    for row, column in ((0, 0), (40, 66), (89, 3), (12, 119)):
+        x, y = (column - 59.5) * 7 + 310, (row - 44.5) * 7 - 240
+        cosine = math.cos(math.atan(math.hypot(x, y) / 1700))
+        assert float(found.illumination[row, column]) == pytest.approx(cosine**4, rel=1e-6)  # float32
+
+
 def test_a_smooth_phase_has_one_order_alone():
     assert stray.stray_of(SimpleNamespace(wave=object(), distance_um=D), GRID, DEPTH, (0.0, 0.0)) is None
 
