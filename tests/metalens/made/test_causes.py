@@ -11,7 +11,6 @@ from metalens.made import causes, response
 from metalens.made.causes import CAUSES, Answers, Bends, Guide, Widens
 from metalens.made.response import Answer, Sensitivity
 from metalens.made.solved import Solved
-from metalens.made.spread import DRAWN, Draw, Spread, draws
 from metalens.made.state import State
 
 RNG = np.random.default_rng(17)
@@ -122,36 +121,6 @@ def test_a_taller_layered_pillar_is_taller_in_its_own_material(films, heights):
     made = acts.changed(Cell(0.4, 0.6, layers=layers), 0.012, 0.85)
     assert [layer.height_um for layer in made.layers] == pytest.approx(heights)
     assert made.height_um == pytest.approx(0.612)
-
-
-def test_a_drawn_gradient_points_in_its_own_direction():
-    """From edge to edge: half of it from the axis to the rim, cosine along x and sine along y."""
-    made = Draw({"gradient_nm": 5.0, "bow_nm": -2.0, "height_nm": 6.0}, 0.7).state()
-    assert made["bias_x_nm"] == pytest.approx(2.5 * math.cos(0.7))
-    assert made["bias_y_nm"] == pytest.approx(2.5 * math.sin(0.7))
-    assert (made["bias_r_nm"], made["height_nm"], made["bias_nm"]) == (-2.0, 6.0, 0.0)
-
-
-def test_lenses_are_drawn_with_the_stated_sigma_and_in_all_directions():
-    sigma = {"bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 0.0, "height_nm": 7.0, "index": 0.013, "sidewall_deg": 0.4}
-    sides = {"width_nm", "length_nm", "turn_deg", "pedestal_nm", "cap_nm"}
-    assert set(sigma) == set(DRAWN) - sides
-    lenses = draws(Spread(**sigma), 4000, seed=3)
-    for name, want in sigma.items():
-        values = np.array([lens.amounts[name] for lens in lenses])
-        assert values.std() == pytest.approx(want, rel=0.05)  # 1 / sqrt(8000) is 1.1 %
-        assert abs(values.mean()) <= 4 * want / math.sqrt(4000)
-    turns = np.array([lens.turn_rad for lens in lenses])
-    assert np.histogram(turns, 8, (0, 2 * math.pi))[0] == pytest.approx(np.full(8, 500), abs=100)  # sigma 21
-    assert Spread.only(bow_nm=1.5).values() == dict.fromkeys(DRAWN, 0.0) | {"bow_nm": 1.5}
-    usual = Spread().values()
-    assert usual == {
-        "bias_nm": 4.0, "gradient_nm": 3.0, "bow_nm": 2.0, "height_nm": 7.0, "index": 0.02, "sidewall_deg": 0.5,
-    } | dict.fromkeys(sides, 0.0)  # fmt: skip
-    assert Spread(width_nm=2.0).stated == {n: v for n, v in usual.items() if n not in sides} | {"width_nm": 2.0}
-    some = draws(Spread(length_nm=2.5), 4000, seed=5)
-    assert np.std([lens.amounts["length_nm"] for lens in some]) == pytest.approx(2.5, rel=0.05)
-    assert "width_nm" not in some[0].amounts
 
 
 def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_for():
@@ -299,14 +268,3 @@ def test_the_table_says_what_the_documents_say():
     assert rows["index"] == (0.02, 0.02, -0.075, 0.075, 1.0, False)
     assert rows["sidewall_deg"] == (0.3, 0.5, -1.6, 1.6, pytest.approx(math.pi / 180), False)
     assert rows["coma_x_rad"] == (0.05, 1.0, -6.0, 6.0, 1.0, True)
-
-
-def test_what_every_process_has_is_stated_even_where_it_is_none():
-    """And what no process has unless it says so only where it does."""
-    usual = {name for name, row in DRAWN.items() if row.sigma}
-    rare = sorted(DRAWN.keys() - usual)
-    assert usual
-    assert rare
-    still = Spread(**dict.fromkeys(DRAWN, 0.0))
-    assert still.stated == dict.fromkeys((n for n in DRAWN if n in usual), 0.0)
-    assert Spread(**dict.fromkeys(DRAWN, 0.0) | {rare[0]: 3.7}).stated.keys() == usual | {rare[0]}
