@@ -60,8 +60,7 @@ def _run_lens(options: Options, design: Path, target: Path) -> int:
         result = dataclasses.replace(fit(shots, lens, choice), provenance=about)
         asbuilt.save(draft.path, result)
         report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
-    options.console.result(_lens_values(result), _lens_text(result, target))
-    return 0 if result.trusted else 1
+    return options.console.judged(_lens_values(result), _lens_text(result, target), result.problems)
 
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
@@ -74,8 +73,7 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
         found = fit_pupil(shots, spec, insist=options.insist)
         save(draft.path, found, about)
         report.pupil_report(draft.path.with_suffix(".html"), found)
-    options.console.result(_values(found), _text(found, target))
-    return 1 if found.problems else 0
+    return options.console.judged(_values(found), _text(found, target), found.problems)
 
 
 def _provenance(options: Options, *sources: Path) -> store.Provenance:
@@ -111,7 +109,7 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
     for name, v in zip(result.names, result.value, strict=True):
         low, high = result.interval(name)
         lines.append(f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_within(result, name)}")
-    for label, words in (("cannot tell", result.degeneracies), ("note", result.cautions), ("PROBLEM", result.problems)):
+    for label, words in (("cannot tell", result.degeneracies), ("note", result.cautions)):
         lines += [f"  {label}: {text}" for text in words]
     return "\n".join(lines)
 
@@ -147,5 +145,4 @@ def _text(found: PupilFit, target: Path) -> str:
     lines += [
         f"  {n} = {v:.4g} +- {s:.2g}" for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
     ]
-    lines += ["  note: " + words for words in found.cautions]
-    return "\n".join(lines + ["  PROBLEM: " + words for words in found.problems])
+    return "\n".join(lines + ["  note: " + words for words in found.cautions])

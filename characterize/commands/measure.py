@@ -65,13 +65,12 @@ def run(options: Options) -> int:
         raise ConfigError(f"--edge-um {options.edge_um}: need the pixel in um, above 0")
     measure = _micrograph if of_pillars else _frames if options.edge_um is None else _edge
     with options.claim_folder(options.output) as draft:
-        values, text, good = measure(options, draft.path)
-    options.console.result(values, text)
-    return 0 if good else 1
+        values, text, failures = measure(options, draft.path)
+    return options.console.judged(values, text, failures)
 
 
-def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
-    """Measure captures into the folder: numbers, text, and that all is well."""
+def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
+    """Measure captures into the folder: numbers, text, and no failure."""
     shots = captures.load(options.source)
     design = lenses.load(options.design) if options.design else None
     found = frames.measure(shots, design=design, reference_e=options.reference_e)
@@ -94,15 +93,15 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, boo
     lines += [f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um" for (x, y), z in found.best_depth_um.items()]
     lines += [f"  distortion at {x:g}, {y:g} deg: {d:+.3%}" for (x, y), d in found.distortion.items()]
     lines += [f"  note: {words}" for words in found.notes]
-    return values, "\n".join(lines), True
+    return values, "\n".join(lines), []
 
 
 def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, float]]:
     return [{"angle_deg": x, "angle_y_deg": y, name: value} for (x, y), value in values.items()]
 
 
-def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
-    """Measure the modulation across an edge into the folder: numbers, text, and that all is well."""
+def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
+    """Measure the modulation across an edge into the folder: numbers, text, and no failure."""
     image, pixel = _cropped(picture.read(options.source), options.crop), float(options.edge_um or 0)
     found = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([found.frequency_per_um, found.modulation], 1)
@@ -113,11 +112,11 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]
     store.write_text(folder / "measure.json", _json(values))
     measure_page.edge_page(folder / "measure.html", image, found, pixel_um=pixel)
     text = f"{options.output}: modulation one half at {found.mtf50_per_um:.4g} per um (Nyquist {0.5 / pixel:.4g})"
-    return values, text, True
+    return values, text, []
 
 
-def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, bool]:
-    """Measure a picture of pillars into the folder: numbers, text, and whether any pillar was measured."""
+def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
+    """Measure a picture of pillars into the folder: numbers, text, and why its pillars are not measured."""
     whole = picture.read(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
     image = _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
@@ -138,18 +137,23 @@ def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str,
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
-    strange = float((found.collapsed | found.oval).mean()) > sem.MOST
-    good = bool(np.isfinite(found.diameter_nm).any()) and not strange
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
     if not options.crop and len(image) < len(whole):
         lines.append(f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise")
     if table and not options.edge_bias_nm:
         lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
-    if strange:
-        pitch = values["pitch_nm"]
-        lines.append(f"  most sites hold no round pillar: is the lattice of {pitch:.4g} nm right? --pitch-nm states it")
-        lines.append("  (tops may be dark, but rims must stand out from the ground by more than noise and blur leave)")
-    return values, "\n".join(lines), good
+    return values, "\n".join(lines), _unmeasured(found, pixel)
+
+
+def _unmeasured(found: sem.Diameters, pixel_nm: float) -> list[str]:
+    """Why a picture's pillars are not measured; nothing where they are."""
+    if float((found.collapsed | found.oval).mean()) > sem.MOST:
+        return [
+            f"most sites hold no round pillar: is the lattice of {found.lattice.pitch_px * pixel_nm:.4g} nm right? "
+            "--pitch-nm states it (tops may be dark, but rims must stand out from the ground by more than noise and "
+            "blur leave)"
+        ]
+    return [] if np.isfinite(found.diameter_nm).any() else ["no pillar could be measured"]
 
 
 def _drawn_round(path: Path) -> DiameterMap:

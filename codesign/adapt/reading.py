@@ -14,10 +14,13 @@ class Accuracy:
     """Errors of one network on one lens: (n,) absolute errors of the slippage, mean over axes and along each, in mm.
 
     The error that the studies speak of is ``slip_mm``, the mean over the three axes.
+
+    above: why the error of the images that were read is above what their run asks for; empty where it is not.
     """
 
     error_mm: Tensor
     iou: Tensor
+    above: str = ""
 
     @property
     def slip_mm(self) -> float:
@@ -54,7 +57,7 @@ class Accuracy:
 
 def accuracy(answers: Answers, seen: Seen) -> Accuracy:
     """Errors of answers against the truth of their frames."""
-    return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou)
+    return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou, seen.above)
 
 
 def bootstrap(values: Array, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:

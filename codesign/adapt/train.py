@@ -92,6 +92,12 @@ class Outcome:
             return None
         return (self.before.slip_mm - self.after.slip_mm) / self.gap_mm
 
+    @property
+    def above(self) -> str:
+        """Why the error of some case's images is above what the run asks for, of the made lens first; empty where none
+        is."""
+        return self.after.above or self.designed.above
+
     def rows(self) -> dict[str, dict[str, float]]:
         """Numbers by name of the case."""
         cases = {n: getattr(self, n) for n in ("designed", "nominal", "before", "after", "known")}
@@ -229,7 +235,8 @@ def judge(
         seen = assess.frames(going, frames, config.test_batches, stack=made)
         answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
         parts.append(reading.accuracy(answers, seen))
-    return Accuracy(torch.stack([p.error_mm for p in parts]).mean(0), torch.stack([p.iou for p in parts]).mean(0))
+    error, iou = (torch.stack([getattr(p, name) for p in parts]).mean(0) for name in ("error_mm", "iou"))
+    return Accuracy(error, iou, next((p.above for p in parts if p.above), ""))
 
 
 def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]) -> Outcome:

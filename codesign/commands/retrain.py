@@ -15,7 +15,7 @@ from codesign.adapt.sure import MAP, judge
 from codesign.commands import onnx_file
 from codesign.commands.options.retrain import Options
 from codesign.network import Subnet
-from codesign.optics import MadeLens, formed, posterior, psf_error
+from codesign.optics import MadeLens, posterior, psf_error
 from codesign.train import Record, Trainer, checkpoint, device_of, place
 from metalens import __version__, lens
 from metalens.ground import config, reading, store
@@ -30,7 +30,7 @@ Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
 
 
 def run(options: Options) -> int:
-    """Train on, judge, correct, report; exit 1 where the error of the made lens's image is above what the run asks
+    """Train on, judge, correct, report; exit 1 where the error of the images that judge is above what the run asks
     for."""
     source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
     retraining.network(source.run.trainer)  # refused now, not after the lenses were imaged
@@ -44,14 +44,7 @@ def run(options: Options) -> int:
     with options.claim_work(options.output, keep=("*.safetensors",), resume=options.resume) as draft:
         _agree(draft, recipe, resume=options.resume)
         story = _story(options, draft.path, recipe, (source, result, design, truth, old))
-    return options.console.judged(_values(story, options), _text(story, options.output), [_above(story, source)])
-
-
-def _above(story: retrain_report.Story, source: Source) -> str:
-    """Why the error of the image that the network was trained on with is too large; empty where it is not."""
-    settings, scenes = source.settings.optics, source.settings.scenes
-    side, given = scenes.pixels + 2 * scenes.margin, source.run.trainer.model.coefficients_rad
-    return formed.above(settings, formed.imager(settings, given, side, margin=scenes.margin, made=story.lenses.best))
+    return options.console.judged(_values(story, options), _text(story, options.output), [story.outcome.above])
 
 
 def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retrain_report.Story:

@@ -20,6 +20,8 @@ class Seen:
     frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm: (n, 3). batch: frames at a time.
     wide: the frame's width over the image's (:func:`frame_wide`).
     vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`; None where it is not known.
+    above: why the error of their images is above ``optics.image_tolerance`` (:func:`codesign.optics.formed.above`);
+        empty where it is not.
     """
 
     frames: Tensor
@@ -28,6 +30,7 @@ class Seen:
     batch: int
     vergence: Tensor | None = None
     wide: float = 1.0
+    above: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +51,14 @@ class Assessment:
 def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None) -> Seen:
     """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
     prepared: UniformImager | Imager | None = None
-    pitch, wide = trainer.model.pitch_um, 1.0
+    pitch, wide, above = trainer.model.pitch_um, 1.0, ""
     pixels, masks, slips, depths = [], [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
             given = trainer.optics, trainer.model.coefficients_rad, samples(batch.frames)
             prepared = formed.imager(*given, margin=scenes.margin, made=stack, device=trainer.light.device)
+            above = formed.above(trainer.optics, prepared)
         light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
         noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
         wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
@@ -62,7 +66,8 @@ def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | Non
         masks.append(losses.framed(batch.mask, wide))
         slips.append(batch.slip_mm)
         depths.append(blur.window_vergence(depth_um(batch.frames, margin=scenes.margin)))
-    return Seen(torch.cat(pixels), torch.cat(masks), torch.cat(slips), trainer.inner.batch, torch.cat(depths), wide)
+    shown = torch.cat(pixels), torch.cat(masks), torch.cat(slips)
+    return Seen(*shown, trainer.inner.batch, torch.cat(depths), wide, above)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

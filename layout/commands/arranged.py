@@ -41,8 +41,7 @@ def run(options: Options) -> int:
         _write(work, made)
         with work.stages("report"):
             _accompany(work, made)
-    options.console.result(_values(work, made), _text(work, made))
-    return 0 if not work.failures else 1
+    return options.console.judged(_values(work, made), _text(work, made), work.failures)
 
 
 def _refuse_negative(work: Work) -> None:
@@ -193,7 +192,7 @@ def _sheet(work: Work, made: Assembly) -> list[str]:
 
 def _text(work: Work, made: Assembly) -> str:
     target = work.options.output
-    lines = [work.verdict, *work.notes]
+    lines = [*([] if work.failures else [work.verdict]), *work.notes]
     lines += [f"  {target / name}: {size / 1e6:.3g} MB, read back" for name, size in work.written.items()]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
     lines.append(

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from layout.commands.validate import Finding, validate
+from layout.commands.validate import validate
 from layout.files import MaskContent, hierarchy, mapped
 from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis_bytes
@@ -61,10 +61,10 @@ def run(options: Options) -> int:
         found = foreign.check(content, process.rules, skip=skip, negative=negative, most=most, last=True)
         if draft is not None:
             markers.write_lyrdb(markers.Top(tops[0], content.unit_nm), found, draft.path)
-    told = "".join(f"\n  form: {finding.text}" for finding in form)
     values = _values(found) | ({"form": [finding.text for finding in form]} if options.strict else {})
-    options.console.result(values, _text(options.mask, found, form) + told)
-    return 0 if found.ok and not form else 1
+    failures = [f"design rules broken: {found.broken}"] if found.broken else []
+    failures += [f"form: {finding.text}" for finding in form]
+    return options.console.judged(values, _text(options.mask, found), failures)
 
 
 def _negative(content: MaskContent, process: processes.Process) -> set[int]:
@@ -105,11 +105,9 @@ def _gap(found: DrcReport) -> str:
     return f"smallest gap {told(least)}" if math.isfinite(least) else f"no gap below {found.limits['gap']:g} nm"
 
 
-def _text(path: Path, found: DrcReport, form: list[Finding]) -> str:
-    broken = ", ".join(filter(None, [found.broken, f"{len(form):,} of form" if form else ""]))
-    verdict = f"FAILS: design rules broken: {broken}" if broken else "keeps the design rules"
+def _text(path: Path, found: DrcReport) -> str:
     lines = [
-        f"{path}: {verdict}",
+        f"{path}: {'keeps' if found.ok else 'breaks'} the design rules",
         f"  {found.pillars:,} shapes; {_gap(found)}, thinnest {told(found.minimum_feature_nm)}",
     ]
     lines += [

@@ -17,12 +17,11 @@ def run(options: Options) -> int:
         return arranged.run(options)
     with options.claim_folder(options.output) as draft, options.shared(), noticed(options.console.say):
         job = make.make(options, draft.path)
-    options.console.result(make.values_of(job), _text(job, options.output))
-    return 0 if job.ok and not job.hardly_known else 1
+    return options.console.judged(make.values_of(job), _text(job, options.output), [*job.failures, job.hardly_known])
 
 
 def _text(job: Job, target: Path) -> str:
-    lines = [job.verdict, job.drc.summary, *filter(None, [job.hardly_known])]
+    lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
         verdict = "" if outcome is None else (", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN")

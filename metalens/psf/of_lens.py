@@ -115,18 +115,22 @@ def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance
     """PSFs of a spectrum: wavelengths for the paths to where few of them say that its light falls, in the window; more
     where the light of all of them says so."""
     within = lens.proxy.wavelengths_um
+
+    def psfs(nodes: Nodes, tolerance: float, **other: Any) -> PsfStack:
+        return _of_nodes(lens, view, spectra.known(nodes, source, within), tolerance=tolerance, **how | other)
+
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
     middle = max(float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans)
-    nodes = spectra.known(spectra.nodes(source, path_um=middle, tolerance=tolerance / 2), source, within)
+    nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
     if len(nodes.weights) > 2 * PILOT:
-        few = spectra.known(Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0), source, within)
-        pilot = _of_nodes(lens, view, few, tolerance=max(tolerance, PILOT_ERROR), **how | {"polarisation": "scalar"})
-        nodes = spectra.known(_asked(source, spans, pilot, tolerance / 2 * SPARE), source, within)
+        few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
+        pilot = psfs(few, max(tolerance, PILOT_ERROR), polarisation="scalar")
+        nodes = _asked(source, spans, pilot, tolerance / 2 * SPARE)
     for last in range(TRIES):
-        stack = _of_nodes(lens, view, nodes, tolerance=tolerance, **how)
+        stack = psfs(nodes, tolerance)
         if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
             break
-        nodes = spectra.known(_asked(source, spans, stack, tolerance / 2), source, within)
+        nodes = _asked(source, spans, stack, tolerance / 2)
     return dataclasses.replace(stack, reason=stack.reason + spectra.beyond(source, within))
 
 

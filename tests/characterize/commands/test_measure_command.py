@@ -210,7 +210,7 @@ def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(tmp_pat
     tifffile.imwrite(tmp_path / "a.tif", picture.astype(np.uint8))
     assert main(["measure", str(tmp_path / "a.tif"), "--pixel-nm", "4", "-o", str(tmp_path / "out")]) == 1
     told = capsys.readouterr().out
-    assert "most sites hold no round pillar: is the lattice of" in told
+    assert "  FAILED: most sites hold no round pillar: is the lattice of" in told
     assert "--pitch-nm states it" in told
     assert (tmp_path / "out" / "pillars.csv").is_file()
 

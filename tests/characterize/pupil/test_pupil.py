@@ -1,6 +1,7 @@
 """The generic pupil: Airy pattern in closed form, exact derivatives, recovery inside its interval."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -186,7 +187,7 @@ def test_command_writes_a_pupil_file_and_a_page(tmp_path):
     assert main(words) == 2  # exists, no --force
 
 
-def test_command_ends_with_1_where_a_fit_is_refused(tmp_path):
+def test_command_ends_with_1_where_a_fit_is_refused(tmp_path, capsys):
     from metalens.cli import main
 
     random = np.random.default_rng(0)
@@ -199,5 +200,8 @@ def test_command_ends_with_1_where_a_fit_is_refused(tmp_path):
     words = ["fit", str(tmp_path / "stack.tif"), "--pupil", str(tmp_path / "pupil.toml"), "-o", str(tmp_path / "p.h5")]
     assert main([*words, "--quiet"]) == 1
     assert not (tmp_path / "p.h5").exists()
-    assert main([*words, "--quiet", "--insist"]) == 1
+    capsys.readouterr()
+    assert main([*words, "--json", "--insist"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["failures"] == told["problems"] != []
     assert (tmp_path / "p.h5").exists()

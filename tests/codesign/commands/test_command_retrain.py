@@ -19,7 +19,7 @@ from characterize.bench import Truth
 from characterize.inference import asbuilt
 from codesign.adapt import retrained
 from codesign.evaluate import gaze_experiment as experiment
-from codesign.optics import MadeLens
+from codesign.optics import MadeLens, formed
 from layout.process import process
 from metalens import lens
 from metalens.cli import main
@@ -53,7 +53,7 @@ def _retrain(folder, *words, record="asbuilt.h5", out="out"):
     return main([*command, *words])
 
 
-def test_files_report_and_rules_of_overwriting(folder, capsys):
+def test_files_report_and_rules_of_overwriting(folder, capsys, monkeypatch):
     truth = ["--truth", str(folder / "truth.toml")]
     assert _retrain(folder, "--json", *truth) == 0
     told = json.loads(capsys.readouterr().out)
@@ -68,7 +68,10 @@ def test_files_report_and_rules_of_overwriting(folder, capsys):
 
     assert _retrain(folder, *truth) == 2
     assert "exists; give --force" in capsys.readouterr().err
-    assert _retrain(folder, *truth, "--resume", "--quiet") == 0  # everything is there: the same story again
+    with monkeypatch.context() as patched:  # images that miss what the run asks for, of every lens that judges
+        patched.setattr(formed, "above", lambda settings, image: "the image's error is too large")
+        assert _retrain(folder, *truth, "--resume") == 1  # everything is there: the same story again
+    assert capsys.readouterr().out.endswith("\n  FAILED: the image's error is too large\n")
     assert (folder / "out" / "retrained.safetensors").read_bytes() == kept
     assert _retrain(folder, *truth, "--resume", "--rate", "0.5") == 2
     assert "settings.rate: 0.0015 -> 0.5" in capsys.readouterr().err

@@ -167,7 +167,9 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder,
     assert "B at (4.6, -4.9) um, pillars" not in told
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
     assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
-    assert "FAILS: PADS: design rules broken: 1 feature" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "  FAILED: PADS: design rules broken: 1 feature" in told.splitlines()
+    assert "passes its own checks" not in told
     page = (tmp_path / "m" / "report.html").read_text()
     assert "FAILS: PADS: design rules broken: 1 feature" in page[page.index("<h1") : page.index("<h2")]
     assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0

@@ -79,6 +79,7 @@ def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
     assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
     told = capsys.readouterr().out
     assert "The mask passes its own checks." in told
+    assert ("  FAILED: --study: how these pillars answer" in told) is bool(code)
     assert ("is known within 52% alone" in told) is bool(code)
     assert json.loads((tmp_path / "mask" / "layout.json").read_text())["answers_error"] == error
 
@@ -133,6 +134,7 @@ def test_a_broken_rule_ends_with_one_and_is_marked(lens_file, tmp_path, capsys):
     values = json.loads(capsys.readouterr().out)
     assert not values["ok"]
     assert values["violations"]["gap"] > 0
+    assert values["failures"] == [f"design rules broken: {values['violations']['gap']:,} gap"]
     rdb = pytest.importorskip("klayout.rdb")
     database = rdb.ReportDatabase()
     database.load(str(target / "mask.lyrdb"))

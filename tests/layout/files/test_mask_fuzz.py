@@ -166,5 +166,5 @@ def test_a_strict_check_tells_the_form_too(plan, tmp_path, capsys):
     assemble.write(Assembly("LIB", both, {}), tmp_path / "m.gds")
     assert cli.main(["check", str(tmp_path / "m.gds"), "--strict"]) == 1
     told = capsys.readouterr().out
-    assert "1 of form" in told.splitlines()[0]
-    assert "form: 2 top cells (ONE, TWO), need one" in told
+    assert "keeps the design rules" in told.splitlines()[0]
+    assert "  FAILED: form: 2 top cells (ONE, TWO), need one" in told.splitlines()

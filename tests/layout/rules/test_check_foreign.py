@@ -115,6 +115,7 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
     assert found["gap"] == region.notch_check(70, False, db.Region.Euclidian).count() == 1
     assert values["minimum_feature_nm"] == 20
     assert values["minimum_gap_nm"] == 45
+    assert values["failures"] == ["design rules broken: 1 gap, 1 feature"]
     rdb = pytest.importorskip("klayout.rdb")
     database = rdb.ReportDatabase()
     database.load(str(tmp_path / "m.lyrdb"))
