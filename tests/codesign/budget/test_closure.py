@@ -13,16 +13,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import made_lens as m
 
 from codesign.adapt import train as retraining
-from codesign.budget import floor, links, total
-from codesign.budget.entry import MEASURED, Entry
-from codesign.budget.person import person
+from codesign.budget import links, total
+from codesign.budget.entry import MEASURED
 from codesign.budget.prepared import Given, bench
 from codesign.budget.reading import Reading
 from codesign.budget.task import TaskSetting
 from codesign.evaluate import AXIAL, ExperimentConfig, experiment
-from codesign.eye.population import Rig
 from codesign.optics import Numerics, formed, image_difference
-from metalens.ground.errors import ConfigError, LensError
+from metalens.ground.errors import LensError
 
 FRAMES = ExperimentConfig(
     subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0, people=9
@@ -82,27 +80,6 @@ def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
     assert not rows["field"].counted
     assert rows["field"].psf > 0.05
     assert rows["sensor noise"].counted
-
-
-def test_fixation_alone_is_its_own_scatter():
-    """Told the truth, a person errs by the scatter of the gaze: two normal angles have a mean of sd sqrt(pi / 2).
-
-    Budget: calibration on 9 stimuli of the same scatter, 7 unknowns each: up to 30 %.
-    """
-    frames = replace(FRAMES, subjects=4, grid=(6, 5), fixation_deg=0.6)
-    subject, fixation = person(frames, Rig())
-    assert math.degrees(fixation.gaze_rad) == pytest.approx(0.6 * math.sqrt(math.pi / 2), rel=0.3)
-    assert 0 < math.degrees(subject.gaze_rad) < 1.5
-    still, none = person(replace(frames, fixation_deg=0.0), Rig())
-    assert still.gaze_rad == subject.gaze_rad  # whoever calibrates looks where told, in both
-    assert none.gaze_rad == 0
-
-
-def test_a_goal_below_the_floor_is_refused_with_its_largest_link():
-    links = (Entry("subject and calibration", math.nan, math.nan, 3e-3, ""), Entry("fixation", 0, 0, 4e-3, ""))
-    with pytest.raises(ConfigError, match=r"0.286 deg, most of it fixation with 0.229 deg"):
-        floor.allowance_rad(4.9e-3, links)
-    assert floor.allowance_rad(13e-3, links) == pytest.approx(12e-3)
 
 
 def test_the_reader_of_another_lens_is_refused(source):
