@@ -8,7 +8,7 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -24,7 +24,7 @@ from metalens.ground.errors import ConfigError
 from metalens.image import Grid, Imager, PsfBasis
 from metalens.lens import Lens
 from metalens.pillars import Sweep
-from metalens.psf import Source
+from metalens.psf import Source, spectrum
 
 PILLARS: dict[str, tuple[float, ...]] = {"library_tolerance": (3e-2, 1e-2, 1e-3, 1e-4)}
 MASK: dict[str, tuple[float, ...]] = {"diameter_step_nm": (20, 10, 5, 2, 1)}
@@ -41,6 +41,12 @@ PILOT = Numerics(12, 1, 1e-4, 1e-4)  # of the other knobs while one is looked at
 TRUE_PILOT = 0.1  # the same: tolerance of the true image
 SETTLE_STEPS = 2  # of the estimator, which starts at the true state
 
+LIGHT = (
+    "the light of a plan is one wavelength or a diode about it (wavelength_nm, led_fwhm_nm); measured curves, single "
+    "lines and sources of finite size are for metalens psf"
+)
+LAYERS = "the lens of a plan has neither glass nor stop; metalens budget LENS reckons with them"
+
 Kind = Literal["true", "uniform"]
 Optics = PsfBasis | Imager
 Imaging = Numerics | float  # how the optics are computed: numerics of one PSF a depth, or the true image's tolerance
@@ -56,6 +62,8 @@ class PlanConfig:
     source_distance_mm: at which the lens is focused. led_fwhm_nm: width of the source's spectrum; 0 for one wavelength.
     cell: of the pillars. task: what is looked at.
     """
+
+    ELSEWHERE: ClassVar[dict[str, str]] = {"spectrum": LIGHT, "wavelengths_nm": LIGHT, "layers": LAYERS}
 
     aperture_mm: float = 1.0
     wavelength_nm: float = field(default=850.0, metadata={"above": 0})
@@ -74,6 +82,13 @@ class PlanConfig:
                 f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}, led_fwhm_nm = "
                 f"{self.led_fwhm_nm}: need 0.02 to 4 mm, 1 or more of both, and a width of 0 or more"
             )
+        if self.source is not None:
+            spectrum.points(self.source)  # refused now, not after the floor was measured
+
+    @property
+    def source(self) -> Source | None:
+        """The diode; None for one wavelength."""
+        return Source(self.wavelength_nm, self.led_fwhm_nm) if self.led_fwhm_nm else None
 
     @property
     def focus(self) -> Focus:
@@ -174,12 +189,11 @@ class Chain:
         grid = Grid(
             (setting.pixels,) * 2, setting.pitch_um, self.eyes.depths_um, setting.margin, 2 * setting.margin + 1
         )
-        width = self.config.led_fwhm_nm
         maps = self.aperture.maps(self.aperture.designed())
         return device(
             gathered(lens, *maps, window_um=grid.window * grid.step_um), grid, layers=lens.layers,
             distance_um=lens.sensor_distance_um, tolerance=tolerance,
-            spectrum=Source(self.config.wavelength_nm, width) if width else None,
+            spectrum=self.config.source,
         )  # fmt: skip
 
     def electrons(self, optics: Optics) -> torch.Tensor:

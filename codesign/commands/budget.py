@@ -22,6 +22,7 @@ from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.reading import reader
 from metalens.made import of_process
+from metalens.psf import Source, spectrum
 
 
 def run(options: Options) -> int:
@@ -30,6 +31,8 @@ def run(options: Options) -> int:
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
     made, given = lens.load_plain(options.lens), _given(options)
+    if given.fwhm_nm:
+        spectrum.points(Source(made.wavelength_um * 1e3, given.fwhm_nm))  # refused now, not after the work
     with options.claim(target, beside=(".html", ".png")) as draft:
         origin = _provenance(options, given)
         title = f"{__version__}\n{origin.config}{origin.inputs}{given.frames}"

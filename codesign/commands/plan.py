@@ -16,6 +16,7 @@ from metalens import __version__
 from metalens.ground import config, reading, report, store
 from metalens.ground.errors import ConfigError
 from metalens.pillars import workers
+from metalens.psf import spectrum
 
 UNITS = {"deg": math.pi / 180, "arcmin": math.pi / 10_800, "mrad": 1e-3, "rad": 1.0}
 
@@ -127,8 +128,19 @@ def psf_text(best: Plan, measured: Pilot, chain: Chain) -> str:
         depths, tolerance, angles = choice.depth_count, choice.psf_tolerance, [0.0]
     step = (far - near) / max(depths - 1, 1)
     return (
-        f"depths_mm = [{near:.3f}, {far:.3f}, {step:.4f}]\nangles_deg = {angles}\n"
-        f"led_fwhm_nm = {chain.config.led_fwhm_nm}\ntolerance = {tolerance}\n"
+        f"{_one_wavelength(chain.config)}depths_mm = [{near:.3f}, {far:.3f}, {step:.4f}]\nangles_deg = {angles}\n"
+        f"tolerance = {tolerance}\n"
+    )
+
+
+def _one_wavelength(wanted: PlanConfig) -> str:
+    """What a diode's PSFs need beyond the library of the design's wavelength, which is all that the plan looked at."""
+    if wanted.source is None:
+        return ""
+    swept = spectrum.sweep(spectrum.points(wanted.source)[0] * 1e3)
+    return (
+        f"# of one wavelength, as cell.toml; the diode's: led_fwhm_nm = {wanted.led_fwhm_nm:g} here, and a library of\n"
+        f"# cell.toml with {swept}\n"
     )
 
 

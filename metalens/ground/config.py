@@ -38,8 +38,7 @@ def load(path: str | Path, record: type[Record], *, empty: bool = True) -> Recor
     or ``may_be_empty``. A seed is any whole number from 0. What a record itself refuses comes with file and key.
 
     Raises:
-        ConfigError: missing file, TOML syntax, unknown key, wrong type, missing key, or a value that the
-            record refuses; the message gives file and key.
+        ConfigError: missing file, TOML syntax, unknown or missing key, wrong type, a value that the record refuses.
     """
     return from_table(read(path, record, empty=empty), record, where=str(path))
 
@@ -112,7 +111,8 @@ def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
     hints = typing.get_type_hints(record)
     for key in table:
         if key not in fields:
-            raise ConfigError(f"{where}: unknown key {prefix + key!r}{nearest(key, fields)}")
+            elsewhere: dict[str, str] = getattr(record, "ELSEWHERE", {})
+            raise ConfigError(f"{where}: unknown key {prefix + key!r}{nearest(key, fields, elsewhere)}")
     values = {}
     for key, value in table.items():
         with _meaning(record, key):

@@ -4,7 +4,7 @@ All derive from ``ValueError``, so a caller may catch one type; commands turn th
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 # what libraries raise on damaged files
 DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
@@ -78,8 +78,13 @@ class TrainingError(MetalensError):
     """A co-design run cannot start, resume or go on."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known names."""
+def nearest(name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None) -> str:
+    """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known names.
+
+    elsewhere: what is said of names that belong to another place (of a record of settings its ``ELSEWHERE``).
+    """
+    if elsewhere and name in elsewhere:
+        return f"; {elsewhere[name]}"
     options = sorted(known)
     close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(options)}"

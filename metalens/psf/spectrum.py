@@ -270,12 +270,16 @@ def _refusal(light: tuple[Array, Array], within_um: tuple[float, float], narrow:
     (nm, share), (low, high) = light, (edge * 1e3 for edge in within_um)
     told = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
     part = float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum()) if high > low else 1.0
-    ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
-    sweep = f"[sweep] wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
     return PropagationError(
         f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {told}, and {part:.2g} of it lies "
-        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ({sweep})"
+        f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {sweep(nm)})"
     )
+
+
+def sweep(nm: Array) -> str:
+    """The key of CELL.toml whose library is known for light of these wavelengths (n,), ascending."""
+    ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
+    return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 
 
 def beyond(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from codesign.budget.plan import Pilot, PlanConfig
 from codesign.budget.task import TaskSetting
 from codesign.commands import plan as command_plan
 from codesign.train import run as runs
+from metalens.commands.library import CellFile
 from metalens.commands.psf import Settings
 from metalens.ground import config as config_file
 from metalens.ground.errors import ConfigError
@@ -138,6 +140,22 @@ def test_a_run_at_one_wavelength_is_planned():
     assert 0 < best.predicted_rad < math.radians(0.1)
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('spectrum = ["led.csv"]', "measured curves, single lines and sources of finite size are for metalens psf"),
+        ("wavelengths_nm = [850.0, 905.0]", "one wavelength or a diode about it"),
+        ("[[layers.behind]]\nmaterial = 'N-BK7'\nthickness_um = 100.0", "metalens budget LENS reckons with them"),
+        ("led_fwhm_nm = 300.0", "reaches to 100 nm, where the sensor's silicon is not known"),
+        ("led_fwhm_nm = 1e-9", "is one wavelength; give no width for it"),
+    ],
+)
+def test_light_and_lenses_that_no_plan_knows_are_refused_with_where_to_go(tmp_path, text, told):
+    (tmp_path / "plan.toml").write_text(text + "\n")
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        config_file.load(tmp_path / "plan.toml", PlanConfig)
+
+
 @pytest.mark.slow
 def test_a_run_of_true_images_is_planned():
     """A lens of 0.1 mm, tolerances of 0.3 and 0.2: off the axis its image differs from that of the axial PSF."""
@@ -178,7 +196,12 @@ def test_files_of_a_plan_of_true_images(tmp_path):
     seen = config_file.load(tmp_path / "psf.toml", Settings)
     edge = math.degrees(math.atan(20 * 18.0 / 2000))
     assert seen.angles_deg == pytest.approx([0, edge / 3, 2 * edge / 3, edge], abs=1e-3)
-    assert (seen.tolerance, seen.led_fwhm_nm) == (0.04, 30.0)
+    assert (seen.tolerance, seen.led_fwhm_nm) == (0.04, 0.0)  # as the library of cell.toml: metalens psf takes it
+    swept = config_file.load(tmp_path / "cell.toml", CellFile).sweep
+    assert swept.wavelengths_um == (0.85,)
+    told = " ".join((tmp_path / "psf.toml").read_text().splitlines()[:2])  # 2.5 widths to either side
+    assert "led_fwhm_nm = 30 here" in told
+    assert told.endswith("wavelengths_um = [0.775, 0.85, 0.925]")
     assert seen.depths_mm == pytest.approx((15.0, 27.0, 1.5))
     assert "7 rows, 7 columns, 9 depths, 5 wavelengths" in command_plan.text(best, measured, tmp_path)
     assert json.loads((tmp_path / "plan.json").read_text())["nodes"]["wavelengths"] == 5
