@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from metalens.cell import materials
+from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell
 from metalens.ground.errors import CellError
 
@@ -75,10 +76,25 @@ def check_subwavelength(cell: Cell, wavelength_um: float, *, angle_rad: float = 
     if not stray:
         return
     n_side = max(materials.index(m, wavelength_um).real for m in (cell.substrate, cell.cover))
-    tilt = max(abs(math.cos(azimuth_rad)), abs(math.sin(azimuth_rad))) * abs(math.sin(angle_rad))
+    limit = _limit_um(cell.lattice, wavelength_um / n_side, min(abs(math.sin(angle_rad)) / n_side, 1.0), azimuth_rad)
     named = ", ".join(f"({order.m}, {order.n}) in the {order.side}" for order in stray[:8])
     more = f" and {len(stray) - 8} more" if len(stray) > 8 else ""
     raise CellError(
         f"pitch {cell.pitch_um:.6g} um at {wavelength_um:.6g} um: diffraction orders {named}{more} propagate; "
-        f"need pitch_um < {cell.lattice.least_order * wavelength_um / (n_side + tilt):.6g}, or a longer wavelength"
+        f"need pitch_um < {limit:.6g}, or a longer wavelength"
     )
+
+
+def _limit_um(lattice: Lattice, wavelength_um: float, sine: float, azimuth_rad: float) -> float:
+    """Pitch below which no other order propagates in a medium, for the wavelength and the sine of the angle in it.
+
+    The shortest reciprocal vectors of each direction meet the circle of the medium first: of (2π/pitch) g along u,
+    |k sine ± (2π/pitch) g u| = k at pitch / wavelength = g / (|c| + sqrt(1 - s²)), with c of the sine along u and s
+    across.
+    """
+    if lattice.centred:
+        short = [(lattice.least_order, math.pi * (2 * m + 1) / 6) for m in range(3)]
+    else:
+        short = [(1.0, 0.0), (1 / lattice.ratio, math.pi / 2)]
+    off = [(g, azimuth_rad - turn) for g, turn in short]
+    return min(wavelength_um * g / (abs(sine * math.cos(t)) + math.sqrt(1 - (sine * math.sin(t)) ** 2)) for g, t in off)

@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 
 from metalens.cell.lattice import Lattice
-from metalens.cell.orders import no_resonance_um, propagating
+from metalens.cell.orders import check_subwavelength, no_resonance_um, propagating
 from metalens.cell.record import Cell, Film, Index
+from metalens.ground.errors import CellError
 
 
 @pytest.mark.parametrize("lattice", [Lattice("rectangular", 1.63), Lattice("rectangular", 0.71), Lattice("hexagonal")])
@@ -42,3 +44,21 @@ def test_below_the_pitch_without_resonances_the_densest_material_carries_no_othe
     assert no_resonance_um(dataclasses.replace(cell, under=(film,)), 0.62) == pytest.approx(
         2.7 / 3.1 * no_resonance_um(cell, 0.62)
     )
+
+
+@pytest.mark.parametrize(
+    "lattice", [Lattice(), Lattice("rectangular", 1.3), Lattice("rectangular", 0.71), Lattice("hexagonal")]
+)
+@pytest.mark.parametrize(
+    ("angle_rad", "azimuth_rad"), [(0.0, 0.0), (0.5, 0.0), (0.5, math.pi / 6), (-0.9, 0.7), (1.2, math.pi / 2)]
+)
+def test_the_pitch_that_a_refusal_names_is_the_limit_for_any_lattice_and_light(lattice, angle_rad, azimuth_rad):
+    """Other orders propagate from that pitch on and none below it; six digits are told."""
+    light = {"angle_rad": angle_rad, "azimuth_rad": azimuth_rad}
+    coarse = Cell(1.3, substrate=Index(1.45), cover=Index(1.2), lattice=lattice)
+    with pytest.raises(CellError) as refused:
+        check_subwavelength(coarse, 0.85, **light)
+    limit = float(re.search(r"need pitch_um < ([\d.]+),", str(refused.value))[1])
+    fine, above = (dataclasses.replace(coarse, pitch_um=limit * (1 + off)) for off in (-1e-5, 1e-5))
+    assert len(propagating(fine, 0.85, **light)) == 2
+    assert len(propagating(above, 0.85, **light)) > 2
