@@ -102,10 +102,10 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
     """Render the eyes, prepare the device and its reader; the finest optics have twice the depths (64 at most).
 
     Raises:
-        LensError: the run's lens is another than the one given.
+        LensError: the run's lens is another than the one given; turned pillars, or another lattice than a square one.
     """
     setting = replace(setting or TaskSetting(), sensor_distance_um=lens.reduced_um)  # as the true image maps directions
-    eyes, aperture = task.views(setting), Aperture(lens)
+    aperture, eyes = Aperture(lens), task.views(setting)
     finest = finest_of(given.numerics, fwhm_nm=given.fwhm_nm)
     window = Window(*eyes.depths_um, setting.pitch_um)
     if given.run is not None:

@@ -45,7 +45,16 @@ def run(options: Options) -> int:
         store.write_bytes(draft.path.with_suffix(".png"), budget_page.chart(rows))
     journal.finish()
     values = {"rows": [dataclasses.asdict(row) for row in rows], **summary(rows)}
-    return options.console.judged(_plain(values), text(rows), about.above)
+    light = of_light(made)
+    words = "\n".join(filter(None, [text(rows), light]))
+    return options.console.judged(_plain(values | {"light": light}), words, about.above)
+
+
+def of_light(made: lens.Lens) -> str:
+    """Of which light a budget is, where pillars of one size answer x and y apart; empty for others."""
+    if not made.one_light:
+        return ""
+    return f"of {made.one_light}: these pillars ({made.cell.described}) answer x and y apart"
 
 
 def summary(rows: list[Entry]) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The error budget: entries of known changes, files, and refusals."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from codesign.commands import budget as command_budget
 from codesign.optics.numerics import Aperture, Numerics, Window, kernels, psf_difference
 from metalens import design
 from metalens.cell.record import Cell, Index
+from metalens.cell.shapes import Rectangle
 from metalens.design.profiles import Focus
 from metalens.ground.errors import ConfigError, LensError, StoreError
 from metalens.made import Printed, Spread, of_process
@@ -90,6 +92,13 @@ def test_files_come_back_as_they_were(tmp_path):
     assert "mask grid" in command_budget.text(rows)
     budget_page.write(tmp_path / "b.html", [*rows, Entry("all links", 0.1, 0.2, 1e-3, "sum")])
     assert "sensor noise" in (tmp_path / "b.html").read_text(encoding="utf-8")
+
+
+def test_a_budget_of_pillars_that_answer_x_and_y_apart_says_of_which_light_it_is(lens):
+    assert command_budget.of_light(lens) == ""
+    rectangles = replace(lens, cell=Cell(lens.cell.pitch_um, lens.cell.height_um, shape=Rectangle(0.6)))
+    told = command_budget.of_light(rectangles)
+    assert told == "of light along x: these pillars (rectangle 1:0.6 on a square lattice) answer x and y apart"
 
 
 def test_spread_and_run_are_read_or_refused(tmp_path):
