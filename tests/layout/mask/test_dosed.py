@@ -1,5 +1,7 @@
 """A mask with its doses: shapes as before, each on a datatype of its dose, and each dose that of the solution."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -119,3 +121,22 @@ def test_shapes_that_touch_are_one(made):
     assert len(set(group[right].tolist())) == 1
     assert len(set(group[alone].tolist())) == 1
     assert len(set(group.tolist())) == 3
+
+
+def test_what_is_exposed_is_told_in_micrometres_whatever_the_unit_of_the_mask():
+    """Units of half a nanometre: discs by their diameters, any other shape by its corners, sites by their pitches."""
+    size = np.array([240, 400, 520])
+    about = {"layer": (1, 0), "grid": 1, "unit_nm": 0.5, "vertices": 16, "shape": "round", "prefix": "D"}
+    classes = tuple(pillar_classes(size, **about))
+    lattice = Lattice("LENS", 7, 5, 840, -1500, 2300, lambda first, end: np.ones((end - first, 5), np.uint8), None, 727)
+    made = MaskPlan("TOP", classes, (lattice,), (), layer_names={}, doses={(1, 0): 1.0})
+    discs = dosed._drawn(made, 5e-4)
+    assert discs.diameter_um == pytest.approx([0.0, 0.12, 0.2, 0.26], rel=1e-12)
+    mixed = dataclasses.replace(classes[1], round=False)
+    shapes = dosed._drawn(made.replace(classes=(classes[0], mixed, classes[2])), 5e-4)
+    assert shapes.area_um2 == pytest.approx([0.0, *(area(one.outline) * 2.5e-7 for one in classes)], rel=1e-12)
+    body = dosed._body(lattice, 5e-4)
+    assert (body.rows, body.columns, body.centred) == (7, 5, False)
+    assert (body.pitch_um, body.x_um, body.y_um) == pytest.approx((0.42, -0.75, 1.15), rel=1e-12)
+    assert body.columns_um == pytest.approx(-0.75 + 0.42 * np.arange(5), rel=1e-12)
+    assert body.rows_um(2, 4) == pytest.approx(1.15 - 0.3635 * np.arange(2, 6), rel=1e-12)
