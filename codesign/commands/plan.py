@@ -93,12 +93,9 @@ def values(best: Plan, measured: Pilot) -> dict[str, object]:
 def write(folder: Path, best: Plan, measured: Pilot, chain: Chain) -> None:
     """Settings files for the commands, plan.json and the report."""
     choice, wanted = best.choice, chain.config
-    cell = config.dumps(wanted.cell)
-    lines = [line for line in cell.splitlines() if line]
-    split = next((i for i, line in enumerate(lines) if line.startswith("[")), len(lines))
-    tables = [line.replace("[", "[cell.", 1) if line.startswith("[") else line for line in lines[split:]]
-    sweep = [f"wavelengths_um = [{wanted.wavelength_nm * 1e-3}]", f"tolerance = {choice.library_tolerance}"]
-    store.write_text(folder / "cell.toml", "\n".join(["[cell]", *lines[:split], *tables, "", "[sweep]", *sweep]) + "\n")
+    cell = re.sub(r"^(\[+)", r"\1cell.", config.dumps(wanted.cell), flags=re.MULTILINE)
+    sweep = f"wavelengths_um = [{wanted.wavelength_nm * 1e-3}]\ntolerance = {choice.library_tolerance}\n"
+    store.write_text(folder / "cell.toml", f"[cell]\n{cell}\n[sweep]\n{sweep}")
     store.write_text(folder / "psf.toml", psf_text(best, measured, chain))
     store.write_text(folder / "run.toml", run_text(best, chain))
     store.write_text(folder / "process.toml", f"[rules]\ndiameter_step_nm = {int(choice.diameter_step_nm)}\n")

@@ -13,6 +13,8 @@ from codesign.budget.plan import Pilot, PlanConfig
 from codesign.budget.task import TaskSetting
 from codesign.commands import plan as command_plan
 from codesign.train import run as runs
+from metalens.cell import Cell, Layer
+from metalens.cell.shapes import Square
 from metalens.commands.library import CellFile
 from metalens.commands.psf import Settings
 from metalens.ground import config as config_file
@@ -181,8 +183,9 @@ def test_a_run_of_true_images_is_planned():
 
 def test_files_of_a_plan_of_true_images(tmp_path):
     """Seven columns of nodes: axis, two between, edge of 20 pixels of 18 um beside the middle."""
+    layered = Cell(0.32, 0.7, shape=Square(), layers=(Layer(0.6), Layer(0.1, material="SiO2")))
     config = PlanConfig(
-        aperture_mm=0.3, led_fwhm_nm=30.0, source_distance_mm=33.0, task=TaskSetting(pixels=32, margin=4)
+        aperture_mm=0.3, led_fwhm_nm=30.0, source_distance_mm=33.0, task=TaskSetting(pixels=32, margin=4), cell=layered
     )
     eyes, lens = SimpleNamespace(depths_um=(15e3, 27e3)), SimpleNamespace(sensor_distance_um=2000.0)
     chain = SimpleNamespace(config=config, eyes=eyes, lens=lens)
@@ -199,8 +202,8 @@ def test_files_of_a_plan_of_true_images(tmp_path):
     edge = math.degrees(math.atan(20 * 18.0 / 2000))
     assert seen.angles_deg == pytest.approx([0, edge / 3, 2 * edge / 3, edge], abs=1e-3)
     assert (seen.tolerance, seen.led_fwhm_nm) == (0.04, 0.0)  # as the library of cell.toml: metalens psf takes it
-    swept = config_file.load(tmp_path / "cell.toml", CellFile).sweep
-    assert swept.wavelengths_um == (0.85,)
+    swept = config_file.load(tmp_path / "cell.toml", CellFile)
+    assert (swept.cell, swept.sweep.wavelengths_um, swept.sweep.tolerance) == (layered, (0.85,), 3e-2)
     told = " ".join((tmp_path / "psf.toml").read_text().splitlines()[:2])  # 2.5 widths to either side
     assert "led_fwhm_nm = 30 here" in told
     assert told.endswith("wavelengths_um = [0.775, 0.85, 0.925]")
