@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from codesign.budget.plan import Plan as Plan
     from codesign.budget.prepared import Given as Given
     from codesign.budget.prepared import bench as bench
+    from codesign.budget.prepared import same_geometry as same_geometry
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -38,6 +39,7 @@ __getattr__, __dir__, __all__ = attach(
         "links": "",
         "page": "",
         "plan": "",
+        "same_geometry": "prepared",
         "total": "entry",
     },
 )

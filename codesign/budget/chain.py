@@ -96,6 +96,11 @@ class PlanConfig:
         return Source(self.wavelength_nm, self.led_fwhm_nm) if self.led_fwhm_nm else None
 
     @property
+    def geometry(self) -> tuple[float, float, float]:
+        """Sensor distance in mm, wavelength in nm and aperture in mm: what a reader is trained before."""
+        return self.sensor_distance_mm, self.wavelength_nm, self.aperture_mm
+
+    @property
     def focus(self) -> Focus:
         """What the lens images onto what."""
         return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)

@@ -137,16 +137,28 @@ def finest_of(numerics: Numerics, *, fwhm_nm: float) -> Numerics:
 
 
 def same_lens(lens: Lens, optics: OpticsConfig) -> None:
-    """Refuse a reader that was trained before another lens: one that differs by more than 2 %.
+    """:func:`same_geometry` of a lens file.
 
     Raises:
         LensError: sensor distance, wavelength or aperture differ.
     """
     mine = lens.sensor_distance_um * 1e-3, lens.wavelength_um * 1e3, 2e-3 * lens.diameters.radius_um
+    same_geometry(mine, optics, "the lens file; give the lens.h5 of the run")
+
+
+def same_geometry(mine: tuple[float, float, float], optics: OpticsConfig, where: str) -> None:
+    """Refuse a reader that was trained before another lens: one that differs by more than 2 %.
+
+    Args:
+        mine: sensor distance in mm, wavelength in nm and aperture in mm. where: they stand, and what to do.
+
+    Raises:
+        LensError: sensor distance, wavelength or aperture differ.
+    """
     its = optics.sensor_distance_mm, optics.wavelength_nm, optics.aperture_mm
     if any(abs(a - b) > 0.02 * b for a, b in zip(mine, its, strict=True)):
         raise LensError(
             "the run's reader was trained before another lens: sensor distance, wavelength, aperture are "
             f"{its[0]:g} mm, {its[1]:g} nm, {its[2]:g} mm there and {mine[0]:g} mm, {mine[1]:g} nm, {mine[2]:g} mm in "
-            "the lens file; give the lens.h5 of the run"
+            f"{where}"
         )

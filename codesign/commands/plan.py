@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from codesign.adapt import train as retraining
-from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, total
+from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, same_geometry, total
 from codesign.commands.options.plan import Options
 from metalens import __version__
 from metalens.ground import config, reading, report, store
@@ -44,7 +44,7 @@ def run(options: Options) -> int:
     """Measure, choose, write; exit 1 where even the finest settings miss the goal, or the image its tolerance.
 
     Raises:
-        ConfigError: the goal is below what no setting changes.
+        ConfigError: the goal is below what no setting changes. LensError: the run is of another lens.
     """
     goal = angle_rad(options.gaze_error)
     wanted = PlanConfig() if options.config is None else config.load(options.config, PlanConfig, empty=False)
@@ -52,6 +52,8 @@ def run(options: Options) -> int:
     with options.claim_folder(target) as draft:
         rig = replace(wanted.task.rig, sensor_distance_um=wanted.focus.sensor_distance_um)
         run = retraining.load(options.run) if options.run else None
+        if run is not None:
+            same_geometry(wanted.geometry, run.settings.optics, "the plan; give PLAN.toml those of the run")
         least = floor.floor(rig, run, options.frames, fwhm_nm=wanted.led_fwhm_nm)
         floor.allowance_rad(goal, least)
         chain = Chain(wanted, options.console.say)
