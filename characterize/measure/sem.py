@@ -2,7 +2,8 @@
 
 Edges are found along many rays from each pillar's centre, as the place where the smoothed profile falls through half of
 the step from the pillar's rim to the gap, whether its top is bright or dark; the diameter is that of the area within,
-and what the picture's blur takes of a disc (s² / R of its diameter, Gaussian of s) is given back. Charging
+and what the picture's blur takes of a disc (s² / R of its diameter, Gaussian of s; of one that is not wide beside it,
+what is read of such a disc: ``radial``) is given back. Charging
 (slow shades), noise and drift of the scan are taken off or averaged over the rays. The lattice may be of any kind.
 """
 
@@ -11,19 +12,22 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage
 
+from characterize.measure import radial
 from characterize.measure.lattice import Lattice, find
+from characterize.measure.radial import RAYS
 from characterize.model import Known
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-RAYS = 72
 _ROUND = 2 / 3  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
-_TRIED = 25  # sites of a lattice that is only tried
+_TRIED = 25  # sites of a lattice that is only tried, discs of which the blur of a picture is told
+_TELLS = 3.0  # radius over blur from which on a disc tells its blur as well as all together do
 MOST = 0.5  # share of sites above which what is there decides of a lattice, or of a picture
-_UNSURE = 0.1  # share of what blur takes of a radius by which clean discs (9 to 30 pixels, blur 0.8 to 2) are off
 _OVAL = 1.15  # length over width from which on a pillar is none of round ones: a circle's radius is off by 0.4 % there
+_LEVELS = 1.2  # errors of narrow discs (7 to 12 pixels, noise of a tenth) over those of edges: their tops are one place
+_UNSURE = 0.1  # share of what blur does to a radius by which clean discs (7 to 30 pixels, blur 0.5 to 2.5) are off
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Diameters:
     """Pillars found in a micrograph.
 
     row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is missing or collapsed.
-    sigma_nm: (p,) standard error of each diameter: noise of its edges, rim and gap, and a tenth of what blur took. It
+    sigma_nm: (p,) standard error of each diameter: noise of its edges, rim and gap, and a tenth of what blur did. It
         holds 95 % of drawn discs without a bright rim; a rim adds a constant (edge_bias_nm).
     missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far from round.
     oval: (p,) longer than wide by more than 15 %, beyond noise; not measured.
@@ -138,6 +142,8 @@ def _on(flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0) -> D
     if not results:
         raise CaptureError("no whole pillar in the picture; need a wider picture")
     row, column, radius, sigma, missing, collapsed = (np.array(v) for v in zip(*results, strict=True))
+    whole = np.where(collapsed.astype(bool), np.nan, radius)
+    radius, sigma = _sharper(flat, np.stack([row, column], 1), whole, sigma, lattice.pitch_px)
     diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
     missing, collapsed = missing.astype(bool), collapsed.astype(bool)
     near = ~missing & (np.hypot(*(np.stack([row, column], 1) - place).T) < 0.2 * lattice.pitch_px)
@@ -179,14 +185,39 @@ def _rays(flat: Array, row: float, column: float, pitch: float) -> tuple[Array, 
     reach = np.arange(0, 0.5 * pitch + 1, fine)
     points = row + reach[:, None] * np.sin(angle), column + reach[:, None] * np.cos(angle)
     rays = ndimage.map_coordinates(flat, points, order=1, mode="nearest")
-    smooth = max(1.0, pitch / 150) / fine
+    smooth = radial.smoothing(pitch) / fine
     return reach, angle, ndimage.gaussian_filter(rays, (smooth, 1.0), mode=("nearest", "wrap"))
+
+
+def _sharper(flat: Array, place: Array, radius: Array, sigma: Array, pitch: float) -> tuple[Array, Array]:
+    """Radii and their errors, those of solid discs that are not wide beside the blur found anew.
+
+    Blur is one of the picture: the median over ``_TRIED`` discs or a few more. A disc wider than a few blurs tells its
+    own, whose noise offsets that of the levels of its rim and gap.
+    """
+    radius, sigma, smooth = radius.copy(), sigma.copy(), radial.smoothing(pitch)
+    there = np.flatnonzero(np.isfinite(radius))
+    some = there[:: max(len(there) // _TRIED, 1)]
+    own = {k: radial.blur(*_rays(flat, *place[k], pitch)[::2], smooth) for k in some}
+    blurs = np.array(list(own.values()))
+    if np.isfinite(blurs).sum() <= MOST * len(some):
+        return radius, sigma
+    usual = float(np.nanmedian(blurs))
+    for k in there:
+        blur = usual
+        if radial.wide(radius[k], usual, smooth, times=_TELLS):
+            mine = own[k] if k in own else radial.blur(*_rays(flat, *place[k], pitch)[::2], smooth)
+            blur = mine if math.isfinite(mine) else usual
+        found = _edges(flat, *place[k], pitch, blur)
+        if found is not None and math.isfinite(found[2]):
+            radius[k], sigma[k] = found[2:4]
+    return radius, sigma
 
 
 def _step(flat: Array, row: float, column: float, pitch: float) -> float:
     """Height of the fall from a pillar's rim to the gap, in the mean over all rays."""
     reach, _, rays = _rays(flat, row, column, pitch)
-    inner, outer, _ = _plateaus(reach, rays)
+    inner, outer, _ = radial.plateaus(reach, rays)
     return inner - outer
 
 
@@ -213,15 +244,18 @@ def _pillar(
     return y, x, radius, sigma, False, bool(off or scatter > max(0.15 * radius, 1.5))
 
 
-def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float, float, float, float, float] | None:
+def _edges(
+    flat: Array, row: float, column: float, pitch: float, blur: float | None = None
+) -> tuple[float, float, float, float, float] | None:
     """Disc through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges.
 
     Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t; the radius is that of the same area, less what blur
-    takes. The scatter is about the circle alone, and infinite where too many rays have their edges elsewhere.
+    takes; with the variance of a ``blur`` that is known, less what that does to a solid disc which is not wide beside
+    it. The scatter is about the circle alone, and infinite where too many rays have their edges elsewhere.
     """
     reach, angle, rays = _rays(flat, row, column, pitch)
-    inner, outer, rim = _plateaus(reach, rays)
-    found = _falls(reach, rays, (inner + outer) / 2, rim)
+    inner, outer, rim = radial.plateaus(reach, rays)
+    found = radial.falls(reach, rays, (inner + outer) / 2, rim)
     good = np.isfinite(found)
     if inner - outer < 0.2 or good.sum() < RAYS // 2:
         return None
@@ -238,33 +272,15 @@ def _edges(flat: Array, row: float, column: float, pitch: float) -> tuple[float,
     # half of the rim's level and half of the gap's, as noisy as edges, are in every edge
     shared = 0.25 / _independent(float(reach[rim])) + 0.25 / _independent(0.5 * (mean + 0.5 * pitch))
     edge, radius = terms @ np.array([mean, dy, dx, *oval]), math.sqrt(mean**2 + wide)
-    drawn_in = _blur(reach, rays, edge, inner - outer, pitch) / (2 * radius)
-    error = math.hypot(math.sqrt(noise * (own + shared)), _UNSURE * drawn_in)
+    smooth, noise = radial.smoothing(pitch), math.sqrt(noise * (own + shared))
+    taken = radial.drawn_in(reach, rays, edge, radius, smooth)
+    true, unsure = radius + taken, _UNSURE * taken
+    if blur is not None and not radial.wide(radius, blur, smooth):
+        (true, gain), plain = radial.unblurred(reach, radius, blur, smooth), blur / (2 * radius)
+        noise, unsure = noise * gain * _LEVELS, _UNSURE * (plain + abs(true - radius - plain))
+    error = math.hypot(noise, unsure)
     scatter = math.sqrt(rest.var() + wide) if good.mean() > _ROUND else math.inf
-    return float(dy), float(dx), radius + drawn_in, error, scatter
-
-
-def _falls(reach: Array, rays: Array, half: float, rim: int) -> Array:
-    """(ray,) where each first falls below a level beyond the rim; nan where it does not."""
-    found = np.full(RAYS, math.nan)
-    for j in range(RAYS):
-        below = rim + np.flatnonzero(rays[rim:, j] < half)
-        if len(below) and below[0] > rim:
-            i = int(below[0])
-            high, low = rays[i - 1, j], rays[i, j]
-            found[j] = reach[i - 1] + (reach[1] - reach[0]) * (high - half) / (high - low)
-    return found
-
-
-def _blur(reach: Array, rays: Array, edge: Array, step: float, pitch: float) -> float:
-    """Variance s² of the picture's blur across the edges: a disc of radius R has half of its step at R - s² / (2 R).
-
-    By what rays fall by within a pixel of their edges, erf(1 / (s sqrt 2)) of the step, less the smoothing along rays.
-    """
-    near = np.clip((edge + np.array([[-1.0], [1.0]])) / reach[1], 0, len(reach) - 1)
-    inside, outside = (ndimage.map_coordinates(rays, (places, np.arange(RAYS)), order=1) for places in near)
-    share = float(np.clip((inside - outside).mean() / step, 0.05, 0.99))
-    return max(0.5 / float(special.erfinv(share)) ** 2 - max(1.0, pitch / 150) ** 2, 0.0)
+    return float(dy), float(dx), true, error, scatter
 
 
 def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
@@ -298,23 +314,3 @@ def _independent(radius: float) -> float:
     """
     step = 2 * math.pi * max(radius, 0.5) / RAYS
     return RAYS / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / (6 * step**2)))
-
-
-def _plateaus(reach: Array, rays: Array) -> tuple[float, float, int]:
-    """(level of the rim, of the gap, where the rim is brightest) about the steepest fall of the mean over the rays.
-
-    A fall counts by its steepness over its noise: where rays are less than a pixel apart they cross the same pixels.
-    The rim is looked for just inside the fall, within a fifth of its radius or 16 samples: tops may be dark. The gap is
-    the darkest third beyond the fall: of crowded pillars it is a few pixels wide.
-    """
-    mean = rays.mean(1)
-    apart = reach[:-1] * 2 * math.pi / RAYS
-    fall = int(np.argmin(np.diff(mean) * np.sqrt(np.minimum(apart, 1.0))))
-    beyond = np.sort(mean[fall + 1 :])
-    outer = float(beyond[: max(len(beyond) // 3, 2)].mean())
-    steep = float(mean[fall] - mean[fall + 1])
-    inner = float(mean[max(fall - 16, 0) : fall + 1].max())
-    blur = (inner - outer) / max(math.sqrt(2 * math.pi) * steep, 1e-12)  # samples
-    first = max(fall - max(16, fall // 5, int(min(3 * blur, fall))), fall // 4)
-    rim = first + int(np.argmax(mean[first : fall + 1]))
-    return float(mean[rim]), outer, rim

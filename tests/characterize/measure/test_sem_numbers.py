@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from characterize.measure import sem
+from characterize.measure import radial, sem
 from characterize.measure.lattice import Lattice
 
 LATTICE = Lattice(np.array([3.0, 4.0]), np.array([0.0, 50.0]), np.array([50.0, 0.0]))
@@ -169,16 +169,16 @@ def test_plateaus_are_the_brightest_rim_and_the_darkest_third_beyond_it():
     mean = np.concatenate([np.full(28, 0.5), [0.6, 0.8, 0.9, 0.85], [0.3], np.full(40, 0.1)])
     mean[60] = 0.02
     rays = mean[:, None] + np.array([0.03, -0.03, 0.0])
-    inner, outer, rim = sem._plateaus(REACH[: len(rays)], rays)
+    inner, outer, rim = radial.plateaus(REACH[: len(rays)], rays)
     assert rim == 30
     assert inner == pytest.approx(0.9)
     assert outer == pytest.approx((12 * 0.1 + 0.02) / 13)  # of 41 beyond the fall, its foot among them
     far = np.concatenate(
         [[0.65], np.full(29, 0.5), [0.7], np.full(30, 0.5), [0.6], np.full(40, 0.1)]
     )  # bright beyond 16 samples of the fall
-    assert sem._plateaus(REACH[: len(far)], far[:, None])[2] == 61
+    assert radial.plateaus(REACH[: len(far)], far[:, None])[2] == 61
     wide = np.concatenate([np.full(70, 0.5), [0.9], np.full(17, 0.6), np.full(40, 0.1)])
-    assert sem._plateaus(REACH[: len(wide)], wide[:, None])[2] == 70  # a fifth of 87: 17 samples
+    assert radial.plateaus(REACH[: len(wide)], wide[:, None])[2] == 70  # a fifth of 87: 17 samples
 
 
 def test_rays_run_from_a_place_in_all_directions():
