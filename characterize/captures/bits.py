@@ -61,14 +61,14 @@ def _aligned(
         return images, bits or 16, "counts are real numbers: taken as they are", tuple(beside)
     if depth := _stretched(whole, bits):
         share = ((1 << depth) - 1) / 65_535
-        images, *rest = (np.rint(a * share).astype(a.dtype) if any(a is w for w in whole) else a * share for a in every)
-        return images, depth, f"{depth}-bit counts were stretched over 16 bits: taken back", tuple(rest)
+        back = [np.rint(a * share).astype(a.dtype) if any(a is w for w in whole) else a * share for a in every]
+        return back[0], depth, f"{depth}-bit counts were stretched over 16 bits: taken back", tuple(back[1:])
     used = int(np.bitwise_or.reduce([np.bitwise_or.reduce(a.astype(np.int64), axis=None) for a in whole]))
-    back, depth, note = _alignment(used, bits, images.dtype.itemsize, where)
-    if not back:
+    shift, depth, note = _alignment(used, bits, images.dtype.itemsize, where)
+    if not shift:
         return images, depth, note, tuple(beside)
-    rest = tuple(a >> back if any(a is w for w in whole) else a / 2**back for a in beside)
-    return images >> back, depth, note, rest
+    rest = tuple(a >> shift if any(a is w for w in whole) else a / 2**shift for a in beside)
+    return images >> shift, depth, note, rest
 
 
 def _alignment(used: int, bits: int | None, item_bytes: int, where: str) -> tuple[int, int, str]:

@@ -196,19 +196,23 @@ def _sharper(flat: Array, place: Array, radius: Array, sigma: Array, pitch: floa
     own, whose noise offsets that of the levels of its rim and gap.
     """
     radius, sigma, smooth = radius.copy(), sigma.copy(), radial.smoothing(pitch)
-    there = np.flatnonzero(np.isfinite(radius))
-    some = there[:: max(len(there) // _TRIED, 1)]
-    own = {k: radial.blur(*_rays(flat, *place[k], pitch)[::2], smooth) for k in some}
+
+    def told(k: int) -> float:
+        reach, _, rays = _rays(flat, place[k, 0], place[k, 1], pitch)
+        return radial.blur(reach, rays, smooth)
+
+    there = np.flatnonzero(np.isfinite(radius)).tolist()
+    own = {k: told(k) for k in there[:: max(len(there) // _TRIED, 1)]}
     blurs = np.array(list(own.values()))
-    if np.isfinite(blurs).sum() <= MOST * len(some):
+    if np.isfinite(blurs).sum() <= MOST * len(blurs):
         return radius, sigma
     usual = float(np.nanmedian(blurs))
     for k in there:
         blur = usual
         if radial.wide(radius[k], usual, smooth, times=_TELLS):
-            mine = own[k] if k in own else radial.blur(*_rays(flat, *place[k], pitch)[::2], smooth)
+            mine = own[k] if k in own else told(k)
             blur = mine if math.isfinite(mine) else usual
-        found = _edges(flat, *place[k], pitch, blur)
+        found = _edges(flat, place[k, 0], place[k, 1], pitch, blur)
         if found is not None and math.isfinite(found[2]):
             radius[k], sigma[k] = found[2:4]
     return radius, sigma
