@@ -91,8 +91,9 @@ def read_stage(folder: Path) -> Rows | None:
     JSON: a list of such objects.
 
     Raises:
-        CaptureError: unknown column, two of depth or of one angle, no column ``file``, columns not parted by commas, a
-            value that is no number, a page that is not whole; file and row are named.
+        CaptureError: unknown column, one without its unit, two of depth or of one angle, no column ``file``, columns
+            not parted by commas, more values than columns, a value that is no number, a page that is not whole; file
+            and row are named. A table in another format (``stage.xlsx``).
     """
     if path := naming.table(folder, "stage"):
         return _rows(_read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path)
@@ -241,7 +242,8 @@ def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]
     """A row by column names in small letters, without blanks about them, the micro sign or a Greek letter as u."""
     if None in entries:
         raise CaptureError(
-            f"{path}, row {row}: more values than columns; a comma inside a number? write it with a point (0.73)"
+            f"{path}, row {row}: more values than columns ({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
+            "a number? write it with a point (0.73)"
         )
     plain = {str(key).strip().lower().translate(_MICRO): value for key, value in entries.items()}
     if len(plain) < len(entries):

@@ -137,7 +137,7 @@ def test_tables_as_spreadsheets_and_people_write_them_are_read(tmp_path, table):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        (TABLE.replace("1.5", "1,5"), "row 2: more values than columns; a comma inside a number"),
+        (TABLE.replace("1.5", "1,5"), r"row 2: more values than columns \(file, depth_mm\); a comma inside a number"),
         (TABLE.replace("2.5", '"2,5"'), "row 3: depth_mm is '2,5', need a number with a point"),
         (TABLE.replace("depth_mm", "depth"), "column 'depth' without a unit; name it depth_um"),
         (TABLE.replace("depth_mm", "depth (mm)"), "did you mean 'depth_mm'"),
