@@ -36,11 +36,15 @@ def test_folder_with_stage_and_description(tmp_path):
 
 @pytest.mark.parametrize(("about", "pitch"), [("", 3.0), ('channel = "blue"\nmosaic = "RGGB"\n', 6.0)])
 def test_a_pixel_is_as_wide_as_the_camera_has_it_whatever_its_colour(tmp_path, about, pitch):
-    """3 um wide and high, each or every second of them."""
-    found = capture.load(folder(tmp_path, about=f"pixel_um = 3.0\n{about}"))
-    assert found.pixel_um == pitch
-    assert found.fill * found.pixel_um == 3.0
-    assert found.frames.shape[1:] == (12 * 3 / pitch, 16 * 3 / pitch)
+    """3 um wide and high, each or every second of them, in a folder or a file of all frames."""
+    (tmp_path / "stack.toml").write_text(f"pixel_um = 3.0\n{about}")
+    tifffile.imwrite(tmp_path / "stack.tif", FRAMES, photometric="minisblack")
+    (tmp_path / "folder").mkdir()
+    for place in (folder(tmp_path / "folder", about=f"pixel_um = 3.0\n{about}"), tmp_path / "stack.tif"):
+        found = capture.load(place)
+        assert found.pixel_um == pitch
+        assert found.fill * found.pixel_um == 3.0
+        assert found.frames.shape == (4, 12 * 3 / pitch, 16 * 3 / pitch)
 
 
 def test_stage_order_is_the_order_of_the_frames(tmp_path):
