@@ -51,6 +51,14 @@ def gram(matrix: np.ndarray) -> np.ndarray:
     return product
 
 
+def congruent(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which have no diagonal, are left out."""
+    rows = np.flatnonzero(inner.diagonal())
+    few = outer[rows]
+    product: np.ndarray = few.T @ (inner.take(rows, 0).take(rows, 1) @ few)
+    return product
+
+
 def eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values, rising, and vectors of a symmetric matrix.
 

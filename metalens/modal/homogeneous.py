@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as sl
 
-from metalens.modal.dense import eigen_pairs
+from metalens.modal.dense import congruent, eigen_pairs, gram
 from metalens.modal.spaces import Space
 
 
@@ -92,7 +92,7 @@ def modes(space: Space, *, careful: bool = False, quick: bool = False) -> Basis:
     te, mix = np.linalg.eigh(rest.T @ space.cell.curl @ rest)
     rest = rest @ mix
     vector = np.concatenate([rest, vector[:, : len(tm)]], 1)
-    disc = vector.T @ space.disc.mass @ vector, rest.T @ space.disc.curl @ rest
+    disc = congruent(space.disc.mass, vector), congruent(space.disc.curl, rest)
     return made(space, te, tm, lambda: vector, scalar, disc)
 
 
@@ -101,34 +101,35 @@ def quick_modes(space: Space) -> Basis:
 
     With G the gradients, K = Gᵀ mass G, the TM modes solve K f = tm scalar f, and the TE modes are x on the cotree
     less its projection on the gradients: curl_cc x = te (mass_cc - mass_cG K⁻¹ mass_Gc) x. Half the time; the
-    difference loses digits (1e-8 of t at worst).
+    difference loses digits (1e-8 of t at worst). Of the disc's matrices the rows that are not zero alone are taken.
     """
     c, down_to = space.cotree, space.transposed
     corner = c[:, None], c
     mass = (down_to @ space.cell.mass).T
     tm, scalar = eigen_pairs(down_to @ mass, space.cell.scalar)
     unit = scalar / np.sqrt(tm)
-    inner = mass[c] @ unit
-    te, x = eigen_pairs(space.cell.curl[corner], space.cell.mass[corner] - inner @ inner.T)
-    down = inner.T @ x
-    disc = (down_to @ space.disc.mass).T
-    across = x.T @ (disc[c] @ unit)
-    low = unit.T @ (down_to @ disc) @ unit
+    inner = unit.T @ mass[c].T
+    te, x = eigen_pairs(space.cell.curl[corner], space.cell.mass[corner] - gram(inner))
+    down = inner @ x
+    inside, few = np.flatnonzero(space.disc.mass.diagonal()[c]), unit[space.within]
+    disc = (space.within_transposed @ space.disc.mass).T
+    across = x[inside].T @ (disc[c[inside]] @ few)
+    low = few.T @ (space.within_transposed @ disc) @ few
     drawn = (low @ down).T
     mixed = (across - drawn / 2) @ down
-    high = x.T @ space.disc.mass[corner] @ x - mixed - mixed.T
+    high = congruent(space.disc.mass[corner], x) - mixed - mixed.T
     across -= drawn
-    a = len(te)
+    a, gradient = len(te), space.gradient
     disc_mass = np.empty((a + len(tm), a + len(tm)))
     disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = high, across, across.T, low
 
     def vector() -> np.ndarray:
-        gradients = space.gradient @ unit
+        gradients = gradient @ unit
         rest = -gradients @ down
         rest[c] += x
         return np.concatenate([rest, gradients], 1)
 
-    return made(space, te, tm, vector, scalar, (disc_mass, x.T @ space.disc.curl[corner] @ x))
+    return made(space, te, tm, vector, scalar, (disc_mass, congruent(space.disc.curl[corner], x)))
 
 
 def made(
@@ -149,5 +150,5 @@ def made(
         scalar=scalar,
         disc_mass=disc[0],
         disc_curl=disc[1],
-        disc_scalar=scalar.T @ space.disc.scalar @ scalar,
+        disc_scalar=congruent(space.disc.scalar, scalar),
     )

@@ -50,6 +50,13 @@ class Selection:
         """Whether a Bloch phase ties the ends of the cell together."""
         return len(self.order) > self.inside
 
+    def unknowns(self, functions: np.ndarray) -> np.ndarray:
+        """Values of the unknowns from those of the functions of the quarter cell."""
+        picked = functions[self.order]
+        second = picked[: self.inside] if self.periodic else picked[:0]
+        first = self.inside + self.start
+        return np.concatenate([picked[:first], second, picked[first:]])
+
 
 def select(wall: np.ndarray, *, electric: bool, half_phase_rad: float | None) -> Selection:
     """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with electric x walls for None."""
@@ -93,7 +100,8 @@ class Space:
     """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch.
 
     cotree: unknowns that with all gradients make a well-conditioned basis (those of the edges off a spanning tree).
-    transposed: of the gradient, sparse.
+    transposed: of the gradient, sparse. within: scalars that reach into the disc; of no others the gradient does.
+    within_transposed: their rows of ``transposed``.
     """
 
     cell: Part
@@ -103,16 +111,20 @@ class Space:
     half_phase_rad: float | None
     cotree: np.ndarray
     transposed: scipy.sparse.csr_array
+    within: np.ndarray
+    within_transposed: scipy.sparse.csr_array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Topology:
-    """What a symmetry class has for all diameters: its unknowns, and the gradient, dense and transposed sparse."""
+    """What a symmetry class has for all diameters: its unknowns, and the rest as in ``Space``."""
 
     vectors: Selection
     scalars: Selection
     gradient: np.ndarray
     transposed: scipy.sparse.csr_array
+    within: np.ndarray
+    within_transposed: scipy.sparse.csr_array
 
 
 @lru_cache(maxsize=32)
@@ -122,7 +134,12 @@ def topology(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> To
     vectors = select(mesh.vector_wall, electric=electric, half_phase_rad=half_phase_rad)
     scalars = select(mesh.scalar_wall, electric=electric, half_phase_rad=half_phase_rad)
     dense = restrict(gradient(plan), vectors, scalars)
-    return Topology(vectors, scalars, dense, scipy.sparse.csr_array(dense.T))
+    reaches = np.zeros(len(mesh.scalar_wall), bool)
+    for patch in mesh.patches:
+        reaches[patch.scalar] |= patch.inside
+    within = np.flatnonzero(scalars.unknowns(reaches))
+    down_to = scipy.sparse.csr_array(dense.T)
+    return Topology(vectors, scalars, dense, down_to, within, down_to[within])
 
 
 @lru_cache(maxsize=32)
@@ -154,6 +171,8 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
         half_phase_rad,
         cotree(plan, electric, step),
         known.transposed,
+        known.within,
+        known.within_transposed,
     )
 
 
@@ -177,8 +196,8 @@ def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | N
     cell, disc = integrate(geometry.mesh, geometry.rho, rate=True)
     still = np.zeros((vectors.size, scalars.size))
     turned = restrict(geometry.gradient, vectors, scalars, rate=True)
-    none, flat = np.zeros(0, int), known.transposed
+    rest = np.zeros(0, int), known.transposed, known.within, known.within_transposed
     return (
-        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, none, flat),
-        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, none, flat),
+        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, *rest),
+        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, *rest),
     )

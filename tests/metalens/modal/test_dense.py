@@ -41,6 +41,13 @@ def test_factors_inverses_and_products():
     assert np.abs(dense.added(definite.copy(), 0.3) - definite - 0.3 * np.eye(20)).max() < ROUNDING
 
 
+def test_rows_of_zeros_count_for_nothing_between_vectors():
+    _, _, right = drawn()
+    inner = np.zeros((20, 20))
+    inner[3:17:2, 3:17:2] = right[:7, :9] @ right[:7, :9].T  # semidefinite, and 13 rows of zeros
+    assert np.abs(dense.congruent(inner, right[:, :8]) - right[:, :8].T @ inner @ right[:, :8]).max() < ROUNDING
+
+
 def test_eigenvectors_of_one_matrix_and_of_two():
     definite, symmetric, _ = drawn()
     level, vectors = dense.eigenvectors(lower_alone(symmetric))
