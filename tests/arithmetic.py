@@ -92,7 +92,7 @@ def environment(name: str) -> dict[str, str]:
     """The environment of a run under the arithmetic ``name``."""
     switches, prefixes, threads = ARITHMETIC[name]
     kind = switches.get("NUMBA_CPU_NAME", "own")
-    own = {"NUMBA_CACHE_DIR": str(ROOT / "build" / "arithmetic" / kind), "CI": "1"}
+    own = {"NUMBA_CACHE_DIR": str(ROOT / "build" / "arithmetic" / kind), "CI": "1", "OMP_WAIT_POLICY": "passive"}
     own |= {key: str(threads) for key in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")}
     features = {"NPY_DISABLE_CPU_FEATURES": _without(prefixes)} if prefixes else {}
     return os.environ | switches | features | own
