@@ -20,12 +20,13 @@ from metalens.modal.layer import Medium, electric_modes, magnetic_modes
 from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, nearness, scattering, zero_order
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
-from metalens.modal.spaces import space
+from metalens.modal.spaces import space, topology
 from metalens.rcwa import anchored
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
 CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
+SMALL = 500  # unknowns of a symmetry class: bases of no more are kept for longer
 MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimate follows: the next move it by 1e-4
 
 
@@ -35,15 +36,24 @@ def geometry(rho: float, plan: MeshPlan) -> Geometry:
     return assemble(rho, plan)
 
 
-@lru_cache(maxsize=6)  # both classes of three diameters: the probes of a curve, for either polarisation
 def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False) -> Basis:
     """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change.
 
     quick: as in ``modes``; nearly uniform gradients then need no care until later.
     """
+    small = topology(plan, electric, bloch or None).vectors.size <= SMALL
+    return (kept_long if small else kept)(rho, plan, electric, bloch, quick)
+
+
+@lru_cache(maxsize=6)  # both classes of three diameters: the probes of a curve, for either polarisation
+def kept(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool) -> Basis:
+    """See ``basis``."""
     symmetry_class = space(geometry(rho, plan), electric=electric, half_phase_rad=bloch or None)
     careful = 0 < bloch < (QUICK_CAREFUL_RAD if quick else CAREFUL_RAD)
     return modes(symmetry_class, careful=careful, quick=quick)
+
+
+kept_long = lru_cache(maxsize=24)(kept.__wrapped__)  # what one polarisation adds to a curve, 5 MB each
 
 
 def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ Solver = Callable[[float], Response]
 FIT_SHARE = 0.2  # of the tolerance: residual of the rational fit
 FLOOR_SHARE = 0.1  # of the tolerance: added to every estimate, for what no rival shows
 DOUBT_SHARE = 0.5  # of the tolerance: disagreement of the fits at which the search ends
+CHEAP_SHARE = 0.5  # of the largest disagreement: what a cheaper diameter has to show
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
 SCAN = 1200  # places where the fits are compared
 FIRST = 13  # Chebyshev points that a search begins with
@@ -131,7 +132,14 @@ def starts(low_um: float, high_um: float, count: int = FIRST) -> list[float]:
 
 
 def explore(
-    solve: Solver, low_um: float, high_um: float, *, tolerance: float, first: int = FIRST, most: int = 80
+    solve: Solver,
+    low_um: float,
+    high_um: float,
+    *,
+    tolerance: float,
+    first: int = FIRST,
+    most: int = 80,
+    cheaper_um: Array | None = None,
 ) -> Nodes:
     """Choose diameters one by one and solve them, until the rational fit predicts what comes.
 
@@ -139,17 +147,20 @@ def explore(
         solve: exact response at a diameter, on one discretisation (jumps look like resonances).
         first: Chebyshev points to begin with.
         most: solves at most; where they do not suffice ``converged`` is False.
+        cheaper_um: (any,) diameters that cost less, taken where they tell half as much as the best, or more.
     """
+    cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
+    cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
     x = starts(low_um, high_um, first)
     made = [solve(v) for v in x]
     past: list[Rational] = []
     calm = 0
     while calm < CALM and len(x) < most:
         fit, simpler = _fits(np.array(x), _responses(made), tolerance)
-        where, doubt = _suspect(fit, [simpler, *past[-2:]], np.array(x))
+        where, doubt = _suspect(fit, [simpler, *past[-2:]], np.array(x), cheaper)
         enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(simpler.support)
         still = enough and doubt < DOUBT_SHARE * tolerance
-        where = _widest_gap(x) if still and calm == 0 else where
+        where = _widest_gap(x, cheaper) if still and calm == 0 else where
         response = solve(where)
         missed = np.abs(fit(np.array([where]))[0] - (response.t, response.r)).max()
         x.append(where)
@@ -180,30 +191,36 @@ def _fits(x: Array, y: Array, tolerance: float) -> tuple[Rational, Rational]:
     return best, simpler
 
 
-def _suspect(fit: Rational, rivals: list[Rational], x: Array) -> tuple[float, float]:
-    """Where the fits disagree most, and by how much; narrow resonances are looked at on their own scale."""
+def _suspect(fit: Rational, rivals: list[Rational], x: Array, cheaper: Array) -> tuple[float, float]:
+    """Where the fits disagree most, or nearly so at a cheaper place, and by how much at most; narrow resonances are
+    looked at on their own scale."""
     low, high = x.min(), x.max()
     poles = fit.poles()
     poles = poles[(poles.real > low) & (poles.real < high) & (np.abs(poles.imag) < 0.1 * (high - low))]
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
-    even, near = np.linspace(low, high, SCAN + 1), np.concatenate(around)
+    even, near = np.concatenate([np.linspace(low, high, SCAN + 1), cheaper]), np.concatenate(around)
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
     near = near[(near > low) & (near < high) & (_distance(near, x) > FINEST_UM)]
     places = np.concatenate([even, near])
     value = fit(places)[:, 0]
     doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)
     worst = int(np.argmax(doubt))
-    return float(places[worst]), float(doubt[worst])
+    cheap = np.flatnonzero(np.isin(places, cheaper) & (doubt >= CHEAP_SHARE * doubt[worst]))
+    chosen = cheap[np.argmax(doubt[cheap])] if len(cheap) else worst
+    return float(places[chosen]), float(doubt[worst])
 
 
 def _distance(places: Array, x: Array) -> Array:
     return np.asarray(np.abs(places[:, None] - x).min(axis=1, initial=np.inf))
 
 
-def _widest_gap(x: list[float]) -> float:
+def _widest_gap(x: list[float], cheaper: Array) -> float:
+    """The middle of the widest gap, or the cheaper place nearest to it in the middle half."""
     ordered = np.sort(x)
     widest = int(np.argmax(np.diff(ordered)))
-    return float((ordered[widest] + ordered[widest + 1]) / 2)
+    middle, quarter = (ordered[widest] + ordered[widest + 1]) / 2, (ordered[widest + 1] - ordered[widest]) / 4
+    away = np.abs(cheaper - middle)
+    return float(cheaper[np.argmin(away)] if away.min(initial=np.inf) < quarter else middle)
 
 
 def _responses(made: list[Response]) -> Array:

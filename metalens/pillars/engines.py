@@ -1,7 +1,6 @@
 """Which solver takes a pillar cell, and one whose error changes smoothly with the diameter."""
 
 import functools
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -13,6 +12,8 @@ from metalens.ground.errors import CellError
 from metalens.pillars.curve import FIRST, starts
 
 PROBES = [4, 7, FIRST - 1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
+MESHES = 3  # that a curve takes: the one that serves most diameters, and what follows it beside a resonance
+ENOUGH = 1.2  # of the tolerance, half of an entry's: with the share of the fit the entry is still within its own
 Engine = Literal["auto", "rcwa", "modal"]
 
 
@@ -60,11 +61,10 @@ def smooth_all(
     levels = list(zip(*of_lights, strict=True))
     probes = np.array(starts(*span_um))[PROBES].tolist()
     allowed = 1 if engine == "modal" else 0
-    for coarse, fine in itertools.pairwise(levels):
-        if all(_failing(at, probes, allowed) <= allowed for at in coarse):
-            if engine != "modal":
-                return list(coarse)
-            return [functools.partial(_met, *both) for both in zip(coarse, fine, strict=True)]
+    for place, level in enumerate(levels[:-1]):
+        if all(_failing(at, probes, allowed) <= allowed for at in level):
+            taken = levels[place : place + MESHES] if engine == "modal" else [level]
+            return [_stepped(meshes, ENOUGH * tolerance) for meshes in zip(*taken, strict=True)]
     return list(levels[-1])
 
 
@@ -89,10 +89,36 @@ def _failing(at: Callable[[float], Response], probes: list[float], allowed: int)
     return failing
 
 
-def _met(coarse: Callable[[float], Response], fine: Callable[[float], Response], diameter_um: float) -> Response:
-    """Of the coarse mesh where it meets the tolerance at this diameter, else of the better one."""
-    found = coarse(diameter_um)
-    return found if found.converged else min(found, fine(diameter_um), key=lambda made: made.t_error)
+def _stepped(meshes: Sequence[Callable[[float], Response]], enough: float) -> Callable[[float], Response]:
+    """:func:`_met`, remembered; between two diameters that needed a finer mesh, beside a resonance, that one begins."""
+    needed: dict[float, int] = {}
+
+    @functools.cache
+    def at(diameter_um: float) -> Response:
+        below = max((known for known in needed if known < diameter_um), default=None)
+        above = min((known for known in needed if known > diameter_um), default=None)
+        begin = 0 if below is None or above is None else min(needed[below], needed[above])
+        needed[diameter_um], found = _met(meshes, diameter_um, enough, begin)
+        return found
+
+    return at
+
+
+def _met(
+    meshes: Sequence[Callable[[float], Response]], diameter_um: float, enough: float, begin: int = 0
+) -> tuple[int, Response]:
+    """Of the first mesh from ``begin`` on that meets the tolerance at this diameter, else of the best; its place first.
+
+    The third costs several times as much as both before, and is asked where neither has an error of ``enough`` or less.
+    """
+    tried: list[tuple[int, Response]] = []
+    for place in range(begin, len(meshes)):
+        if place > 1 and any(made.t_error <= enough for _, made in tried):
+            break
+        tried.append((place, meshes[place](diameter_um)))
+        if tried[-1][1].converged:
+            return tried[-1]
+    return min(tried, key=lambda made: made[1].t_error)
 
 
 def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:

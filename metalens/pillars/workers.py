@@ -59,11 +59,17 @@ def work(task: Task) -> Result:
     for diameter in reduced.starts(low, high):  # every curve begins with them: one after the other they share modes
         for solve in solves:
             solve(diameter)
-    return _joined([_explored(solve, (low, high), FIT_SHARE * task["tolerance"]) for solve in solves])
+    parts: list[Result] = []
+    for solve in solves:  # and later ones take diameters of those before, where these serve
+        known = [d for part in parts for d in part["diameter_um"]]
+        parts.append(_explored(solve, (low, high), FIT_SHARE * task["tolerance"], known))
+    return _joined(parts)
 
 
-def _explored(solve: Callable[[float], Response], span_um: tuple[float, float], tolerance: float) -> Result:
-    nodes = reduced.explore(solve, *span_um, tolerance=tolerance)
+def _explored(
+    solve: Callable[[float], Response], span_um: tuple[float, float], tolerance: float, known_um: list[float]
+) -> Result:
+    nodes = reduced.explore(solve, *span_um, tolerance=tolerance, cheaper_um=np.array(known_um))
     order = nodes.diameter_um.tolist()
     return _listed(order, [solve(d) for d in order]) | {"converged": [nodes.converged], "reason": [nodes.reason]}
 

@@ -55,6 +55,27 @@ def test_estimate_holds_on_ten_thousand_held_out_diameters(tolerance):
     assert error < tolerance
 
 
+def test_cheaper_diameters_are_taken_where_they_serve_and_the_estimate_holds_as_well():
+    """Of 25 that lie anywhere, and of those that another search found: fewer others are solved than without."""
+    plain = explored(1e-3).nodes.diameter_um
+    for cheaper in (np.random.default_rng(13).uniform(*SPAN, 25), plain + 1e-5):
+        nodes = reduced.explore(exact, *SPAN, tolerance=1e-3, cheaper_um=cheaper)
+        assert nodes.converged
+        taken = np.isin(nodes.diameter_um, cheaper)
+        assert taken.sum() >= 8
+        assert (~taken).sum() <= len(plain) - 8
+        silent = reduced.Nodes(nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, "")
+        wrong, error, _ = violations(reduced.curve(silent, tolerance=1e-3), 400)
+        assert wrong == 0
+        assert error < 1e-3
+
+
+def test_the_widest_gap_is_halved_or_nearly_so_where_that_is_cheaper():
+    assert reduced._widest_gap([0.1, 0.18, 0.22, 0.29], np.empty(0)) == pytest.approx(0.14, rel=1e-12)
+    assert reduced._widest_gap([0.1, 0.18, 0.22, 0.29], np.array([0.125, 0.151, 0.25])) == 0.151
+    assert reduced._widest_gap([0.1, 0.18, 0.22, 0.29], np.array([0.119, 0.25])) == pytest.approx(0.14, rel=1e-12)
+
+
 def test_resonances_are_the_poles():
     found = explored(1e-4).resonances()
     sharpest = found[np.argmin(found[:, 1])]

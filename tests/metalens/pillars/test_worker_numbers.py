@@ -29,8 +29,8 @@ def test_half_of_a_tolerance_is_the_solver_s_and_two_fifths_the_fit_s(monkeypatc
         asked.append((lights, span, tolerance, engine))
         return [lambda d, k=k: first.append((d, k)) or of(k, d) for k in range(2)]
 
-    def explore(solve, low, high, *, tolerance):
-        fits.append((low, high, tolerance))
+    def explore(solve, low, high, *, tolerance, cheaper_um):
+        fits.append((low, high, tolerance, cheaper_um.tolist()))
         at = np.array([low, 0.11, high][: 1 + len(fits)])
         return SimpleNamespace(diameter_um=at, converged=len(fits) == 1, reason=f"reason {len(fits)}")
 
@@ -41,7 +41,8 @@ def test_half_of_a_tolerance_is_the_solver_s_and_two_fifths_the_fit_s(monkeypatc
     found = workers.work(workers.curves_task(CELL, LIGHTS, (0.07, 0.23), tolerance=6e-3, engine="rcwa"))
     assert asked == [(LIGHTS, (0.07, 0.23), pytest.approx(3e-3), "rcwa")]
     assert first[:4] == [(0.07, 0), (0.07, 1), (0.23, 0), (0.23, 1)]
-    assert fits == [(0.07, 0.23, pytest.approx(2.4e-3))] * 2
+    assert [fit[:3] for fit in fits] == [(0.07, 0.23, pytest.approx(2.4e-3))] * 2
+    assert [fit[3] for fit in fits] == [[], [0.07, 0.11]]  # of the light before
     assert found["counts"] == [2, 3]
     made = workers.curves(found, tolerance=6e-3)
     assert [tolerance for _, tolerance in made] == [pytest.approx(2.4e-3)] * 2
@@ -71,13 +72,47 @@ def test_elements_of_a_jones_matrix_are_rows_and_take_the_energy_of_what_comes(m
     assert made["error"] == [4e-4] * 4
 
 
+def meshes(asked, *errors):
+    """Meshes with these errors, which may depend on the diameter; at 1e-2 they meet the tolerance."""
+
+    def mesh(place, error):
+        def at(diameter_um):
+            asked.append((place, diameter_um))
+            found = error(diameter_um) if callable(error) else error
+            return SimpleNamespace(t_error=found, converged=found <= 1e-2)
+
+        return at
+
+    return [mesh(place, error) for place, error in enumerate(errors)]
+
+
 @pytest.mark.parametrize(
-    ("coarse", "fine", "kept"),
-    [((0.03, True), (0.01, True), 0.03), ((0.03, False), (0.01, False), 0.01), ((0.02, False), (0.05, False), 0.02)],
+    ("errors", "kept", "solved"),
+    [
+        ((0.009, 0.001), 0, 1),
+        ((0.03, 0.01, 0.001), 1, 2),
+        ((0.02, 0.05), 0, 2),
+        ((0.03, 0.0121, 0.001), 2, 3),  # above 1.2 times the tolerance the third is worth its time
+        ((0.03, 0.0119, 0.001), 1, 2),
+        ((0.0119, 0.03, 0.001), 0, 2),
+        ((0.03, 0.02, 0.025), 1, 3),
+    ],
 )
-def test_a_diameter_takes_the_coarse_mesh_where_it_serves_and_else_the_better_one(coarse, fine, kept):
-    made = [lambda at, one=one: SimpleNamespace(t_error=one[0], converged=one[1]) for one in (coarse, fine)]
-    assert engines._met(*made, 0.17).t_error == kept
+def test_a_diameter_takes_the_first_mesh_that_serves_and_else_the_best(errors, kept, solved):
+    asked = []
+    place, found = engines._met(meshes(asked, *errors), 0.17, 1.2e-2)
+    assert (place, found.t_error) == (kept, errors[kept])
+    assert asked == [(k, 0.17) for k in range(solved)]
+
+
+def test_between_two_diameters_that_need_a_finer_mesh_that_one_begins():
+    """A resonance from 0.15 to 0.19; beside it, and where a neighbour did not fail, the coarse mesh is asked first."""
+    asked = []
+    at = engines._stepped(meshes(asked, lambda d: 0.05 if 0.15 < d < 0.19 else 0.002, 0.004), 1.2e-2)
+    order = [0.1, 0.2, 0.16, 0.18, 0.17, 0.12, 0.165, 0.17]
+    assert [at(d).t_error for d in order] == [0.002, 0.002, 0.004, 0.004, 0.004, 0.002, 0.004, 0.004]
+    want = [(0, 0.1), (0, 0.2), (0, 0.16), (1, 0.16), (0, 0.18), (1, 0.18), (1, 0.17), (0, 0.12), (1, 0.165)]
+    assert asked == want  # 0.17 is remembered
 
 
 def test_a_line_of_a_journal_counts_where_its_columns_are_as_long_as_one_another():
