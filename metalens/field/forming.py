@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from metalens.field import compiled, even, products, together
-from metalens.field.patches import Patch, dense, lagrange
+from metalens.field.patches import Patch, dense, depths_first, lagrange
 from metalens.field.plan import Grid, Plan
 from metalens.field.slopes import by_nodes
 from metalens.field.stray import Stray, add_stray
@@ -27,7 +27,8 @@ from metalens.ground.errors import SceneError
 from metalens.image import Frames
 
 FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one
-CHUNK, AT_ONCE = 8, 128  # frames that are imaged together: on the processor, on another device
+CHUNK, MOST, AT_ONCE = 8, 32, 128  # frames that are imaged together: on the processor at least and at most, elsewhere
+SAMPLES = 1_000_000  # of the sheets that are imaged together on the processor, where that is more than CHUNK frames
 LIGHT = ("outside", "unknown")  # of the parts: shares of light, no errors
 
 
@@ -128,7 +129,9 @@ def _imaged(
 ) -> Tensor:
     """(frames, y, x) of what ``work`` makes of some frames at a time: the image on the whole frame, and all light."""
     grid = optics.grid
-    chunk = chunk or (CHUNK if optics.stack.device.type == "cpu" else AT_ONCE)
+    if chunk is None:
+        few = min(max(SAMPLES // math.prod(given[0].shape[1:]) // CHUNK * CHUNK, CHUNK), MOST)
+        chunk = few if optics.stack.device.type == "cpu" else AT_ONCE
     size = tuple(n + 2 * grid.margin for n in grid.samples)
     if tuple(given[0].shape[-2:]) != size:
         raise SceneError(f"frames of {tuple(given[0].shape[-2:])} samples, need {size}: grid and margin")
@@ -336,7 +339,7 @@ def returned(whole: Tensor, grid: Grid) -> Tensor:
 def _illumination(patch: Patch, between: list[Tensor], energy: Tensor) -> Tensor:
     """(pixels, depths) E at every pixel of a patch."""
     ends = [weights[a:b] for (a, b), weights in zip((patch.rows, patch.columns), between, strict=True)]
-    return torch.einsum("ya,xb,abz->yxz", *ends, energy).flatten(0, 1)
+    return depths_first(torch.einsum("ya,xb,abz->yxz", *ends, energy).flatten(0, 1))
 
 
 def between_nodes(grid: Grid, plan: Plan) -> list[Tensor]:

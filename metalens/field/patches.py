@@ -67,7 +67,12 @@ def _lit(weights: Tensor, mix: Tensor, share: Tensor) -> Tensor:
     """
     held, whole = weights @ mix.sum(1), share[:, None]
     scale = torch.where(held > whole / 2, whole / held, 1.0)
-    return (weights * scale[..., None]).contiguous()
+    return depths_first(weights * scale[..., None])
+
+
+def depths_first(table: Tensor) -> Tensor:
+    """The same (pixels, depths, …), but pixels lie side by side in memory: compiled loops run along them."""
+    return table.movedim(0, -1).contiguous().movedim(-1, 0)
 
 
 def lagrange(wanted: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -252,7 +257,7 @@ def _patch(known: Products, energy: Tensor, lines: tuple[Line, Line], tolerance:
         along[1].ends,
         share.float(),
         _lit(table, mix, share).float(),
-        lit.float(),
+        depths_first(lit.float()),
         mix.float(),
         nodes,
         torch.cat([missing, missing.new_zeros(1)])[: rank + 1],

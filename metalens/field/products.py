@@ -10,6 +10,7 @@ otherwise where it comes from numba's cache.
 
 import functools
 import itertools
+import operator
 from typing import NamedTuple
 
 import numba
@@ -20,7 +21,7 @@ from metalens.field.patches import Patch
 from metalens.ground.arrays import Array
 from metalens.ground.threads import one_blas_thread, split
 
-TOGETHER = 4  # frames that share a reading of the tables
+TOGETHER = 4  # frames whose products are taken at once; a patch's tables are read once for all frames of a call
 SETS = 2  # of patches, summed apart
 LANES = 16  # what the frequencies along a row are filled up to a multiple of
 HELD = 48  # weighted sheets that are transformed at once: 1 MB of them
@@ -85,16 +86,18 @@ def through(
         out: (frames, kinds, sheets, y, x) float32; half a window larger at each side than the frames.
     """
     sets = [out, *(np.zeros_like(out) for _ in range(SETS - 1))]
-    tasks = list(itertools.product(range(0, len(out), TOGETHER), range(SETS)))
+    tasks = list(itertools.product(range(SETS), range(0, len(out), TOGETHER)))
     least = tuple(NOTHING * _largest(part) for part in frames[: out.shape[1]])
     jobs = list(zip(patches, transfer, sizes, strict=True))
 
     def work(start: int, stop: int) -> None:
         room = _room(sizes)
-        for first, which in tasks[start:stop]:
-            few = slice(first, first + TOGETHER)
+        for which, mine in itertools.groupby(tasks[start:stop], key=operator.itemgetter(0)):
+            first = [task[1] for task in mine]
+            few = slice(first[0], first[-1] + TOGETHER)
+            given = [part[few] for part in frames]
             for patch, kernels, size in jobs[which::SETS]:
-                _add([part[few] for part in frames], patch, (kernels, size), least, room, sets[which][few])
+                _add(given, patch, (kernels, size), least, room, sets[which][few])
 
     with one_blas_thread():
         split(len(tasks), work)
@@ -121,10 +124,11 @@ def _add(
     room: tuple[Array, ...],
     out: Array,
 ) -> None:
-    """One patch of a few frames."""
+    """One patch of some frames."""
     (top, below), (left, right) = patch.rows, patch.columns
     kernels, size = given
-    tables = patch.weights.numpy(), patch.energy.numpy()
+    weights, energy = patch.weights.numpy().transpose(1, 2, 0), patch.energy.numpy().T
+    tables = np.ascontiguousarray(weights), np.ascontiguousarray(energy)  # as they lie: see patches.depths_first
     window = out.shape[-1] - frames[0].shape[-1] + 1
     axes = bases(below - top, size[0], window), bases(right - left, size[1], window)
     for kind, content in enumerate(frames[: out.shape[1]]):
@@ -158,13 +162,33 @@ def _any_above(content, least):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _convolved(content, place, held, tables, kind, kernels, axes, room, out, window):  # type: ignore[no-untyped-def]
-    """Add what the sheets ``held`` (frame, sheet) give: weighted, transformed, mixed, led back.
+    """Add what the sheets ``held`` (frame, sheet) give, those of TOGETHER frames at once: weighted, transformed, mixed,
+    led back.
 
     Whole frames and the window of the patch in them: parts of arrays and whole ones would be compiled one by one.
     """
     (top, below), (left, right) = window
-    high, wide = below - top, right - left
+    beyond = out.shape[3] - content.shape[2]  # the window of a PSF less one
     part, depth = content[:, :, top:below, left:right], place[:, :, top:below, left:right]
+    seen = out[:, kind, :, top : below + beyond, left : right + beyond]
+    begin, ready = 0, 0
+    while begin < len(held):
+        end, last = begin, held[begin, 0] // TOGETHER
+        while end < len(held) and held[end, 0] // TOGETHER == last:
+            end += 1
+        few = held[begin:end], kind == 0, ready
+        ready = _together(part, depth, few, tables, kernels, axes, room, seen)
+        begin = end
+
+
+@numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
+def _together(part, depth, given, tables, kernels, axes, room, seen):  # type: ignore[no-untyped-def]
+    """:func:`_convolved` of a few sheets of a patch. Returns of how many kernels the halves are at hand.
+
+    given: the sheets, whether the relative illumination weighs too, kernels whose halves are at hand already.
+    """
+    held, lit, ready = given
+    high, wide = part.shape[2:]
     y, x = axes
     count, lanes, frequencies = len(held), x.cos.shape[1], len(y.across_cos)
     mixed = room[3][: 4 * frequencies * count * lanes].reshape(2, frequencies, count, 2, lanes)
@@ -173,16 +197,18 @@ def _convolved(content, place, held, tables, kind, kernels, axes, room, out, win
     for first in range(0, len(kernels), step):
         few = min(step, len(kernels) - first)
         source = room[0][: high * few * count * wide].reshape(high, few, count, wide)
-        weigh(part, depth, held, tables, kind == 0, first, source)
+        weigh(part, depth, held, tables, lit, first, source)
         cosines, sines = _transformed(source.reshape(high, few * count, wide), axes, room)
         halves = room[2][: 4 * few * frequencies * lanes].reshape(few, frequencies, 4, lanes)
-        _halve(kernels[first : first + few], y.turn, x.turn, halves)
+        if first > 0 or few != ready:
+            _halve(kernels[first : first + few], y.turn, x.turn, halves)
+            ready = few if first == 0 else 0
         shape = frequencies, 2, few, count, lanes
         _mix(cosines.reshape(shape), sines.reshape(shape), halves, mixed)
-    beyond = out.shape[3] - content.shape[2]  # the window of a PSF less one
-    image = _led_back(mixed, axes, (high + beyond, wide + beyond), room)
+    image = _led_back(mixed, axes, seen.shape[2:], room)
     for job in range(count):
-        _add_folded(image, job, out[held[job, 0], kind, held[job, 1], top : below + beyond, left : right + beyond])
+        _add_folded(image, job, seen[held[job, 0], held[job, 1]])
+    return ready
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
@@ -192,10 +218,12 @@ def _transformed(source, axes, room):  # type: ignore[no-untyped-def]
     y, x = axes
     count, lanes, half = high * sheets, x.cos.shape[1], (wide + 1) // 2
     given, folded = source.reshape(count, wide), room[1][: 2 * count * half].reshape(2, count, half)
+    last = np.uint64(wide - 1)  # unsigned: no place counts from the end
     for row in range(count):
+        seen, even, odd = given[row], folded[0, row], folded[1, row]
         for i in range(half):
-            one, other = given[row, i], given[row, wide - 1 - i]
-            folded[0, row, i], folded[1, row, i] = one + other, one - other
+            one, other = seen[i], seen[last - np.uint64(i)]
+            even[i], odd[i] = one + other, one - other
     parts = room[0][: 2 * count * lanes].reshape(2, count, lanes)
     np.dot(folded[0], x.cos, parts[0])
     np.dot(folded[1], x.sin, parts[1])
@@ -277,24 +305,18 @@ def _mix(cosines, sines, halves, mixed):  # type: ignore[no-untyped-def]
     cosines, sines: (F, [real, imaginary], kernels, sheets, G) products with the cosines along y, C, and the sines, S.
     halves: see :func:`_halve`. mixed: ([cosines, sines], F, sheets, [real, imaginary], G).
     """
-    part = np.empty((4, LANES), np.float32)
     _, frequencies, count, _, lanes = mixed.shape
     for f in range(frequencies):
         for job in range(count):
-            for start in range(0, lanes, LANES):
-                part[:] = 0
-                for k in range(len(halves)):
-                    for lane in range(LANES):
-                        g = start + lane
-                        c, d = cosines[f, 0, k, job, g], cosines[f, 1, k, job, g]
-                        s, t = sines[f, 0, k, job, g], sines[f, 1, k, job, g]
-                        p, q, u, v = halves[k, f, 0, g], halves[k, f, 1, g], halves[k, f, 2, g], halves[k, f, 3, g]
-                        part[0, lane] += c * p - d * q - s * u + t * v
-                        part[1, lane] += c * q + d * p - s * v - t * u
-                        part[2, lane] += c * u - d * v + s * p - t * q
-                        part[3, lane] += c * v + d * u + s * q + t * p
-                for lane in range(LANES):
-                    mixed[0, f, job, 0, start + lane] += part[0, lane]
-                    mixed[0, f, job, 1, start + lane] += part[1, lane]
-                    mixed[1, f, job, 0, start + lane] += part[2, lane]
-                    mixed[1, f, job, 1, start + lane] += part[3, lane]
+            a, b, m, n = mixed[0, f, job, 0], mixed[0, f, job, 1], mixed[1, f, job, 0], mixed[1, f, job, 1]
+            for k in range(len(halves)):
+                c, d, s, t = cosines[f, 0, k, job], cosines[f, 1, k, job], sines[f, 0, k, job], sines[f, 1, k, job]
+                p, q, u, v = halves[k, f, 0], halves[k, f, 1], halves[k, f, 2], halves[k, f, 3]
+                for g in range(lanes):  # a loop a sum: with more arrays in one, numbers would be taken one by one
+                    a[g] += c[g] * p[g] - d[g] * q[g] - s[g] * u[g] + t[g] * v[g]
+                for g in range(lanes):
+                    b[g] += c[g] * q[g] + d[g] * p[g] - s[g] * v[g] - t[g] * u[g]
+                for g in range(lanes):
+                    m[g] += c[g] * u[g] - d[g] * v[g] + s[g] * p[g] - t[g] * q[g]
+                for g in range(lanes):
+                    n[g] += c[g] * v[g] + d[g] * u[g] + s[g] * q[g] + t[g] * p[g]

@@ -22,7 +22,8 @@ def test_every_pixel_takes_the_weights_of_its_own_depth(depths, lit):
     energy = draw.uniform(0.5, 1, (high * wide, depths)).astype(np.float32)
     held = np.array([[1, 2], [0, 1], [1, 0]])
     out = np.full((high, few, len(held), wide), np.nan, np.float32)
-    weigh(content, place, held, (table, energy), lit, first, out)
+    depths_first = tuple(np.ascontiguousarray(np.moveaxis(t, 0, -1)) for t in (table, energy))
+    weigh(content, place, held, depths_first, lit, first, out)
     n = min(4, depths)
     for job, (f, s) in enumerate(held):
         for y, x in np.ndindex(high, wide):

@@ -133,18 +133,21 @@ def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_wher
     assert seen.bytes == [3 * each, 3 * each, each]
 
 
-@pytest.mark.parametrize(("device", "sizes"), [("cpu", [8, 8, 1]), (AWAY, [17])])
-def test_a_cache_holds_eight_frames_and_a_gpu_is_given_a_hundred_and_twenty_eight(monkeypatch, device, sizes):
+@pytest.mark.parametrize(
+    ("device", "side", "sizes"), [("cpu", 250, [8, 8, 8, 8, 2]), ("cpu", 20, [32, 2]), (AWAY, 20, [34])]
+)
+def test_a_processor_images_eight_frames_or_more_small_ones_and_a_gpu_a_hundred(monkeypatch, device, side, sizes):
+    """A million samples of two sheets are 8 frames of 250 samples along a side, and far more than 32 of 20."""
     seen = []
     monkeypatch.setattr(forming, "blurred", lambda few, optics: seen.append(len(few.radiance)) or few.radiance[:, 0])
     monkeypatch.setattr(forming, "returned", lambda total, grid: total)
-    optics = SimpleNamespace(grid=GRID, stack=torch.empty(1, device=device), stray=None)
-    size = tuple(n + 2 * GRID.margin for n in GRID.samples)
-    many = torch.empty(17, 2, *size, device=device)
+    grid = dataclasses.replace(GRID, samples=(side, side), margin=0)
+    optics = SimpleNamespace(grid=grid, stack=torch.empty(1, device=device), stray=None)
+    many = torch.empty(34, 2, side, side, device=device)
     forming.image(Frames(many, many, many), optics)
     assert seen == sizes
     if device == AWAY:
-        more = torch.empty(300, 2, *size, device=device)
+        more = torch.empty(300, 2, side, side, device=device)
         forming.image(Frames(more, more, more), optics)
         assert seen[1:] == [128, 128, 44]
 
