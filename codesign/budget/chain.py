@@ -82,10 +82,11 @@ class PlanConfig:
                 f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}, led_fwhm_nm = "
                 f"{self.led_fwhm_nm}: need 0.02 to 4 mm, 1 or more of both, and a width of 0 or more"
             )
-        if self.cell.lattice.kind != "square" or not self.cell.alike:
+        square = self.cell.lattice.kind == "square"
+        if not square or not self.cell.alike:
             raise ConfigError(
-                f"cell: {self.cell.described}: a plan is of unpolarised light and needs pillars on a square "
-                "lattice that answer x and y alike (metalens psf, layout and view take any)"
+                f"cell.{'shape' if square else 'lattice'}: {self.cell.described}: a plan is of unpolarised light and "
+                "needs pillars on a square lattice that answer x and y alike (metalens psf, layout and view take any)"
             )
         if self.source is not None:
             spectrum.points(self.source)  # refused now, not after the floor was measured

@@ -149,8 +149,14 @@ def test_a_run_at_one_wavelength_is_planned():
         ("wavelengths_nm = [850.0, 905.0]", "one wavelength or a diode about it"),
         ("[[layers.behind]]\nmaterial = 'N-BK7'\nthickness_um = 100.0", "metalens budget LENS reckons with them"),
         ("led_fwhm_nm = 300.0", "reaches to 100 nm, where the sensor's silicon is not known"),
-        ("[cell]\npitch_um = 0.35\n[cell.lattice]\nkind = 'hexagonal'", "needs pillars on a square lattice"),
-        ("[cell]\npitch_um = 0.4\n[cell.shape]\nkind = 'rectangle'\nratio = 0.6", "that answer x and y alike"),
+        (
+            "[cell]\npitch_um = 0.35\n[cell.lattice]\nkind = 'hexagonal'",
+            "cell.lattice: circle on a hexagonal lattice: ",
+        ),
+        (
+            "[cell]\npitch_um = 0.4\n[cell.shape]\nkind = 'rectangle'\nratio = 0.6",
+            "cell.shape: rectangle 1:0.6 on a square lattice: ",
+        ),
         ("led_fwhm_nm = 1e-9", "is one wavelength; give no width for it"),
     ],
 )
