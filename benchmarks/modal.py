@@ -15,7 +15,7 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
 from metalens.modal import gradient, solve
 from metalens.modal.case import case_of
-from metalens.modal.engine import basis, evaluate, geometry
+from metalens.modal.engine import evaluate, geometry, kept, kept_long
 from metalens.modal.ladder import RUNGS
 
 WAVELENGTH_UM = 0.85
@@ -51,8 +51,9 @@ def references(angle_deg: float) -> dict[tuple[float, str], complex]:
 
 
 def forget() -> None:
-    geometry.cache_clear()
-    basis.cache_clear()
+    """Whatever earlier solves left."""
+    for held in (geometry, kept, kept_long):
+        held.cache_clear()
 
 
 def normal(tolerance: float) -> Row:

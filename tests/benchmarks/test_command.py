@@ -6,9 +6,10 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from benchmarks import Row
+from benchmarks import Row, modal
 from benchmarks.__main__ import LONG, main, table
 from benchmarks._stored import compared, machine
+from metalens.modal import engine
 
 
 def test_topics_that_are_not_there_are_refused_before_any_work(capsys):
@@ -68,3 +69,11 @@ def test_a_machine_tells_its_speed_by_jobs_of_their_own():
     speed = machine()["speed"]
     assert set(speed) == {"products_gflops", "transform_ms", "loop_ms"}
     assert all(value > 0 for value in speed.values())
+
+
+def test_solves_of_the_modal_benchmark_find_nothing_of_those_before():
+    modal.solve(modal.CELL, 0.1, 0.85, tolerance=1e-2)
+    held = engine.geometry, engine.kept, engine.kept_long
+    assert any(cache.cache_info().currsize for cache in held)
+    modal.forget()
+    assert [cache.cache_info().currsize for cache in held] == [0, 0, 0]
