@@ -166,3 +166,60 @@ def test_cells_on_the_rim_of_a_pupil_weigh_their_share_inside():
     rim = (share > 0) & (share < 1)
     assert np.abs(weight - share)[rim].mean() < 0.05  # slant of the rim; slow growth of obliquity to it
     assert weight[rim].sum() == pytest.approx(share[rim].sum(), rel=0.03)
+
+
+@pytest.mark.parametrize("high", [0.4, 2.0, 600.0])
+def test_a_plane_without_noise_is_found_whatever_stands_on_it(high):
+    """Three robust sigma of nothing leave only the plane itself: weak light is no part of it, nor is strong."""
+    y, x = np.mgrid[-1:1:21j, -1:1:27j]
+    plane = 5.3 * x - 7.1 * y
+    level = 40 + plane
+    for row, column in ((0, 20), (3, 26), (18, 25), (20, 22)):
+        level[row, column] += high
+    assert pupilfit._plane(np.tile(level, (3, 1, 1))) == pytest.approx(plane, abs=1e-7)  # 1e-9 a round
+
+
+def frames_of(light, usable=None):
+    usable = np.ones(light.shape, bool) if usable is None else usable
+    return SimpleNamespace(
+        electrons=light, usable=usable, saturated=np.zeros(light.shape, bool),
+        variance_e2=np.full(light.shape, 4.0), scale=np.arange(light[0].size, dtype=float).reshape(light.shape[1:]),
+    )  # fmt: skip
+
+
+def bead_at(row, column):
+    """5 x 5 pixels of 600, 750 and 900 in the middle."""
+    y, x = np.mgrid[:30, :41]
+    bead = 900.0 - 150 * np.maximum(np.abs(x - column), np.abs(y - row))
+    return np.where(bead < 500, 0, bead)
+
+
+@pytest.mark.parametrize(
+    ("centre", "first"), [((14, 21), (6, 13)), ((4, 21), (0, 13)), ((14, 36), (6, 25)), ((26, 4), (14, 0))]
+)
+def test_the_window_lies_about_the_bead_and_moves_inwards_at_an_edge(centre, first):
+    """16 pixels of 30 x 41 about the brightest place, or about the one that is stated."""
+    light = 20.0 + np.array([0.3, 1.0, 0.7, 0.5])[:, None, None] * bead_at(*centre)
+    found, background, notes = pupilfit._crop(frames_of(light), SPEC)
+    part = (slice(None), slice(first[0], first[0] + 16), slice(first[1], first[1] + 16))
+    assert found.electrons == pytest.approx(light[part])
+    assert background == pytest.approx(20.0, abs=1e-9)  # the median is far from the bead
+    assert any("near the edge" in words for words in notes) == (first != (centre[0] - 8, centre[1] - 8))
+    whole = np.broadcast_to(frames_of(light).scale, light.shape)
+    assert np.array_equal(found.scale, whole[part])
+
+
+@pytest.mark.parametrize(("tilt", "taken"), [(8.5, False), (9.5, True)])
+def test_a_plane_is_taken_off_from_a_fiftieth_of_the_light_on(tilt, taken):
+    """Over the window it changes by ``tilt`` along each axis, of a light of 900 above the middle of the frame."""
+    y, x = np.mgrid[:30, :41]
+    slope = tilt / 15 * ((x - 20) - (y - 15))
+    light = np.tile(50.0 + slope + bead_at(15, 20), (4, 1, 1))
+    found, background, notes = pupilfit._crop(frames_of(light), SPEC)
+    part = (slice(7, 23), slice(12, 28))
+    plane = np.ptp(slope[part])
+    assert plane == pytest.approx(2 * tilt)
+    level = 0.0 if not taken else tilt / 15 * ((x - 19.5) - (y - 14.5))[part]
+    assert found.electrons[0] == pytest.approx((light[0][part] - level), abs=1e-9)
+    assert any(f"plane of {plane:.3g} e" in words for words in notes) == taken
+    assert background == pytest.approx(50.0 if taken else np.median(light), abs=1e-9)

@@ -61,6 +61,19 @@ def test_a_corner_that_points_at_a_corner():
     assert convex.gap(one, two, 17, 25) == 0.0  # corner on corner
 
 
+@pytest.mark.parametrize(
+    ("step", "count", "at"), [((20, 17), 17, 6), ((2, 11), 39, 5), ((1, 25), 56, 9), ((3, 7), 8, 3)]
+)
+def test_a_corner_on_a_slanted_side_touches_exactly(step, count, at):
+    """A side of so many steps of whole numbers; the corner lies on one of them, where shares of the side round."""
+    (p, q), corner = step, np.array([[0, 0], [40, -70], [90, -60]])
+    side = np.array([[0, 0], [count * p, count * q], [0, count * q]])
+    assert convex.gap(side, corner, at * p, at * q) == 0.0
+    assert convex.gap(corner, side, -at * p, -at * q) == 0.0
+    assert convex.gap(side, corner, at * p - 1, at * q) == -1.0
+    assert 0 < convex.gap(side, corner, at * p + 1, at * q) < 1
+
+
 @given(
     seed=st.integers(0, 10_000),
     sides=st.tuples(st.integers(3, 9), st.integers(3, 9)),
