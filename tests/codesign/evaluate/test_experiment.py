@@ -130,17 +130,6 @@ def test_spread_points_reach_the_corners():
     assert gaps.max() < 10.0  # of a field of 35 x 25 degrees
 
 
-def test_a_share_is_of_all_points_of_an_oblong_grid():
-    """18 points: 0.17 of them are three, enough to calibrate on; 0.05 are one."""
-    for grid in ((2, 9), (9, 2)):
-        assert len(ExperimentConfig(grid=grid, share=0.17).stimuli_deg) == 18
-        with pytest.raises(ConfigError, match="3 or more stimuli"):
-            ExperimentConfig(grid=grid, share=0.05)
-    config = ExperimentConfig(subjects=3, grid=(2, 9), axial_mm=(1.0, 2.0, 4.0), lateral_mm=(-3.0,))
-    assert config.frames == 3 * 18 * (1 + 3 + 1)
-    assert config.slips_mm.tolist() == [[0, 0, 0], [-3, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 4]]
-
-
 @pytest.mark.parametrize("change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}])
 def test_impossible_experiments_are_refused(change):
     with pytest.raises(ConfigError, match="subject"):
