@@ -33,6 +33,7 @@ def test_frames_are_the_same_from_two_workers(here):
         assert frames() == here
 
 
+@pytest.mark.slow  # in small: metalens/pillars/test_workers.py
 def test_frames_are_the_same_from_a_cluster_that_loses_a_worker(here, tmp_path):
     with losing_one(tmp_path) as address, executor.on(address):
         assert frames() == here

@@ -13,24 +13,19 @@ from tests.lost_worker import losing_one
 
 
 def content(lens):
-    """All numbers of a study with 40 draws, two batches, as bytes."""
-    found = tolerance.analyse(lens, Process(), sens=SENS, draws=40, seed=3)
+    """All numbers of a study with 26 draws, two batches, as bytes."""
+    found = tolerance.analyse(lens, Process(), sens=SENS, draws=26, seed=3)
     rows = [getattr(found.draws, field.name).tobytes() for field in dataclasses.fields(found.draws)]
     return [*rows, repr((found.effects, found.rank, found.error))]
 
 
 @pytest.fixture(scope="module")
 def plain():
-    lens = hyperbolic(51)
+    lens = hyperbolic(31)
     return lens, content(lens)
 
 
-def test_draws_are_the_same_from_more_workers_than_batches(plain):
-    lens, here = plain
-    with executor.on(processes=3):  # two batches
-        assert content(lens) == here
-
-
+@pytest.mark.slow  # in small: metalens/pillars/test_workers.py
 def test_draws_are_the_same_from_a_cluster_that_loses_a_worker(plain, tmp_path):
     lens, here = plain
     with losing_one(tmp_path) as address, executor.on(address):
@@ -43,9 +38,10 @@ def unlike(cell, diameter_um, wavelength_um, finer):
     return (1 + 0.01 * finer) * (change * diameter_um / wavelength_um + 2.1)
 
 
-def test_answers_of_a_solver_are_gathered_in_the_order_of_their_causes():
-    lens = dataclasses.replace(hyperbolic(), cell=dataclasses.replace(hyperbolic().cell, pillar=Index(3.6)))
-    here = sensitivity.sensitivities(lens, count=5, solver=unlike)
-    with executor.on(processes=2):
-        there = sensitivity.sensitivities(lens, count=5, solver=unlike)
-    assert there.rates.tobytes() == here.rates.tobytes()
+def test_more_workers_than_batches_give_the_same_draws_and_answers_in_the_order_of_their_causes(plain):
+    lens, here = plain
+    solved = dataclasses.replace(lens, cell=dataclasses.replace(lens.cell, pillar=Index(3.6)))
+    answers = sensitivity.sensitivities(solved, count=5, solver=unlike)
+    with executor.on(processes=3):  # two batches
+        assert content(lens) == here
+        assert sensitivity.sensitivities(solved, count=5, solver=unlike).rates.tobytes() == answers.rates.tobytes()

@@ -95,6 +95,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
     tasks = [workers.points_task(CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa") for i in range(6)]
     with losing_one(tmp_path) as address, executor.on(address):
         found = dict(workers.run(tasks))
+        assert executor.gather(divmod, 47, [5, 9, 3]) == [(9, 2), (5, 2), (15, 2)]  # in the order of the tasks
     assert found == dict(workers.run(tasks, processes=1))
 
 
