@@ -86,8 +86,21 @@ def test_dense_windows_step_by_half_their_size_both_ways():
     }
     assert {v.box for v in found.violations} == boxes
     assert {(v.rule, v.value, v.limit, v.text) for v in found.violations} == {("density", share, 0.9 * share, "L")}
-    assert found.maximum_density == share
+    assert (found.maximum_density, found.counts["density"]) == (share, 4)
     assert drc.check(plan, dataclasses.replace(rules, maximum_density=share)).ok
+
+
+def test_windows_reach_over_the_last_rows_and_columns():
+    """30 rows of 300 and 25 columns of 400 units, in tiles of 27 and 20: windows begin at rows 0 and 27 (of 3 left) and
+    columns 0 and 20 (of 5 left)."""
+    plan = plan_of(rectangle("C", 160, 100), classes=np.ones((30, 25), np.uint8), pitch=400, down=300)
+    found = drc.check(plan, dataclasses.replace(LOOSE, maximum_density=1e-6, density_window_um=8))
+    one = 320 * 200 / (16_000 * 16_200)
+    assert {(v.box[0], v.box[3]): v.value for v in found.violations} == pytest.approx(
+        {(-700, 900): 750 * one, (7300, 900): 150 * one, (-700, -7200): 75 * one, (7300, -7200): 15 * one}
+    )
+    small = drc.check(plan, dataclasses.replace(LOOSE, maximum_density=0.1, density_window_um=0.1))
+    assert small.maximum_density == pytest.approx(320 * 200 / (400 * 300))  # a window is two pillars wide at least
 
 
 def test_feet_are_told_once_a_lattice():
