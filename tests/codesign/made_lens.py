@@ -33,7 +33,7 @@ pixels = 48
 margin = 4
 [inner]
 steps = 1
-batch = 2
+batch = 8
 [inner.optics]
 rate = 0.0
 [search]

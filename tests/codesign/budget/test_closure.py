@@ -31,7 +31,7 @@ FRAMES = ExperimentConfig(
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     folder = tmp_path_factory.mktemp("closure") / "run"
-    m.finished_run(folder)
+    m.finished_run(folder, m.TINY.replace("batch = 8", "batch = 48"))  # a subject's frames are read at once
     return retraining.load(folder)
 
 

@@ -24,6 +24,7 @@ from layout.process import process
 from metalens import lens
 from metalens.cli import main
 from metalens.ground import config
+from tests.command_line import run
 
 DIES = """
 import os, signal, sys
@@ -48,15 +49,36 @@ def folder(tmp_path_factory):
     return path
 
 
-def _retrain(folder, *words, record="asbuilt.h5", out="out"):
-    command = ["retrain", str(folder / "run"), "--asbuilt", str(folder / record), "-o", str(folder / out), *SHORT]
-    return main([*command, *words])
+def _command(folder, *words, record="asbuilt.h5", out="out"):
+    return ["retrain", folder / "run", "--asbuilt", folder / record, "-o", folder / out, *SHORT, *words]
 
 
-def test_files_report_and_rules_of_overwriting(folder, capsys, monkeypatch):
+def _retrain(folder, *words, **files):
+    return main([str(word) for word in _command(folder, *words, **files)])
+
+
+@pytest.fixture(scope="module")
+def told(folder):
+    """What a retraining whose truth is known says; its folder is ``out``."""
+    done = run(*_command(folder, "--json", "--truth", folder / "truth.toml"))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def bowed(folder):
+    """The same of a lens whose truth nobody knows and whose bow is known to 5 nm, all else to 0.1: ``bowed``."""
+    made = m.asbuilt()
+    covariance = made.covariance.copy()
+    covariance[made.names.index("bias_r_nm")] *= 2500.0  # on the diagonal alone
+    asbuilt.save(folder / "bowed.h5", dataclasses.replace(made, covariance=covariance))
+    done = run(*_command(folder, "--json", record="bowed.h5", out="bowed"))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch):
     truth = ["--truth", str(folder / "truth.toml")]
-    assert _retrain(folder, "--json", *truth) == 0
-    told = json.loads(capsys.readouterr().out)
     assert set(told["cases"]) == {"designed", "nominal", "before", "after", "known"}
     assert told["next_lens"][0]["name"] == "as made"
     page = (folder / "out" / "report.html").read_text()
@@ -130,17 +152,9 @@ def test_a_foreign_folder_is_not_overwritten_by_force(folder, capsys):
     assert (folder / "thesis" / "chapter.txt").exists()
 
 
-def test_where_the_map_alone_is_open_the_table_is_written(folder, capsys):
-    """A bow known to 5 nm, all else to 0.1."""
-    made = m.asbuilt()
-    covariance = made.covariance.copy()
-    covariance[made.names.index("bias_r_nm")] *= 2500.0  # on the diagonal alone
-    asbuilt.save(folder / "bowed.h5", dataclasses.replace(made, covariance=covariance))
-    truth = ["--truth", str(folder / "truth.toml")]
-    assert _retrain(folder, "--json", *truth, record="bowed.h5", out="bowed") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["correction_refused"] == ""
-    assert "what varies over the lens" in told["map_refused"]
+def test_where_the_map_alone_is_open_the_table_is_written(folder, bowed):
+    assert bowed["correction_refused"] == ""
+    assert "what varies over the lens" in bowed["map_refused"]
     assert (folder / "bowed" / "bias.toml").exists()
     assert not (folder / "bowed" / "lens_corrected.h5").exists()
     assert "No lens_corrected.h5 is written" in (folder / "bowed" / "report.html").read_text()
@@ -160,6 +174,7 @@ def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(fol
 
 
 LOOK = ["--subjects", "1", "--grid", "3", "3", "--share", "0.3", "--people", "2"]
+LOOK += ["--axial-mm", "2.5", "--lateral-mm", "1.5"]
 
 
 def _shown(folder, *runs, out):
@@ -167,23 +182,22 @@ def _shown(folder, *runs, out):
     return main(["evaluate", "experiment", *places, "-o", str(folder / out), *LOOK, "--json", "--force"])
 
 
+@pytest.mark.usefixtures("told")
 def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(folder, capsys):
     """What the run read through its design, the unwarned and the retrained network read through the lens as made."""
-    assert _retrain(folder, "--quiet", "--truth", str(folder / "truth.toml"), out="told") == 0
-    capsys.readouterr()
-    assert _shown(folder, "run", "told/nominal.safetensors", "told", out="shown") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in told["runs"]] == ["run", "told nominal", "told"]
-    assert list(told["lenses"].values()) == ["as designed", "as made", "as made"]
-    assert "told: through the lens as made" in (folder / "shown" / "report.html").read_text()
-    made, plain = retrained.load(folder / "told"), retrained.load(folder / "run")
+    assert _shown(folder, "run", "out/nominal.safetensors", "out", out="shown") == 0
+    seen = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in seen["runs"]] == ["run", "out nominal", "out"]
+    assert list(seen["lenses"].values()) == ["as designed", "as made", "as made"]
+    assert "out: through the lens as made" in (folder / "shown" / "report.html").read_text()
+    made, plain = retrained.load(folder / "out"), retrained.load(folder / "run")
     design = lens.load_plain(folder / "run" / "lens.h5")
     response = asbuilt.load(folder / "asbuilt.h5").response
     true = config.load(folder / "truth.toml", Truth)
     wanted = MadeLens(design, made.settings.optics, response=response).stack(true.vector())
     assert torch.equal(made.made.intensity, wanted.intensity)
     assert plain.made is None
-    kept = load_file(folder / "told" / "retrained.safetensors")
+    kept = load_file(folder / "out" / "retrained.safetensors")
     before = plain.run.trainer.model.net.state_dict()
     moved = {n: w for n, w in made.run.trainer.model.net.state_dict().items() if not torch.equal(w, before[n])}
     assert moved
@@ -192,16 +206,16 @@ def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
     assert not torch.equal(through[0].stack, through[1].stack)
 
 
+@pytest.mark.usefixtures("bowed")
 def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(folder, tmp_path, capsys):
-    for name in ("run", "asbuilt.h5"):
+    for name in ("run", "bowed", "bowed.h5"):
         (shutil.copytree if (folder / name).is_dir() else shutil.copy)(folder / name, tmp_path / name)
-    assert _retrain(tmp_path, "--quiet", out="told") == 0
-    assert retrained.lens_of(tmp_path / "told") == "as fitted"
-    assert _shown(tmp_path, "told/known.safetensors", out="shown") == 2
+    assert retrained.lens_of(tmp_path / "bowed") == "as fitted"
+    assert _shown(tmp_path, "bowed/known.safetensors", out="shown") == 2
     assert "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err
-    asbuilt.save(tmp_path / "asbuilt.h5", m.asbuilt(sigma=0.2))
-    assert _shown(tmp_path, "told", out="shown") == 2
-    assert "asbuilt.h5 is not what it was retrained from" in capsys.readouterr().err
+    asbuilt.save(tmp_path / "bowed.h5", m.asbuilt(sigma=0.2))
+    assert _shown(tmp_path, "bowed", out="shown") == 2
+    assert "bowed.h5 is not what it was retrained from" in capsys.readouterr().err
     (tmp_path / "run").rename(tmp_path / "away")
-    assert _shown(tmp_path, "told", out="shown") == 2
+    assert _shown(tmp_path, "bowed", out="shown") == 2
     assert "its run is no longer at" in capsys.readouterr().err

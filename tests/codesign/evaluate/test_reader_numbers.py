@@ -16,7 +16,9 @@ import made_lens as m
 from codesign.evaluate import reader
 from codesign.evaluate.reader import Frames, Read, ReaderConfig
 from codesign.network import blur
+from metalens import design
 from metalens.cell import Film, Index
+from metalens.design import Focus
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers
 
@@ -200,9 +202,11 @@ def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometre
     made = []
     monkeypatch.setattr(reader, "scenery", lambda config, *, sensor_distance_um: sensor_distance_um)
     monkeypatch.setattr(reader, "read", lambda optics, seen, config: made.append((optics, seen)))
-    config = ReaderConfig(pixels=32, pitch_um=9.0, depths_mm=(2.1, 3.4), tolerance=0.2)
-    glass = Layers(behind=(Film(Index(1.5), 60.0),))
-    behind = replace(m.small(), layers=glass)
+    config = ReaderConfig(pixels=32, pitch_um=9.0, depths_mm=(2.1, 3.4), tolerance=0.4)
+    glass, focus = Layers(behind=(Film(Index(1.5), 60.0),)), Focus(0.85, 300.0, 3000.0)
+    wanted = design.phase_of(None, focus, radius_um=18.0)
+    bare = design.make(wanted, focus, aperture_um=36.0, cell=m.CELL, proxy=m.PROXY)[0]
+    behind = replace(bare, layers=glass)
     assert [name for name, _ in reader.judged({"glass": behind}, config)] == ["glass"]
     ((optics, seen),) = made
     assert seen == pytest.approx(240.0 + 60.0 / 1.5)
@@ -210,4 +214,4 @@ def test_lenses_are_read_through_their_true_images_over_the_depths_in_micrometre
     assert (grid.samples, grid.step_um, grid.depths_um) == ((32, 32), 9.0, (2.1e3, 3.4e3))
     assert (grid.margin, grid.window) == (16, 33)  # 144 um
     with pytest.raises(ConfigError, match="different sensor distances"):  # 300 and 280 um
-        list(reader.judged({"glass": behind, "air": m.small()}, config))
+        list(reader.judged({"glass": behind, "air": bare}, config))
