@@ -168,7 +168,7 @@ def test_cells_on_the_rim_of_a_pupil_weigh_their_share_inside():
     assert weight[rim].sum() == pytest.approx(share[rim].sum(), rel=0.03)
 
 
-@pytest.mark.parametrize("high", [0.4, 2.0, 600.0])
+@pytest.mark.parametrize("high", [0.4, 2.0, 600.0, -2.0])
 def test_a_plane_without_noise_is_found_whatever_stands_on_it(high):
     """Three robust sigma of nothing leave only the plane itself: weak light is no part of it, nor is strong."""
     y, x = np.mgrid[-1:1:21j, -1:1:27j]

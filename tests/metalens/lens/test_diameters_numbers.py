@@ -27,7 +27,7 @@ def test_columns_and_rows_of_a_hexagonal_lattice():
     assert made.grid == pytest.approx(Grid(0.25, 0.25 * math.sqrt(3), math.sqrt(3) / 2 * 0.25))
     assert made.x_um == pytest.approx([-0.375, -0.125, 0.125, 0.375])
     assert made.y_um == pytest.approx(np.array([-1, 0, 1]) * 0.25 * math.sqrt(3))
-    assert made.pillars == 6
+    assert (made.pillars, DiameterMap(checkered(3, 5), 0.5, HEXAGONAL).pillars) == (6, 8)
     assert not made.plain
 
 
@@ -61,7 +61,7 @@ def test_the_outermost_pillar_on_unlike_axes(monkeypatch, blocks):
     lattice = Lattice("rectangular", 1.5)
     for pillars, farthest in (
         ([(2, 2)], (0, 0.5)), ([(0, 1), (2, 3)], (2, 0.5)), ([(3, 0), (1, 2)], (1, 1.5)), ([(2, 0), (2, 1)], (0, 1.5)),
-        ([(1, 3), (3, 2)], (1, 1.5)),
+        ([(1, 3), (3, 2)], (1, 1.5)), ([(2, 1), (2, 3)], (0, 1.5)),
     ):  # fmt: skip
         sizes = np.zeros((5, 4))
         for row, column in pillars:
@@ -75,6 +75,9 @@ def test_the_outermost_pillar_on_unlike_axes(monkeypatch, blocks):
 def test_the_first_diameter_that_cannot_be_is_named(monkeypatch, bad):
     monkeypatch.setattr(diameters, "_BLOCK_ROWS", 2)
     sizes = np.full((6, 3), 0.2)
+    sizes[0, 0], sizes[5, 1] = 0, bad
+    with pytest.raises(LensError, match=f"row 5, column 1 is {bad} um"):
+        DiameterMap(sizes, 0.5)
     sizes[3, 2] = sizes[4, 0] = bad
     with pytest.raises(LensError, match=f"row 3, column 2 is {bad} um"):
         DiameterMap(sizes, 0.5)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from metalens.ground.errors import DomainError
-from metalens.pillars import inverse
+from metalens.pillars import inverse, polynomial
 from metalens.pillars.polynomial import Curve
 
 TURN = 2 * math.pi
@@ -79,3 +79,15 @@ def test_a_tensor_has_the_derivative_of_the_inverse():
     (found * torch.tensor([1.0, -3.0])).sum().backward()
     rate = (HIGH**2 - LOW**2) / (2 * 1.5) / (2 * found.detach().numpy())
     assert phase.grad.tolist() == pytest.approx((rate * [1, -3]).tolist(), rel=1e-9)
+
+
+def test_one_step_from_the_table_is_the_rule(monkeypatch):
+    """4095 steps of 2 rad: between two, phase is a line of the diameter to 1e-7 rad, squared beyond rounding."""
+    slope_of, steps = polynomial.slope_of, []
+    monkeypatch.setattr(polynomial, "slope_of", lambda p, d: steps.append(len(d)) or slope_of(p, d))
+    for half in (1.0, -1.0):
+        steps.clear()
+        phase = np.linspace(1.0, 3.0, 701)
+        found = inverse.diameter(line(2.0, half), phase, within_um=None, gap="refuse")
+        assert found == pytest.approx(at((phase - 2.0) / half), rel=1e-9)
+        assert steps == [701]
