@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.model import LIGHT, PLACE, Known, Spectrum, extra_path, incidence_rad, light_maps, made, vector
+from characterize.model import LIGHT, PLACE, Films, Known, Spectrum, extra_path, incidence_rad, light_maps, made, vector
 from metalens import psf
 from metalens.ground import executor
 from metalens.ground.arrays import Array
@@ -135,7 +135,7 @@ def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
     seen = executor.gather(_shown, _Made(lens, truth, response), tasks, beside=False)
     for task, light in zip(tasks, seen, strict=True):
         frames[task.index] += task.weight * light
-    return np.asarray(frames / depth[:, None, None] ** 2)
+    return np.asarray(frames / Films.of(lens.layers, lens.wavelength_um).apparent_um(depth[:, None, None]) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,14 +149,15 @@ class _Way:
 
 def _alike(lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Array) -> Iterator[tuple[_Way, list[int]]]:
     """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold; through glass one by one."""
-    distance = lens.sensor_distance_um + x[PLACE["distance_um"]]
+    distance, films = lens.sensor_distance_um + x[PLACE["distance_um"]], Films.of(lens.layers, lens.wavelength_um)
     ways: dict[_Way, list[int]] = {}
     for i, (z, angle) in enumerate(zip(depth_um.tolist(), angles_rad.tolist(), strict=True)):
         chief = [
             math.tan(a) + math.tan(math.radians(x[PLACE[f"tilt_{n}_deg"]])) for a, n in zip(angle, "xy", strict=True)
         ]
-        source = [c - x[PLACE[f"source_{a}_um"]] / z for c, a in zip(chief, "xy", strict=True)]
-        shift = [distance * (c - s) + x[PLACE[f"decentre_{a}_um"]] for c, s, a in zip(chief, source, "xy", strict=True)]
+        source = [c - x[PLACE[f"source_{a}_um"]] / films.apparent_um(z) for c, a in zip(chief, "xy", strict=True)]
+        ends = zip(*(films.chief_um(distance, (one[0], one[1])) for one in (chief, source)), strict=True)
+        shift = [c - s + x[PLACE[f"decentre_{a}_um"]] for (c, s), a in zip(ends, "xy", strict=True)]
         incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
         ways.setdefault(_Way((source[0], source[1]), (shift[0], shift[1]), incidence), []).append(i)
     fine = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
@@ -218,8 +219,10 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
     if uneven.any():
         radius = lens.diameters.radius_um
         t = t * np.exp(np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2)
+    films = Films.of(lens.layers, wavelength_um)
+    near, far = films.reduced_um(distance), films.apparent_um(depth_um)
     if x[PLACE["glass_um"]]:
-        path = extra_path(across, down, tangents=way.source, depth_um=float(depth_um[0]), values=x)
+        path = extra_path(across, down, tangents=way.source, depth_um=float(far[0]), values=x)
         t = t * np.exp(2j * math.pi / wavelength_um * path)
     side = camera.pixels + 2 * _MARGIN
     middle = 0.0 if camera.pixels % 2 else -camera.pixel_um / 2  # the chief ray meets pixel (n // 2, n // 2)
@@ -238,8 +241,8 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
         layers=lens.layers,
     )
     step, out = camera.pixel_um / FINE, []
-    for light, energy, z in zip(stack.intensity, stack.energy_um2, depth_um, strict=True):
-        disc_px = x[PLACE["pinhole_um"]] * distance / z / step
+    for light, energy, z in zip(stack.intensity, stack.energy_um2, far, strict=True):
+        disc_px = x[PLACE["pinhole_um"]] * near / z / step
         light = _cell_means(_blur(light * energy, disc_px, x[PLACE["crosstalk_px"]] * FINE))
         out.append(light.reshape(side, FINE, side, FINE).sum((1, 3))[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
     return np.stack(out)

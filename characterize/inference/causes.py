@@ -221,7 +221,7 @@ def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
 
 def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
     """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus there."""
-    k, radius, d = 2 * math.pi / lens.wavelength_um, lens.diameters.radius_um, lens.sensor_distance_um
+    k, radius, d = 2 * math.pi / lens.wavelength_um, lens.diameters.radius_um, lens.reduced_um
     r = radius * np.hypot(u, v)
     sine = 1 / np.hypot(r, d) + (1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0)
     return np.asarray(k * radius * (u, v)[along] * sine)

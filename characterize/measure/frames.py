@@ -124,7 +124,7 @@ def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Fi
     place_px: (x, y) of its middle from the window's.
     """
     wave = capture.wavelength_um if math.isfinite(capture.wavelength_um) else design.wavelength_um
-    sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.sensor_distance_um)
+    sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.reduced_um)
     within = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
     y, x = (
         (np.arange(n)[:, None] - (n - 1) / 2 - p + within).ravel() for n, p in zip(shape, place_px[::-1], strict=True)
@@ -251,7 +251,7 @@ def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dic
         tangent = np.tan(np.radians(field))
         if not tangent.any():
             continue
-        straight = design.sensor_distance_um * tangent
+        straight = design.reduced_um * tangent
         ratio[field] = float((np.mean(places[field], axis=0) - zero) @ straight / (straight @ straight))
         least = ratio[field] if math.isinf(least) else least
     return {field: value / least - 1 for field, value in sorted(ratio.items())}

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from characterize.model import thinplate as thinplate
     from characterize.model.detector import oversampling as oversampling
     from characterize.model.forward import ForwardModel as ForwardModel
+    from characterize.model.glass import Films as Films
     from characterize.model.glass import extra_path as extra_path
     from characterize.model.parameters import NAMES as NAMES
     from characterize.model.parameters import PARAMETERS as PARAMETERS
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Films": "glass",
         "ForwardModel": "forward",
         "Known": "parameters",
         "LIGHT": "setting",

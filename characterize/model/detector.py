@@ -167,7 +167,7 @@ def fine_enough(pixel_um: float, highest: float) -> int:
 
 def oversampling(lens: Lens, pixel_um: float) -> int:
     """Samples along a pixel's side that are fine enough for the light of a lens."""
-    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.sensor_distance_um)
+    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.reduced_um)
     return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
 
 

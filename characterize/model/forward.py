@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from characterize.model import detector, moments
-from characterize.model.glass import source_paths
+from characterize.model.glass import Films, source_paths
 from characterize.model.kernel import real_of, turns
 from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
@@ -32,7 +32,6 @@ from characterize.model.window import Operators
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
-from metalens.ground.paths import sensor_path
 from metalens.lens import Lens
 from metalens.made import Answers, Sensitivity, Widens, named, of_kind
 
@@ -59,11 +58,8 @@ class ForwardModel:
     """
 
     def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
-        if not lens.layers.plain or lens.layers.stop is not None:
-            raise FitError(
-                f"the lens has layers ({len(lens.layers.films)} films, cover {lens.layers.filling}, {lens.layers.stop})"
-                ", the model of the fit has air alone: fit a lens that has no layers; its distance is then that in air"
-            )
+        if lens.layers.stop is not None:
+            raise FitError("the lens has an aperture stop, whose shadow moves with depth and angle: fit it without")
         self.lens, self.setting, s = lens, setting, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
         over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
@@ -73,6 +69,7 @@ class ForwardModel:
         self._lit = EVERY, EVERY
         self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
         self._pillars: dict[float, Pillars] = {}
+        self.films = Films.of(lens.layers, lens.wavelength_um)
         self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
         self.stage_centre_um = float(setting.depth_um.mean())
         self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
@@ -172,21 +169,20 @@ class ForwardModel:
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
         light, slopes = self._light(x, wanted)
-        s, centre_um = self.setting, self.stage_centre_um
-        scale = brightness(x, s, centre_um=centre_um, reference_um=self.reference_um) / self.area_um2
-        sampled = scale[:, None, None] * light
-        image = sampled + background(x, s)
+        s, about = self.setting, {"centre_um": self.stage_centre_um, "films": self.films}
+        scale = brightness(x, s, reference_um=self.reference_um, **about)[:, None, None] / self.area_um2
+        sampled = scale * light
         if wanted is None:
-            return image, None
+            return sampled + background(x, s), None
         out = np.zeros((len(wanted), *light.shape))
         plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
         plain |= {name: s.glow * edge for name, edge in zip(("background_y_e", "background_x_e"), s.edges, strict=True)}
         for j, name in enumerate(wanted):
-            out[j] = plain[name] if name in plain else scale[:, None, None] * slopes[name]
-        for name, rate in dimming(x, s, centre_um).items():
+            out[j] = plain[name] if name in plain else scale * slopes[name]
+        for name, rate in dimming(x, s, **about).items():
             if name in wanted:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
-        return image, out
+        return sampled + background(x, s), out
 
     def _light(self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None) -> Light:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
@@ -298,15 +294,18 @@ class ForwardModel:
         """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken off, aberrations; light."""
         reduced, index, nominal = group.reduced, group.index, group.reduced.bench
         here, every = (reduced.x_um[cut], reduced.y_um[cut]), (slice(None), *cut)
-        k = 2 * math.pi / (nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3)
+        wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
+        k = 2 * math.pi / wavelength_um
         d = nominal.distance_um + x[PLACE["distance_um"]]
         lean = [math.tan(math.radians(x[PLACE[f"tilt_{a}_deg"]])) for a in "xy"]
         tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
         held = self.grid.middle_um
-        centre = d * tx + x[PLACE["decentre_x_um"]] - held[0], d * ty + x[PLACE["decentre_y_um"]] - held[1]
-        exit_path = sensor_path(*here, centre, d)
+        chief = reduced.films.chief_um(d, (tx, ty))
+        centre = chief[0] + x[PLACE["decentre_x_um"]] - held[0], chief[1] + x[PLACE["decentre_y_um"]] - held[1]
+        films = Films.of(self.lens.layers, wavelength_um)
+        exit_path = films.sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
-        out = source_paths(*here, depth_um=depth, tangents=(tx, ty), values=x)
+        out = source_paths(*here, depth_um=depth, tangents=(tx, ty), values=x, films=films)
         out += exit_path
         out *= k
         out -= reduced.known[cut]
@@ -333,15 +332,19 @@ class ForwardModel:
 
     def _growth(self, x: Array, group: Group) -> dict[str, Array]:
         """(frames,) relative growth of the source's image with the parameters that change its magnification."""
-        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
-        distance = np.full(len(depth), self.lens.sensor_distance_um + x[PLACE["distance_um"]])
-        return {"distance_um": 1 / distance, "stage_zero_um": -1 / depth}
+        near, far = self._reduced(x, group)
+        return {"distance_um": 1 / (self.films.filling * near), "stage_zero_um": -1 / far}
+
+    def _reduced(self, x: Array, group: Group) -> tuple[Array, Array]:
+        """(frames,) distances to sensor and source in air that bend paraxial light as much."""
+        far = self.films.apparent_um(true_depth(x, self.setting, self.stage_centre_um)[group.index])
+        return np.full(len(far), self.films.reduced_um(group.reduced.bench.distance_um + x[PLACE["distance_um"]])), far
 
     def _transfer(
         self, x: Array, group: Group, names: list[str], grid: detector.Grid | None = None
     ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
         """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
-        depth = true_depth(x, self.setting, self.stage_centre_um)[group.index]
-        shrink = (self.lens.sensor_distance_um + x[PLACE["distance_um"]]) / depth
+        near, far = self._reduced(x, group)
+        shrink = near / far
         blur, sizes, kind = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]] * shrink, real_of(group.reduced.kind)
         return detector.transfers(grid or self.grid, blur, sizes, shrink, sized="pinhole_um" in names, kind=kind)

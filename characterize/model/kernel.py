@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import spherical_jn
 
+from characterize.model.glass import AIR, Films
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import longer
@@ -30,8 +31,11 @@ Span = tuple[float, float]
 class Kernel:
     """d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) of one wavelength and distance.
 
+    Through films r is the path of the ray, and d / r² is √(passed / spread) of :mod:`metalens.lens.media`.
+
     p, q: spans of direction cosines of the lens seen from the window's centre, at the nominal distance.
-    nominal_um, distance_um: lens to sensor. tangents: (x, y) of the chief ray.
+    nominal_um, distance_um: lens to sensor. tangents: (x, y) of the chief ray, in air. films: between them.
+    nodes_um: distance in air that p and q are counted at; None for the nominal one.
     """
 
     k: float
@@ -40,15 +44,35 @@ class Kernel:
     nominal_um: float
     distance_um: float
     tangents: tuple[float, float] = (0.0, 0.0)
+    films: Films = AIR
+    nodes_um: float | None = None
 
     def path(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
-        """(r - r_w, r), um: to a point of the window and to its centre, without cancellation."""
-        d, (tx, ty) = self.distance_um, self.tangents
-        r_0 = self.nominal_um / np.sqrt(1 - np.square(p) - np.square(q))
-        dx, dy = (d - self.nominal_um) * tx - r_0 * p, (d - self.nominal_um) * ty - r_0 * q
-        r_w = np.sqrt(dx**2 + dy**2 + d**2)
-        path = longer(r_w, X * X + Y * Y + 2 * (X * dx + Y * dy))
-        return np.asarray(path), np.asarray(r_w + path)
+        """r - r_w, um, to a point of the window and to its centre, without cancellation; and what tells the ray: r in
+        air, its reach² through films."""
+        d, (dx, dy) = self.distance_um, self._across(p, q)
+        more = X * X + Y * Y + 2 * (X * dx + Y * dy)
+        if self.films.none_behind:
+            r_w = np.sqrt(dx**2 + dy**2 + d**2)
+            path = longer(r_w, more)
+            return np.asarray(path), np.asarray(r_w + path)
+        near2 = np.asarray(dx**2 + dy**2)
+        far2 = near2 + more
+        rays = self.films.rays(d, max(near2.max(), far2.max()))
+        return np.asarray(rays.chord(far2) - rays.chord(near2)), far2
+
+    def _across(self, p: Array | float, q: Array | float) -> tuple[Any, Any]:
+        """(x, y) from the nodes to the window's centre, um."""
+        off, (tx, ty) = self.distance_um - self.nominal_um, self.films.drift(self.tangents)
+        r_0 = (self.nodes_um or self.nominal_um) / np.sqrt(1 - np.square(p) - np.square(q))
+        return off * tx - r_0 * p, off * ty - r_0 * q
+
+    def amplitude(self, ray: Array) -> tuple[Array, Array]:
+        """(size, r) of size (1/r - ik) exp(ikr), of a ray as :meth:`path` tells it."""
+        if self.films.none_behind:
+            return self.distance_um / (2 * np.pi * ray**2), ray
+        rays = self.films.rays(self.distance_um, ray.max())
+        return np.asarray(rays.level(ray) / (2 * np.pi)), np.asarray(rays.along_um + rays.chord(ray))
 
     def window(self, X: Array, Y: Array) -> Array:
         """exp(ik H(X, Y)); arguments broadcast."""
@@ -87,18 +111,16 @@ class Kernel:
 
     def _steep(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
         """dF/dX and dF/dY: the direction cosines seen from (X, Y)."""
-        r_0 = self.nominal_um / np.sqrt(1 - np.square(p) - np.square(q))
-        off, (tx, ty) = self.distance_um - self.nominal_um, self.tangents
-        r = self.path(p, q, X, Y)[1]
-        return np.asarray((X + off * tx - r_0 * p) / r), np.asarray((Y + off * ty - r_0 * q) / r)
+        (dx, dy), ray = self._across(p, q), self.path(p, q, X, Y)[1]
+        bend = ray if self.films.none_behind else self.films.rays(self.distance_um, ray.max()).bend(ray)
+        return np.asarray((X + dx) / bend), np.asarray((Y + dy) / bend)
 
     def rest(self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64) -> Array:
         """What the three factors leave, with the amplitude, as ``kind`` complex numbers; arguments broadcast."""
-        path, r = self._left(p, q, X, Y)
-        real = real_of(kind)
-        size = (self.distance_um / (2 * np.pi * r**2)).astype(real)
-        fade = (1 / r).astype(real) - np.dtype(kind).type(1j * self.k)
-        return np.asarray(size * fade * turns(self.k * path, kind))
+        path, ray = self._left(p, q, X, Y)
+        size, r = self.amplitude(ray)
+        fade = (1 / r).astype(real_of(kind)) - np.dtype(kind).type(1j * self.k)
+        return np.asarray(size.astype(real_of(kind)) * fade * turns(self.k * path, kind))
 
     def counts(self, wy: float, wx: float, tolerance: float = _USUAL) -> tuple[int, int]:
         """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx): of the window, of the directions.
@@ -111,15 +133,15 @@ class Kernel:
         Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
         turn = self.k * self._left(p, q, X, Y)[0]
         slopes = [float(np.abs(np.diff(turn, axis=axis)).max()) / (t[1] - t[0]) for axis in range(4)]
-        branch = 1 / math.asinh(self.distance_um / max(wy, wx))
+        branch = 1 / math.asinh(self.films.reduced_um(self.distance_um) / max(wy, wx))
         beyond = _terms(max(slopes[:2]), tolerance) + (6 + more) * branch
         window = max(12, math.ceil((14 + more) * branch), math.ceil(beyond))
         aperture = int((10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + more / 8))
         return window, max(aperture, _terms(max(slopes[2:]), tolerance))
 
     def _left(self, p: Array, q: Array, X: Array, Y: Array) -> tuple[Array, Array]:
-        path, r = self.path(p, q, X, Y)
-        return path - self.by_x(p, X) - self.by_y(q, Y) - self._by_window(X, Y), r
+        path, ray = self.path(p, q, X, Y)
+        return path - self.by_x(p, X) - self.by_y(q, Y) - self._by_window(X, Y), ray
 
     def _by_window(self, X: Array, Y: Array) -> Array:
         a, b = _middle(self.p), _middle(self.q)

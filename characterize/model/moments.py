@@ -225,8 +225,8 @@ def _moves(turned: Turned, factor: Factor, p: Array, q: Array, places: tuple[Arr
 
 
 def _logarithm(kernel: Kernel, p: Array, q: Array, places: tuple[Array, Array]) -> Array:
-    path, r = kernel.path(p, q, places[1], places[0])
-    return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.distance_um / r**2))
+    path, ray = kernel.path(p, q, places[1], places[0])
+    return np.asarray(1j * kernel.k * path + np.log(kernel.k * kernel.amplitude(ray)[0]))
 
 
 def _amounts(basis: Array, values: Sequence[Array]) -> list[Array]:

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from characterize.model import gather
+from characterize.model.glass import Films
 from characterize.model.kernel import Kernel, digits, factors, precision, real_of, turns
 from characterize.model.pillars import Pillars
 from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, Ways, turned, ways
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
-from metalens.ground.paths import sensor_path, source_path
-from metalens.lens import Lens
+from metalens.lens import Lens, media
 
 Axes = tuple[Array, Array]
 _KEPT = 12  # operators: of a place that each of some threads is at
@@ -39,7 +39,7 @@ _BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when t
 class Bench:
     """Where source, lens and sensor stand for one field angle.
 
-    tangents: (x, y) of the chief ray; the window sits where it meets the sensor.
+    tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
     reference_um: source depth whose phase is taken off before gathering.
     """
 
@@ -64,6 +64,8 @@ class Reduced:
     ) -> None:
         self.bench, self.tolerance, self.window_um = bench, tolerance, window_um
         self.kind = precision(tolerance)
+        self._layers, self.films = lens.layers, Films.of(lens.layers, bench.wavelength_um)
+        self._near_um = self.films.reduced_um(bench.distance_um)  # that directions are counted at
         self.half_um = np.array([lens.diameters.y_um[-1], lens.diameters.x_um[-1]])
         self.site_um2, self.radius_um = lens.diameters.site_um2, lens.diameters.radius_um
         self.k = 2 * math.pi / bench.wavelength_um
@@ -111,7 +113,7 @@ class Reduced:
 
     def _directions(self, beyond: float) -> None:
         """Nodes for waves as steep as the window makes them, and ``beyond``: radians a half span."""
-        d, (cx, cy) = self.bench.distance_um, self.center_um
+        d, (cx, cy) = self._near_um, self.center_um
         hy, hx = self.half_um
         edge = np.linspace(-1, 1, 41)
         x, y = (g.ravel() for g in np.meshgrid(edge * hx - cx, edge * hy - cy))
@@ -143,8 +145,7 @@ class Reduced:
     @property
     def center_um(self) -> tuple[float, float]:
         """(x, y) of the window on the sensor at the nominal distance."""
-        tx, ty = self.bench.tangents
-        return self.bench.distance_um * tx, self.bench.distance_um * ty
+        return self.films.chief_um(self.bench.distance_um, self.bench.tangents)
 
     def seen(self) -> tuple[Array, Array, Array]:
         """(q, p) direction cosines p and q of the nodes, and which of them meet the lens."""
@@ -188,7 +189,7 @@ class Reduced:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
         hy, hx = self.half_um
         x, y = (gather.even(n, gather.pull(n, self.tolerance), -h, h) for h in (hx, hy))
-        (cx, cy), d, m = self.center_um, self.bench.distance_um, self.nodes
+        (cx, cy), d, m = self.center_um, self._near_um, self.nodes
         p = (x[None] - cx) / np.sqrt((x[None] - cx) ** 2 + (y[:, None] - cy) ** 2 + d**2)
         at = functools.partial(gather.at, m, self._pull)
         turned = np.stack([fields[:, j] @ at(self._p, p[j]) for j in range(n)], 1)
@@ -198,9 +199,9 @@ class Reduced:
 
     def path(self, x: Array, y: Array, distance_um: float, bench: Bench) -> Array:
         """Path from the reference source by (x, y) on the lens to the window's centre, um, less that by the axis."""
-        tx, ty = bench.tangents
-        centre = distance_um * tx, distance_um * ty
-        return np.asarray(source_path(x, y, (tx, ty), 1 / bench.reference_um) + sensor_path(x, y, centre, distance_um))
+        centre = self.films.chief_um(distance_um, bench.tangents)
+        come = media.source_path(self.films.front, x, y, bench.tangents, 1 / bench.reference_um)
+        return np.asarray(come + self.films.sensor_path(x, y, centre, distance_um))
 
     def operators(
         self,
@@ -231,11 +232,10 @@ class Reduced:
     def _operators_of(
         self, wavelength_um: float, distance_um: float, axes_um: Axes, edge_um: float, turned_um: Axes
     ) -> Operators:
-        kernel = Kernel(
-            2 * math.pi / wavelength_um, self._p, self._q, self.bench.distance_um, distance_um, self.bench.tangents
-        )
+        usual_um, films = self.bench.distance_um, Films.of(self._layers, wavelength_um)
+        nominal = Kernel(self.k, self._p, self._q, usual_um, usual_um, self.bench.tangents, self.films, self._near_um)
+        kernel = dataclasses.replace(nominal, k=2 * math.pi / wavelength_um, distance_um=distance_um, films=films)
         reach = [float(np.abs(axis).max()) for axis in axes_um]
-        nominal = dataclasses.replace(kernel, k=self.k, distance_um=self.bench.distance_um)
         pairs = zip(nominal.bands(reach[0], reach[1]), kernel.bands(reach[0], reach[1]), strict=True)
         bands = [_SPARE * usual * _WIDER ** math.ceil(math.log(band / usual / _SPARE, _WIDER)) for usual, band in pairs]
         about: dict[str, Any] = {"k": kernel.k, "tolerance": self.tolerance, "step_um": STEP * distance_um}
@@ -323,7 +323,7 @@ class Reduced:
 
     def _on_lens(self, p: Array, q: Array) -> tuple[Array, Array]:
         """(x, y) on the lens of direction cosines seen from the window's centre."""
-        r = self.bench.distance_um / np.sqrt(1 - p**2 - q**2)
+        r = self._near_um / np.sqrt(1 - p**2 - q**2)
         return self.center_um[0] + r * p, self.center_um[1] + r * q
 
 

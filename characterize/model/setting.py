@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from characterize.model.glass import AIR, Films
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars
 from characterize.model.reduced import Reduced
@@ -66,16 +67,16 @@ def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
     return np.asarray(np.maximum(depth, 0.2 * stated))
 
 
-def brightness(x: Array, setting: Setting, *, centre_um: float, reference_um: float) -> Array:
+def brightness(x: Array, setting: Setting, *, centre_um: float, reference_um: float, films: Films = AIR) -> Array:
     """(n,) electrons in a pixel for light of unit density from ``reference_um``, by gain, exposure and depth."""
-    depth = true_depth(x, setting, centre_um)
+    depth = films.apparent_um(true_depth(x, setting, centre_um))
     gain = np.exp(x[PLACE["log_gain"]]) * (setting.fill * setting.pixel_um) ** 2
-    return np.asarray(gain * setting.exposure * (reference_um / depth) ** 2)
+    return np.asarray(gain * setting.exposure * (films.apparent_um(reference_um) / depth) ** 2)
 
 
-def dimming(x: Array, setting: Setting, centre_um: float) -> dict[str, Array]:
+def dimming(x: Array, setting: Setting, centre_um: float, films: Films = AIR) -> dict[str, Array]:
     """(n,) relative changes of :func:`brightness` by the stage: light falls as the square of the depth."""
-    rate = -2 / true_depth(x, setting, centre_um)
+    rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))
     return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
 
 
@@ -147,14 +148,16 @@ class Spectrum:
 
     @classmethod
     def of(cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float) -> "Spectrum":
-        """Paths from axis and rim to sources and chief ray's places through air; a wavelength more for the pillars.
+        """Paths from axis and rim to sources and chief ray's places, through films as through as much air as bends
+        light like them; a wavelength more for the pillars.
 
         Args:
             depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
         """
         turn = np.linspace(0, 2 * math.pi, _RIM, endpoint=False)
         x, y = (np.append(lens.diameters.radius_um * part, 0.0) for part in (np.cos(turn), np.sin(turn)))
-        z, d, (tx, ty) = depth_um[:, None], lens.sensor_distance_um, np.tan(angle_rad.T)[..., None]
+        z = Films.of(lens.layers, lens.wavelength_um).apparent_um(depth_um[:, None])
+        d, (tx, ty) = lens.reduced_um, np.tan(angle_rad.T)[..., None]
         paths = np.sqrt((x + z * tx) ** 2 + (y + z * ty) ** 2 + z**2)
         paths = paths + np.sqrt((x - d * tx) ** 2 + (y - d * ty) ** 2 + d**2)
         return cls(float(np.ptp(paths, axis=1).max()) + lens.wavelength_um, lens.wavelength_um, tolerance)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from metalens.ground import paths
 from metalens.ground.errors import PropagationError
 
 NEWTON = 14  # steps at most; each doubles the digits
@@ -68,6 +69,32 @@ def reach(media: Media, p: Any) -> Any:
 def path(media: Media, p: Any) -> Any:
     """Optical path of that ray less the path along the normal, um, without cancellation."""
     return sum((n * t * p * p / (rest * (n + rest)) for n, t, rest in _with_normals(media.layers, p * p)), p * 0)
+
+
+def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
+    """Optical path from a source to (x, y), less its path to the lens centre, um; for a source at infinity too.
+
+    Args:
+        front: films that the light goes through, air apart. tangents: (x, y) of the ray to the lens centre, in air.
+            inverse: 1 / depth, 1/um; operands broadcast.
+    """
+    if not front:
+        return paths.source_path(x, y, tangents, inverse)
+    tx, ty = tangents
+    sine2 = (tx * tx + ty * ty) / (1 + tx * tx + ty * ty)
+    cosine = (1 - sine2) ** 0.5
+    thick = sum(t for _, t in front)
+    pairs = [(1.0, 1 - thick * inverse), *((n, t * inverse) for n, t in front)]
+    g = bend(pairs, sine2)
+    more = (x * x + y * y) * inverse + 2 * g * cosine * (x * tx + y * ty)
+    return longer(pairs, sine2, sine2 * g * g, more, inverse)[1]
+
+
+def sensor_path(layers: Pairs, x: Any, y: Any, centre: tuple[Any, Any]) -> Any:
+    """Optical path from (x, y) on the lens to a point of the sensor, less that from the lens centre, um."""
+    cx, cy = centre
+    reach2 = cx * cx + cy * cy
+    return longer(layers, square(layers, reach2), reach2, x * x + y * y - 2 * (x * cx + y * cy))[1]
 
 
 def spread(media: Media, p: Any) -> Any:

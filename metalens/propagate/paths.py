@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from metalens.ground.arrays import Array
-from metalens.ground.paths import longer, source_path
-from metalens.ground.paths import sensor_path as sensor_path_in_air
+from metalens.ground.paths import longer, sensor_path
 from metalens.lens import media, saddle
 from metalens.propagate.geometry import Case
 
@@ -35,30 +34,18 @@ def reference_depth(case: Case) -> float:
 def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
     """Optical path from a source to (x, y), less its path to the lens centre, um; numpy or torch operands.
 
-    ``tangents`` are those in air; without films :func:`metalens.ground.paths.source_path`.
+    ``tangents`` are those in air.
     """
-    if not case.front:
-        return source_path(x, y, tangents, inverse)
-    tx, ty = tangents
-    sine2 = (tx * tx + ty * ty) / (1 + tx * tx + ty * ty)
-    cosine = (1 - sine2) ** 0.5
-    thick = sum(t for _, t in case.front)
-    pairs = [(1.0, 1 - thick * inverse), *((n, t * inverse) for n, t in case.front)]
-    g = media.bend(pairs, sine2)
-    more = (x * x + y * y) * inverse + 2 * g * cosine * (x * tx + y * ty)
-    return media.longer(pairs, sine2, sine2 * g * g, more, inverse)[1]
+    return media.source_path(case.front, x, y, tangents, inverse)
 
 
 def to_sensor(case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None) -> Any:
     """Optical path from (x, y) on the lens to a point of the sensor, by default the middle of the window, less that
     from the lens centre, um."""
-    cx, cy = case.centre_um if centre is None else centre
+    at = case.centre_um if centre is None else centre
     if case.behind is None:
-        return sensor_path_in_air(x, y, (cx, cy), case.sensor_distance_um)
-    reach2 = cx * cx + cy * cy
-    pairs = case.behind.layers
-    more = x * x + y * y - 2 * (x * cx + y * cy)
-    return media.longer(pairs, media.square(pairs, reach2), reach2, more)[1]
+        return sensor_path(x, y, at, case.sensor_distance_um)
+    return media.sensor_path(case.behind.layers, x, y, at)
 
 
 def chief_path(case: Case) -> float:

@@ -48,14 +48,14 @@ def test_narrow_light_on_a_small_lens_is_two_colours_and_wide_light_on_a_large_o
 
 def test_the_longest_path_of_a_lens_is_from_its_axis_to_its_rim():
     """On the axis r² / 2 (1/z + 1/d) to first order, most for the nearest source; a wavelength more for the pillars."""
-    lens = SimpleNamespace(diameters=SimpleNamespace(radius_um=20.0), sensor_distance_um=110.0, wavelength_um=0.85)
-    exact = math.hypot(20, 380) - 380 + math.hypot(20, 110) - 110
+    lens, radius = b.lens(), b.lens().diameters.radius_um
+    exact = math.hypot(radius, 380) - 380 + math.hypot(radius, 110) - 110
     line = Spectrum.of(lens, np.array([600.0, 380.0]), np.zeros((2, 2)), tolerance=1e-3)
     assert line.path_um == pytest.approx(exact + 0.85, rel=1e-9)
     aside = Spectrum.of(lens, np.array([380.0, 600.0]), np.array([[0.2, -0.1], [0.2, -0.1]]), tolerance=1e-3)
     slope = np.tan(np.array([0.2, -0.1]))
     turn = np.linspace(0, 2 * np.pi, 2000)
-    places = [np.zeros(2), *(20.0 * np.stack([np.cos(turn), np.sin(turn)], -1))]
+    places = [np.zeros(2), *(radius * np.stack([np.cos(turn), np.sin(turn)], -1))]
     found = [math.hypot(*(place + 380 * slope), 380) + math.hypot(*(place - 110 * slope), 110) for place in places]
     assert aside.path_um - 0.85 == pytest.approx(max(found) - min(found), rel=3e-3)  # 48 places of the rim
 
