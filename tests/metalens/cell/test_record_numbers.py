@@ -73,4 +73,3 @@ def test_gaps_and_widest_sizes_of_squares():
     wide = Cell(0.5, 0.7, shape=Square(), layers=(Layer(0.7, grow_um=0.12),))
     assert wide.widest_um(0.05) == pytest.approx(0.98 * 0.5 - 0.12, abs=1.1e-4)  # what is wider leaves a fiftieth
     assert wide.widest_um(0.2) == pytest.approx(0.3, abs=1.1e-4)  # the size itself leaves more
-    assert cell.widest_um(0.6) == pytest.approx(0, abs=1e-4)
