@@ -169,8 +169,8 @@ class ForwardModel:
     def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
         """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
         light, slopes = self._light(x, wanted)
-        s, about = self.setting, {"centre_um": self.stage_centre_um, "films": self.films}
-        scale = brightness(x, s, reference_um=self.reference_um, **about)[:, None, None] / self.area_um2
+        s, films, about = self.setting, self.films, {"centre_um": self.stage_centre_um}
+        scale = brightness(x, s, reference_um=self.reference_um, films=films, **about)[:, None, None] / self.area_um2
         sampled = scale * light
         if wanted is None:
             return sampled + background(x, s), None
@@ -179,7 +179,7 @@ class ForwardModel:
         plain |= {name: s.glow * edge for name, edge in zip(("background_y_e", "background_x_e"), s.edges, strict=True)}
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale * slopes[name]
-        for name, rate in dimming(x, s, **about).items():
+        for name, rate in dimming(x, s, films=films, **about).items():
             if name in wanted:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return sampled + background(x, s), out
