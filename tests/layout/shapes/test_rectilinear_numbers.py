@@ -20,7 +20,11 @@ def inside(shape, x, y):
     return crossed.sum(-1) % 2 == 1
 
 
-@pytest.mark.parametrize("shape", [NOTCHED, ARMS, NOTCHED[::-1], np.roll(ARMS, 3, axis=0)], ids=str)
+@pytest.mark.parametrize(
+    "shape",
+    [NOTCHED, ARMS, NOTCHED[::-1], np.roll(ARMS, 3, axis=0)],
+    ids=["notched", "arms", "clockwise", "begun later"],
+)
 def test_rectangles_cover_every_unit_of_a_polygon_once(shape):
     x, y = np.meshgrid(np.arange(-6, 12) + 0.5, np.arange(-6, 12) + 0.5)
     times = np.zeros(x.shape, int)

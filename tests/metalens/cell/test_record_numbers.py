@@ -4,8 +4,9 @@ import math
 
 import pytest
 
+from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
-from metalens.cell.shapes import Ellipse, Ring, Square
+from metalens.cell.shapes import Circle, Ellipse, Polygon, Ring, Square
 from metalens.ground.errors import CellError
 
 SLOPE = 2 * math.tan(0.05)  # of the width, for each um that it is lower
@@ -72,4 +73,45 @@ def test_gaps_and_widest_sizes_of_squares():
     assert 0.37 - 1e-4 * 0.5 - 5e-5 <= found <= 0.37 + 5e-5  # rounded to four digits
     wide = Cell(0.5, 0.7, shape=Square(), layers=(Layer(0.7, grow_um=0.12),))
     assert wide.widest_um(0.05) == pytest.approx(0.98 * 0.5 - 0.12, abs=1.1e-4)  # what is wider leaves a fiftieth
-    assert wide.widest_um(0.2) == pytest.approx(0.3, abs=1.1e-4)  # the size itself leaves more
+
+
+def test_round_pillars_end_at_the_gap_or_where_a_foot_comes_near():
+    """A foot is 0.4 SLOPE = 40 nm wider than the size, and keeps a fiftieth of 0.5 um: 50 nm in all."""
+    tilted = Cell(0.5, 0.8, sidewall_rad=0.05)
+    assert tilted.widest_um(0.07) == pytest.approx(0.43)
+    assert tilted.widest_um(0.03) == pytest.approx(0.49 - 0.4 * SLOPE)
+    assert tilted.size_um(0.08) == 0.08
+    assert tilted.size_um(0.03) == pytest.approx(0.01 + 0.4 * SLOPE)
+    upright = Cell(0.5, 0.8)
+    assert (upright.widest_um(0.003), upright.size_um(0.003)) == (pytest.approx(0.497), 0.003)  # nothing is wider
+
+
+def regular(sides):
+    """Corners of a regular polygon about the middle, the first off both axes."""
+    return Polygon(tuple((math.cos(a), math.sin(a)) for a in (0.3 + 2 * math.pi * k / sides for k in range(sides))))
+
+
+@pytest.mark.parametrize(
+    ("shape", "square", "hexagonal"),
+    [
+        (Circle(), True, True), (Square(0.2), True, False), (Ellipse(0.6), False, False), (regular(3), False, True),
+        (regular(6), False, True), (regular(4), True, False), (regular(5), False, False), (regular(12), True, True),
+    ],
+    ids=["circle", "square", "ellipse", "3", "6", "4", "5", "12"],
+)  # fmt: skip
+def test_light_along_x_and_y_meets_the_same_cell_where_shape_and_lattice_share_a_turn(shape, square, hexagonal):
+    """By a quarter on a square lattice, by a third or a sixth on a hexagonal one, by none on a rectangular one."""
+    assert Cell(0.5, shape=shape).alike is square
+    assert Cell(0.5, shape=shape, lattice=Lattice("hexagonal")).alike is hexagonal
+    assert not Cell(0.5, shape=shape, lattice=Lattice("rectangular", 1.2)).alike
+
+
+def test_a_plain_round_pillar_is_a_circle_in_one_piece_on_a_square_lattice():
+    assert Cell(0.5, sidewall_rad=0.05).round
+    assert not Cell(0.5, shape=Square()).round
+    assert not Cell(0.5, shape=Circle(hole=True)).round
+    assert not Cell(0.5, lattice=Lattice("hexagonal")).round
+    assert not Cell(0.5, lattice=Lattice("rectangular", 1.2)).round
+    assert not layered().round
+    assert layered().described == "circle on a square lattice in 3 layers"
+    assert Cell(0.5, shape=Circle(hole=True)).described == "circle (hole) on a square lattice"
