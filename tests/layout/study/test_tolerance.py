@@ -227,12 +227,14 @@ def _drawn(study, most, *given, **more):
 def test_the_report_sections_say_what_was_found(monkeypatch):
     for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
         monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
+    monkeypatch.setattr(study_page, "CHOICE_RAD", (0.1, 0.3))
     lens = hyperbolic(31)
     process = Process(write_field=WriteField(size_um=6.0))
     made = study_page.sections(lens, process, fields.split(lens.diameters, process), {"": SENS})
     assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
     tables = [item for section in made for item in section.items if isinstance(item, Table)]
     assert [row[0] for row in tables[1].rows] == list(Spread().stated)
+    assert [row[0] for row in tables[-1].rows] == ["as designed", "within 0.1 rad", "within 0.3 rad"]
     assert all(
         np.isfinite(value) for table in tables for row in table.rows for value in row if isinstance(value, float)
     )
