@@ -205,7 +205,7 @@ def test_a_true_image_costs_its_stacks_and_its_frames(true, exact, monkeypatch):
     assert seconds == pytest.approx([7 * 0.5 + 110 * 0.45, finest, finest])
     coarse, middle, fine = (true.optics(exact, tolerance) for tolerance in (0.5, 0.2, 0.06))
     assert coarse.plan.window.period < fine.plan.window.period
-    for found, optics in zip(errors, (coarse, middle, fine), strict=True):
+    for found, optics in zip(errors[:2], (coarse, middle), strict=True):
         assert found == pytest.approx(misread(true, fine, optics), rel=1e-6, abs=1e-9)
     assert errors[2] == pytest.approx(np.zeros((2, 2)), abs=1e-9)
     for found, optics in zip(nodes[[0, 2]].tolist(), (coarse, fine), strict=True):

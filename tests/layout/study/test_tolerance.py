@@ -296,14 +296,15 @@ def test_sensitivities_agree_with_an_independent_solver():
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
     found = sensitivities(dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3)
 
-    def rate(low, high, step):
-        less, more = (modal.solve(each, 0.13, 0.85, tolerance=1e-4).t for each in (low, high))
+    def rate(low, high, step, tolerance=1e-4):
+        less, more = (modal.solve(each, 0.13, 0.85, tolerance=tolerance).t for each in (low, high))
         return np.log(more / less) / (2 * step)
 
     height = rate(dataclasses.replace(cell, height_um=0.69), dataclasses.replace(cell, height_um=0.71), 0.01)
     index = rate(dataclasses.replace(cell, pillar=Index(3.58)), dataclasses.replace(cell, pillar=Index(3.62)), 0.02)
     lean = 0.008  # a wall acts in second order, of a twentieth of the height's size at 8 mrad: differences are exact
-    wall = rate(dataclasses.replace(cell, sidewall_rad=-lean), dataclasses.replace(cell, sidewall_rad=lean), lean)
+    leans = (dataclasses.replace(cell, sidewall_rad=sign * lean) for sign in (-1, 1))
+    wall = rate(*leans, lean, 3e-4)  # 1.3 % from that at 1e-4, at a quarter of its cost
     assert abs(found.rates[0, 1] / height - 1) < 0.03  # truncation of the plane waves: 1 to 2 % here
     assert abs(found.rates[1, 1] / index - 1) < 0.05
     assert abs(found.rates[2, 1] / wall - 1) < 0.08  # and 4 %; differences at four harmonics had the other sign

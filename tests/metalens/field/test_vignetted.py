@@ -1,5 +1,6 @@
 """The image behind a stop that covers the lens from some fields: dark places count by their light."""
 
+import functools
 import math
 import sys
 from pathlib import Path
@@ -27,18 +28,29 @@ class _Behind(Referee):
 
     hole = HOLE
 
+    @functools.cached_property
+    def covered(self):
+        """Share of every sample that lies within the hole, the same for every point's wave."""
+        off = (np.arange(5) - 2) / 5 * self.fine
+        return np.mean(
+            [np.hypot(self.x - MIDDLE[0] + a, self.y - MIDDLE[1] + b) <= self.hole for a in off for b in off], axis=0
+        )
+
+    @functools.cached_property
+    def answer(self):
+        """Of the lens."""
+        return self.open * np.exp(1j * self.lens_phase())
+
     def intensity(self, place, depth, wavelength):
         k, (tx, ty) = 2 * np.pi / wavelength, (place[0] / DISTANCE, place[1] / DISTANCE)
         x, y = self.x + tx * depth, self.y + ty * depth
-        off = (np.arange(5) - 2) / 5 * self.fine
-        edge = [np.hypot(self.x - MIDDLE[0] + a, self.y - MIDDLE[1] + b) <= self.hole for a in off for b in off]
         way = np.sqrt(x**2 + y**2 + (depth - GAP) ** 2)
         p, q = np.meshgrid(*2 * [wavelength * np.fft.fftfreq(self.count, self.fine)])
         s = np.sqrt(np.maximum(1 - p**2 - q**2, 1e-6))
         runs = p**2 + q**2 < 1
-        wave = np.fft.fft2(np.mean(edge, axis=0) * np.exp(1j * k * (way - depth)) / way)
+        wave = np.fft.fft2(self.covered * np.exp(1j * k * (way - depth)) / way)
         wave = np.fft.ifft2(wave * np.exp(1j * k * GAP * s) * runs) * np.sqrt(x**2 + y**2 + depth**2)
-        wave = wave * self.open * np.exp(1j * self.lens_phase())
+        wave = wave * self.answer
         to = np.exp(1j * k * (DISTANCE * s + p * place[0] + q * place[1])) * runs * self._lands(p, q, s, place)
         out = np.fft.fftshift(np.fft.ifft2(np.fft.fft2(np.fft.ifftshift(wave)) * to))
         lit = math.pi * (self.hole * depth / (depth - GAP)) ** 2 / self.fine**2
