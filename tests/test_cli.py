@@ -134,24 +134,24 @@ def test_info_shows_kind_and_provenance(tmp_path):
     assert values["arrays"]["image"] == "float64 (20, 20)"
 
 
-# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.1 mm and a network that hardly trains.
+# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.06 mm, a network that hardly trains.
 CHAIN = {
     "run.toml": """
         preset = "smoke"
-        test_batches = 2
-        validation_batches = 2
-        scenes = { pixels = 32, margin = 4, pool = 12 }
-        inner = { steps = 6, batch = 2 }
+        test_batches = 1
+        validation_batches = 1
+        scenes = { pixels = 32, margin = 4, pool = 4 }
+        inner = { steps = 2, batch = 2 }
         search = { population = 2, tournament = 1, rounds = 2 }
         run = { pitch_um = 12.0, budgets_mmacs = [4.0] }
 
         [optics]
         image = "uniform"
-        aperture_mm = 0.1
+        aperture_mm = 0.06
         sensor_distance_mm = 0.5
         sample_um = 12.0
         polynomials = 0
-        depth_count = 6
+        depth_count = 3
         window_samples = 9
 
         [space]
