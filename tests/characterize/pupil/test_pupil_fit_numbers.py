@@ -37,13 +37,14 @@ def spot(light, row, column, half, height, planes):
 
 @pytest.mark.parametrize(
     ("half", "height", "planes"),
-    [(0, 1200.0, 1), (1, 290.0, 6), (0, 800.0, 6), (3, 270.0, 6)],
+    [(0, 4400.0, 1), (1, 290.0, 7), (0, 800.0, 7), (3, 270.0, 7)],
     ids=["flash of one plane", "weaker in all", "a hot pixel", "wide and even"],
 )
 def test_light_is_looked_for_in_the_brightest_three_planes_seen_through_a_pixel_of_blur(half, height, planes):
     """A square of 3 pixels and 360 in three planes. One pixel keeps 0.16 of its height under the blur, a square of
-    three 0.78, one of seven all: 281 of it stand against 191, 226, 127 and 270."""
-    light = np.zeros((6, 31, 33))
+    three 0.78, one of seven all: 281 of it stand against
+    233, 226, 127 and 270."""
+    light = np.zeros((7, 31, 33))
     spot(light, 9, 22, 1, 360.0, slice(1, 4))
     spot(light, 21, 8, half, height, slice(0, planes))
     light[:, 28, 30] = np.nan
@@ -54,15 +55,81 @@ def test_light_is_looked_for_in_the_brightest_three_planes_seen_through_a_pixel_
 def test_a_window_of_odd_size_has_its_middle_at_the_bead(window, first):
     light = np.full((4, 30, 41), 20.0)
     spot(light, 14, 20, 1, 500.0, slice(0, 4))
-    found, _, notes = pupilfit._crop(
-        SimpleNamespace(
-            electrons=light, usable=np.ones(light.shape, bool), saturated=np.zeros(light.shape, bool),
-            variance_e2=np.ones(light.shape), scale=np.ones(light.shape),
-        ),
-        dataclasses.replace(SPEC, window=window),
-    )  # fmt: skip
+    found, _, notes = pupilfit._crop(frames_of(light), dataclasses.replace(SPEC, window=window))
     assert found.electrons == pytest.approx(light[:, first[0] :, first[1] :][:, :window, :window])
     assert notes == []
+
+
+def frames_of(light):
+    return SimpleNamespace(
+        electrons=light, usable=np.ones(light.shape, bool), saturated=np.zeros(light.shape, bool),
+        variance_e2=np.ones(light.shape), scale=np.ones(light.shape),
+    )  # fmt: skip
+
+
+def test_a_bead_is_found_on_a_slope_that_is_brighter_and_its_background_is_the_least_fifth():
+    """20 electrons a pixel across, 800 in all, and a bead of 300; noise of 9 about the plane."""
+    x = np.tile(np.arange(41.0), (30, 1))
+    noise = RNG.normal(0, 9, (30, 41))
+    light = np.tile(100 + 20.0 * x + noise, (4, 1, 1))
+    spot(light, 14, 20, 2, 300.0, slice(0, 4))
+    found, background, notes = pupilfit._crop(frames_of(light), SPEC)
+    part = light[:, 6:22, 12:28]
+    plane = pupilfit._plane(part)
+    assert found.electrons == pytest.approx(part - plane)
+    assert background == pytest.approx(np.percentile(part - plane, 20), rel=1e-12)
+    assert plane == pytest.approx(
+        (20.0 * (x - x[:, 12:28].mean()))[:16, 12:28], abs=9.0
+    )  # 9 over 90 pixels, at corners
+    assert ["plane" in words for words in notes] == [True]
+
+
+def test_a_start_moves_to_a_bead_off_the_middle():
+    """Pixels of 0.4 um from row and column 8: 5 rows down are 2 um along y, 3 columns to the left -1.2 along x."""
+    light = np.full((4, 16, 16), 12.0)
+    spot(light, 13, 5, 1, 90.0, slice(0, 4))
+    pupil = PupilModel(SPEC, np.array([-8.0, -3.0, 1.0, 6.0]), phase_order=4, amplitude_order=2)
+    phase, amplitude, dx, dy, *_ = pupil.layout().split(pupilfit._start(pupil, data_of(light), 0.0))
+    assert dx.tolist() == pytest.approx([-1.2, *[0] * (len(dx) - 1)])
+    assert dy.tolist() == pytest.approx([2.0, *[0] * (len(dy) - 1)])
+    assert not np.concatenate([phase, amplitude]).any()
+
+
+def test_low_orders_from_three_starts_then_all_from_the_best(monkeypatch):
+    position, asked = np.array([-8.0, -3.0, 1.0, 6.0]), []
+    light = np.full((4, 16, 16), 12.0)
+    spot(light, 8, 8, 1, 90.0, slice(0, 4))
+    spec = dataclasses.replace(SPEC, phase_order=5)
+
+    def fit(images, data, start, *, prior, settings):
+        asked.append((images.__self__, start, settings))
+        merit = (3.0, 1.0, 2.0, 0.0)[len(asked) - 1]
+        return SimpleNamespace(value=start + 0.01 * len(asked), merit=merit)
+
+    monkeypatch.setattr(pupilfit.leastsquares, "fit", fit)
+    model, solution = pupilfit._fit(spec, position, data_of(light))
+    models, starts, settings = zip(*asked, strict=True)
+    place = models[0].phase_indices.index((4, 0))
+    assert [float(start[place]) for start in starts[:3]] == pytest.approx([0.0, 0.8, -0.8])
+    assert {max(n for n, _ in each.phase_indices) for each in models[:3]} == {4}
+    assert [len(each.amplitude_indices) for each in models] == [0, 0, 0, len(model.amplitude_indices)]
+    assert models[3] is model
+    assert max(n for n, _ in model.phase_indices) == 5
+    whole, best = model.layout().split(starts[3]), models[1].layout().split(starts[1] + 0.02)
+    for part, before in zip(whole[2:], best[2:], strict=True):
+        assert part == pytest.approx(before)
+    assert whole[0][: len(best[0])] == pytest.approx(best[0])
+    assert (model.layout().size, solution.value[0]) == (len(starts[3]), pytest.approx(starts[3][0] + 0.04))
+    for each in settings[:3]:
+        assert (each.iterations, each.step_tolerance, each.near, each.secant, each.finish) == (
+            12,
+            1.0,
+            1.0,
+            True,
+            False,
+        )
+    last = settings[3]
+    assert (last.iterations, last.step_tolerance, last.near, last.secant, last.finish) == (60, 1.0, 2.0, True, True)
 
 
 @pytest.mark.parametrize(
