@@ -23,6 +23,27 @@ def test_a_pupil_on_the_sphere_comes_back_from_its_image():
     found = axis.optical_axis(torch.tensor(image), torch.tensor(SLIP), EYE)
     assert found.hit.all()
     assert found.direction.numpy() == pytest.approx(DIRECTION, abs=1e-12)
+    rows = torch.tensor(np.stack([image, image[::-1]])), torch.tensor(np.stack([SLIP, SLIP[::-1]]))
+    many = axis.optical_axis(*rows, EYE)  # of a batch of batches, each by itself
+    assert many.hit.shape == (2, 3)
+    assert many.direction.numpy() == pytest.approx(np.stack([DIRECTION, DIRECTION[::-1]]), abs=1e-12)
+    apart = axis.angle_rad(many.direction, many.direction[:1])
+    want = np.arccos(np.clip((DIRECTION[::-1] * DIRECTION).sum(1), -1, 1))
+    assert apart.numpy() == pytest.approx(np.stack([np.zeros(3), want]), abs=1e-7)  # arccos near 1
+
+
+@pytest.mark.parametrize(("beside", "hit"), [(8.98, True), (9.02, False)])
+def test_a_ray_meets_the_eye_up_to_its_radius(beside, hit):
+    """Past the middle at 8.98 and 9.02 mm of 9: 0.6 mm before it the sphere is met, or nowhere."""
+    eye = EyeGeometry((0.0, 0.0, 40.0), radius_mm=9.0, sensor_distance_mm=3.0)
+    sine = beside / 40.0
+    image = torch.tensor([[0.0, 3.0 * sine / math.sqrt(1 - sine**2)]], dtype=torch.float64)
+    found = axis.optical_axis(image, torch.zeros(1, 3, dtype=torch.float64), eye)
+    assert bool(found.hit) is hit
+    before = math.sqrt(max(81 - beside**2, 0.0))
+    across, along = np.array([math.sqrt(1 - sine**2), -sine]), np.array([sine, math.sqrt(1 - sine**2)])
+    place = beside * across - before * along  # of y and z, from the middle of the eye
+    assert found.direction[0, 1:].tolist() == pytest.approx((place / np.linalg.norm(place)).tolist(), abs=1e-12)
 
 
 def test_a_ray_beside_the_eye_names_the_nearest_place_on_it():

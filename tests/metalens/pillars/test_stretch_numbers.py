@@ -108,7 +108,30 @@ def test_a_resonance_reaches_two_half_widths_and_is_told_with_its_angle():
 def test_a_stretch_within_ends_and_of_twelve_entries_at_least():
     found = stretch(library(), **ASKED, within_um=(D[7], D[18]))
     assert found.diameter_um == pytest.approx(D[7:19])
+    found = stretch(library(), **ASKED, within_um=(D[7] + 5e-10, D[18] - 5e-10))  # rounding of the ends
+    assert found.diameter_um == pytest.approx(D[7:19])
     with pytest.raises(DomainError, match="no 12 diameters in a row"):
         stretch(library(), **ASKED, within_um=(D[7], D[17]))
+    dark = at(0, 0.8, 0.8)
+    dark[..., :49] = 0.1
+    with pytest.raises(DomainError, match="no 12 diameters in a row"):
+        stretch(library(dark), **ASKED)  # eleven are left at the end
+    dark[..., 48] = 0.8
+    assert stretch(library(dark), **ASKED).diameter_um == pytest.approx(D[48:])
+    assert stretch(library(at(0, 0.1, 0.8)), **ASKED).notes == ("cut at 0.1050 um: |t| falls to 0.10, below 0.5",)
     with pytest.raises(DomainError, match=r"\(\|t\| falls to 0.20, below 0.5\)"):
         stretch(library(0.2), **ASKED)
+
+
+def test_phases_are_unwrapped_over_diameters_wavelengths_and_angles():
+    """Steps of 2.9 rad from wave to wave and 2.2 from angle to angle, of 0.4 between polarisations that grow apart."""
+    made = library()
+    along = np.arange(60)
+    phase = 0.4 * np.arange(2).reshape(2, 1, 1, 1) * (1 + along / 60) + 2.2 * np.arange(2).reshape(1, 2, 1, 1)
+    made.t = 0.8 * np.exp(1j * (phase + 2.9 * np.arange(3).reshape(1, 1, 3, 1) + 0.2 * along))
+    found = stretch(made, **ASKED)
+    mean = 0.2 * along + 0.2 * (1 + along / 60)
+    want = mean + 2.2 * np.arange(2).reshape(2, 1, 1) + 2.9 * np.arange(3).reshape(1, 3, 1)
+    turns = (found.phase - want) / (2 * math.pi)
+    assert turns == pytest.approx(np.full(want.shape, np.rint(turns[0, 0, 0])), abs=1e-9)
+    assert found.polarization_spread == pytest.approx(0.8 * math.sin(0.2 * (1 + 59 / 60)))
