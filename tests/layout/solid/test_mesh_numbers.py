@@ -94,3 +94,36 @@ def test_every_mesh_of_a_gltf_lies_where_its_views_say_with_unit_normals_outward
         assert np.linalg.norm(parts["NORMAL"], axis=1) == pytest.approx(np.ones(len(want)), abs=1e-6)
         middle = np.array([0, 0.35e-6, 0])  # of a convex body: every face is seen from without
         assert ((want - middle) * parts["NORMAL"]).sum(1).min() > 0
+
+
+@pytest.mark.parametrize("sides", [3, 5, 8])
+def test_a_frustum_has_flats_towards_x_and_the_areas_of_its_circles(sides):
+    """Corners at half steps of the turn; n/2 sin(2π/n) R² is π d²/4."""
+    made = mesh.frustum(0.3, 0.2, 0.7, sides=sides)
+    turn = 2 * math.pi * (np.arange(sides) + 0.5) / sides
+    for part, d, z in ((made.vertices_um[:sides], 0.3, 0.0), (made.vertices_um[sides:], 0.2, 0.7)):
+        reach = d / 2 * math.sqrt(math.pi / (sides / 2 * math.sin(2 * math.pi / sides)))
+        want = np.column_stack([reach * np.cos(turn), reach * np.sin(turn), np.full(sides, z)])
+        assert part == pytest.approx(want, abs=1e-12)
+    assert mesh.volume_um3(made) == pytest.approx(math.pi * 0.7 / 12 * (0.09 + 0.06 + 0.04), rel=1e-12)
+    assert len(made.triangles) == 4 * sides - 4
+
+
+@pytest.mark.parametrize("name", range(4))
+def test_a_gltf_is_as_long_as_its_header_says_in_whole_words(tmp_path, name):
+    """Of texts of unlike lengths: filled with blanks to four bytes; two chunks, each with its length and kind."""
+    several = pillars([0, 1, 0], (0.24 + 1e-4 * 10**name, 0.31), (0.19, 0.28))
+    mesh.write_gltf(tmp_path / "a.glb", several, sides=3 + name)
+    data = (tmp_path / "a.glb").read_bytes()
+    assert struct.unpack("<4sII", data[:12]) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack("<I4s", data[12:20])
+    assert (length % 4, kind) == (0, b"JSON")
+    text = data[20 : 20 + length]
+    assert len(text) - len(text.rstrip(b" ")) < 4
+    rest, kind = struct.unpack("<I4s", data[20 + length : 28 + length])
+    assert (rest, kind) == (len(data) - 28 - length, b"BIN\0")
+    tree = json.loads(text)
+    assert [view["buffer"] for view in tree["bufferViews"]] == [0] * 4
+    assert tree["scene"] == 0
+    places = [node["translation"] for node in tree["nodes"][:-1]]
+    assert np.array(places) == pytest.approx(np.column_stack([1e-6 * X, 0 * X, -1e-6 * Y]), rel=1e-12)
