@@ -19,9 +19,9 @@ from metalens.image.pupil import Pupil
 SMALL = Pupil(radius_um=150.0, nodes=80)
 FOCUS = Focus(0.85, 2000.0, 20e3)
 TOML = """profile = "fisher"
-aperture_mm = 0.2
+aperture_mm = 0.12
 [fisher]
-iterations = 6
+iterations = 3
 starts = 1
 grids = [6, 0]
 encircled = 0.1
