@@ -45,5 +45,5 @@ def test_a_saturated_pixel_says_something_only_where_the_model_falls_short_of_it
 
 def test_samples_of_a_pixel_are_twice_the_light_s_highest_frequency():
     """A lens of 300 um at 400 um: sine 0.6, 2 sine / wavelength = 1.5 cycles/um at 0.8 um: 3 samples a um."""
-    lens = SimpleNamespace(diameters=SimpleNamespace(radius_um=300.0), sensor_distance_um=400.0, wavelength_um=0.8)
+    lens = SimpleNamespace(diameters=SimpleNamespace(radius_um=300.0), reduced_um=400.0, wavelength_um=0.8)
     assert [oversampling(lens, pixel_um) for pixel_um in (0.2, 1.0, 2.1)] == [1, 3, 7]

@@ -197,7 +197,7 @@ def test_the_phase_of_a_moved_field_is_that_of_the_focus_there():
     lens = SimpleNamespace(
         wavelength_um=0.87,
         diameters=SimpleNamespace(radius_um=300.0),
-        sensor_distance_um=1100.0,
+        reduced_um=1100.0,
         source_distance_um=5200.0,
     )
     u, v = np.array([0.6, -0.3, 0.1]), np.array([-0.2, 0.7, 0.4])

@@ -20,7 +20,8 @@ LIGHT, LEANING, MOVED = RNG.uniform(3, 9, SHAPE), RNG.normal(size=SHAPE), RNG.no
 LENS = SimpleNamespace(
     wavelength_um=0.83,
     diameters=SimpleNamespace(radius_um=300.0),
-    sensor_distance_um=1100.0,
+    sensor_distance_um=1170.0,
+    reduced_um=1100.0,  # through films
     source_distance_um=5200.0,
     cell=SimpleNamespace(sidewall_rad=0.0),
 )

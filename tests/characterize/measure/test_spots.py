@@ -12,7 +12,7 @@ from characterize.measure import frames, metrics
 WAVE, RADIUS, DISTANCE = 0.85, 30.0, 140.0
 SINE = RADIUS / math.hypot(RADIUS, DISTANCE)
 DESIGN = SimpleNamespace(
-    wavelength_um=WAVE, diameters=SimpleNamespace(radius_um=RADIUS), sensor_distance_um=DISTANCE
+    wavelength_um=WAVE, diameters=SimpleNamespace(radius_um=RADIUS), reduced_um=DISTANCE
 )  # fmt: skip
 ACROSS = (np.arange(64) + 0.5) / 32 - 1
 U, V = np.meshgrid(ACROSS, ACROSS)
