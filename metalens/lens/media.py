@@ -90,13 +90,6 @@ def source_path(front: Pairs, x: Any, y: Any, tangents: Any, inverse: Any) -> An
     return longer(pairs, sine2, sine2 * g * g, more, inverse)[1]
 
 
-def sensor_path(layers: Pairs, x: Any, y: Any, centre: tuple[Any, Any]) -> Any:
-    """Optical path from (x, y) on the lens to a point of the sensor, less that from the lens centre, um."""
-    cx, cy = centre
-    reach2 = cx * cx + cy * cy
-    return longer(layers, square(layers, reach2), reach2, x * x + y * y - 2 * (x * cx + y * cy))[1]
-
-
 def spread(media: Media, p: Any) -> Any:
     """Area on the plane per area of p: (reach / p) (d reach / d p), um²."""
     return widening(media.layers, p * p)

@@ -42,10 +42,13 @@ def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
 def to_sensor(case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None) -> Any:
     """Optical path from (x, y) on the lens to a point of the sensor, by default the middle of the window, less that
     from the lens centre, um."""
-    at = case.centre_um if centre is None else centre
+    cx, cy = case.centre_um if centre is None else centre
     if case.behind is None:
-        return sensor_path(x, y, at, case.sensor_distance_um)
-    return media.sensor_path(case.behind.layers, x, y, at)
+        return sensor_path(x, y, (cx, cy), case.sensor_distance_um)
+    reach2 = cx * cx + cy * cy
+    pairs = case.behind.layers
+    more = x * x + y * y - 2 * (x * cx + y * cy)
+    return media.longer(pairs, media.square(pairs, reach2), reach2, more)[1]
 
 
 def chief_path(case: Case) -> float:
