@@ -82,7 +82,7 @@ class Worker:
     server: Server
     graph: Graph
     reach: Reach
-    near: int
+    near: tuple[int, ...]
     longest_s: float
 
     @classmethod
@@ -91,7 +91,7 @@ class Worker:
         trees: list[str],
         reach: Reach,
         tests: str,
-        near: int = 0,
+        near: tuple[int, ...] = (),
         files: tuple[str, ...] = (),
         longest_s: float = LONGEST_S,
     ) -> None:
@@ -132,12 +132,24 @@ class Worker:
 
     @classmethod
     def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
-        """As ``judge``, by the nearest test files in full; what they do not answer in time has survived them, unless
-        they answer the plain source in that time.
+        """As ``judge``, by the nearest test files; where it survives them, by the next ones, that are farther off."""
+        said, spent, asked, seen = "survived", 0.0, [], 0
+        for reach in cls.near:
+            tests, seen = _near(cls.graph, module, reach)[seen:], reach
+            if said != "survived" or not tests:
+                break
+            outcome, seconds = cls._asked(mutant, module, source, tests, loops)
+            spent, asked = spent + seconds, asked + tests
+            said = outcome if outcome == "survived" or reach == cls.near[0] else table.FARTHER
+        return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": asked}
+
+    @classmethod
+    def _asked(cls, mutant: rules.Mutant, module: str, source: str, tests: list[str], loops: bool) -> tuple[str, float]:
+        """(outcome, seconds) by test files in full; what they do not answer in time has survived them, unless they
+        answer the plain source in that time.
 
         Where no function in memory changes it may be a default, of which the list of promised ones is asked first.
         """
-        tests = _near(cls.graph, module, cls.near)
         answer = None if loops else cls.server.outcome(mutant.path, source, tests, cls.longest_s)
         if answer is None and not loops:
             tests = [PROMISED, *tests]
@@ -146,7 +158,7 @@ class Worker:
         said = "killed" if outcome == "failed" else "survived"
         if outcome == "time" and cls.bench.run(tests, max(cls.longest_s - SLACK_S, 0) / 3, fresh=False)[0] == "passed":
             said = "killed by time"
-        return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": tests}
+        return said, spent
 
 
 def _near(graph: Graph, module: str, count: int) -> list[str]:
@@ -169,6 +181,7 @@ def main(words: list[str]) -> int:
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--budget", type=float, default=60.0, help="seconds of tests for one mutant")
     parser.add_argument("--near", type=int, default=0, help="ask so many nearest test files, measure nothing first")
+    parser.add_argument("--far", type=int, default=0, help="with --near: ask survivors of so many files in all")
     parser.add_argument(
         "--longest", type=float, default=LONGEST_S, help="processor seconds of these files, with --near"
     )
@@ -186,8 +199,9 @@ def main(words: list[str]) -> int:
             reach = Reach(**json.loads(SEEN.read_text(encoding="utf-8")))
         elif not asked.near:
             reach = _measured(trees, asked.tests)
-        files = _files(chosen, asked.tests, asked.near) if asked.near else ()
-        begun = trees, reach, asked.tests, asked.near, files, asked.longest
+        near = tuple(count for count in (asked.near, asked.far) if count)
+        files = _files(chosen, asked.tests, max(near)) if near else ()
+        begun = trees, reach, asked.tests, near, files, asked.longest
         rows = []
         with multiprocessing.get_context("fork").Pool(asked.jobs, Worker.begin, begun) as pool:
             for row in pool.imap_unordered(Worker.judge, [(m, asked.budget) for m in chosen]):

@@ -3,6 +3,7 @@
 from collections import defaultdict
 
 Row = dict[str, object]
+FARTHER = "killed farther off"  # by test files beyond the nearest
 LEFT = ("survived", "no test")
 
 
@@ -51,5 +52,9 @@ def summary(rows: list[Row]) -> str:
         if part:
             counted = len(part) - len(equal)
             share = len(killed) / max(counted, 1)
-            parts.append(f"{name}: {len(killed)} of {counted} killed ({share:.1%}), {len(equal)} more are equivalent")
+            far = sum(r["outcome"] == FARTHER for r in killed)
+            beyond = f" (of them {far} by test files farther off than the nearest)" if far else ""
+            parts.append(
+                f"{name}: {len(killed)} of {counted} killed ({share:.1%}){beyond}, {len(equal)} more are equivalent"
+            )
     return "; ".join(parts) + "."

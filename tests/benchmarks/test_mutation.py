@@ -213,3 +213,32 @@ def test_test_files_of_closed_forms_are_asked_first(tree):
         "sums_parts.py",
         "other.py",
     ]
+
+
+def _told_by(tree, near):
+    """What test files, so many of the nearest and then of all, say of a sum that became a difference."""
+    worker = main.Worker
+    worker.graph, worker.near, worker.longest_s = Graph(tree), near, 20.0
+    worker.bench, worker.server = runner.Bench(tree), server.Server(tree)
+    made = rules.mutants(tree, tree / "metalens" / "numbers_of.py")
+    mutant = next(m for m in made if m.was.endswith(" - SCALE") and m.rule == "sign")
+    row = worker.judge((mutant, 20.0))
+    worker.server.close()
+    return row["outcome"], [name.split("test_")[1] for name in row["tests"]]
+
+
+def test_survivors_are_asked_of_test_files_farther_off(tree, monkeypatch):
+    """The nearest file holds a width alone; the spread of 3 and 4 less 2, √12.5 - 2, is known to the next one."""
+    monkeypatch.setattr(main, "ROOT", tree)
+    folder = tree / "tests" / "metalens"
+    folder.mkdir(parents=True)
+    said = f"import sys\nsys.path.insert(0, {str(tree / 'metalens')!r})\nimport numbers_of\n\n"
+    said += "def for_the_graph():\n    from metalens import numbers_of\n\ndef test_one():\n    assert numbers_of."
+    (folder / "test_numbers_of.py").write_text(f"{said}Box().width(-3.5) == 3.5\n")
+    (folder / "test_other.py").write_text(f"{said}sigma_of([3.0, 4.0]) < 1.54\n")
+    assert _told_by(tree, (1,)) == ("survived", ["numbers_of.py"])
+    assert _told_by(tree, (1, 2)) == ("killed farther off", ["numbers_of.py", "other.py"])
+    assert _told_by(tree, (2,)) == ("killed", ["numbers_of.py", "other.py"])
+    assert "1 of 1 killed (100.0%) (of them 1 by test files farther off" in main.table.summary(
+        [{"outcome": "killed farther off", "bar": False}]
+    )
