@@ -20,7 +20,9 @@ _MOST_BYTES = 1 << 34  # of all frames of a file
 _LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
 _CFA = 32803  # what its values mean: a raw mosaic of colours
 _MEANING = {0: "says that white is 0 (photometric 0)", 3: "holds places in a table of colours"}
-_ELSEWHERE = {5: "LZW", 32773: "PackBits", 34925: "LZMA", 50000: "Zstandard"}  # need a package of their own
+_OPENCV = {5: "LZW", 32773: "PackBits"}  # what OpenCV's reader unpacks and tifffile leaves to a package of its own
+_ELSEWHERE = {34925: "LZMA", 50000: "Zstandard"}  # only that package
+_TURNED = 274  # the tag that says which way up an image is
 
 
 def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
@@ -78,7 +80,7 @@ def order(path: Path) -> str | None:
 def _images(path: Path, file: Any) -> Array:
     count, first = stacked(file), file.pages.first
     if count == len(file.pages):
-        return np.stack(_alike([page.asarray() for page in file.pages], path))
+        return np.stack(_alike(_pages(path, file), path))
     begins, size = first.dataoffsets[0], path.stat().st_size
     if int(first.compression) != 1 or begins + count * first.nbytes > size:
         raise CaptureError(
@@ -88,6 +90,39 @@ def _images(path: Path, file: Any) -> Array:
     kind = first.dtype.newbyteorder(file.byteorder)
     values = np.fromfile(path, kind, count * math.prod(first.shape), offset=begins)
     return values.astype(first.dtype, copy=False).reshape(count, *first.shape)
+
+
+def _pages(path: Path, file: Any) -> list[Array]:
+    """The image of every page, in the file's own order of colours."""
+    packed = {n for n, page in enumerate(file.pages) if int(page.compression) in _OPENCV}
+    if not packed or importlib.util.find_spec("imagecodecs") is not None:
+        return [page.asarray() for page in file.pages]
+    found = _unpacked(path)
+    images = []
+    for number, page in enumerate(file.pages):
+        if number not in packed:
+            images.append(page.asarray())
+            continue
+        image = found[number] if len(found) == len(file.pages) else np.empty(0)
+        turned = page.tags.valueof(_TURNED, 1) != 1  # which OpenCV turns upright
+        if turned or image.shape != page.shape or image.dtype != page.dtype:
+            raise CaptureError(
+                f"{path}: frame {number} is compressed ({_OPENCV[int(page.compression)]}) and damaged, turned or of a "
+                f"kind ({page.dtype}) that is not read so; save it plain or deflated, or install imagecodecs"
+            )
+        images.append(image[..., [2, 1, 0, 3][: image.shape[-1]]] if image.ndim == 3 else image)  # blue comes first
+    return images
+
+
+def _unpacked(path: Path) -> Sequence[Array]:
+    """All images of a file as OpenCV reads them, without its own words on what it cannot."""
+    import cv2
+
+    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return tuple(cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)[1])
+    finally:
+        cv2.utils.logging.setLogLevel(before)
 
 
 def _check(path: Path, file: Any) -> None:
