@@ -49,14 +49,15 @@ def test_a_smooth_part_is_the_tensor_product_of_rows_down_and_columns_across():
 
 
 def test_cells_are_equal_parts_of_direction_cosines_and_go_on_beyond_the_last():
-    """Node k of 24 from (k - 12) / 12 of the rim's cosine on; x / √(x² + y² + d²) of a place."""
-    controls, edge = rng.normal(size=(24, 24)), 210.0 / math.hypot(210.0, 1700.0)
-    x, y = np.array([-209.0, -52.0, 4.0, 137.0, 300.0]), np.array([-400.0, -33.0, 71.0, 190.0])
-    path = np.sqrt(x**2 + y[:, None] ** 2 + 1700.0**2)
+    """Node k of 24 from (k - 12) / 12 of the rim's cosine on; x / √(x² + y² + d²) of a place, d below the rim."""
+    near, controls, edge = Pupil(210.0, 190.0, 0.81, 24), rng.normal(size=(24, 24)), 210.0 / math.hypot(210.0, 190.0)
+    x, y = np.array([-209.0, -52.0, 4.0, 137.0, 600.0]), np.array([-800.0, -33.0, 71.0, 190.0])
+    path = np.sqrt(x**2 + y[:, None] ** 2 + 190.0**2)
     column = np.clip(np.floor((x / path / edge + 1) * 12), 0, 23).astype(int)
     row = np.clip(np.floor((y[:, None] / path / edge + 1) * 12), 0, 23).astype(int)
-    assert (row.min(), row.max(), column.max()) == (0, 22, 23)
-    assert np.array_equal(search.free_form(controls, PUPIL, cells=True)(x, y), controls[row, column])
+    assert column[:, 3].tolist() == [14, 21, 21, 19]
+    assert (row.min(), row.max(), column.max()) == (0, 23, 23)
+    assert np.array_equal(search.free_form(controls, near, cells=True)(x, y), controls[row, column])
 
 
 @pytest.mark.parametrize("zones", [1, 3])
