@@ -40,6 +40,7 @@ def test_single_frames_and_what_is_stated_are_left_alone(shape, order):
     ("shape", "known", "why"),
     [
         ((9, 7, 5), {"count": 5}, "since 5 frames of it are listed"),
+        ((2, 7, 5), {"count": 5}, "since 5 frames of it are listed"),
         ((5, 7, 5), {"count": 5}, ""),
         ((9, 7, 5), {"count": 9}, ""),
         ((9, 7, 5), {"count": 7}, ""),
@@ -103,6 +104,8 @@ def test_a_stack_of_which_nothing_is_known_is_taken_told_or_refused_by_its_shape
         ((16, 10, 4), (7, 5), 2, False),
         ((14, 8, 4), (7, 5), 2, False),
         ((7, 5, 4, 3), (7, 5), 1, True),
+        ((4, 7, 5, 3), (7, 5), 1, False),
+        ((7, 7, 7), (7, 7), 1, False),  # either way: as it lies
     ],
 )
 def test_a_dark_frame_is_known_by_the_size_of_the_frames(shape, size, pitch, lies):

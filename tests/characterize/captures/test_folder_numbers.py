@@ -46,6 +46,7 @@ def test_dark_frames_of_another_kind_are_refused_unless_there_are_others(tmp_pat
         (("t3_z5.tif", "t3_z12.tif", "t3_z13.tif", "t3_z14.tif"), (12, 5, 7, 1)),  # the first step is the wide one
         (("t3_z5.tif", "t3_z7.tif", "t3_z9.tif"), None),
         (("t3_z5.tif", "t4_z7.tif", "t5_z11.tif"), None),  # two numbers count
+        (("t3_z5.tif", "t4_z7.tif", "t4_z13.tif"), None),
         (("t3_z5.tif", "u3_z7.tif", "t3_z11.tif"), None),  # other words
         (("t3_z5.tif", "t3_z5.tiff"), None),  # none counts
     ],

@@ -38,6 +38,7 @@ def stack(light=LIGHT, angles=2):
     ("shape", "angles", "words"),
     [
         ((3, 4, 5), 1, "depth y x"),
+        ((3, 4, 1), 1, "depth y x"),  # a single column is no angle
         ((2, 3, 4, 5), 2, "angle depth y x"),
         ((4, 3, 4, 5), 2, "lens depth y x"),
         ((7, 2, 3, 4, 5), 2, "lens angle depth y x"),

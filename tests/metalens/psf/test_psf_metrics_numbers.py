@@ -1,5 +1,6 @@
 """What two lit samples of a small window are worth: transfers, circles, widths and information by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -49,6 +50,9 @@ def test_the_centre_of_light_counts_from_the_middle_of_the_window():
     x, y = metrics.centroid(PAIR)
     assert x == pytest.approx(STEP * np.array([0.25 * -2 + 0.75 * 1, 0.6 * 4 + 0.4 * 2]))
     assert y == pytest.approx(STEP * np.array([0.25 * -1.5 + 0.75 * 0.5, 0.6 * 2.5 + 0.4 * -2.5]))
+    angled = dataclasses.replace(PAIR, intensity=np.stack([PAIR.intensity[::-1], PAIR.intensity]))
+    for one, of_angles in zip((x, y), metrics.centroid(angled), strict=True):
+        assert of_angles == pytest.approx(np.stack([one[::-1], one]), rel=1e-12)
 
 
 def test_circles_about_the_centre_hold_parts_of_the_samples_at_their_rim():
@@ -92,6 +96,7 @@ def test_the_blur_is_at_most_the_disc_that_is_as_bright_as_the_window():
     lone[3, 1] = 2.0
     assert metrics.blur_um(lone, STEP, 0.45) == pytest.approx(EVEN / math.sqrt(0.45), rel=1e-12)
     assert metrics.blur_um(lone, STEP, 0.55) == pytest.approx(STEP / 2 / 0.404, rel=1e-3)  # one sample each way
+    assert metrics.blur_um(PROFILES, STEP, 1.3) == metrics.blur_um(PROFILES, STEP)  # no more than all
     some = metrics.blur_um(np.stack([lone, PROFILES]), STEP, np.array([1.0, 0.45]))
     assert some == pytest.approx([STEP / 2 / 0.404, EVEN / math.sqrt(0.45)], rel=1e-3)
 
