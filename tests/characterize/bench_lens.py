@@ -15,8 +15,9 @@ from characterize.model import NAMES, ForwardModel
 from characterize.model.parameters import Known
 from characterize.model.setting import Setting
 from metalens import design, profiles
-from metalens.cell.record import Cell
-from metalens.lens.record import Lens
+from metalens.cell.record import Cell, Film, Index
+from metalens.lens import Layers
+from metalens.lens.record import DiameterMap, Lens
 from metalens.made import Sensitivity
 from metalens.pillars.proxy import Proxy
 
@@ -60,6 +61,18 @@ def lens(strength_rad: float = 0.0) -> Lens:
     return design.make(
         design.phase_of(shape, focus, radius_um=20.0), focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy()
     )[0]
+
+
+GLASS = Layers(behind=(Film(Index(1.4), 245.0),))  # Σ t / n from the pillars is 70 um less than the distance
+
+
+def row(radius_um: float = 20.0, **more: object) -> Lens:
+    """One row of equal pillars from rim to rim, for what asks a lens for its radius, distances and films alone."""
+    n = round(radius_um / 0.2) + 1
+    across = DiameterMap(np.full((1, n), 0.2), 2 * radius_um / (n - 1))
+    usual = {"diameters": across, "cell": Cell(across.pitch_um), "proxy": proxy(), "wavelength_um": 0.85}
+    usual |= {"sensor_distance_um": 110.0, "source_distance_um": 600.0, "profile": "hyperbolic"}
+    return Lens(**(usual | more))
 
 
 def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> Truth:

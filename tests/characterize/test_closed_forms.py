@@ -1,9 +1,13 @@
 """Closed forms of parts of the fit: power of a dipole, pixels that say nothing, samples of a pixel."""
 
-from types import SimpleNamespace
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import bench_lens as b
 
 from characterize.inference import leastsquares
 from characterize.inference.leastsquares import Data, Prior
@@ -44,6 +48,6 @@ def test_a_saturated_pixel_says_something_only_where_the_model_falls_short_of_it
 
 
 def test_samples_of_a_pixel_are_twice_the_light_s_highest_frequency():
-    """A lens of 300 um at 400 um: sine 0.6, 2 sine / wavelength = 1.5 cycles/um at 0.8 um: 3 samples a um."""
-    lens = SimpleNamespace(diameters=SimpleNamespace(radius_um=300.0), reduced_um=400.0, wavelength_um=0.8)
+    """300 um wide, 400 um away as seen through glass: sine 0.6, 2 sine / 0.8 um = 1.5 cycles/um: 3 samples a um."""
+    lens = b.row(300.0, sensor_distance_um=470.0, layers=b.GLASS, wavelength_um=0.8)
     assert [oversampling(lens, pixel_um) for pixel_um in (0.2, 1.0, 2.1)] == [1, 3, 7]

@@ -1,17 +1,20 @@
 """The virtual bench number by number: where light comes from and lands, what a camera reads, with typed light."""
 
 import math
+import sys
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
 from characterize.bench import bench
 from characterize.bench.bench import Camera, Truth
 from characterize.model import Known
-from metalens.lens import Layers
-
-IN_AIR = {"layers": Layers(), "wavelength_um": 0.85}
 
 
 def truth(**more):
@@ -40,11 +43,7 @@ def test_the_background_is_a_plane_that_is_never_below_nothing():
 def test_light_falls_with_the_square_of_its_true_distance_and_adds_over_the_line(monkeypatch):
     """Depths off by a zero of 400 and a scale of 0.02 about their mean of 27 mm; each line by its weight."""
     seen = []
-    lens = SimpleNamespace(
-        diameters=SimpleNamespace(diameter_um=np.ones((4, 5)), radius_um=300.0),
-        reduced_um=1900.0,
-        **IN_AIR,
-    )
+    lens = b.row(300.0, sensor_distance_um=1900.0)
 
     def frames(lens, truth, colour, t, way, depth):
         seen.append(colour[bench.PLACE["wavelength_nm"]])
@@ -68,7 +67,7 @@ def test_light_falls_with_the_square_of_its_true_distance_and_adds_over_the_line
 
 def test_sources_off_the_axis_come_from_their_own_side_and_the_window_stays_with_the_stage():
     """dx/dz of the light less the source's own place over its depth; the window by what it was moved."""
-    lens = SimpleNamespace(sensor_distance_um=1900.0, proxy=SimpleNamespace(max_angle_rad=0.5), **IN_AIR)
+    lens = b.row(sensor_distance_um=1900.0, proxy=replace(b.proxy(), max_angle_rad=0.5))
     x = truth(
         parameter=knows(
             distance_um=60.0, tilt_x_deg=0.8, tilt_y_deg=-0.5, source_x_um=300.0, source_y_um=-120.0,
@@ -123,7 +122,7 @@ def test_frames_are_as_bright_as_asked_for_and_flats_half_full(monkeypatch):
 
 def test_as_many_frames_are_formed_at_once_as_a_million_fine_samples_hold():
     """Of 6 pixels and 4 about them, nine samples each: (14 x 9)² a frame, 62 of them. Through glass one by one."""
-    lens = SimpleNamespace(sensor_distance_um=1900.0, proxy=SimpleNamespace(max_angle_rad=0.5), **IN_AIR)
+    lens = b.row(sensor_distance_um=1900.0, proxy=replace(b.proxy(), max_angle_rad=0.5))
     depth, angle = np.linspace(2e4, 3e4, 70), np.zeros((70, 2))
     index = [index for _, index in bench._alike(lens, truth(), truth().vector(), depth, angle)]
     assert [len(some) for some in index] == [62, 8]

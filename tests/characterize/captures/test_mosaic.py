@@ -2,11 +2,15 @@
 
 import dataclasses
 import math
-from types import SimpleNamespace
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures import capture
 from characterize.inference import prepare
@@ -40,9 +44,8 @@ def test_the_lit_colour_of_a_mosaic_is_taken_at_twice_the_pitch(tmp_path, mosaic
 
 def test_an_error_of_the_pitch_is_the_same_share_of_a_mosaic(tmp_path):
     """0.034 of 1.7 um: 2 %, at either pitch."""
-    lens = SimpleNamespace(wavelength_um=0.85)
     found = capture.load(folder(tmp_path, 'channel = "green"\nmosaic = "GBRG"\nwavelength_um = 0.85'))
-    known = {k.name: k for k in prepare.stated(found, lens)}
+    known = {k.name: k for k in prepare.stated(found, b.row())}
     assert known["pixel_percent"].sigma == pytest.approx(2.0)
     placed = dataclasses.replace(found, position_um=np.array([400.0, 500.0, 600.0]))
     assert prepare.setting_of(placed, 48)[0].fill == 0.5

@@ -1,10 +1,16 @@
 """Error bars at places where the usual case hides them: bounds, outliers, few pixels, chi-square below 1, bent ends."""
 
 import math
+import sys
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.inference import estimate, explore, missing, posterior, search, verdict
 from characterize.inference.ends import Profile
@@ -164,7 +170,7 @@ def test_structure_is_looked_for_with_common_errors_over_the_noise(monkeypatch):
 def test_the_reach_of_distances_is_two_sigma_of_what_is_known_within_a_quarter():
     from characterize.model import Known
 
-    lens = SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1700.0)
+    lens = b.row(sensor_distance_um=1700.0)
     assert estimate._reach_um({"distance_um": Known("distance_um", 3.0, 41.0)}, lens) == pytest.approx(82.0)
     assert estimate._reach_um({"distance_um": Known("distance_um", 3.0, 4100.0)}, lens) <= 1700 / 4
 
@@ -179,7 +185,7 @@ def test_causes_that_are_stated_are_reckoned_with_as_stated():
         "index": Known("index", 0.01, 0.003),
         "pinhole_um": Known("pinhole_um", 6.0, 0.0),
     }
-    lens = SimpleNamespace(wavelength_um=0.7)
+    lens = b.row(wavelength_um=0.7)
     task = SimpleNamespace(known=known, unfitted={"stitching_nm": 11.0}, model=SimpleNamespace(lens=lens))
     assert causes._size(task, "sidewall_deg") == pytest.approx(1.0)
     assert causes._size(task, "index") == 0.003
@@ -194,12 +200,8 @@ def test_the_phase_of_a_moved_field_is_that_of_the_focus_there():
     """Pillars moved by 1 um along x see the path to the sensor and from the source change by x / r and x / r'."""
     from characterize.inference import causes
 
-    lens = SimpleNamespace(
-        wavelength_um=0.87,
-        diameters=SimpleNamespace(radius_um=300.0),
-        reduced_um=1100.0,
-        source_distance_um=5200.0,
-    )
+    distances = {"sensor_distance_um": 1170.0, "layers": b.GLASS, "source_distance_um": 5200.0}
+    lens = b.row(300.0, wavelength_um=0.87, **distances)
     u, v = np.array([0.6, -0.3, 0.1]), np.array([-0.2, 0.7, 0.4])
     for along in (0, 1):
         shape = causes._field_off(lens, along)(u, v, 1)[0]
@@ -214,7 +216,7 @@ def test_the_phase_of_a_moved_field_is_that_of_the_focus_there():
             rate = (path(x + step[0], y + step[1]) - path(x - step[0], y - step[1])) / (2 * h)
             want = 2 * math.pi / 0.87 * rate if u[k] > 0 else 0.0
             assert shape[k] == pytest.approx(want, rel=1e-6, abs=1e-9)
-    flat = SimpleNamespace(**{**vars(lens), "source_distance_um": 0.0})
+    flat = replace(lens, source_distance_um=0.0)
     assert causes._moved_phase(flat, u, v, 0)[0] == pytest.approx(
         2 * math.pi / 0.87 * 180 / math.hypot(180, 60, 1100), rel=1e-9
     )

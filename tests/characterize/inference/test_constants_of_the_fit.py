@@ -78,7 +78,7 @@ def test_spots_of_twice_the_width_are_the_lens_and_of_seven_times_another(wider,
     likeness, _ = likeness_of(3.7 * seen, told, 0.0)
     assert likeness == pytest.approx(2 * wider / (1 + wider**2), abs=0.02)  # of pixels, and the rim of the picture
     found = SimpleNamespace(likeness=likeness)
-    lens = SimpleNamespace(profile="hyperbolic")
+    lens = b.row()
     if refused:
         with pytest.raises(FitRefused, match="no image of this lens"):
             estimate._check_likeness(found, lens)

@@ -1,10 +1,15 @@
 """What the tests on straight models cannot tell: bent valleys to their ends, draws, weights of outliers, priors."""
 
 import math
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.inference import ends, explore, posterior, search, verdict
 from characterize.inference.leastsquares import Data, Prior, Settings, fit
@@ -250,7 +255,7 @@ def test_information_counts_outliers_by_huber_and_satisfied_saturated_pixels_not
 def test_metrology_with_an_error_takes_the_place_of_what_is_usual():
     names = ("bias_nm", "height_nm", "distance_um", "background_e")
     known = {"bias_nm": Known("bias_nm", 3.1, 0.7), "height_nm": Known("height_nm", -4.2, 0.0)}
-    got = search.prior_of(names, known, SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1800.0))
+    got = search.prior_of(names, known, b.row(sensor_distance_um=1800.0))
     table = [PARAMETERS[PLACE[name]] for name in names]
     assert got.mean.tolist() == [3.1, -4.2, table[2].start, table[3].start]
     assert got.sigma.tolist() == [0.7, table[1].sigma, table[2].sigma, table[3].sigma]

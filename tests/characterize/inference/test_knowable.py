@@ -1,9 +1,14 @@
 """What frames can tell: combinations and their errors by hand, in the units of each parameter."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures import Gain
 from characterize.inference import estimate, knowable
@@ -109,7 +114,7 @@ def asbuilt(**more):
         "low": np.empty(0),
         "high": np.empty(0),
         "draws": np.empty((0, 0)),
-        "design": SimpleNamespace(wavelength_um=0.83, sensor_distance_um=4000.0),
+        "design": b.row(wavelength_um=0.83, sensor_distance_um=4000.0),
     }
     for name, value in (numbers | more).items():
         object.__setattr__(found, name, value)

@@ -1,10 +1,15 @@
 """From a capture to what is fitted: brackets as one frame, the window about the light's centre, refusals at limits."""
 
 import dataclasses
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures import Capture, Frames, Gain
 from characterize.inference import prepare
@@ -148,7 +153,7 @@ def test_one_frame_fixes_eight_parameters_of_the_lens_and_three_pixels_one():
 @pytest.mark.parametrize(("source", "sensor"), [(26e3, 2e3), (np.inf, 2.6e3)])
 def test_depths_a_thousand_times_off_are_told_their_column(source, sensor):
     """Within a factor of 5 of it; the middle of the depths counts. A lens for infinity: ten image distances."""
-    lens = SimpleNamespace(source_distance_um=source, sensor_distance_um=sensor)
+    lens = b.row(source_distance_um=source, sensor_distance_um=sensor)
 
     def said(middle):
         return refused(prepare.check_depths, np.array([0.3 * middle, middle, 9 * middle]), lens)

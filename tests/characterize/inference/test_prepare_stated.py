@@ -1,15 +1,20 @@
 """What capture.toml says of the bench becomes the fit's priors, in the units of its parameters."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.inference.prepare import stated
 
 
 def said(**about):
     capture = SimpleNamespace(wavelength_um=0.8523, fill=1.0, pixel_um=0.75, about=about)
-    return {one.name: (one.value, one.sigma) for one in stated(capture, SimpleNamespace(wavelength_um=0.85))}
+    return {one.name: (one.value, one.sigma) for one in stated(capture, b.row())}
 
 
 def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
@@ -25,5 +30,5 @@ def test_words_of_a_capture_are_priors_in_units_of_the_parameters():
 def test_half_a_nanometre_of_wavelength_where_nothing_is_said_and_as_much_of_a_long_one():
     assert said() == {"wavelength_nm": (pytest.approx(2.3), 0.5)}
     capture = SimpleNamespace(wavelength_um=10.603, fill=1.0, pixel_um=12.0, about={})
-    (one,) = stated(capture, SimpleNamespace(wavelength_um=10.6))
+    (one,) = stated(capture, b.row(wavelength_um=10.6))
     assert (one.value, one.sigma) == (pytest.approx(3.0), pytest.approx(0.5 * 10.6 / 0.85))

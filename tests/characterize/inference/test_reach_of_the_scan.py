@@ -1,8 +1,12 @@
 """How far distances are looked at before a fit: two sigma of what is known, no farther than the bounds."""
 
-from types import SimpleNamespace
+import sys
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.inference import estimate
 from characterize.model import Known
@@ -12,5 +16,5 @@ from characterize.model import Known
 def test_distances_are_scanned_over_two_sigma_within_the_bounds(sigma, reach):
     """Unknown to 100 um where nobody says; the bounds lie 400 um to either side."""
     known = {} if sigma is None else {"distance_um": Known("distance_um", 12.0, sigma)}
-    lens = SimpleNamespace(sensor_distance_um=5200.0, wavelength_um=0.83)
+    lens = b.row(sensor_distance_um=5200.0, wavelength_um=0.83)
     assert estimate._reach_um(known, lens) == pytest.approx(reach)

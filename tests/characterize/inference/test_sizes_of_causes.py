@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,22 +10,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
 from characterize.inference import causes
 from characterize.model import MODES, PLACE, Known, Setting, prior_rad, unstated, vector
+from metalens.lens import Lens
 from metalens.made import Bends, named
 
 SHAPE = (4, 5, 7)
 RNG = np.random.default_rng(41)
 SLOPES = RNG.normal(size=(len(PLACE), *SHAPE))
 LIGHT, LEANING, MOVED = RNG.uniform(3, 9, SHAPE), RNG.normal(size=SHAPE), RNG.normal(size=(MODES + 3, *SHAPE))
-LENS = SimpleNamespace(
-    wavelength_um=0.83,
-    diameters=SimpleNamespace(radius_um=300.0),
-    sensor_distance_um=1170.0,
-    reduced_um=1100.0,  # through films
-    source_distance_um=5200.0,
-    cell=SimpleNamespace(sidewall_rad=0.0),
-)
+LENS = b.row(300.0, wavelength_um=0.83, sensor_distance_um=1170.0, layers=b.GLASS, source_distance_um=5200.0)
 
 
 @dataclass
@@ -47,7 +45,7 @@ class Model:
     moved: tuple[float, ...] = ()
     setting: Sensor = field(default_factory=Sensor)
     grid: Sensor = field(default_factory=Sensor)
-    lens: SimpleNamespace = field(default_factory=lambda: LENS)
+    lens: Lens = field(default_factory=lambda: LENS)
     modes: tuple[int, ...] = ()
     groups: tuple[SimpleNamespace, ...] = ()
     cut: float = 0.0

@@ -1,10 +1,15 @@
 """What a verdict counts: intervals over 3.92, products of neighbouring frames over their own scatter."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures import Gain
 from characterize.inference import verdict
@@ -70,7 +75,7 @@ def test_an_interval_is_that_of_the_profile_or_1_96_sigma_and_draws_follow_the_c
     covariance = np.array([[0.09, -0.06], [-0.06, 0.25]])
     names = ("bias_nm", "distance_um")
     fitted = SimpleNamespace(
-        design=SimpleNamespace(wavelength_um=0.85, sensor_distance_um=1700.0),
+        design=b.row(sensor_distance_um=1700.0),
         names=names, value=np.array([7.0, 0.4]), covariance=covariance, low=np.array([]), high=np.array([]),
         draws=np.empty((0, 2)), sigma=AsBuilt.sigma.fget(SimpleNamespace(covariance=covariance)),
     )  # fmt: skip

@@ -1,11 +1,16 @@
 """Micrographs on the mask, edges on a shade, spots above their rim and the sharpest depth, each by hand."""
 
 import math
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import special
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures.capture import Capture
 from characterize.measure import frames, metrics, overlay, sem
@@ -231,7 +236,7 @@ def test_knots_hold_six_pillars_at_least():
 
 
 def test_distortion_is_the_place_over_that_of_a_straight_ray_relative_to_the_smallest_angle():
-    design = SimpleNamespace(reduced_um=1900.0)
+    design = b.row(sensor_distance_um=1970.0, layers=b.GLASS)
     place = {a: 1900 * math.tan(math.radians(a)) * (0.98 + 1e-3 * a**2) for a in (-7.0, 4.0, 11.0)}
     rows = [row(20e3, 0.0, 1.0, 3.1 - 0.4), row(30e3, 0.0, 1.0, 3.1 + 0.4)]
     rows += [row(20e3, a, 1.0, x + 3.1) for a, x in place.items()]
@@ -245,7 +250,7 @@ def test_distortion_is_the_place_over_that_of_a_straight_ray_relative_to_the_sma
 
 def test_distortion_is_measured_along_the_field_whichever_way_it_lies():
     """Spots of oblique fields at (0.97 + k |angle|) of the straight ray's place from that of the axis, (1.7, -2.9)."""
-    design = SimpleNamespace(reduced_um=1900.0)
+    design = b.row(sensor_distance_um=1970.0, layers=b.GLASS)
     share = {(0.0, -5.0): 0.97, (6.0, 8.0): 0.99, (0.0, 11.0): 1.01}
     rows = [row(20e3, 0.0, 1.0, 1.7, y=-2.9)]
     for (ax, ay), k in share.items():
@@ -257,7 +262,7 @@ def test_distortion_is_measured_along_the_field_whichever_way_it_lies():
 
 def test_the_airy_pattern_falls_to_nothing_at_its_first_ring():
     """0.61 λ / sin of the rim, on pixels so small that they do not blur; wide pixels take its mean."""
-    design = SimpleNamespace(wavelength_um=0.9, diameters=SimpleNamespace(radius_um=400.0), reduced_um=1500.0)
+    design = b.row(400.0, wavelength_um=0.9, sensor_distance_um=1570.0, layers=b.GLASS)
     sine = 400 / math.hypot(400, 1500)
     ring = 3.8317059702 / (2 * math.pi * sine / 0.9)
     pattern = frames.airy(design, capture(pixel_um=ring / 20), (41, 61))

@@ -1,19 +1,21 @@
 """Spots on pixels as wide as they are, with noise: Strehl ratio and encircled energy by sums over a pupil."""
 
 import math
-from types import SimpleNamespace
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
 
 from characterize.captures.capture import Capture
 from characterize.measure import frames, metrics
 
 WAVE, RADIUS, DISTANCE = 0.85, 30.0, 140.0
 SINE = RADIUS / math.hypot(RADIUS, DISTANCE)
-DESIGN = SimpleNamespace(
-    wavelength_um=WAVE, diameters=SimpleNamespace(radius_um=RADIUS), reduced_um=DISTANCE
-)  # fmt: skip
+DESIGN = b.row(RADIUS, wavelength_um=WAVE, sensor_distance_um=DISTANCE)
 ACROSS = (np.arange(64) + 0.5) / 32 - 1
 U, V = np.meshgrid(ACROSS, ACROSS)
 COMA = 0.6 * math.sqrt(8) * (3 * (U**2 + V**2) - 2) * U

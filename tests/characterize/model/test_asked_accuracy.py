@@ -1,13 +1,18 @@
 """Accuracy that is asked for: more digits where the tolerance is tighter; slopes of a lens of one diameter."""
 
 import math
-from types import SimpleNamespace
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import bench_lens as b
+
 from characterize.model import kernel, pillar_slopes
 from metalens.ground.errors import FitError
+from metalens.lens import DiameterMap
 
 
 @pytest.mark.parametrize(("tolerance", "more"), [(5e-4 / math.e**2, 2.0), (5e-7, math.log(1e3)), (5e-3, 0.0)])
@@ -41,7 +46,7 @@ def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):
     monkeypatch.setattr(pillar_slopes, "_upright", lambda cell: False)
     monkeypatch.setattr(pillar_slopes, "_exact", exact)
     diameters = np.where(np.eye(5) > 0, 0.0, only)
-    lens = SimpleNamespace(diameters=SimpleNamespace(diameter_um=diameters), cell=None, wavelength_um=0.85)
+    lens = b.row(diameters=DiameterMap(diameters, 0.4))
     found = pillar_slopes._solve(lens, 1e-4, ())
     assert only - 1.0001e-3 < min(asked) < only < max(asked) < only + 1.0001e-3
     assert (found.low_um, found.high_um) == pytest.approx((only - 1e-3, only + 1e-3), abs=1e-9)
