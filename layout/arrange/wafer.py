@@ -40,7 +40,7 @@ def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
         if size > pitch + 1e-9:
             raise ProcessError(f"wafer.pitch_um is {pitch:g} along {axis}, but a die is {size:.3f} um long; raise it")
     radius = 500 * wafer.diameter_mm
-    reach = [int(radius / pitch) + 2 for pitch in wafer.pitch_um]
+    reach = [int((radius + abs(off)) / pitch) + 2 for pitch, off in zip(wafer.pitch_um, wafer.offset_um, strict=True)]
     if (2 * reach[0] + 1) * (2 * reach[1] + 1) > 2 * MOST_DIES:
         raise ProcessError(f"wafer.pitch_um = {list(wafer.pitch_um)}: more than {MOST_DIES} dies; raise it")
     rows, columns = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1].reshape(2, -1)
