@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from metalens import propagate, psf
+from metalens.cell import Film, Index
 from metalens.ground.errors import PropagationError
-from metalens.lens import Media
+from metalens.lens import Layers, Media, Stop
 from metalens.propagate import Case
-from metalens.psf import stack
+from metalens.psf import metrics, stack
 from metalens.psf.compute import Result
 
 RNG = np.random.default_rng(3)
@@ -67,6 +68,16 @@ def test_a_transmission_serves_where_it_is_that_of_the_maps_or_of_all_of_them(ph
 def test_weights_that_weigh_nothing_are_refused(weights):
     with pytest.raises(PropagationError, match="need one weight >= 0 for each"):
         stack._maps(np.zeros((2, 3, 5)), 1.0, [0.84, 0.85], weights)
+
+
+@pytest.mark.parametrize(
+    ("phase", "level"), [((3,), (3,)), ((0, 3, 5), (3, 5)), ((2, 3, 5), (3, 4)), ((3, 5), (1, 3, 5))]
+)
+def test_maps_that_do_not_belong_together_are_refused(phase, level):
+    with pytest.raises(PropagationError, match="of both, alike"):
+        stack._maps(np.zeros(phase), np.ones(level), 0.85, None)
+    with pytest.raises(PropagationError, match="2 wavelengths, but maps of shape"):
+        stack._maps(np.zeros((3, 4, 5)), 1.0, [0.84, 0.85], None)
 
 
 def result(**more):
@@ -165,3 +176,39 @@ def test_a_small_lens_gives_the_squares_of_the_exact_sum(row_um):
     assert made.intensity == pytest.approx(light / sums[:, None, None], abs=1e-9)
     whole = (level**2).sum() * 0.4 * (row_um or 0.4)
     assert made.budget.outside == pytest.approx(1 - sums.min() / whole, rel=1e-6)
+
+
+def test_lenses_of_a_batch_and_angles_stand_before_the_depths():
+    """Each as alone, to the rounding of sums of 374 pillars."""
+    phase, level = RNG.uniform(0, 6.28, (3, 17, 22)), RNG.uniform(0.5, 1, (3, 17, 22))
+    about = {"pitch_um": 0.4, "sensor_distance_um": 37.0, "depths_um": [400.0, np.inf], "wavelength_um": 0.85}
+    about |= {"window_um": (5.0, 4.0), "samples": (5, 4)}
+    angles = [[0.1, -0.2], [0.0, 0.3]]
+    made = psf.psf_stack(phase, level, **about, angle_rad=angles)
+    assert made.intensity.shape == (3, 2, 2, 4, 5)
+    for lens in range(3):
+        for angle in range(2):
+            one = psf.psf_stack(phase[lens], level[lens], **about, angle_rad=angles[angle])
+            assert made.intensity[lens, angle] == pytest.approx(one.intensity, abs=1e-12)
+            assert made.energy_um2[lens, angle] == pytest.approx(one.energy_um2, rel=1e-12)
+
+
+def test_the_error_of_a_stop_is_that_of_its_worst_direction_depth_and_wavelength():
+    """Two lenses of lone samples and of even light, whose blur over the path to the window is the angle that counts;
+    of both lenses the wider blur and the smaller share."""
+    layers = Layers(front=(Film(Index(1.5), 30.0),), stop=Stop(20.0, 30.0))
+    lone, even = np.zeros((3, 4)), np.full((3, 4), 1 / 12)
+    lone[1, 2] = 1.0
+    light = np.array([[[lone, lone], [lone, lone]], [[even, lone], [lone, lone]]])
+    share = np.array([[[0.9, 0.8], [0.95, 0.7]], [[0.85, 0.9], [0.6, 0.99]]])
+    made = dataclasses.replace(recorded(torch.ones(2, 2, 3, 4).double()), intensity=torch.from_numpy(light))
+    narrow = 0.6 / 2 / 0.404
+    wide = metrics.blur_um(even, 0.6, 0.85)
+    want = []
+    for case, blurs, shares in zip(CASES, ((wide, narrow), (narrow, narrow)), ((0.85, 0.8), (0.6, 0.7)), strict=True):
+        path = math.sqrt(62.0**2 + case.centre_um[0] ** 2 + case.centre_um[1] ** 2)
+        for z, blur, held in zip((400.0, math.inf), blurs, shares, strict=True):
+            want += [layers.shadow_error(case.tangents, z, w, blur / path, held) for w in (0.83, 0.87)]
+    assert stack._ripples(made, share, CASES, layers) == pytest.approx(max(want), rel=1e-3)  # of 0.404
+    assert math.isnan(stack._ripples(made, share, CASES, None))
+    assert math.isnan(stack._ripples(made, share, CASES, dataclasses.replace(layers, stop=None)))
