@@ -53,6 +53,11 @@ def test_a_single_size_counts_in_steps_of_a_micrometre():
         one.amplitude(np.array([0.17]), np.array([0.25]), 0.63, "x")
 
 
+def test_two_sizes_have_their_own_step():
+    two = Pairs(WAVES, X[:2], Y, T[:, :2], (210.0, 900.0))
+    assert two.amplitude(np.array([0.14]), np.array([0.25]), 0.63, "y") == T[0, 1, 1, 1]
+
+
 def test_what_stands_for_a_proxy_knows_its_ends_and_the_error_of_the_entries():
     stands = made(entry_error=0.013).proxy
     assert stands.domain_um == (0.11, pytest.approx(0.17 + 1e-9, abs=1e-12))
