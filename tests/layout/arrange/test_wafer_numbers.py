@@ -79,6 +79,11 @@ def fitting(made, box, reach=60):
 def test_all_dies_of_the_raster_that_fit_are_found(offset):
     made = Wafer((1700.0, 900.0), diameter_mm=22.0, edge_exclusion_mm=0.7, offset_um=offset)
     assert places(made, BOX) == fitting(made, BOX)
+    tall, box = (
+        Wafer((900.0, 1700.0), diameter_mm=22.0, edge_exclusion_mm=0.7, offset_um=offset),
+        (-300, -700, 400, 800),
+    )
+    assert places(tall, box) == fitting(tall, box)
 
 
 @pytest.mark.parametrize("steps", [(9, 0), (-9, 4), (2, -23)])
