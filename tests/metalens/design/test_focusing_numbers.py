@@ -129,3 +129,33 @@ def test_pillars_beside_each_other_tell_the_slope_of_their_own_place():
     for across, down, meets in ((60.0, 60.0, True), (60.0, 140.0, False), (140.0, 60.0, False)):
         made, _ = design.make(astigmatic(across, down), Focus(WAVE, 60.0), aperture_um=26.0, cell=cell, proxy=proxy)
         assert design.focused(made) is meets
+
+
+@pytest.mark.parametrize(("aside", "source"), [(0.0, math.inf), (23.0, math.inf), (-17.0, 240.0)])
+def test_steep_rays_of_an_ideal_lens_meet_in_its_focus(aside, source):
+    """Hyperbolic in 190 um, sines up to 0.6, its middle aside along y alone, of light from near by; the slope of the
+    phase is its difference over a pitch: 0.6² / 24 of its third derivative, 1e-5 of the distance."""
+
+    def phase(x, y):
+        x, y = np.meshgrid(x, y)
+        before = np.hypot(np.hypot(x, y), source) - source if math.isfinite(source) else 0.0
+        return -K * (np.hypot(np.hypot(x, y - aside), 190.0) + before)
+
+    assert meeting_um(phase, Focus(WAVE, 700.0, source), **ABOUT) == pytest.approx(190.0, rel=3e-5)
+
+
+def test_rays_that_do_not_leave_are_left_out_where_the_others_meet():
+    assert meeting_um(steep(0.13), Focus(WAVE, 900.0), **ABOUT) == pytest.approx(900.0, rel=1e-5)
+
+
+def test_a_lens_is_looked_at_out_to_the_edges_of_its_pillars(monkeypatch):
+    seen = []
+    monkeypatch.setattr(focusing, "focuses", lambda phase, focus, **about: seen.append((focus, about)) or True)
+    cell = Cell(pitch_um=0.6, pillar=Index(3.4), substrate=Index(1.45))
+    proxy = Proxy(np.array([[0.0, 3 * np.pi]]), np.array([[1.0]]), (0.1, 0.5), (WAVE, WAVE), 1e-6, 1e-6)
+    made, _ = design.make(astigmatic(60.0, 60.0), Focus(WAVE, 60.0, 1e3), aperture_um=12.0, cell=cell, proxy=proxy)
+    focusing.focused(made)
+    focus, about = seen[0]
+    assert (focus.wavelength_um, focus.sensor_distance_um, focus.source_distance_um) == (WAVE, 60.0, 1e3)
+    farthest = np.hypot(*np.meshgrid(made.diameters.x_um, made.diameters.y_um))[made.diameters.diameter_um > 0].max()
+    assert about == {"radius_um": pytest.approx(farthest + 0.3, rel=1e-9), "pitch_um": 0.6}
