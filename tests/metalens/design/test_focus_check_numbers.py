@@ -52,6 +52,7 @@ def top(place, value):
 CASES = {
     "aside": lambda x, y: K * (0.011 * x - 0.0073 * y),
     "near": lambda x, y: -K * (x**2 + y**2) * 2e-4,
+    "far": lambda x, y: K * (x**2 + y**2) * 6e-4,
     "rough": lambda x, y: 0.9 * np.sin(1.7 * x) * np.cos(2.3 * y) + K * 0.004 * y,
 }
 
@@ -75,8 +76,9 @@ def test_peaks_and_strehl_ratio_are_those_of_the_sum_over_pillars(case):
     shifts = np.array([-0.5, -0.25, 0, 0.25, 0.5]) * WAVE / na**2
     along = np.array([summed(lens, [(0.0, 0.0)], s)[0][0] for s in shifts])
     assert found.z_um == pytest.approx(top(shifts, along), abs=1e-5)
-    if case == "near":
-        assert found.z_um < -0.1 * found.depth_um
+    if case in ("near", "far"):
+        assert math.copysign(1, found.z_um) == (1 if case == "far" else -1)
+        assert 0.15 < abs(found.z_um) / found.depth_um < 0.45
     assert math.isnan(check_focus(lens, axial=False).z_um)
 
 
