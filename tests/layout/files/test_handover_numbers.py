@@ -77,7 +77,9 @@ def plan(figures=(), standing=None):
 
 
 LARGE = Figure("APERTURE", {(22, 0): (box(0, 0, 60_000, 50_000),)})  # 120 x 100 um
-TIMES = Figure("MARKS", {(3, 0): (box(0, 0, 5000, 500), box(2000, 500, 2400, 3500)), (3, 1): (box(0, 9000, 700, 9900),)})
+TIMES = Figure(
+    "MARKS", {(3, 0): (box(0, 0, 5000, 500), box(2000, 500, 2400, 3500)), (3, 1): (box(0, 9000, 700, 9900),)}
+)
 
 
 def test_charges_are_doses_times_areas_in_square_centimetres():
