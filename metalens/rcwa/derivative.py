@@ -175,13 +175,15 @@ def _regions(this: Case, ways: Waves, diameter_um: float, steps: int) -> list[_R
     return films(this.cell.under, this.media.under) + pillar + films(this.cell.over, this.media.over)
 
 
-def film_layer(ways: Waves, index: complex) -> Layer:
-    """A homogeneous layer, its plane waves as modes."""
+def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
+    """A homogeneous layer, its plane waves as modes, the longest-lived first; symmetric: whether all that it is matched
+    with are (:class:`metalens.rcwa.layer.Layer`)."""
     kz = normal_component(ways.kappa, index)
     kz = np.where(np.abs(kz) < _GRAZING, _GRAZING, kz)
     is_p = np.arange(len(kz)) < ways.p_count
     P, Q = np.where(is_p, kz**2 / index**2, 1.0), np.where(is_p, index**2, kz**2)
-    return Layer(np.diag(P), np.diag(Q), kz, np.eye(len(kz)), np.diag(Q / kz))
+    order = np.argsort(kz.imag, kind="stable")
+    return Layer(np.diag(P), np.diag(Q), kz[order], np.eye(len(kz))[:, order], np.diag(Q / kz)[:, order], symmetric)
 
 
 def _by_diameter(problem: _Problem, share: Callable[[float], float]) -> complex:

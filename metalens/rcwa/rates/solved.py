@@ -79,7 +79,7 @@ def _regions(this: Problem, space: Orders, ways: Waves, stages: int) -> list[Reg
         parts = [modes.layer(*wall.sample(0.5), symmetric=symmetric) for wall in walls]
         middle = [of_modes(part, wall.reduced_height) for part, wall in zip(parts, walls, strict=True)]
     under, over = (
-        [of_modes(film_layer(ways, index), thickness) for index, thickness in films]
+        [of_modes(film_layer(ways, index, symmetric=symmetric), thickness) for index, thickness in films]
         for films in (this.media.under, this.media.over)
     )
     return [*under, *middle, *over]
