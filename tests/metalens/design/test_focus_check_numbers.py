@@ -112,6 +112,9 @@ def test_glass_behind_counts_by_its_paraxial_distance_and_the_gap_by_its_index()
     assert found.depth_um == pytest.approx(WAVE / p**2, rel=1e-9)
     assert found.strehl == pytest.approx(1.0, abs=1e-3)
     assert abs(found.z_um) < found.depth_um / 4
+    enough = check_focus(made(focus=Focus(WAVE, D, SOURCE, Layers(behind=(Film(Index(1.6), 56.0),)))))
+    assert enough.depth_um / 2 < 4.0 < enough.depth_um
+    assert abs(enough.z_um) < enough.depth_um / 4
     narrow = Layers(behind=(Film(Index(1.6), 58.0),))
     tight = check_focus(made(focus=Focus(WAVE, D, SOURCE, narrow)))
     assert tight.depth_um / 2 > 2.0
