@@ -40,13 +40,7 @@ def test_the_width_is_the_least_of_all_directions(shape, want):
         (BOX, BOX, 20, 3, 0.0),
         (BOX, BOX, 19, 3, -1.0),
         (BOX, BOX, 5, 2, -1.0),
-        (
-            TRIANGLE,
-            BOX,
-            30 + 7,
-            40 + 3,
-            27.6,
-        ),  # (30, 40) is 24 from the slant, in the direction (0.8, 0.6): 6 * 0.6 more
+        (TRIANGLE, BOX, 30 + 7, 40 + 3, 24.0),  # 0.8 * 30 + 0.6 * 40 - 24
         (TRIANGLE, BOX, 15 + 7 - 4, 20 + 3 - 3, -1.0),
         (TRIANGLE, BOX, 15 + 7, 20 + 3, 0.0),  # its corner on the middle of the slant
         (SLANTED, TRIANGLE, 40 + 9, 30 + 12 - 24, 9.0),
