@@ -61,10 +61,17 @@ def test_slopes_of_the_shares_are_those_of_differences():
 
 @pytest.mark.parametrize(
     ("samples", "sample_um", "pitch_um", "cover", "inside"),
-    [(10, 0.7, 2.0, 4, 3), (6, 0.5, 1.5, 2, 2), (3, 0.1, 0.1, 3, 3), (30, 0.1, 0.3, 10, 10), (4, 0.5, 7.0, 1, 0)],
+    [
+        (10, 0.7, 2.0, 4, 3),
+        (6, 0.5, 1.5, 2, 2),
+        (3, 0.1, 0.1, 3, 3),
+        (30, 0.1, 0.3, 10, 10),
+        (1, 0.3, 0.1, 3, 3),
+        (4, 0.5, 7.0, 1, 0),
+    ],
 )
 def test_counts_of_pixels_ignore_rounding(samples, sample_um, pitch_um, cover, inside):
-    """0.1 three times is 3.0000000000000004 of 0.1."""
+    """0.1 three times is 3.0000000000000004 of 0.1, and 0.3 is 2.9999999999999996 of it."""
     assert sensors.pixel_count(samples, sample_um, pitch_um) == cover
     assert sensors.whole_pixels(samples, sample_um, pitch_um) == inside
     for off, more in ((1e-10, 1), (-1e-10, 0)):  # what is no rounding counts
@@ -89,6 +96,7 @@ def test_an_image_in_pixels_of_one_sample_is_itself():
     assert sensors.integrate(image, 0.8, pitch_um=torch.tensor(0.8, dtype=torch.float64)) is image
     assert sensors.integrate(image, 0.8, pitch_um=0.8, grid_um=0.8, shape=(9, 11)) is image
     changed = ({"shift_um": (0.0, 1e-9)}, {"shape": (9, 9)}, {"grid_um": 0.8 + 1e-9}, {"pitch_um": 0.8 + 1e-9})
+    changed += ({"pitch_um": 0.8 - 1e-9, "shape": (9, 11)},)
     for other in changed:
         assert sensors.integrate(image, 0.8, **{"pitch_um": 0.8} | other) is not image
     asked = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)

@@ -48,6 +48,8 @@ def test_a_row_of_rounding_does_not_count_and_a_little_more_does():
     for size, want in ((1.9e-5, 0.0), (2.1e-5, 0.5)):
         assert rates([[20, 1], [size, size / 2], [0, 0]], [[20, 1], [size, 0], [0, 0]]).error == pytest.approx(want)
     assert rates([[0, 0], [0, 0]], [[0, 0], [0, 0]]).error == 0
+    turned = rates([[-20, -1], [-8, -3], [0, 0]], [[-20, -1], [-8.8, -3], [0, 0]])  # signs do not count
+    assert turned.error == pytest.approx(0.8 / math.hypot(8.8, 3))
     tiny = rates([[2e-10, 0], [0, 0]], [[4e-10, 0], [0, 0]])  # less than 1e-9 is measured against that
     assert tiny.error == pytest.approx(0.2)
 
@@ -107,6 +109,25 @@ def test_each_size_is_asked_of_two_truncations_and_edges_less_size(monkeypatch, 
             assert line == pytest.approx(np.array(want))
     every = np.vstack([found.rates, found.edges])
     assert 0 < found.error < 0.01 * np.abs(every).max()
+
+
+def test_a_cause_of_no_number_goes_by_differences_beside_those_that_have_one(monkeypatch):
+    numbers = SimpleNamespace(
+        acts=Answers(quick=None, changed=None, step=0.1, numbers=lambda cell, d: {"height_um": d})
+    )
+    steps = SimpleNamespace(acts=Answers(quick=None, changed=None, step=0.1))
+    bends = SimpleNamespace(acts=None)
+    assert own._numbers(numbers, CELL, 0.3) == {"height_um": 0.3}
+    assert own._numbers(steps, CELL, 0.3) is None
+    assert own._numbers(bends, CELL, 0.3) is None
+    monkeypatch.setattr(own, "of_kind", lambda kind: [(2, steps), (5, numbers)])
+    monkeypatch.setattr("metalens.rcwa.jones_derivatives", solver([]))
+    monkeypatch.setattr(own, "_difference", lambda row, wave, weights, task: [wave * 1j for _ in weights])
+    weights = (np.diag([1.0, 0]), np.diag([0, 1.0]))
+    found = own._derived((0.85, {"size_um": -1.0}, weights), (CELL, 0.2, 7))
+    for line, weight in zip(found, weights, strict=True):
+        want = [0.85j, expected({"height_um": 0.2}, 0.2, 7, weight), expected({"size_um": -1.0}, 0.2, 7, weight)]
+        assert line == pytest.approx(want)
 
 
 def test_pillars_of_two_sizes_are_each_seen_in_both_lights_and_have_no_edges(monkeypatch):
