@@ -1,5 +1,8 @@
 """Every key of every settings file with every value that it should not have: refused by file and key, none computes."""
 
+import functools
+import typing
+
 import pytest
 
 from benchmarks import _hardness_values as matrix
@@ -15,7 +18,10 @@ ABOVE_ZERO = ("tolerance", "wavelength", "pitch_um", "aperture", "pixel_um", "sa
 
 @pytest.fixture(scope="module")
 def trials():
-    return list(matrix.trials())
+    """All of them; kinds of a record's keys are worked out once and not for each of ten thousand."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typing, "get_type_hints", functools.cache(typing.get_type_hints))
+        return list(matrix.trials())
 
 
 def _taken(trials, *values):

@@ -170,6 +170,10 @@ def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fi
     assert any("glass" in words and "would be taken for" in words for words in fitted.degeneracies)
 
 
+def test_orientation_of_a_symmetric_design_is_declared_unobservable(fitted):
+    assert any("orientation of the frames cannot be seen" in words for words in fitted.cautions)
+
+
 def test_what_cannot_be_told_is_reckoned_with_beside_the_model(fitted):
     """A plate of glass moves the stage zero, a source of some size the blur; the interval holds that of the model."""
     assert "a plate of glass in the beam" in fitted.most("stage_zero_um")

@@ -55,11 +55,6 @@ def test_shuffled_order_is_recovered():
     assert right(found)
 
 
-def test_orientation_of_a_symmetric_design_is_declared_unobservable():
-    found = fit(b.capture(b.electrons()))
-    assert any("orientation of the frames cannot be seen" in words for words in found.cautions)
-
-
 @pytest.mark.parametrize("wave", [(0.35, -0.37), pytest.param((0.32, 0.28), marks=pytest.mark.slow)])
 def test_opposite_astigmatism_is_not_mistaken_for_the_true_one(wave):
     """Sources all near the focus: the lens with the opposite even aberrations gives nearly the same images."""

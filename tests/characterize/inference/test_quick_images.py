@@ -1,6 +1,7 @@
 """A quick model put right at one lens: images of all lenses that explain the same frames differ from the whole model's
 by less than the noise can tell."""
 
+import functools
 import sys
 from pathlib import Path
 
@@ -18,62 +19,64 @@ DEPTHS = (560.0, 600.0, 640.0)
 FREE = {"bias_nm", "bias_x_nm", "stage_zero_um", "distance_um", "coma_x_rad", "log_gain", "background_e"}
 
 
+@functools.cache
 def fitted():
-    """The task of three frames near focus, and its fit."""
+    """The task of three frames near focus, its fit, and the quick model put right there."""
     data, model = b.near_focus(DEPTHS, bias_nm=6.0, stage_zero_um=4.0, coma_x_rad=0.2)
     start = vector({"crosstalk_px": 0.2})
     held = {p.name: Known(p.name, p.start) for p in search.PARAMETERS if p.name not in FREE}
     found = Arrangement(0, 0, (0, 0), 1, np.arange(3), False, True, 0, False, ())
     about = search.Task(model, data, start, held, found)
     begin = search.starts(about, biases_nm=(0.0,))[0]
-    return about, search.refine(about, begin[[search.PLACE[name] for name in about.names]])
-
-
-ABOUT, MODE = fitted()
-QUICK = search.anchored(ABOUT, MODE)
+    mode = search.refine(about, begin[[search.PLACE[name] for name in about.names]])
+    return about, mode, search.anchored(about, mode)
 
 
 def test_it_is_the_whole_model_at_its_place_and_its_part_for_some_frames():
-    want, slopes = ABOUT.problem()(MODE.value, True)
-    got, rates = QUICK.problem()(MODE.value, True)
+    about, mode, quick = fitted()
+    want, slopes = about.problem()(mode.value, True)
+    got, rates = quick.problem()(mode.value, True)
     assert got == pytest.approx(want, abs=1e-3)  # electrons: single precision of 6000
-    assert np.abs(rates - MODE.slopes).max() < 1e-3 * np.abs(slopes).max()
+    assert np.abs(rates - mode.slopes).max() < 1e-3 * np.abs(slopes).max()
     some = np.array([0, 2])
-    part, few = QUICK.problem(some)(MODE.value, True)
+    part, few = quick.problem(some)(mode.value, True)
     assert part == pytest.approx(want[some], abs=1e-3)
-    assert np.abs(few - MODE.slopes[:, some]).max() < 1e-3 * np.abs(slopes).max()
+    assert np.abs(few - mode.slopes[:, some]).max() < 1e-3 * np.abs(slopes).max()
 
 
 def test_it_leaves_out_a_percent_and_yet_differs_by_no_tenth_of_a_sigma_within_the_posterior():
     """What few terms leave out is seen in the image itself; of the change by 2.5 sigma of the parameters they leave out
     a few percent: less than 0.1 sigma, whose square is 0.01."""
-    noise = np.sqrt(ABOUT.data.variance(MODE.image))
-    plain = ABOUT.model.quick().images(ABOUT.all_of(MODE.value))[0]
-    assert np.linalg.norm((plain - MODE.image) / noise) > 0.3
-    size, turn = np.linalg.eigh(MODE.covariance)
+    about, mode, quick = fitted()
+    noise = np.sqrt(about.data.variance(mode.image))
+    plain = about.model.quick().images(about.all_of(mode.value))[0]
+    assert np.linalg.norm((plain - mode.image) / noise) > 0.3
+    size, turn = np.linalg.eigh(mode.covariance)
     apart = []
     for way in np.random.default_rng(3).standard_normal((6, len(size))):
-        value = MODE.value + turn @ (np.sqrt(size) * 2.5 * way / np.linalg.norm(way))
-        got, want = (one.problem()(value, False)[0] for one in (QUICK, ABOUT))
+        value = mode.value + turn @ (np.sqrt(size) * 2.5 * way / np.linalg.norm(way))
+        got, want = (one.problem()(value, False)[0] for one in (quick, about))
         apart.append(float((((got - want) / noise) ** 2).sum()))
     assert 1e-7 < max(apart) < 0.01
 
 
 def test_its_slopes_miss_a_few_percent_where_polynomials_stand_for_smooth_factors(monkeypatch):
     """Factors that polynomials miss by up to 5 % in place of 0.5 %, and few terms; as on a lens of large pixels."""
+    about, mode, _ = fitted()
     monkeypatch.setattr(moments, "_COARSE_PIXEL", 0.2)
-    x, names = ABOUT.all_of(MODE.value), ABOUT.names
-    slopes = [np.asarray(model.images(x, names)[1]) for model in (ABOUT.model, ABOUT.model.quick())]
+    x, names = about.all_of(mode.value), about.names
+    slopes = [np.asarray(model.images(x, names)[1]) for model in (about.model, about.model.quick())]
     for name, want, got in zip(names, *slopes, strict=True):
         assert np.linalg.norm(got - want) < 0.05 * np.linalg.norm(want), name
 
 
 def test_a_fit_by_it_from_afar_ends_where_that_of_the_whole_model_does():
     """To a tenth of a sigma, of which the end of either fit is 0.02."""
-    begin = MODE.value + 6 * np.sqrt(np.diag(MODE.covariance)) * np.where(np.arange(len(MODE.value)) % 2, 1, -1)
-    found = leastsquares.fit(QUICK.problem(), ABOUT.data, begin, prior=ABOUT.prior)
-    assert (np.abs(found.value - MODE.value) / np.sqrt(np.diag(MODE.covariance))).max() < 0.1
-    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(np.sqrt(np.diag(MODE.covariance)), rel=0.03)
+    about, mode, quick = fitted()
+    begin = mode.value + 6 * np.sqrt(np.diag(mode.covariance)) * np.where(np.arange(len(mode.value)) % 2, 1, -1)
+    found = leastsquares.fit(quick.problem(), about.data, begin, prior=about.prior)
+    assert (np.abs(found.value - mode.value) / np.sqrt(np.diag(mode.covariance))).max() < 0.1
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(np.sqrt(np.diag(mode.covariance)), rel=0.03)
 
 
 def test_terms_of_the_usual_distance_are_turned_and_as_bright_as_own_ones():
@@ -96,7 +99,8 @@ def test_terms_of_the_usual_distance_are_turned_and_as_bright_as_own_ones():
 
 def test_a_quick_model_has_fewer_samples_and_terms_and_rougher_slopes_than_its_own():
     """Samples a pixel are 4 sin / wavelength = 0.842 / um times its side at least, of a quick one 0.85 of that."""
-    assert (ABOUT.model.quick().cut, ABOUT.model.cut) == (0.02, 0.0)
+    about = fitted()[0]
+    assert (about.model.quick().cut, about.model.cut) == (0.02, 0.0)
     for pixel_um, whole, fewer in ((1.5, 2, 2), (2.6, 3, 2), (1.3, 2, 1)):
         one = ForwardModel(
             b.lens(), Setting(np.array([600.0]), np.zeros((1, 2)), np.ones(1), pixel_um, 8, 8), b.RESPONSE
