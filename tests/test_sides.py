@@ -4,6 +4,7 @@ The cell is solved at one truncation throughout, so that what is compared is the
 """
 
 import dataclasses
+import functools
 import math
 from types import SimpleNamespace
 
@@ -34,6 +35,7 @@ SIZES = np.array([0.142, 0.167, 0.19, 0.214, 0.233])
 LOW, HIGH = 0.12, 0.255
 
 
+@functools.cache
 def solved(width_um, length_um, turn_rad=0.0):
     """t for light along x of a rectangle of these sides."""
     cell = dataclasses.replace(CELL, shape=Rectangle(length_um / width_um, turn_rad))
