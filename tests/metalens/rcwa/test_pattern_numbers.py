@@ -80,6 +80,23 @@ def test_the_weight_of_normals_is_one_at_the_wall_and_a_half_half_way_to_the_far
     assert n[0] @ [1, 0] == pytest.approx(-1, abs=0.01)
 
 
+@pytest.mark.parametrize("reach", [(2, 3), (17, 2)])
+def test_tables_of_normals_are_means_of_the_field_over_the_cell(reach):
+    """An ellipse that no mirror keeps, summed as it is at 150 x 190 places: the field is smooth but where two walls are
+    equally near, which a grid takes to a step of it; of coefficients up to 0.4."""
+    this = Cell(PITCH, lattice=Lattice("rectangular", 1.3), shape=Ellipse(0.7, 0.2), **ABOUT)
+    outlines = (this.outline(0.24),)
+    found = pattern.normal_tables(outlines, this, reach)
+    x, y = ((np.arange(count) / count - 0.5) * edge for count, edge in ((150, X), (190, Y)))
+    px, py = np.meshgrid(x, y, indexing="ij")
+    n, weight = pattern.normals_at(outlines, this, px, py)
+    m, k = np.arange(-2 * reach[0], 2 * reach[0] + 1), np.arange(-2 * reach[1], 2 * reach[1] + 1)
+    turns = np.exp(-2j * np.pi * np.outer(m, x) / X), np.exp(-2j * np.pi * np.outer(k, y) / Y)
+    for table, values in zip(found, (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]), strict=True):
+        assert table.shape == (len(m), len(k))
+        assert np.abs(table - turns[0] @ (weight * values) @ turns[1].T / px.size).max() < 4e-3
+
+
 def test_permittivity_is_that_of_the_innermost_outline_about_any_pillar():
     """Points on the lattice of rectangles, 0.41 by 0.533 um apart, and on a hexagonal one."""
     slab = pattern.Slab((OBLONG.outline(0.2), OBLONG.outline(0.2, grow_um=0.03)), (INNER, FILM), OUTER)
