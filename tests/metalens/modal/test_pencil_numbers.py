@@ -20,9 +20,9 @@ def part(rng, size, most):
 
 
 def basis():
-    """Levels to both sides of 32 times what permittivities add: 32 K2 STEP = 342, and 44 in the magnetic form."""
+    """Levels to both sides of 32 times what permittivities add: 32 K2 STEP = 342."""
     rng = np.random.default_rng(8)
-    te, tm = np.array([0.0, 4.1, 9.3, 61.0, 377.0, 512.0]), np.array([3.7, 8.2, 330.0, 350.0, 611.0])
+    te, tm = np.array([0.0, 4.1, 9.3, 330.0, 377.0, 512.0]), np.array([3.7, 8.2, 330.0, 350.0, 611.0])
     return Basis(te, tm, te, tm, lambda: np.eye(A + B), np.eye(B), part(rng, A + B, 0.9), part(rng, A, 40.0),
                  part(rng, B, 0.9))  # fmt: skip
 
@@ -80,6 +80,13 @@ def test_the_magnetic_form_has_the_values_of_its_equation():
     assert found.te_rest is None
     want = values(inverse_growth @ (curl - K2 * np.eye(A + B)))
     assert values(written_out(found)) == pytest.approx(want, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("medium", [MEDIUM, Medium(1.7, 1.6 + 0j, 5.3 + 0j)])
+def test_levels_that_are_diagonalised_end_where_permittivities_weigh_little(medium):
+    """Four of the six and three of the five lie below 342, whichever side is the denser."""
+    assert len(pencil.electric_pencil(basis(), medium).te_turn.low) == 4
+    assert len(pencil.magnetic_pencil(basis(), medium).tm_turn.low) == 3
 
 
 def whole(turn):
@@ -140,7 +147,14 @@ def test_a_turn_is_the_dense_matrix_that_it_stands_for():
 
 @pytest.mark.parametrize(
     ("disc", "around", "same"),
-    [(5.3, 1.6, True), (5.3 + 0.1j, 1.6, False), (5.3, 1.6 - 0.1j, False), (-5.3, 1.6, False), (5.3, 0, False)],
+    [
+        (5.3, 1.6, True),
+        (0.9, 0.4, True),
+        (5.3 + 0.1j, 1.6, False),
+        (5.3, 1.6 - 0.1j, False),
+        (-5.3, 1.6, False),
+        (5.3, 0, False),
+    ],
 )
 def test_a_layer_is_lossless_where_both_permittivities_are_positive(disc, around, same):
     assert pencil.lossless(Medium(1.7, disc, around)) is same
