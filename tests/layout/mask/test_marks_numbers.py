@@ -10,7 +10,8 @@ from layout.mask.marks import Box, Units
 from layout.process.process import Die, Process
 from metalens.ground.errors import ProcessError
 
-UNIT = Units(SimpleNamespace(unit_nm=2.0, grid=5, lattices=[SimpleNamespace(constant=403)]))
+PLAN = SimpleNamespace(unit_nm=2.0, grid=5, lattices=[SimpleNamespace(constant=403)])
+UNIT = Units(PLAN)
 DIE = Box(-200_000, -175_000, 200_000, 175_000)  # 800 x 700 um
 
 
@@ -34,8 +35,9 @@ def edges(shape):
 
 
 def test_lengths_go_to_the_nearest_step_and_boxes_to_no_smaller_ones():
-    assert (UNIT.per_um, UNIT.grid, UNIT.pitch) == (500.0, 5, 403)
-    assert [UNIT(v) for v in (1.0, 0.0049, 0.0051, 7.504, -3.307)] == [500, 0, 5, 3750, -1655]
+    unit = Units(PLAN)
+    assert (unit.per_um, unit.grid, unit.pitch) == (500.0, 5, 403)
+    assert [unit(v) for v in (1.0, 0.0049, 0.0051, 7.504, -3.307)] == [500, 0, 5, 3750, -1655]
     assert UNIT.snapped(Box(-12, -10, 11, 15)) == Box(-15, -10, 15, 15)
     assert UNIT.snapped(Box(1, 4, 6, -4)) == Box(0, 0, 10, 0)
     assert edges(Box(-12, -10, 11, 15).polygon) == (-12, -10, 11, 15)
@@ -140,6 +142,11 @@ def test_bars_are_a_step_wide_at_least_on_each_side():
     narrow = Units(SimpleNamespace(unit_nm=2.0, grid=1000, lattices=[SimpleNamespace(constant=403)]))
     drawn, _ = marks._vernier(narrow, 2000, 1000)
     assert edges(drawn[10])[::2] == (-1000, 1000)
+    finest = Units(SimpleNamespace(unit_nm=2.0, grid=1, lattices=[SimpleNamespace(constant=403)]))
+    drawn, opened = marks._vernier(finest, 3771, 33)
+    assert edges(drawn[11])[::2] == (3771 - 707, 3771 + 707)  # 0.375 of 3771 is 1414
+    assert edges(opened[9])[::2] == (-3804 - 707, -3804 + 707)
+    assert edges(opened[21]) == (-39_595, 0, 39_595, 10_000)  # ten and a half pitches
 
 
 @pytest.mark.parametrize(("half", "fits"), [(183_475, True), (183_470, False)])

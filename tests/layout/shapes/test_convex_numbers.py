@@ -51,6 +51,12 @@ def test_the_gap_is_the_least_distance_of_any_two_points(first, second, dx, dy, 
     assert convex.gap(second, first, -dx, -dy) == pytest.approx(want, rel=1e-15)
 
 
+def test_boxes_of_a_unit_lie_a_unit_apart():
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    assert convex.gap(unit, unit, 2, 0) == 1.0
+    assert convex.gap(unit, unit, 0, -1) == 0.0
+
+
 def test_gaps_agree_with_points_along_both_outlines():
     """500 places on each side of each: never nearer than the gap, and within their step of it."""
     rng = np.random.default_rng(12)
