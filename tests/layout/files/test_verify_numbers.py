@@ -40,7 +40,7 @@ def mask(pillars=PILLARS, turns=QUARTERS, **other):
     cells = {
         "A": CellContent("A", circles={(1, 0): [(0, 0, 60)]}),
         "B": CellContent("B", {(1, 0): [np.roll(BIG, 1, axis=0)[::-1]]}),
-        "MARKS": CellContent("MARKS", {(3, 0): [BAR + 700, np.roll(BAR, 2, axis=0)]}),
+        "MARKS": CellContent("MARKS", {(3, 0): [(BAR + 700)[::-1], np.roll(BAR, 2, axis=0)]}),
         "LENS": CellContent("LENS", placed=placed(("A", "B"), *pillars, turns=turns)),
         "TOP": CellContent("TOP", placed=placed(("MARKS", "LENS"), (0, 0, 0, 0), (1, 0, 0, 0))),
     }
@@ -188,3 +188,16 @@ def test_pieces_of_which_only_sums_were_kept_must_be_pieces_of_the_plan():
     row = dataclasses.replace(summed(*PILLARS), name="ROW")
     nested = mask(ROW=row, LENS=CellContent("LENS", placed=placed(("ROW",), (0, 0, 0, 0))))
     assert told(nested) == (0, ["LENS places ROW, which are no pieces of the plan"])
+
+
+def test_classes_beyond_a_byte_are_told_apart():
+    """300 classes: number 256 more or less is another one."""
+    classes = tuple(PillarClass(f"C{k:03}", 121.0, 121, (1, 0), SQUARE) for k in range(300))
+    sites = np.array([[299, 43]], np.uint16)
+    many = MaskPlan("TOP", classes, (Lattice.of("LENS", sites, pitch=410, x0=0, y0=0),), unit_nm=2.0)
+    cells = {f"C{k:03}": CellContent(f"C{k:03}", {(1, 0): [SQUARE]}) for k in (298, 42)}
+    cells["TOP"] = CellContent("TOP", placed=placed(("LENS",), (0, 0, 0, 0)))
+    swapped = ("LENS: 2 sites differ, the first at row 0, column 0",)
+    for order, want in ((("C298", "C042"), ()), (("C042", "C298"), swapped)):
+        cells["LENS"] = CellContent("LENS", placed=placed(order, (0, 0, 0, 0), (1, 410, 0, 0)))
+        assert verify.compare(many, MaskContent("GDSII", 2.0, cells)).differences == want
