@@ -32,7 +32,7 @@ ASKED = {
     "one mirror": ["height_um", "shape.corners.1.x", "pillar.n"],
     "films and layers": ["under.1.thickness_um", "over.0.thickness_um", "layers.1.coat_um", "between.n"],
     "half turn": ["shape.angle_rad", "layers.1.coat.n"],
-    "tilted": ["shape.corners.2.y", "sidewall_rad", "over.0.thickness_um"],
+    "tilted": ["shape.corners.2.y", "sidewall_rad", "height_um", "over.0.thickness_um"],
 }  # fmt: skip
 
 
