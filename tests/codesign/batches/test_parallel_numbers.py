@@ -18,8 +18,8 @@ COUNT = 3
 class Group:
     """A group of processes whose members are threads."""
 
-    def __init__(self):
-        self.mine, self.gate, self.given = threading.local(), threading.Barrier(COUNT), [None] * COUNT
+    def __init__(self, count=COUNT):
+        self.mine, self.gate, self.given = threading.local(), threading.Barrier(count), [None] * count
 
     def is_initialized(self):
         return True
@@ -28,29 +28,30 @@ class Group:
         return self.mine.rank
 
     def get_world_size(self):
-        return COUNT
+        return len(self.given)
 
     def all_reduce(self, value):
         self.given[self.mine.rank] = value.clone()
-        self.gate.wait(20)
+        self.gate.wait(4)
         total = sum(self.given)
-        self.gate.wait(20)
+        self.gate.wait(4)
         value.copy_(total)
 
 
 @pytest.fixture
 def together(monkeypatch):
     """Runs ``work(rank)`` as each of three members at once: what each of them found."""
-    group = Group()
-    monkeypatch.setattr(parallel, "dist", group)
 
-    def run(work):
+    def run(work, count=COUNT):
+        group = Group(count)
+        monkeypatch.setattr(parallel, "dist", group)
+
         def member(rank):
             group.mine.rank = rank
             return work(rank)
 
-        with ThreadPoolExecutor(COUNT) as pool:
-            return list(pool.map(member, range(COUNT)))
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(member, range(count)))
 
     return run
 
@@ -101,6 +102,19 @@ def test_gradients_and_numbers_are_means_over_the_three(together):
         assert means == pytest.approx([1.3, -7.0], rel=1e-12)
 
 
+def test_gradients_of_one_kind_are_means_as_well(together):
+    """4, 7 and 10 times a pattern; values of one dtype alone."""
+
+    def work(rank):
+        parameters = [torch.nn.Parameter(torch.zeros(n)) for n in (2, 5)]
+        for parameter in parameters:
+            parameter.grad = (4.0 + 3 * rank) * torch.arange(1.0, 1 + len(parameter))
+        parallel.average(parameters)
+        return [p.grad.tolist() for p in parameters]
+
+    assert together(work) == [[[7.0, 14.0], [7.0, 14.0, 21.0, 28.0, 35.0]]] * COUNT
+
+
 def test_work_is_dealt_out_in_turn_and_told_to_all(together):
     done = [[] for _ in range(COUNT)]
 
@@ -109,6 +123,7 @@ def test_work_is_dealt_out_in_turn_and_told_to_all(together):
 
     assert together(work) == [[7.5, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5]] * COUNT
     assert done == [[3, 6, 9], [4, 7], [5, 8]]
+    assert together(lambda rank: parallel.each(lambda item: item + 0.5, [1, 2, 4]), 2) == [[1.5, 2.5, 4.5]] * 2
 
 
 def test_statistics_of_a_layer_and_their_gradients_are_those_of_all_frames(together):
