@@ -114,3 +114,9 @@ def test_the_limit_of_light_along_a_diagonal_is_by_parts_along_and_across():
         check_subwavelength(
             Cell(0.9, substrate=Index(1.45)), WAVE, angle_rad=math.asin(0.4), azimuth_rad=math.radians(145)
         )
+
+
+def test_media_rarer_than_air_are_refused_by_name_too():
+    """Light of sine 0.96 outside goes along the surface in an index of 0.9."""
+    with pytest.raises(CellError, match=r"in the substrate.* need pitch_um < 0\.\d+"):
+        check_subwavelength(Cell(2.0, substrate=Index(0.9), cover=Index(0.9)), WAVE, angle_rad=1.3)
