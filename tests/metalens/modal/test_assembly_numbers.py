@@ -127,6 +127,22 @@ def partition(made):
     return out
 
 
+def test_the_cell_holds_the_disc_and_what_is_around_it(made):
+    """Functions of the disc alone have the same matrices in both, those beyond it none in the disc."""
+    for kind, names in (("vector", ("mass", "curl")), ("scalar", ("scalar",))):
+        seen = {
+            side: np.unique(np.concatenate([getattr(p, kind).ravel() for p in made.mesh.patches if p.inside is side]))
+            for side in (True, False)
+        }
+        only, never = np.setdiff1d(seen[True], seen[False]), np.setdiff1d(seen[False], seen[True])
+        for name in names:
+            cell, disc = getattr(made.cell, name), getattr(made.disc, name)
+            assert np.array_equal(cell[only], disc[only])
+            assert not disc[never].any()
+            assert (cell.diagonal() > disc.diagonal())[seen[False]].all()
+            assert (disc.diagonal()[seen[True]] > 0).all()
+
+
 def test_what_is_not_strictly_inside_the_cell_is_refused(made):
     assert made.rho == 0.63
     for rho in (0.0, 1.0, -0.2, math.nan, math.inf):
