@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from characterize.inference import Data, Task, Unstated, invert, missing, posterior
-from characterize.model import NAMES, PARAMETERS, PLACE, UNFITTED, ForwardModel, Known, Setting, usual, vector
+from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, unfitted, usual, vector
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
@@ -135,7 +135,7 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
 def _unstated(lens: Lens, protocol: Protocol, response: Sensitivity, frames: Array) -> Unstated:
     """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as asked for, will reckon with."""
     known = {k.name: k for k in protocol.known}
-    unfitted = {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
+    sizes = unfitted(known, lens)
     angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
     setting = Setting(frames[:, 0], angles, frames[:, 2], protocol.pixel_um, protocol.pixels, protocol.pixels)
     model = ForwardModel(lens, setting, response)
@@ -146,7 +146,7 @@ def _unstated(lens: Lens, protocol: Protocol, response: Sensitivity, frames: Arr
     full, ones = image >= protocol.full_well_e, np.ones_like(image)
     data = Data(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
     free = tuple(name for name in protocol.free if name not in known or known[name].sigma > 0)
-    return missing.expected(Task(model, data, x, known, None, free, unfitted))
+    return missing.expected(Task(model, data, x, known, None, free, sizes))
 
 
 def _left(names: tuple[str, ...], untold: Array, wanted: Sequence[Wanted]) -> list[Wanted]:

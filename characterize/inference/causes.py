@@ -24,10 +24,11 @@ from characterize.model import (
 )
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
-from metalens.lens import Lens
+from metalens.lens import Lens, Stop
 from metalens.made import Bends, maps, named
 
 _STITCH_UM = 0.05
+_STOP_UM = 3.0
 _WALL_DEG = 1.5
 _LIGHT_STEP = 0.2
 _ENOUGH = 4e-3
@@ -104,6 +105,7 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
     yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
     yield from _of_camera(task, x, light)
+    yield from _of_stop(task, x, image)
     held = tuple(name for name in LIGHT if name not in task.names)
     if held:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
@@ -174,6 +176,25 @@ def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
             moved[k, :, index] = np.stack(sideways, 1)[index]
         told = "{:.3g} px at one of the angles"
         yield Change(WINDOWS, moved.reshape(-1, *sideways[0].shape), 1.0, told, _size(task, "window_px"))
+
+
+def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
+    """An aperture stop beside its place: the part of the lens that the light meets moves, as by a lean of the lens."""
+    model, stop = task.model, task.model.lens.layers.stop
+    if stop is None:
+        return
+    for along in (0, 1):
+        centre = np.add(stop.centre_um, _STOP_UM * np.eye(2)[along])
+        moved = behind(model, dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1])))).images(x)[0]
+        told, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
+        yield Change(f"an aperture stop off along {'xy'[along]}", (moved - image)[None], _STOP_UM, told, sigma)
+
+
+def behind(model: ForwardModel, stop: Stop) -> ForwardModel:
+    """The model of the same lens behind another stop."""
+    lens = dataclasses.replace(model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop))
+    part = ForwardModel(lens, model.setting, model.response).about(model.grid.middle_um).rough(model.cut)
+    return part.with_residual(model.modes, basis) if len(model.modes) else part
 
 
 def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:

@@ -28,11 +28,11 @@ from characterize.inference.search import Task, with_values
 from characterize.model import (
     NAMES,
     PLACE,
-    UNFITTED,
     ForwardModel,
     Known,
     slopes,
     thinplate,
+    unfitted,
     usual,
     vector,
 )
@@ -88,14 +88,14 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     check_depths(setting.depth_um, lens)
     data = data_of(frames, window)
     known = {k.name: k for k in (*stated(capture, lens), *options.known)}
-    unfitted = {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
+    sizes = unfitted(known, lens)
     check_enough(data, search.names_of(known, options.free))
     model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
     start = vector({name: k.value for name, k in known.items()})
     scan_um = 0.12 * float(np.median(setting.depth_um)) if options.scan_um is None else options.scan_um
     found = arrange(model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens))
     _check_likeness(found, lens)
-    whole = Task(model, data, start, known, found, options.free, unfitted)
+    whole = Task(model, data, start, known, found, options.free, sizes)
     task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
     cautions = [*frames.corrections, *laid_words(task.found or found), *verdict.colours(lens, known)]
     cautions += roughly_known(lens, model.response)

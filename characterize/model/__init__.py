@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from characterize.model.parameters import Known as Known
     from characterize.model.parameters import Parameter as Parameter
     from characterize.model.parameters import state as state
+    from characterize.model.parameters import unfitted as unfitted
     from characterize.model.parameters import unstated as unstated
     from characterize.model.parameters import usual as usual
     from characterize.model.parameters import vector as vector
@@ -62,6 +63,7 @@ __getattr__, __dir__, __all__ = attach(
         "state": "parameters",
         "thinplate": "",
         "true_depth": "setting",
+        "unfitted": "parameters",
         "unstated": "parameters",
         "usual": "parameters",
         "vector": "parameters",

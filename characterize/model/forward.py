@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -10,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from characterize.model import detector, moments
-from characterize.model.glass import Films, source_paths
+from characterize.model.glass import Bench, Films, source_paths
 from characterize.model.kernel import real_of, turns
 from characterize.model.moments import LIT, WHOLE, Bases, Cut, Factor
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars, Range, change, incidence_rad, of_lens
-from characterize.model.reduced import Bench, Reduced
+from characterize.model.reduced import Reduced
 from characterize.model.setting import (
     BENDING,
     LIGHT,
@@ -31,7 +32,6 @@ from characterize.model.setting import (
 from characterize.model.window import Operators
 from metalens.ground import threads
 from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
 from metalens.lens import Lens
 from metalens.made import Answers, Sensitivity, Widens, named, of_kind
 
@@ -58,8 +58,6 @@ class ForwardModel:
     """
 
     def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
-        if lens.layers.stop is not None:
-            raise FitError("the lens has an aperture stop, whose shadow moves with depth and angle: fit it without")
         self.lens, self.setting, s = lens, setting, setting
         self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
         over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
@@ -88,7 +86,7 @@ class ForwardModel:
             self._pillars[incidence] = of_lens(self.lens, self.response, span=self._span, angle_rad=incidence)
         pillars = self._pillars[incidence]
         reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
-        return Group.of(index, pillars, reduced)
+        return Group.of(index, pillars, reduced).shaded(self.lens, setting.depth_um)
 
     def only(self, frames: Array) -> "ForwardModel":
         """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
@@ -96,9 +94,7 @@ class ForwardModel:
         part.setting = dataclasses.replace(
             s, depth_um=s.depth_um[frames], angle_rad=s.angle_rad[frames], exposure=s.exposure[frames]
         )
-        places = [np.flatnonzero(np.isin(frames, group.index)) for group in self.groups]
-        pairs = [(group, place) for group, place in zip(self.groups, places, strict=True) if len(place)]
-        part.groups = [dataclasses.replace(group, index=place) for group, place in pairs]
+        part.groups = [one for one in (group.only(frames) for group in self.groups) if one is not None]
         return part
 
     def about(self, middle_um: tuple[float, float]) -> "ForwardModel":
@@ -156,7 +152,7 @@ class ForwardModel:
         part = copy.copy(self)
         part.modes = np.asarray(modes)
         if len(modes):
-            part.groups = [dataclasses.replace(g, residual=self._shapes(g, len(modes), basis)) for g in self.groups]
+            part.groups = [g.bent(lambda one: self._shapes(one, len(modes), basis)) for g in self.groups]
         return part
 
     def _shapes(self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
@@ -191,7 +187,7 @@ class ForwardModel:
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
-            for group in self.groups:
+            for group in itertools.chain.from_iterable(group.lit for group in self.groups):
                 part, more = self._group_light(x, group, offset_nm, names)
                 light[group.index, *self._lit] += weight * part
                 for name in names:

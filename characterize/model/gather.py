@@ -7,7 +7,7 @@ import numpy as np
 
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
-from metalens.lens import DiameterMap
+from metalens.lens import DiameterMap, Stop
 
 
 def even(count: int, pull: float, low: float, high: float) -> Array:
@@ -37,11 +37,12 @@ def density(count: int, tolerance: float) -> float:
     return math.asin(pulled) / pulled
 
 
-def mirrored(diameters: DiameterMap, tangents: tuple[float, float]) -> bool:
-    """Whether pillars and the path of a chief ray are alike to both sides of both axes: a quarter of them tells all."""
+def mirrored(diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None) -> bool:
+    """Whether pillars, the path of a chief ray and the shadow of a stop are alike to both sides of both axes: a quarter
+    of them tells all."""
     d = diameters.diameter_um
     plain = diameters.angle_rad is None and diameters.length_um is None and not any(tangents)
-    return plain and np.array_equal(d, d[::-1]) and np.array_equal(d, d[:, ::-1])
+    return plain and (stop is None or stop.centred) and np.array_equal(d, d[::-1]) and np.array_equal(d, d[:, ::-1])
 
 
 def folded(weights: Array, first: int) -> Array:

@@ -22,6 +22,20 @@ Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
 @dataclass(frozen=True, slots=True)
+class Bench:
+    """Where source, lens and sensor stand for one field angle.
+
+    tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
+    reference_um: source depth whose phase is taken off before gathering.
+    """
+
+    distance_um: float
+    wavelength_um: float
+    reference_um: float
+    tangents: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Films:
     """Plane-parallel films of a lens at one wavelength.
 

@@ -98,6 +98,7 @@ UNFITTED: tuple[Unfitted, ...] = (
     Unfitted("pixel_percent", "true pixel pitch over the stated one, less 1", 1.0),
     Unfitted("camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0),
     Unfitted("window_px", "window of a field angle off the chief ray there, each way, beside the common decentre", 0.3),
+    Unfitted("stop_um", "aperture stop of the lens beside its place in the design, each way", 3.0),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}
@@ -155,6 +156,17 @@ def unstated(name: str, lens: Lens) -> float:
 def _times(row: Parameter, factor: float) -> Parameter:
     sizes = {name: factor * getattr(row, name) for name in ("scale", "sigma", "low", "high", "plausible")}
     return dataclasses.replace(row, **sizes)
+
+
+def unfitted(known: dict[str, Known], lens: Lens) -> dict[str, float]:
+    """Stated sizes of what is never fitted, by name; they are taken out of ``known``.
+
+    Raises:
+        ConfigError: that of a stop, which the lens does not have.
+    """
+    if "stop_um" in known and lens.layers.stop is None:
+        raise ConfigError("stop_um: the lens has no aperture stop; leave it out of [[known]]")
+    return {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
 
 
 def vector(values: Mapping[str, float] | None = None) -> Array:

@@ -14,16 +14,15 @@ import itertools
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from characterize.model import gather
-from characterize.model.glass import Films
+from characterize.model.glass import Bench, Films
 from characterize.model.kernel import Kernel, digits, factors, precision, real_of, turns
 from characterize.model.pillars import Pillars
-from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, Ways, turned, ways
+from characterize.model.window import MIXED, STEP, Operators, Terms, Turned, turned, ways
 from metalens.ground import legendre, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -33,20 +32,6 @@ Axes = tuple[Array, Array]
 _KEPT = 12  # operators: of a place that each of some threads is at
 _SPARE, _WIDER = 1.05, 1.25  # of bands over the nominal ones, and from there on: one serves all distances of a fit
 _BESIDE = 0.1  # weight of directions that miss the lens, and of the rim, when the low-rank terms are chosen
-
-
-@dataclass(frozen=True, slots=True)
-class Bench:
-    """Where source, lens and sensor stand for one field angle.
-
-    tangents: (x, y) of the chief ray in air; the window sits where it meets the sensor.
-    reference_um: source depth whose phase is taken off before gathering.
-    """
-
-    distance_um: float
-    wavelength_um: float
-    reference_um: float
-    tangents: tuple[float, float] = (0.0, 0.0)
 
 
 class Reduced:
@@ -71,6 +56,7 @@ class Reduced:
         self.k = 2 * math.pi / bench.wavelength_um
         self._operators: dict[tuple[float, ...], Operators] = {}
         self._near, self._usual = False, dict[tuple[float, ...], Terms]()
+        self._lesser: dict[tuple[float, int], Any] = {}  # both of these, of quick ones
         self._from_few: dict[int, Array] = {}
         self._changing = threading.Lock()  # several fits may ask at once
         self._blur = self.k * float(np.abs(1 / np.asarray(depths_um) - 1 / bench.reference_um).max())
@@ -91,13 +77,19 @@ class Reduced:
         which there is no light: light that lands s off a place of the window turns by s over the nodes, and n of these
         show it there only where s is 2 n; half of what tells s from all others is enough to keep it off."""
         part = copy.copy(self)
-        part._operators, part._near, part._usual = {}, True, {}
-        part.window_um = min(window_um or self.window_um, self.window_um)
+        part._near, part.window_um = True, min(window_um or self.window_um, self.window_um)
         part._directions(0.0 if part.window_um < self.window_um else self._blur)
+        part._operators, part._usual = self._lesser.setdefault((part.window_um, part.nodes), ({}, {}))
         if part.nodes < self.nodes:
             part._from_few = {}
             to_q, to_p = self._between(part, self)
             part._hold(to_q.T @ self.gathered @ to_p)
+        return part
+
+    def shaded(self, lens: Lens, pillars: Pillars, depth_um: float) -> "Reduced":
+        """Lit from a depth through the lens' stop; what does not hang on the pillars is shared with this one."""
+        part = copy.copy(self)
+        part._hold(self._gather(lens, pillars, depth_um))
         return part
 
     def seen_by(self, other: "Reduced", values: Array) -> Array:
@@ -151,14 +143,14 @@ class Reduced:
         """(q, p) direction cosines p and q of the nodes, and which of them meet the lens."""
         return self.p, self.q, np.hypot(self.u, self.v) < 1
 
-    def _gather(self, lens: Lens, pillars: Pillars) -> Array:
-        d = lens.diameters
+    def _gather(self, lens: Lens, pillars: Pillars, depth_um: float | None = None) -> Array:
+        """(r, q, p) fields; depth_um: of the source whose light the lens' stop shades, None for all that meets it."""
+        d, (hy, hx) = lens.diameters, self.half_um
         x, y = d.x_um, d.y_um
-        hy, hx = self.half_um
         n, r = self.nodes + 6, len(pillars.basis)
         real_kind = real_of(self.kind)
         pull = gather.pull(n, self.tolerance)
-        y0, x0 = (len(y) // 2, len(x) // 2) if gather.mirrored(d, self.bench.tangents) else (0, 0)
+        y0, x0 = (len(y) // 2, len(x) // 2) if gather.mirrored(d, self.bench.tangents, lens.layers.stop) else (0, 0)
         across, along = (
             gather.folded(gather.at(n, pull, (-h, h), t), first).astype(real_kind)
             for h, t, first in ((hx, x, x0), (hy, y, y0))
@@ -173,10 +165,7 @@ class Reduced:
                 rows = parts[i]
                 some = x0 + np.flatnonzero((d.diameter_um[rows, x0:] > 0).any(0))
                 built = slice(some[0], some[-1] + 1) if len(some) else slice(0)
-                path = self.path(x[None, built], y[rows, None], self.bench.distance_um, self.bench)
-                place = pillars.entries(d, rows, built)
-                turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[:, built]
-                light = gather.lit(table, place, turns(self.k * path + turn, self.kind))
+                light = gather.lit(table, pillars.entries(d, rows, built), self._met(lens, rows, built, depth_um))
                 halves = across[built].T @ light.reshape(len(light), -1)
                 sums[i] = along[rows].T @ halves.reshape(n, -1, 2 * r)  # x, then y
 
@@ -184,6 +173,18 @@ class Reduced:
             threads.split(len(parts), some)
         whole = sums.sum(0, dtype=float).T
         return self._to_directions(whole[:r] + 1j * whole[r:], n)
+
+    def _met(self, lens: Lens, rows: slice, built: slice, depth_um: float | None) -> Array:
+        """(rows, columns) phasors that a block of pillars meets: of the path taken off, of how they are turned, and
+        behind a stop its shadow."""
+        d = lens.diameters
+        places = d.x_um[None, built], d.y_um[rows, None]
+        turn = np.broadcast_to(lens.geometric_rad(rows), d.diameter_um[rows].shape)[:, built]
+        found = turns(self.k * self.path(*places, self.bench.distance_um, self.bench) + turn, self.kind)
+        if depth_um is None:
+            return found
+        about = self.bench.tangents, depth_um, self.bench.wavelength_um
+        return np.asarray(found * lens.layers.shadow(*about, places, math.sqrt(d.site_um2)).astype(self.kind))
 
     def _to_directions(self, fields: Array, n: int) -> Array:
         """Lens nodes (y, x) to direction nodes (q, p): adjoint interpolation, first along x, then along y."""
@@ -243,7 +244,7 @@ class Reduced:
         y, down = ways(kernel.by_y, self.q[:, 0], axes_um[0], bands[0], **about)
         x, across = ways(kernel.by_x, self.p[0], axes_um[1], bands[1], **about)
         kind = self.kind
-        parts = [_as(one, kind) for one in (down, across)]
+        parts = [one.of_kind(kind) for one in (down, across)]
         inner = reach[0] - edge_um, reach[1] - edge_um
 
         def moved(name: str) -> Terms:
@@ -336,13 +337,6 @@ def _on_even(count: int, first: float, last: float, samples: int) -> Array:
 def _named(axes_um: tuple[Array, Array]) -> tuple[float, ...]:
     """What tells even axes apart, as they are kept by: counts and first places."""
     return tuple(float(part) for axis in axes_um for part in (len(axis), axis[0]))
-
-
-def _as(way: Ways, kind: Any) -> Ways:
-    """In numbers of a kind."""
-    fine = way.fine.astype(real_of(kind))
-    moved = functools.cache(lambda name: way.moved(name).astype(kind))
-    return Ways(way.to.astype(kind), fine, way.carrier.astype(kind), moved)
 
 
 def _pair(values: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,6 +102,7 @@ class Group:
     """Frames of one field angle, by their ``index``, and the lens as they see it.
 
     bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the diameters, of a residual phase.
+    apart: the same frames depth by depth, behind a stop before the pillars, whose light others of them meet.
     """
 
     index: Array
@@ -109,6 +111,12 @@ class Group:
     bending: Array
     widening: Array
     residual: Array
+    apart: tuple["Group", ...] = ()
+
+    @property
+    def lit(self) -> tuple["Group", ...]:
+        """Groups whose frames meet the same pillars."""
+        return self.apart or (self,)
 
     @classmethod
     def of(cls, index: Array, pillars: Pillars, reduced: Reduced) -> "Group":
@@ -116,11 +124,33 @@ class Group:
         bending, widening = (maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens))
         return cls(index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape)))
 
+    def shaded(self, lens: Lens, depth_um: Array) -> "Group":
+        """The same behind the lens' stop; (frames,) depths of all."""
+        if lens.layers.stop is None:
+            return self
+        at = depth_um[self.index]
+        if lens.layers.stop.distance_um == 0:
+            return Group.of(self.index, self.pillars, self.reduced.shaded(lens, self.pillars, float(at[0])))
+        reduced = [(self.index[at == z], self.reduced.shaded(lens, self.pillars, z)) for z in np.unique(at).tolist()]
+        return dataclasses.replace(self, apart=tuple(Group.of(some, self.pillars, one) for some, one in reduced))
+
+    def only(self, frames: Array) -> "Group | None":
+        """Of some frames, in rising order of their index, which are counted anew; None without any."""
+        place = np.flatnonzero(np.isin(frames, self.index))
+        apart = tuple(one for one in (part.only(frames) for part in self.apart) if one is not None)
+        return dataclasses.replace(self, index=place, apart=apart) if len(place) else None
+
+    def bent(self, shapes: Callable[["Group"], Array]) -> "Group":
+        """With a residual phase of these shapes."""
+        apart = tuple(one.bent(shapes) for one in self.apart)
+        return dataclasses.replace(self, residual=shapes(self), apart=apart)
+
     def quick(self, window_um: float | None) -> "Group":
         """See :meth:`Reduced.quick`."""
         reduced = self.reduced.quick(window_um)
         residual = self.reduced.seen_by(reduced, self.residual)
-        return dataclasses.replace(Group.of(self.index, self.pillars, reduced), residual=residual)
+        apart = tuple(one.quick(window_um) for one in self.apart)
+        return dataclasses.replace(Group.of(self.index, self.pillars, reduced), residual=residual, apart=apart)
 
     def turning(self, name: str) -> Array | None:
         """Phase on the nodes for one unit of a wave-front parameter, imaginary of uneven light; None for any other."""

@@ -10,10 +10,11 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from characterize.model.kernel import Kernel
+from characterize.model.kernel import Kernel, real_of
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 
@@ -39,6 +40,11 @@ class Ways:
     fine: Array
     carrier: Array
     moved: Callable[[str], Array]
+
+    def of_kind(self, kind: Any) -> "Ways":
+        """In complex numbers of a kind."""
+        moved = functools.cache(lambda name: self.moved(name).astype(kind))
+        return Ways(self.to.astype(kind), self.fine.astype(real_of(kind)), self.carrier.astype(kind), moved)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

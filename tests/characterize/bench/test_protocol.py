@@ -16,6 +16,7 @@ import bench_lens as b
 from characterize.bench import protocol
 from characterize.bench.protocol import Protocol, Wanted
 from characterize.inference import missing
+from characterize.model import UNFITTED
 from metalens import lens as lenses
 from metalens.cli import main
 from metalens.ground.errors import FitError
@@ -220,7 +221,7 @@ def test_what_is_known_of_the_bench_is_information_and_what_is_certain_is_not_fi
 def test_what_nobody_states_is_judged_on_frames_as_bright_as_asked_for(monkeypatch):
     """At exposure 1 the brightest pixel has 7000 electrons; what is stated without doubt is not free."""
     monkeypatch.setattr(missing, "expected", lambda task: task)
-    unfitted = protocol.UNFITTED[0].name
+    unfitted = UNFITTED[0].name
     stated = (("height_nm", 3.0, 2.5), ("distance_um", 4.0, 0.0), (unfitted, 0.0, 0.37))
     known = tuple(protocol.Known(*one) for one in stated)
     wanted = Protocol(

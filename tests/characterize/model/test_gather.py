@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from characterize.model.gather import folded, lit, mirrored
+from characterize.model.glass import Bench
 from characterize.model.pillars import Pillars
-from characterize.model.reduced import Bench, Reduced
+from characterize.model.reduced import Reduced
 from metalens import design
 from metalens.cell import Cell
 from metalens.design import profiles
+from metalens.lens import Stop
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import bench_lens as b
@@ -85,3 +87,5 @@ def test_pillars_are_alike_to_both_sides_only_where_all_of_them_and_the_light_ar
     assert not mirrored(dataclasses.replace(d, diameter_um=one_way.T), (0.0, 0.0))
     assert not mirrored(dataclasses.replace(d, length_um=d.diameter_um), (0.0, 0.0))
     assert not mirrored(dataclasses.replace(d, angle_rad=np.zeros_like(d.diameter_um)), (0.0, 0.0))
+    assert mirrored(d, (0.0, 0.0), Stop(7.0, 30.0))
+    assert not mirrored(d, (0.0, 0.0), Stop(7.0, 30.0, (0.0, 0.3)))

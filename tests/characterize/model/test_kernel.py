@@ -15,10 +15,11 @@ from characterize.bench import bench
 from characterize.bench.bench import Camera, Truth
 from characterize.inference.search import prior_of
 from characterize.model.forward import ForwardModel, Setting
+from characterize.model.glass import Bench
 from characterize.model.kernel import SINGLE, Kernel, factors, least_tolerance, precision, turns
 from characterize.model.parameters import Known
 from characterize.model.pillars import Change, Pillars
-from characterize.model.reduced import Bench, Reduced
+from characterize.model.reduced import Reduced
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.ground import legendre

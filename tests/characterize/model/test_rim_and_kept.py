@@ -12,9 +12,10 @@ import bench_lens as b
 
 from characterize.inference import explore
 from characterize.model import gather
+from characterize.model.glass import Bench
 from characterize.model.kernel import digits
 from characterize.model.pillars import Change, Pillars
-from characterize.model.reduced import Bench, Reduced
+from characterize.model.reduced import Reduced
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.ground import legendre

@@ -25,8 +25,7 @@ from characterize.model.glass import AIR, Films
 from characterize.model.parameters import NAMES, Known, vector
 from metalens import design, profiles
 from metalens.cell import Cell, Film, Index
-from metalens.ground.errors import FitError
-from metalens.lens import Layers, Stop
+from metalens.lens import Layers
 
 DISTANCE, WAVELENGTH = 117.0, 0.85
 FRONT, BEHIND = ((1.45, 63.0),), ((1.52, 31.0), (1.38, 18.0))
@@ -34,10 +33,10 @@ DEPTHS = np.array([470.0, 640.0])
 
 
 @functools.lru_cache
-def lens(filling=1.0, stop=None):
+def lens(filling=1.0):
     """40 um wide, focused from 600 um through its films on its sensor."""
     films = {name: tuple(Film(Index(n), t) for n, t in side) for name, side in (("front", FRONT), ("behind", BEHIND))}
-    layers = Layers(**films, cover=Index(filling), stop=stop)
+    layers = Layers(**films, cover=Index(filling))
     focus = profiles.Focus(WAVELENGTH, DISTANCE, 600.0, layers=layers)
     cell = Cell(pitch_um=0.4, cover=Index(filling))
     phase = design.phase_of(None, focus, radius_um=20.0)
@@ -154,12 +153,6 @@ def test_the_bench_shows_what_the_model_expects_through_films(source_um, within)
             x * np.where(np.array(NAMES) == "pinhole_um", 1.05, 1)
         )
         assert np.linalg.norm(wider[0] - want) > 1.5 * within * np.linalg.norm(want)
-
-
-def test_a_lens_behind_a_stop_is_refused_by_name():
-    setting = Setting(DEPTHS, np.zeros((2, 2)), np.ones(2), 1.5, 16, 16)
-    with pytest.raises(FitError, match="stop"):
-        ForwardModel(lens(1.0, Stop(50.0, 40.0)), setting, b.RESPONSE)
 
 
 @pytest.mark.slow
