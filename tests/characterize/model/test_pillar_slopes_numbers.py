@@ -110,6 +110,22 @@ def test_without_a_table_slopes_are_the_solver_s_derivatives_over_t(monkeypatch)
         assert found == pytest.approx(want)
 
 
+def test_what_no_solver_knows_is_a_difference_over_a_degree_where_it_is_wanted(monkeypatch):
+    """Of ln t = (0.2 - 0.9i) lean + 0.4 lean³ in degrees, half of one to either side: of the cube a quarter."""
+
+    def solved(cell, diameter_um, wavelength_um):
+        lean = np.degrees(cell.sidewall_rad)
+        known = {row.acts.exact: 0.0 for _, row in of_kind(Answers) if row.acts.exact}
+        return SimpleNamespace(t=1.7j * np.exp((0.2 - 0.9j) * lean + 0.4 * lean**3), **known)
+
+    monkeypatch.setattr(pillar_slopes.rcwa, "derivatives", solved)
+    monkeypatch.setattr(pillar_slopes.modal, "gradient", lambda *_, **__: solved(*_))
+    found = pillar_slopes._exact(CELL, 0.14, 0.83, {"sidewall_deg"}, None)
+    place = NAMES.index("sidewall_deg")
+    assert found[place] == pytest.approx((0.2 + 0.4 / 4 - 0.9j) * 180 / np.pi, rel=1e-9)
+    assert not any(value for k, value in enumerate(found) if k != place)
+
+
 def test_round_upright_pillars_without_films_have_their_own_solver():
     assert pillar_slopes._upright(CELL)
     for more in ({"sidewall_rad": 0.01}, {"under": (Film(Index(1.9), 0.1),)}, {"over": (Film(Index(1.9), 0.1),)}):
