@@ -135,9 +135,30 @@ def test_sensitivities_are_of_the_most_frequent_pair_first_with_the_unseen_besid
     assert found["x"].error == pytest.approx(0.011, abs=1e-9)  # 0.17 is the middle of a straight line
     assert found["y"].error == pytest.approx(0.3, abs=1e-9)
     assert found["x"].width_um == pytest.approx([0.13, 0.21, 0.17])
+    rates = {0.13: 1.0, 0.21: 5.0, 0.17: 2.0}  # the line has 3 in the middle: half of 2 off
+
+    def bent(lens, width, long):
+        found = np.array([[rates[round(float(w), 6)] for w in width]], complex)
+        return {"x": OwnRates(found, np.zeros(3), 0.011)}
+
+    monkeypatch.setattr(two_sizes, "pair_rates", bent)
+    assert two_sizes.pair_sensitivities(lens(size=size, length=length))["x"].error == pytest.approx(0.511)
+    monkeypatch.setattr(two_sizes, "pair_rates", solved)
     few = two_sizes.pair_sensitivities(lens(size=size, length=length), count=1)
     assert few["x"].error == 0.011
     assert asked[-1][0] == pytest.approx([0.13])
+
+
+def test_two_dozen_pairs_are_solved(monkeypatch):
+    asked = []
+
+    def solved(lens, width, long):
+        asked.append(len(width))
+        return {"x": OwnRates(np.ones((1, len(width)), complex), np.zeros(len(width)), 0.0)}
+
+    monkeypatch.setattr(two_sizes, "pair_rates", solved)
+    two_sizes.pair_sensitivities(lens(size=0.1 + 0.002 * np.arange(35.0).reshape(5, 7), length=np.full((5, 7), 0.2)))
+    assert asked == [24]
 
 
 def test_what_is_unseen_is_the_largest_relative_miss_of_the_second_half():

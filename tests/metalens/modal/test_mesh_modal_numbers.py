@@ -117,6 +117,12 @@ def test_functions_are_counted_once_and_know_their_walls():
         assert np.count_nonzero((made.vector_wall & corner) == corner) == 0
 
 
+def test_rules_have_four_or_five_points_more_than_degrees_and_two_dozen_at_the_rim():
+    """(3 + 4)² of the core; 3 + 5 along every ring, across it 2 + 5, 2 + 24 on both sides of the rim, 4 + 5."""
+    points = [len(patch.basis.weight) for patch in mesh.build(PLAN).patches]
+    assert points == [49, 7 * 8, 26 * 8, 26 * 8, 9 * 8]
+
+
 def test_every_function_is_had_by_as_many_elements_as_meet_there():
     made = mesh.build(PLAN)
     for name, wall in (("vector", made.vector_wall), ("scalar", made.scalar_wall)):
