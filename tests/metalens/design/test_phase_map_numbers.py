@@ -127,14 +127,19 @@ def test_a_pitch_that_is_given_too_is_the_files_within_a_millionth(tmp_path, x, 
 
 def test_rows_and_columns_of_numbers_are_no_map(tmp_path):
     """A matrix of one row is passed over where the only map is looked for, and refused where it is named."""
-    file = tmp_path / "m.npz"
-    np.savez(file, map=PHASE, x=np.zeros((1, 4)), y=np.zeros((5, 1)), stack=np.zeros((2, 3, 4)))
-    found = phase_map.read(PhaseMap(file, 0.9))
+    held = {"map": PHASE, "x": np.zeros((1, 4)), "y": np.zeros((5, 1)), "stack": np.zeros((2, 3, 4)), "one": 3.0}
+    assert phase_map._named(tmp_path, held, None) is PHASE
+    assert phase_map._named(tmp_path, held, "y") is held["y"]
+    with pytest.raises(LensError, match=r"holds 2 matrices \(back, map\); name one"):
+        phase_map._named(tmp_path, held | {"back": PHASE.T}, None)
+    for name, shape in (("x", r"\(1, 4\)"), ("y", r"\(5, 1\)"), ("stack", r"\(2, 3, 4\)")):
+        np.save(tmp_path / "m.npy", held[name])
+        with pytest.raises(LensError, match=rf"holds float64 of shape {shape}, need real \(y, x\) of 2 by 2"):
+            phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9))
+    np.save(tmp_path / "m.npy", PHASE)
+    found = phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9))
     assert np.array_equal(found.phase_rad, PHASE)
     assert (found.step_um, found.centre_um) == ((0.9, 0.9), (0.0, 0.0))
-    for name, shape in (("x", r"\(1, 4\)"), ("y", r"\(5, 1\)"), ("stack", r"\(2, 3, 4\)")):
-        with pytest.raises(LensError, match=rf"holds float64 of shape {shape}, need real \(y, x\) of 2 by 2"):
-            phase_map.read(PhaseMap(file, 0.9, variable=name))
 
 
 def test_numbers_that_are_not_finite_are_named_by_row_and_column(tmp_path):
