@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from metalens.ground import executor, threads
+from metalens.ground import executor, report, threads
 
 # No clock decides a test: no deadline, no complaint of slow data. With CI set, as .ci/run does, every run draws alike.
 hypothesis.settings.register_profile(
@@ -72,6 +72,22 @@ def pools() -> Iterator[Run]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(executor, "run", run)
         yield own
+
+
+@pytest.fixture(scope="session", autouse=True)
+def pixels_of_pictures() -> Iterator[int]:
+    """Those of an inch as users have them. In tests a quarter of that: two thirds of the time, the same drawing."""
+    usual = report.png.__kwdefaults__
+    fine = usual["dpi"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(usual, "dpi", fine // 4)
+        yield fine
+
+
+@pytest.fixture
+def fine_pictures(pixels_of_pictures: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures as users have them, for a test that asks how large they are."""
+    monkeypatch.setitem(report.png.__kwdefaults__, "dpi", pixels_of_pictures)
 
 
 @pytest.fixture(scope="session")

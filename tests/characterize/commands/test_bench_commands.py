@@ -52,7 +52,7 @@ def shoot(bench, *more):
     )
 
 
-def test_capture_then_fit(bench, capsys):
+def test_capture_then_fit(bench, capsys, fine_pictures):
     assert shoot(bench, "--quiet") == 0
     shots = characterize.load(bench / "shots")
     assert shots.frames.shape == (3, 16, 16)

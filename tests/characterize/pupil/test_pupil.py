@@ -170,7 +170,7 @@ def test_real_beads_predict_the_planes_left_out():
     assert fit.held_out.plane_ncc >= 0.975
 
 
-def test_command_writes_a_pupil_file_and_a_page(tmp_path):
+def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
     from metalens.cli import main
     from metalens.ground import store
 

@@ -37,7 +37,7 @@ def made(folder, capsys, *, ratio=""):
     return status, json.loads(told.out) if status < 2 else told.err
 
 
-def test_a_library_over_two_sizes_is_written_shown_and_right(tmp_path, capsys):
+def test_a_library_over_two_sizes_is_written_shown_and_right(tmp_path, capsys, fine_pictures):
     status, told = made(tmp_path, capsys)
     assert status == 0
     assert told["failures"] == []

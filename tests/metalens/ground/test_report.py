@@ -77,7 +77,7 @@ def test_keys_are_said_in_plain_words_with_their_unit(key, said):
     assert report.in_words(key) == said
 
 
-def test_a_picture_has_two_pixels_for_each_of_the_page():
+def test_a_picture_has_two_pixels_for_each_of_the_page(fine_pictures):
     figure, _ = report.canvas(size=(4.0, 3.0))
     width = int.from_bytes(report.png(figure)[16:20], "big")
     assert width == pytest.approx(2 * 4.0 * 110, rel=0.1)  # cut to what is drawn
