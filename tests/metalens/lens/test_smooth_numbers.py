@@ -48,6 +48,18 @@ def test_a_thousand_places_are_enough_and_fewer_are_asked_each():
         assert found == pytest.approx(0.4 - 1.1 * unit + 0.3 * (2 * unit**2 - 1), abs=1e-14)
 
 
+def test_places_may_lie_close_together():
+    asked = []
+
+    def cosine(u):
+        asked.append(u.size)
+        return np.cos(u)
+
+    close = np.linspace(2.0, 2.02, 1000)
+    assert smooth.over(cosine, close) == pytest.approx(np.cos(close), abs=1e-14)
+    assert asked == [9]
+
+
 def test_what_no_degree_reaches_is_asked_at_every_place():
     asked = []
 
