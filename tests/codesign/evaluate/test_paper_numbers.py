@@ -1,0 +1,121 @@
+"""Claims of the paper beside typed measurements: cells of the table, and what each file is read for."""
+
+import json
+import math
+
+import pytest
+
+from codesign.evaluate import paper
+from codesign.evaluate.paper import Claim, Line, Measured
+
+
+def claim(value=math.inf, unit="", note=""):
+    return Claim("Table 9", "what", "key", "metalens this", value, unit, note)
+
+
+def test_a_ratio_is_ours_over_the_papers():
+    assert Line(claim(0.8), Measured(0.2)).ratio == pytest.approx(0.25, rel=1e-12)
+    assert math.isnan(Line(claim(0.8), None).ratio)
+    assert math.isnan(Line(claim(), Measured(0.2)).ratio)
+    assert claim().picture
+    assert not claim(0.0).picture
+
+
+@pytest.mark.parametrize(
+    ("line", "cells"),
+    [
+        (Line(claim(0.8, "mm", "a note"), Measured(0.213, 0.15, 0.31, "here")),
+         ("0.8 mm", "0.213 [0.15, 0.31]", "0.27", "here; paper: a note")),
+        (Line(claim(1.85, "ratio"), Measured(2.7)), ("1.85", "2.7", "1.46", "")),
+        (Line(claim(1.85, "ratio", "a note"), Measured(2.7)), ("1.85", "2.7", "1.46", "paper: a note")),
+        (Line(claim(), Measured(2.7, conditions="so")), ("picture", "2.7", "", "so")),
+        (Line(claim(note="a note"), None, "fig.svg"), ("picture", "fig.svg", "", "a note")),
+        (Line(claim(7.0, "deg"), None), ("7 deg", "not measured", "", "measure with: metalens this")),
+    ],
+)  # fmt: skip
+def test_cells_of_a_line(line, cells):
+    assert line.words() == ("Table 9", "what", *cells)
+
+
+def test_pictures_are_looked_for_by_name_and_numbers_are_no_pictures(tmp_path):
+    shown = [c for c in paper.claims() if c.picture]
+    number = next(c for c in paper.claims() if not c.picture)
+    first = shown[0].key.removeprefix("picture/")
+    for name in (first, number.key.replace("/", "-")):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+    told = {line.claim.key: line for line in paper.lines({number.key: Measured(3.0)}, tmp_path)}
+    assert told[shown[0].key].picture == first
+    assert told[shown[1].key].picture == ""
+    assert told[number.key].ours == Measured(3.0)
+    assert told[number.key].picture == ""
+    assert [line.picture for line in paper.lines({}) if line.picture] == []
+
+
+def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyperbolic_lens(tmp_path):
+    """Quantities without an interval have none; a network without a mask has no overlap."""
+    run = {"name": "proposed", "mmacs": 3.14159, "slip_mm": 0.31, "slip_mm_interval": [0.2, 0.45], "iou": None,
+           "gaze_axial_deg": 1.7, "gaze_axial_deg_interval": [1.1, 2.9], "gaze_lateral_deg": 0.6}  # fmt: skip
+    ratios = [
+        {"quantity": q, "against": a, "ratio": r, "interval": [r - 0.1, r + 0.3]}
+        for q, a, r in (
+            ("slip_mm", "hyperbolic", 0.4), ("gaze_axial_deg", "double_helix", 0.9),
+            ("gaze_lateral_deg", "hyperbolic", 0.7), ("iou", "hyperbolic", 1.2),
+        )
+    ]  # fmt: skip
+    told = {"runs": [run], "ratios": ratios, "settings": {"subjects": 6, "seed": 11}}
+    (tmp_path / "e.json").write_text(json.dumps(told))
+    found = paper.of_experiment(tmp_path / "e.json")
+    words = "6 synthetic subjects, 3.1 MMACs, seed 11"
+    assert set(found) == {f"{k}/proposed" for k in ("slip", "gaze_axial", "gaze_lateral")} | {
+        "slip/ratio",
+        "gaze_lateral/ratio",
+    }
+    assert found["slip/proposed"] == Measured(0.31, 0.2, 0.45, words)
+    assert found["gaze_axial/proposed"] == Measured(1.7, 1.1, 2.9, words)
+    lateral = found["gaze_lateral/proposed"]
+    assert lateral.value == 0.6
+    assert math.isnan(lateral.low)
+    assert math.isnan(lateral.high)
+    assert (found["slip/ratio"].value, found["slip/ratio"].low, found["slip/ratio"].high) == pytest.approx(
+        (0.4, 0.3, 0.7)
+    )
+    assert found["gaze_lateral/ratio"].value == 0.7
+
+
+def test_dim_light_is_ours_over_ours_and_theirs_over_ours(tmp_path):
+    """1.2 in good light, 1.8 in poor: 1.5; the others 2.7 and 4.5 beside it."""
+
+    def written(name, **errors):
+        (tmp_path / name).write_text(
+            json.dumps({"runs": [{"name": n, "gaze_axial_deg": v} for n, v in errors.items()]})
+        )
+        return tmp_path / name
+
+    bright = written("a", proposed=1.2, hyperbolic=1.1, double_helix=2.0)
+    found = paper.of_dim(bright, written("b", proposed=1.8, hyperbolic=2.7, double_helix=4.5))
+    values = {key: one.value for key, one in found.items()}
+    assert values == pytest.approx({"dim/proposed": 1.5, "dim/hyperbolic": 1.5, "dim/double_helix": 2.5})
+    assert set(paper.of_dim(bright, written("c", proposed=1.8, double_helix=0.9))) == {
+        "dim/proposed",
+        "dim/double_helix",
+    }
+    assert paper.of_dim(bright, written("d", hyperbolic=0.9)) == {}
+
+
+def rows(*pairs):
+    return [{"budget_mmacs": b, "mmacs": m, "axial_slip_mm": e} for b, m, e in pairs]
+
+
+def test_equal_errors_are_enough_and_what_is_never_reached_is_left_out():
+    """Their best, 0.4 mm at 6.3 MMACs and dearer again: ours has just that at 2.1 and less at 4.2."""
+    theirs = rows((2.0, 1.9, 0.8), (9.0, 8.8, 0.4), (7.0, 6.3, 0.4))
+    ours = rows((3.0, 2.1, 0.4), (9.0, 4.2, 0.3), (2.0, 1.6, 0.41), (7.0, 6.1, 0.2))
+    found = paper.of_runs({"proposed": ours, "hyperbolic": theirs})
+    assert found["fig8a/compute"].value == pytest.approx(2.1 / 6.3)
+    assert found["fig8a/error"].value == pytest.approx(0.41 / 0.8)
+    worse = paper.of_runs({"proposed": rows((2.0, 1.6, 0.41)), "hyperbolic": theirs})
+    assert set(worse) == {"fig8a/error"}
+    assert paper.of_runs({"proposed": rows((2.5, 2.1, 0.4)), "hyperbolic": theirs}) == {}
+    unread = [*theirs, {"budget_mmacs": 1.0, "mmacs": 0.9}]
+    assert paper.of_runs({"proposed": ours, "hyperbolic": unread})["fig8a/error"].value == pytest.approx(0.41 / 0.8)
