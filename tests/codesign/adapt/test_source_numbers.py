@@ -74,6 +74,8 @@ def test_an_architecture_is_read_as_it_was_written_without_its_error_and_cost():
     assert source.architecture_of({**told, "error": 0.3, "macs": 7e6}, run, Path("x")) == chosen
     with pytest.raises(TrainingError, match=r"x/result\.json: its network is of another version"):
         source.architecture_of({**told, "colour": 3}, run, Path("x"))
+    with pytest.raises(TrainingError, match="its network is of another version"):
+        source.architecture_of(None, run, Path("x"))
 
 
 @pytest.mark.parametrize(("off_um", "same"), [(0.9e-6, True), (-0.9e-6, True), (1.1e-6, False), (-1.1e-6, False)])

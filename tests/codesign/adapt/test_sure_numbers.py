@@ -98,6 +98,14 @@ def test_a_spread_up_to_what_is_allowed_is_a_table(about, limit, seed):
             assert f"the posterior leaves the bias table open by {wide}. Settle it by " in told.words
 
 
+def test_a_spread_of_just_what_is_allowed_is_a_table():
+    found, rows = fit(), drawn(0.3)
+    found.samples = lambda count, seed: [(row, 0.0, 0.0) for row in rows]
+    widest = float(sure.judge(found, table).sigma_nm.max())
+    assert sure.judge(found, table, wide_nm=widest).usable
+    assert not sure.judge(found, table, wide_nm=widest * (1 - 1e-12)).usable
+
+
 def test_a_draw_that_no_table_can_hold_leaves_no_numbers():
     found = fit()
     found.samples = lambda count, seed: [found.value]
@@ -106,5 +114,5 @@ def test_a_draw_that_no_table_can_hold_leaves_no_numbers():
         raise ConfigError("3 nm per nm")
 
     told = sure.judge(found, impossible)
-    assert (told.table_nm.size, told.sigma_nm.size) == (0, 0)
+    assert (told.table_nm.shape, told.sigma_nm.shape) == ((0, 0), (0,))
     assert told.words == "no correction: for lenses of the posterior 3 nm per nm"

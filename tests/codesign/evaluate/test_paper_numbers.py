@@ -119,3 +119,28 @@ def test_equal_errors_are_enough_and_what_is_never_reached_is_left_out():
     assert paper.of_runs({"proposed": rows((2.5, 2.1, 0.4)), "hyperbolic": theirs}) == {}
     unread = [*theirs, {"budget_mmacs": 1.0, "mmacs": 0.9}]
     assert paper.of_runs({"proposed": ours, "hyperbolic": unread})["fig8a/error"].value == pytest.approx(0.41 / 0.8)
+
+
+def test_information_is_summed_over_depths_of_unbinned_pixels_beside_the_hyperbolic_lens(tmp_path):
+    """7 and 9 over 3 and 1 at 5 degrees; binned ones stand beside and are not read."""
+
+    def lens(first, second, scenes):
+        return {"information_per_mm2": [[first, [0.5, 0.1]], [second, [0.2, 0.9]]], "scene_ratios": scenes}
+
+    told = {
+        "angles_deg": [0.0, 5.0], "normalisation": "energy",
+        "lenses": {
+            "hyperbolic": lens([2.0, 3.0], [3.0, 1.0], {}),
+            "mine": lens([1.0, 0.5], [7.0, 9.0], {"slip": [1.6, 1.5, 1.8]}),
+        },
+    }  # fmt: skip
+    (tmp_path / "o.json").write_text(json.dumps(told))
+    found = paper.of_optics(tmp_path / "o.json")
+    assert found["information/5/mine"].value == pytest.approx(4.0)
+    assert found["information/0/mine"].value == pytest.approx(0.3)
+    assert found["information/5/mine"].conditions == "honest I(z), energy normalisation, pixels not binned"
+    assert (found["scenes/slip/mine"].value, found["scenes/slip/mine"].low, found["scenes/slip/mine"].high) == (
+        1.6,
+        1.5,
+        1.8,
+    )
