@@ -85,7 +85,7 @@ def test_every_part_begins_where_the_one_before_it_ends_and_has_its_volume():
     assert list(parts) == list(want)
     for name, (low, high, volume) in want.items():
         box = parts[name].bounding_box()
-        # the kernel's boxes are wider by 1e-7 mm
-        assert [box.min.Z, box.max.Z] == pytest.approx([low, high], abs=1e-6)
+        ends = [box.min.Z, box.max.Z]
+        assert ends == pytest.approx([low, high], abs=1e-6)  # the kernel's boxes are wider by 1e-7 mm
         assert parts[name].volume == pytest.approx(volume, rel=1e-9)
         assert tuple(parts[name].color)[:3] == pytest.approx(module.COLOURS[name][:3], abs=1e-6)
