@@ -75,7 +75,7 @@ name = "PADS"
 relative_dose = 1.5
 checked = false
 [wafer]
-diameter_mm = 4
+diameter_mm = 3.2
 edge_exclusion_mm = 0.1
 pitch_um = [340, 290]
 flat_mm = 1.5
@@ -103,7 +103,7 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
     values = json.loads(capsys.readouterr().out)
     table = np.loadtxt(tmp_path / "m" / "dies.csv", delimiter=",", skiprows=1)
     dies = [(round(1000 * x), round(1000 * y)) for x, y in table[:, 3:]]
-    assert len(dies) == values["dies"] > 60
+    assert len(dies) == values["dies"] > 40  # more than one of the readers keeps
     wanted = set()
     for name, x, y, turn in (
         ("a", -37200, 11300, 3),
