@@ -89,6 +89,20 @@ def test_a_grid_holds_the_bowl_between_the_pillars_and_a_few_points_beyond():
             export.grid_phase(one, wrong)
 
 
+@pytest.mark.parametrize(("ratio", "sites"), [(0.26, 2), (0.42, 2)])
+def test_a_grid_goes_on_by_four_of_its_points_and_a_site(ratio, sites):
+    """4 · 0.26 + 1 and 4 · 0.42 + 1 sites: two whole ones, 6.0 um from the middle where pillars end at 5.0; three
+    points would be one site at the first, five three at the second."""
+    one = lens(bowl(X, Y[:, None]), X**2 + (Y[:, None] * 0.7) ** 2 <= 5.3**2)
+    samples = 1 + 2 * round(one.diameters.radius_um / (ratio * PITCH))
+    found = export.grid_phase(one, samples)
+    assert found.step_um == pytest.approx(ratio * PITCH, rel=0.02)
+    middle = (samples - 1) // 2
+    last = np.flatnonzero(np.isfinite(found.phase_rad[middle])).max() - middle
+    end = 5.0 + sites * PITCH
+    assert end - found.step_um - 1e-9 < last * found.step_um <= end + 1e-9
+
+
 def test_other_lattices_and_slits_have_no_grid():
     slit = np.zeros((NY, NX), bool)
     slit[20, 15] = True
@@ -135,7 +149,9 @@ def test_the_file_says_its_size_in_millimetres_and_flags_points_without_data():
 def test_each_format_is_written_with_the_values_of_the_lens(tmp_path):
     one = lens(bowl(X, Y[:, None]), DISC)
     error = export.write(tmp_path / "a.dat", one)
-    assert error == export.grid_phase(one, 501).error_rad
+    plain = export.grid_phase(one)
+    assert plain.phase_rad.shape == (501, 501)
+    assert error == plain.error_rad
     assert (tmp_path / "a.dat").read_text().startswith("501 501 ")
     assert export.write(tmp_path / "a.npz", one) == 0.0
     assert export.write(tmp_path / "a.MAT", one) == 0.0
