@@ -89,3 +89,63 @@ def test_what_is_known_where_nothing_is_said():
     given = Given()
     assert (given.fwhm_nm, given.draws, given.tolerance) == (0.0, 4, 1e-3)
     assert given.frames.subjects == 5
+
+
+def prepared_with(monkeypatch, given, reading=None):
+    """What a bench of a lens of 0.8 um is made of, by names; the grid of its device and the window of its cells."""
+    asked = {}
+
+    def gathered(lens, phase, level, *, window_um):
+        asked["window_um"] = window_um
+        return "wave"
+
+    def device(wave, grid, *, layers, distance_um, spectrum):
+        asked.update(grid=grid, spectrum=spectrum, distance_um=distance_um)
+        return SimpleNamespace(whole="whole")
+
+    aperture = SimpleNamespace(maps=lambda table: (table, "level"), designed=lambda: "designed")
+    eyes = SimpleNamespace(depths_um=(15_000.0, 28_000.0))
+    monkeypatch.setattr(prepared, "Aperture", lambda lens: aperture)
+    monkeypatch.setattr(prepared.task, "views", lambda setting: asked.update(setting=setting) or eyes)
+    monkeypatch.setattr(prepared.task, "linear", lambda eyes, optics, setting: optics)
+    monkeypatch.setattr(prepared, "gathered", gathered)
+    monkeypatch.setattr(prepared, "device", device)
+    monkeypatch.setattr(prepared, "same_lens", lambda lens, optics: asked.update(same=optics))
+    monkeypatch.setattr(prepared, "Reading", lambda run, frames, *, fwhm_nm: reading)
+    monkeypatch.setattr(
+        prepared, "kernels", lambda lens, maps, finest, window, *, fwhm_nm: f"kernels of {fwhm_nm:g} nm"
+    )
+    lens = SimpleNamespace(reduced_um=2_121.0, wavelength_um=0.8, sensor_distance_um=2_300.0, layers="films")
+    made = prepared.bench(lens, given, prepared.TaskSetting(scenes=2, pixels=29, margin=6, pitch_um=4.7))
+    return made, asked
+
+
+@pytest.mark.parametrize("fwhm_nm", [0.0, 37.0])
+def test_a_bench_without_a_run_images_its_eyes_with_windows_of_their_margin(monkeypatch, fwhm_nm):
+    """Twice 6 samples and one of 4.7 um are 61.1 um."""
+    made, asked = prepared_with(monkeypatch, Given(fwhm_nm=fwhm_nm))
+    grid = asked["grid"]
+    assert (grid.samples, grid.margin, grid.window) == ((29, 29), 6, 13)
+    assert asked["window_um"] == pytest.approx(61.1, rel=1e-12)
+    assert asked["distance_um"] == 2_300.0
+    assert asked["setting"].sensor_distance_um == 2_121.0
+    assert (made.window.near_um, made.window.far_um, made.window.pitch_um) == (15_000.0, 28_000.0, 4.7)
+    assert made.reader == "whole"
+    assert made.reading is None
+    if fwhm_nm:
+        assert (asked["spectrum"].peak_nm, asked["spectrum"].fwhm_nm) == (pytest.approx(800.0), 37.0)
+    else:
+        assert asked["spectrum"] is None
+
+
+def test_a_bench_with_a_run_stands_on_its_frames_and_its_estimator_knows_one_psf(monkeypatch):
+    about = []
+    reading = SimpleNamespace(
+        true=SimpleNamespace(window_um=88.0),
+        stands=lambda *stood: about.append(stood) or SimpleNamespace(whole="seen"),
+    )
+    run = SimpleNamespace(settings=SimpleNamespace(optics="optics"))
+    made, asked = prepared_with(monkeypatch, Given(run=run, fwhm_nm=37.0), reading)
+    assert about == [("wave", "films", 2_300.0)]
+    assert (asked["window_um"], asked["same"]) == (88.0, "optics")
+    assert (made.reader, made.reading, made.device.whole) == ("kernels of 37 nm", reading, "seen")

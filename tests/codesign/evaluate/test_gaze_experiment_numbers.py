@@ -14,6 +14,7 @@ from codesign.eye import POPULATION
 from codesign.eye import population as eye
 from codesign.gaze import Readings, Sphere, face_angles
 from metalens.ground.errors import ConfigError
+from metalens.image.sensor import Sensor
 
 CONFIG = ExperimentConfig(
     subjects=3, grid=(3, 4), field_deg=(24.0, 18.0), axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), share=0.34,
@@ -245,3 +246,109 @@ def test_eyes_stay_within_the_depths_of_the_images():
             checked(axial=(-2.5, 3.0), held=held)
     with pytest.raises(ConfigError, match="no run to evaluate"):
         ge._check([], CONFIG)
+
+
+def test_subjects_are_seen_one_by_one_and_results_come_with_the_last(monkeypatch):
+    """Two runs, three subjects; noise of each subject's own; displacements in mm."""
+    asked = []
+    monkeypatch.setattr(ge, "_check", lambda sources, config: None)
+    monkeypatch.setattr(ge, "ready", lambda source, *, image: f"imager of {source.name}, {image}")
+    monkeypatch.setattr(ge, "calibrator", lambda source, imager, config: f"how of {source.name}")
+    monkeypatch.setattr(ge, "states_of", lambda config, subject, scenes: (subject, f"trial {subject}"))
+
+    def render(states, *, rig, camera):
+        return SimpleNamespace(
+            labels=SimpleNamespace(shift_um=torch.full((2, 3), 1000.0 * (states + 1), dtype=torch.float64))
+        )
+
+    def through(source, made, imager, *, seed, snr_db):
+        asked.append((source.name, imager, seed, snr_db))
+        return seed
+
+    def result(label, source, kept, whole, config, how):
+        made = ge.Result(label, 1.0, whole, None, None, None, None, None, None, (0.0, 0.0, 0.0), how)
+        return replace(made, slip_mm=kept)
+
+    monkeypatch.setattr(ge, "render", render)
+    monkeypatch.setattr(ge, "through", through)
+    monkeypatch.setattr(ge, "_answers", lambda source, seen: seen)
+    monkeypatch.setattr(ge, "joined", list)
+    monkeypatch.setattr(ge, "_result", result)
+    monkeypatch.setattr(ge.formed, "above", lambda settings, image: f"above of {image}")
+
+    def run(name):
+        one = source()
+        one.name, one.run.trainer = name, SimpleNamespace(optics="optics")
+        return one
+
+    dim = replace(CONFIG, snr_db=15.0, image="trained")
+    *before, (done, results) = ge.experiment([run("a"), run("b")], dim)
+    assert before == [(1, []), (2, [])]
+    assert done == 3
+    seeds = [1_000_003, 1_000_004, 1_000_005]
+    assert asked == [(name, f"imager of {name}, trained", seed, 15.0) for seed in seeds for name in "ab"]
+    assert [one.name for one in results] == ["run 1", "run 2"]
+    assert [one.slip_mm for one in results] == [seeds, seeds]
+    assert results[1].how == "how of b"
+    assert results[1].above == "above of imager of b, trained"
+    assert results[0].trial == ["trial 0", "trial 1", "trial 2"]
+    assert results[0].visible_mm[:, 1].tolist() == pytest.approx([1.0, 1.0, 2.0, 2.0, 3.0, 3.0])
+    (*_, (_, named)) = ge.experiment([run("a"), run("b")], dim, names=("mine", "theirs"))
+    assert [one.name for one in named] == ["mine", "theirs"]
+
+
+@pytest.mark.parametrize(("batches", "measured"), [(3, 3), (8, 8), (11, 8)])
+@pytest.mark.parametrize("made", [None, "made lens"])
+def test_a_run_is_imaged_with_the_margin_on_either_side(monkeypatch, batches, measured, made):
+    """32 and twice 4 samples; statistics of eight batches at most, of a retraining those of its own lenses."""
+    asked = []
+    one = source()
+    one.made, one.architecture, one.settings.test_batches = made, "member", batches
+    model = SimpleNamespace(net="net", coefficients_rad="phase")
+    one.run.trainer = SimpleNamespace(optics=ge.ExperimentConfig(image="trained"), model=model, scenes="scenes")
+    monkeypatch.setattr(ge.assess, "frames", lambda trainer, scenes, count: count)
+    monkeypatch.setattr(ge.assess, "parts", lambda seen: f"{seen} parts")
+    monkeypatch.setattr(ge, "recalibrate", lambda *about: asked.append(about))
+    monkeypatch.setattr(ge.retraining, "settle", lambda trainer, source: asked.append("settled"))
+    monkeypatch.setattr(
+        ge.formed, "imager", lambda seen, phase, size, *, margin, made: (seen.image, phase, size, margin, made)
+    )
+    assert ge.ready(one) == ("true", "phase", 40, 4, made)
+    assert asked == (["settled"] if made else [("net", "member", f"{measured} parts")])
+    assert ge.ready(one, image="trained")[0] == "trained"
+
+
+@pytest.mark.parametrize("snr_db", [None, 15.0])
+def test_frames_go_through_lens_and_sensor_with_noise_of_their_seed(monkeypatch, snr_db):
+    """The dimmed sensor keeps the pitch that training moves; the mask is cut to what the pixels see."""
+    asked = []
+    one = source()
+    sensor = Sensor(7.0)
+    pitch = torch.tensor(5.5)
+    one.run.trainer = SimpleNamespace(
+        sensor=sensor, model=SimpleNamespace(pitch_um=pitch), optics=SimpleNamespace(sample_um=3.0),
+        inner=SimpleNamespace(batch=12),
+    )  # fmt: skip
+    light = torch.full((2, 24, 24), 0.3)
+    batch = SimpleNamespace(frames="frames", mask="mask", slip_mm="slip")
+    monkeypatch.setattr(ge, "as_batch", lambda made, margin: batch if margin == 4 else None)
+    monkeypatch.setattr(ge, "irradiance", lambda frames, prepared, *, margin: light if margin == 4 else None)
+
+    def low(at, mean, *, snr_db):
+        asked.append((at.pitch_um, mean, snr_db))
+        return at
+
+    def read_out(light, sample_um, pitch, sensor, *, generator, quiet):
+        asked.append((sample_um, float(pitch), sensor.pitch_um, generator.initial_seed(), quiet))
+        return "pixels"
+
+    monkeypatch.setattr(ge, "low_snr", low)
+    monkeypatch.setattr(ge, "read_out", read_out)
+    monkeypatch.setattr(ge.losses, "framed", lambda mask, wide: (mask, wide))
+    seen = ge.through(one, "made", "imager", seed=77, snr_db=snr_db, quiet=True)
+    dimmed = [(5.5, pytest.approx(0.3), 15.0)] if snr_db else []
+    assert asked == [*dimmed, (3.0, 5.5, 7.0, 77, True)]
+    assert (seen.frames, seen.batch) == ("pixels", 12)
+    wide = ge.frame_wide(24, 3.0, 5.5)
+    assert seen.mask == ("mask", wide)
+    assert (seen.slip_mm, seen.wide) == ("slip", wide)
