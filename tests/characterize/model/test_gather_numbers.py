@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from characterize.model import gather
-from metalens.lens import DiameterMap
+from metalens.lens import DiameterMap, Stop
 
 RNG = np.random.default_rng(3)
 
@@ -58,6 +58,8 @@ def test_both_mirrors_and_straight_light_are_needed_for_a_quarter_to_tell_all(ax
         whole = whole + 0.01 * np.expand_dims(np.arange(whole.shape[axis]), 1 - axis)
     d = DiameterMap(whole, 0.4)
     assert gather.mirrored(d, (0.0, 0.0)) is alike
+    assert gather.mirrored(d, (0.0, 0.0), Stop(20.0, 30.0)) is alike
+    assert not gather.mirrored(d, (0.0, 0.0), Stop(20.0, 30.0, (0.0, 0.2)))
     assert not gather.mirrored(d, (0.1, 0.0))
     assert not gather.mirrored(d, (0.0, -0.1))
 

@@ -8,7 +8,7 @@ import pytest
 
 from metalens.cell import Cell, Film, Index, Lattice, Light
 from metalens.cell.record import Layer
-from metalens.cell.shapes import Polygon, Rectangle
+from metalens.cell.shapes import Ellipse, Polygon, Rectangle
 from metalens.ground.errors import CellError
 from metalens.rcwa import near, near_waves, pattern
 from metalens.rcwa.near import Grid
@@ -146,11 +146,37 @@ def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interfac
     kz = math.sqrt(1.46**2 - math.sin(0.3) ** 2)
     comes = (u / U + w / V)[:, place] / 2  # what goes up
     assert comes == pytest.approx(np.exp(1j * K0 * kz * (z - ends[0])), abs=1e-12)
+    back = (u / U - w / V) / 2
+    below = np.sqrt(1.46**2 - one.ways.kappa**2 + 0j)
+    assert back[0] == pytest.approx(back[1] * np.exp(1j * K0 * below * 0.15), abs=1e-12)  # later by 0.15 um
+    assert np.abs(back[1]).max() > 1e-2
     U, V = half_space(one.ways, 1.1)
     u, w = near_waves._heights(this, slabs, one, np.array([0.6, 0.9]))
     assert u / U == pytest.approx(w / V, abs=1e-12)  # nothing comes down
     top = np.sqrt(1.1**2 - one.ways.kappa**2 + 0j)
     assert (u / U)[1] == pytest.approx((u / U)[0] * np.exp(1j * K0 * top * 0.3), abs=1e-12)
+
+
+def test_the_displacement_across_interfaces_is_continuous():
+    """eps Ez of all orders from both sides: between films, from a film into a section, and at the half-spaces."""
+    upright = dataclasses.replace(CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6))))
+    this = problem(upright, SIZE, WAVE, 0.3, 0.7)
+    slabs = near_waves.slabs_of(this, 1)
+    space = mirrors.orders(1, pattern.frame(upright, (IDENTITY,)))
+    one = near_waves.solved(this, slabs, Light(WAVE, 0.3, "p", 0.7), space)
+    ends, gap = near_waves.edges(this, slabs) / K0, 1e-9
+    sections = [mirrors.product(space, pattern.tables(s.section, upright, space.reach)[0], 2) for s in slabs[2:4]]
+    unit = np.eye(len(space.ez.m))
+    eps = [1.46**2 * unit, 1.9**2 * unit, 1.6**2 * unit, *sections, (1.3 + 0.2j) ** 2 * unit, 1.1**2 * unit]
+    below = near_waves.orders_at(this, slabs, one, ends - gap)
+    above = near_waves.orders_at(this, slabs, one, ends + gap)
+    for k in range(6):
+        assert eps[k] @ below.ez[k] == pytest.approx(eps[k + 1] @ above.ez[k], abs=1e-6)
+        assert np.abs(below.ez[k]).max() > 1e-2
+        assert below.hz[k] == pytest.approx(above.hz[k], abs=1e-6)
+        if k in (1, 2, 5):  # within a film D is eps times E
+            assert above.dx[k - 1] == pytest.approx(eps[k][0, 0] * above.ex[k - 1], abs=1e-9)
+            assert above.dy[k - 1] == pytest.approx(eps[k][0, 0] * above.ey[k - 1], abs=1e-9)
 
 
 def test_the_jump_takes_the_normal_part_of_the_field_from_d():
@@ -188,6 +214,17 @@ def test_points_see_the_media_that_they_lie_in():
         assert got == pytest.approx(weight * part)
 
 
+def test_normals_that_lie_between_the_axes_have_all_three_products():
+    this = problem(dataclasses.replace(CELL, shape=Ellipse(0.7, 0.2), sidewall_rad=0.0), SIZE, WAVE, 0.0, 0.0)
+    slabs = near_waves.slabs_of(this, 1)
+    x, y = np.array([0.07, -0.1, 0.02]), np.array([0.06, -0.03])
+    looks = near._looks(this, slabs, Grid(x, y, [0.1]))
+    n, weight = pattern.normals_at(slabs[2].section.outlines, this.cell, *np.meshgrid(x, y))
+    assert (np.abs(n).min((0, 1)) > 0.03).all()
+    for got, part in zip(looks[3].normal, (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]), strict=True):
+        assert got == pytest.approx(weight * part)
+
+
 @pytest.mark.parametrize("axis", ["x_um", "y_um", "z_um"])
 def test_axes_of_points_are_lists_of_finite_lengths(axis):
     good = {"x_um": [0.0], "y_um": [0.1], "z_um": [0.2]}
@@ -209,3 +246,56 @@ def test_the_error_of_a_field_is_the_farthest_truncation_before_times_its_factor
     assert fields[1].error == pytest.approx(min(crowded * near.safety(1), 2.0))
     assert [fields[n].orders for n in (1, 2, 3)] == [5, 13, 29]
     assert [fields[n].converged for n in (1, 2, 3)] == [fields[n].error <= 0.05 for n in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(("harmonics", "factor"), [(6, None), (7, 2.5)])
+def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_four(harmonics, factor):
+    cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
+    light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
+    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
+    stack = near._stack(this, 1, [grid])
+    every = [near._fields(this, stack, light, [grid], n)[0][0] for n in range(harmonics - 4, harmonics + 1)]
+    farthest = max(np.linalg.norm(one - every[-1]) for one in every[:-1]) / np.linalg.norm(every[-1])
+    found = near.near_fields(cell, SIZE, light, [grid], harmonics=harmonics, tolerance=1e-6)[0]
+    crowded = near.ladder(this, harmonics).crowded
+    assert found.error == pytest.approx(crowded * (factor or near.safety(6)) * farthest, rel=1e-9)
+    assert found.e == pytest.approx(every[-1], abs=1e-12)
+    assert near.safety(6) > 2.6
+
+
+def test_a_field_on_one_grid_is_that_of_its_axes():
+    cell, axes = Cell(0.36, shape=Rectangle(0.6), **ABOUT), ([0.02, 0.09, -0.1], [0.05], [0.1, 0.5])
+    light = Light(WAVE, 0.3, "p", 0.7)
+    one = near.near_field(cell, SIZE, light, x_um=axes[0], y_um=axes[1], z_um=axes[2], harmonics=1, tolerance=0.3)
+    (same,) = near.near_fields(cell, SIZE, light, [Grid(*axes)], harmonics=1, tolerance=0.3)
+    assert one.e.shape == (3, 2, 1, 3)
+    assert np.array_equal(one.e, same.e)
+    assert np.array_equal(one.h, same.h)
+    assert one.error == same.error
+
+
+def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypatch):
+    """Of two steps, whose normals are quickly found."""
+    monkeypatch.setattr(near, "_STEPS", 2)
+    cell = Cell(0.36, shape=Rectangle(0.6), sidewall_rad=0.04, **ABOUT)
+    light, grid = Light(WAVE, 0.0, "x"), Grid([0.02], [0.05], [0.1, 0.5])
+    this = problem(cell, SIZE, WAVE, 0.0, 0.0)
+    fields = {
+        (steps, n): near._fields(this, near._stack(this, steps, [grid]), light, [grid], n)[0][0]
+        for steps, n in ((1, 2), (2, 2), (2, 1))
+    }
+    found = near.near_fields(cell, SIZE, light, [grid], harmonics=2, tolerance=1e-6)[0]
+    assert found.e == pytest.approx(fields[2, 2], abs=1e-12)
+    size = np.linalg.norm(fields[2, 2])
+    cut = np.linalg.norm(fields[1, 2] - fields[2, 2]) / size
+    moved = np.linalg.norm(fields[2, 1] - fields[2, 2]) / size
+    want = near.ladder(this, 2).crowded * near.safety(2) * moved + cut
+    assert cut > 1e-5
+    stacks = [near._stack(this, steps, [grid]) for steps in (1, 2)]
+    half, full = (
+        near._fields(this, stack, light, [grid], 3)[0][0] for stack in stacks
+    )  # the least of five, and two more
+    told = near._staircase(this, stacks[1], 2, light, [grid], near.Ladder(range(1, 6), 4, 1.0))
+    assert told == pytest.approx([np.linalg.norm(half - full) / np.linalg.norm(full)], rel=1e-9)
+    assert found.error == pytest.approx(min(want, 2.0), rel=1e-9)
+    assert want < 2

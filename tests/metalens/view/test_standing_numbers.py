@@ -112,3 +112,6 @@ def test_the_phase_of_a_large_lens_has_five_hundred_and_twelve_pixels_along_its_
     found = standing.phase(lens(np.full((31, 1201), 0.15)))
     assert found.step_um == pytest.approx(480 / 512)
     assert found.values.shape == (1, 2 * 7 + 1, 2 * 256 + 1)
+    tall = standing.phase(lens(np.full((1201, 31), 0.15)))
+    assert tall.step_um == pytest.approx(480 / 512)
+    assert tall.values.shape == (1, 2 * 256 + 1, 2 * 7 + 1)
