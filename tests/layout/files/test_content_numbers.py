@@ -88,7 +88,9 @@ SHAPE = np.array([[0, 0], [5, 0], [0, 7]])
 def test_a_cell_is_taken_for_its_shapes_and_an_empty_one_for_one():
     drawn = CellContent("A", {(1, 0): [SHAPE] * 3, (2, 0): [SHAPE]}, {(1, 0): [(0, 0, 3)] * 2})
     assert drawn.taken == 6
-    assert CellContent("B").taken == 1
+    assert (CellContent("B").taken, CellContent("B").texts) == (1, 0)
+    nothing = CellContent("B").placed
+    assert [len(v) for v in (nothing.child, nothing.x, nothing.y, nothing.turn, nothing.children)] == [0] * 5
     assert CellContent("C", placed=placed(("A",))).taken == 0
 
 
