@@ -176,3 +176,29 @@ def test_the_table_that_goes_with_a_lens_has_both_answers_and_the_focus_of_y():
     assert np.array_equal(made.t[..., 1], t[..., 1, 1])
     assert made.entry_error == 0.017
     assert made.focus_y_um == (52.0, 700.0)
+
+
+def test_the_peak_of_a_choice_is_the_sum_of_both_squares():
+    made = stock(phasors([(10, 50), (200, 110)], [(0.8, 0.5), (0.9, 0.7)]))
+    x, y = np.radians([30.0, 180.0]), np.radians([20.0, 100.0])
+    assert made.nearest(x, y).tolist() == [0, 1]
+    first = abs(0.8 * np.exp(1j * np.radians(-20)) + 0.9 * np.exp(1j * np.radians(20))) ** 2 / 4
+    second = abs(0.5 * np.exp(1j * np.radians(30)) + 0.7 * np.exp(1j * np.radians(10))) ** 2 / 4
+    assert made._peak(x, y) == pytest.approx(first + second, rel=1e-9)
+
+
+def test_what_a_lens_makes_of_either_light_is_of_its_own_focus():
+    """Apertures of a radius of 21 um at 37 and at 52 um; whole turns; each light's own pillars."""
+    made, sums = stock(phasors([(10, 50), (20, 60)]), error=[0.01, 0.02]), (paired.Sums(), paired.Sums())
+    sums[0].add(np.zeros(4), np.zeros(4), np.full(4, 0.9))
+    sums[1].add(np.zeros(4), np.full(4, 0.3), np.full(4, 0.8))
+    focuses = Focus(0.94, 37.0), Focus(0.94, 52.0)
+    given = SimpleNamespace(cell=Cell(0.4, pillar=Index(3.6)))
+    found = paired._split(made, sums, np.array([3, 1]), focuses, 42.0, given, alike=True)
+    for one, distance, level in ((found.x, 37.0, 0.9), (found.y, 52.0, 0.8)):
+        assert one.numerical_aperture == pytest.approx(21 / math.hypot(21, distance), rel=1e-12)
+        assert one.efficiency == pytest.approx(level**2, rel=1e-12)
+        assert one.turns == 1.0
+        assert one.sampled_aperture == pytest.approx(0.94 / 0.8, rel=1e-12)
+    assert found.efficiency_error == pytest.approx((1.8 * 0.0125 + 0.0125**2, 1.6 * 0.0125 + 0.0125**2), rel=1e-12)
+    assert (found.multiplexed, found.pairs) == (False, 2)

@@ -74,7 +74,7 @@ def test_light_and_coverage_are_added_up_over_patches_kernels_and_sources(kinds,
 
 
 def sized(rows, columns, kernels, points):
-    one = SimpleNamespace(rows=(3, 3 + rows), columns=(1, 1 + columns))
+    one = SimpleNamespace(rows=(3 + kernels, 3 + kernels + rows), columns=(2 * kernels, 2 * kernels + columns))
     return one, torch.zeros(kernels, points // kernels)
 
 
