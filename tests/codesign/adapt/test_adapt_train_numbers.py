@@ -14,6 +14,8 @@ from codesign.adapt import train as retraining
 from codesign.adapt.reading import Accuracy
 from codesign.adapt.settings import RetrainConfig
 from codesign.adapt.train import Lenses, Outcome
+from codesign.train import InnerConfig
+from codesign.train.moving import Schedule
 
 CONFIG = RetrainConfig(draws=3, judge=2, seed=6, test_batches=4)
 
@@ -135,3 +137,42 @@ def test_the_bar_of_a_gap_is_of_differences_frame_by_frame():
     assert told.recovered == pytest.approx(0.625, rel=1e-5)
     alike = errors(1.0, 1.0)
     assert Outcome(alike, alike, alike, alike, None).recovered is None  # no gap and no bar
+
+
+@pytest.mark.parametrize(("share", "counted"), [(1.2, False), (1.98, False), (2.02, True)])
+def test_a_gap_counts_from_two_of_its_bars_on(share, counted):
+    """Differences of a gap -+ 0.3 over 10 frames: a bar of 0.3 sqrt(10 / 9) / sqrt(10) = 0.1."""
+    nominal = errors(*[1.0] * 10)
+    before = errors(*(1.0 + 0.1 * share + 0.3 * (-1) ** k for k in range(10)))
+    told = Outcome(nominal, nominal, before, nominal, None)
+    assert told.gap_sigma_mm == pytest.approx(0.1, rel=1e-5)
+    assert (told.recovered is not None) == counted
+
+
+def test_what_is_wrong_with_images_is_told_of_the_made_lens_first():
+    plain, bad, worse = errors(1.0), replace(errors(1.0), above="made"), replace(errors(1.0), above="designed")
+    assert Outcome(worse, plain, plain, bad, None).above == "made"
+    assert Outcome(worse, plain, plain, plain, None).above == "designed"
+    assert Outcome(plain, plain, plain, plain, None).above == ""
+
+
+def test_seeds_lie_apart_by_a_prime_and_weights_move_to_the_end():
+    """7919 a retraining, the first one included; the batch is the run's."""
+    run = InnerConfig(seed=5, batch=12, weights=Schedule(3e-3, 0.25, 0.75, clip=0.4))
+    for seed, want in ((0, 7_924), (1, 15_843), (6, 55_438)):
+        made = retraining.fine_tuning(run, RetrainConfig(seed=seed, steps=33, rate=7e-4))
+        assert (made.seed, made.steps, made.batch) == (want, 33, 12)
+        assert made.weights == Schedule(7e-4, 0.0, 1.0, clip=0.4)
+        assert made.optics == made.pitch == Schedule(0.0)
+
+
+def test_without_frames_the_run_s_own_test_frames_judge(monkeypatch):
+    seen = []
+    monkeypatch.setattr(retraining, "settle", lambda going, source: None)
+    monkeypatch.setattr(retraining, "held", lambda source, config: "held")
+    monkeypatch.setattr(retraining.assess, "frames", lambda going, scenes, count, *, stack: seen.append(scenes))
+    monkeypatch.setattr(retraining.assess, "predict", lambda *about: None)
+    monkeypatch.setattr(retraining.reading, "accuracy", lambda answers, shown: errors(1.0, 2.0))
+    going = SimpleNamespace(model=SimpleNamespace(net="net"), inner="inner")
+    retraining.judge(going, SimpleNamespace(architecture="member"), CONFIG, ("a",))
+    assert seen == ["held"]
