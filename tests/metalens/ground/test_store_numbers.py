@@ -70,7 +70,15 @@ def test_files_have_the_mode_of_any_new_file_and_the_mask_stays(tmp_path, mask, 
 
 @pytest.mark.parametrize(
     ("before", "after"),
-    [("", "né\n"), ("ab\n", "ab\nné\n"), ("ab\ncd", "ab\nné\n"), ("abc", "né\n"), ("ab\n\ncd\n", "ab\n\ncd\nné\n")],
+    [
+        ("", "né\n"),
+        ("ab\n", "ab\nné\n"),
+        ("ab\ncd", "ab\nné\n"),
+        ("abc", "né\n"),
+        ("ab\nc", "ab\nné\n"),
+        ("\n", "\nné\n"),
+        ("ab\n\ncd\n", "ab\n\ncd\nné\n"),
+    ],
 )
 def test_a_line_is_added_after_the_last_whole_one(tmp_path, before, after):
     (tmp_path / "j").write_text(before)
