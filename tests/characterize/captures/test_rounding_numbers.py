@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 from characterize.captures.rounding import Dark, told
 
@@ -114,3 +114,24 @@ def test_hot_pixels_read_as_they_are_with_the_scatter_of_all():
     assert found.error[2, 3] == found.error[5, 6] == pytest.approx(counts.std() / 3)
     assert found.error[7, 8] < 0.5 * counts.std() / 3
     assert found.level.shape == found.error.shape == (11, 12)
+
+
+def test_frames_that_read_alike_leave_what_is_usual_to_a_factor_of_two():
+    """72 pixels, four times 7 each: noise about 0.15 and scatter about 0.1 counts, and the chance that all read so."""
+    level = np.linspace(-1, 1, 2001)
+
+    def unlikely(x):
+        noise, scatter = np.exp(x)
+        alike = stats.norm.cdf((0.5 - level) / noise) - stats.norm.cdf((-0.5 - level) / noise)
+        chance = np.trapezoid(stats.norm.pdf(level, scale=scatter) * alike**4, level)
+        away = (x - np.log([0.15, 0.1])) / math.log(2)
+        return away @ away / 2 - 72 * math.log(chance)
+
+    best = optimize.minimize(
+        unlikely, np.log([0.15, 0.1]), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6}
+    )
+    noise, scatter = np.exp(best.x)
+    found = Dark.of(np.full((4, 9, 8), 7.0))
+    assert found.noise == pytest.approx(noise, rel=0.02)  # the search ends at 1e-3, on 61 levels
+    assert found.level == pytest.approx(np.full((9, 8), 7.0), abs=0.01)
+    assert found.error[2, 3] == pytest.approx(scatter, rel=0.1)  # of levels whose ends are a little less likely
