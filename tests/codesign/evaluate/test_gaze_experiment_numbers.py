@@ -198,6 +198,7 @@ def test_errors_are_of_frames_that_calibrated_nobody_and_beside_them_those_of_tr
 def test_who_tells_an_axis_is_calibrated_by_people_on_a_stage_of_the_same_reach(monkeypatch):
     """Three people with at most 30 of their frames each; places between the ends of the axial and lateral ones, 0
     included; noise of twice the stream."""
+    assert ge.EACH == 120  # of a person's frames, as many of them as there are
     monkeypatch.setattr(ge, "EACH", 30)
     shown, looked, learned = [], [], []
     whole = ge.states_of

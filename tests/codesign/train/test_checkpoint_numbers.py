@@ -1,11 +1,12 @@
 """What a checkpoint says of itself, read without the module that wrote it."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import save_file
 
 from codesign.train import checkpoint
 from metalens.ground.errors import TrainingError
@@ -46,3 +47,32 @@ def test_a_setting_that_holds_an_equals_sign_is_compared_whole():
     assert checkpoint.difference('steps = 10\nname = "a = b"\n', Settings(name="a = b")) == ""
     assert checkpoint.difference('name = "x"\n', Settings(name="x")) == ""  # what is not known stands at its default
     assert checkpoint.difference("width = 3\n", Settings()) == "width: 3 -> absent"
+
+
+def test_a_file_that_says_nothing_is_of_no_kind(tmp_path):
+    save_file({"a": torch.ones(2)}, str(tmp_path / "c"))
+    with pytest.raises(TrainingError, match="holds 'no kind' version no version"):
+        checkpoint.load(tmp_path / "c", settings=Settings())
+
+
+@dataclass(frozen=True)
+class Part:
+    steps: int = 4
+
+
+@dataclass(frozen=True)
+class Nested:
+    steps: int = 3
+    sides: tuple[int, ...] = field(default_factory=lambda: (5, 7))
+    one: Part = field(default_factory=Part)
+    other: Part = field(default_factory=Part)
+
+
+def test_settings_of_one_name_in_two_tables_are_two_and_defaults_that_are_made_are_defaults():
+    now = Nested(sides=(5, 8), one=Part(6))
+    told = checkpoint.difference("steps = 3\n", now).splitlines()
+    assert told == ["one.steps: 4 -> 6", "sides: [5, 7] -> [5, 8]"]
+    assert checkpoint.difference("steps = 3\n", Nested()) == ""
+    assert checkpoint.difference("steps = 3\n[one]\nsteps = 6\n[other]\nsteps = 9\n", now) == (
+        "other.steps: 9 -> 4\nsides: [5, 7] -> [5, 8]"
+    )
