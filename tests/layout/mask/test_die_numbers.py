@@ -114,6 +114,7 @@ def test_an_aperture_without_furniture_has_the_area_of_its_circle():
     x, y = disc.T
     assert 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() == pytest.approx(math.pi * 40_000**2, rel=2e-5)  # grid
     assert not (disc % 4).any()
+    assert len(disc) == 316  # pi sqrt(40 000 / 4) = 314.2: edges of fewer sink in by more than half a step of 4 nm
     assert (made.doses, made.layer_names) == ({(1, 0): 1.1, (2, 0): 1.0}, {(1, 0): "pillar", (2, 0): "aperture"})
 
 

@@ -63,11 +63,12 @@ def test_corners_agree_to_a_hundred_thousandth_of_the_reach(part, count):
 @pytest.mark.parametrize("count", [0, 1])
 def test_heights_agree_to_five_millionths(count):
     away = (4.9e-6, 5.1e-6)[count] * HEIGHT
-    for moved in (corners() + np.array([0, 0, away]), corners() - [0, 0, away], corners() * [1, 1, 1 + away / HEIGHT]):
+    up, part = np.array([0, 0, away]), away / HEIGHT
+    for moved in (corners() + up, corners() - up, corners() * [1, 1, 1 + part], corners() * [1, 1, 1 - part]):
         lines = told(moved)
         assert [line[:5] for line in lines] == ["from "] * count
     if count:
-        assert lines[0] == "from 0 to 0.700004 um high, planned 0 to 0.7"
+        assert lines[0] == "from 0 to 0.699996 um high, planned 0 to 0.7"
 
 
 @pytest.mark.parametrize(("down", "closed"), [(2.05e-5, True), (2.13e-5, False)])
