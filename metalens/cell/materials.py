@@ -260,7 +260,8 @@ def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> 
 
 def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
     """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) / (a + 2 e) + (1 - f) (b - e) /
-    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b; then the offsets."""
+    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b, the root that absorbs (of two
+    media that emit no light one does, Im e >= 0); then the offsets."""
     base, base_rate = _index_and_slope(wanted.base, wavelength_um)
     n, rate = base, base_rate
     if wanted.other:
@@ -269,8 +270,9 @@ def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex
         a, b, da, db = base**2, other**2, 2 * base * base_rate, 2 * other * other_rate
         h, dh = (3 * f - 1) * a + (2 - 3 * f) * b, (3 * f - 1) * da + (2 - 3 * f) * db
         root = np.sqrt(h * h + 8 * a * b + 0j)
+        root = -root if root.imag < 0 else root
         e, de = (h + root) / 4, (dh + (h * dh + 4 * (a * db + b * da)) / root) / 4
-        n = complex(np.sqrt(e))
+        n = complex(np.sqrt(complex(e.real, max(e.imag, 0.0))))  # below 0 is rounding
         rate = complex(de / (2 * n))
     n += complex(wanted.n_offset, wanted.k_offset)
     if n.real <= 0 or n.imag < 0:

@@ -136,3 +136,16 @@ def test_kin_that_hold_at_their_very_ends_are_named():
 def test_plain_numbers_have_no_slope_and_absorb_as_they_say():
     assert materials.index(Index(1.7, 0.03), 123.0) == 1.7 + 0.03j
     assert materials.slope(Index(1.7, 0.03), 123.0) == 0
+
+
+@pytest.mark.parametrize("metal", ["Au", "Ag", "Al"])
+def test_blends_with_metals_go_from_one_to_the_other_and_absorb(metal):
+    """Both of Bruggeman's roots solve his equation; the one that absorbs at every share leads from metal to glass."""
+    b, shares = materials.index("SiO2", 0.85) ** 2, np.linspace(0.0, 1.0, 81)
+    a = materials.index(metal, 0.85) ** 2
+    e = np.array([materials.index(Blend(metal, "SiO2", share), 0.85) ** 2 for share in shares.tolist()])
+    left = (1 - shares) * (a - e) / (a + 2 * e) + shares * (b - e) / (b + 2 * e)
+    assert np.abs(left).max() < 1e-12
+    assert e.imag.min() > -1e-12
+    assert [e[0], e[-1]] == pytest.approx([a, b], rel=1e-12)
+    assert np.abs(np.diff(e)).max() < 0.1 * abs(a - b)  # a wrong root jumps by most of it
