@@ -7,7 +7,7 @@ nothing is copied but what is overwritten.
 import numpy as np
 from scipy.linalg import blas, lapack
 
-LEFT, UPPER, TRANSPOSED = 0, 0, 1  # of LAPACK
+UPPER, TRANSPOSED = 0, 1  # of LAPACK
 
 
 def added(matrix: np.ndarray, diagonal: np.ndarray | float) -> np.ndarray:

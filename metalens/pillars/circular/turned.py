@@ -27,7 +27,7 @@ class Turned:
 
     size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one period of the lattice.
     t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver. earlier: (n, k, 2, 2) t of coarser
-    truncations: shares of the light have three times their farthest change over them as error bar.
+    truncations: shares of the light have ``rcwa.SAFETY`` times their farthest change over them as error bar.
     """
 
     size_um: float
