@@ -7,7 +7,8 @@ import numpy as np
 
 from layout.files.content import QUARTERS, CellContent, MaskContent, Placed
 from layout.files.digest import Digest, Sums
-from layout.mask import Lattice, MaskPlan, PillarClass, symmetry
+from layout.mask import Figure, Lattice, MaskPlan, PillarClass, symmetry
+from layout.process import LayerNumber
 from metalens.ground.arrays import Array
 
 _CHUNK = 1 << 20
@@ -44,9 +45,10 @@ def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
     for made in used:
         found += _compare_class(made, content.cells[made.name])
     for figure in plan.figures:
-        for layer, polygons in figure.polygons.items():
-            if not _same(polygons, content.cells[figure.name].polygons.get(layer, [])):
-                found.append(f"figure {figure.name}: polygons on layer {layer} differ")
+        found += _compare_figure(figure, content.cells[figure.name])
+    for name in (plan.name, *(lattice.name for lattice in plan.lattices)):
+        if _layers(content.cells[name]):
+            found.append(f"cell {name} holds shapes of its own, which the plan lacks")
     found += _compare_top(plan, content.cells[plan.name])
     pillars = 0
     for lattice in plan.lattices:
@@ -60,12 +62,28 @@ def compare(plan: MaskPlan, content: MaskContent) -> Comparison:
     return Comparison(pillars, tuple(found))
 
 
+def _layers(cell: CellContent) -> set[LayerNumber]:
+    """Layers on which a cell holds shapes itself."""
+    return {layer for shapes in (cell.polygons, cell.circles) for layer, some in shapes.items() if some}
+
+
+def _compare_figure(figure: Figure, cell: CellContent) -> list[str]:
+    found = []
+    for layer in sorted(figure.polygons.keys() | _layers(cell)):
+        planned, read = figure.polygons.get(layer, ()), cell.polygons.get(layer, [])
+        if cell.circles.get(layer) or not _same(planned, read):
+            found.append(f"figure {figure.name}: polygons on layer {layer} differ")
+    return found
+
+
 def _compare_class(made: PillarClass, cell: CellContent) -> list[str]:
     circles = cell.circles.get(made.layer)
-    if circles is not None:
-        same = circles == [(0, 0, made.diameter_units // 2)] and not cell.polygons
+    if _layers(cell) != {made.layer}:
+        same = False
+    elif circles:
+        same = circles == [(0, 0, made.diameter_units // 2)] and not cell.polygons.get(made.layer)
     else:
-        same = list(cell.polygons) == [made.layer] and _same(made.polygons, cell.polygons[made.layer])
+        same = _same(made.polygons, cell.polygons[made.layer])
     return [] if same else [f"class {made.name}: the shape differs"]
 
 

@@ -103,6 +103,27 @@ def test_figures_and_what_the_top_cell_places():
         assert told(mask(TOP=top))[1] == [text]
 
 
+@pytest.mark.parametrize("shapes", [{"polygons": {(3, 1): [BAR]}}, {"circles": {(3, 1): [(0, 0, 7)]}}])
+def test_shapes_where_the_plan_has_none_are_told(shapes):
+    """On a layer of their own in a figure or a class, in the cell of a lattice, in the top cell."""
+    kept = mask().cells
+    kinds = {"polygons": {}, "circles": {}}
+    added = {n: {k: getattr(kept[n], k) | shapes.get(k, {}) for k in kinds} for n in ("MARKS", "A", "LENS", "TOP")}
+    cells = {name: dataclasses.replace(kept[name], **both) for name, both in added.items()}
+    words = {
+        "MARKS": "figure MARKS: polygons on layer (3, 1) differ",
+        "A": "class A: the shape differs",
+        "LENS": "cell LENS holds shapes of its own, which the plan lacks",
+        "TOP": "cell TOP holds shapes of its own, which the plan lacks",
+    }
+    for name, cell in cells.items():
+        assert told(mask(**{name: cell}))[1] == [words[name]]
+    assert told(mask(MARKS=dataclasses.replace(kept["MARKS"], circles={(3, 0): [(0, 0, 7)]})))[1] == [
+        "figure MARKS: polygons on layer (3, 0) differ"
+    ]
+    assert told(mask(TOP=dataclasses.replace(kept["TOP"], polygons={(3, 0): []})))[1] == []
+
+
 @pytest.mark.parametrize("chunk", [1 << 20, 3])
 @pytest.mark.parametrize(
     "row",
