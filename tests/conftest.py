@@ -2,14 +2,13 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import hypothesis
 import pytest
 
-from metalens.ground import executor, report, threads
+from metalens.ground import report
 
 # No clock decides a test: no deadline, no complaint of slow data. With CI set, as .ci/run does, every run draws alike.
 hypothesis.settings.register_profile(
@@ -46,32 +45,6 @@ def cache_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
         yield
-
-
-Run = Callable[..., Iterator[tuple[int, Any]]]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def pools() -> Iterator[Run]:
-    """The executor's own way. Without a number of processes tasks are done in the process of the test, one by one.
-
-    The start of a pool's processes costs seconds, which most sweeps of tests do not; what pools do is asked of them by
-    their number or by this fixture, and by commands in processes of their own.
-    """
-    own = executor.run
-
-    def run(work: Callable[[Any], Any], tasks: Sequence[Any], *, processes: int | None = None) -> Iterator[Any]:
-        if processes is not None or executor._PLACE.get() is not None:
-            yield from own(work, tasks, processes=processes)
-            return
-        for index, task in enumerate(tasks):
-            with threads.one_blas_thread():
-                result = work(task)
-            yield index, result
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(executor, "run", run)
-        yield own
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -22,12 +22,6 @@ CELL = Cell(0.30, 0.7, Index(3.6))
 TASK = workers.points_task(CELL, Light(0.85), [0.1, 0.15], tolerance=5e-2, engine="rcwa")
 
 
-@pytest.fixture(autouse=True)
-def a_process_a_core(pools, monkeypatch):
-    """Where no number of processes is asked for."""
-    monkeypatch.setattr(executor, "run", pools)
-
-
 def test_what_comes_back_is_what_was_computed():
     ((index, result),) = workers.run([TASK])
     assert index == 0
