@@ -16,7 +16,7 @@ def markdown(rows: list[Row], command: str, drawn: str = "", commit: str = "") -
         out += [
             f"As drawn: {drawn}",
             "",
-            "Survivors have tests since, or went with their source; judged once more:",
+            "Survivors have tests since, were found to be equivalent, or went with their source; judged once more:",
             "",
         ]
     out += [summary(rows), ""]
