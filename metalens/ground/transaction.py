@@ -268,8 +268,7 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
             _refuse(target, (), terms, is_folder=True)
         number, ready, old = new.stat().st_ino, scratch / _READY, scratch / "old"
         with _finished(target, lambda: old.exists() or (target.exists() and target.stat().st_ino == number), ready):
-            ready.write_text(f"{number}", encoding="ascii")
-            store.sync_folder(scratch)
+            store.write_bytes(ready, b"%d" % number)  # whole or not at all: an empty one is a file's
             _put(scratch, new, target)
 
 
@@ -331,7 +330,7 @@ def _recover(scratch: Path, target: Path) -> None:
     new, old, ready = scratch / "new", scratch / "old", scratch / _READY
     if ready.is_file() and ready.stat().st_size:
         _recover_folder(scratch, target, int(ready.read_text(encoding="ascii")))
-    elif ready.is_file():
+    elif ready.is_file() and new.is_dir() and old.is_dir():  # of a file: both are made before
         done = not (new / target.name).exists()
         for path in (new if done else old).iterdir():
             if not target.with_name(path.name).exists():

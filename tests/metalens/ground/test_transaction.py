@@ -262,6 +262,47 @@ def test_killed_while_it_clears_up_is_no_obstacle(tmp_path):
     assert store.load(tmp_path / "out.h5").attributes["value"] == 5
 
 
+KILLED_AS_IT_COMMITS = """
+    import os, sys
+    sys.path.insert(0, sys.argv[1])
+    from test_transaction import put
+    from pathlib import Path
+    put(Path("out"), a="first")
+    place = Path.replace
+
+    def killed(part, target):
+        if target.name == "ready":
+            os._exit(9)
+        return place(part, target)
+
+    Path.replace = killed
+    put(Path("out"), a="second", b="too")
+"""
+
+
+def test_a_folder_whose_owner_is_killed_as_it_commits_stays_as_it_was(tmp_path):
+    words = [sys.executable, "-c", textwrap.dedent(KILLED_AS_IT_COMMITS), Path(__file__).parent]
+    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 9
+    assert (tmp_path / "out" / "a").read_text() == "first"
+    with pytest.raises(OutputError, match="exists"), transaction.folder(tmp_path / "out"):
+        pass  # the claim alone clears up
+    assert os.listdir(tmp_path) == ["out"]
+    assert sorted(os.listdir(tmp_path / "out")) == ["a", manifest.NAME]
+
+
+@pytest.mark.parametrize("put_aside", [False, True])
+def test_a_mark_that_the_disk_lost_moves_nothing_beside_the_output(tmp_path, put_aside):
+    """Its number is gone: before the exchange the new folder is no output yet, after it the old one none any more."""
+    scratch = tmp_path / ".out.part-abc"
+    kept = scratch / ("old" if put_aside else "new")
+    kept.mkdir(parents=True)
+    (kept / "part_0").write_text("0")
+    (scratch / "ready").touch()
+    put(tmp_path / "out", a="last")
+    assert os.listdir(tmp_path) == ["out"]
+    assert sorted(os.listdir(tmp_path / "out")) == ["a", manifest.NAME]
+
+
 LOOP = """
     import sys
     sys.path.insert(0, sys.argv[1])
