@@ -14,10 +14,6 @@ that of the elastic network, further down.
 
 Made by `python -m benchmarks.design_guide run --work DIR`, and `report`; `--only CELL/SEED` reruns one. All numbers,
 and the coefficients of the trained lenses, are in `benchmarks/results/design_guide.json`.
-
-The rows of one knob and the lenses of `angle`, of `line`, of the oblique field and of the ring are read by the reader
-of today, whose branch sees how steps of brightness are spread. The elastic network's rows, and the runs that chose for
-the oblique field at 30 nm, are of the one before, and due again.
 """
 FIELD = """
 ## Field and light of the device
