@@ -133,32 +133,34 @@ class Worker:
     @classmethod
     def _judged_near(cls, mutant: rules.Mutant, module: str, source: str, loops: bool) -> dict[str, object]:
         """As ``judge``, by the nearest test files; where it survives them, by the next ones, that are farther off."""
-        said, spent, asked, seen = "survived", 0.0, [], 0
+        said, spent, asked, seen = "survived", 0.0, list[str](), 0
         for reach in cls.near:
             tests, seen = _near(cls.graph, module, reach)[seen:], reach
             if said != "survived" or not tests:
                 break
-            outcome, seconds = cls._asked(mutant, module, source, tests, loops)
+            outcome, seconds, tests = cls._asked(mutant, module, source, tests, loops, promised=not asked)
             spent, asked = spent + seconds, asked + tests
             said = outcome if outcome == "survived" or reach == cls.near[0] else table.FARTHER
         return _row(mutant) | {"outcome": said, "seconds": round(spent, 1), "tests": asked}
 
     @classmethod
-    def _asked(cls, mutant: rules.Mutant, module: str, source: str, tests: list[str], loops: bool) -> tuple[str, float]:
-        """(outcome, seconds) by test files in full; what they do not answer in time has survived them, unless they
-        answer the plain source in that time.
+    def _asked(
+        cls, mutant: rules.Mutant, module: str, source: str, tests: list[str], loops: bool, *, promised: bool
+    ) -> tuple[str, float, list[str]]:
+        """(outcome, seconds, test files) by files in full; what they do not answer in time has survived them, unless
+        they answer the plain source in that time.
 
-        Where no function in memory changes it may be a default, of which the list of promised ones is asked first.
+        promised: where no function in memory changes it may be a default, of which the list of these is asked first.
         """
         answer = None if loops else cls.server.outcome(mutant.path, source, tests, cls.longest_s)
-        if answer is None and not loops:
+        if promised and answer is None and not loops:
             tests = [PROMISED, *tests]
         fresh = module in cls.graph.compiled
         outcome, spent = answer or cls.bench.outcome(mutant.path, source, tests, cls.longest_s / 3, fresh=fresh)
         said = "killed" if outcome == "failed" else "survived"
         if outcome == "time" and cls.bench.run(tests, max(cls.longest_s - SLACK_S, 0) / 3, fresh=False)[0] == "passed":
             said = "killed by time"
-        return said, spent
+        return said, spent, tests
 
 
 def _near(graph: Graph, module: str, count: int) -> list[str]:
@@ -190,6 +192,8 @@ def main(words: list[str]) -> int:
     parser.add_argument("--result", type=Path, default=RESULT, help="file that keeps the table")
     parser.add_argument("--again", action="store_true", help="judge the survivors of the kept result once more")
     asked = parser.parse_args(words)
+    if asked.far and not 0 < asked.near < asked.far:
+        parser.error("--far: need --near, and more files than that")
     chosen = _survivors(asked.result) if asked.again else drawn(asked.count, asked.seed, asked.only, asked.bars)
     load_libraries()
     with contextlib.ExitStack() as stack:

@@ -10,6 +10,11 @@ from metalens.ground.errors import CaptureError
 CHANNELS = ("red", "green", "blue")
 
 
+def red_first(image: Array) -> Array:
+    """(y, x, red green blue [alpha]) of an image as OpenCV has it, blue first; grey (y, x) as it is."""
+    return image[..., [2, 1, 0, 3][: image.shape[-1]]] if image.ndim == 3 else image
+
+
 @dataclass(frozen=True, slots=True)
 class Colours:
     """Which colour is lit, and how a raw mosaic holds it.

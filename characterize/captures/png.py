@@ -4,8 +4,7 @@ import math
 import struct
 from pathlib import Path
 
-import numpy as np
-
+from characterize.captures.colour import red_first
 from characterize.captures.tiff_pages import DENSEST
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
@@ -28,9 +27,8 @@ def read(path: Path) -> Array:
         raise CaptureError(f"{path}: not a readable PNG file ({error.err})") from None
     if image is None:
         raise CaptureError(f"{path}: truncated or not a PNG file")
-    if image.ndim == 3:  # blue comes first
-        return np.asarray(image[None][..., [2, 1, 0, 3][: image.shape[-1]]])
-    return np.asarray(image)
+    image = red_first(image)
+    return image[None] if image.ndim == 3 else image
 
 
 def _check(path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from characterize.captures.colour import red_first
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
@@ -110,7 +111,7 @@ def _pages(path: Path, file: Any) -> list[Array]:
                 f"{path}: frame {number} is compressed ({_OPENCV[int(page.compression)]}) and damaged, turned or of a "
                 f"kind ({page.dtype}) that is not read so; save it plain or deflated, or install imagecodecs"
             )
-        images.append(image[..., [2, 1, 0, 3][: image.shape[-1]]] if image.ndim == 3 else image)  # blue comes first
+        images.append(red_first(image))
     return images
 
 

@@ -192,9 +192,10 @@ def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
 
 def behind(model: ForwardModel, stop: Stop) -> ForwardModel:
     """The model of the same lens behind another stop."""
-    lens = dataclasses.replace(model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop))
-    part = ForwardModel(lens, model.setting, model.response).about(model.grid.middle_um).rough(model.cut)
-    return part.with_residual(model.modes, basis) if len(model.modes) else part
+    part = copy.copy(model)
+    part.lens = dataclasses.replace(model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop))
+    part.groups = [group.shaded(part.lens, model.setting.depth_um) for group in model.groups]
+    return part
 
 
 def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -152,7 +151,7 @@ class ForwardModel:
         part = copy.copy(self)
         part.modes = np.asarray(modes)
         if len(modes):
-            part.groups = [g.bent(lambda one: self._shapes(one, len(modes), basis)) for g in self.groups]
+            part.groups = [g.bent(self._shapes(g, len(modes), basis)) for g in self.groups]
         return part
 
     def _shapes(self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
@@ -187,7 +186,7 @@ class ForwardModel:
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
-            for group in itertools.chain.from_iterable(group.lit for group in self.groups):
+            for group in (part for whole in self.groups for part in whole.lit):
                 part, more = self._group_light(x, group, offset_nm, names)
                 light[group.index, *self._lit] += weight * part
                 for name in names:

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +101,7 @@ class Group:
     """Frames of one field angle, by their ``index``, and the lens as they see it.
 
     bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the diameters, of a residual phase.
-    apart: the same frames depth by depth, behind a stop before the pillars, whose light others of them meet.
+    apart: the same frames behind a stop, depth by depth where it stands before the pillars: others of them are lit.
     """
 
     index: Array
@@ -129,10 +128,17 @@ class Group:
         if lens.layers.stop is None:
             return self
         at = depth_um[self.index]
-        if lens.layers.stop.distance_um == 0:
-            return Group.of(self.index, self.pillars, self.reduced.shaded(lens, self.pillars, float(at[0])))
-        reduced = [(self.index[at == z], self.reduced.shaded(lens, self.pillars, z)) for z in np.unique(at).tolist()]
-        return dataclasses.replace(self, apart=tuple(Group.of(some, self.pillars, one) for some, one in reduced))
+        alike = [at == z for z in np.unique(at)] if lens.layers.stop.distance_um else [slice(None)]
+        apart = tuple(
+            dataclasses.replace(
+                self,
+                index=self.index[some],
+                reduced=self.reduced.shaded(lens, self.pillars, float(at[some][0])),
+                apart=(),
+            )
+            for some in alike
+        )
+        return dataclasses.replace(self, apart=apart)
 
     def only(self, frames: Array) -> "Group | None":
         """Of some frames, in rising order of their index, which are counted anew; None without any."""
@@ -140,10 +146,10 @@ class Group:
         apart = tuple(one for one in (part.only(frames) for part in self.apart) if one is not None)
         return dataclasses.replace(self, index=place, apart=apart) if len(place) else None
 
-    def bent(self, shapes: Callable[["Group"], Array]) -> "Group":
-        """With a residual phase of these shapes."""
-        apart = tuple(one.bent(shapes) for one in self.apart)
-        return dataclasses.replace(self, residual=shapes(self), apart=apart)
+    def bent(self, residual: Array) -> "Group":
+        """With the shapes of a residual phase; groups apart have the same nodes."""
+        apart = tuple(dataclasses.replace(one, residual=residual) for one in self.apart)
+        return dataclasses.replace(self, residual=residual, apart=apart)
 
     def quick(self, window_um: float | None) -> "Group":
         """See :meth:`Reduced.quick`."""

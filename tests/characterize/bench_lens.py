@@ -9,6 +9,8 @@ import numpy as np
 from characterize.bench import bench
 from characterize.bench.bench import Camera, Truth
 from characterize.captures.capture import Capture
+from characterize.inference.asbuilt import AsBuilt
+from characterize.inference.estimate import Options, fit
 from characterize.inference.leastsquares import Data, Prior
 from characterize.inference.search import Task
 from characterize.model import NAMES, ForwardModel
@@ -153,3 +155,17 @@ def with_a_moved_frame(shots: Capture) -> Capture:
     frames = shots.frames.copy()
     frames[2] = np.roll(frames[2], 1, 1)
     return dataclasses.replace(shots, frames=frames)
+
+
+def found_again(made: Lens) -> tuple[AsBuilt, dict[str, float], dict[str, float]]:
+    """The fit of a lens to frames of the hidden one by the engine that designs; what it is off in standard deviations
+    of the model, and these, by name."""
+    hidden = truth(peak_e=6000.0)
+    light = bench.irradiance(made, hidden, RESPONSE)
+    frames = capture(light * (6000.0 / light.max()) + bench.background(hidden))
+    found = fit(frames, made, Options(scan_um=60.0), response=dataclasses.replace(RESPONSE, error=0.08))
+    names = [name for name in found.names if name in VALUES and not name.startswith("background")]
+    places = [found.names.index(name) for name in names]
+    sigma = {name: float(np.sqrt(found.within_covariance[i, i])) for name, i in zip(names, places, strict=True)}
+    off = {name: (found.value[i] - VALUES[name]) / sigma[name] for name, i in zip(names, places, strict=True)}
+    return found, off, sigma
