@@ -37,10 +37,14 @@ def model():
     return ForwardModel(b.lens(), SETTING, b.RESPONSE)
 
 
-@pytest.fixture(scope="module")
-def fitted():
+def fit_usual():
     known = dataclasses.replace(b.RESPONSE, error=0.08)
     return characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=known)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit_usual()
 
 
 @pytest.mark.slow
@@ -48,7 +52,7 @@ def test_a_fit_is_the_same_bytes_for_any_number_of_threads(fitted):
     before = torch.get_num_threads()
     torch.set_num_threads(3 if before == 1 else 1)
     try:
-        other = characterize.fit(b.capture(b.electrons()), b.lens(), USUAL, response=b.RESPONSE)
+        other = fit_usual()
     finally:
         torch.set_num_threads(before)
     for name in ("value", "covariance", "low", "high", "draws", "predicted"):
