@@ -30,7 +30,7 @@ def told(off: Array, noise: Array) -> tuple[Array, Array]:
         off: count less expected light, in counts. noise: standard deviation before rounding, in counts, above 0.
     """
     off, noise = np.broadcast_arrays(np.asarray(off, float), np.asarray(noise, float))
-    score, information = off / (noise**2 + 1 / 12), 1 / (noise**2 + 1 / 12)
+    score, information = np.asarray(off / (noise**2 + 1 / 12)), np.asarray(1 / (noise**2 + 1 / 12))
     some = noise < _SMOOTH
     if some.any():
         x, s = off[some], noise[some]

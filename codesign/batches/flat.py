@@ -64,8 +64,12 @@ def depth_um(frames: Frames | Flat, *, margin: int = 0, device: torch.device | s
     else:
         few = frames.to(device)
         made = torch.where(few.coverage[:, 1] > 0.5, few.depth_um[:, 1], few.depth_um[:, 0])
-    inside = slice(margin, made.shape[-1] - margin)
-    return made[:, inside, inside].clamp_min(1.0)
+    return made[:, *_inside(made.shape[-2:], margin)].clamp_min(1.0)
+
+
+def _inside(shape: tuple[int, ...], margin: int) -> list[slice]:
+    """Rows and columns without the margin."""
+    return [slice(margin, n - margin) for n in shape]
 
 
 def _radiance(frames: Flat, device: torch.device | str) -> Tensor:
@@ -85,8 +89,7 @@ def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin:
         return _elsewhere(frames, optics, margin=margin)
     table = _table(optics)
     near, far = 1 / float(optics.psf.depths_um[0]), 1 / float(optics.psf.depths_um[-1])
-    size = frames.light.shape[-2:]
-    out = []
+    inside, out = _inside(frames.light.shape[-2:], margin), []
     for start in range(0, len(frames.light), 4):  # a few frames stay in the processor's cache
         part = slice(start, start + 4)
         scale = frames.scale[part].astype(np.float32)
@@ -94,7 +97,7 @@ def irradiance(frames: Frames | Flat, optics: UniformImager | Imager, *, margin:
         _weigh(frames.light[part], frames.depth_um[part], scale, table, np.float32(near), np.float32(far), sources)
         spectrum = torch.fft.rfft2(torch.from_numpy(sources))
         blurred = torch.fft.irfft2((spectrum * optics.transfer).sum(1), s=optics.shape)
-        out.append(blurred[:, margin : size[0] - margin, margin : size[1] - margin])
+        out.append(blurred[:, *inside])
     return torch.cat(out)
 
 
@@ -106,8 +109,7 @@ def _elsewhere(frames: Flat, optics: UniformImager, *, margin: int) -> Tensor:
     code = ((near - 1 / depth) * ((len(table) - 1) / (near - far)) + 0.5).clamp(0, len(table) - 1).long()
     sources = scene.padded(table[code].movedim(-1, 0) * light, optics.shape)
     blurred: Tensor = torch.fft.irfft2((torch.fft.rfft2(sources) * optics.transfer[:, None]).sum(0), s=optics.shape)
-    inside = [slice(margin, n - margin) for n in light.shape[-2:]]
-    return blurred[:, inside[0], inside[1]]
+    return blurred[:, *_inside(light.shape[-2:], margin)]
 
 
 def _table(optics: UniformImager) -> Array:

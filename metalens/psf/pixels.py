@@ -18,7 +18,7 @@ def on_pixels(
     shift_um: tuple[float, float] = (0.0, 0.0),
     count: int | None = None,
 ) -> PsfStack:
-    """Light per pixel, each PSF again of sum 1 over the pixels.
+    """Light per pixel, each PSF again of sum 1 over the pixels; one without light there stays 0, with no energy.
 
     Args:
         pitch_um: of one pixel, a number or a torch scalar (the result is differentiable in it, continuously).
@@ -40,7 +40,8 @@ def on_pixels(
     shape = None if count is None else (count, count)
     pixels = integrate(light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um)
     share = pixels.sum((-1, -2))
-    result: tuple[Any, Any] = pixels / share[..., None, None], torch.as_tensor(stack.energy_um2) * share
+    least = torch.finfo(share.dtype).tiny
+    result: tuple[Any, Any] = pixels / share.clamp_min(least)[..., None, None], torch.as_tensor(stack.energy_um2) * share
     if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
         result = result[0].numpy(), result[1].numpy()
     return dataclasses.replace(stack, intensity=result[0], energy_um2=result[1], step_um=width)

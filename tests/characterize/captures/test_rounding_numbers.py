@@ -37,6 +37,7 @@ def test_counts_of_unlike_noise_are_told_each_by_its_own():
         assert information[at] == pytest.approx(want[1], rel=1e-9)
     assert score[2] == pytest.approx(off[2] / (noise[2] ** 2 + 1 / 12), rel=1e-12)
     assert information[2] == pytest.approx(1 / (noise[2] ** 2 + 1 / 12), rel=1e-12)
+    assert [float(part) for part in told(0.45, 0.2)] == [score[0, 2], information[0, 2]]  # plain numbers
     one = told(np.array([0.45, -0.2]), 0.2)[1]  # one noise for all
     assert one == pytest.approx([by_sum(0.45, 0.2)[1], by_sum(-0.2, 0.2)[1]], rel=1e-9)
 

@@ -118,3 +118,9 @@ def test_two_sheets_go_their_own_way():
     got = flat.irradiance(frames, imager(11, 11), margin=MARGIN)
     assert got.shape == (1, 7, 7)
     assert got.numpy() == pytest.approx(0.6, abs=1e-5)
+
+
+def test_frames_that_are_wider_than_high_lose_their_margin_on_every_side():
+    """Nine columns of five rows: one row and five columns are left of a margin of two."""
+    kept = Flat(np.zeros((1, 5, 9), np.uint8), np.arange(45, dtype=np.uint16).reshape(1, 5, 9) + 7, np.ones(1))
+    assert flat.depth_um(kept, margin=2).tolist() == [[[27.0, 28.0, 29.0, 30.0, 31.0]]]

@@ -66,3 +66,10 @@ def test_pixels_are_as_wide_as_samples_at_least(pitch, bins, refused):
             on_pixels(TWO, pitch_um=pitch, bins=bins)
     else:
         assert on_pixels(TWO, pitch_um=pitch, bins=bins).intensity == pytest.approx(TWO.intensity, abs=1e-12)
+
+
+def test_a_psf_whose_light_falls_beside_the_pixels_stays_dark():
+    """Of the corner's light the middle two by two pixels see none: 0 and no energy, where 0 / 0 was no number."""
+    found = on_pixels(stack([(0, 0, 1.0)], [(5, 5, 1.0)]), pitch_um=1.5, count=2)
+    assert found.intensity.tolist() == [[[0.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]]]
+    assert found.energy_um2.tolist() == [0.0, 4.0]
