@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from codesign.batches import parallel
-from codesign.network import blur
-from codesign.network.architecture import Architecture, Block, Space, blocks, largest, stem_channels
+from codesign.network import blur, normed
+from codesign.network.architecture import Activation, Architecture, Block, Space, blocks, largest, stem_channels
 from codesign.network.cost import (
     MASK_CHANNELS,
     POINT_FEATURES,
@@ -27,6 +27,7 @@ from codesign.network.cost import (
     lateral_strides,
     network,
 )
+from codesign.network.normed import activated
 from codesign.network.running import RunningNorm
 from codesign.network.windows import resampled
 from metalens.ground.arrays import Array
@@ -73,16 +74,17 @@ class SlicedNorm(nn.Module):
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
         self.measuring = False
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, act: Activation | None = None) -> Tensor:
+        """Normalised, and the activation of it."""
         count = x.shape[1]
         weight, bias = self.weight[:count], self.bias[:count]
         if self.measuring:
             self._measure(x)
         if self.training and not self.measuring and parallel.ranks() > 1:
-            return parallel.batch_norm(x, weight, bias)
+            return activated(parallel.batch_norm(x, weight, bias), act)
         if self.training or self.measuring:
-            return F.batch_norm(x, None, None, weight, bias, training=True)
-        return F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias)
+            return normed.batch_norm(x, weight, bias, act)
+        return activated(F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias), act)
 
     @torch.no_grad()
     def _measure(self, x: Tensor) -> None:
@@ -105,12 +107,14 @@ class SlicedConv(nn.Module):
         self.norm = SlicedNorm(outputs)
         self.depthwise = depthwise
 
-    def forward(self, x: Tensor, outputs: int, *, kernel: int = 1, stride: int = 1) -> Tensor:
+    def forward(
+        self, x: Tensor, outputs: int, *, kernel: int = 1, stride: int = 1, act: Activation | None = None
+    ) -> Tensor:
         trim = (self.weight.shape[-1] - kernel) // 2
         inside = slice(trim, trim + kernel)
         weight = self.weight[:outputs, : 1 if self.depthwise else x.shape[1], inside, inside]
         groups = outputs if self.depthwise else 1
-        y: Tensor = self.norm(F.conv2d(x, weight, stride=stride, padding=kernel // 2, groups=groups))
+        y: Tensor = self.norm(F.conv2d(x, weight, stride=stride, padding=kernel // 2, groups=groups), act)
         return y
 
 
@@ -142,9 +146,9 @@ class ElasticBlock(nn.Module):
         self.project = SlicedConv(most.hidden, most.outputs)
 
     def forward(self, x: Tensor, block: Block) -> Tensor:
-        act = F.relu if block.activation == "relu" else F.hardswish
-        y = act(self.expand(x, block.hidden)) if block.hidden != block.inputs else x
-        y = act(self.depthwise(y, block.hidden, kernel=block.kernel, stride=block.stride))
+        act = block.activation
+        y = self.expand(x, block.hidden, act=act) if block.hidden != block.inputs else x
+        y = self.depthwise(y, block.hidden, kernel=block.kernel, stride=block.stride, act=act)
         if self.squeeze is not None:
             y = self.squeeze(y, block.squeeze)
         projected: Tensor = self.project(y, block.outputs)
@@ -165,11 +169,11 @@ class PerceptionHead(nn.Module):
         self.points = nn.Conv2d(MASK_CHANNELS, POINTS, 1)
 
     def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        total = F.hardswish(self.laterals[-1](features[-1], MASK_CHANNELS))
+        total = self.laterals[-1](features[-1], MASK_CHANNELS, act="hardswish")
         for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
             total = F.interpolate(total, size=feature.shape[-2:], mode="nearest")
-            total = total + F.hardswish(lateral(feature, MASK_CHANNELS))
-        decoded = F.hardswish(self.smooth(total, MASK_CHANNELS, kernel=3))
+            total = total + lateral(feature, MASK_CHANNELS, act="hardswish")
+        decoded = self.smooth(total, MASK_CHANNELS, kernel=3, act="hardswish")
         return self.mask(decoded)[:, 0], self.points(decoded), decoded
 
 
@@ -194,7 +198,7 @@ class CalibrationHead(nn.Module):
         self.axis = nn.Linear(SLIP_HIDDEN, 3)
 
     def forward(self, features: Tensor, depths: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        reduced = F.hardswish(self.reduce(features, SLIP_CHANNELS))
+        reduced = self.reduce(features, SLIP_CHANNELS, act="hardswish")
         grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
         seen = F.hardswish(torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1))
         joined = F.hardswish(self.joined(torch.cat([seen, F.hardswish(self.depths(depths))], 1)))
@@ -221,7 +225,7 @@ class Supernet(nn.Module):
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
         seen = scaled(frames, architecture.resolution)
-        x = F.hardswish(self.stem(seen, self._stem(architecture), kernel=3, stride=2))
+        x = self.stem(seen, self._stem(architecture), kernel=3, stride=2, act="hardswish")
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
         for i, (stage, row) in enumerate(zip(self.stages, blocks(self.space, architecture), strict=True)):

@@ -41,7 +41,10 @@ def on_pixels(
     pixels = integrate(light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um)
     share = pixels.sum((-1, -2))
     least = torch.finfo(share.dtype).tiny
-    result: tuple[Any, Any] = pixels / share.clamp_min(least)[..., None, None], torch.as_tensor(stack.energy_um2) * share
+    result: tuple[Any, Any] = (
+        pixels / share.clamp_min(least)[..., None, None],
+        torch.as_tensor(stack.energy_um2) * share,
+    )
     if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
         result = result[0].numpy(), result[1].numpy()
     return dataclasses.replace(stack, intensity=result[0], energy_um2=result[1], step_um=width)
