@@ -79,10 +79,13 @@ class _Normed(torch.autograd.Function):
             rows, x.shape[1], lambda low, high, out: _slopes(rows, slope, a, b, middle, act, low, high, out)
         )
         along = -gain * inverse**2 * two / count
-        lines = [_wide(part, rows) for part in (gain, along, -gain * one / count - along * mean)]
-        out = torch.empty_like(x)
+        scale, level = _wide(gain, rows), _wide(-gain * one / count - along * mean, rows)
+        tilt, out = _wide(along, rows), torch.empty_like(x)
         made = _rows(out)
-        split(len(rows), lambda low, high: _back(rows[low:high], slope[low:high], a, b, act, *lines, made[low:high]))
+        split(
+            len(rows),
+            lambda low, high: _back(rows[low:high], slope[low:high], a, b, act, scale, tilt, level, made[low:high]),
+        )
         to_weight, to_bias = (torch.from_numpy(part.astype(np.float32)) for part in (inverse * two, one))
         return out, to_weight, to_bias, None
 

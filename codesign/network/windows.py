@@ -152,16 +152,17 @@ def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     Compiled, as means over blocks already, where no derivative is asked, and nobody follows what is done.
     """
     first = samples[0]
-    if first.device.type == "cpu" and first.dtype == torch.float32 and not first.requires_grad and not traced():
+    if first.device.type == "cpu" and first.dtype == torch.float32 and not first.requires_grad and not followed():
         return stepped.moments(samples, REACHES, _kernels(), GRID + 1, STEP_FLOOR)
     square = torch.cat([_steps(of, reach) for of, reach in zip(samples, REACHES, strict=True)], 1) ** 2
     told = torch.log1p(square / STEP_FLOOR)
     return told, told**2, (square**2) ** 2  # squares twice: a power of four is a function call a number
 
 
-def traced() -> bool:
+def followed() -> bool:
     """Whether a graph is being made of the network."""
-    return torch.jit.is_tracing() or torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
+    traced: bool = torch.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+    return traced or torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export()
 
 
 @functools.lru_cache(maxsize=1)
