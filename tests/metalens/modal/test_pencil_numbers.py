@@ -7,6 +7,7 @@ from metalens.modal import pencil
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium
 from metalens.modal.pencil import Turn
+from tests.metalens.modal.unordered import apart
 
 A, B = 6, 5
 MEDIUM = Medium(1.7, 5.3 + 0j, 1.6 + 0j)
@@ -39,7 +40,7 @@ def written_out(found):
 
 
 def values(matrix):
-    return np.sort_complex(np.linalg.eigvals(matrix))
+    return np.linalg.eigvals(matrix)
 
 
 def equation():
@@ -62,7 +63,7 @@ def test_the_electric_form_has_the_values_of_its_equation():
     assert np.array_equal(found.tm_sign, -np.sign(found.tm))
     assert found.tm_rest is None
     want = values(growth @ stiffness)
-    assert values(written_out(found)) == pytest.approx(want, rel=1e-9, abs=1e-9)  # of values up to 2e3, in float64
+    assert apart(values(written_out(found)), want).max() < 1e-9  # of values up to 2e3, in float64
 
 
 def test_the_magnetic_form_has_the_values_of_its_equation():
@@ -79,7 +80,7 @@ def test_the_magnetic_form_has_the_values_of_its_equation():
     assert found.tm_sign.tolist() == [-1.0] * B
     assert found.te_rest is None
     want = values(inverse_growth @ (curl - K2 * np.eye(A + B)))
-    assert values(written_out(found)) == pytest.approx(want, rel=1e-9, abs=1e-9)
+    assert apart(values(written_out(found)), want).max() < 1e-9
 
 
 @pytest.mark.parametrize("medium", [MEDIUM, Medium(1.7, 1.6 + 0j, 5.3 + 0j)])
