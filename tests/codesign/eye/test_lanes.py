@@ -49,7 +49,7 @@ def looked_up(operations, k, u, v, x):
 @pytest.mark.parametrize(("k", "u", "v"), PLACES)
 def test_a_sample_lies_between_the_four_pixels_of_its_texture(interpreted, k, u, v):
     """float32 places of 300 pixels: 3e-5 of a pixel, over which a texture of noise changes by 1e-4."""
-    found = looked_up(lanes.plain(LANES), k, np.float32(u), np.float32(v), np.zeros(2 * LANES, np.float32))
+    found = looked_up(lanes.plain(LANES), k, np.float32(u), np.float32(v), np.zeros(3 * LANES, np.float32))
     assert found == pytest.approx(texture(k, u, v), abs=1e-4)
 
 
@@ -57,7 +57,7 @@ def test_a_sample_lies_between_the_four_pixels_of_its_texture(interpreted, k, u,
 def test_slopes_of_a_sample_are_those_of_the_texture(interpreted, k, u, v):
     du, dv = (0.7, -0.4), (-1.3, 2.1)
     given = [tuple(np.float32(n) for n in dual) for dual in ((k, 0, 0), (u, *du), (v, *dv))]
-    value, *slopes = looked_up(lanes.dual(LANES), *given, np.zeros(6 * LANES, np.float32))
+    value, *slopes = looked_up(lanes.dual(LANES), *given, np.zeros(7 * LANES, np.float32))
     assert value == pytest.approx(texture(k, u, v), abs=1e-4)
     for slope, along, down in zip(slopes, du, dv, strict=True):
         h = 1e-5
