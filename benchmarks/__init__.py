@@ -1,7 +1,10 @@
-"""Benchmarks: every row prints a time beside an error, and what the error is measured against.
+"""Benchmarks: every row prints a time beside an error, and what the error is measured
+against.
 
-A topic is a module ``benchmarks/<topic>.py`` with ``rows() -> list[Row]`` (or an iterator, whose rows are shown as they
-come), and, where it compares with other projects, ``peer_rows() -> list[Row]`` (run by ``make bench-peers`` in an
+A topic is a module ``benchmarks/<topic>.py`` with ``rows() -> list[Row]`` (or an
+iterator, whose rows are shown as they
+come), and, where it compares with other projects, ``peer_rows() -> list[Row]`` (run by
+``make bench-peers`` in an
 environment of their own).
 """
 
@@ -19,7 +22,8 @@ class Row:
 
     case, method: what was computed, and how.
     seconds: of the fastest of a few repeats.
-    error: in the unit that ``against`` names; nan where the row has none (say so in ``against``).
+    error: in the unit that ``against`` names; nan where the row has none (say so in
+    ``against``).
     against: the reference of the error.
     peak_mb: memory above the inputs, nan where not measured.
     goal: the number that was asked for, and whether it is met, in words.
@@ -47,8 +51,14 @@ def fastest(work: Callable[[], object], *, repeats: int = 3) -> float:
 
 
 def kept_lines(path: Path) -> list[dict[str, Any]]:
-    """Lines of a study that goes on where it stopped: one JSON object a run; none where it has not begun."""
-    return [json.loads(text) for text in path.read_text("utf-8").splitlines()] if path.exists() else []
+    """Lines of a study that goes on where it stopped: one JSON object a run; none where
+    it has not begun.
+    """
+    return (
+        [json.loads(text) for text in path.read_text("utf-8").splitlines()]
+        if path.exists()
+        else []
+    )
 
 
 def keep_line(path: Path, line: dict[str, Any]) -> None:

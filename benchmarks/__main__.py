@@ -1,8 +1,10 @@
-"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables, keep them in benchmarks/results and in the README.
+"""``python -m benchmarks [TOPIC ...] [--peers]``: print the tables, keep them in
+benchmarks/results and in the README.
 
 Beneath each table stand its times and errors over those that were stored before.
 
-Without a topic all are run but those that take a quarter of an hour, or need an extra package or a GPU (``LONG``).
+Without a topic all are run but those that take a quarter of an hour, or need an extra
+package or a GPU (``LONG``).
 """
 
 import argparse
@@ -22,17 +24,31 @@ LONG = (
     "closure", "engines", "gpu", "gpu_training", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee",
     "shaped_cells", "shaped_seen",
 )  # fmt: skip
-HEAD = ("case", "method", "threads", "time/ms", "peak/MB", "error", "measured against", "goal")
+HEAD = (
+    "case",
+    "method",
+    "threads",
+    "time/ms",
+    "peak/MB",
+    "error",
+    "measured against",
+    "goal",
+)
 
 
 def main(words: list[str]) -> int:
-    """Run topics; one that fails is told and the others go on. 0: all done, 1: some failed.
+    """Run topics; one that fails is told and the others go on. 0: all done, 1: some
+    failed.
 
     Raises:
         SystemExit: unknown words.
     """
     asked = _parser().parse_args(words)
-    failed = [topic for topic in asked.topics or sorted(set(_topics()) - set(LONG)) if not _done(topic, asked.peers)]
+    failed = [
+        topic
+        for topic in asked.topics or sorted(set(_topics()) - set(LONG))
+        if not _done(topic, asked.peers)
+    ]
     figures.write()
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
@@ -41,8 +57,18 @@ def main(words: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("topics", nargs="*", metavar="TOPIC", choices=_topics(), help=", ".join(_topics()))
-    parser.add_argument("--peers", action="store_true", help="beside other projects, where these are installed")
+    parser.add_argument(
+        "topics",
+        nargs="*",
+        metavar="TOPIC",
+        choices=_topics(),
+        help=", ".join(_topics()),
+    )
+    parser.add_argument(
+        "--peers",
+        action="store_true",
+        help="beside other projects, where these are installed",
+    )
     return parser
 
 
@@ -50,7 +76,11 @@ def _topics() -> list[str]:
     """Modules with ``rows`` or ``peer_rows``, found without importing them."""
     folder = Path(__file__).parent
     made = re.compile(r"^def (peer_)?rows\(", re.M)
-    return [p.stem for p in sorted(folder.glob("[!_]*.py")) if made.search(p.read_text(encoding="utf-8"))]
+    return [
+        p.stem
+        for p in sorted(folder.glob("[!_]*.py"))
+        if made.search(p.read_text(encoding="utf-8"))
+    ]
 
 
 def _done(topic: str, peers: bool) -> bool:
@@ -63,7 +93,11 @@ def _done(topic: str, peers: bool) -> bool:
     try:
         for row in make():  # a topic whose rows take minutes gives them one by one
             rows.append(row)
-            print(f"{topic}: {row.case}, {row.method}: {row.seconds * 1e3:.4g} ms", file=sys.stderr, flush=True)
+            print(
+                f"{topic}: {row.case}, {row.method}: {row.seconds * 1e3:.4g} ms",
+                file=sys.stderr,
+                flush=True,
+            )
     except Exception:  # noqa: BLE001 whatever it is, the other topics go on
         print(f"\n{topic}", file=sys.stderr)
         traceback.print_exc()
@@ -80,7 +114,10 @@ def table(rows: list[Row]) -> str:
     """Rows as aligned columns."""
     cells = [HEAD, *(_cells(row) for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(HEAD))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+    return "\n".join(
+        "  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip()
+        for line in cells
+    )
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -88,7 +125,16 @@ def _cells(row: Row) -> tuple[str, ...]:
     peak = blank if row.peak_mb != row.peak_mb else f"{row.peak_mb:.0f}"
     error = blank if row.error != row.error else f"{row.error:.2g}"
     time = f"{row.seconds * 1e3:.4g}"
-    return (row.case, row.method, str(row.threads), time, peak, error, row.against, row.goal)
+    return (
+        row.case,
+        row.method,
+        str(row.threads),
+        time,
+        peak,
+        error,
+        row.against,
+        row.goal,
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Damage to files: cut, flipped, doubled or odd bytes, and damage under checksums that are good again."""
+"""Damage to files: cut, flipped, doubled or odd bytes, and damage under checksums that
+are good again.
+"""
 
 import functools
 import math
@@ -13,7 +15,15 @@ import h5py
 import numba
 import numpy as np
 
-ODD_BYTES = (b"\xff" * 4, b"\0" * 4, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0" * 8, b"\xff" * 8)
+ODD_BYTES = (
+    b"\xff" * 4,
+    b"\0" * 4,
+    b"\x7f\xff\xff\xff",
+    b"\xff\xff\xff\x7f",
+    b"\0\0\0\x80",
+    b"\0" * 8,
+    b"\xff" * 8,
+)
 ODD_WORDS = (
     b"nan", b"inf", b"-inf", b"-1", b"0", b"1e20", b"1e400", b"99999999999999999999", b'""', b"[]", b"{}", b"true",
     b"\0", b"\x1b[2J", b"[" * 3000, b"{a=" * 400, b"9" * 5000, "ä€".encode(), b"\xef\xbb\xbf", b"\xff\xfe", b"'", b'"',
@@ -29,10 +39,14 @@ _HEADS = (b"OHDR", b"OCHK", b"FRHP", b"FHDB", b"FHIB", b"BTHD", b"BTIN", b"BTLF"
 
 
 def text(whole: bytes, chance: random.Random) -> bytes:
-    """A text with odd words in place of words, lines lost or doubled, or bytes of no text."""
+    """A text with odd words in place of words, lines lost or doubled, or bytes of no
+    text.
+    """
     if chance.random() < 0.3:
         return plain(whole, chance)
-    words = whole.split(b" ") if chance.random() < 0.5 else whole.splitlines(keepends=True)
+    words = (
+        whole.split(b" ") if chance.random() < 0.5 else whole.splitlines(keepends=True)
+    )
     for _ in range(chance.randint(1, 3)):
         at = chance.randrange(len(words))
         how = chance.randrange(5)
@@ -44,9 +58,13 @@ def text(whole: bytes, chance: random.Random) -> bytes:
             other = chance.randrange(len(words))
             words[at], words[other] = words[other], words[at]
         elif how == 3 and b"=" in words[at]:
-            words[at] = words[at].partition(b"=")[0] + b"= " + chance.choice(ODD_WORDS) + b"\n"
+            words[at] = (
+                words[at].partition(b"=")[0] + b"= " + chance.choice(ODD_WORDS) + b"\n"
+            )
         else:
-            words[at] = chance.choice(ODD_WORDS) + (b"\n" if words[at].endswith(b"\n") else b"")
+            words[at] = chance.choice(ODD_WORDS) + (
+                b"\n" if words[at].endswith(b"\n") else b""
+            )
         if not words:
             return b""
     return (b" " if b"\n" not in words[0] else b"").join(words)
@@ -73,7 +91,9 @@ def plain(whole: bytes, chance: random.Random) -> bytes:
 
 
 def head(whole: bytes, chance: random.Random) -> bytes:
-    """As :func:`plain`, mostly in the first two kilobytes, where a file says what it holds."""
+    """As :func:`plain`, mostly in the first two kilobytes, where a file says what it
+    holds.
+    """
     size = min(len(whole), chance.choice((64, 512, 2048, len(whole))))
     return plain(whole[:size], chance) + whole[size:]
 
@@ -97,7 +117,8 @@ def png(whole: bytes, chance: random.Random) -> bytes:
     if chance.random() < 0.2:
         blocks.insert(chance.randrange(len(blocks)), chance.choice(blocks))
     return whole[:8] + b"".join(
-        len(b).to_bytes(4, "big") + kind + b + zlib.crc32(kind + b).to_bytes(4, "big") for kind, b in blocks
+        len(b).to_bytes(4, "big") + kind + b + zlib.crc32(kind + b).to_bytes(4, "big")
+        for kind, b in blocks
     )
 
 
@@ -120,7 +141,9 @@ def safetensors(whole: bytes, chance: random.Random) -> bytes:
 
 
 def hdf5(whole: bytes, chance: random.Random) -> bytes:
-    """Bytes changed inside the metadata of HDF5, Jenkins' checksums of the blocks made good again."""
+    """Bytes changed inside the metadata of HDF5, Jenkins' checksums of the blocks made
+    good again.
+    """
     data, found = bytearray(whole), _blocks(whole)
     for _ in range(chance.randint(1, 3)):
         start, end = chance.choice(found)
@@ -139,13 +162,18 @@ def hdf5(whole: bytes, chance: random.Random) -> bytes:
 
 @functools.lru_cache(maxsize=8)
 def _blocks(data: bytes) -> list[tuple[int, int]]:
-    """(start, place of the checksum) of the blocks of metadata: where the checksum is good, there a block ends."""
+    """(start, place of the checksum) of the blocks of metadata: where the checksum is
+    good, there a block ends.
+    """
     found = [(0, 44)] if lookup3(data[:44]).to_bytes(4, "little") == data[44:48] else []
     for mark in _HEADS:
         start = data.find(mark)
         while start >= 0:
             for end in range(start + 6, min(start + 6000, len(data) - 3)):
-                if lookup3(data[start:end]).to_bytes(4, "little") == data[end : end + 4]:
+                if (
+                    lookup3(data[start:end]).to_bytes(4, "little")
+                    == data[end : end + 4]
+                ):
                     found.append((start, end))
                     break
             start = data.find(mark, start + 4)
@@ -153,12 +181,20 @@ def _blocks(data: bytes) -> list[tuple[int, int]]:
 
 
 def lookup3(data: bytes) -> int:
-    """Jenkins' hash of HDF5's metadata (hashlittle of lookup3.c, initial value 0; public domain).
+    """Jenkins' hash of HDF5's metadata (hashlittle of lookup3.c, initial value 0;
+    public domain).
 
     >>> hex(lookup3(b"Four score and seven years ago"))
     '0x17770551'
     """
-    return int(_hash(np.frombuffer(data.ljust(-len(data) // 12 * -12, b"\0"), "<u4").astype(np.uint32), len(data)))
+    return int(
+        _hash(
+            np.frombuffer(data.ljust(-len(data) // 12 * -12, b"\0"), "<u4").astype(
+                np.uint32
+            ),
+            len(data),
+        )
+    )
 
 
 @numba.njit(cache=False)  # type: ignore[untyped-decorator]
@@ -166,7 +202,11 @@ def _hash(words: Any, length: int) -> Any:
     a = b = c = np.uint32(0xDEADBEEF + length)
     turns = len(words) // 3
     for i in range(turns):
-        a, b, c = np.uint32(a + words[3 * i]), np.uint32(b + words[3 * i + 1]), np.uint32(c + words[3 * i + 2])
+        a, b, c = (
+            np.uint32(a + words[3 * i]),
+            np.uint32(b + words[3 * i + 1]),
+            np.uint32(c + words[3 * i + 2]),
+        )
         if i == turns - 1:
             for k in (14, 11, 25, 16, 4, 14, 24):
                 c = np.uint32((c ^ b) - np.uint32((b << k) | (b >> (32 - k))))
@@ -180,7 +220,9 @@ def _hash(words: Any, length: int) -> Any:
 
 
 def edited(path: Path, whole: bytes, chance: random.Random) -> None:
-    """Put something of the wrong kind into an HDF5 file with the library itself, so with good checksums."""
+    """Put something of the wrong kind into an HDF5 file with the library itself, so
+    with good checksums.
+    """
     path.write_bytes(whole)
     with h5py.File(path, "r+") as file:
         names: list[str] = []
@@ -203,7 +245,9 @@ def edited(path: Path, whole: bytes, chance: random.Random) -> None:
 
 
 def _put(file: h5py.File, name: str, held: Any, chance: random.Random) -> None:
-    """What stands in the place of an entry: nothing, an odd value, another shape or type, a claim, a link, a group."""
+    """What stands in the place of an entry: nothing, an odd value, another shape or
+    type, a claim, a link, a group.
+    """
     choices: list[Callable[[], Any]] = [
         lambda: None,
         lambda: file.__setitem__(name, chance.choice(ODD_VALUES)),
@@ -223,6 +267,12 @@ def _other(held: Any, chance: random.Random) -> Any:
     how = chance.randrange(6)
     if how < 3:
         changed = np.array(held, float)
-        changed.flat[chance.randrange(changed.size)] = chance.choice((math.nan, math.inf, -1.0, 0.0, 1e300, 1e-300))
+        changed.flat[chance.randrange(changed.size)] = chance.choice(
+            (math.nan, math.inf, -1.0, 0.0, 1e300, 1e-300)
+        )
         return changed
-    return (held[:-1] if held.ndim else held, held.ravel(), np.asarray(held, "f4") * -1)[how - 3]
+    return (
+        held[:-1] if held.ndim else held,
+        held.ravel(),
+        np.asarray(held, "f4") * -1,
+    )[how - 3]

@@ -1,7 +1,10 @@
-"""The commands that the hardness benchmark kills, and how they are begun: as forks of a process that has loaded all.
+"""The commands that the hardness benchmark kills, and how they are begun: as forks of a
+process that has loaded all.
 
-A fork costs its work alone, not the seconds of loading, and an audit hook inside it tells its file operations apart: so
-a death can be put at any one of them, where a clock would mostly find the computing in between.
+A fork costs its work alone, not the seconds of loading, and an audit hook inside it
+tells its file operations apart: so
+a death can be put at any one of them, where a clock would mostly find the computing in
+between.
 """
 
 import contextlib
@@ -27,7 +30,9 @@ CELL = "[cell]\npitch_um = {}\npillar = {{n = 3.6}}\n[sweep]\nwavelengths_um = [
 DESIGN = "aperture_mm = {}\nlibrary = 'library.h5'\n"
 FRAME = "frames = 1\npixels = {}\npitch_um = 60.0\n"
 CAMERA = "dark_frames = 8\nflat_frames = 8\npeak_e = 6000.0\n[camera]\npixel_um = 16.0\npixels = 24\n"
-STUDY = "pitches_um = [{}]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\n"
+STUDY = (
+    "pitches_um = [{}]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\n"
+)
 OPTICS = (
     "[axial]\ncount = 3\nangles_deg = [0.0]\nbinnings = [1]\nwindow_um = 48.0\n[scenes]\ncount = 1\npixels = 32\n"
     "window_um = 48.0\npitch_um = 12.0\n"
@@ -73,11 +78,17 @@ VERBS = {
     "layout": ("layout lens{}.h5 -o out", "out"),
     "scene": ("scene scene{}.toml -o out", "out"),
     "library": ("library cell{}.toml -o out.h5 --accept-partial-turn", "out.h5"),
-    "field": ("field cell{}.toml --diameter-um 0.15 -o out.h5 --samples 24 --tolerance 0.3", "out.h5"),
+    "field": (
+        "field cell{}.toml --diameter-um 0.15 -o out.h5 --samples 24 --tolerance 0.3",
+        "out.h5",
+    ),
     "study": ("study study{}.toml -o out", "out"),
     "capture": ("capture lens0.h5 --truth truth{}.toml -o out", "out"),
     "measure": ("measure shots{} -o out", "out"),
-    "fit": ("fit shots{} --design lens0.h5 --metrology known.toml -o out.h5 --insist", "out.h5"),
+    "fit": (
+        "fit shots{} --design lens0.h5 --metrology known.toml -o out.h5 --insist",
+        "out.h5",
+    ),
     "check": ("check mask0/mask.gds --process rules{}.toml -o out.lyrdb", "out.lyrdb"),
     "view": ("view lens{}.h5 -o out.html", "out.html"),
     "evaluate": ("evaluate optics lens{}.h5 --config optics.toml -o out", "out"),
@@ -94,7 +105,8 @@ _UNTYPED = 70
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """What came of a command: exit status (negative: a signal), errors in words, seconds, file operations.
+    """What came of a command: exit status (negative: a signal), errors in words,
+    seconds, file operations.
 
     times: seconds of the processor at every operation, and at the end.
     """
@@ -117,7 +129,10 @@ class Child:
     def wait(self) -> Ended:
         """Its end."""
         status = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        seconds, report = time.perf_counter() - self.start, self.told.with_suffix(".json")
+        seconds, report = (
+            time.perf_counter() - self.start,
+            self.told.with_suffix(".json"),
+        )
         nothing: dict[str, Any] = {"operations": 0, "modules": [], "times": []}
         made = json.loads(report.read_text()) if report.is_file() else nothing
         load(made["modules"])
@@ -129,7 +144,9 @@ class Child:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """A file operation that is about to be done: its number from 1, the audit event and what it is called with."""
+    """A file operation that is about to be done: its number from 1, the audit event and
+    what it is called with.
+    """
 
     number: int
     event: str
@@ -153,7 +170,8 @@ def at(number: int, act: Callable[[], object]) -> Each:
 
 @dataclass(eq=False, slots=True)
 class Hook:
-    """Counts the file operations of this process in a folder, and calls ``each`` at every one.
+    """Counts the file operations of this process in a folder, and calls ``each`` at
+    every one.
 
     told: where the command's errors go.
     """
@@ -221,7 +239,11 @@ def _child(folder: Path, told: Path, words: str, each: Each) -> None:
             status = end.code if isinstance(end.code, int) else _UNTYPED
         hook.busy = True
         took = [*(t - begun for t in hook.times), time.process_time() - begun]
-        made = {"operations": hook.seen, "modules": sorted(sys.modules) if each is bool else [], "times": took}
+        made = {
+            "operations": hook.seen,
+            "modules": sorted(sys.modules) if each is bool else [],
+            "times": took,
+        }
         hook.told.with_suffix(".part").write_text(json.dumps(made))
         hook.told.with_suffix(".part").replace(hook.told.with_suffix(".json"))
     except BaseException:  # noqa: BLE001 (what is judged)
@@ -232,14 +254,18 @@ def _child(folder: Path, told: Path, words: str, each: Each) -> None:
 
 
 def _heard() -> None:
-    """Signals are answered as in a terminal, also where a shell that began the benchmark aside let them be ignored."""
+    """Signals are answered as in a terminal, also where a shell that began the
+    benchmark aside let them be ignored.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
 
 def _count_writes(hook: Hook) -> None:
-    """Two operations that are no audit events: flushing, and a write of the HDF5 library."""
+    """Two operations that are no audit events: flushing, and a write of the HDF5
+    library.
+    """
     flush, write = os.fsync, reading.Through.write
 
     def flushed(handle: Any) -> None:
@@ -266,15 +292,35 @@ def load(names: list[str]) -> None:
 
 def settings(folder: Path) -> dict[str, str]:
     """Write the settings files; their text by name."""
-    texts = {"psf.toml": "depths_mm = [16.0, 18.0, 1.0]\nangles_deg = [0.0]\nsamples = 32\n", "optics.toml": OPTICS}
-    texts |= {"process.toml": "", "known.toml": '[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n'}
+    texts = {
+        "psf.toml": "depths_mm = [16.0, 18.0, 1.0]\nangles_deg = [0.0]\nsamples = 32\n",
+        "optics.toml": OPTICS,
+    }
+    texts |= {
+        "process.toml": "",
+        "known.toml": '[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n',
+    }
     for i, (pitch, aperture, pixels) in enumerate(((0.3, 0.02, 24), (0.32, 0.03, 32))):
-        texts |= {f"cell{i}.toml": CELL.format(pitch), f"design{i}.toml": DESIGN.format(aperture)}
+        texts |= {
+            f"cell{i}.toml": CELL.format(pitch),
+            f"design{i}.toml": DESIGN.format(aperture),
+        }
         texts[f"wide{i}.toml"] = DESIGN.format(0.06 + 0.01 * i)
-        texts |= {f"scene{i}.toml": FRAME.format(pixels), f"study{i}.toml": STUDY.format(pitch)}
-        texts |= {f"truth{i}.toml": f"depths_um = [16000.0, 20000.0, 30000.0]\nseed = {i}\n{CAMERA}"}
-        texts |= {f"plan{i}.toml": PLAN.format(5 + i), f"run{i}.toml": RUN.format(3 + i)}
-        texts |= {f"chain{i}.toml": CHAIN.format(i), f"rules{i}.toml": f"[rules]\nminimum_gap_nm = {200 + i}\n"}
+        texts |= {
+            f"scene{i}.toml": FRAME.format(pixels),
+            f"study{i}.toml": STUDY.format(pitch),
+        }
+        texts |= {
+            f"truth{i}.toml": f"depths_um = [16000.0, 20000.0, 30000.0]\nseed = {i}\n{CAMERA}"
+        }
+        texts |= {
+            f"plan{i}.toml": PLAN.format(5 + i),
+            f"run{i}.toml": RUN.format(3 + i),
+        }
+        texts |= {
+            f"chain{i}.toml": CHAIN.format(i),
+            f"rules{i}.toml": f"[rules]\nminimum_gap_nm = {200 + i}\n",
+        }
     for name, text in texts.items():
         (folder / name).write_text(text)
     return texts
@@ -283,11 +329,17 @@ def settings(folder: Path) -> dict[str, str]:
 def inputs(verbs: tuple[str, ...]) -> Iterator[str]:
     """Words of the commands that make the other inputs of some verbs."""
     yield "library cell0.toml -o library.h5 --accept-partial-turn"
-    yield from (f"design design{i}.toml -o lens{i}.h5 --accept-partial-turn" for i in (0, 1))
+    yield from (
+        f"design design{i}.toml -o lens{i}.h5 --accept-partial-turn" for i in (0, 1)
+    )
     if {"measure", "fit"} & set(verbs):
-        yield from (f"capture lens0.h5 --truth truth{i}.toml -o shots{i}" for i in (0, 1))
+        yield from (
+            f"capture lens0.h5 --truth truth{i}.toml -o shots{i}" for i in (0, 1)
+        )
     if "budget" in verbs:
-        yield from (f"design wide{i}.toml -o wide{i}.h5 --accept-partial-turn" for i in (0, 1))
+        yield from (
+            f"design wide{i}.toml -o wide{i}.h5 --accept-partial-turn" for i in (0, 1)
+        )
     if "check" in verbs:
         yield "layout lens0.h5 -o mask0"
     if "retrain" in verbs:
@@ -295,10 +347,14 @@ def inputs(verbs: tuple[str, ...]) -> Iterator[str]:
 
 
 def found(folder: Path, verbs: tuple[str, ...]) -> None:
-    """Write what a fit of minutes would find of the run's lens, where a verb needs that."""
+    """Write what a fit of minutes would find of the run's lens, where a verb needs
+    that.
+    """
     if "retrain" in verbs and not (folder / "asbuilt.h5").exists():
         design = lens.load(folder / "run0" / "lens.h5")
-        asbuilt.save(folder / "asbuilt.h5", samples.asbuilt_of(design, sensitivity(design)))
+        asbuilt.save(
+            folder / "asbuilt.h5", samples.asbuilt_of(design, sensitivity(design))
+        )
 
 
 def signalled(number: int) -> Callable[[], None]:

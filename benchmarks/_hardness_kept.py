@@ -1,4 +1,6 @@
-"""What a bench of commands made and the next one needs again: in the user's cache folder, never in the repository."""
+"""What a bench of commands made and the next one needs again: in the user's cache
+folder, never in the repository.
+"""
 
 import hashlib
 import json
@@ -25,7 +27,10 @@ def inputs(of: str) -> Path:
 def sources(texts: dict[str, str]) -> str:
     """What inputs and results depend on: the code that makes them and the settings."""
     code = [path for name in _PACKAGES for path in sorted((_ROOT / name).rglob("*.py"))]
-    return _short(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in code) + _bytes(texts))
+    return _short(
+        b"".join(hashlib.sha256(path.read_bytes()).digest() for path in code)
+        + _bytes(texts)
+    )
 
 
 def results(of: str, verb: str, words: str) -> Path:
@@ -35,7 +40,10 @@ def results(of: str, verb: str, words: str) -> Path:
 
 def modules() -> list[str]:
     """Modules that commands needed."""
-    told = [json.loads(path.read_text("utf-8"))["modules"] for path in _place().glob(f"results-*/{TOLD}")]
+    told = [
+        json.loads(path.read_text("utf-8"))["modules"]
+        for path in _place().glob(f"results-*/{TOLD}")
+    ]
     return sorted(set().union(*told)) if told else []
 
 

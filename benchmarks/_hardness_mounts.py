@@ -1,4 +1,6 @@
-"""Copies of a folder that a process may take for the folder itself: mounts that no other process sees (Linux)."""
+"""Copies of a folder that a process may take for the folder itself: mounts that no
+other process sees (Linux).
+"""
 
 import ctypes
 import fcntl
@@ -6,7 +8,9 @@ import os
 import shutil
 from pathlib import Path
 
-_LIBC = ctypes.PyDLL(None, use_errno=True)  # keeps the lock of the interpreter, so that a fork has it too
+_LIBC = ctypes.PyDLL(
+    None, use_errno=True
+)  # keeps the lock of the interpreter, so that a fork has it too
 _NEW_NAMESPACE, _BIND, _PRIVATE, _DETACH = 0x20000, 0x1000, (1 << 18) | 0x4000, 2
 _MAKING = os.O_CREAT | os.O_EXCL | os.O_TRUNC
 
@@ -15,13 +19,20 @@ def own() -> bool:
     """Mounts of this process are its own from here on; False where that is not allowed."""
     unshare = getattr(_LIBC, "unshare", None)
     return (
-        unshare is not None and unshare(_NEW_NAMESPACE) == 0 and _LIBC.mount(b"none", b"/", None, _PRIVATE, None) == 0
+        unshare is not None
+        and unshare(_NEW_NAMESPACE) == 0
+        and _LIBC.mount(b"none", b"/", None, _PRIVATE, None) == 0
     )
 
 
 def memory(folder: Path, size: int) -> bool:
-    """Mount a file system of memory with so many bytes; False where that is not allowed."""
-    return bool(_LIBC.mount(b"none", os.fsencode(folder), b"tmpfs", 0, f"size={size}".encode()) == 0)
+    """Mount a file system of memory with so many bytes; False where that is not
+    allowed.
+    """
+    return bool(
+        _LIBC.mount(b"none", os.fsencode(folder), b"tmpfs", 0, f"size={size}".encode())
+        == 0
+    )
 
 
 def gone(folder: Path) -> None:
@@ -35,7 +46,8 @@ def fork() -> int:
 
 
 def enter(place: Path, folder: Path) -> None:
-    """Put ``place`` where ``folder`` is, for this process; its open files become those of the copy, locks too.
+    """Put ``place`` where ``folder`` is, for this process; its open files become those
+    of the copy, locks too.
 
     The current folder, in it, becomes that of the copy.
 
@@ -43,18 +55,24 @@ def enter(place: Path, folder: Path) -> None:
         OSError: it cannot be mounted.
     """
     current = os.getcwd()
-    if _LIBC.unshare(_NEW_NAMESPACE) or _LIBC.mount(os.fsencode(place), os.fsencode(folder), None, _BIND, None):
+    if _LIBC.unshare(_NEW_NAMESPACE) or _LIBC.mount(
+        os.fsencode(place), os.fsencode(folder), None, _BIND, None
+    ):
         raise OSError(ctypes.get_errno(), "a copy cannot be mounted", str(folder))
     os.chdir(current)
     for name in os.listdir("/proc/self/fd"):
         link = f"/proc/self/fd/{name}"
         path = os.readlink(link) if os.path.islink(link) else ""
-        if (path == str(folder) or path.startswith(f"{folder}/")) and os.path.exists(path):
+        if (path == str(folder) or path.startswith(f"{folder}/")) and os.path.exists(
+            path
+        ):
             _reopen(int(name), path)
 
 
 def _reopen(handle: int, path: str) -> None:
-    """The copy of an open file under the same handle, at the same place, with the same lock."""
+    """The copy of an open file under the same handle, at the same place, with the same
+    lock.
+    """
     told = Path(f"/proc/self/fdinfo/{handle}").read_text("ascii")
     about = dict(line.split(":", 1) for line in told.splitlines())
     other = os.open(path, int(about["flags"], 8) & ~_MAKING)
@@ -85,9 +103,16 @@ def copied(folder: Path, place: Path, stem: str, *, linked: bool) -> None:
 
 
 def _renumber(ready: Path, folder: Path, place: Path) -> None:
-    """A scratch folder names the folder that it puts in place by a number, which is another one for the copy."""
+    """A scratch folder names the folder that it puts in place by a number, which is
+    another one for the copy.
+    """
     number = ready.read_text("ascii")
-    made = [folder / ready.parent.name / "new", *(p for p in folder.iterdir() if not p.name.startswith("."))]
+    made = [
+        folder / ready.parent.name / "new",
+        *(p for p in folder.iterdir() if not p.name.startswith(".")),
+    ]
     for path in made:
         if number and path.is_dir() and path.stat().st_ino == int(number):
-            ready.write_text(str((place / path.relative_to(folder)).stat().st_ino), "ascii")
+            ready.write_text(
+                str((place / path.relative_to(folder)).stat().st_ino), "ascii"
+            )

@@ -1,4 +1,6 @@
-"""One small good file of every kind that a command reads, and the reader that the commands give it to."""
+"""One small good file of every kind that a command reads, and the reader that the
+commands give it to.
+"""
 
 import contextlib
 import os
@@ -45,18 +47,66 @@ Reader = Callable[[Path], object]
 CELL = Cell(pitch_um=0.30, pillar=Index(3.6))
 FRAMES = (np.arange(2 * 12 * 14).reshape(2, 12, 14) * 37 % 1000).astype(np.uint16)
 TEXTS: dict[str, tuple[str, str, Any]] = {
-    "cell": ("cell.toml", "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n[sweep]\nwavelengths_um = [0.85]\n", CellFile),
-    "design": ("design.toml", 'profile = "cubic"\naperture_mm = 0.5\n[limits]\nmin_gap_nm = 70\n', Design),
-    "psf_settings": ("psf.toml", "depths_mm = [16.0, 26.0, 0.5]\nangles_deg = [0.0, 10.0]\n", Settings),
-    "process": ("process.toml", 'name = "x"\n[rules]\ngrid_nm = 1\n[bias]\ntable_nm = [[80, -6.0]]\n', None),
-    "truth": ("truth.toml", 'depths_um = [18000.0]\n[[parameter]]\nname = "bias_nm"\nvalue = 3.0\n', Truth),
-    "metrology": ("known.toml", '[[known]]\nname = "height_nm"\nvalue = -3.0\nsigma = 3.0\n', Metrology),
-    "pupil_settings": ("pupil.toml", "numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\n", PupilSpec),
-    "plan": ("plan.toml", "aperture_mm = 0.3\nstacks = 10\nframes = 100\nled_fwhm_nm = 30.0\n", PlanConfig),
-    "chain": ("chain.toml", 'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\n', ChainFiles),
-    "scene": ("scene.toml", "frames = 2\npixels = 64\ngaze_deg = [18.0, 13.0]\n", Scene),
-    "study": ("study.toml", "pitches_um = [0.3]\nheights_um = [0.7]\ntolerance = 1e-2\n", Study),
-    "run": ("run.toml", 'preset = "smoke"\n[inner]\nsteps = 3\n[run]\npitch_um = 18.0\n', None),
+    "cell": (
+        "cell.toml",
+        "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n[sweep]\nwavelengths_um = [0.85]\n",
+        CellFile,
+    ),
+    "design": (
+        "design.toml",
+        'profile = "cubic"\naperture_mm = 0.5\n[limits]\nmin_gap_nm = 70\n',
+        Design,
+    ),
+    "psf_settings": (
+        "psf.toml",
+        "depths_mm = [16.0, 26.0, 0.5]\nangles_deg = [0.0, 10.0]\n",
+        Settings,
+    ),
+    "process": (
+        "process.toml",
+        'name = "x"\n[rules]\ngrid_nm = 1\n[bias]\ntable_nm = [[80, -6.0]]\n',
+        None,
+    ),
+    "truth": (
+        "truth.toml",
+        'depths_um = [18000.0]\n[[parameter]]\nname = "bias_nm"\nvalue = 3.0\n',
+        Truth,
+    ),
+    "metrology": (
+        "known.toml",
+        '[[known]]\nname = "height_nm"\nvalue = -3.0\nsigma = 3.0\n',
+        Metrology,
+    ),
+    "pupil_settings": (
+        "pupil.toml",
+        "numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\n",
+        PupilSpec,
+    ),
+    "plan": (
+        "plan.toml",
+        "aperture_mm = 0.3\nstacks = 10\nframes = 100\nled_fwhm_nm = 30.0\n",
+        PlanConfig,
+    ),
+    "chain": (
+        "chain.toml",
+        'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\n',
+        ChainFiles,
+    ),
+    "scene": (
+        "scene.toml",
+        "frames = 2\npixels = 64\ngaze_deg = [18.0, 13.0]\n",
+        Scene,
+    ),
+    "study": (
+        "study.toml",
+        "pitches_um = [0.3]\nheights_um = [0.7]\ntolerance = 1e-2\n",
+        Study,
+    ),
+    "run": (
+        "run.toml",
+        'preset = "smoke"\n[inner]\nsteps = 3\n[run]\npitch_um = 18.0\n',
+        None,
+    ),
 }
 PAGE = """REFERENCES: "made up"
 DATA:
@@ -78,10 +128,15 @@ ZEMAX = "2 2 0.01 0.01 0 0 0\n0.1 0 0 0\n0.2 0 0 0\n0.3 0 0 0\n0.4 0 0 0 0\n"
 
 
 def _shown(verb: str) -> Reader:
-    """A command that only reads, as the command line calls it; what it prints is thrown away."""
+    """A command that only reads, as the command line calls it; what it prints is thrown
+    away.
+    """
 
     def read(path: Path) -> object:
-        with open(os.devnull, "w", errors="backslashreplace") as nowhere, contextlib.redirect_stdout(nowhere):
+        with (
+            open(os.devnull, "w", errors="backslashreplace") as nowhere,
+            contextlib.redirect_stdout(nowhere),
+        ):
             module = __import__(cli.VERBS[verb][0], fromlist=["run"])
             return module.run(module.Options(path))
 
@@ -92,7 +147,9 @@ def _settings(path: Path) -> object:
     name = path.parent.name
     if name == "run":
         return runs.load(path)
-    return process.load(path) if name == "process" else config.load(path, TEXTS[name][2])
+    return (
+        process.load(path) if name == "process" else config.load(path, TEXTS[name][2])
+    )
 
 
 def _map(path: Path) -> object:
@@ -151,7 +208,9 @@ _PLAIN = {
 
 
 def _lens() -> Lens:
-    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
+    )
     diameters = np.linspace(0.08, 0.21, 36, dtype=np.float32).reshape(6, 6)
     return Lens(DiameterMap(diameters, 0.3), CELL, proxy, 0.85, 2000.0, 20_000.0, "map")
 
@@ -159,14 +218,25 @@ def _lens() -> Lens:
 def _library() -> PillarLibrary:
     d = np.linspace(0.08, 0.21, 20)
     t = (0.9 * np.exp(55j * d))[None, None, None]
-    parts = (np.zeros(1), np.array([0.85]), d, t, t, np.full(t.shape, 1e-4), np.ones(t.shape), np.zeros((0, 5)))
+    parts = (
+        np.zeros(1),
+        np.array([0.85]),
+        d,
+        t,
+        t,
+        np.full(t.shape, 1e-4),
+        np.ones(t.shape),
+        np.zeros((0, 5)),
+    )
     return PillarLibrary(CELL, Sweep(), ("x",), *parts, "modal", 20, _lens().proxy)
 
 
 def _psf() -> psf.PsfStack:
     axis = (np.array([2e4]), np.zeros((1, 2)), np.array([0.85]), np.ones(1))
     light = np.random.default_rng(3).random((1, 1, 96, 96))
-    return psf.PsfStack(light, np.ones((1, 1)), *axis, 0.75, np.zeros((1, 2)), 2000.0, 1e-4, 1e-5, "x")
+    return psf.PsfStack(
+        light, np.ones((1, 1)), *axis, 0.75, np.zeros((1, 2)), 2000.0, 1e-4, 1e-5, "x"
+    )
 
 
 def asbuilt_of(design: Lens, response: Sensitivity) -> asbuilt.AsBuilt:
@@ -185,14 +255,40 @@ def _artefacts(folder: Path) -> None:
     library.save(folder / "library" / "f.h5", _library())
     psf.save(folder / "psf" / "f.h5", _psf())
     psf.save(folder / "info" / "f.h5", _psf())
-    asbuilt.save(folder / "asbuilt" / "f.h5", asbuilt_of(_lens(), Sensitivity(np.zeros((3, 6)), 0.15)))
-    budgets.save(folder / "budget" / "f.h5", [Entry("grid", 0.1, 0.2, 1e-4, "rounded")], store.Provenance())
+    asbuilt.save(
+        folder / "asbuilt" / "f.h5",
+        asbuilt_of(_lens(), Sensitivity(np.zeros((3, 6)), 0.15)),
+    )
+    budgets.save(
+        folder / "budget" / "f.h5",
+        [Entry("grid", 0.1, 0.2, 1e-4, "rounded")],
+        store.Provenance(),
+    )
     light = np.zeros((1, 2, 4, 4), np.uint8)
-    about = {"radiance": light, "coverage": light[:, 0], "depth_um": light.astype(np.uint16), "pupil": light[:, 0]}
-    store.save(folder / "shard" / "f.h5", "scene", about | {"labels/slip_um": np.zeros((1, 3))})
-    frames = {"light": light[0], "depth_um": light[0].astype(np.uint16), "mask": light[0]}
-    places = {"place_um": np.ones((2, 3)), "seen_um": np.ones((2, 3)), "here_um": np.ones(3), "depths_um": np.ones(2)}
-    pose = {"axis": np.ones((2, 3), np.float32), "points": np.zeros((2, 10, 2), np.float32)}
+    about = {
+        "radiance": light,
+        "coverage": light[:, 0],
+        "depth_um": light.astype(np.uint16),
+        "pupil": light[:, 0],
+    }
+    store.save(
+        folder / "shard" / "f.h5", "scene", about | {"labels/slip_um": np.zeros((1, 3))}
+    )
+    frames = {
+        "light": light[0],
+        "depth_um": light[0].astype(np.uint16),
+        "mask": light[0],
+    }
+    places = {
+        "place_um": np.ones((2, 3)),
+        "seen_um": np.ones((2, 3)),
+        "here_um": np.ones(3),
+        "depths_um": np.ones(2),
+    }
+    pose = {
+        "axis": np.ones((2, 3), np.float32),
+        "points": np.zeros((2, 10, 2), np.float32),
+    }
     store.save(folder / "pool" / "f.h5", "pool", frames | places | pose)
 
 
@@ -200,15 +296,24 @@ def _frames(folder: Path) -> None:
     import cv2
     import tifffile
 
-    for kind, how in (("tiff", {}), ("tiff_deflated", {"compression": "zlib", "predictor": True})):
-        tifffile.imwrite(folder / kind / "f.tif", FRAMES, photometric="minisblack", **how)
+    for kind, how in (
+        ("tiff", {}),
+        ("tiff_deflated", {"compression": "zlib", "predictor": True}),
+    ):
+        tifffile.imwrite(
+            folder / kind / "f.tif", FRAMES, photometric="minisblack", **how
+        )
     for kind in ("stage", "about"):
         tifffile.imwrite(folder / kind / "f.tif", FRAMES)
     (folder / "stage" / "capture.toml").write_text(ABOUT)
     (folder / "about" / "stage.csv").write_text(STAGE)
     cv2.imwrite(str(folder / "png" / "f.png"), FRAMES[0])
-    with h5py.File(folder / "capture_h5" / "f.h5", "w", libver=("v110", "v110")) as file:
-        file.create_dataset("frames", data=FRAMES, chunks=(1, 6, 7), compression="gzip", fletcher32=True)
+    with h5py.File(
+        folder / "capture_h5" / "f.h5", "w", libver=("v110", "v110")
+    ) as file:
+        file.create_dataset(
+            "frames", data=FRAMES, chunks=(1, 6, 7), compression="gzip", fletcher32=True
+        )
 
 
 def _maps(folder: Path) -> None:
@@ -227,7 +332,9 @@ def _masks(folder: Path) -> None:
     plan = layout.plan(_lens(), Process())
     layout.write_gdsii(plan, folder / "gdsii" / "f.gds")
     layout.write_oasis(plan, folder / "oasis" / "f.oas")
-    layout.write_oasis(plan, folder / "oasis_plain" / "f.oas", form="reader", circles=True)
+    layout.write_oasis(
+        plan, folder / "oasis_plain" / "f.oas", form="reader", circles=True
+    )
 
 
 def _states(folder: Path) -> None:
@@ -235,6 +342,8 @@ def _states(folder: Path) -> None:
 
     for kind in ("checkpoint", "network"):
         state = {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0], "note": "x"}
-        checkpoint.save(folder / kind / "c.safetensors", state, settings=InnerConfig(steps=7))
+        checkpoint.save(
+            folder / kind / "c.safetensors", state, settings=InnerConfig(steps=7)
+        )
     (folder / "manifest" / "a.txt").write_text("held")
     manifest.write(folder / "manifest", "design d.toml")

@@ -1,4 +1,6 @@
-"""The matrix of bad values: every key of every settings file with every value that it should not have."""
+"""The matrix of bad values: every key of every settings file with every value that it
+should not have.
+"""
 
 import dataclasses
 import math
@@ -35,7 +37,9 @@ NEEDED: dict[str, dict[str, Any]] = {
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Trial:
-    """A value at a key: what was said against it, '' where it was taken; typed: whether that was a refusal."""
+    """A value at a key: what was said against it, '' where it was taken; typed: whether
+    that was a refusal.
+    """
 
     settings: str
     key: str
@@ -45,7 +49,9 @@ class Trial:
 
     @property
     def names_it(self) -> bool:
-        """Whether the refusal names the file, and the key or the table that it stands in."""
+        """Whether the refusal names the file, and the key or the table that it stands
+        in.
+        """
         parts = [part.partition("[")[0] for part in self.key.split(".")]
         return "FILE" in self.said and any(part in self.said for part in parts[-2:])
 
@@ -59,7 +65,10 @@ die = {size_um = [4000.0, 3000.0]}
 
 def roots() -> dict[str, tuple[Any, dict[str, Any]]]:
     """{settings: (record, a good table)} of every settings file of every command."""
-    found = {kind: (record, tomllib.loads(text)) for kind, (_, text, record) in samples.TEXTS.items()}
+    found = {
+        kind: (record, tomllib.loads(text))
+        for kind, (_, text, record) in samples.TEXTS.items()
+    }
     found["run"] = (RunConfig, config.merged(preset_table("smoke"), found["run"][1]))
     found["process"] = (Process, found["process"][1])
     found["protocol"] = (Protocol, {"depths_um": [18000.0, 22000.0]})
@@ -82,7 +91,9 @@ def trials() -> Iterator[Trial]:
                     yield Trial(name, _text(path), shown, repr(error), typed=False)
 
 
-Path = tuple[tuple[str, Any], ...]  # (key, record of the table that stands there or None), from the top
+Path = tuple[
+    tuple[str, Any], ...
+]  # (key, record of the table that stands there or None), from the top
 
 
 def _text(path: Path) -> str:
@@ -129,5 +140,9 @@ def _with(table: dict[str, Any], path: Path, value: Any) -> dict[str, Any]:
 
 def _needed(record: Any) -> dict[str, Any]:
     hint = typing.get_type_hints(record).get("kind")
-    kind = {"kind": typing.get_args(hint)[0]} if typing.get_origin(hint) is typing.Literal else {}
+    kind = (
+        {"kind": typing.get_args(hint)[0]}
+        if typing.get_origin(hint) is typing.Literal
+        else {}
+    )
     return kind | NEEDED.get(record.__name__, {})

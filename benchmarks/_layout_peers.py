@@ -1,4 +1,6 @@
-"""gdstk and KLayout at their best on the pillars of the mask bench, and their agreement with our files."""
+"""gdstk and KLayout at their best on the pillars of the mask bench, and their agreement
+with our files.
+"""
 
 import time
 from pathlib import Path
@@ -47,7 +49,9 @@ def klayout_layout(mask: MaskPlan) -> Any:
     cells = []
     for kind in mask.classes:
         cell = made.create_cell(kind.name)
-        cell.shapes(layer).insert(db.Polygon([db.Point(*p) for p in kind.outline.tolist()]))
+        cell.shapes(layer).insert(
+            db.Polygon([db.Point(*p) for p in kind.outline.tolist()])
+        )
         cells.append(cell.cell_index())
     rows, columns = np.nonzero(grid)
     x, y = ((columns - 1250) * PITCH).tolist(), ((1250 - rows) * PITCH).tolist()
@@ -67,11 +71,24 @@ def _gdstk_rows(target: Path) -> list[Row]:
     made = []
     for name, write in (
         ("GDSII", lambda: gdstk_library(mask).write_gds(target / "g.gds")),
-        ("OASIS level 6", lambda: gdstk_library(mask).write_oas(target / "g.oas", compression_level=6)),
+        (
+            "OASIS level 6",
+            lambda: gdstk_library(mask).write_oas(
+                target / "g.oas", compression_level=6
+            ),
+        ),
     ):
         seconds = fastest(write, repeats=1)
         size = (target / ("g.gds" if name == "GDSII" else "g.oas")).stat().st_size / 1e6
-        made.append(Row("free-form", f"gdstk build + write {name}", seconds, NAN, f"{size:.2f} MB, no comparison"))
+        made.append(
+            Row(
+                "free-form",
+                f"gdstk build + write {name}",
+                seconds,
+                NAN,
+                f"{size:.2f} MB, no comparison",
+            )
+        )
     layout.write_oasis(mask, target / "r.oas", form="reader")
     start = time.perf_counter()
     library = gdstk.read_oas(target / "r.oas")
@@ -81,7 +98,17 @@ def _gdstk_rows(target: Path) -> list[Row]:
     wrong = float(count - np.count_nonzero(grid))
     valid, _ = gdstk.oas_validate(target / "r.oas")
     text = f"pillars less the plan; checksum {'right' if valid else 'WRONG'}"
-    return [*made, Row("free-form", "gdstk opens OASIS reader", seconds, wrong, text, goal="<= 0.5 s")]
+    return [
+        *made,
+        Row(
+            "free-form",
+            "gdstk opens OASIS reader",
+            seconds,
+            wrong,
+            text,
+            goal="<= 0.5 s",
+        ),
+    ]
 
 
 def _klayout_rows(target: Path) -> list[Row]:
@@ -94,7 +121,15 @@ def _klayout_rows(target: Path) -> list[Row]:
 
     start = time.perf_counter()
     klayout_layout(mask).write(str(target / "k.gds"))
-    made = [Row("free-form", "KLayout build + write GDSII", time.perf_counter() - start, NAN, "no comparison")]
+    made = [
+        Row(
+            "free-form",
+            "KLayout build + write GDSII",
+            time.perf_counter() - start,
+            NAN,
+            "no comparison",
+        )
+    ]
     for name, write in (("m.gds", layout.write_gdsii), ("m.oas", layout.write_oasis)):
         write(mask, target / name)
         start = time.perf_counter()
@@ -103,7 +138,15 @@ def _klayout_rows(target: Path) -> list[Row]:
         seconds = time.perf_counter() - start
         count = db.Region(read.cell("TOP").begin_shapes_rec(read.layer(1, 0))).count()
         wrong = float(count - np.count_nonzero(grid))
-        made.append(Row("free-form", f"KLayout reads {name[2:]}", seconds, wrong, "pillars less the plan"))
+        made.append(
+            Row(
+                "free-form",
+                f"KLayout reads {name[2:]}",
+                seconds,
+                wrong,
+                "pillars less the plan",
+            )
+        )
     return [*made, _klayout_check(db, mask)]
 
 
@@ -111,9 +154,14 @@ def _klayout_check(db: object, mask: MaskPlan) -> Row:
     """The space check of KLayout on a patch of 240 000 pillars."""
     patch = mask.lattices[0].whole()[1005:1495, 1005:1495]
     region = db.Region()  # type: ignore[attr-defined]
-    shapes = [db.Polygon([db.Point(*p) for p in kind.outline.tolist()]) for kind in mask.classes]  # type: ignore[attr-defined]
+    shapes = [
+        db.Polygon([db.Point(*p) for p in kind.outline.tolist()])
+        for kind in mask.classes
+    ]  # type: ignore[attr-defined]
     for row, column in np.argwhere(patch > 0).tolist():
-        region.insert(shapes[patch[row, column] - 1].moved(column * PITCH, -row * PITCH))
+        region.insert(
+            shapes[patch[row, column] - 1].moved(column * PITCH, -row * PITCH)
+        )
     region.merged_semantics = False
     start = time.perf_counter()
     count = region.space_check(70, False, db.Region.Euclidian).count()  # type: ignore[attr-defined]
@@ -122,7 +170,11 @@ def _klayout_check(db: object, mask: MaskPlan) -> Row:
     seconds = time.perf_counter() - start
     plan_of_patch = lens_of(Lattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0))
     own = drc.check(plan_of_patch, RULES).counts
-    wrong = abs(count - own["gap"]) + abs(min(thin, 1) - min(own["feature"], 1)) + abs(overlap - own["overlap"])
+    wrong = (
+        abs(count - own["gap"])
+        + abs(min(thin, 1) - min(own["feature"], 1))
+        + abs(overlap - own["overlap"])
+    )
     whole = fastest(lambda: drc.check(mask, RULES))
     ratio = seconds / patch.size / (whole / np.count_nonzero(mask.lattices[0].whole()))
     return Row(

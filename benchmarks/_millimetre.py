@@ -19,16 +19,33 @@ import bench_lens
 
 RESPONSE, PIXEL_UM, PIXELS, PEAK_E = bench_lens.RESPONSE, 3.0, 32, 8000.0
 DEPTHS = tuple((1 / np.linspace(1 / 15e3, 1 / 28e3, 11)).tolist())
-HIDDEN = bench_lens.VALUES | {"stage_zero_um": 120.0, "distance_um": 6.0, "background_x_e": 0.0}
+HIDDEN = bench_lens.VALUES | {
+    "stage_zero_um": 120.0,
+    "distance_um": 6.0,
+    "background_x_e": 0.0,
+}
 
 
 def shoot() -> tuple[Lens, float, np.ndarray]:
-    """(design, seconds that the sum over every pillar took, noise-free light of the bench)."""
+    """(design, seconds that the sum over every pillar took, noise-free light of the
+    bench).
+    """
     focus = profiles.Focus(0.85, 2000.0, 20000.0)
     phase = design.phase_of(None, focus, radius_um=500.0)
-    lens = design.make(phase, focus, aperture_um=1000.0, cell=Cell(pitch_um=0.4), proxy=bench_lens.proxy())[0]
+    lens = design.make(
+        phase,
+        focus,
+        aperture_um=1000.0,
+        cell=Cell(pitch_um=0.4),
+        proxy=bench_lens.proxy(),
+    )[0]
     known = tuple(Known(name, value) for name, value in HIDDEN.items())
-    truth = Truth(DEPTHS, peak_e=PEAK_E, parameter=known, camera=Camera(pixel_um=PIXEL_UM, pixels=PIXELS))
+    truth = Truth(
+        DEPTHS,
+        peak_e=PEAK_E,
+        parameter=known,
+        camera=Camera(pixel_um=PIXEL_UM, pixels=PIXELS),
+    )
     start = time.perf_counter()
     light = bench.irradiance(lens, truth, RESPONSE)
     return lens, time.perf_counter() - start, light
@@ -37,5 +54,7 @@ def shoot() -> tuple[Lens, float, np.ndarray]:
 def model(lens: Lens) -> ForwardModel:
     """The reduced model of these captures."""
     n = len(DEPTHS)
-    setting = Setting(np.array(DEPTHS), np.zeros((n, 2)), np.ones(n), PIXEL_UM, PIXELS, PIXELS)
+    setting = Setting(
+        np.array(DEPTHS), np.zeros((n, 2)), np.ones(n), PIXEL_UM, PIXELS, PIXELS
+    )
     return ForwardModel(lens, setting, RESPONSE)

@@ -1,4 +1,6 @@
-"""Where a fit's time goes: seconds, images and Jacobians of each of its phases, found by wrapping the functions."""
+"""Where a fit's time goes: seconds, images and Jacobians of each of its phases, found
+by wrapping the functions.
+"""
 
 import contextlib
 import time
@@ -29,7 +31,9 @@ MODEL = "characterize.model.forward", "ForwardModel"
 
 @contextlib.contextmanager
 def timed() -> Iterator[dict[str, tuple[float, float]]]:
-    """{phase: (seconds, processor seconds)} of the fits inside; a phase inside another is counted by itself only."""
+    """{phase: (seconds, processor seconds)} of the fits inside; a phase inside another
+    is counted by itself only.
+    """
     spent: dict[str, tuple[float, float]] = {}
     inner: list[list[float]] = [[0.0, 0.0]]
 
@@ -42,7 +46,10 @@ def timed() -> Iterator[dict[str, tuple[float, float]]]:
             finally:
                 whole = time.perf_counter() - start[0], time.process_time() - start[1]
                 under, before = inner.pop(), spent.get(phase, (0.0, 0.0))
-                spent[phase] = before[0] + whole[0] - under[0], before[1] + whole[1] - under[1]
+                spent[phase] = (
+                    before[0] + whole[0] - under[0],
+                    before[1] + whole[1] - under[1],
+                )
                 inner[-1] = [inner[-1][0] + whole[0], inner[-1][1] + whole[1]]
 
         return run
@@ -50,13 +57,17 @@ def timed() -> Iterator[dict[str, tuple[float, float]]]:
     with contextlib.ExitStack() as stack:
         for phase, home, name in PHASES:
             module = import_module(home)
-            stack.enter_context(mock.patch.object(module, name, wrapped(phase, getattr(module, name))))
+            stack.enter_context(
+                mock.patch.object(module, name, wrapped(phase, getattr(module, name)))
+            )
         yield spent
 
 
 @contextlib.contextmanager
 def counted() -> Iterator[dict[str, list[int]]]:
-    """{phase: [images, Jacobians]} that the forward model of the fits inside computed; "" is outside all phases."""
+    """{phase: [images, Jacobians]} that the forward model of the fits inside computed;
+    "" is outside all phases.
+    """
     made: dict[str, list[int]] = {}
     where = [""]
     home = import_module(MODEL[0])
@@ -80,5 +91,7 @@ def counted() -> Iterator[dict[str, list[int]]]:
         stack.enter_context(mock.patch.object(getattr(home, MODEL[1]), "images", one))
         for phase, module, name in PHASES:
             found = import_module(module)
-            stack.enter_context(mock.patch.object(found, name, wrapped(phase, getattr(found, name))))
+            stack.enter_context(
+                mock.patch.object(found, name, wrapped(phase, getattr(found, name)))
+            )
         yield made

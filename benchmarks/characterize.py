@@ -1,4 +1,6 @@
-"""Captures to the as-built lens: real beads, errors against the Cramér-Rao bound, the reduced model, micrographs."""
+"""Captures to the as-built lens: real beads, errors against the Cramér-Rao bound, the
+reduced model, micrographs.
+"""
 
 import sys
 import time
@@ -21,7 +23,13 @@ from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilSpec
 
 ROOT = Path(__file__).parents[1]
-BEADS = ROOT.parent / "shared" / "captures" / "bead_stack" / "psf_wl520nm_z300nm_x130nm_na0.85_n1.0.tif"
+BEADS = (
+    ROOT.parent
+    / "shared"
+    / "captures"
+    / "bead_stack"
+    / "psf_wl520nm_z300nm_x130nm_na0.85_n1.0.tif"
+)
 sys.path.insert(0, str(ROOT / "tests" / "characterize" / "measure"))
 
 
@@ -41,22 +49,63 @@ def _beads() -> list[Row]:
     score = found.held_out
     if score is None or found.between is None:
         return []
-    third = fit_pupil(shots, PupilSpec(0.85, 0.52, 0.13, step_um=0.3), sparse=3, insist=True)
+    third = fit_pupil(
+        shots, PupilSpec(0.85, 0.52, 0.13, step_um=0.3), sparse=3, insist=True
+    )
     sparse = [
-        Row(f"bead stack, {name}", method, float("nan"), error, "16 planes predicted from every third, 40 x 40 crop")
-        for method, one in (("vectorial pupil", third.held_out), ("cubic spline", third.between))
+        Row(
+            f"bead stack, {name}",
+            method,
+            float("nan"),
+            error,
+            "16 planes predicted from every third, 40 x 40 crop",
+        )
+        for method, one in (
+            ("vectorial pupil", third.held_out),
+            ("cubic spline", third.between),
+        )
         if one is not None
         for name, error in (("NRMSE", one.nrmse), ("1 - NCC", 1 - one.ncc))
     ]
     about = "12 odd planes predicted from 13 even ones, 40 x 40 crop"
     return [
-        Row("bead stack, NRMSE", "vectorial pupil", seconds, score.nrmse, about, goal="<= 0.20 (best known 0.279)"),
         Row(
-            "bead stack, 1 - NCC", "vectorial pupil", seconds, 1 - score.ncc, about, goal="<= 0.025 (best known 0.053)"
+            "bead stack, NRMSE",
+            "vectorial pupil",
+            seconds,
+            score.nrmse,
+            about,
+            goal="<= 0.20 (best known 0.279)",
         ),
-        Row("bead stack, 1 - mean NCC of planes", "vectorial pupil", seconds, 1 - score.plane_ncc, about),
-        Row("bead stack, NRMSE", "cubic spline", float("nan"), found.between.nrmse, about),
-        Row("bead stack, 1 - NCC", "cubic spline", float("nan"), 1 - found.between.ncc, about),
+        Row(
+            "bead stack, 1 - NCC",
+            "vectorial pupil",
+            seconds,
+            1 - score.ncc,
+            about,
+            goal="<= 0.025 (best known 0.053)",
+        ),
+        Row(
+            "bead stack, 1 - mean NCC of planes",
+            "vectorial pupil",
+            seconds,
+            1 - score.plane_ncc,
+            about,
+        ),
+        Row(
+            "bead stack, NRMSE",
+            "cubic spline",
+            float("nan"),
+            found.between.nrmse,
+            about,
+        ),
+        Row(
+            "bead stack, 1 - NCC",
+            "cubic spline",
+            float("nan"),
+            1 - found.between.ncc,
+            about,
+        ),
         *sparse,
     ]
 
@@ -72,38 +121,98 @@ def _millimetre() -> list[Row]:
     found *= (found * light).sum() / (found**2).sum()
     quick = fastest(lambda: model.images(x))
     peak = float(np.abs(found - light).max() / light.max())
-    worst = max(np.abs(f - w).max() / w.max() for f, w in zip(found, light, strict=True))
-    case, threads = f"1 mm lens, 11 depths of {millimetre.PIXELS} x {millimetre.PIXELS} pixels", torch.get_num_threads()
+    worst = max(
+        np.abs(f - w).max() / w.max() for f, w in zip(found, light, strict=True)
+    )
+    case, threads = (
+        f"1 mm lens, 11 depths of {millimetre.PIXELS} x {millimetre.PIXELS} pixels",
+        torch.get_num_threads(),
+    )
     times = f"<= 1e-3; {spent / quick:.0f} times faster, {built:.1f} s to gather the pillars once"
     about = "sum over every pillar, share of the peak"
     return [
         Row(case, "every pillar", spent, float("nan"), "is the reference", threads),
         Row(case, "reduced model", quick, peak, about, threads, goal=times),
-        Row(case, "reduced model", quick, float(worst), "the same, of each frame's own peak", threads, goal="<= 1e-3"),
+        Row(
+            case,
+            "reduced model",
+            quick,
+            float(worst),
+            "the same, of each frame's own peak",
+            threads,
+            goal="<= 1e-3",
+        ),
     ]
 
 
 def _fit() -> list[Row]:
-    """The fit of a 1 mm lens of the referee bench with default priors; pillars as an earlier run left them, and solved.
+    """The fit of a 1 mm lens of the referee bench with default priors; pillars as an
+    earlier run left them, and solved.
 
-    Its truth shares no pillar, camera or prior with the fit (:mod:`benchmarks.characterize_referee`).
+    Its truth shares no pillar, camera or prior with the fit
+    (:mod:`benchmarks.characterize_referee`).
     """
     start = time.perf_counter()
     referee.prepared("whole")
     solved = time.perf_counter() - start
     with phases.timed() as spent, phases.counted() as made:
         run = referee.study("whole", 0)
-    case, threads = "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts", torch.get_num_threads()
-    seconds, goal = run["wall_seconds"], f"<= 8 s; {run['seconds']:.1f} s of processor time"
+    case, threads = (
+        "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts",
+        torch.get_num_threads(),
+    )
+    seconds, goal = (
+        run["wall_seconds"],
+        f"<= 8 s; {run['seconds']:.1f} s of processor time",
+    )
     z, inside = np.array(list(run["z"].values())), list(run["inside"].values())
     return [
-        Row(case, "pillars", solved, float("nan"), "solved, or found in the cache", threads),
-        Row(case, "fit", seconds, float(np.sqrt((z**2).mean())), "truth, sigma, rms", threads, goal=goal),
-        Row(case, "fit", seconds, float(np.abs(z).max()), "truth, sigma, worst", threads),
-        Row(case, "fit", seconds, float(np.mean(inside)), "intervals that hold the truth", threads),
-        Row(case, "fit", seconds, run["chi2_per_dof"], "chi-square per degree", threads, goal="0.95 to 1.05"),
+        Row(
+            case,
+            "pillars",
+            solved,
+            float("nan"),
+            "solved, or found in the cache",
+            threads,
+        ),
+        Row(
+            case,
+            "fit",
+            seconds,
+            float(np.sqrt((z**2).mean())),
+            "truth, sigma, rms",
+            threads,
+            goal=goal,
+        ),
+        Row(
+            case, "fit", seconds, float(np.abs(z).max()), "truth, sigma, worst", threads
+        ),
+        Row(
+            case,
+            "fit",
+            seconds,
+            float(np.mean(inside)),
+            "intervals that hold the truth",
+            threads,
+        ),
+        Row(
+            case,
+            "fit",
+            seconds,
+            run["chi2_per_dof"],
+            "chi-square per degree",
+            threads,
+            goal="0.95 to 1.05",
+        ),
         *(
-            Row(case, f"of the fit: {phase}", wall, float("nan"), _work(work, made.get(phase, [0, 0])), threads)
+            Row(
+                case,
+                f"of the fit: {phase}",
+                wall,
+                float("nan"),
+                _work(work, made.get(phase, [0, 0])),
+                threads,
+            )
             for phase, (wall, work) in spent.items()
         ),
     ]
@@ -129,7 +238,13 @@ def _reduced() -> list[Row]:
     quick = fastest(lambda: model.images(x))
     about = "sum over every pillar, share of the peak"
     return [
-        Row("5 frames, 40 um lens", "every pillar", full, float("nan"), "is the reference"),
+        Row(
+            "5 frames, 40 um lens",
+            "every pillar",
+            full,
+            float("nan"),
+            "is the reference",
+        ),
         Row(
             "5 frames, 40 um lens",
             "reduced model",
@@ -149,12 +264,22 @@ def _micrographs() -> list[Row]:
     pictures = [test_sem.render(truth, seed) for seed in range(8)]
     drawn = time.perf_counter() - start
     start = time.perf_counter()
-    found = np.array([sem.measure(p, test_sem.ABOUT).diameter_nm for p in pictures]) / test_sem.PIXEL
+    found = (
+        np.array([sem.measure(p, test_sem.ABOUT).diameter_nm for p in pictures])
+        / test_sem.PIXEL
+    )
     seconds = (time.perf_counter() - start) / len(pictures)
     error = found - truth.ravel() / test_sem.PIXEL
     about = f"drawn diameters, pixels (drawing took {drawn:.1f} s)"
     return [
-        Row("micrograph of 16 pillars", "bias", seconds, float(error.mean()), about, goal="<= 0.3 px"),
+        Row(
+            "micrograph of 16 pillars",
+            "bias",
+            seconds,
+            float(error.mean()),
+            about,
+            goal="<= 0.3 px",
+        ),
         Row(
             "micrograph of 16 pillars",
             "repeatability",

@@ -1,12 +1,18 @@
-"""A hundred hidden lenses, drawn anew with every seed: errors against the Cramér-Rao bound, coverage, prediction.
+"""A hundred hidden lenses, drawn anew with every seed: errors against the Cramér-Rao
+bound, coverage, prediction.
 
-``python -m benchmarks.characterize_study 8000 200 --minutes 9`` fits the seeds that are still missing at these peak
-electrons and keeps each at once in ``benchmarks/results/characterize_study``; what is there is printed by
-``python -m benchmarks characterize_study``. The lens is small (40 um, 5 depths of 16 x 16 pixels), so that a seed
+``python -m benchmarks.characterize_study 8000 200 --minutes 9`` fits the seeds that are
+still missing at these peak
+electrons and keeps each at once in ``benchmarks/results/characterize_study``; what is
+there is printed by
+``python -m benchmarks characterize_study``. The lens is small (40 um, 5 depths of 16 x
+16 pixels), so that a seed
 takes seconds.
 
-Every true parameter is drawn from what the fit is told beforehand (``SPREAD``, one sigma), so that the bound with that
-knowledge (van Trees) is the inverse of the fit's own information, and 95 % of the intervals must cover.
+Every true parameter is drawn from what the fit is told beforehand (``SPREAD``, one
+sigma), so that the bound with that
+knowledge (van Trees) is the inverse of the fit's own information, and 95 % of the
+intervals must cover.
 """
 
 import json
@@ -31,7 +37,11 @@ from metalens.ground import store
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "characterize"))
 FOLDER = Path(__file__).parent / "results" / "characterize_study"
 SEEDS, PEAKS, GOALS = 100, (8000, 200), {8000: 1.10, 200: 1.25}
-DEPTHS, NEW_DEPTHS, NEW_ANGLE_DEG = (380.0, 480.0, 600.0, 800.0, 1150.0), (430.0, 680.0, 950.0), 3.0
+DEPTHS, NEW_DEPTHS, NEW_ANGLE_DEG = (
+    (380.0, 480.0, 600.0, 800.0, 1150.0),
+    (430.0, 680.0, 950.0),
+    3.0,
+)
 SPREAD = {
     "bias_nm": 4.0,
     "bias_x_nm": 2.0,
@@ -60,19 +70,33 @@ PLANE = {"background_e": 20.0, "background_x_e": 2.0, "background_y_e": -1.0}
 def hidden(seed: int) -> dict[str, float]:
     """True parameters of a seed."""
     random = np.random.default_rng([seed, 7])
-    return {name: MIDDLE.get(name, 0.0) + s * float(random.standard_normal()) for name, s in SPREAD.items()} | PLANE
+    return {
+        name: MIDDLE.get(name, 0.0) + s * float(random.standard_normal())
+        for name, s in SPREAD.items()
+    } | PLANE
 
 
 def study(seed: int, peak_e: int) -> dict[str, Any]:
-    """Capture a hidden lens, fit it, compare with the truth and at places that the fit never saw."""
+    """Capture a hidden lens, fit it, compare with the truth and at places that the fit
+    never saw.
+    """
     import bench_lens as b
 
     values = hidden(seed)
-    told = tuple(Known(name, MIDDLE.get(name, 0.0), sigma) for name, sigma in SPREAD.items())
+    told = tuple(
+        Known(name, MIDDLE.get(name, 0.0), sigma) for name, sigma in SPREAD.items()
+    )
     light = bench.irradiance(b.lens(), _truth(values, DEPTHS, 0.0), b.RESPONSE)
-    electrons = light * (peak_e / light.max()) + bench.background(_truth(values, DEPTHS, 0.0))
+    electrons = light * (peak_e / light.max()) + bench.background(
+        _truth(values, DEPTHS, 0.0)
+    )
     start = time.process_time()
-    found = fit(_read(electrons, seed), b.lens(), Options(known=told, scan_um=60.0, insist=True), response=b.RESPONSE)
+    found = fit(
+        _read(electrons, seed),
+        b.lens(),
+        Options(known=told, scan_um=60.0, insist=True),
+        response=b.RESPONSE,
+    )
     seconds = time.process_time() - start
     z, directions = _normalised(found, values)
     return {
@@ -100,7 +124,9 @@ def _rows(peak: int, stored: dict[str, Any]) -> list[Row]:
     seconds = float(np.mean([run["seconds"] for run in runs]))
     case = f"{len(runs)} hidden lenses, peak {peak} e"
     directions = np.array([v for run in runs for v in run["directions"]])
-    covered = float(np.mean([abs(v) < 1.959964 for run in runs for v in run["z"].values()]))
+    covered = float(
+        np.mean([abs(v) < 1.959964 for run in runs for v in run["z"].values()])
+    )
     worst = max(float(np.sqrt(np.mean(np.square(run["directions"])))) for run in runs)
     chi2 = [run["chi2_per_dof"] for run in runs]
 
@@ -108,17 +134,49 @@ def _rows(peak: int, stored: dict[str, Any]) -> list[Row]:
         return Row(case, what, seconds, error, against, goal=goal)
 
     rms = float(np.sqrt((directions**2).mean()))
-    predicted = "<= 0.01" if peak >= 8000 else "photon noise: the bound itself is above 0.01"
+    predicted = (
+        "<= 0.01" if peak >= 8000 else "photon noise: the bound itself is above 0.01"
+    )
     return [
         row("error over the Cramér-Rao bound, rms", rms, "truth", f"<= {GOALS[peak]}"),
-        row("the same of the worst lens (a local minimum: above 2)", worst, "truth", "none above 2"),
+        row(
+            "the same of the worst lens (a local minimum: above 2)",
+            worst,
+            "truth",
+            "none above 2",
+        ),
         row("share of 95 % intervals that cover", covered, "truth", "0.92 to 0.98"),
         row("chi-square per degree, mean", float(np.mean(chi2)), "1", "0.95 to 1.05"),
-        row("chi-square per degree, farthest from 1", max(chi2, key=lambda c: abs(c - 1)), "1", "sigma is 0.04"),
-        row("frames seen, NRMSE", _mean(runs, "seen_nrmse"), "noise-free truth", predicted),
-        row("new depths, NRMSE", _mean(runs, "depths_nrmse"), "noise-free truth", predicted),
-        row("new angle, NRMSE", _mean(runs, "angles_nrmse"), "noise-free truth", predicted),
-        row("refused", float(np.mean([bool(run["problems"]) for run in runs])), "none", "0"),
+        row(
+            "chi-square per degree, farthest from 1",
+            max(chi2, key=lambda c: abs(c - 1)),
+            "1",
+            "sigma is 0.04",
+        ),
+        row(
+            "frames seen, NRMSE",
+            _mean(runs, "seen_nrmse"),
+            "noise-free truth",
+            predicted,
+        ),
+        row(
+            "new depths, NRMSE",
+            _mean(runs, "depths_nrmse"),
+            "noise-free truth",
+            predicted,
+        ),
+        row(
+            "new angle, NRMSE",
+            _mean(runs, "angles_nrmse"),
+            "noise-free truth",
+            predicted,
+        ),
+        row(
+            "refused",
+            float(np.mean([bool(run["problems"]) for run in runs])),
+            "none",
+            "0",
+        ),
     ]
 
 
@@ -126,9 +184,13 @@ def _mean(runs: list[dict[str, Any]], key: str) -> float:
     return float(np.mean([run[key] for run in runs]))
 
 
-def _truth(values: dict[str, float], depths: tuple[float, ...], angle_deg: float) -> Truth:
+def _truth(
+    values: dict[str, float], depths: tuple[float, ...], angle_deg: float
+) -> Truth:
     known = tuple(Known(name, value) for name, value in values.items())
-    return Truth(depths, (angle_deg,), parameter=known, camera=Camera(pixel_um=1.5, pixels=16))
+    return Truth(
+        depths, (angle_deg,), parameter=known, camera=Camera(pixel_um=1.5, pixels=16)
+    )
 
 
 def _read(electrons: np.ndarray, seed: int) -> Capture:
@@ -137,8 +199,15 @@ def _read(electrons: np.ndarray, seed: int) -> Capture:
     return b.capture(electrons, seed=seed)
 
 
-def _predicted(found: AsBuilt, values: dict[str, float], depths: tuple[float, ...], angle_deg: float) -> float:
-    """NRMSE at places never captured; the stated depths pass through the fitted and the true stage alike."""
+def _predicted(
+    found: AsBuilt,
+    values: dict[str, float],
+    depths: tuple[float, ...],
+    angle_deg: float,
+) -> float:
+    """NRMSE at places never captured; the stated depths pass through the fitted and the
+    true stage alike.
+    """
     import bench_lens as b
 
     middle = float(np.mean(DEPTHS))
@@ -147,7 +216,9 @@ def _predicted(found: AsBuilt, values: dict[str, float], depths: tuple[float, ..
     want = bench.irradiance(b.lens(), truth, b.RESPONSE)
     n = len(depths)
     angles = np.tile([math.radians(angle_deg), 0.0], (n, 1))
-    model = ForwardModel(b.lens(), Setting(np.array(depths), angles, np.ones(n), 1.5, 16, 16), b.RESPONSE)
+    model = ForwardModel(
+        b.lens(), Setting(np.array(depths), angles, np.ones(n), 1.5, 16, 16), b.RESPONSE
+    )
     model.stage_centre_um = middle
     x = found.parameters()
     x[[PLACE[name] for name in PLANE]] = 0.0
@@ -161,8 +232,12 @@ def _nrmse(predicted: np.ndarray, electrons: np.ndarray, found: AsBuilt) -> floa
     return float(np.linalg.norm(predicted - electrons) / np.linalg.norm(light))
 
 
-def _normalised(found: AsBuilt, values: dict[str, float]) -> tuple[dict[str, float], list[float]]:
-    """Errors over sigma: of every parameter, and along the directions where the frames halve the prior's sigma."""
+def _normalised(
+    found: AsBuilt, values: dict[str, float]
+) -> tuple[dict[str, float], list[float]]:
+    """Errors over sigma: of every parameter, and along the directions where the frames
+    halve the prior's sigma.
+    """
     keep = [i for i, name in enumerate(found.names) if name != "log_gain"]
     names = [found.names[i] for i in keep]
     error = np.array([found.value[i] - values.get(found.names[i], 0.0) for i in keep])
@@ -181,7 +256,9 @@ def _stored(peak: int) -> dict[str, Any]:
 
 def main(words: list[str]) -> None:
     """Fit what is missing until the time is up."""
-    minutes = float(words[words.index("--minutes") + 1]) if "--minutes" in words else math.inf
+    minutes = (
+        float(words[words.index("--minutes") + 1]) if "--minutes" in words else math.inf
+    )
     end = time.monotonic() + 60 * minutes
     peaks = [int(w) for w in words if w.isdigit() and int(w) in PEAKS] or list(PEAKS)
     FOLDER.mkdir(exist_ok=True)
@@ -190,7 +267,9 @@ def main(words: list[str]) -> None:
             stored = _stored(peak)
             if str(seed) not in stored and time.monotonic() < end:
                 stored[str(seed)] = study(seed, peak)
-                store.write_text(FOLDER / f"peak_{peak}.json", json.dumps(stored, indent=1) + "\n")
+                store.write_text(
+                    FOLDER / f"peak_{peak}.json", json.dumps(stored, indent=1) + "\n"
+                )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""The error budget of a reader against what the virtual experiment measures on its frames, link by link.
+"""The error budget of a reader against what the virtual experiment measures on its
+frames, link by link.
 
-``python -m benchmarks closure`` takes a lens of 0.4 mm and a reader of 240 steps: minutes, the whole budget to its end.
+``python -m benchmarks closure`` takes a lens of 0.4 mm and a reader of 240 steps:
+minutes, the whole budget to its end.
 ``python -m benchmarks.closure demo`` takes the demo's run and its five subjects.
 """
 
@@ -49,7 +51,9 @@ rounds = 1
 pitch_um = 9.0
 budgets_mmacs = [4.0]
 """
-FRAMES = ExperimentConfig(subjects=4, grid=(5, 4), share=0.3, axial_mm=(-2.5, 2.5), lateral_mm=(-1.5,))
+FRAMES = ExperimentConfig(
+    subjects=4, grid=(5, 4), share=0.3, axial_mm=(-2.5, 2.5), lateral_mm=(-1.5,)
+)
 
 
 def rows() -> list[Row]:
@@ -68,25 +72,47 @@ def closed(recipe: str, frames: ExperimentConfig) -> list[Row]:
         given = Given(run=retraining.load(folder), frames=frames)
         found = []
         for entry in links.entries(bench(lens.load(folder / "lens.h5"), given)):
-            print(f"{time.perf_counter() - start:7.1f} s  {entry.link}", file=sys.stderr, flush=True)
+            print(
+                f"{time.perf_counter() - start:7.1f} s  {entry.link}",
+                file=sys.stderr,
+                flush=True,
+            )
             found.append(entry)
         spent = time.perf_counter() - start
     measured = next(e.gaze_rad for e in found if e.link == MEASURED)
-    return [_row(entry, spent if entry.link == TOTAL else math.nan, measured) for entry in found]
+    return [
+        _row(entry, spent if entry.link == TOTAL else math.nan, measured)
+        for entry in found
+    ]
 
 
 def _row(entry: Entry, seconds: float, measured_rad: float) -> Row:
     degrees = math.degrees(entry.gaze_rad)
-    goal = f"within 1.5x of measured: {entry.gaze_rad / measured_rad:.2f}x" if entry.link == TOTAL else ""
+    goal = (
+        f"within 1.5x of measured: {entry.gaze_rad / measured_rad:.2f}x"
+        if entry.link == TOTAL
+        else ""
+    )
     said = entry.method if entry.counted else f"{entry.method} (not in the sum)"
-    return Row(entry.link, "metalens budget --run", seconds, degrees, f"deg of gaze; {said}", goal=goal)
+    return Row(
+        entry.link,
+        "metalens budget --run",
+        seconds,
+        degrees,
+        f"deg of gaze; {said}",
+        goal=goal,
+    )
 
 
 if __name__ == "__main__":
     if sys.argv[1:] not in ([], ["demo"]):
         raise SystemExit(f"{sys.argv[1:]}: need nothing, or demo")
     if sys.argv[1:]:
-        shipped = resources.files("metalens").joinpath("data", "demo", "run.toml").read_text(encoding="utf-8")
+        shipped = (
+            resources.files("metalens")
+            .joinpath("data", "demo", "run.toml")
+            .read_text(encoding="utf-8")
+        )
         made = closed(shipped, ExperimentConfig(subjects=5))
     else:
         made = rows()

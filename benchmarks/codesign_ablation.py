@@ -1,9 +1,11 @@
-"""Ablations: whole co-design runs of one config with optics, pitch or architecture frozen, against nothing frozen.
+"""Ablations: whole co-design runs of one config with optics, pitch or architecture
+frozen, against nothing frozen.
 
     python -m benchmarks.codesign_ablation run --work DIR       # every run that has no line yet
     python -m benchmarks.codesign_ablation report --work DIR    # benchmarks/results and docs/codesign
 
-Each is what ``metalens codesign RUN.toml --freeze PART`` does: joint training, search under the budget, fine-tuning.
+Each is what ``metalens codesign RUN.toml --freeze PART`` does: joint training, search
+under the budget, fine-tuning.
 """
 
 import argparse
@@ -40,7 +42,12 @@ TABLE: dict[str, Any] = {
     "space": {"resolution": [0.3, 1.0]},
     "optics": {"focus_mm": 33.0},
     "sensor": {"exposure_e": 2000.0, "full_well_e": 4000.0},
-    "inner": {"steps": 1200, "optics_weight": 0.0, "budget_mmacs": 4.0, "pitch": {"rate": 0.005}},
+    "inner": {
+        "steps": 1200,
+        "optics_weight": 0.0,
+        "budget_mmacs": 4.0,
+        "pitch": {"rate": 0.005},
+    },
     "run": {"pitch_um": 14.0, "budgets_mmacs": [4.0], "finetune_steps": 300},
 }
 HEAD = """# Ablations
@@ -59,23 +66,36 @@ def settings_of(variant: str, seed: int) -> RunConfig:
     """The config of one run."""
     table = config.merged(run.preset_table("laptop"), TABLE)
     made = config.from_table(table, RunConfig, where="the ablations")
-    return replace(made, inner=replace(made.inner, seed=seed), run=replace(made.run, frozen=VARIANTS[variant]))
+    return replace(
+        made,
+        inner=replace(made.inner, seed=seed),
+        run=replace(made.run, frozen=VARIANTS[variant]),
+    )
 
 
 def run_one(work: Path, variant: str, seed: int) -> dict[str, Any]:
-    """Train, search, fine-tune and test one run; its line, the error of every frame beside it."""
+    """Train, search, fine-tune and test one run; its line, the error of every frame
+    beside it.
+    """
     begun = time.perf_counter()
     settings = settings_of(variant, seed)
     going, path = run.start(settings), work / "going.safetensors"
     for record in run.train(going, path):
         if record.step % 100 == 0:
-            print(f"{variant}-{seed} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um", flush=True)
+            print(
+                f"{variant}-{seed} step {record.step}: {record.task:.3f}, {record.pitch_um:.2f} um",
+                flush=True,
+            )
     for _ in run.search(going, path):
         pass
     ((row, model),) = finish.finished(going)
     best = evolution.best(going.searches[0].history)
-    pairs = ambiguity.ambiguous(replace(going.scenes(TEST), seed=0), settings.ambiguity_pairs, 17)
-    seen = assess.frames(going.trainer, pairs, max(1, len(pairs) // settings.inner.batch))
+    pairs = ambiguity.ambiguous(
+        replace(going.scenes(TEST), seed=0), settings.ambiguity_pairs, 17
+    )
+    seen = assess.frames(
+        going.trainer, pairs, max(1, len(pairs) // settings.inner.batch)
+    )
     answers = assess.predict(model.net, best.architecture, seen, settings.inner)
     error = (answers.slip_mm - seen.slip_mm).abs().numpy()
     np.savez_compressed(stem(work, variant, seed), ambiguous=error)
@@ -95,30 +115,48 @@ def report(work: Path) -> None:
     for line in kept_lines(work / LINES):
         lines[line["variant"]].append(line)
     errors = {
-        v: np.stack([np.load(stem(work, v, line["seed"]))["ambiguous"] for line in mine]) for v, mine in lines.items()
+        v: np.stack(
+            [np.load(stem(work, v, line["seed"]))["ambiguous"] for line in mine]
+        )
+        for v, mine in lines.items()
     }
-    text = HEAD + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um "
-    text += "| pixels that the network sees / um |\n|---|---|---|---|---|---|---|---|---|\n"
+    text = (
+        HEAD
+        + "| frozen | runs | axial / mm | to nothing frozen | lateral / mm | IoU | MMACs | pitch / um "
+    )
+    text += (
+        "| pixels that the network sees / um |\n|---|---|---|---|---|---|---|---|---|\n"
+    )
     rows = []
     for variant, mine in lines.items():
         means = {k: float(np.mean([m[k] for m in mine])) for k in MEANS}
         axial, lateral = errors[variant][..., 2], float(errors[variant][..., :2].mean())
         against = ratio(axial, errors["nothing frozen"][..., 2])
         by_seed = [round(float(e), 4) for e in axial.mean(1)]
-        rows.append({"variant": variant, "axial_by_seed_mm": by_seed, "to_nothing_frozen": against, **means})
-        text += (
-            f"| {variant} | {len(mine)} | {axial.mean():.3f} | {against[0]:.2f} [{against[1]:.2f}, {against[2]:.2f}] "
+        rows.append(
+            {
+                "variant": variant,
+                "axial_by_seed_mm": by_seed,
+                "to_nothing_frozen": against,
+                **means,
+            }
         )
+        text += f"| {variant} | {len(mine)} | {axial.mean():.3f} | {against[0]:.2f} [{against[1]:.2f}, {against[2]:.2f}] "
         text += f"| {lateral:.3f} | {means['ambiguous_iou']:.3f} | {means['mmacs']:.2f} | {means['pitch_um']:.1f} "
         text += f"| {means['effective_pitch_um']:.1f} |\n"
-    store.write_text(ROOT / "benchmarks" / "results" / "codesign_ablation.json", json.dumps(rows, indent=1) + "\n")
+    store.write_text(
+        ROOT / "benchmarks" / "results" / "codesign_ablation.json",
+        json.dumps(rows, indent=1) + "\n",
+    )
     store.write_text(ROOT / "docs" / "codesign" / "ablations.md", text)
     print(text)
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("verb", choices=["run", "report"])
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
@@ -128,7 +166,9 @@ def main() -> None:
         return
     torch.set_num_threads(1)
     options.work.mkdir(parents=True, exist_ok=True)
-    there = {(line["variant"], line["seed"]) for line in kept_lines(options.work / LINES)}
+    there = {
+        (line["variant"], line["seed"]) for line in kept_lines(options.work / LINES)
+    }
     for seed in options.seeds:
         for variant in (v for v in VARIANTS if (v, seed) not in there):
             line = run_one(options.work, variant, seed)

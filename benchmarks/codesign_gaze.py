@@ -1,4 +1,5 @@
-"""Gaze of the runs of the co-design study: population eye, own eye, personal calibration on 20 % of the points.
+"""Gaze of the runs of the co-design study: population eye, own eye, personal
+calibration on 20 % of the points.
 
 python -m benchmarks.codesign_gaze --work DIR [--case p9]      # writes benchmarks/results/codesign_gaze.json
 """
@@ -12,7 +13,14 @@ from typing import Any
 import torch
 
 from benchmarks import kept_lines
-from benchmarks.codesign_study import CASES, SCENES, architecture_of, restored, scenes_of, stem
+from benchmarks.codesign_study import (
+    CASES,
+    SCENES,
+    architecture_of,
+    restored,
+    scenes_of,
+    stem,
+)
 from codesign.batches.batch import Batch
 from codesign.batches.flat import flattened
 from codesign.batches.scenes import TEST
@@ -47,7 +55,9 @@ def rendered(test: People) -> Rendered:
     return Rendered(out)
 
 
-def gaze_of(work: Path, line: dict[str, Any], test: People, frames: Rendered) -> dict[str, Any]:
+def gaze_of(
+    work: Path, line: dict[str, Any], test: People, frames: Rendered
+) -> dict[str, Any]:
     """Gaze errors of one run of the study."""
     trainer = restored(work, line, frames)
     seen = assess.frames(trainer, frames, len(frames.batches))
@@ -55,13 +65,19 @@ def gaze_of(work: Path, line: dict[str, Any], test: People, frames: Rendered) ->
     answers = assess.predict(trainer.model.net, architecture, seen, trainer.inner)
     return {
         "run": line["run"],
-        **asdict(gaze_test.gaze_errors(test, gaze_test.read_of(test, answers.centre, answers.slip_mm))),
+        **asdict(
+            gaze_test.gaze_errors(
+                test, gaze_test.read_of(test, answers.centre, answers.slip_mm)
+            )
+        ),
     }
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--case", default="p9")
     options = parser.parse_args()
@@ -76,7 +92,9 @@ def main() -> None:
             print(json.dumps(rows[-1]), flush=True)
     target = ROOT / "benchmarks" / "results" / "codesign_gaze.json"
     target.write_text(
-        json.dumps({"people": PEOPLE, "frames_each": EACH, "rows": rows}, indent=1) + "\n", encoding="utf-8"
+        json.dumps({"people": PEOPLE, "frames_each": EACH, "rows": rows}, indent=1)
+        + "\n",
+        encoding="utf-8",
     )
 
 

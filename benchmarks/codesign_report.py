@@ -1,4 +1,5 @@
-"""Tables and figures of the co-design study: paired bootstrap over test scenes and over runs.
+"""Tables and figures of the co-design study: paired bootstrap over test scenes and over
+runs.
 
 python -m benchmarks.codesign_report --work DIR                  # writes benchmarks/results and docs/codesign
 python -m benchmarks.codesign_report --work DIR --only p18blur   # writes benchmarks/results/codesign_study_p18blur.json
@@ -50,7 +51,8 @@ The best focus is the fixed lens of one focus (`hyperF`, `obliqueF`) of least er
 class Runs:
     """All runs of one lens under one set of conditions.
 
-    lines: of the study, by seed. errors: {test: (seeds, frames, 3)} absolute slippage errors, mm.
+    lines: of the study, by seed. errors: {test: (seeds, frames, 3)} absolute slippage
+    errors, mm.
     """
 
     lens: str
@@ -66,7 +68,9 @@ class Runs:
         return np.asarray(self.errors["ambiguous"].mean(-1))
 
     def means(self) -> dict[str, Any]:
-        """What every table says of the runs; no ``iou`` of a network that draws no mask."""
+        """What every table says of the runs; no ``iou`` of a network that draws no
+        mask.
+        """
         iou, response = (
             float(np.mean([line[part][key] for line in self.lines]))
             for part, key in (("ambiguous", "iou"), ("depth_response", "mm_per_mm"))
@@ -92,16 +96,24 @@ def load(work: Path) -> dict[str, dict[str, Runs]]:
     found: dict[str, dict[str, Runs]] = defaultdict(dict)
     for (case, lens), mine in lines.items():
         mine.sort(key=lambda line: int(line["run"].rsplit("/", 1)[1]))
-        kept = [np.load(work / (line["run"].replace("/", "-") + ".npz")) for line in mine]
-        errors = {test: np.stack([k[test] for k in kept]) for test in ("ambiguous", "natural")}
+        kept = [
+            np.load(work / (line["run"].replace("/", "-") + ".npz")) for line in mine
+        ]
+        errors = {
+            test: np.stack([k[test] for k in kept]) for test in ("ambiguous", "natural")
+        }
         found[case][lens] = Runs(lens, mine, errors)
     return found
 
 
-def ratio(one: Array, other: Array, *, draws: int = 4000, seed: int = 0) -> tuple[float, float, float]:
-    """Ratio of mean errors with its 95 % interval; scenes (in pairs that share a pupil) and runs drawn anew.
+def ratio(
+    one: Array, other: Array, *, draws: int = 4000, seed: int = 0
+) -> tuple[float, float, float]:
+    """Ratio of mean errors with its 95 % interval; scenes (in pairs that share a pupil)
+    and runs drawn anew.
 
-    Scenes are the same for both lenses, so they are drawn together; so are runs, as far as both have the same seeds.
+    Scenes are the same for both lenses, so they are drawn together; so are runs, as far
+    as both have the same seeds.
 
     Args:
         one, other: (seeds, frames), the same frames.
@@ -109,7 +121,9 @@ def ratio(one: Array, other: Array, *, draws: int = 4000, seed: int = 0) -> tupl
     generator = np.random.default_rng(seed)
     both = min(len(one), len(other))
     one, other = one[:both], other[:both]
-    a, b = (e.reshape(both, -1, 2).mean(-1) for e in (one, other))  # pairs of frames are no two scenes
+    a, b = (
+        e.reshape(both, -1, 2).mean(-1) for e in (one, other)
+    )  # pairs of frames are no two scenes
     values = np.empty(draws)
     for i in range(draws):
         runs = generator.integers(0, both, both)
@@ -120,7 +134,9 @@ def ratio(one: Array, other: Array, *, draws: int = 4000, seed: int = 0) -> tupl
 
 
 def best_focus(runs: dict[str, Runs]) -> str:
-    """The fixed lens of one focus and least axial error on natural frames: the ambiguous ones do not choose it."""
+    """The fixed lens of one focus and least axial error on natural frames: the
+    ambiguous ones do not choose it.
+    """
     fixed = [name for name in runs if name.startswith(("hyper", "oblique"))]
     return min(fixed, key=lambda name: float(runs[name].axial("natural").mean()))
 
@@ -141,12 +157,18 @@ def summaries(runs: dict[str, Runs]) -> list[dict[str, Any]]:
     return sorted(out, key=lambda row: float(row["axial_mm"]))
 
 
-def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs]]) -> str:
+def table(
+    found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs]]
+) -> str:
     """Markdown."""
     parts = []
     for case, mine in found.items():
         best = best_focus(runs[case])
-        references = {"to_mid_range": "hyper20", "to_best_focus": best, "slip_to_best_focus": best}
+        references = {
+            "to_mid_range": "hyper20",
+            "to_best_focus": best,
+            "slip_to_best_focus": best,
+        }
         line = f"## {case}: {mine[0]['mmacs']:.1f} MMACs, {mine[0]['frames']} training frames a run, best focus: "
         parts.append(line + f"`{best}`\n")
         parts.append(
@@ -154,7 +176,10 @@ def table(found: dict[str, list[dict[str, Any]]], runs: dict[str, dict[str, Runs
             "focus | IoU | mm per mm of PSF depth |\n|---|---|---|---|---|---|---|---|---|"
         )
         for row in mine:
-            ratios = ["1" if row["lens"] == name else _interval(row.get(key)) for key, name in references.items()]
+            ratios = [
+                "1" if row["lens"] == name else _interval(row.get(key))
+                for key, name in references.items()
+            ]
             parts.append(
                 f"| {row['lens']} | {row['seeds']} | {row['axial_mm']:.3f} | {ratios[0]} | {ratios[1]} | "
                 f"{row['lateral_mm']:.3f} | {ratios[2]} | {_share(row['iou'])} | {row['response_mm_per_mm']:.2f} |"
@@ -171,13 +196,24 @@ def _interval(value: tuple[float, float, float] | None) -> str:
     return "-" if value is None else f"{value[0]:.3f} [{value[1]:.3f}, {value[2]:.3f}]"
 
 
-def matched(runs: dict[str, dict[str, Runs]], *, small: str = "p18", large: str = "p9") -> dict[str, Any]:
-    """The best trained lens before the small network against the mid-range lens before the large one.
+def matched(
+    runs: dict[str, dict[str, Runs]], *, small: str = "p18", large: str = "p9"
+) -> dict[str, Any]:
+    """The best trained lens before the small network against the mid-range lens before
+    the large one.
 
-    Slippage error: mean over the three axes. Both saw equally many frames; the test frames are the same.
+    Slippage error: mean over the three axes. Both saw equally many frames; the test
+    frames are the same.
     """
-    trained = [r for name, r in runs[small].items() if name.startswith(("joint", "swift", "rush"))]
-    one, other = min(trained, key=lambda r: float(r.errors["natural"].mean())), runs[large]["hyper20"]
+    trained = [
+        r
+        for name, r in runs[small].items()
+        if name.startswith(("joint", "swift", "rush"))
+    ]
+    one, other = (
+        min(trained, key=lambda r: float(r.errors["natural"].mean())),
+        runs[large]["hyper20"],
+    )
     share = one.lines[0]["mmacs"] / other.lines[0]["mmacs"]
     slips = [float(r.slip().mean()) for r in (one, other)]
     seeds = [len(r.lines) for r in (one, other)]
@@ -203,15 +239,25 @@ def matched_text(found: dict[str, Any]) -> str:
     )
 
 
-def networks(runs: dict[str, dict[str, Runs]], *, lens: str = "hyper33") -> list[dict[str, Any]]:
-    """Networks behind one fixed lens after equally many frames, against the elastic one."""
+def networks(
+    runs: dict[str, dict[str, Runs]], *, lens: str = "hyper33"
+) -> list[dict[str, Any]]:
+    """Networks behind one fixed lens after equally many frames, against the elastic
+    one.
+    """
     ours = runs["p18long"][lens]
-    cases = {"elastic": "p18long"} | {name: f"p18{name}" for name in BASELINES if lens in runs.get(f"p18{name}", {})}
+    cases = {"elastic": "p18long"} | {
+        name: f"p18{name}" for name in BASELINES if lens in runs.get(f"p18{name}", {})
+    }
     out = []
     for name, case in cases.items():
         mine = runs[case][lens]
         row = {"network": name, **mine.means()}
-        out.append(row if name == "elastic" else row | {"to_elastic": ratio(mine.axial(), ours.axial())})
+        out.append(
+            row
+            if name == "elastic"
+            else row | {"to_elastic": ratio(mine.axial(), ours.axial())}
+        )
     return out
 
 
@@ -241,22 +287,31 @@ def figure(found: dict[str, list[dict[str, Any]]]) -> bytes:
             axes.plot([row["axial_mm"]], [i], "|", markersize=18, color="k")
         axes.set_yticks(range(len(mine)), [row["lens"] for row in mine])
         axes.set(xlabel="axial slippage error / mm (ambiguity set)", title=case)
-        axes.set_xlim(0, 1.05 * max(max(row["axial_by_seed_mm"]) for row in mine) + 0.05)
+        axes.set_xlim(
+            0, 1.05 * max(max(row["axial_by_seed_mm"]) for row in mine) + 0.05
+        )
         axes.invert_yaxis()
     return report.png(canvas)
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--only", nargs="*", default=None, help="cases; their JSON alone is written")
+    parser.add_argument(
+        "--only", nargs="*", default=None, help="cases; their JSON alone is written"
+    )
     options = parser.parse_args()
     runs = load(options.work)
     if options.only:
         for case in options.only:
             rows = summaries(runs[case])
-            store.write_text(RESULTS / f"codesign_study_{case}.json", json.dumps(rows, indent=1) + "\n")
+            store.write_text(
+                RESULTS / f"codesign_study_{case}.json",
+                json.dumps(rows, indent=1) + "\n",
+            )
             print(table({case: rows}, runs))
         return
     found = {case: summaries(mine) for case, mine in runs.items() if len(mine) > 1}

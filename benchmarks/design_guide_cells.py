@@ -1,4 +1,6 @@
-"""Names of the design guide's cells: what each knob may be, and what a reader sees of it."""
+"""Names of the design guide's cells: what each knob may be, and what a reader sees of
+it.
+"""
 
 import math
 import re
@@ -9,14 +11,18 @@ from benchmarks.design_guide_image import HELD
 from codesign.evaluate.reader import ReaderConfig
 
 READERS = ("reference", "network")
-LENS = re.compile(r"(free-|radial-)?(focus|quadratic|(?<!free-)stop|(?<!radial-)oblique|(?<!-)helix|(?<!-)split)(\d+)")
+LENS = re.compile(
+    r"(free-|radial-)?(focus|quadratic|(?<!free-)stop|(?<!radial-)oblique|(?<!-)helix|(?<!-)split)(\d+)"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Part of the field that a camera sees: width of its square sensor, and field angle of the middle.
+    """Part of the field that a camera sees: width of its square sensor, and field angle
+    of the middle.
 
-    share: (y, x) of the field that its PSFs vary over; held along an axis, they are those of its middle.
+    share: (y, x) of the field that its PSFs vary over; held along an axis, they are
+    those of its middle.
     """
 
     width_um: float
@@ -35,7 +41,10 @@ FIELDS = {
 
 def corner_rad(place: Place, distance_um: float = 2000.0) -> float:
     """Field angle of the farthest corner of what a camera sees."""
-    half, aside = place.width_um / 2, distance_um * math.tan(math.radians(place.angle_deg))
+    half, aside = (
+        place.width_um / 2,
+        distance_um * math.tan(math.radians(place.angle_deg)),
+    )
     return math.atan(math.hypot(abs(aside) + half, half) / distance_um)
 
 
@@ -43,13 +52,20 @@ def corner_rad(place: Place, distance_um: float = 2000.0) -> float:
 class Cell:
     """Values of all knobs; the defaults are the base.
 
-    lens: ``focusF``, hyperbolic, for sources at F mm. ``quadraticF``: r² alone, whose blur is the same over the field,
-        in six radial terms. ``obliqueF``: free of aberrations at the middle of the field. ``helixN``: double helix of N
-        rings. ``splitA``: two halves whose images lie A um apart. ``free-`` before one of the first three, ``radial-``
-        before one of the first two: 63 or 6 terms trained with the reader from there. ``stopF``: six radial terms
-        behind a stop on the other face of the substrate (:mod:`benchmarks.design_guide_stop`); ``radial-`` too.
-    field: of :data:`FIELDS`. fwhm: of the light, nm. pitch: of the pixels, um. electrons: from white in 9 um.
-    frames: that the reader learns from. reader: the ``reference``, or the elastic ``network``.
+    lens: ``focusF``, hyperbolic, for sources at F mm. ``quadraticF``: r² alone, whose
+    blur is the same over the field,
+        in six radial terms. ``obliqueF``: free of aberrations at the middle of the
+        field. ``helixN``: double helix of N
+        rings. ``splitA``: two halves whose images lie A um apart. ``free-`` before one
+        of the first three, ``radial-``
+        before one of the first two: 63 or 6 terms trained with the reader from there.
+        ``stopF``: six radial terms
+        behind a stop on the other face of the substrate
+        (:mod:`benchmarks.design_guide_stop`); ``radial-`` too.
+    field: of :data:`FIELDS`. fwhm: of the light, nm. pitch: of the pixels, um.
+    electrons: from white in 9 um.
+    frames: that the reader learns from. reader: the ``reference``, or the elastic
+    ``network``.
     """
 
     lens: str = "focus40"
@@ -64,11 +80,20 @@ class Cell:
     def name(self) -> str:
         """What differs from the base."""
         values = ((f.name, getattr(self, f.name), f.default) for f in fields(self))
-        return ",".join(f"{n}={v}" if isinstance(v, str) else f"{n}={v:g}" for n, v, d in values if v != d) or "base"
+        return (
+            ",".join(
+                f"{n}={v}" if isinstance(v, str) else f"{n}={v:g}"
+                for n, v, d in values
+                if v != d
+            )
+            or "base"
+        )
 
     @property
     def light(self) -> "Cell":
-        """The cell of the base lens in the same field, light and pixels: what a ratio is taken to."""
+        """The cell of the base lens in the same field, light and pixels: what a ratio
+        is taken to.
+        """
         return replace(self, lens=Cell().lens)
 
     @property
@@ -76,12 +101,18 @@ class Cell:
         """Settings of the reader but for the seed."""
         pixels = round(FIELDS[self.field].width_um / self.pitch)
         return ReaderConfig(
-            frames=self.frames, pixels=pixels, pitch_um=self.pitch, electrons=self.electrons, fwhm_nm=self.fwhm
+            frames=self.frames,
+            pixels=pixels,
+            pitch_um=self.pitch,
+            electrons=self.electrons,
+            fwhm_nm=self.fwhm,
         )
 
     @property
     def design(self) -> str:
-        """Name of the cell that a lens is designed for: who reads it, after how many frames, has no part in it."""
+        """Name of the cell that a lens is designed for: who reads it, after how many
+        frames, has no part in it.
+        """
         return replace(self, frames=Cell().frames, reader=Cell().reader).name
 
 
@@ -96,11 +127,15 @@ def cell_of(name: str) -> Cell:
     for part in [] if name == "base" else name.split(","):
         knob, _, value = part.partition("=")
         if knob not in kinds or knob in found:
-            raise SystemExit(f"cell {name!r}: no knob {knob!r} (or twice): need {', '.join(kinds)}, or base alone")
+            raise SystemExit(
+                f"cell {name!r}: no knob {knob!r} (or twice): need {', '.join(kinds)}, or base alone"
+            )
         try:
             found[knob] = kinds[knob](value)
         except ValueError:
-            raise SystemExit(f"cell {name!r}: {knob} = {value!r} is no number") from None
+            raise SystemExit(
+                f"cell {name!r}: {knob} = {value!r} is no number"
+            ) from None
     cell = Cell(**found)
     if cell.field not in FIELDS or not LENS.fullmatch(cell.lens):
         raise SystemExit(
@@ -109,9 +144,13 @@ def cell_of(name: str) -> Cell:
             "radial- of the first two and of stopF"
         )
     if cell.reader not in READERS:
-        raise SystemExit(f"cell {name!r}: reader = {cell.reader!r}: need one of {', '.join(READERS)}")
+        raise SystemExit(
+            f"cell {name!r}: reader = {cell.reader!r}: need one of {', '.join(READERS)}"
+        )
     if cell.reader == "network" and FIELDS[cell.field].share != (1.0, 1.0):
-        raise SystemExit(f"cell {name!r}: the network trains on the true image: need a field that is not held")
+        raise SystemExit(
+            f"cell {name!r}: the network trains on the true image: need a field that is not held"
+        )
     return cell
 
 

@@ -1,4 +1,5 @@
-"""The true image of a part of the field, and the rungs below it: PSFs held along one or both axes of the field.
+"""The true image of a part of the field, and the rungs below it: PSFs held along one or
+both axes of the field.
 
 angle   every window sees the PSFs of the middle of the field: one field angle
 line    the PSFs vary along x as they do in the whole field, and are those of the middle row everywhere
@@ -16,19 +17,25 @@ from codesign.optics import formed
 from codesign.optics.stack import OpticsConfig
 from metalens.image import Grid, Imager, imager
 
-HELD = 1e-3  # share of the field that a held axis keeps: a micrometre, over which no PSF changes
+# share of the field that a held axis keeps: a micrometre, over which no PSF changes
+HELD = 1e-3
 
 
 @dataclass(frozen=True)
 class Narrow(Grid):
-    """A grid whose field angles span shares (y, x) of what its samples span; all else is the grid's."""
+    """A grid whose field angles span shares (y, x) of what its samples span; all else
+    is the grid's.
+    """
 
     share: tuple[float, float] = (1.0, 1.0)
 
     @property
     def half_um(self) -> list[float]:
         """[y, x] from the middle of the field to its end."""
-        return [(n - 1) / 2 * self.step_um * share for n, share in zip(self.frame, self.share, strict=True)]
+        return [
+            (n - 1) / 2 * self.step_um * share
+            for n, share in zip(self.frame, self.share, strict=True)
+        ]
 
 
 def forms(share: tuple[float, float]) -> Forms:
@@ -37,9 +44,16 @@ def forms(share: tuple[float, float]) -> Forms:
         return formed.imager
 
     @torch.no_grad()
-    def narrow(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> Imager:
-        plane, grid = formed.optics_of(settings, coefficients_rad), formed.grid_of(settings, frame, margin)
-        held = Narrow(grid.samples, grid.step_um, grid.depths_um, grid.margin, grid.window, share)
+    def narrow(
+        settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
+    ) -> Imager:
+        plane, grid = (
+            formed.optics_of(settings, coefficients_rad),
+            formed.grid_of(settings, frame, margin),
+        )
+        held = Narrow(
+            grid.samples, grid.step_um, grid.depths_um, grid.margin, grid.window, share
+        )
         return imager(
             plane.wave,
             held,

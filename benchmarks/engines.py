@@ -1,8 +1,12 @@
-"""Two engines that share no code, the modal method and RCWA, on cells drawn at random: do they agree within their bars?
+"""Two engines that share no code, the modal method and RCWA, on cells drawn at random:
+do they agree within their bars?
 
-``python -m benchmarks engines`` draws 200 round pillars of each kind (an hour); ``python -m benchmarks.engines N
-[KIND ...]`` prints the table of fewer. t and r are compared, phases included. RCWA takes few orders, fixed: its bars
-are then wide, but the orders that a tolerance asks of strange cells take minutes. No times are taken.
+``python -m benchmarks engines`` draws 200 round pillars of each kind (an hour);
+``python -m benchmarks.engines N
+[KIND ...]`` prints the table of fewer. t and r are compared, phases included. RCWA
+takes few orders, fixed: its bars
+are then wide, but the orders that a tolerance asks of strange cells take minutes. No
+times are taken.
 """
 
 import math
@@ -28,10 +32,19 @@ def _ordinary(oblique: bool) -> Callable[[np.random.Generator], Drawn]:
 
     def draw(rng: np.random.Generator) -> Drawn:
         pitch, wavelength = rng.uniform(0.25, 0.5), rng.uniform(0.5, 1.2)
-        about = [Index(rng.uniform(*ends)) for ends in ((1.9, 3.7), (1.35, 1.8), (1.0, 1.3), (1.0, 1.3))]
+        about = [
+            Index(rng.uniform(*ends))
+            for ends in ((1.9, 3.7), (1.35, 1.8), (1.0, 1.3), (1.0, 1.3))
+        ]
         cell = Cell(pitch, rng.uniform(0.3, 1.1), *about)
         angle = rng.uniform(0.02, 0.6) if oblique else 0.0
-        return cell, pitch * rng.uniform(0.2, 0.85), wavelength, angle, str(rng.choice(["s", "p"])) if oblique else "x"
+        return (
+            cell,
+            pitch * rng.uniform(0.2, 0.85),
+            wavelength,
+            angle,
+            str(rng.choice(["s", "p"])) if oblique else "x",
+        )
 
     return draw
 
@@ -44,21 +57,40 @@ def _any(
     heights: tuple[float, float] = (0.05, 6.0),
     low_contrast: bool = False,
 ) -> Callable[[np.random.Generator], Drawn]:
-    """Cells far beyond those of lenses. angle: in rad. rarer: share of discs of the rarer medium.
+    """Cells far beyond those of lenses. angle: in rad. rarer: share of discs of the
+    rarer medium.
 
-    waves: of the denser medium in a pitch. heights: in pitches, evenly over their logarithm.
+    waves: of the denser medium in a pitch. heights: in pitches, evenly over their
+    logarithm.
     """
 
     def draw(rng: np.random.Generator) -> Drawn:
         pitch, thin = rng.uniform(0.2, 1.0), rng.uniform(1.0, 2.2)
-        dense = thin * math.sqrt(rng.uniform(1.02, 2.0)) if low_contrast else rng.uniform(thin, 4.2)
-        about = [Index(dense), Index(rng.uniform(1.2, 2.2)), Index(rng.uniform(1.0, 1.8)), Index(thin)]
+        dense = (
+            thin * math.sqrt(rng.uniform(1.02, 2.0))
+            if low_contrast
+            else rng.uniform(thin, 4.2)
+        )
+        about = [
+            Index(dense),
+            Index(rng.uniform(1.2, 2.2)),
+            Index(rng.uniform(1.0, 1.8)),
+            Index(thin),
+        ]
         if rng.uniform() < rarer:
             about = [about[3], *about[1:3], about[0]]
         height = pitch * float(np.exp(rng.uniform(*np.log(heights))))
         where = rng.uniform(*angle), str(rng.choice(["s", "p"]))
-        cell, wavelength = Cell(pitch, height, *about), pitch * dense / rng.uniform(*waves)
-        return cell, pitch * rng.uniform(0.04, 0.97), wavelength, *(where if where[0] else (0.0, "x"))
+        cell, wavelength = (
+            Cell(pitch, height, *about),
+            pitch * dense / rng.uniform(*waves),
+        )
+        return (
+            cell,
+            pitch * rng.uniform(0.04, 0.97),
+            wavelength,
+            *(where if where[0] else (0.0, "x")),
+        )
 
     return draw
 
@@ -79,7 +111,9 @@ KINDS = {
 
 
 def compared(kind: str, count: int, seed: int = SEED) -> dict[str, float]:
-    """Counts of one kind: cells, those that either engine refuses, those apart by more than both bars; medians."""
+    """Counts of one kind: cells, those that either engine refuses, those apart by more
+    than both bars; medians.
+    """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     shares: list[float] = []
     bars: list[tuple[float, float]] = []
@@ -87,11 +121,19 @@ def compared(kind: str, count: int, seed: int = SEED) -> dict[str, float]:
     for _ in range(count):
         cell, diameter, wavelength, angle, polarization = KINDS[kind](rng)
         turned = float(rng.integers(4) * math.pi / 2) if angle else 0.0
-        light = {"angle_rad": angle, "azimuth_rad": turned, "polarization": polarization}
+        light = {
+            "angle_rad": angle,
+            "azimuth_rad": turned,
+            "polarization": polarization,
+        }
         try:
             one = modal.solve(cell, diameter, wavelength, **light, tolerance=TOLERANCE)
-            two = rcwa.solve(cell, diameter, wavelength, **light, harmonics=HARMONICS[angle > 0])
-        except CellError:  # no zero order on one side, or elements that degenerate: refused, not wrong
+            two = rcwa.solve(
+                cell, diameter, wavelength, **light, harmonics=HARMONICS[angle > 0]
+            )
+        except (
+            CellError
+        ):  # no zero order on one side, or elements that degenerate: refused, not wrong
             refused += 1
             continue
         apart = max(abs(one.t - two.t), abs(one.r - two.r))
@@ -131,4 +173,6 @@ def _row(kind: str, found: dict[str, float]) -> Row:
 if __name__ == "__main__":
     from benchmarks.__main__ import table
 
-    sys.stdout.write(table(list(rows(int(sys.argv[1]), tuple(sys.argv[2:]) or tuple(KINDS)))) + "\n")
+    sys.stdout.write(
+        table(list(rows(int(sys.argv[1]), tuple(sys.argv[2:]) or tuple(KINDS)))) + "\n"
+    )

@@ -1,10 +1,16 @@
-"""Cells of any shape, lattice and section against fmmax, which shares no code: do both agree within their bars?
+"""Cells of any shape, lattice and section against fmmax, which shares no code: do both
+agree within their bars?
 
-``python -m benchmarks engines_shapes --peers`` (in the environment of ``make bench-peers``) draws 200 cells of each
-kind (half an hour); ``python -m benchmarks.engines_shapes N [SEED [KIND ...]]`` prints the table of fewer. All four
-numbers of t and of r are compared, phases included. Ours: few orders, fixed. fmmax has no bars: it is given ``FACTOR``
-times what its last truncation changes, and ``RASTER`` for its pixels, which are filled by the shapes' definitions
-here. A section with a tilted wall is a staircase there, and its bar so much wider. No times are taken.
+``python -m benchmarks engines_shapes --peers`` (in the environment of ``make
+bench-peers``) draws 200 cells of each
+kind (half an hour); ``python -m benchmarks.engines_shapes N [SEED [KIND ...]]`` prints
+the table of fewer. All four
+numbers of t and of r are compared, phases included. Ours: few orders, fixed. fmmax has
+no bars: it is given ``FACTOR``
+times what its last truncation changes, and ``RASTER`` for its pixels, which are filled
+by the shapes' definitions
+here. A section with a tilted wall is a staircase there, and its bar so much wider. No
+times are taken.
 """
 
 import dataclasses
@@ -20,17 +26,34 @@ from benchmarks import Row
 from benchmarks.shaped_cells import Drawn, fitting
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
-from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Polygon,
+    Rectangle,
+    RegularPolygon,
+    Ring,
+    Square,
+)
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 
 COUNT, SEED = 200, 9377
-HARMONICS = {4: 9, 2: 8, 1: 7}  # of ours, by the last truncation that it would take by itself
+HARMONICS = {
+    4: 9,
+    2: 8,
+    1: 7,
+}  # of ours, by the last truncation that it would take by itself
 TERMS = (49, 97)  # of fmmax
 FACTOR = 3.0
 STEPS = (3, 6)  # of a tilted wall
 PIXELS, FINE, RASTER = 72, (55, 34), 1e-3  # and what the raster may leave
-HEXAGONAL, WIDE, FLAT = Lattice("hexagonal"), Lattice("rectangular", 1.3), Lattice("rectangular", 0.8)
+HEXAGONAL, WIDE, FLAT = (
+    Lattice("hexagonal"),
+    Lattice("rectangular", 1.3),
+    Lattice("rectangular", 0.8),
+)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.55)))
 
 
@@ -38,21 +61,35 @@ Shaped = Callable[[np.random.Generator], Any]
 
 
 def _kind(
-    shape: Shaped, lattices: tuple[Lattice, ...] = (Lattice(),), *, light: str = "normal", **how: Any
+    shape: Shaped,
+    lattices: tuple[Lattice, ...] = (Lattice(),),
+    *,
+    light: str = "normal",
+    **how: Any,
 ) -> Callable[[np.random.Generator], Drawn]:
-    """Cells of a shape, wider than lenses have them: index 1.4 to 4, 0.3 to 1.6 waves in a pitch, flat to tall.
+    """Cells of a shape, wider than lenses have them: index 1.4 to 4, 0.3 to 1.6 waves
+    in a pitch, flat to tall.
 
-    light: normal, axis (oblique along x or y), or any (any azimuth). how: see ``_cell``.
+    light: normal, axis (oblique along x or y), or any (any azimuth). how: see
+    ``_cell``.
     """
 
     def draw(rng: np.random.Generator) -> Drawn:
         pitch = float(rng.uniform(0.25, 0.7))
-        cell = _cell(rng, pitch, shape(rng), lattices[int(rng.integers(len(lattices)))], **how)
+        cell = _cell(
+            rng, pitch, shape(rng), lattices[int(rng.integers(len(lattices)))], **how
+        )
         wavelength = pitch * cell.substrate.n / rng.uniform(0.4, 1.3)  # type: ignore[union-attr]
         angle = 0.0 if light == "normal" else float(rng.uniform(0.03, 1.0))
-        azimuth = float(rng.uniform(-3.1, 3.1) if light == "any" else rng.integers(4) * math.pi / 2)
+        azimuth = float(
+            rng.uniform(-3.1, 3.1) if light == "any" else rng.integers(4) * math.pi / 2
+        )
         return Drawn(
-            cell, fitting(cell, pitch * rng.uniform(0.2, 0.9), 0.03), wavelength, angle, azimuth if angle else 0.0
+            cell,
+            fitting(cell, pitch * rng.uniform(0.2, 0.9), 0.03),
+            wavelength,
+            angle,
+            azimuth if angle else 0.0,
         )
 
     return draw
@@ -80,12 +117,31 @@ def _cell(
     heights = rng.uniform(0.1, 0.3, 3) * (1.0, 3.0, 0.6) * pitch
     if layered:
         layers = (
-            Layer(heights[0], grow_um=0.1 * pitch * rng.uniform(), material=Index(rng.uniform(1.4, 2.4))),
+            Layer(
+                heights[0],
+                grow_um=0.1 * pitch * rng.uniform(),
+                material=Index(rng.uniform(1.4, 2.4)),
+            ),
             Layer(heights[1], coat_um=0.04 * pitch, coat=Index(rng.uniform(1.5, 2.4))),
-            Layer(heights[2], grow_um=-0.05 * pitch * rng.uniform(), material=Index(rng.uniform(1.5, 3.0), 0.1)),
+            Layer(
+                heights[2],
+                grow_um=-0.05 * pitch * rng.uniform(),
+                material=Index(rng.uniform(1.5, 3.0), 0.1),
+            ),
         )
-        films = {"under": (Film(Index(2.1), 0.1 * pitch),), "over": (Film(Index(1.6), 0.2 * pitch),)}
-        return Cell(pitch, float(sum(heights)), **about, shape=shape, lattice=lattice, layers=layers, **films)
+        films = {
+            "under": (Film(Index(2.1), 0.1 * pitch),),
+            "over": (Film(Index(1.6), 0.2 * pitch),),
+        }
+        return Cell(
+            pitch,
+            float(sum(heights)),
+            **about,
+            shape=shape,
+            lattice=lattice,
+            layers=layers,
+            **films,
+        )
     tilt = {"sidewall_rad": float(rng.uniform(-0.06, 0.12))} if tilted else {}
     height = pitch * (rng.uniform(0.3, 1.0) if tilted else 2 ** rng.uniform(-4, 2))
     return Cell(pitch, height, **about, shape=shape, lattice=lattice, **tilt)
@@ -102,9 +158,14 @@ SHAPES: dict[str, Shaped] = {
     "ellipses": lambda rng: Ellipse(rng.uniform(0.3, 0.95), _turned(rng)),
     "rings": lambda rng: Ring(rng.uniform(0.25, 0.75)),
     "crosses": lambda rng: Cross(rng.uniform(0.25, 0.6), _turned(rng)),
-    "polygons": lambda rng: [RegularPolygon(int(rng.integers(3, 9)), _turned(rng)), TRIANGLE][rng.uniform() < 0.2],
+    "polygons": lambda rng: [
+        RegularPolygon(int(rng.integers(3, 9)), _turned(rng)),
+        TRIANGLE,
+    ][rng.uniform() < 0.2],
 }
-HOLES = tuple(SHAPES[name] for name in ("circles", "squares", "rectangles", "ellipses", "crosses"))
+HOLES = tuple(
+    SHAPES[name] for name in ("circles", "squares", "rectangles", "ellipses", "crosses")
+)
 
 
 def _one_of(shapes: tuple[Shaped, ...], *, hole: bool = False) -> Shaped:
@@ -115,11 +176,17 @@ def _one_of(shapes: tuple[Shaped, ...], *, hole: bool = False) -> Shaped:
     return draw
 
 
-ANY, GROWING = _one_of(tuple(SHAPES.values())), _one_of(tuple(SHAPES[n] for n in SHAPES if n != "polygons"))
+ANY, GROWING = (
+    _one_of(tuple(SHAPES.values())),
+    _one_of(tuple(SHAPES[n] for n in SHAPES if n != "polygons")),
+)
 KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     **{name: _kind(shape) for name, shape in SHAPES.items() if name != "circles"},
     "holes": _kind(_one_of(HOLES, hole=True)),
-    "hexagonal lattice": _kind(_one_of((SHAPES["circles"], SHAPES["ellipses"], SHAPES["rectangles"])), (HEXAGONAL,)),
+    "hexagonal lattice": _kind(
+        _one_of((SHAPES["circles"], SHAPES["ellipses"], SHAPES["rectangles"])),
+        (HEXAGONAL,),
+    ),
     "rectangular lattice": _kind(ANY, (WIDE, FLAT)),
     "in layers, films": _kind(GROWING, layered=True),
     "tilted walls": _kind(GROWING, tilted=True),
@@ -130,9 +197,13 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
 
 
 def raster(cell: Cell, size_um: float, grow_um: float) -> Array:
-    """Share of every pixel of the primitive cell, pitch 1, that the section covers: from the definitions of shapes."""
+    """Share of every pixel of the primitive cell, pitch 1, that the section covers:
+    from the definitions of shapes.
+    """
     count, generator = FINE
-    k = np.arange(count)  # points of a pixel: a lattice of rank 1, no two in a row or column
+    k = np.arange(
+        count
+    )  # points of a pixel: a lattice of rank 1, no two in a row or column
     i = (np.arange(PIXELS)[:, None, None] + (k + 0.5) / count) / PIXELS
     j = (np.arange(PIXELS)[:, None] + (generator * k % count + 0.5) / count) / PIXELS
     u, v = primitive(cell.lattice)
@@ -141,7 +212,9 @@ def raster(cell: Cell, size_um: float, grow_um: float) -> Array:
     size, grow = size_um / cell.pitch_um, grow_um / cell.pitch_um
     for a in (-1, 0):  # sites at the corners; no section reaches further
         for b in (-1, 0):
-            inside |= within(cell.shape, size, grow, x + a * u[0] + b * v[0], y + a * u[1] + b * v[1])
+            inside |= within(
+                cell.shape, size, grow, x + a * u[0] + b * v[0], y + a * u[1] + b * v[1]
+            )
     return np.asarray(inside.mean(axis=2))
 
 
@@ -171,14 +244,26 @@ def within(shape: Any, size: float, grow: float, x: Array, y: Array) -> Array:
     if isinstance(shape, RegularPolygon):
         apothem = size / 2 * math.cos(math.pi / shape.sides) + grow / 2
         faces = (2 * np.arange(shape.sides) + 1) * math.pi / shape.sides
-        return np.all([x * math.cos(f) + y * math.sin(f) < apothem for f in faces], axis=0)
+        return np.all(
+            [x * math.cos(f) + y * math.sin(f) < apothem for f in faces], axis=0
+        )
     corners = size * np.array(shape.corners)
-    edges = np.roll(corners, -1, axis=0) - corners  # anticlockwise and convex, as ``TRIANGLE`` is
-    return np.all([e[0] * (y - p[1]) - e[1] * (x - p[0]) > 0 for p, e in zip(corners, edges, strict=True)], axis=0)
+    edges = (
+        np.roll(corners, -1, axis=0) - corners
+    )  # anticlockwise and convex, as ``TRIANGLE`` is
+    return np.all(
+        [
+            e[0] * (y - p[1]) - e[1] * (x - p[0]) > 0
+            for p, e in zip(corners, edges, strict=True)
+        ],
+        axis=0,
+    )
 
 
 def slabs(one: Drawn, steps: int) -> tuple[list[Array], list[float]]:
-    """Permittivities on the raster and heights in pitches, foot first; films and half-spaces are left out."""
+    """Permittivities on the raster and heights in pitches, foot first; films and
+    half-spaces are left out.
+    """
     cell, foot, found, heights = one.cell, 0.0, [], []
     for layer in cell.sections:
         pieces = steps if cell.sidewall_rad else 1
@@ -194,14 +279,21 @@ def slabs(one: Drawn, steps: int) -> tuple[list[Array], list[float]]:
 def permittivity(one: Drawn, layer: Layer, grow_um: float) -> Array:
     """Of one section, on the raster."""
     cell = one.cell
-    pillar, around = (_square(a or b) for a, b in ((layer.material, cell.pillar), (layer.between, cell.between)))
+    pillar, around = (
+        _square(a or b)
+        for a, b in ((layer.material, cell.pillar), (layer.between, cell.between))
+    )
     if cell.shape.hole:
         pillar, around = around, pillar
     solid = raster(cell, one.size_um, grow_um)
     if layer.coat is None:
         return around + (pillar - around) * solid
     coated = raster(cell, one.size_um, grow_um + 2 * layer.coat_um)
-    return around + (_square(layer.coat) - around) * coated + (pillar - _square(layer.coat)) * solid
+    return (
+        around
+        + (_square(layer.coat) - around) * coated
+        + (pillar - _square(layer.coat)) * solid
+    )
 
 
 def _square(material: Any) -> complex:
@@ -210,7 +302,9 @@ def _square(material: Any) -> complex:
 
 @functools.cache
 def _compiled(lattice: Lattice, terms: int) -> Callable[..., Any]:
-    """The scattering matrix of fmmax for lengths in pitches, compiled: zero-order (Hx, Hy) blocks of t and r."""
+    """The scattering matrix of fmmax for lengths in pitches, compiled: zero-order (Hx,
+    Hy) blocks of t and r.
+    """
     import fmmax
     import jax
 
@@ -246,10 +340,17 @@ def fmmax_both(one: Drawn, terms: int, steps: int) -> Array:
     cell, pitch = one.cell, one.cell.pitch_um
     inner, heights = slabs(one, steps)
     films = [
-        [(np.full((1, 1), _square(f.material)), f.thickness_um / pitch) for f in s] for s in (cell.under, cell.over)
+        [(np.full((1, 1), _square(f.material)), f.thickness_um / pitch) for f in s]
+        for s in (cell.under, cell.over)
     ]
     ends = [np.full((1, 1), _square(m)) for m in (cell.substrate, cell.cover)]
-    eps = [ends[0], *(e for e, _ in films[0]), *inner, *(e for e, _ in films[1]), ends[1]]
+    eps = [
+        ends[0],
+        *(e for e, _ in films[0]),
+        *inner,
+        *(e for e, _ in films[1]),
+        ends[1],
+    ]
     thick = [0.0, *(h for _, h in films[0]), *heights, *(h for _, h in films[1]), 0.0]
     wavelength, sine = one.wavelength_um / pitch, math.sin(one.angle_rad)
     along = np.array([math.cos(one.azimuth_rad), math.sin(one.azimuth_rad)])
@@ -259,15 +360,20 @@ def fmmax_both(one: Drawn, terms: int, steps: int) -> Array:
         tuple(jnp.asarray(e, dtype=complex) for e in eps),
         tuple(jnp.asarray(h) for h in thick),
     )
-    below, above = (_amplitudes(complex(e[0, 0]).real, sine, along, bool(one.angle_rad)) for e in ends)
+    below, above = (
+        _amplitudes(complex(e[0, 0]).real, sine, along, bool(one.angle_rad))
+        for e in ends
+    )
     back = np.linalg.inv(below)
     return np.stack([above @ np.asarray(t) @ back, -below @ np.asarray(r) @ back])
 
 
 def _amplitudes(eps: float, sine: float, along: Array, oblique: bool) -> Array:
-    """(2, 2): from tangential (Hx, Hy) of a forward wave to power-normalised amplitudes, signs those of the field E.
+    """(2, 2): from tangential (Hx, Hy) of a forward wave to power-normalised
+    amplitudes, signs those of the field E.
 
-    With k the plane of incidence and s = z x k: E_s = -H_k / kz, E_k = kz H_s / eps (lengths over k0).
+    With k the plane of incidence and s = z x k: E_s = -H_k / kz, E_k = kz H_s / eps
+    (lengths over k0).
     """
     kz = math.sqrt(eps - sine**2)
     s = np.array([-along[1], along[0]])
@@ -277,7 +383,9 @@ def _amplitudes(eps: float, sine: float, along: Array, oblique: bool) -> Array:
 
 def shares(one: Drawn) -> tuple[float, float, float]:
     """|difference| over the sum of both bars, the largest of t and r; both bars."""
-    most = rcwa.most_harmonics(one.cell, one.size_um, angle_rad=one.angle_rad, azimuth_rad=one.azimuth_rad)
+    most = rcwa.most_harmonics(
+        one.cell, one.size_um, angle_rad=one.angle_rad, azimuth_rad=one.azimuth_rad
+    )
     harmonics = HARMONICS[{15: 4, 10: 2, 7: 1}[most]]
     ours = one.jones(harmonics=harmonics)
     tilted = bool(one.cell.sidewall_rad)
@@ -312,7 +420,9 @@ def compared(kind: str, count: int, seed: int = SEED) -> dict[str, float]:
     }
 
 
-def peer_rows(count: int = COUNT, seed: int = SEED, kinds: tuple[str, ...] = tuple(KINDS)) -> list[Row]:
+def peer_rows(
+    count: int = COUNT, seed: int = SEED, kinds: tuple[str, ...] = tuple(KINDS)
+) -> list[Row]:
     """One row a kind."""
     return [_row(kind, compared(kind, count, seed)) for kind in kinds]
 
@@ -333,4 +443,7 @@ if __name__ == "__main__":
     from benchmarks.__main__ import table
 
     numbers = [int(word) for word in sys.argv[1:3]]
-    sys.stdout.write(table(peer_rows(*numbers, *([tuple(sys.argv[3:])] if sys.argv[3:] else []))) + "\n")  # type: ignore[arg-type]
+    sys.stdout.write(
+        table(peer_rows(*numbers, *([tuple(sys.argv[3:])] if sys.argv[3:] else [])))
+        + "\n"
+    )  # type: ignore[arg-type]

@@ -1,13 +1,18 @@
-"""The virtual experiment of the paper's Sec. 5: best focus, mid-range, asphere, jointly trained lens of one network.
+"""The virtual experiment of the paper's Sec. 5: best focus, mid-range, asphere, jointly
+trained lens of one network.
 
-    python -m benchmarks.experiment train NAME --seed 0 --work DIR  # NAME: of LENSES; resumes
+    python -m benchmarks.experiment train NAME --seed 0 --work DIR  # NAME: of LENSES;
+    resumes
     python -m benchmarks.experiment run --work DIR                  # of the runs there, beside the kept ones of others
 
-Trained and judged on the true image: a field of ±25 degrees in light of 30 nm. Gaze is calibrated on stimuli drawn at
-random, or with ``--points spread`` on as many spread over the field. Networks of another seed have other weights,
+Trained and judged on the true image: a field of ±25 degrees in light of 30 nm. Gaze is
+calibrated on stimuli drawn at
+random, or with ``--points spread`` on as many spread over the field. Networks of
+another seed have other weights,
 frames and noise; the subjects are the same.
 
-``python -m benchmarks experiment`` shows what was kept, and times the experiment itself on small untrained networks.
+``python -m benchmarks experiment`` shows what was kept, and times the experiment itself
+on small untrained networks.
 """
 
 import argparse
@@ -32,7 +37,8 @@ RESULT = Path(__file__).parent / "results" / "experiment_study.json"
 WIDE = Recipe(
     focus_mm=33.0,
     pitch_um=12.0,
-    edge_um=1872.0,  # 20 mm at the eye: the pupil stays in the image at every stimulus and slippage
+    # 20 mm at the eye: the pupil stays in the image at every stimulus and slippage
+    edge_um=1872.0,
     steps=4000,
     batch=8,
     pool=12288,
@@ -44,12 +50,16 @@ WIDE = Recipe(
     fwhm_nm=30.0,
 )
 ASPHERE = experiment_asphere.kept()
-STANDING = replace(WIDE, focus_mm=ASPHERE["focus_mm"], asphere_rad=tuple(ASPHERE["coefficients_rad"]))
+STANDING = replace(
+    WIDE, focus_mm=ASPHERE["focus_mm"], asphere_rad=tuple(ASPHERE["coefficients_rad"])
+)
 LENSES = {
     "bestfocus": WIDE,
     "midrange": replace(WIDE, focus_mm=20.0),
     "asphere": STANDING,
-    "codesigned": replace(STANDING, moves=True),  # from the designer's lens: the best start there is
+    "codesigned": replace(
+        STANDING, moves=True
+    ),  # from the designer's lens: the best start there is
 }
 QUANTITIES = (
     "gaze_axial_deg",
@@ -65,7 +75,9 @@ QUANTITIES = (
 
 
 def rows() -> list[Row]:
-    """Time of the experiment on untrained networks, and the kept result of trained ones."""
+    """Time of the experiment on untrained networks, and the kept result of trained
+    ones.
+    """
     with tempfile.TemporaryDirectory() as folder:
         finished(Path(folder) / "run", replace(LENSES["midrange"], steps=1, pool=64))
         source = retraining.load(Path(folder) / "run")
@@ -87,20 +99,43 @@ def rows() -> list[Row]:
     ]
     if RESULT.is_file():
         for points, found in json.loads(RESULT.read_text("utf-8")).items():
-            out += [row for name, seeds in found.items() for row in _kept(name, points, seeds, found)]
+            out += [
+                row
+                for name, seeds in found.items()
+                for row in _kept(name, points, seeds, found)
+            ]
     return out
 
 
-def _kept(name: str, points: str, seeds: dict[str, Any], all_lenses: dict[str, Any]) -> list[Row]:
-    """Means over the seeds of one lens, and its ratio to the mid-range lens of the same seeds."""
+def _kept(
+    name: str, points: str, seeds: dict[str, Any], all_lenses: dict[str, Any]
+) -> list[Row]:
+    """Means over the seeds of one lens, and its ratio to the mid-range lens of the same
+    seeds.
+    """
     out = []
     for quantity in (q for q in QUANTITIES if all(q in of for of in seeds.values())):
         case = f"{quantity}, {name}, {points} points"
         found = over_seeds(seeds, quantity)
-        out.append(Row(case, f"{found.seeds} seeds", float("nan"), found.mean, f"truth: {found}"))
+        out.append(
+            Row(
+                case,
+                f"{found.seeds} seeds",
+                float("nan"),
+                found.mean,
+                f"truth: {found}",
+            )
+        )
         if name != "midrange" and set(seeds) & set(all_lenses.get("midrange", {})):
-            to = ratio(*({int(s): of[quantity] for s, of in lens.items()} for lens in (seeds, all_lenses["midrange"])))
-            out.append(Row(case, "to mid-range", float("nan"), to.mean, f"paired seeds: {to}"))
+            to = ratio(
+                *(
+                    {int(s): of[quantity] for s, of in lens.items()}
+                    for lens in (seeds, all_lenses["midrange"])
+                )
+            )
+            out.append(
+                Row(case, "to mid-range", float("nan"), to.mean, f"paired seeds: {to}")
+            )
     return out
 
 
@@ -110,7 +145,9 @@ def over_seeds(seeds: dict[str, Any], quantity: str) -> Interval:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("train", "run"))
     parser.add_argument("name", nargs="?", choices=tuple(LENSES))
     parser.add_argument("--work", type=Path, required=True)
@@ -125,17 +162,27 @@ def main() -> None:
         return
     folders = sorted(f.parent for f in given.work.glob("*-*/result.json"))
     kept = json.loads(RESULT.read_text("utf-8")) if RESULT.is_file() else {}
-    kept[given.points] = kept.get(given.points, {}) | _shown(given.work, given.points, folders)
+    kept[given.points] = kept.get(given.points, {}) | _shown(
+        given.work, given.points, folders
+    )
     store.write_text(RESULT, json.dumps(kept, indent=1) + "\n")
 
 
-def _shown(work: Path, points: Points, folders: list[Path]) -> dict[str, dict[str, Any]]:
-    """{lens: {seed: numbers of its run}} of one way to calibrate; every run sees the same frames."""
+def _shown(
+    work: Path, points: Points, folders: list[Path]
+) -> dict[str, dict[str, Any]]:
+    """{lens: {seed: numbers of its run}} of one way to calibrate; every run sees the
+    same frames.
+    """
     from codesign.commands import experiment as command_experiment
 
     out, settings = work / f"experiment_{points}", ExperimentConfig(points=points)
     names = tuple(folder.name for folder in folders)
-    command_experiment.run(command_experiment.Options(tuple(folders), out, names=names, settings=settings, force=True))
+    command_experiment.run(
+        command_experiment.Options(
+            tuple(folders), out, names=names, settings=settings, force=True
+        )
+    )
     found: dict[str, dict[str, Any]] = {}
     for row in json.loads((out / command_experiment.JSON).read_text("utf-8"))["runs"]:
         name, seed = row.pop("name").rsplit("-", 1)

@@ -1,8 +1,12 @@
-"""``python -m benchmarks.figures``: the table of the README, written anew from the result files.
+"""``python -m benchmarks.figures``: the table of the README, written anew from the
+result files.
 
-figures.md holds the table with a reference in the place of each figure, ``{file; words; key; digits}``: the file of
-benchmarks/results, words that each appear in the row's case, method, goal or "N threads" (the row must be the only
-one), the column (or an expression that finds the figure in those words), and how it is written: a count of digits,
+figures.md holds the table with a reference in the place of each figure, ``{file; words;
+key; digits}``: the file of
+benchmarks/results, words that each appear in the row's case, method, goal or "N
+threads" (the row must be the only
+one), the column (or an expression that finds the figure in those words), and how it is
+written: a count of digits,
 ``ms``, ``GB`` (of a column in MB), ``%``, ``rate`` (one over it) or ``text``.
 """
 
@@ -11,7 +15,11 @@ import re
 from pathlib import Path
 
 HERE = Path(__file__).parent
-README, TEMPLATE, RESULTS = HERE.parent / "README.md", HERE / "figures.md", HERE / "results"
+README, TEMPLATE, RESULTS = (
+    HERE.parent / "README.md",
+    HERE / "figures.md",
+    HERE / "results",
+)
 SENTENCES = (  # of the README's text, beside its table
     "{characterize_study; peak 8000 e & Cramér-Rao; error; 3} times the\nCramér-Rao bound",
     "| the fit of a 1 mm lens in 8 s | {characterize; fit & rms; seconds; 2} s |",
@@ -26,16 +34,22 @@ REFERENCE = re.compile(r"\{([^;{}]+); ([^;{}]+); ([^;{}]+); ([^;{}]+)\}")
 
 
 def filled(text: str) -> str:
-    """``text`` with the figure in the place of each reference; LookupError names a reference that finds none or two."""
+    """``text`` with the figure in the place of each reference; LookupError names a
+    reference that finds none or two.
+    """
     return REFERENCE.sub(lambda found: _figure(*found.groups()), text)
 
 
 def _figure(file: str, words: str, key: str, form: str) -> str:
     rows = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8"))["rows"]
-    fitting = [row for row in rows if all(word in _words(row) for word in words.split(" & "))]
+    fitting = [
+        row for row in rows if all(word in _words(row) for word in words.split(" & "))
+    ]
     fitting = _exact(fitting, words)
     if len(fitting) != 1:
-        raise LookupError(f"{file}.json has {len(fitting)} rows for {words!r}; benchmarks/figures.md needs one")
+        raise LookupError(
+            f"{file}.json has {len(fitting)} rows for {words!r}; benchmarks/figures.md needs one"
+        )
     row = fitting[0]
     if key in row:
         return _written(float(row[key]), form)
@@ -46,11 +60,16 @@ def _figure(file: str, words: str, key: str, form: str) -> str:
 
 
 def _words(row: dict[str, object]) -> str:
-    return " | ".join(str(row[key]) for key in ("case", "method", "against", "goal")) + f" | {row['threads']} threads"
+    return (
+        " | ".join(str(row[key]) for key in ("case", "method", "against", "goal"))
+        + f" | {row['threads']} threads"
+    )
 
 
 def _exact(rows: list[dict[str, object]], words: str) -> list[dict[str, object]]:
-    """Of several rows the one whose method or case is one of the words whole: ``fit`` beside ``fit, with gradient``."""
+    """Of several rows the one whose method or case is one of the words whole: ``fit``
+    beside ``fit, with gradient``.
+    """
     whole = [row for row in rows if row["method"] in words.split(" & ")]
     return whole if len(rows) > 1 and whole else rows
 

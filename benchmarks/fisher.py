@@ -1,4 +1,6 @@
-"""Axial information: honest against coarse, lens against lens, and the cost of a design step."""
+"""Axial information: honest against coarse, lens against lens, and the cost of a design
+step.
+"""
 
 import json
 import time
@@ -25,11 +27,16 @@ FRONTIER = Path(__file__).parents[1] / "docs" / "fisher" / "frontier.json"
 PUPIL = Pupil(nodes=160)
 FOCUS = Focus(PUPIL.wavelength_um, PUPIL.sensor_distance_um, 20e3)
 DEPTHS = torch.arange(16e3, 26.01e3, 1e3, dtype=torch.float64)
-HONEST = {"hyperbolic 20 mm": (0.24, 0.09, 0.045), "double helix, 2 zones": (0.29, 0.089, 0.04)}
+HONEST = {
+    "hyperbolic 20 mm": (0.24, 0.09, 0.045),
+    "double helix, 2 zones": (0.29, 0.089, 0.04),
+}
 
 
 def rows() -> list[Row]:
-    """Rows of this topic; ``error`` of a lens is against the values measured apart, in a paraxial model."""
+    """Rows of this topic; ``error`` of a lens is against the values measured apart, in
+    a paraxial model.
+    """
     flat = torch.zeros(160, 160, dtype=torch.float64)
     x, y = (a.numpy() for a in pupil.coordinates(PUPIL))
     helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
@@ -42,7 +49,16 @@ def rows() -> list[Row]:
             seconds, value = time.perf_counter() - start, float(made.information.mean())
             want = HONEST[name][k]
             goal = f"I(z) {value:.3f} per mm², energy {float(made.encircled.min()):.2f} or more"
-            out.append(Row(name, f"honest, {binning} x {binning}", seconds, abs(value / want - 1), "apart", goal=goal))
+            out.append(
+                Row(
+                    name,
+                    f"honest, {binning} x {binning}",
+                    seconds,
+                    abs(value / want - 1),
+                    "apart",
+                    goal=goal,
+                )
+            )
     out.append(_coarse(helix))
     out.append(_step(flat))
     return [*out, *_tuned(), _designed(), _exploited(), _full_size(), *_frontier()]
@@ -50,16 +66,26 @@ def rows() -> list[Row]:
 
 def _coarse(phase: torch.Tensor) -> Row:
     near, far = (
-        pupil.psf(phase, PUPIL, depths_um=d, focus_um=20e3, sample_um=3.0, samples=48) for d in (DEPTHS, DEPTHS + 200)
+        pupil.psf(phase, PUPIL, depths_um=d, focus_um=20e3, sample_um=3.0, samples=48)
+        for d in (DEPTHS, DEPTHS + 200)
     )
     setting = dict(step_um=200.0, sample_um=3.0, pixel_um=3.0, normalisation="l2")
     claimed = float(fisher.pixel_information(near, far, **setting).mean())  # type: ignore[arg-type]
     asked = Fisher().about(FOCUS, PUPIL.radius_um)
-    honest = float(design_fisher.score(phase, PUPIL, focus_um=20e3, settings=asked).information.mean())
+    honest = float(
+        design_fisher.score(
+            phase, PUPIL, focus_um=20e3, settings=asked
+        ).information.mean()
+    )
     seconds = fastest(lambda: fisher.pixel_information(near, far, **setting))  # type: ignore[arg-type]
     goal = f"claims {claimed:.2f}, has {honest:.2f}"
     return Row(
-        "double helix, 2 zones", "sampled every 3 um, one position", seconds, claimed / honest - 1, "honest", goal=goal
+        "double helix, 2 zones",
+        "sampled every 3 um, one position",
+        seconds,
+        claimed / honest - 1,
+        "honest",
+        goal=goal,
     )
 
 
@@ -71,7 +97,13 @@ def _step(flat: torch.Tensor) -> Row:
         stack = pupil.psf(phase, PUPIL, depths_um=depths, focus_um=20e3)
         (stack**2).sum().backward()
 
-    return Row("21 depths, forward and gradient", "pupil model, 160² nodes", fastest(work), float("nan"), "-")
+    return Row(
+        "21 depths, forward and gradient",
+        "pupil model, 160² nodes",
+        fastest(work),
+        float("nan"),
+        "-",
+    )
 
 
 def _tuned() -> list[Row]:
@@ -79,20 +111,46 @@ def _tuned() -> list[Row]:
     out = []
     for binning in (1, 2, 3):
         start = time.perf_counter()
-        pair = baselines.tuned_pair(PUPIL, Fisher(pixel_um=3.0 * binning).about(FOCUS, PUPIL.radius_um))
+        pair = baselines.tuned_pair(
+            PUPIL, Fisher(pixel_um=3.0 * binning).about(FOCUS, PUPIL.radius_um)
+        )
         seconds = time.perf_counter() - start
-        goal = "; ".join(f"{b.name}: {b.information:.3f} per mm², energy {b.encircled:.2f}" for b in pair)
-        out.append(Row("tuned baselines", f"{binning} x {binning}", seconds, NONE, "-", goal=goal))
+        goal = "; ".join(
+            f"{b.name}: {b.information:.3f} per mm², energy {b.encircled:.2f}"
+            for b in pair
+        )
+        out.append(
+            Row(
+                "tuned baselines",
+                f"{binning} x {binning}",
+                seconds,
+                NONE,
+                "-",
+                goal=goal,
+            )
+        )
     return out
 
 
 def _designed() -> Row:
     """One start of the default design, of the three that the command takes."""
     start = time.perf_counter()
-    made = design_fisher.optimise(PUPIL, Fisher(starts=1, pixel_um=6.0).about(FOCUS, PUPIL.radius_um))
-    found, energy = float(made.score.information.mean()), float(made.score.encircled.min())
+    made = design_fisher.optimise(
+        PUPIL, Fisher(starts=1, pixel_um=6.0).about(FOCUS, PUPIL.radius_um)
+    )
+    found, energy = (
+        float(made.score.information.mean()),
+        float(made.score.encircled.min()),
+    )
     goal = f"I(z) {found:.3f} per mm², energy {energy:.2f}; asked 1.7 x the tuned 0.115"
-    return Row("free form, 2 x 2", "one start of the default design", time.perf_counter() - start, NONE, "-", goal=goal)
+    return Row(
+        "free form, 2 x 2",
+        "one start of the default design",
+        time.perf_counter() - start,
+        NONE,
+        "-",
+        goal=goal,
+    )
 
 
 def _exploited() -> Row:
@@ -136,10 +194,21 @@ def _frontier() -> list[Row]:
     out = []
     for k, binning in enumerate((1, 2, 3)):
         best = max(b["information"][k] for b in values["baselines"].values())
-        kept = {name: d for name, d in values["designs"].items() if d["encircled"] >= 0.4995}
+        kept = {
+            name: d for name, d in values["designs"].items() if d["encircled"] >= 0.4995
+        }
         name = max(kept, key=lambda n: kept[n]["information"][k])
         value = kept[name]["information"][k]
         times = f"{value / best:.2f} x the better tuned baseline ({best:.3f})"
         goal = f"{value:.3f} per mm², {times}; asked {ASKED[k]} x, goal 2 x"
-        out.append(Row(f"frontier, {binning} x {binning}", f"free form {name}", NONE, NONE, "-", goal=goal))
+        out.append(
+            Row(
+                f"frontier, {binning} x {binning}",
+                f"free form {name}",
+                NONE,
+                NONE,
+                "-",
+                goal=goal,
+            )
+        )
     return out

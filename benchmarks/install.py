@@ -1,8 +1,10 @@
-"""A fresh install of the wheel with each extra: time, size on disk, and whether its part of the chain runs.
+"""A fresh install of the wheel with each extra: time, size on disk, and whether its
+part of the chain runs.
 
     python -m benchmarks install        # some ten minutes: downloads and unpacks torch, OpenCV and a CAD kernel
 
-Each extra gets an environment of its own, without this folder in sight. The error counts its commands that fail.
+Each extra gets an environment of its own, without this folder in sight. The error
+counts its commands that fail.
 """
 
 import os
@@ -28,13 +30,23 @@ EXTRAS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "view lens.h5",
         ),
     ),
-    "optics": (("cv2", "OCP"), ("design design.toml -o lens.h5", "psf lens.h5 -o psf.h5 --tolerance 1e-3")),
+    "optics": (
+        ("cv2", "OCP"),
+        ("design design.toml -o lens.h5", "psf lens.h5 -o psf.h5 --tolerance 1e-3"),
+    ),
     "bench": (
         ("OCP",),
-        ("design design.toml -o lens.h5", "capture lens.h5 --truth truth.toml -o shots", "measure shots -o measured"),
+        (
+            "design design.toml -o lens.h5",
+            "capture lens.h5 --truth truth.toml -o shots",
+            "measure shots -o measured",
+        ),
     ),
     "codesign": (("OCP",), ("scene -o scene",)),
-    "cad": (("torch",), ("design design.toml -o lens.h5", "layout lens.h5 -o mask --step")),
+    "cad": (
+        ("torch",),
+        ("design design.toml -o lens.h5", "layout lens.h5 -o mask --step"),
+    ),
 }
 CELL = "[cell]\npitch_um = 0.30\npillar = { n = 3.6 }\n[sweep]\nwavelengths_um = [0.85]\ntolerance = 1e-2\n"
 DESIGN = (
@@ -49,7 +61,9 @@ def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, "wheel", "--no-deps", "-w", str(folder), str(ROOT)], check=True)
+        subprocess.run(
+            [*pip, "wheel", "--no-deps", "-w", str(folder), str(ROOT)], check=True
+        )
         wheel = next(folder.glob("*.whl"))
         return [_row(folder, wheel, extra) for extra in EXTRAS]
 
@@ -62,16 +76,42 @@ def _row(folder: Path, wheel: Path, extra: str) -> Row:
     before = _megabytes(home / "venv")
     wanted = f"{wheel}[{extra}]" if extra else str(wheel)
     began = time.perf_counter()
-    words = [str(python), "-m", "pip", "install", "--quiet", "-c", str(ROOT / "constraints.txt"), wanted]
+    words = [
+        str(python),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "-c",
+        str(ROOT / "constraints.txt"),
+        wanted,
+    ]
     subprocess.run(words, env=_clean(), check=True)
     seconds = time.perf_counter() - began
     size = _megabytes(home / "venv") - before
-    found = [name for name in forbidden if _run(home, [str(python), "-c", f"import {name}"])]
-    failed = [words for words in commands if not _run(home, [str(home / "venv/bin/metalens"), *words.split()])]
-    against = "; ".join([f"of {len(commands)} commands run", *(f"{name} was brought" for name in found), *failed])
+    found = [
+        name for name in forbidden if _run(home, [str(python), "-c", f"import {name}"])
+    ]
+    failed = [
+        words
+        for words in commands
+        if not _run(home, [str(home / "venv/bin/metalens"), *words.split()])
+    ]
+    against = "; ".join(
+        [
+            f"of {len(commands)} commands run",
+            *(f"{name} was brought" for name in found),
+            *failed,
+        ]
+    )
     case = f"[{extra}]" if extra else "no extra"
     return Row(
-        case, f"{size:.0f} MB on disk", seconds, len(failed) + len(found), against, threads=len(os.sched_getaffinity(0))
+        case,
+        f"{size:.0f} MB on disk",
+        seconds,
+        len(failed) + len(found),
+        against,
+        threads=len(os.sched_getaffinity(0)),
     )
 
 
@@ -80,7 +120,12 @@ def _run(home: Path, words: list[str]) -> bool:
     (home / "cell.toml").write_text(CELL, encoding="utf-8")
     (home / "design.toml").write_text(DESIGN, encoding="utf-8")
     (home / "truth.toml").write_text(TRUTH, encoding="utf-8")
-    return subprocess.run(words, cwd=home, env=_clean(), capture_output=True, check=False).returncode == 0
+    return (
+        subprocess.run(
+            words, cwd=home, env=_clean(), capture_output=True, check=False
+        ).returncode
+        == 0
+    )
 
 
 def _clean() -> dict[str, str]:
@@ -89,4 +134,7 @@ def _clean() -> dict[str, str]:
 
 
 def _megabytes(folder: Path) -> float:
-    return sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir()) / 1e6
+    return (
+        sum(path.lstat().st_size for path in folder.rglob("*") if not path.is_dir())
+        / 1e6
+    )

@@ -1,6 +1,8 @@
-"""Mask files and their check: a 1 mm lens of 4.9 million free-form pillars in 101 diameters, and far larger ones.
+"""Mask files and their check: a 1 mm lens of 4.9 million free-form pillars in 101
+diameters, and far larger ones.
 
-Errors: pillars or sites that differ from the plan when the file is read back, or the worst area error of a class.
+Errors: pillars or sites that differ from the plan when the file is read back, or the
+worst area error of a class.
 """
 
 import contextlib
@@ -39,7 +41,9 @@ NAN = float("nan")
 
 @functools.cache
 def sites(*, freeform: bool) -> Array:
-    """(2501, 2501) classes 1..101 of a focusing lens, with or without a strong free-form phase added; 0 outside."""
+    """(2501, 2501) classes 1..101 of a focusing lens, with or without a strong
+    free-form phase added; 0 outside.
+    """
     x = (np.arange(2501) - 1250) * 0.4
     r2 = x**2 + x[:, None] ** 2
     phase = -2 * np.pi / 0.94 * (np.sqrt(r2 + 2000.0**2) - 2000)
@@ -48,7 +52,11 @@ def sites(*, freeform: bool) -> Array:
         rng = np.random.default_rng(0)
         phase = phase + 40 * (u**3 + v**3)
         for _ in range(12):
-            a, fx, fy, shift = 3 * rng.normal(), *12 * rng.normal(size=2), rng.uniform(0, 6.28)
+            a, fx, fy, shift = (
+                3 * rng.normal(),
+                *12 * rng.normal(size=2),
+                rng.uniform(0, 6.28),
+            )
             phase += a * np.sin(fx * u + fy * v + shift)
     turn = np.remainder(phase, 2 * np.pi) / (2 * np.pi)
     classes = np.round(100 * turn**0.8).astype(np.uint8) + np.uint8(1)
@@ -58,12 +66,22 @@ def sites(*, freeform: bool) -> Array:
 @functools.cache
 def plan(*, freeform: bool = True) -> MaskPlan:
     """The mask of the lens alone."""
-    return lens_of(Lattice.of("LENS", sites(freeform=freeform), pitch=PITCH, x0=-1250 * PITCH, y0=1250 * PITCH))
+    return lens_of(
+        Lattice.of(
+            "LENS",
+            sites(freeform=freeform),
+            pitch=PITCH,
+            x0=-1250 * PITCH,
+            y0=1250 * PITCH,
+        )
+    )
 
 
 def lens_of(lattice: Lattice) -> MaskPlan:
     """A mask of one lattice of the bench's sizes."""
-    classes = pillar_classes(SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round")
+    classes = pillar_classes(
+        SIZES, layer=(1, 0), grid=1, unit_nm=1.0, vertices=32, shape="round"
+    )
     return MaskPlan("TOP", classes, (lattice,), layer_names={(1, 0): "pillar"})
 
 
@@ -78,7 +96,9 @@ def large(diameter_mm: float) -> MaskPlan:
         for row in range(first, end):
             r2 = x**2 + x[row] ** 2
             phase = (np.sqrt(r2 + focus**2) - focus) / 0.94
-            out[row - first] = np.where(r2 <= reach, 1 + (101 * (1 - phase % 1)).astype(np.uint8) % 101, 0)
+            out[row - first] = np.where(
+                r2 <= reach, 1 + (101 * (1 - phase % 1)).astype(np.uint8) % 101, 0
+            )
         return out
 
     half = (count - 1) * PITCH // 2
@@ -100,7 +120,11 @@ def peak_mb() -> Iterator[list[float]]:
 def _resident(status: Path, key: str) -> float:
     if not status.exists():
         return NAN
-    return next(float(line.split()[1]) / 1024 for line in status.read_text().splitlines() if line.startswith(key))
+    return next(
+        float(line.split()[1]) / 1024
+        for line in status.read_text().splitlines()
+        if line.startswith(key)
+    )
 
 
 def measured(work: Callable[[], object], *, repeats: int = 3) -> tuple[float, float]:
@@ -112,13 +136,21 @@ def measured(work: Callable[[], object], *, repeats: int = 3) -> tuple[float, fl
 
 
 def rows() -> Iterator[Row]:
-    """All rows, one by one; build and write beside gdstk and KLayout where these are installed."""
+    """All rows, one by one; build and write beside gdstk and KLayout where these are
+    installed.
+    """
     from benchmarks import _layout_fresh
 
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder)
         yield from _layout_fresh.rows(target)
-        for some in (_file_rows, _streaming_rows, _certificate_rows, _foreign_check_rows, _command_rows):
+        for some in (
+            _file_rows,
+            _streaming_rows,
+            _certificate_rows,
+            _foreign_check_rows,
+            _command_rows,
+        ):
             yield from some(target)
         yield from _check_rows()
         yield from _polygon_rows()
@@ -129,42 +161,84 @@ def _file_rows(target: Path) -> list[Row]:
     free, symmetric = plan(), plan(freeform=False)
     cases = [
         ("free-form", "GDSII", free, "m.gds", {}, "write <= 1.3x a raw write"),
-        ("free-form", "OASIS small", free, "s.oas", {"form": "small"}, "<= 3.0 MB (2.0), <= 1 s"),
-        ("free-form", "OASIS fast", free, "f.oas", {"form": "fast"}, "10x gdstk level 6, <= 0.75 of its size"),
+        (
+            "free-form",
+            "OASIS small",
+            free,
+            "s.oas",
+            {"form": "small"},
+            "<= 3.0 MB (2.0), <= 1 s",
+        ),
+        (
+            "free-form",
+            "OASIS fast",
+            free,
+            "f.oas",
+            {"form": "fast"},
+            "10x gdstk level 6, <= 0.75 of its size",
+        ),
         ("free-form", "OASIS reader", free, "r.oas", {"form": "reader"}, "<= 6.5 MB"),
         ("free-form", "OASIS circles", free, "c.oas", {"circles": True}, ""),
-        ("symmetric", "OASIS small", symmetric, "y.oas", {"form": "small"}, "<= 0.36 MB, <= 0.15 s"),
+        (
+            "symmetric",
+            "OASIS small",
+            symmetric,
+            "y.oas",
+            {"form": "small"},
+            "<= 0.36 MB, <= 0.15 s",
+        ),
     ]
     made = []
     for case, method, mask, name, options, goal in cases:
         path = target / name
         write = layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis
         read = layout.read_gdsii if path.suffix == ".gds" else layout.read_oasis
-        seconds, peak = measured(lambda w=write, m=mask, p=path, o=options: w(m, p, **o))
+        seconds, peak = measured(
+            lambda w=write, m=mask, p=path, o=options: w(m, p, **o)
+        )
         size = path.stat().st_size
         start = time.perf_counter()
         outcome = verify.compare(mask, read(path))
         back = time.perf_counter() - start
         threads = 1 if path.suffix == ".gds" else 2
-        wrong = float(len(outcome.differences) + outcome.pillars - np.count_nonzero(mask.lattices[0].whole()))
+        wrong = float(
+            len(outcome.differences)
+            + outcome.pillars
+            - np.count_nonzero(mask.lattices[0].whole())
+        )
         text = f"{size / 1e6:.3f} MB; differences after reading back"
-        made.append(Row(case, f"write {method}", seconds, wrong, text, threads, peak, goal))
-        made.append(Row(case, f"read back and compare {method}", back, wrong, text, 1, NAN, ""))
+        made.append(
+            Row(case, f"write {method}", seconds, wrong, text, threads, peak, goal)
+        )
+        made.append(
+            Row(case, f"read back and compare {method}", back, wrong, text, 1, NAN, "")
+        )
     return [*made, _raw_row(target)]
 
 
 def _raw_row(target: Path) -> Row:
-    """The same bytes as the GDSII file, written from memory in the same blocks, made durable in the same way."""
+    """The same bytes as the GDSII file, written from memory in the same blocks, made
+    durable in the same way.
+    """
     size = (target / "m.gds").stat().st_size
     block = memoryview(bytes(gdsii_write._BLOCK))
 
     def raw() -> None:
-        with store.replacing(target / "raw") as part, open(part, "wb", buffering=0) as file:
+        with (
+            store.replacing(target / "raw") as part,
+            open(part, "wb", buffering=0) as file,
+        ):
             for _ in range(size // len(block)):
                 file.write(block)
             file.write(block[: size % len(block)])
 
-    return Row("free-form", "raw write of the GDSII bytes", fastest(raw), 0.0, f"{size / 1e6:.1f} MB of zeros")
+    return Row(
+        "free-form",
+        "raw write of the GDSII bytes",
+        fastest(raw),
+        0.0,
+        f"{size / 1e6:.1f} MB of zeros",
+    )
 
 
 def _check_rows() -> list[Row]:
@@ -173,19 +247,40 @@ def _check_rows() -> list[Row]:
     found = drc.check(mask, RULES)
     goal = "<= 0.25 s, <= 100 MB"
     text = "gap less that of the widest neighbours / nm"
-    return [Row("free-form", "design-rule check", seconds, found.minimum_gap_nm - 100, text, 1, peak, goal)]
+    return [
+        Row(
+            "free-form",
+            "design-rule check",
+            seconds,
+            found.minimum_gap_nm - 100,
+            text,
+            1,
+            peak,
+            goal,
+        )
+    ]
 
 
 def _polygon_rows() -> list[Row]:
     made = []
     for grid in (1, 2, 5):
-        for point in polygon.frontier(range(100, 302, 10), grid_nm=grid, vertices=(8, 16, 24, 32, 48, 64)):
+        for point in polygon.frontier(
+            range(100, 302, 10), grid_nm=grid, vertices=(8, 16, 24, 32, 48, 64)
+        ):
             text = f"area; edge {point.edge_error_nm:.2f} nm, {point.corners:.0f} vertices, {point.shots:.0f} shots"
             start = time.perf_counter()
             polygon._pillar.cache_clear()
             list(polygon.frontier([200], grid_nm=grid, vertices=(point.vertices,)))
             seconds = time.perf_counter() - start
-            made.append(Row(f"grid {grid} nm", f"{point.shape} {point.vertices}", seconds, point.area_error, text))
+            made.append(
+                Row(
+                    f"grid {grid} nm",
+                    f"{point.shape} {point.vertices}",
+                    seconds,
+                    point.area_error,
+                    text,
+                )
+            )
     return made
 
 
@@ -194,7 +289,11 @@ def _streaming_rows(target: Path) -> list[Row]:
     for diameter_mm, goal in ((4.0, "<= 8 s, <= 64 MB"), (10.0, "<= 60 s, <= 64 MB")):
         mask = large(diameter_mm)
         for method, write, name in (
-            ("OASIS fast", lambda p, m=mask: oasis_write.write(m, p, form="fast"), "l.oas"),
+            (
+                "OASIS fast",
+                lambda p, m=mask: oasis_write.write(m, p, form="fast"),
+                "l.oas",
+            ),
             ("OASIS small", lambda p, m=mask: oasis_write.write(m, p), "l.oas"),
         ):
             with peak_mb() as grown:
@@ -203,7 +302,18 @@ def _streaming_rows(target: Path) -> list[Row]:
                 seconds = time.perf_counter() - start
             size = (target / name).stat().st_size / 1e6
             text = f"{size:.1f} MB; the error of the 1 mm lens holds"
-            made.append(Row(f"{diameter_mm:g} mm", f"stream {method}", seconds, NAN, text, 2, grown[0], goal))
+            made.append(
+                Row(
+                    f"{diameter_mm:g} mm",
+                    f"stream {method}",
+                    seconds,
+                    NAN,
+                    text,
+                    2,
+                    grown[0],
+                    goal,
+                )
+            )
             os.unlink(target / name)
     return made
 
@@ -215,11 +325,24 @@ def _command_rows(target: Path) -> list[Row]:
     from metalens import lens as lenses
 
     lenses.save(target / "lens.h5", lens())
-    options = command.Options(lens=target / "lens.h5", output=target / "mask", quiet=True, force=True)
+    options = command.Options(
+        lens=target / "lens.h5", output=target / "mask", quiet=True, force=True
+    )
     seconds, peak = measured(lambda: command.run(options), repeats=1)
     error = float(command.run(options))
     goal = "<= 15 s, <= 1.5 GB"
-    return [Row("1 mm lens", "metalens layout, all of it", seconds, error, "exit status", 2, peak, goal)]
+    return [
+        Row(
+            "1 mm lens",
+            "metalens layout, all of it",
+            seconds,
+            error,
+            "exit status",
+            2,
+            peak,
+            goal,
+        )
+    ]
 
 
 def _certificate_rows(target: Path) -> list[Row]:
@@ -235,26 +358,60 @@ def _certificate_rows(target: Path) -> list[Row]:
     doses.write(made.plan, process, target / "c.csv")
     content, table = layout.read_gdsii(target / "c.gds"), doses.read(target / "c.csv")
     found = survey(content, made.plan, table, process)
-    seconds, peak = measured(lambda: survey(content, made.plan, table, process), repeats=1)
+    seconds, peak = measured(
+        lambda: survey(content, made.plan, table, process), repeats=1
+    )
     text = f"worst exposure of {found.pillars:,} pillars less 1; worst diameter {found.worst_nm:.2f} nm"
-    return [Row("1 mm lens", "certificate", seconds, found.worst_exposure, text, 1, peak, "<= 10 s, 1 %, 1 nm")]
+    return [
+        Row(
+            "1 mm lens",
+            "certificate",
+            seconds,
+            found.worst_exposure,
+            text,
+            1,
+            peak,
+            "<= 10 s, 1 %, 1 nm",
+        )
+    ]
 
 
 def _lens(diameter_mm: float, pitch_um: float, *, cubic_rad: float = 3.0) -> "Lens":
-    """A focusing lens with a cubic phase, diameters in float32; without that it is alike in all its eighths."""
+    """A focusing lens with a cubic phase, diameters in float32; without that it is
+    alike in all its eighths.
+    """
     from metalens.cell import Cell
     from metalens.lens import DiameterMap, Lens
     from metalens.pillars import Proxy
 
     count, reach = round(diameter_mm * 1e3 / pitch_um), 500 * diameter_mm
     x = ((np.arange(count) - (count - 1) / 2) * pitch_um).astype(np.float32)
-    d, focus, widest = np.zeros((count, count), np.float32), 2000 * diameter_mm, 0.7 * pitch_um
+    d, focus, widest = (
+        np.zeros((count, count), np.float32),
+        2000 * diameter_mm,
+        0.7 * pitch_um,
+    )
     for row in range(count):
         r2 = x**2 + x[row] ** 2
         phase = (np.sqrt(r2 + focus**2) - focus) / 0.94 + cubic_rad * (x / reach) ** 3
         d[row] = np.where(r2 < reach**2, 0.09 + (widest - 0.09) * (1 - phase % 1), 0)
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
-    return Lens(DiameterMap(d, pitch_um), Cell(pitch_um), proxy, 0.94, focus, float("inf"), "map")
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
+    return Lens(
+        DiameterMap(d, pitch_um),
+        Cell(pitch_um),
+        proxy,
+        0.94,
+        focus,
+        float("inf"),
+        "map",
+    )
 
 
 _PEAK = """
@@ -285,31 +442,58 @@ print(code, time.process_time() - start, peak_mb())
 
 
 def _foreign_check_rows(target: Path) -> list[Row]:
-    """``metalens check`` of 8.7 million pillars from OASIS, in a process of its own: CPU time, peak of all memory.
+    """``metalens check`` of 8.7 million pillars from OASIS, in a process of its own:
+    CPU time, peak of all memory.
 
-    A file of every pillar, and the one of an eighth and its copies that ``metalens layout`` writes of a round lens.
+    A file of every pillar, and the one of an eighth and its copies that ``metalens
+    layout`` writes of a round lens.
     """
     from layout.mask import build
     from layout.process.process import Process
     from metalens import lens as lenses
 
     for diameter_mm in (0.02, 1.0):  # the first compiles what the second runs
-        made = build.prepare(_lens(diameter_mm, 0.3).diameters, Process(), furniture="none", with_doses=False)
+        made = build.prepare(
+            _lens(diameter_mm, 0.3).diameters,
+            Process(),
+            furniture="none",
+            with_doses=False,
+        )
         layout.write_oasis(made.plan, target / "check.oas")
         code, seconds, peak = _ran(_CHECK, str(target / "check.oas"))
     text = f"exit status of {int(made.plan.counts()[1:].sum()):,} pillars; CPU s, all memory"
-    whole = Row("1 mm lens", "metalens check, OASIS", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")
+    whole = Row(
+        "1 mm lens",
+        "metalens check, OASIS",
+        seconds,
+        code,
+        text,
+        1,
+        peak,
+        "<= 10 s, <= 1000 MB",
+    )
     lenses.save(target / "round.h5", _lens(1.0, 0.3, cubic_rad=0.0))
     _ran(_COMMAND, str(target / "round.h5"), "-o", str(target / "round"))
     code, seconds, peak = _ran(_CHECK, str(target / "round" / "mask.oas"))
     text = "exit status; CPU s, all memory"
-    folded = Row("1 mm lens", "metalens check, OASIS of an eighth", seconds, code, text, 1, peak, "<= 10 s, <= 1000 MB")
+    folded = Row(
+        "1 mm lens",
+        "metalens check, OASIS of an eighth",
+        seconds,
+        code,
+        text,
+        1,
+        peak,
+        "<= 10 s, <= 1000 MB",
+    )
     return [whole, folded]
 
 
 def _ran(code: str, *words: str) -> tuple[float, float, float]:
     """What a program tells at its end: exit status, seconds, peak of its memory in MB."""
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True
+    )
     status, seconds, peak = map(float, done.stdout.split()[-3:])
     return status, seconds, peak
 
@@ -319,16 +503,35 @@ def _large_command_rows(target: Path) -> Iterator[Row]:
     from metalens import lens as lenses
 
     process = target / "process.toml"
-    process.write_text("[exposure]\nalpha_um = 0.010\nbeta_um = 31.0\neta = 0.6\n", encoding="utf-8")
+    process.write_text(
+        "[exposure]\nalpha_um = 0.010\nbeta_um = 31.0\neta = 0.6\n", encoding="utf-8"
+    )
     ways = (("", []), (", doses corrected and certified", ["--process", str(process)]))
-    goals = ((0.02, ""), (1.0, "<= 8 s"), (2.0, ""), (4.0, "<= 60 s"), (10.0, "<= 300 s, <= 1000 MB"))
+    goals = (
+        (0.02, ""),
+        (1.0, "<= 8 s"),
+        (2.0, ""),
+        (4.0, "<= 60 s"),
+        (10.0, "<= 300 s, <= 1000 MB"),
+    )
     for diameter_mm, goal in goals:
         lenses.save(target / "large.h5", _lens(diameter_mm, 0.4))
         for said, more in ways if diameter_mm not in (2.0, 4.0) else ways[:1]:
-            code, seconds, peak = _ran(_COMMAND, str(target / "large.h5"), "-o", str(target / "large"), *more)
+            code, seconds, peak = _ran(
+                _COMMAND, str(target / "large.h5"), "-o", str(target / "large"), *more
+            )
             method = f"metalens layout, OASIS{said}"
             if diameter_mm > 0.02:  # the smallest compiles what the others run
-                yield Row(f"{diameter_mm:g} mm lens", method, seconds, code, "exit status; all memory", 2, peak, goal)
+                yield Row(
+                    f"{diameter_mm:g} mm lens",
+                    method,
+                    seconds,
+                    code,
+                    "exit status; all memory",
+                    2,
+                    peak,
+                    goal,
+                )
 
 
 def peer_rows() -> list[Row]:

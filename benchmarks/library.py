@@ -1,4 +1,6 @@
-"""Pillar library: rational curves against held-out solves, sweeps with error bars, proxy error and evaluation."""
+"""Pillar library: rational curves against held-out solves, sweeps with error bars,
+proxy error and evaluation.
+"""
 
 import functools
 import time
@@ -29,7 +31,13 @@ def rows() -> list[Row]:
     start = time.perf_counter()
     fitted = proxy_fit.fit(made)
     seconds = time.perf_counter() - start
-    return [*_curves(), one, *_proxy(fitted, seconds), *_evaluations(fitted.proxy), _table()]
+    return [
+        *_curves(),
+        one,
+        *_proxy(fitted, seconds),
+        *_evaluations(fitted.proxy),
+        _table(),
+    ]
 
 
 @functools.cache
@@ -38,7 +46,9 @@ def _exact(diameter_um: float) -> Response:
 
 
 def _curves() -> list[Row]:
-    """Exact solves that a curve with every resonance takes, and what its estimate is worth."""
+    """Exact solves that a curve with every resonance takes, and what its estimate is
+    worth.
+    """
     d = np.random.default_rng(11).uniform(*SPAN, HELD_OUT)
     exact = np.array([_exact(float(x)).t for x in d])
     found = []
@@ -46,13 +56,21 @@ def _curves() -> list[Row]:
         start = time.perf_counter()
         nodes = reduced.explore(_exact, *SPAN, tolerance=tolerance)
         seconds = time.perf_counter() - start
-        silent = reduced.Nodes(nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, "")
+        silent = reduced.Nodes(
+            nodes.diameter_um, nodes.response, 0 * nodes.error, nodes.energy, True, ""
+        )
         value, estimate = reduced.curve(silent, tolerance=tolerance)(d)
         error = np.abs(value[:, 0] - exact)
         held = f"{int((error <= estimate).sum())} of {HELD_OUT} held-out diameters within their estimate"
-        goal = f"{len(nodes.diameter_um)} solves" + (" (60 at most)" if tolerance == 1e-6 else "")
+        goal = f"{len(nodes.diameter_um)} solves" + (
+            " (60 at most)" if tolerance == 1e-6 else ""
+        )
         case = f"t(D) 80-320 nm, every resonance, {tolerance:g}"
-        found.append(Row(case, "rational, adaptive", seconds, float(error.max()), held, goal=goal))
+        found.append(
+            Row(
+                case, "rational, adaptive", seconds, float(error.max()), held, goal=goal
+            )
+        )
     return found
 
 
@@ -62,7 +80,14 @@ def _sweep(case: str, sweep: Sweep) -> tuple[Row, PillarLibrary]:
     seconds = time.perf_counter() - start
     against = f"largest error bar; {int((made.t_error <= made.sweep.bar).sum())} of {made.t.size} within the tolerance"
     method = f"{made.solves} solves, {made.engine}"
-    return Row(case, method, seconds, float(made.t_error.max()), against, threads=executor.cores()), made
+    return Row(
+        case,
+        method,
+        seconds,
+        float(made.t_error.max()),
+        against,
+        threads=executor.cores(),
+    ), made
 
 
 def _table() -> Row:
@@ -71,11 +96,21 @@ def _table() -> Row:
     sweep = Sweep(waves, (0.0, 5.0, 10.0, 15.0, 20.0), (0.06, 0.205))
     row, _ = _sweep("200 x 11 x 5 x 2 entries", sweep)
     met = "met" if row.seconds <= 60 and row.error <= 1e-3 else "missed"
-    return Row(row.case, row.method, row.seconds, row.error, row.against, row.threads, goal=f"60 s at 1e-3: {met}")
+    return Row(
+        row.case,
+        row.method,
+        row.seconds,
+        row.error,
+        row.against,
+        row.threads,
+        goal=f"60 s at 1e-3: {met}",
+    )
 
 
 def _proxy(fitted: proxy_fit.ProxyFit, seconds: float) -> list[Row]:
-    """Error against coefficients; the time is that of the whole fit, this table with it."""
+    """Error against coefficients; the time is that of the whole fit, this table with
+    it.
+    """
     return [
         Row(
             f"proxy, {trial.coefficients} coefficients",
@@ -90,17 +125,33 @@ def _proxy(fitted: proxy_fit.ProxyFit, seconds: float) -> list[Row]:
 
 
 def _evaluations(proxy: Proxy) -> list[Row]:
-    """Phase, |T| and both slopes of ten million pillars; the inverse; torch forward and backward."""
+    """Phase, |T| and both slopes of ten million pillars; the inverse; torch forward and
+    backward.
+    """
     found = []
     for dtype in (np.float64, np.float32):
         d = np.random.default_rng(0).uniform(*proxy.domain_um, PILLARS).astype(dtype)
         wanted = np.random.default_rng(1).uniform(-np.pi, np.pi, PILLARS).astype(dtype)
         few = d[:1000].astype(float)
-        error = float(np.abs(proxy.phase_rad(d[:1000], 0.85) - proxy.phase_rad(few, 0.85)).max())
+        error = float(
+            np.abs(proxy.phase_rad(d[:1000], 0.85) - proxy.phase_rad(few, 0.85)).max()
+        )
         name = np.dtype(dtype).name
         work: list[tuple[str, Callable[[], object], float, str, str]] = [
-            ("value and gradient", lambda d=d: _all(proxy, d), error, "phase in float64, rad", "0.5 s"),
-            ("torch forward, backward", lambda d=d: _torch(proxy, d), error, "phase in float64, rad", "0.5 s"),
+            (
+                "value and gradient",
+                lambda d=d: _all(proxy, d),
+                error,
+                "phase in float64, rad",
+                "0.5 s",
+            ),
+            (
+                "torch forward, backward",
+                lambda d=d: _torch(proxy, d),
+                error,
+                "phase in float64, rad",
+                "0.5 s",
+            ),
             (
                 "phase to diameter",
                 lambda wanted=wanted: proxy.diameter_um(wanted, 0.85),
@@ -112,18 +163,35 @@ def _evaluations(proxy: Proxy) -> list[Row]:
         for method, call, off, against, goal in work:
             seconds = fastest(call, repeats=3)
             told = f"{goal}: {'met' if seconds <= 0.5 else 'missed'}" if goal else ""
-            found.append(Row(f"10^7 pillars, {name}", method, seconds, off, against, executor.cores(), goal=told))
+            found.append(
+                Row(
+                    f"10^7 pillars, {name}",
+                    method,
+                    seconds,
+                    off,
+                    against,
+                    executor.cores(),
+                    goal=told,
+                )
+            )
     return found
 
 
 def _all(proxy: Proxy, d: np.ndarray) -> None:
-    for verb in (proxy.phase_rad, proxy.transmission, proxy.dphase_ddiameter, proxy.dtransmission_ddiameter):
+    for verb in (
+        proxy.phase_rad,
+        proxy.transmission,
+        proxy.dphase_ddiameter,
+        proxy.dtransmission_ddiameter,
+    ):
         verb(d, 0.85)
 
 
 def _torch(proxy: Proxy, d: np.ndarray) -> None:
     leaf = torch.from_numpy(d).requires_grad_()
-    (proxy.phase_rad(leaf, 0.85).sum() + proxy.transmission(leaf, 0.85).sum()).backward()
+    (
+        proxy.phase_rad(leaf, 0.85).sum() + proxy.transmission(leaf, 0.85).sum()
+    ).backward()
 
 
 def _round_trip(proxy: Proxy, wanted: np.ndarray) -> float:

@@ -1,9 +1,11 @@
-"""Time and memory of every command, each a process of its own: a lens of 1 mm and nine million pillars, a bench, a run.
+"""Time and memory of every command, each a process of its own: a lens of 1 mm and nine
+million pillars, a bench, a run.
 
     python -m benchmarks limits                              # all of them, some fifteen minutes on two quiet cores
     python -m benchmarks.limits library info --work DIR      # these alone, on what DIR already holds
 
-Library, design, PSF, mask, budget, plan and scene are at full size; bench and networks are those of the demo.
+Library, design, PSF, mask, budget, plan and scene are at full size; bench and networks
+are those of the demo.
 """
 
 import argparse
@@ -21,11 +23,25 @@ from metalens.chain import stages as chain
 from metalens.chain.stages import Stage
 
 NAN = float("nan")
-BUDGET = ("budget", "lens.h5", "--library", "library.h5", "--process", "process.toml", "-o", "budget.h5")
+BUDGET = (
+    "budget",
+    "lens.h5",
+    "--library",
+    "library.h5",
+    "--process",
+    "process.toml",
+    "-o",
+    "budget.h5",
+)
 EVALUATE = ("evaluate", "experiment", "run", "-o", "experiment")
 OTHERS = (
     Stage("", "", BUDGET, ("gaze_error_deg", "deg of gaze from all links")),
-    Stage("", "", ("plan", "--gaze-error", "2deg", "-o", "plan"), ("predicted_deg", "deg of gaze, predicted")),
+    Stage(
+        "",
+        "",
+        ("plan", "--gaze-error", "2deg", "-o", "plan"),
+        ("predicted_deg", "deg of gaze, predicted"),
+    ),
     Stage("", "", ("scene", "-o", "scene"), ("", "no error")),
     Stage("", "", ("evaluate", "optics", "lens.h5", "-o", "optics"), ("", "no error")),
     Stage("", "", EVALUATE, ("", "no error")),
@@ -46,7 +62,9 @@ def measured(folder: Path, verbs: tuple[str, ...]) -> list[Row]:
     files = chain.shipped()
     chain.laid(files, None, aperture_mm=None).write(folder)
     every = [*chain.stages(files), *OTHERS]
-    return [_row(folder, stage) for stage in every if not verbs or stage.words[0] in verbs]
+    return [
+        _row(folder, stage) for stage in every if not verbs or stage.words[0] in verbs
+    ]
 
 
 def _row(folder: Path, stage: Stage) -> Row:
@@ -57,26 +75,47 @@ def _row(folder: Path, stage: Stage) -> Row:
     number = float(error) if isinstance(error, int | float) else NAN
     size = SIZES.get(stage.words[0], "of the demo")
     words = " ".join(w for w in stage.words[:2] if not w.startswith("-"))
-    return Row(words, size, seconds, number, meaning, threads=len(os.sched_getaffinity(0)), peak_mb=peak)
+    return Row(
+        words,
+        size,
+        seconds,
+        number,
+        meaning,
+        threads=len(os.sched_getaffinity(0)),
+        peak_mb=peak,
+    )
 
 
 def _run(folder: Path, words: list[str]) -> tuple[dict[str, object], float, float]:
-    """(--json result, wall seconds, largest resident memory in MB) of one command, by itself."""
+    """(--json result, wall seconds, largest resident memory in MB) of one command, by
+    itself.
+    """
     start, verb = time.perf_counter(), " ".join(words)
     process = subprocess.Popen(
-        [sys.executable, "-m", "metalens", *words], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "metalens", *words],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
     )
     shown = process.stdout.read() if process.stdout else b""
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 1) or not shown:
-        raise RuntimeError(f"metalens {verb} ended with {process.returncode}, {len(shown)} bytes of result")
-    print(f"{time.perf_counter() - start:8.1f} s  metalens {verb}", file=sys.stderr, flush=True)
+        raise RuntimeError(
+            f"metalens {verb} ended with {process.returncode}, {len(shown)} bytes of result"
+        )
+    print(
+        f"{time.perf_counter() - start:8.1f} s  metalens {verb}",
+        file=sys.stderr,
+        flush=True,
+    )
     return json.loads(shown), time.perf_counter() - start, usage.ru_maxrss / 1024
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("verbs", nargs="*")
     parser.add_argument("--work", type=Path, required=True)
     given = parser.parse_args()

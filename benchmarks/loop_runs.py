@@ -1,4 +1,5 @@
-"""Small finished runs for the studies of the closing loop: one network, trained with one lens, as a run folder.
+"""Small finished runs for the studies of the closing loop: one network, trained with
+one lens, as a run folder.
 
 The settings of every study are made here, from one text over the preset ``smoke``.
 """
@@ -67,12 +68,17 @@ WINDOW_UM = 300.0  # of the PSFs
 class Recipe:
     """What the studies vary.
 
-    focus_mm: of the hyperbolic lens that training starts from. moves: whether training moves the lens as well.
-    pitch_um: of pixels and samples. edge_um: of the image. width: of the network. slip_mm, gaze_deg: reach of slippage
-    and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics loss. steps: of ``batch``
+    focus_mm: of the hyperbolic lens that training starts from. moves: whether training
+    moves the lens as well.
+    pitch_um: of pixels and samples. edge_um: of the image. width: of the network.
+    slip_mm, gaze_deg: reach of slippage
+    and gaze. rate: largest step of a lens that moves, rad. optics_weight: of the optics
+    loss. steps: of ``batch``
     frames.
-    seed: of weights, frames and noise. image, fwhm_nm: see :class:`codesign.optics.stack.OpticsConfig`.
-    asphere_rad: coefficients of the radial terms that a lens starts from; none for the hyperbolic one, which moves in
+    seed: of weights, frames and noise. image, fwhm_nm: see
+    :class:`codesign.optics.stack.OpticsConfig`.
+    asphere_rad: coefficients of the radial terms that a lens starts from; none for the
+    hyperbolic one, which moves in
     35 terms of free form.
     """
 
@@ -108,7 +114,9 @@ class Recipe:
 
 
 def finished(folder: Path, recipe: Recipe) -> None:
-    """A run folder of these settings, trained with its largest architecture alone; goes on where it stopped."""
+    """A run folder of these settings, trained with its largest architecture alone; goes
+    on where it stopped.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     store.write_text(folder / "run.toml", recipe.toml)
     settings = runs.load(folder / "run.toml")
@@ -126,7 +134,9 @@ def finished(folder: Path, recipe: Recipe) -> None:
     scenes, coefficients = settings.scenes, runs.coefficients(going)
     side = scenes.pixels + 2 * scenes.margin
     said = formed.described(settings.optics, coefficients, side, margin=scenes.margin)
-    store.write_text(folder / "result.json", json.dumps({"rows": finish(going), "image": said}))
+    store.write_text(
+        folder / "result.json", json.dumps({"rows": finish(going), "image": said})
+    )
 
 
 def _begun(settings: runs.RunConfig, recipe: Recipe) -> runs.Run:
@@ -134,7 +144,9 @@ def _begun(settings: runs.RunConfig, recipe: Recipe) -> runs.Run:
     fresh = runs.start(settings)
     if recipe.asphere_rad:
         with torch.no_grad():
-            fresh.trainer.model.coefficients_rad.copy_(torch.tensor(recipe.asphere_rad, dtype=torch.float64))
+            fresh.trainer.model.coefficients_rad.copy_(
+                torch.tensor(recipe.asphere_rad, dtype=torch.float64)
+            )
     return fresh
 
 
@@ -143,4 +155,13 @@ def _design(path: Path, settings: runs.RunConfig, coefficients: np.ndarray) -> N
     phase = trained.phase_of(settings.optics, coefficients)
     aperture = settings.optics.aperture_mm * 1e3
     shape = settings.optics.focus
-    lens.save(path, design.make(phase, shape, aperture_um=aperture, cell=made.cell, proxy=library.proxy_of(made))[0])
+    lens.save(
+        path,
+        design.make(
+            phase,
+            shape,
+            aperture_um=aperture,
+            cell=made.cell,
+            proxy=library.proxy_of(made),
+        )[0],
+    )

@@ -1,4 +1,6 @@
-"""One pillar by the modal engine: time beside error, against the committed references; fmmax on the same pillars."""
+"""One pillar by the modal engine: time beside error, against the committed references;
+fmmax on the same pillars.
+"""
 
 import itertools
 import json
@@ -21,7 +23,12 @@ from metalens.modal.ladder import RUNGS
 WAVELENGTH_UM = 0.85
 CELL = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
 REFERENCES = Path(__file__).parent / "results" / "reference_pillars.json"
-DIAMETERS = np.unique(np.round(np.concatenate([np.linspace(0.08, 0.32, 25), [0.1925, 0.1937, 0.301, 0.3035]]), 4))
+DIAMETERS = np.unique(
+    np.round(
+        np.concatenate([np.linspace(0.08, 0.32, 25), [0.1925, 0.1937, 0.301, 0.3035]]),
+        4,
+    )
+)
 GOALS = {
     "coarse": "5e-3 at 50 times fmmax N = 7, goal 150; 1.2e-3 in 10 ms",
     "finer": "1e-6 in 1 s",
@@ -30,14 +37,21 @@ GOALS = {
 
 @cache
 def dense() -> dict[float, complex]:
-    """t over 80-320 nm, the dip and the flank with it, on the fine mesh: 6e-6 off the references."""
+    """t over 80-320 nm, the dip and the flank with it, on the fine mesh: 6e-6 off the
+    references.
+    """
     rung = next(rung for rung in RUNGS if rung.name == "fine")
     cases = {float(d): case_of(CELL, float(d), Light(WAVELENGTH_UM)) for d in DIAMETERS}
-    return {d: complex(evaluate(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0]) for d, c in cases.items()}
+    return {
+        d: complex(evaluate(c, rung.choice(c.rho).plan, weak=rung.weak).matrix[1, 0])
+        for d, c in cases.items()
+    }
 
 
 def references(angle_deg: float) -> dict[tuple[float, str], complex]:
-    """t of the lossless 0.40 um cell at 850 nm by (diameter, polarisation); those 80 to 320 nm wide."""
+    """t of the lossless 0.40 um cell at 850 nm by (diameter, polarisation); those 80 to
+    320 nm wide.
+    """
     entries = json.loads(REFERENCES.read_text(encoding="utf-8"))["entries"]
     return {
         (e["diameter_um"], e["polarization"]): complex(*e["t"])
@@ -57,7 +71,9 @@ def forget() -> None:
 
 
 def normal(tolerance: float) -> Row:
-    """Fresh diameters at normal incidence, each refined to the tolerance: nothing is shared between the solves."""
+    """Fresh diameters at normal incidence, each refined to the tolerance: nothing is
+    shared between the solves.
+    """
     wanted = dense()
     found = {d: solve(CELL, d, WAVELENGTH_UM, tolerance=tolerance) for d in wanted}
     errors = np.array([abs(found[d].t - t) for d, t in wanted.items()])
@@ -69,21 +85,36 @@ def normal(tolerance: float) -> Row:
             solve(CELL, d, WAVELENGTH_UM, tolerance=tolerance)
 
     seconds = fastest(work, repeats=1) / len(wanted)
-    ratio = np.median(claimed / np.maximum(errors, 1e-15))  # the reference may be the very same solve
+    ratio = np.median(
+        claimed / np.maximum(errors, 1e-15)
+    )  # the reference may be the very same solve
     goal = f"claimed {claimed.max():.1e}, median {ratio:.1f} times the error"
     case = f"{len(wanted)} diameters 80-320 nm, per solve"
-    return Row(case, f"tolerance {tolerance:g}", seconds, float(errors.max()), "max |dt| to the fine mesh", goal=goal)
+    return Row(
+        case,
+        f"tolerance {tolerance:g}",
+        seconds,
+        float(errors.max()),
+        "max |dt| to the fine mesh",
+        goal=goal,
+    )
 
 
 def mesh(name: str) -> Row:
-    """One rung of the ladder, whatever its estimate; the finest ones against the committed references."""
+    """One rung of the ladder, whatever its estimate; the finest ones against the
+    committed references.
+    """
     rung = next(rung for rung in RUNGS if rung.name == name)
     rough = rung.usual > 5e-5
     wanted = dense() if rough else {d: t for (d, _), t in references(0.0).items()}
     cases = {d: case_of(CELL, d, Light(WAVELENGTH_UM)) for d in wanted}
 
     def one(d: float) -> complex:
-        return complex(evaluate(cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak).matrix[1, 0])
+        return complex(
+            evaluate(cases[d], rung.choice(cases[d].rho).plan, weak=rung.weak).matrix[
+                1, 0
+            ]
+        )
 
     error = max(abs(one(d) - t) for d, t in wanted.items())
 
@@ -95,7 +126,9 @@ def mesh(name: str) -> Row:
     seconds = fastest(work, repeats=3 if rough else 1) / len(cases)
     against = "max |dt| to the fine mesh" if rough else "max |dt| to reference"
     case = f"{len(cases)} diameters 80-320 nm, per solve"
-    return Row(case, f"{rung.name} mesh", seconds, error, against, goal=GOALS.get(name, ""))
+    return Row(
+        case, f"{rung.name} mesh", seconds, error, against, goal=GOALS.get(name, "")
+    )
 
 
 def oblique(tolerance: float) -> Row:
@@ -103,7 +136,9 @@ def oblique(tolerance: float) -> Row:
     angle = math.radians(10)
 
     def one(d: float, p: str) -> complex:
-        return solve(CELL, d, WAVELENGTH_UM, angle_rad=angle, polarization=p, tolerance=tolerance).t
+        return solve(
+            CELL, d, WAVELENGTH_UM, angle_rad=angle, polarization=p, tolerance=tolerance
+        ).t
 
     error = max(abs(one(d, p) - t) for (d, p), t in wanted.items())
 
@@ -113,19 +148,38 @@ def oblique(tolerance: float) -> Row:
             one(d, p)
 
     seconds = fastest(work, repeats=1) / len(wanted)
-    return Row("10 degrees, s and p, per solve", f"tolerance {tolerance:g}", seconds, error, "max |dt| to reference")
+    return Row(
+        "10 degrees, s and p, per solve",
+        f"tolerance {tolerance:g}",
+        seconds,
+        error,
+        "max |dt| to reference",
+    )
 
 
 def sweep() -> Row:
     """A piece of a library; every entry with its own error bar."""
-    diameters, wavelengths, angles = (0.11, 0.23), (0.84, 0.85, 0.86), np.radians([0.0, 10.0])
+    diameters, wavelengths, angles = (
+        (0.11, 0.23),
+        (0.84, 0.85, 0.86),
+        np.radians([0.0, 10.0]),
+    )
     start = time.perf_counter()
     found = [
-        solve(CELL, d, wavelength, angle_rad=float(angle), polarization=p, tolerance=1e-3)
-        for d, angle, wavelength, p in itertools.product(diameters, angles, wavelengths, ("s", "p"))
+        solve(
+            CELL, d, wavelength, angle_rad=float(angle), polarization=p, tolerance=1e-3
+        )
+        for d, angle, wavelength, p in itertools.product(
+            diameters, angles, wavelengths, ("s", "p")
+        )
     ]
-    seconds, error = (time.perf_counter() - start) / len(found), max(each.t_error for each in found)
-    return Row("piece of a library, per entry", "solve 1e-3", seconds, error, "own estimate")
+    seconds, error = (
+        (time.perf_counter() - start) / len(found),
+        max(each.t_error for each in found),
+    )
+    return Row(
+        "piece of a library, per entry", "solve 1e-3", seconds, error, "own estimate"
+    )
 
 
 def slopes() -> Row:
@@ -138,11 +192,20 @@ def slopes() -> Row:
 
     value = gradient(CELL, 0.2, WAVELENGTH_UM, tolerance=10.0)
     step = 1e-4
-    apart = [solve(CELL, 0.2 + s, WAVELENGTH_UM, tolerance=10.0).t for s in (-2 * step, -step, step, 2 * step)]
+    apart = [
+        solve(CELL, 0.2 + s, WAVELENGTH_UM, tolerance=10.0).t
+        for s in (-2 * step, -step, step, 2 * step)
+    ]
     want = (8 * (apart[2] - apart[1]) - (apart[3] - apart[0])) / (12 * step)
     error = abs(value.diameter_um - want) / abs(want)
     seconds = fastest(work) / len(wanted)
-    return Row("t and six derivatives", "tolerance 0.01", seconds, error, "relative, differences in diameter")
+    return Row(
+        "t and six derivatives",
+        "tolerance 0.01",
+        seconds,
+        error,
+        "relative, differences in diameter",
+    )
 
 
 def rows() -> list[Row]:
@@ -157,18 +220,24 @@ def rows() -> list[Row]:
 
 
 def fmmax_solver(order: int) -> Any:
-    """t(diameter) of fmmax's fastest formulation with harmonics -order..order along both axes, double precision."""
+    """t(diameter) of fmmax's fastest formulation with harmonics -order..order along
+    both axes, double precision.
+    """
     import jax
     import jax.numpy as jnp
     from fmmax import basis as fmmax_basis
     from fmmax import fmm, scattering
 
     jax.config.update("jax_enable_x64", True)
-    lattice = fmmax_basis.LatticeVectors(u=CELL.pitch_um * fmmax_basis.X, v=CELL.pitch_um * fmmax_basis.Y)
+    lattice = fmmax_basis.LatticeVectors(
+        u=CELL.pitch_um * fmmax_basis.X, v=CELL.pitch_um * fmmax_basis.Y
+    )
     expansion = fmmax_basis.generate_expansion(
         lattice, (2 * order + 1) ** 2, truncation=fmmax_basis.Truncation.PARALLELOGRAMIC
     )
-    zero = int(np.flatnonzero((np.asarray(expansion.basis_coefficients) == 0).all(1))[0])
+    zero = int(
+        np.flatnonzero((np.asarray(expansion.basis_coefficients) == 0).all(1))[0]
+    )
     x = (np.arange(400) + 0.5) / 400 * CELL.pitch_um - CELL.pitch_um / 2
     radius = np.hypot(x[:, None], x)
 
@@ -184,16 +253,23 @@ def fmmax_solver(order: int) -> Any:
 
     @jax.jit
     def amplitude(pattern: Any) -> Any:
-        layers = [layer(jnp.full((1, 1), e + 0j)) for e in (1.4525**2, pattern, 1.0) if not hasattr(e, "shape")]
+        layers = [
+            layer(jnp.full((1, 1), e + 0j))
+            for e in (1.4525**2, pattern, 1.0)
+            if not hasattr(e, "shape")
+        ]
         stack = [layers[0], layer(pattern), layers[1]]
         thickness = [jnp.asarray(0.0), jnp.asarray(CELL.height_um), jnp.asarray(0.0)]
         return scattering.stack_s_matrix(stack, thickness).s11[zero, zero]
 
     def transmission(diameter_um: float) -> complex:
-        inside = 0.5 * (1 - np.tanh((radius - diameter_um / 2) * 1600 / CELL.pitch_um))  # a quarter of a pixel soft
+        inside = 0.5 * (
+            1 - np.tanh((radius - diameter_um / 2) * 1600 / CELL.pitch_um)
+        )  # a quarter of a pixel soft
         return complex(amplitude(jnp.asarray(1.0 + (3.6**2 - 1) * inside + 0j)))
 
-    # the amplitudes of fmmax are not power-normalised: an empty layer, known in closed form, gives the factor
+    # the amplitudes of fmmax are not power-normalised: an empty layer, known in closed
+    # form, gives the factor
     r = (1.4525 - 1) / (1.4525 + 1)
     known = math.sqrt(1 - r**2) * np.exp(2j * np.pi * CELL.height_um / WAVELENGTH_UM)
     factor = known / transmission(-1.0)
@@ -209,5 +285,7 @@ def peer_rows() -> list[Row]:
         error = max(abs(transmission(d) - t) for (d, _), t in wanted.items())
         seconds = fastest(lambda run=transmission: run(0.2), repeats=1)
         method = f"fmmax N = {order}, jones direct fourier"
-        out.append(Row("80-320 nm, per solve", method, seconds, error, "max |dt| to reference"))
+        out.append(
+            Row("80-320 nm, per solve", method, seconds, error, "max |dt| to reference")
+        )
     return out

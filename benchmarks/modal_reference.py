@@ -1,7 +1,10 @@
-"""Reference values of hard pillars: ``python -m benchmarks.modal_reference [FILE]`` (an hour on one core).
+"""Reference values of hard pillars: ``python -m benchmarks.modal_reference [FILE]`` (an
+hour on one core).
 
-Each value is the mean of both forms on the finer of two unrelated meshes, its uncertainty the distance to the mean
-on the other. Entries already in the file are kept unless they were made on coarser meshes than are asked for now, so an
+Each value is the mean of both forms on the finer of two unrelated meshes, its
+uncertainty the distance to the mean
+on the other. Entries already in the file are kept unless they were made on coarser
+meshes than are asked for now, so an
 interrupted run goes on where it stopped.
 """
 
@@ -26,11 +29,20 @@ FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.5
 FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
 BOTH = MeshPlan(5, 6, 5, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0))
 OTHER = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
-CONTACT = MeshPlan(4, 5, 4, (0.7, 1.3), sectors=(0.03, 0.12, 0.4, 1.0))  # graded towards the point of contact
+CONTACT = MeshPlan(
+    4, 5, 4, (0.7, 1.3), sectors=(0.03, 0.12, 0.4, 1.0)
+)  # graded towards the point of contact
 CONTACT_OTHER = MeshPlan(4, 4, 4, (0.7, 1.3), sectors=(0.1, 0.4, 1.0))
 NORMAL, OBLIQUE, TOUCHING = (FINEST, FINE), (BOTH, OTHER), (CONTACT, CONTACT_OTHER)
-WEAK = 2e-9  # layer modes that carry less are left out: far below any uncertainty, and a tenth of the time
-NOT_ENOUGH = ((0.272, 5.0), (0.272, 10.0), (0.272, 20.0), (0.2, 20.0))  # diameters and angles for the finest meshes
+# layer modes that carry less are left out: far below any uncertainty, and a tenth of
+# the time
+WEAK = 2e-9
+NOT_ENOUGH = (
+    (0.272, 5.0),
+    (0.272, 10.0),
+    (0.272, 20.0),
+    (0.2, 20.0),
+)  # diameters and angles for the finest meshes
 PAPER = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
 NIR = Cell(0.40, 0.7, Index(3.6), Index(1.4513), Index(1.0), Index(1.0))
 DISPUTED = Cell(0.418, 0.7, Index(3.698, 0.0086), Index(1.4513), Index(1.0), Index(1.0))
@@ -44,7 +56,14 @@ def absorbing(k: float) -> Cell:
 def wanted() -> list[Wanted]:
     """Name, cell, diameter, wavelength, angle in degrees, polarisation, the two meshes."""
     out: list[Wanted] = []
-    for d, name in ((0.08, "thin"), (0.128, "128"), (0.2, "200"), (0.1937, "dip"), (0.272, "272"), (0.302, "flank")):
+    for d, name in (
+        (0.08, "thin"),
+        (0.128, "128"),
+        (0.2, "200"),
+        (0.1937, "dip"),
+        (0.272, "272"),
+        (0.302, "flank"),
+    ):
         out.append((name, PAPER, d, 0.85, 0.0, "x", NORMAL))
     out.append(("wide", PAPER, 0.32, 0.85, 0.0, "x", NORMAL))
     out.append(("needle", PAPER, 0.01, 0.85, 0.0, "x", NORMAL))
@@ -56,17 +75,33 @@ def wanted() -> list[Wanted]:
     out.append(("nearly touching", PAPER, 0.39, 0.85, 0.0, "x", NORMAL))
     out.append(("touching but for 40 pm", PAPER, 0.39996, 0.85, 0.0, "x", TOUCHING))
     for height in (50.0, 1000.0):
-        out.append((f"{height:g} um tall", replace(PAPER, height_um=height), 0.2, 0.85, 0.0, "x", NORMAL))
+        out.append(
+            (
+                f"{height:g} um tall",
+                replace(PAPER, height_um=height),
+                0.2,
+                0.85,
+                0.0,
+                "x",
+                NORMAL,
+            )
+        )
     for angle in (5.0, 10.0, 20.0):
         for d in (0.2, 0.272, 0.128):
             for polarization in "ps":
-                name = "dark mode" if (angle, d, polarization) == (5.0, 0.272, "p") else "oblique"
+                name = (
+                    "dark mode"
+                    if (angle, d, polarization) == (5.0, 0.272, "p")
+                    else "oblique"
+                )
                 plans = NORMAL if (d, angle) in NOT_ENOUGH else OBLIQUE
                 out.append((name, PAPER, d, 0.85, angle, polarization, plans))
     return out
 
 
-def entry(name: str, cell: Cell, d: float, wavelength: float, angle: float, p: str, plans: Any) -> dict[str, Any]:
+def entry(
+    name: str, cell: Cell, d: float, wavelength: float, angle: float, p: str, plans: Any
+) -> dict[str, Any]:
     """Solve one case on both meshes."""
     case = case_of(cell, d, Light(wavelength, float(np.deg2rad(angle)), p))
     finer, other = (evaluate(case, plan, weak=WEAK) for plan in plans)
@@ -98,11 +133,20 @@ def unknowns(plan: MeshPlan, angle: float) -> int:
     wall, phase = build(plan).vector_wall, 0.1 if angle else None
     if phase is None:
         return select(wall, electric=False, half_phase_rad=None).size
-    return sum(select(wall, electric=electric, half_phase_rad=phase).size for electric in (True, False)) // 2
+    return (
+        sum(
+            select(wall, electric=electric, half_phase_rad=phase).size
+            for electric in (True, False)
+        )
+        // 2
+    )
 
 
 def identity(item: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(item[key] for key in ("name", "diameter_um", "wavelength_um", "angle_deg", "polarization"))
+    return tuple(
+        item[key]
+        for key in ("name", "diameter_um", "wavelength_um", "angle_deg", "polarization")
+    )
 
 
 def main(file: Path) -> None:
@@ -118,7 +162,9 @@ def main(file: Path) -> None:
     done = {identity(item): at for at, item in enumerate(document["entries"])}
     for name, cell, d, wavelength, angle, p, plans in wanted():
         at = done.get((name, d, wavelength, angle, p))
-        if at is not None and document["entries"][at]["unknowns"][0] >= unknowns(plans[0], angle):
+        if at is not None and document["entries"][at]["unknowns"][0] >= unknowns(
+            plans[0], angle
+        ):
             continue
         start = time.perf_counter()
         item = entry(name, cell, d, wavelength, angle, p, plans)
@@ -127,7 +173,9 @@ def main(file: Path) -> None:
         else:
             document["entries"][at] = item
         file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        print(f"{name:16s} {d:.4f} {angle:4.1f} {p}  +-{item['uncertainty']:.1e}  {time.perf_counter() - start:.0f} s")
+        print(
+            f"{name:16s} {d:.4f} {angle:4.1f} {p}  +-{item['uncertainty']:.1e}  {time.perf_counter() - start:.0f} s"
+        )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,12 @@
-"""What a PSF and an image owe to each part of the model: their error where it is left out, and where it is taken.
+"""What a PSF and an image owe to each part of the model: their error where it is left
+out, and where it is taken.
 
-``python -m benchmarks model``: a row a part, left out and then taken, against sums that share no code with the engine
-(``tests/referees``): plane waves of every pillar of a 1 mm lens in float64 through every film, both polarisations, one
-wavelength at a time; RCWA for pillars met at an angle; a cut of unlike pillars solved whole; every scene point through
+``python -m benchmarks model``: a row a part, left out and then taken, against sums that
+share no code with the engine
+(``tests/referees``): plane waves of every pillar of a 1 mm lens in float64 through
+every film, both polarisations, one
+wavelength at a time; RCWA for pillars met at an angle; a cut of unlike pillars solved
+whole; every scene point through
 its own PSF. Errors are relative L2 of PSFs of sum 1 unless the row says otherwise.
 """
 
@@ -33,17 +37,26 @@ from metalens.psf import PsfStack, Source, View, from_lens, spectrum
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 PITCH, COUNT, WAVELENGTH = 0.4, 3600, 0.85
-NEAR = 540.0  # um from the rim to a window, and its diffraction: the referee of films fades what falls further aside
-NARROW, WIDE = 81, 241  # samples of a window, a pitch each; the wide one for steep light of a lens with coma
+# um from the rim to a window, and its diffraction: the referee of films fades what
+# falls further aside
+NEAR = 540.0
+NARROW, WIDE = (
+    81,
+    241,
+)  # samples of a window, a pitch each; the wide one for steep light of a lens with coma
 DEPTH = 20e3
 LED = Source(850.0, 30.0)
-LINES = 41  # wavelengths of the referee's diode: rim and middle of the lens part by 0.35 waves from one to the next
+# wavelengths of the referee's diode: rim and middle of the lens part by 0.35 waves from
+# one to the next
+LINES = 41
 LEFT, TAKEN = "left out", "taken"
 Timed = tuple[PsfStack, float]
 
 
 def rows() -> Iterator[Row]:
-    """Field angle, spectrum, glass, cover, polarisation, angle at the pillar, neighbours, radiometry, the image."""
+    """Field angle, spectrum, glass, cover, polarisation, angle at the pillar,
+    neighbours, radiometry, the image.
+    """
     yield from field_rows()
     yield from spectrum_rows()
     yield from medium_rows()
@@ -60,8 +73,11 @@ def millimetre() -> Lens:
     return pillar_lens(Focus(WAVELENGTH, 2e3, 33e3), 500.0)
 
 
-def referee(lens: Lens, count: int = COUNT, *, points: int = 1, light: Array | None = None) -> Any:
-    """Plane waves of the pillars of a lens on a lattice of ``count``, ``points`` of it a pitch; light: (y, x) complex
+def referee(
+    lens: Lens, count: int = COUNT, *, points: int = 1, light: Array | None = None
+) -> Any:
+    """Plane waves of the pillars of a lens on a lattice of ``count``, ``points`` of it
+    a pitch; light: (y, x) complex
     of every site, that of the lens if None."""
     from referees.true_image import Referee
 
@@ -75,18 +91,31 @@ def referee(lens: Lens, count: int = COUNT, *, points: int = 1, light: Array | N
         count=count,
         looked_at=WIDE * PITCH / 2,
     )
-    sites = lens.transmission() * np.exp(1j * lens.phase_rad()) if light is None else light
+    sites = (
+        lens.transmission() * np.exp(1j * lens.phase_rad()) if light is None else light
+    )
     half = len(sites) // 2
     whole, first = np.zeros((count, count), complex), count // 2 - half * points
-    whole[first : first + 2 * half * points + 1 : points, first : first + 2 * half * points + 1 : points] = sites
+    whole[
+        first : first + 2 * half * points + 1 : points,
+        first : first + 2 * half * points + 1 : points,
+    ] = sites
     made.open, phase = np.abs(whole), np.angle(whole)
     made.lens_phase = lambda: phase
     return made
 
 
-def seen(lens: Lens, angle: float = 0.0, *, samples: int = NARROW, **about: Any) -> Timed:
-    """PSF of a source at ``DEPTH`` in the direction of an angle along x, and seconds of the second call."""
-    return looked(lens, View((DEPTH,), ((angle, 0.0),), samples * lens.cell.pitch_um, samples), **about)
+def seen(
+    lens: Lens, angle: float = 0.0, *, samples: int = NARROW, **about: Any
+) -> Timed:
+    """PSF of a source at ``DEPTH`` in the direction of an angle along x, and seconds of
+    the second call.
+    """
+    return looked(
+        lens,
+        View((DEPTH,), ((angle, 0.0),), samples * lens.cell.pitch_um, samples),
+        **about,
+    )
 
 
 def looked(lens: Lens, view: View, **about: Any) -> Timed:
@@ -103,7 +132,11 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 def off(found: PsfStack | Array, wanted: Array) -> float:
     """Relative L2 distance of PSFs, both of sum 1 in the window of ``found``."""
-    got = np.asarray(found.intensity, float)[0, 0] if isinstance(found, PsfStack) else found
+    got = (
+        np.asarray(found.intensity, float)[0, 0]
+        if isinstance(found, PsfStack)
+        else found
+    )
     middle = len(wanted) // 2 - len(got) // 2
     want = wanted[middle : middle + len(got), middle : middle + len(got)]
     want, got = want / want.sum(), got / got.sum()
@@ -111,16 +144,32 @@ def off(found: PsfStack | Array, wanted: Array) -> float:
 
 
 def stated(found: PsfStack) -> float:
-    """Error of a PSF by its budget, without neighbours and angle, which the referees leave out as well."""
+    """Error of a PSF by its budget, without neighbours and angle, which the referees
+    leave out as well.
+    """
     assert found.budget is not None
     terms = (found.budget.computed, found.budget.polarisation, found.budget.glass)
     return math.hypot(*(t for t in terms if not math.isnan(t)))
 
 
-def pair(part: str, judge: str, without: tuple[float, float], with_: tuple[float, float], said: float) -> Iterator[Row]:
-    """Two rows of a part: (seconds, error) left out and taken; said: the error that the engine states."""
+def pair(
+    part: str,
+    judge: str,
+    without: tuple[float, float],
+    with_: tuple[float, float],
+    said: float,
+) -> Iterator[Row]:
+    """Two rows of a part: (seconds, error) left out and taken; said: the error that the
+    engine states.
+    """
     yield Row(part, LEFT, *without, judge, threads=torch.get_num_threads())
-    yield Row(part, f"{TAKEN}, {said:.1e} stated", *with_, judge, threads=torch.get_num_threads())
+    yield Row(
+        part,
+        f"{TAKEN}, {said:.1e} stated",
+        *with_,
+        judge,
+        threads=torch.get_num_threads(),
+    )
 
 
 def field_rows() -> Iterator[Row]:
@@ -131,9 +180,17 @@ def field_rows() -> Iterator[Row]:
     for degrees in (5, 10, 15, 20):
         angle = math.radians(degrees)
         true, took = seen(lens, angle, samples=WIDE)
-        wanted = judge.flux((lens.sensor_distance_um * math.tan(angle), 0.0), DEPTH, WAVELENGTH)
+        wanted = judge.flux(
+            (lens.sensor_distance_um * math.tan(angle), 0.0), DEPTH, WAVELENGTH
+        )
         before, after = (seconds, off(axis, wanted)), (took, off(true, wanted))
-        yield from pair(f"field angle of {degrees} deg", "plane waves, both polarisations", before, after, stated(true))
+        yield from pair(
+            f"field angle of {degrees} deg",
+            "plane waves, both polarisations",
+            before,
+            after,
+            stated(true),
+        )
 
 
 def spectrum_rows() -> Iterator[Row]:
@@ -143,34 +200,50 @@ def spectrum_rows() -> Iterator[Row]:
     some = np.linspace(um[0], um[-1], LINES)
     weights = np.interp(some, um, share)
     judge = referee(lens)
-    wanted = sum(w * judge.intensity((0.0, 0.0), DEPTH, c) for c, w in zip(some, weights / weights.sum(), strict=True))
+    wanted = sum(
+        w * judge.intensity((0.0, 0.0), DEPTH, c)
+        for c, w in zip(some, weights / weights.sum(), strict=True)
+    )
     (one, seconds), (all_, took) = seen(lens), seen(lens, spectrum=LED)
     before, after = (seconds, off(one, wanted)), (took, off(all_, wanted))
-    yield from pair("spectrum of 30 nm", f"plane waves of {LINES} wavelengths", before, after, stated(all_))
+    yield from pair(
+        "spectrum of 30 nm",
+        f"plane waves of {LINES} wavelengths",
+        before,
+        after,
+        stated(all_),
+    )
 
 
 def medium_rows() -> Iterator[Row]:
-    """Glass before the sensor of a lens that was designed without, and a medium in place of air."""
+    """Glass before the sensor of a lens that was designed without, and a medium in
+    place of air.
+    """
     from referees.films import Stack
 
     lens, n = millimetre(), 1.51
-    distance, judge = lens.sensor_distance_um, "plane waves of both polarisations through the films"
+    distance, judge = (
+        lens.sensor_distance_um,
+        "plane waves of both polarisations through the films",
+    )
     glass = replace(lens, layers=Layers(behind=(Film(Index(n), 500.0),)))
     cast = replace(lens, cell=replace(lens.cell, cover=Index(1.5)), layers=Layers())
     for name, real, films in (
         ("500 um of glass", glass, ((1.0, distance - 500.0), (n, 500.0))),
         ("cover of 1.5", cast, ((1.5, distance),)),
     ):
-        wanted = Stack(films, wavelength=WAVELENGTH, step=PITCH, count=COUNT + 1, near=NEAR).flux(
-            turned_light(lens, films[0][0])
-        )
+        wanted = Stack(
+            films, wavelength=WAVELENGTH, step=PITCH, count=COUNT + 1, near=NEAR
+        ).flux(turned_light(lens, films[0][0]))
         (bare, seconds), (true, took) = seen(lens), seen(real)
         before, after = (seconds, off(bare, wanted)), (took, off(true, wanted))
         yield from pair(name, judge, before, after, stated(true))
 
 
 def turned_light(lens: Lens, index: float) -> Array:
-    """(2, 2, y, x) transverse fields of both polarisations behind a lens in a medium, the source on the axis."""
+    """(2, 2, y, x) transverse fields of both polarisations behind a lens in a medium,
+    the source on the axis.
+    """
     from referees.vectorial import turned
 
     at = lens.diameters
@@ -181,78 +254,147 @@ def turned_light(lens: Lens, index: float) -> Array:
 
 
 def polarised_rows() -> Iterator[Row]:
-    """Both polarisations: the flux, one scalar whose rays carry their power, and one that knows of neither."""
+    """Both polarisations: the flux, one scalar whose rays carry their power, and one
+    that knows of neither.
+    """
     fast = pillar_lens(Focus(WAVELENGTH, 15.0, 60.0), 20.0)
-    for na, lens, depth, count, points in ((0.24, millimetre(), DEPTH, COUNT, 1), (0.8, fast, 50.0, 3200, 2)):
+    for na, lens, depth, count, points in (
+        (0.24, millimetre(), DEPTH, COUNT, 1),
+        (0.8, fast, 50.0, 3200, 2),
+    ):
         part, judge = f"polarisation, NA {na}", referee(lens, count, points=points)
         wanted = judge.flux((0.0, 0.0), depth, WAVELENGTH)
         view = View((depth,), window_um=NARROW * PITCH / points, samples=NARROW)
         middle = slice(count // 2 - 40, count // 2 + 41)
-        plain, seconds = timed(lambda judge=judge, depth=depth: judge.intensity((0.0, 0.0), depth, WAVELENGTH))  # type: ignore[misc]
+        plain, seconds = timed(
+            lambda judge=judge, depth=depth: judge.intensity(
+                (0.0, 0.0), depth, WAVELENGTH
+            )
+        )  # type: ignore[misc]
         against = "plane waves of both polarisations"
-        yield Row(part, f"{LEFT}: |U|² of plane waves", seconds, off(plain[middle, middle], wanted), against)
+        yield Row(
+            part,
+            f"{LEFT}: |U|² of plane waves",
+            seconds,
+            off(plain[middle, middle], wanted),
+            against,
+        )
         for kind in ("scalar", "flux"):
             found, took = looked(lens, view, polarisation=kind)
-            yield Row(part, f"{TAKEN} by the {kind}, {stated(found):.1e} stated", took, off(found, wanted), against)
+            yield Row(
+                part,
+                f"{TAKEN} by the {kind}, {stated(found):.1e} stated",
+                took,
+                off(found, wanted),
+                against,
+            )
 
 
 def pillar_rows() -> Iterator[Row]:
-    """Pillars that answer light of 20 degrees as their library has it at that angle, and as at normal incidence."""
+    """Pillars that answer light of 20 degrees as their library has it at that angle,
+    and as at normal incidence.
+    """
     cell, angle = library.DEFAULT_CELL, math.radians(20)
     proxies = {}
     for angles in ((0.0,), (0.0, 10.0, 20.0)):
         about = library.Sweep((WAVELENGTH,), angles, samples=60, tolerance=5e-3)
-        proxies[angles] = timed(lambda about=about: library.proxy_of(library.sweep(cell, about)))  # type: ignore[misc]
+        proxies[angles] = timed(
+            lambda about=about: library.proxy_of(library.sweep(cell, about))
+        )  # type: ignore[misc]
     (plain, seconds), (proxy, took) = proxies[(0.0,)], proxies[(0.0, 10.0, 20.0)]
     thickest = min(plain.domain_um[1], proxy.domain_um[1])  # that both know
-    focus, limits = Focus(WAVELENGTH, 240.0, DEPTH), design.Limits(90, max(80, 1e3 * (cell.pitch_um - thickest)))
+    focus, limits = (
+        Focus(WAVELENGTH, 240.0, DEPTH),
+        design.Limits(90, max(80, 1e3 * (cell.pitch_um - thickest))),
+    )
     phase = design.phase_of(None, focus, radius_um=60.0)
-    about = {"aperture_um": 120.3, "limits": limits, "accept_partial_turn": True}  # an odd number of pillars across
+    about = {
+        "aperture_um": 120.3,
+        "limits": limits,
+        "accept_partial_turn": True,
+    }  # an odd number of pillars across
     lens = design.make(phase, focus, cell=cell, proxy=proxy, **about)[0]  # type: ignore[arg-type]
-    (true, _), (bare, _) = (seen(each, angle) for each in (lens, replace(lens, proxy=plain)))
+    (true, _), (bare, _) = (
+        seen(each, angle) for each in (lens, replace(lens, proxy=plain))
+    )
     wanted = _met(lens, cell, angle)
     before, after = (seconds, off(bare, wanted)), (took, off(true, wanted))
-    yield from pair("angle at the pillars, 20 deg", "pillars by RCWA, plane waves", before, after, stated(true))
+    yield from pair(
+        "angle at the pillars, 20 deg",
+        "pillars by RCWA, plane waves",
+        before,
+        after,
+        stated(true),
+    )
 
 
 def _met(lens: Lens, cell: Cell, angle: float) -> Array:
-    """Light of a lens whose every pillar is solved by RCWA at an angle along x, the mean of both polarisations."""
+    """Light of a lens whose every pillar is solved by RCWA at an angle along x, the
+    mean of both polarisations.
+    """
     sizes = lens.diameters.diameter_um
     known = np.unique(np.round(sizes[sizes > 0], 3))
     place = (lens.sensor_distance_um * math.tan(angle), 0.0)
     total: Any = 0.0
     for light in ("s", "p"):
-        t = [rcwa.solve(cell, d, WAVELENGTH, angle_rad=angle, polarization=light, harmonics=7).t for d in known]
+        t = [
+            rcwa.solve(
+                cell, d, WAVELENGTH, angle_rad=angle, polarization=light, harmonics=7
+            ).t
+            for d in known
+        ]
         sites = np.where(sizes > 0, np.interp(sizes, known, t), 0)
-        total = total + referee(lens, 1350, light=sites).intensity(place, DEPTH, WAVELENGTH)
+        total = total + referee(lens, 1350, light=sites).intensity(
+            place, DEPTH, WAVELENGTH
+        )
     return np.asarray(total)
 
 
 def neighbour_rows() -> Iterator[Row]:
-    """TiO2 of NA 0.8: power in the focus of unlike pillars over that of pillars one by one."""
+    """TiO2 of NA 0.8: power in the focus of unlike pillars over that of pillars one by
+    one.
+    """
     na, distance, counts = rows_of_unlike.LENSES[0]
     lens = rows_of_unlike.lens_at(distance)
-    found, seconds = timed(lambda: neighbours(lens, counts=counts, harmonics=rows_of_unlike.HARMONICS))
+    found, seconds = timed(
+        lambda: neighbours(lens, counts=counts, harmonics=rows_of_unlike.HARMONICS)
+    )
     cut = rows_of_unlike.solved_whole(lens, "x")
-    _, after, before = rows_of_unlike.judged(lens, cut, rows_of_unlike.factor(lens, found, 0))
-    part, judge = f"unlike neighbours, NA {na}", "share of the power; 62 pillars solved whole"
+    _, after, before = rows_of_unlike.judged(
+        lens, cut, rows_of_unlike.factor(lens, found, 0)
+    )
+    part, judge = (
+        f"unlike neighbours, NA {na}",
+        "share of the power; 62 pillars solved whole",
+    )
     yield Row(part, LEFT, float("nan"), before, judge)
-    yield Row(part, f"{TAKEN} by rows of {', '.join(map(str, counts))}", seconds, after, judge)
+    yield Row(
+        part, f"{TAKEN} by rows of {', '.join(map(str, counts))}", seconds, after, judge
+    )
 
 
 def radiometry_rows() -> Iterator[Row]:
-    """Power through the aperture from a small flat source at 20 degrees over that from the axis: the integral of
+    """Power through the aperture from a small flat source at 20 degrees over that from
+    the axis: the integral of
     cos θ cos θ' / r² over the aperture."""
     lens, angle = millimetre(), math.radians(20)
     radius, middle = 500.0, DEPTH * math.tan(angle)
     r = (np.arange(200) + 0.5) / 200 * radius
     turn = 2 * np.pi * (np.arange(64) + 0.5) / 64
     x, y = r[:, None] * np.cos(turn), r[:, None] * np.sin(turn)
-    shares = [((DEPTH**2 / ((x - m) ** 2 + y**2 + DEPTH**2) ** 2) * r[:, None]).sum() for m in (0.0, middle)]
+    shares = [
+        ((DEPTH**2 / ((x - m) ** 2 + y**2 + DEPTH**2) ** 2) * r[:, None]).sum()
+        for m in (0.0, middle)
+    ]
     wanted = shares[1] / shares[0]
     axis, side = (seen(lens, a, samples=WIDE)[0] for a in (0.0, angle))
-    within = (float(s.energy_um2[0, 0] * s.irradiance_per_um2[0, 0]) for s in (axis, side))
-    power = [part / (1 - s.budget.outside) for part, s in zip(within, (axis, side), strict=True)]
+    within = (
+        float(s.energy_um2[0, 0] * s.irradiance_per_um2[0, 0]) for s in (axis, side)
+    )
+    power = [
+        part / (1 - s.budget.outside)
+        for part, s in zip(within, (axis, side), strict=True)
+    ]
     told = power[1] / power[0] * math.cos(angle)  # a flat source shines by the cosine
     judge = "share of the power; solid angles of the aperture's points"
     yield Row("radiometry at 20 deg", LEFT, float("nan"), abs(1 - wanted), judge)
@@ -260,7 +402,9 @@ def radiometry_rows() -> Iterator[Row]:
 
 
 def image_rows() -> Iterator[Row]:
-    """An image of +-17 degrees in two wavelengths: one PSF a depth for all of it, and its own for every point."""
+    """An image of +-17 degrees in two wavelengths: one PSF a depth for all of it, and
+    its own for every point.
+    """
     from referees.true_image import Referee
 
     radius, distance, focus, step, window = 50.0, 240.0, 6000.0, 4.8, 15
@@ -269,24 +413,52 @@ def image_rows() -> Iterator[Row]:
     light, depth = scene(31 + 2 * grid.margin)
     frames = as_frames(light, depth)
     lines = ((0.838, 0.37), (0.861, 0.63))
-    judge = Referee(radius=radius, distance=distance, focus=focus, design_wavelength=WAVELENGTH, fine=0.6, count=256)
+    judge = Referee(
+        radius=radius,
+        distance=distance,
+        focus=focus,
+        design_wavelength=WAVELENGTH,
+        fine=0.6,
+        count=256,
+    )
     m = grid.margin
-    wanted = judge.image(light, depth, step=step, window=window, waves=lines)[m:-m, m:-m]
+    wanted = judge.image(light, depth, step=step, window=window, waves=lines)[
+        m:-m, m:-m
+    ]
     one, seconds = _by_one(wave, distance, grid, frames)
-    made = imager(wave, grid, spectrum=spectrum.Nodes(*np.array(lines).T, 0.0), tolerance=1e-2)
+    made = imager(
+        wave, grid, spectrum=spectrum.Nodes(*np.array(lines).T, 0.0), tolerance=1e-2
+    )
     true, took = timed(lambda: made(frames)[0].numpy())
     before, after = (
-        (s, float(np.linalg.norm(i - wanted) / np.linalg.norm(wanted))) for i, s in ((one, seconds), (true, took))
+        (s, float(np.linalg.norm(i - wanted) / np.linalg.norm(wanted)))
+        for i, s in ((one, seconds), (true, took))
     )
-    yield from pair("image over +-17 deg, two wavelengths", "every scene point's own PSF", before, after, made.error)
+    yield from pair(
+        "image over +-17 deg, two wavelengths",
+        "every scene point's own PSF",
+        before,
+        after,
+        made.error,
+    )
 
 
-def _by_one(wave: SmoothWave, distance: float, grid: Grid, frames: Frames) -> tuple[Array, float]:
+def _by_one(
+    wave: SmoothWave, distance: float, grid: Grid, frames: Frames
+) -> tuple[Array, float]:
     """The image by the axis' PSFs of the design wavelength, and its seconds."""
-    depths = 1 / torch.linspace(1 / grid.depths_um[0], 1 / grid.depths_um[1], 12, dtype=torch.float64)
+    depths = 1 / torch.linspace(
+        1 / grid.depths_um[0], 1 / grid.depths_um[1], 12, dtype=torch.float64
+    )
     axis = torch.zeros(1, 2, dtype=torch.float64)
     window = Window(grid.window, grid.step_um)
-    stack = psfs(Optics(wave, Layers(), distance), axis, depths_um=depths, wavelength_um=WAVELENGTH, window=window)[0]
+    stack = psfs(
+        Optics(wave, Layers(), distance),
+        axis,
+        depths_um=depths,
+        wavelength_um=WAVELENGTH,
+        window=window,
+    )[0]
     size = tuple(n + 2 * grid.margin for n in grid.samples)
     made: UniformImager = uniform_imager(basis(stack, depths), size, margin=0)  # type: ignore[arg-type]
     seen_, seconds = timed(lambda: image(frames, made, margin=grid.margin))
@@ -306,5 +478,7 @@ def scene(edge: int) -> tuple[Array, Array]:
 def as_frames(light: Array, depth: Array) -> Frames:
     """One sheet alone: the far one."""
     one = torch.from_numpy(np.stack([np.zeros_like(light), light])[None])
-    cover = torch.from_numpy(np.stack([np.zeros_like(light), np.ones_like(light)])[None])
+    cover = torch.from_numpy(
+        np.stack([np.zeros_like(light), np.ones_like(light)])[None]
+    )
     return Frames(one, cover, torch.from_numpy(np.stack([depth, depth])[None]))

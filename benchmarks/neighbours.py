@@ -1,9 +1,14 @@
-"""Unlike neighbours: PSFs with the factor of rows of a lens's own pillars, against a cut through the lens solved whole.
+"""Unlike neighbours: PSFs with the factor of rows of a lens's own pillars, against a
+cut through the lens solved whole.
 
-The lens is that of ``examples/lenses/tio2_532.toml``, TiO2 of NA 0.8 and 20 um for 532 nm, and one of NA 0.4: the 62
-pillars along a diameter, repeated across, are one cell of RCWA (a cylinder lens), for light along the cut and across
-it. The predicted light is that of the maps that ``psf_stack`` takes (:mod:`metalens.psf.among`), pillar by pillar. No
-times to quote: rows and cut are solved at the same two orders per pillar, where truncation all but cancels.
+The lens is that of ``examples/lenses/tio2_532.toml``, TiO2 of NA 0.8 and 20 um for 532
+nm, and one of NA 0.4: the 62
+pillars along a diameter, repeated across, are one cell of RCWA (a cylinder lens), for
+light along the cut and across
+it. The predicted light is that of the maps that ``psf_stack`` takes
+(:mod:`metalens.psf.among`), pillar by pillar. No
+times to quote: rows and cut are solved at the same two orders per pillar, where
+truncation all but cancels.
 """
 
 import math
@@ -27,16 +32,23 @@ from metalens.psf import among
 
 FILE = Path(__file__).parents[1] / "examples" / "cells" / "tio2_532.toml"
 WAVELENGTH_UM, APERTURE_UM = 0.532, 20.0
-LENSES = ((0.8, 7.5, (2, 3, 4)), (0.4, 22.9, (4, 6, 8)))  # NA, sensor distance, pillars in the rows
+LENSES = (
+    (0.8, 7.5, (2, 3, 4)),
+    (0.4, 22.9, (4, 6, 8)),
+)  # NA, sensor distance, pillars in the rows
 HARMONICS = 2
 
 
 def rows() -> Iterator[Row]:
-    """Both lenses and polarisations: light in the focus and the PSF, with the factor and without."""
+    """Both lenses and polarisations: light in the focus and the PSF, with the factor
+    and without.
+    """
     for na, distance, counts in LENSES:
         lens = lens_at(distance)
         found = neighbours(lens, counts=counts, harmonics=HARMONICS)
-        for place, (polarization, along) in enumerate((("x", "along"), ("y", "across"))):
+        for place, (polarization, along) in enumerate(
+            (("x", "along"), ("y", "across"))
+        ):
             start = time.perf_counter()
             cut = solved_whole(lens, polarization)
             told, power, plain = judged(lens, cut, factor(lens, found, place))
@@ -60,10 +72,19 @@ def lens_at(distance_um: float) -> Lens:
     file = config.load(FILE, CellFile)
     proxy = library.proxy_of(library.sweep(file.cell, file.sweep))
     focus, limits = design.Focus(WAVELENGTH_UM, distance_um), design.Limits(84, 80)
-    phase, about = design.phase_of(None, focus, radius_um=APERTURE_UM / 2), {"limits": limits}
+    phase, about = (
+        design.phase_of(None, focus, radius_um=APERTURE_UM / 2),
+        {"limits": limits},
+    )
     cell: Cell = file.cell
     return design.make(
-        phase, focus, aperture_um=APERTURE_UM, cell=cell, proxy=proxy, accept_partial_turn=True, **about
+        phase,
+        focus,
+        aperture_um=APERTURE_UM,
+        cell=cell,
+        proxy=proxy,
+        accept_partial_turn=True,
+        **about,
     )[0]
 
 
@@ -76,8 +97,10 @@ def _places(lens: Lens) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cut:
-    """Light of a cut in its orders, amplitudes whose squares are power: solved whole, of pillars one by one, and of an
-    ideal lens. alone: t of every pillar. sines: of the orders. distance_um: to the focus."""
+    """Light of a cut in its orders, amplitudes whose squares are power: solved whole,
+    of pillars one by one, and of an
+    ideal lens. alone: t of every pillar. sines: of the orders. distance_um: to the
+    focus."""
 
     solved: Array
     apart: Array
@@ -97,22 +120,38 @@ class Cut:
         return complex(self.ideal.conj() @ light / (np.abs(self.ideal) ** 2).sum())
 
     def psf(self, light: Array) -> Array:
-        """Light along a line through the focus, ten times the width of the spot, of sum 1."""
-        x = np.linspace(-5, 5, 201) * WAVELENGTH_UM / 2 / float(self.sines[self.ideal != 0].max())
+        """Light along a line through the focus, ten times the width of the spot, of sum
+        1.
+        """
+        x = (
+            np.linspace(-5, 5, 201)
+            * WAVELENGTH_UM
+            / 2
+            / float(self.sines[self.ideal != 0].max())
+        )
         waves = np.exp(2j * np.pi / WAVELENGTH_UM * np.outer(x, self.sines))
         runs = np.abs(self.sines) < 1
         along = np.sqrt(np.where(runs, 1 - self.sines**2, 0)) * self.distance_um
-        spot = np.abs(waves @ (light * runs * np.exp(2j * np.pi / WAVELENGTH_UM * along))) ** 2
+        spot = (
+            np.abs(waves @ (light * runs * np.exp(2j * np.pi / WAVELENGTH_UM * along)))
+            ** 2
+        )
         return np.asarray(spot / spot.sum())
 
 
 def judged(lens: Lens, cut: Cut, factor: Array) -> tuple[str, float, float]:
-    """In words; error of the power in the focus over that of pillars one by one with the factor of every pillar, and
+    """In words; error of the power in the focus over that of pillars one by one with
+    the factor of every pillar, and
     without."""
     predicted = cut.to_orders @ (cut.alone * factor)
-    solved, said = (cut.focus(light) / cut.one_by_one for light in (cut.solved, predicted))
+    solved, said = (
+        cut.focus(light) / cut.one_by_one for light in (cut.solved, predicted)
+    )
     psfs = [cut.psf(light) for light in (predicted, cut.apart, cut.solved)]
-    with_, without = (float(np.linalg.norm(one - psfs[2]) / np.linalg.norm(psfs[2])) for one in psfs[:2])
+    with_, without = (
+        float(np.linalg.norm(one - psfs[2]) / np.linalg.norm(psfs[2]))
+        for one in psfs[:2]
+    )
     words = f"solved {_words(solved)}, predicted {_words(said)} of what pillars one by one give"
     words += f"; PSF {with_:.3f} off, {without:.3f} without"
     return words, abs(abs(solved) ** 2 - abs(said) ** 2), abs(abs(solved) ** 2 - 1)
@@ -124,10 +163,14 @@ def solved_whole(lens: Lens, polarization: str) -> Cut:
     place, x = _places(lens)
     count, width = len(x), len(x) * cell.pitch_um
     phase = _phase(lens)
-    sizes = np.asarray(lens.proxy.diameter_um(phase, wave, within_um=printed(lens), gap="nearest"))
+    sizes = np.asarray(
+        lens.proxy.diameter_um(phase, wave, within_um=printed(lens), gap="nearest")
+    )
     about = {"polarization": polarization, "harmonics": HARMONICS}
     row = solve_row(cell, sizes, wave, **about)
-    known = {d: solve_row(cell, [d], wave, **about).order(0) for d in set(sizes.tolist())}
+    known = {
+        d: solve_row(cell, [d], wave, **about).order(0) for d in set(sizes.tolist())
+    }
     alone = np.array([known[d] for d in sizes.tolist()])
     to_orders = np.exp(-2j * np.pi * np.outer(row.orders, place) / count) / count
     sine = row.orders * wave / width
@@ -135,17 +178,29 @@ def solved_whole(lens: Lens, polarization: str) -> Cut:
     rim = math.sin(math.atan(APERTURE_UM / 2 / lens.sensor_distance_um))
     ideal = np.where(np.abs(sine) < rim, to_orders @ np.exp(1j * phase), 0)
     power = cosine ** (-0.5 if polarization == "x" else 0.5)
-    return Cut(row.t * power, to_orders @ alone, ideal, alone, sine, to_orders, lens.sensor_distance_um)
+    return Cut(
+        row.t * power,
+        to_orders @ alone,
+        ideal,
+        alone,
+        sine,
+        to_orders,
+        lens.sensor_distance_um,
+    )
 
 
 def _phase(lens: Lens) -> Array:
     """Of a cylinder lens at the pillars of the cut."""
     x, distance = _places(lens)[1], lens.sensor_distance_um
-    return np.asarray(-2 * np.pi / lens.wavelength_um * (np.hypot(x, distance) - distance))
+    return np.asarray(
+        -2 * np.pi / lens.wavelength_um * (np.hypot(x, distance) - distance)
+    )
 
 
 def factor(lens: Lens, found: Neighbours, place: int) -> Array:
-    """C at every pillar as PSFs take it from maps, of the field along (0) or across (1) the cut."""
+    """C at every pillar as PSFs take it from maps, of the field along (0) or across (1)
+    the cut.
+    """
     phase = torch.as_tensor(np.tile(_phase(lens), (9, 1)))
     made = among.jones(phase, torch.ones_like(phase), found, lens.cell.pitch_um)
     return np.asarray((made.xx if place == 0 else made.yy)[4].numpy())

@@ -1,4 +1,6 @@
-"""The planner against what its plans achieve: twenty random goals, and what the planned runs cost beside the finest."""
+"""The planner against what its plans achieve: twenty random goals, and what the planned
+runs cost beside the finest.
+"""
 
 import math
 
@@ -11,11 +13,19 @@ from codesign.budget.plan import Chain, Choice, PlanConfig, TrueChoice
 from codesign.budget.task import TaskSetting
 
 GOALS = 20
-CONFIG = PlanConfig(aperture_mm=0.3, led_fwhm_nm=30.0, stacks=20, frames=1000, task=TaskSetting(scenes=4))
+CONFIG = PlanConfig(
+    aperture_mm=0.3,
+    led_fwhm_nm=30.0,
+    stacks=20,
+    frames=1000,
+    task=TaskSetting(scenes=4),
+)
 
 
 def rows() -> list[Row]:
-    """Predicted against achieved gaze error over random goals between the loosest and the finest settings' errors."""
+    """Predicted against achieved gaze error over random goals between the loosest and
+    the finest settings' errors.
+    """
     chain = Chain(CONFIG)
     measured = plan.pilot(chain)
     loosest = plan.choose(measured, math.inf, CONFIG).predicted_rad
@@ -52,15 +62,23 @@ def rows() -> list[Row]:
 
 
 def _achieved(chain: Chain, choice: Choice | TrueChoice, truth: torch.Tensor) -> float:
-    """Gaze error, rad, of the estimator that believes in the optics of ``choice``, on images of :func:`_reality`."""
+    """Gaze error, rad, of the estimator that believes in the optics of ``choice``, on
+    images of :func:`_reality`.
+    """
     optics = chain.optics(chain.table(choice.library_tolerance), choice.imaging)
     return task.gaze_rms(chain.read(truth, optics))
 
 
 def _reality(chain: Chain, diameter_step_nm: float) -> torch.Tensor:
-    """(scenes, pixels) of the eyes through the finest optics, pillars as the mask has them."""
+    """(scenes, pixels) of the eyes through the finest optics, pillars as the mask has
+    them.
+    """
     exact = chain.table(chain.finest.library_tolerance)
-    return chain.electrons(chain.optics(chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.imaging))
+    return chain.electrons(
+        chain.optics(
+            chain.aperture.rounded(exact, diameter_step_nm * 1e-3), chain.finest.imaging
+        )
+    )
 
 
 def _seconds(chain: Chain, choice: Choice | TrueChoice) -> float:

@@ -1,4 +1,6 @@
-"""Bias, dose, fields, stitching, tolerance and solids of a 1 mm lens of 4.9 million free-form pillars."""
+"""Bias, dose, fields, stitching, tolerance and solids of a 1 mm lens of 4.9 million
+free-form pillars.
+"""
 
 import dataclasses
 import functools
@@ -21,30 +23,51 @@ from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
 from metalens.propagate import chief_path, field_at
 
-PROXY = Proxy(np.array([[4.6, 4.2, 0.5, 0.3]]), np.array([[0.9, 0.02, 0.04]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[4.6, 4.2, 0.5, 0.3]]),
+    np.array([[0.9, 0.02, 0.04]]),
+    (0.1, 0.3),
+    (0.85, 0.85),
+    0.0,
+    0.0,
+)
 TABLE_UM = np.arange(100, 301, 2) * 1e-3
 SENS = Sensitivities(
     TABLE_UM,
-    np.array([8j + 30j * (TABLE_UM - 0.1) - 1, 0.3j + 25j * (TABLE_UM - 0.1), 0.2 + 5j * (TABLE_UM - 0.2)]),
+    np.array(
+        [
+            8j + 30j * (TABLE_UM - 0.1) - 1,
+            0.3j + 25j * (TABLE_UM - 0.1),
+            0.2 + 5j * (TABLE_UM - 0.2),
+        ]
+    ),
     0.0,
 )
 BEAM = Exposure(alpha_um=0.010, beta_um=31.0, eta=0.6)
 PROCESS = Process(etch=Etch(sidewall_deg=1.0), exposure=BEAM)
 BIASED = dataclasses.replace(
     PROCESS,
-    bias=dataclasses.replace(PROCESS.bias, table_nm=((80.0, -6.0), (180.0, -1.0), (340.0, 1.0)), isolated_nm=-2.0),
+    bias=dataclasses.replace(
+        PROCESS.bias,
+        table_nm=((80.0, -6.0), (180.0, -1.0), (340.0, 1.0)),
+        isolated_nm=-2.0,
+    ),
 )
 
 
 @functools.cache
 def lens(freeform: bool = True) -> Lens:
-    """Every pillar of a 1 mm aperture at 0.4 um: a focus, with or without a strong free-form phase added."""
+    """Every pillar of a 1 mm aperture at 0.4 um: a focus, with or without a strong
+    free-form phase added.
+    """
     x = (np.arange(2501) - 1250) * 0.4
     r = np.hypot(x, x[:, None])
     phase = -2 * np.pi / 0.85 * (np.sqrt(r**2 + 2000.0**2) + np.sqrt(r**2 + 20000.0**2))
     if freeform:
         u, v = x / 500, x[:, None] / 500
-        phase += 40 * (u**3 + v**3) + 9 * np.sin(8 * u + 3 * v) + 7 * np.cos(11 * v - 5 * u)
+        phase += (
+            40 * (u**3 + v**3) + 9 * np.sin(8 * u + 3 * v) + 7 * np.cos(11 * v - 5 * u)
+        )
     table = PROXY.phase_rad(TABLE_UM, 0.85)
     turn = TABLE_UM[table < table[0] + 2 * np.pi]
     wanted = np.remainder(phase - table[0], 2 * np.pi) + table[0]
@@ -70,11 +93,16 @@ def _process_rows() -> list[Row]:
         "fields": fastest(lambda: fields.split(written, BIASED)),
     }
     result = dose.correct(written, BIASED)
-    wide = dataclasses.replace(BIASED, exposure=dataclasses.replace(BEAM, maximum_classes=4))
+    wide = dataclasses.replace(
+        BIASED, exposure=dataclasses.replace(BEAM, maximum_classes=4)
+    )
     few = dose.correct(written, wide)
     total = sum(times.values())
     case, exact = "4.9 M pillars", "exposure against exact discs, relative"
-    edges, cut = "1 - exposure at the edge of all pillars", fields.split(written, BIASED).cut_before
+    edges, cut = (
+        "1 - exposure at the edge of all pillars",
+        fields.split(written, BIASED).cut_before,
+    )
     return [
         Row(
             case,
@@ -83,8 +111,20 @@ def _process_rows() -> list[Row]:
             float(abs(made - TABLE_UM * 1e3).max()),
             "made - designed diameter at class centres, nm",
         ),
-        Row(case, f"dose, {len(result.factors)} classes", times["dose"], result.error, exact),
-        Row(case, "dose: worst edge, one dose", times["dose"], result.before.worst, edges),
+        Row(
+            case,
+            f"dose, {len(result.factors)} classes",
+            times["dose"],
+            result.error,
+            exact,
+        ),
+        Row(
+            case,
+            "dose: worst edge, one dose",
+            times["dose"],
+            result.before.worst,
+            edges,
+        ),
         Row(
             case,
             f"dose: worst edge, {len(result.factors)} classes",
@@ -94,7 +134,13 @@ def _process_rows() -> list[Row]:
             goal="0.01",
         ),
         Row(case, "dose: worst edge, 4 classes", times["dose"], few.after.worst, edges),
-        Row(case, "field split", times["fields"], 0.0, f"pillars cut; an unshifted raster cuts {cut}"),
+        Row(
+            case,
+            "field split",
+            times["fields"],
+            0.0,
+            f"pillars cut; an unshifted raster cuts {cut}",
+        ),
         Row(
             case,
             "bias + dose + field split",
@@ -114,7 +160,9 @@ def _optics_rows() -> list[Row]:
     choice = tolerant.choose(source, PROCESS, tolerance_rad=0.15)
     seconds = fastest(lambda: stitching.stitching(source, plan, PROCESS), repeats=1)
     amount = fastest(lambda: tolerance.analyse(source, PROCESS, sens=SENS), repeats=1)
-    choosing = fastest(lambda: tolerant.choose(source, PROCESS, tolerance_rad=0.15), repeats=1)
+    choosing = fastest(
+        lambda: tolerant.choose(source, PROCESS, tolerance_rad=0.15), repeats=1
+    )
     case = "4.9 M pillars"
     return [
         Row(
@@ -123,7 +171,13 @@ def _optics_rows() -> list[Row]:
             *_focus_error(),
             "plain Rayleigh-Sommerfeld sum, relative",
         ),
-        Row(case, "stitching +-20 nm, 500 draws", seconds, float(1 - report.strehl.mean()), "mean loss of the peak"),
+        Row(
+            case,
+            "stitching +-20 nm, 500 draws",
+            seconds,
+            float(1 - report.strehl.mean()),
+            "mean loss of the peak",
+        ),
         Row(
             case,
             "stitching +-20 nm, 500 draws",
@@ -131,7 +185,13 @@ def _optics_rows() -> list[Row]:
             float(report.change.max()),
             "worst relative L2 change of the PSF",
         ),
-        Row(case, f"Monte Carlo, 100 draws, rank {study.rank}", amount, study.error, "t of the pillars, rms relative"),
+        Row(
+            case,
+            f"Monte Carlo, 100 draws, rank {study.rank}",
+            amount,
+            study.error,
+            "t of the pillars, rms relative",
+        ),
         Row(
             case,
             "tolerant choice within 0.15 rad",
@@ -146,11 +206,15 @@ def _focus_error() -> tuple[float, float]:
     source = lens(freeform=False)
     middle = slice(1150, 1351)
     small = dataclasses.replace(
-        source, diameters=DiameterMap(source.diameters.diameter_um[middle, middle], 0.4), sensor_distance_um=200.0
+        source,
+        diameters=DiameterMap(source.diameters.diameter_um[middle, middle], 0.4),
+        sensor_distance_um=200.0,
     )
     axis = np.linspace(-6, 9, 6)
     where = focus.Window(axis, axis, 200.0, 0.85, np.array([16e3, 20e3, 26e3]))
-    t = (small.transmission() * np.exp(1j * small.phase_rad()))[None].astype(np.complex64)
+    t = (small.transmission() * np.exp(1j * small.phase_rad()))[None].astype(
+        np.complex64
+    )
     ready = focus.prepare(small, where)
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     exact = field_at(np.angle(t[0]), np.abs(t[0]), ready.case, points).reshape(-1, 6, 6)
@@ -166,23 +230,45 @@ def _focus_error() -> tuple[float, float]:
 def _solid_rows() -> list[Row]:
     hundred = solid.tile(lens(), PROCESS, side_um=126.0)
     ten = solid.tile(lens(), PROCESS, side_um=39.6)
-    cones = np.pi / 12 * hundred.height_um * (hundred.foot_um**2 + hundred.foot_um * hundred.top_um + hundred.top_um**2)
+    cones = (
+        np.pi
+        / 12
+        * hundred.height_um
+        * (hundred.foot_um**2 + hundred.foot_um * hundred.top_um + hundred.top_um**2)
+    )
     want = float(cones[hundred.kind].sum())
     with tempfile.TemporaryDirectory() as folder:
-        stl, step, threemf, gltf = (Path(folder) / f"tile.{end}" for end in ("stl", "step", "3mf", "glb"))
+        stl, step, threemf, gltf = (
+            Path(folder) / f"tile.{end}" for end in ("stl", "step", "3mf", "glb")
+        )
         times = [
             fastest(lambda: solid.write_stl(stl, hundred)),
             fastest(lambda: solid.write_step(step, ten), repeats=1),
             fastest(lambda: solid.write_3mf(threemf, hundred), repeats=1),
             fastest(lambda: solid.write_gltf(gltf, ten), repeats=1),
-            fastest(lambda: solid.write_module(Path(folder) / "module.step", solid.Module()), repeats=1),
+            fastest(
+                lambda: solid.write_module(
+                    Path(folder) / "module.step", solid.Module()
+                ),
+                repeats=1,
+            ),
         ]
-        corners = np.frombuffer(stl.read_bytes()[84:], "V50").view(np.uint8).reshape(-1, 50)[:, 12:48].copy()
+        corners = (
+            np.frombuffer(stl.read_bytes()[84:], "V50")
+            .view(np.uint8)
+            .reshape(-1, 50)[:, 12:48]
+            .copy()
+        )
         a, b, c = corners.view("<f4").reshape(-1, 3, 3).astype(float).transpose(1, 0, 2)
         error = abs(float((a * np.cross(b, c)).sum()) / 6 / want - 1)
-        sizes = {path.suffix: os.path.getsize(path) / 1e6 for path in (stl, step, threemf, gltf)}
+        sizes = {
+            path.suffix: os.path.getsize(path) / 1e6
+            for path in (stl, step, threemf, gltf)
+        }
     count = f"{len(hundred.kind)} tapered pillars"
-    met = ["met" if t <= g else "missed" for t, g in zip(times[:2], (2, 5), strict=True)]
+    met = [
+        "met" if t <= g else "missed" for t, g in zip(times[:2], (2, 5), strict=True)
+    ]
     blank = math.nan
     return [
         Row(
@@ -202,6 +288,18 @@ def _solid_rows() -> list[Row]:
             goal=f"<= 5 s: {met[1]}",
         ),
         Row(count, f"3MF, {sizes['.3mf']:.1f} MB", times[2], blank, "none"),
-        Row(f"{len(ten.kind)} instances", f"glTF, {sizes['.glb']:.1f} MB", times[3], blank, "none"),
-        Row("module", "STEP with clearances", times[4], blank, "none: sizes are tested on re-import"),
+        Row(
+            f"{len(ten.kind)} instances",
+            f"glTF, {sizes['.glb']:.1f} MB",
+            times[3],
+            blank,
+            "none",
+        ),
+        Row(
+            "module",
+            "STEP with clearances",
+            times[4],
+            blank,
+            "none: sizes are tested on re-import",
+        ),
     ]

@@ -1,4 +1,6 @@
-"""PSF engine: time beside error for a 1 mm lens of 2500 x 2500 pillars; see :mod:`benchmarks._psf_case`."""
+"""PSF engine: time beside error for a 1 mm lens of 2500 x 2500 pillars; see
+:mod:`benchmarks._psf_case`.
+"""
 
 import functools
 import math
@@ -36,7 +38,9 @@ from metalens import propagate, psf
 from metalens.propagate.direct import transfer
 from metalens.propagate.estimate import draw, scan, square_error
 
-WIDE = dict(window_um=128.0, samples=64, integrate=False)  # samples 2 um apart, as the exact sum gives them
+WIDE = dict(
+    window_um=128.0, samples=64, integrate=False
+)  # samples 2 um apart, as the exact sum gives them
 CELLS = WIDE | dict(integrate=True)  # the light of pixels of 2 um
 SIZES = (
     (0.25, 21),
@@ -50,17 +54,31 @@ SIZES = (
     (1.0, 401),
     (4.0, 401),
 )
-KINDS = ("hyperbolic", "noisy", "double helix")  # beside the free-form lens of the main rows
+KINDS = (
+    "hyperbolic",
+    "noisy",
+    "double helix",
+)  # beside the free-form lens of the main rows
 
 
 def rows() -> list[Row]:
-    """All rows of the engine: against the textbook, ladder, depths, angles, lenses, polarisations, sizes, low rank,
+    """All rows of the engine: against the textbook, ladder, depths, angles, lenses,
+    polarisations, sizes, low rank,
     Hankel."""
-    return [*_main_rows(), *_ladder_rows(), *_lens_rows(), *polarised_rows(), *_size_rows(), *_other_rows()]
+    return [
+        *_main_rows(),
+        *_ladder_rows(),
+        *_lens_rows(),
+        *polarised_rows(),
+        *_size_rows(),
+        *_other_rows(),
+    ]
 
 
 def _main_rows() -> list[Row]:
-    """The asked case on a free-form lens: windowed first, on a machine that nothing else has warmed or filled."""
+    """The asked case on a free-form lens: windowed first, on a machine that nothing
+    else has warmed or filled.
+    """
     maps, threads = lens("free-form"), torch.get_num_threads()
     start = time.perf_counter()
     stack = forward(maps)
@@ -68,11 +86,17 @@ def _main_rows() -> list[Row]:
     start = time.perf_counter()
     forward(maps, window_um=47.0)
     first = time.perf_counter() - start
-    once, both = fastest(lambda: forward(maps), repeats=15), fastest(lambda: gradient(maps), repeats=15)
+    once, both = (
+        fastest(lambda: forward(maps), repeats=15),
+        fastest(lambda: gradient(maps), repeats=15),
+    )
     memory = peak_mb(lambda: forward(maps)), peak_mb(lambda: gradient(maps))
     case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW)
     h = torch.tensor(transfer(case, (5000, 5000), band_limited=False).astype("c8"))
-    slow = [fastest(lambda g=g: textbook(maps, h, grad=g), repeats=2) * len(DEPTHS) for g in (False, True)]
+    slow = [
+        fastest(lambda g=g: textbook(maps, h, grad=g), repeats=2) * len(DEPTHS)
+        for g in (False, True)
+    ]
     size = maps[0].numel() * 4 / 2**20
     case_name = "1 mm free-form, 21 depths"
     wrong, about = error(stack, maps), f"exact sum (estimate {stack.error:.1e})"
@@ -80,11 +104,32 @@ def _main_rows() -> list[Row]:
         f"{slow[0] / once:.0f}x textbook (300x, goal 600x), 1e-4, 150 MB",
         f"{slow[1] / both:.0f}x textbook (250x, goal 800x), 2e-4, 250 MB",
     )
-    judged, planned = "gradient in float64 at 1e-9", f"{slow[0] / first:.0f}x textbook (300x), with the plan"
+    judged, planned = (
+        "gradient in float64 at 1e-9",
+        f"{slow[0] / first:.0f}x textbook (300x), with the plan",
+    )
     return [
-        Row(case_name, "windowed 1e-4", once, wrong, about, threads, memory[0], goals[0]),
-        Row(case_name, "windowed 1e-4, first call of the geometry", first, wrong, about, threads, goal=planned),
-        Row(case_name, "windowed 1e-4, first call of the process", cold, wrong, about, threads, goal="code is read"),
+        Row(
+            case_name, "windowed 1e-4", once, wrong, about, threads, memory[0], goals[0]
+        ),
+        Row(
+            case_name,
+            "windowed 1e-4, first call of the geometry",
+            first,
+            wrong,
+            about,
+            threads,
+            goal=planned,
+        ),
+        Row(
+            case_name,
+            "windowed 1e-4, first call of the process",
+            cold,
+            wrong,
+            about,
+            threads,
+            goal="code is read",
+        ),
         Row(
             case_name,
             "windowed 1e-4, with gradient",
@@ -95,7 +140,14 @@ def _main_rows() -> list[Row]:
             memory[1] - size,
             goals[1],
         ),
-        Row(case_name, "textbook angular spectrum, complex64", slow[0], _lattice_error(maps), "exact sum", threads),
+        Row(
+            case_name,
+            "textbook angular spectrum, complex64",
+            slow[0],
+            _lattice_error(maps),
+            "exact sum",
+            threads,
+        ),
         Row(case_name, "textbook, with gradient", slow[1], math.nan, "none", threads),
     ]
 
@@ -103,29 +155,61 @@ def _main_rows() -> list[Row]:
 def _lattice_error(maps: Any) -> float:
     """Error of the textbook method on a 16 x 16 window of the lattice, one depth."""
     geometry = GEOMETRY | dict(
-        depths_um=DEPTHS[10], window_um=16 * 2 * PITCH, samples=16, offset_um=(PITCH / 2, PITCH / 2)
+        depths_um=DEPTHS[10],
+        window_um=16 * 2 * PITCH,
+        samples=16,
+        offset_um=(PITCH / 2, PITCH / 2),
     )
     arrays = maps[0].numpy(), maps[1].numpy()
     got = np.abs(propagate.angular_spectrum(*arrays, single=True, **geometry)) ** 2
     want = np.abs(propagate.exact(*arrays, **geometry)) ** 2
-    return float(np.linalg.norm(got / got.sum() - want / want.sum()) / np.linalg.norm(want / want.sum()))
+    return float(
+        np.linalg.norm(got / got.sum() - want / want.sum())
+        / np.linalg.norm(want / want.sum())
+    )
 
 
 def _ladder_rows() -> list[Row]:
     maps, threads = lens("hyperbolic"), torch.get_num_threads()
     base = fastest(lambda: forward(maps))
     found = []
-    for tolerance, dtype, goal in ((1e-6, torch.float32, "2.5x of 1e-4"), (1e-9, torch.float64, "1e-9")):
+    for tolerance, dtype, goal in (
+        (1e-6, torch.float32, "2.5x of 1e-4"),
+        (1e-9, torch.float64, "1e-9"),
+    ):
         cast = tuple(m.to(dtype) for m in maps)
         stack = forward(cast, tolerance=tolerance)
         seconds = fastest(lambda c=cast, t=tolerance: forward(c, tolerance=t))
         reached = f"{seconds / base:.2f}x of 1e-4 ({goal}), estimate {stack.error:.1e}"
         name = f"windowed {tolerance:.0e} {str(dtype)[6:]}"
-        found.append(Row("1 mm, 21 depths", name, seconds, error(stack, cast), "exact sum", threads, goal=reached))
+        found.append(
+            Row(
+                "1 mm, 21 depths",
+                name,
+                seconds,
+                error(stack, cast),
+                "exact sum",
+                threads,
+                goal=reached,
+            )
+        )
     depths = np.linspace(16e3, 26e3, 201)
-    seconds, stack = fastest(lambda: forward(maps, depths_um=depths)), forward(maps, depths_um=depths)
+    seconds, stack = (
+        fastest(lambda: forward(maps, depths_um=depths)),
+        forward(maps, depths_um=depths),
+    )
     goal = f"{seconds / base:.2f}x of 21 depths (2.5x)"
-    found.append(Row("1 mm, 201 depths", "windowed 1e-4", seconds, error(stack, maps), "exact sum", threads, goal=goal))
+    found.append(
+        Row(
+            "1 mm, 201 depths",
+            "windowed 1e-4",
+            seconds,
+            error(stack, maps),
+            "exact sum",
+            threads,
+            goal=goal,
+        )
+    )
     return [*found, *_angle_rows(maps, threads)]
 
 
@@ -160,14 +244,27 @@ def _angle_rows(maps: Any, threads: int) -> list[Row]:
 
 
 def _cells_row(maps: Any, threads: int, samples_s: float) -> Row:
-    """Pixels wider than Nyquist's step, whose light is integrated; against a window of pixels half as wide."""
+    """Pixels wider than Nyquist's step, whose light is integrated; against a window of
+    pixels half as wide.
+    """
     stack, seconds = forward(maps, **CELLS), fastest(lambda: forward(maps, **CELLS))
     finer = forward(maps, window_um=128.0, samples=128).intensity
     light = finer.reshape(*finer.shape[:-2], 64, 2, 64, 2).sum((-3, -1))
-    wrong = float((light / light.sum((-2, -1), keepdims=True) - stack.intensity).norm() / stack.intensity.norm())
+    wrong = float(
+        (light / light.sum((-2, -1), keepdims=True) - stack.intensity).norm()
+        / stack.intensity.norm()
+    )
     goal = f"{seconds / samples_s:.1f}x of samples, estimate {stack.error:.1e}"
     about = "sums over pixels of 1 um"
-    return Row("1 mm, 21 depths, pixels of 2 um", "windowed 1e-4", seconds, wrong, about, threads, goal=goal)
+    return Row(
+        "1 mm, 21 depths, pixels of 2 um",
+        "windowed 1e-4",
+        seconds,
+        wrong,
+        about,
+        threads,
+        goal=goal,
+    )
 
 
 def _lens_rows() -> list[Row]:
@@ -179,51 +276,95 @@ def _lens_rows() -> list[Row]:
         about = f"exact sum (estimate {stack.error:.1e})"
         wrong = f"gradient error {gradient_error(maps, 1e-4):.1e} (2e-4)"
         name = f"1 mm {kind}, 21 depths"
-        found.append(Row(name, "windowed 1e-4", seconds, error(stack, maps), about, threads, goal=wrong))
-    return found
-
-
-def polarised_rows() -> list[Row]:
-    """One scalar, |E|² and the flux of both polarisations: processor time beside the error of the middle depth."""
-    threads, maps = torch.get_num_threads(), lens("hyperbolic")
-    base, found = math.nan, []
-    for kind in ("scalar", "vector", "flux"):
-        stack, seconds = forward(maps, polarisation=kind), fastest(lambda k=kind: forward(maps, polarisation=k))
-        base = seconds if kind == "scalar" else base
-        about, goal = f"sums of E and H (estimate {stack.error:.1e})", f"{seconds / base:.1f}x of the scalar"
-        name = f"1 mm, 21 depths, {kind}"
         found.append(
-            Row(name, "windowed 1e-4", seconds, _polarised_error(stack, maps, kind), about, threads, goal=goal)
+            Row(
+                name,
+                "windowed 1e-4",
+                seconds,
+                error(stack, maps),
+                about,
+                threads,
+                goal=wrong,
+            )
         )
     return found
 
 
-def _polarised_error(stack: psf.PsfStack, maps: tuple[torch.Tensor, torch.Tensor], kind: str) -> float:
-    """Relative L2 at the middle depth against E and H of every pillar summed apart, at drawn points of the window."""
+def polarised_rows() -> list[Row]:
+    """One scalar, |E|² and the flux of both polarisations: processor time beside the
+    error of the middle depth.
+    """
+    threads, maps = torch.get_num_threads(), lens("hyperbolic")
+    base, found = math.nan, []
+    for kind in ("scalar", "vector", "flux"):
+        stack, seconds = (
+            forward(maps, polarisation=kind),
+            fastest(lambda k=kind: forward(maps, polarisation=k)),
+        )
+        base = seconds if kind == "scalar" else base
+        about, goal = (
+            f"sums of E and H (estimate {stack.error:.1e})",
+            f"{seconds / base:.1f}x of the scalar",
+        )
+        name = f"1 mm, 21 depths, {kind}"
+        found.append(
+            Row(
+                name,
+                "windowed 1e-4",
+                seconds,
+                _polarised_error(stack, maps, kind),
+                about,
+                threads,
+                goal=goal,
+            )
+        )
+    return found
+
+
+def _polarised_error(
+    stack: psf.PsfStack, maps: tuple[torch.Tensor, torch.Tensor], kind: str
+) -> float:
+    """Relative L2 at the middle depth against E and H of every pillar summed apart, at
+    drawn points of the window.
+    """
     plain, depth = stack.numpy(), len(stack.depths_um) // 2
     flat = np.asarray(plain.intensity[depth], float).reshape(1, -1)
     points, chance = draw(flat, scan(plain.intensity.shape), 64)
     y, x = np.divmod(points[0], len(plain.x_um))
     where = np.stack([plain.x_um[x], plain.y_um[y]], -1)
-    one = {"depths_um": plain.depths_um[depth], "window_um": plain.step_um, "samples": 1}
+    one = {
+        "depths_um": plain.depths_um[depth],
+        "window_um": plain.step_um,
+        "samples": 1,
+    }
     case = propagate.case(maps[0].shape, **GEOMETRY, **one)
 
     def at(factor: np.ndarray | float) -> np.ndarray:
-        return propagate.field_at(maps[0].numpy(), maps[1].numpy() * factor, case, where)[0]
+        return propagate.field_at(
+            maps[0].numpy(), maps[1].numpy() * factor, case, where
+        )[0]
 
     want = np.abs(at(1.0)) ** 2 if kind == "scalar" else _from_fields(at, case, kind)
-    difference = want * plain.step_um**2 / float(plain.energy_um2[depth]) - np.take_along_axis(flat, points, 1)
+    difference = want * plain.step_um**2 / float(
+        plain.energy_um2[depth]
+    ) - np.take_along_axis(flat, points, 1)
     return math.sqrt(square_error(flat, points, chance, difference) / (flat**2).sum())
 
 
-def _from_fields(at: Callable[[np.ndarray], np.ndarray], case: propagate.Case, kind: str) -> np.ndarray:
-    """Ex Hy* - Ey Hx* or |E|² of both polarisations, each ray turned from the axis to the middle of the window."""
+def _from_fields(
+    at: Callable[[np.ndarray], np.ndarray], case: propagate.Case, kind: str
+) -> np.ndarray:
+    """Ex Hy* - Ey Hx* or |E|² of both polarisations, each ray turned from the axis to
+    the middle of the window.
+    """
     y, x = case.pillars_um
     r = np.sqrt(x**2 + y[:, None] ** 2 + D**2)
     bx, by, bz = -x / r, -y[:, None] / r, D / r
     along = np.array([1 - bx * bx / (1 + bz), -bx * by / (1 + bz), -bx]) / np.sqrt(bz)
     across = np.array([-bx * by / (1 + bz), 1 - by * by / (1 + bz), -by]) / np.sqrt(bz)
-    e, h = (np.array([at(part) for part in field]) for field in (along, across))  # H of light along x is E along y
+    e, h = (
+        np.array([at(part) for part in field]) for field in (along, across)
+    )  # H of light along x is E along y
     if kind == "flux":
         return np.asarray((e[0] * h[1].conj() - e[1] * h[0].conj()).real)
     return np.asarray(((np.abs(e) ** 2).sum(0) + (np.abs(h) ** 2).sum(0)) / 2)
@@ -233,12 +374,24 @@ def _size_rows() -> list[Row]:
     threads, found = torch.get_num_threads(), []
     for millimetres, depths in SIZES:
         maps = lens("hyperbolic", round(millimetres * 1000 / PITCH))
-        arguments: dict[str, Any] = dict(depths_um=np.linspace(16e3, 26e3, depths), integrate=False)
+        arguments: dict[str, Any] = dict(
+            depths_um=np.linspace(16e3, 26e3, depths), integrate=False
+        )
         stack = forward(maps, **arguments)
         seconds = fastest(lambda m=maps, a=arguments: forward(m, **a))
         memory = peak_mb(lambda m=maps, a=arguments: forward(m, **a))
         name = f"{millimetres:g} mm, {depths} depths"
-        found.append(Row(name, "windowed 1e-4", seconds, stack.error, "own estimate", threads, memory))
+        found.append(
+            Row(
+                name,
+                "windowed 1e-4",
+                seconds,
+                stack.error,
+                "own estimate",
+                threads,
+                memory,
+            )
+        )
     return found
 
 
@@ -248,13 +401,21 @@ def _other_rows() -> list[Row]:
     small = lowrank.compress(stack, tolerance=1e-3)
     seconds = fastest(lambda: lowrank.compress(stack, tolerance=1e-3))
     round_lens = Radial(
-        lambda r: -K * (r * r / (np.hypot(r, D) + D) + r * r / (np.hypot(r, SOURCE) + SOURCE)), np.ones_like, RADIUS
+        lambda r: (
+            -K * (r * r / (np.hypot(r, D) + D) + r * r / (np.hypot(r, SOURCE) + SOURCE))
+        ),
+        np.ones_like,
+        RADIUS,
     )
     case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS, **WINDOW)
     hankel = field_radial(round_lens, case, 1e-4)
     light = np.abs(hankel.field) ** 2
     energy = light.sum((1, 2))
-    as_stack = replace(forward(maps), intensity=light / energy[:, None, None], energy_um2=energy * stack.step_um**2)
+    as_stack = replace(
+        forward(maps),
+        intensity=light / energy[:, None, None],
+        energy_um2=energy * stack.step_um**2,
+    )
     return [
         Row(
             "51 depths of 64 x 64",
@@ -276,7 +437,9 @@ def _other_rows() -> list[Row]:
 
 
 def peer_rows() -> list[Row]:
-    """torchoptics' direct integration, one depth times 21, in an environment that holds it; none elsewhere."""
+    """torchoptics' direct integration, one depth times 21, in an environment that holds
+    it; none elsewhere.
+    """
     try:
         from torchoptics import Field
     except ImportError:
@@ -286,19 +449,33 @@ def peer_rows() -> list[Row]:
     z = DEPTHS[10]
     r2 = x**2 + x[:, None] ** 2
     source = r2 / ((r2 + z * z).sqrt() + z)
-    light = torch.polar(maps[1].double(), maps[0].double() + K * source).to(torch.complex64)
+    light = torch.polar(maps[1].double(), maps[0].double() + K * source).to(
+        torch.complex64
+    )
     metre = 1e-6
     field = Field(light, wavelength=WAVELENGTH * metre, z=0.0, spacing=PITCH * metre)
-    go = functools.partial(field.propagate, 64, D * metre, spacing=0.75 * metre, propagation_method="DIM")
+    go = functools.partial(
+        field.propagate, 64, D * metre, spacing=0.75 * metre, propagation_method="DIM"
+    )
     seconds = fastest(go, repeats=1) * len(DEPTHS)
     power = go().data.abs().double().numpy() ** 2
     ours = fastest(lambda: forward(maps), repeats=5)
     stack = forward(maps, depths_um=DEPTHS[10:11])
     points = np.arange(64 * 64).reshape(64, 64)[2::6, 2::6].ravel()
     want, got = exact(maps, stack, (0, 0), points), power.ravel()[points]
-    wrong = float(np.linalg.norm(got / got.sum() - want / want.sum()) / np.linalg.norm(want / want.sum()))
+    wrong = float(
+        np.linalg.norm(got / got.sum() - want / want.sum())
+        / np.linalg.norm(want / want.sum())
+    )
     return [
-        Row("1 mm, 21 depths", "torchoptics direct integration", seconds, wrong, "exact sum", threads),
+        Row(
+            "1 mm, 21 depths",
+            "torchoptics direct integration",
+            seconds,
+            wrong,
+            "exact sum",
+            threads,
+        ),
         Row(
             "1 mm, 21 depths",
             "windowed 1e-4",

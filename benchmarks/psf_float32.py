@@ -1,11 +1,17 @@
-"""Error estimates of PSFs on random cases in single and in double precision: how many lie below the error.
+"""Error estimates of PSFs on random cases in single and in double precision: how many
+lie below the error.
 
-Lenses, pupils and screens of any pitch, wavelength and numerical aperture; windows on their light, beside it, tiny,
-wider than the lens, and as wide as Fourier transforms take them; sources from the side. The referee is the plain sum
-over pillars (:mod:`benchmarks.rivals.plain_sum`), which shares no code with the engine, of the very maps that the
-engine got: at every sample of a window, or at ``POINTS`` of them drawn by their light, its root and evenly.
+Lenses, pupils and screens of any pitch, wavelength and numerical aperture; windows on
+their light, beside it, tiny,
+wider than the lens, and as wide as Fourier transforms take them; sources from the side.
+The referee is the plain sum
+over pillars (:mod:`benchmarks.rivals.plain_sum`), which shares no code with the engine,
+of the very maps that the
+engine got: at every sample of a window, or at ``POINTS`` of them drawn by their light,
+its root and evenly.
 
-``python -m benchmarks psf_float32`` draws 500 cases; ``python -m benchmarks.psf_float32 N [SEED]`` so many.
+``python -m benchmarks psf_float32`` draws 500 cases; ``python -m benchmarks.psf_float32
+N [SEED]`` so many.
 """
 
 import math
@@ -37,13 +43,22 @@ KINDS = {
     "wide windows": 0.08,
     "wide windows beside the light": 0.06,
 }
-UNPULLED = ("window wider than the lens", "lens of 160 to 260 pillars", "wide windows")  # without gradients
-STEEPER = {"wide windows": 0.5, "wide windows beside the light": 0.4, "light from the side": 3}  # angles, times
+UNPULLED = (
+    "window wider than the lens",
+    "lens of 160 to 260 pillars",
+    "wide windows",
+)  # without gradients
+STEEPER = {
+    "wide windows": 0.5,
+    "wide windows beside the light": 0.4,
+    "light from the side": 3,
+}  # angles, times
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drawn:
-    """phase_rad, level: (y, x) float32 maps, so that both precisions get the same; about: arguments of
+    """phase_rad, level: (y, x) float32 maps, so that both precisions get the same;
+    about: arguments of
     :func:`metalens.psf.psf_stack`; kind: one of ``KINDS``."""
 
     phase_rad: Array
@@ -77,7 +92,13 @@ def drawn(rng: np.random.Generator) -> Drawn:
         **_window(rng, kind, half, wavelength),
     }
     wrapped = np.remainder(phase + np.pi, 2 * np.pi) - np.pi
-    return Drawn(wrapped.astype("f4"), level.astype("f4"), about, float(rng.choice(TOLERANCES)), kind)
+    return Drawn(
+        wrapped.astype("f4"),
+        level.astype("f4"),
+        about,
+        float(rng.choice(TOLERANCES)),
+        kind,
+    )
 
 
 def _pillars(kind: str) -> tuple[int, int]:
@@ -89,12 +110,18 @@ def _pillars(kind: str) -> tuple[int, int]:
     return (160, 260) if kind.startswith("lens") else (12, 64)
 
 
-def _maps(rng: np.random.Generator, shape: tuple[int, ...], of: tuple[float, ...]) -> tuple[Array, Array]:
-    """Phase and transmission of a lens, one with errors, a screen of chance, or one that is tilted and out of focus."""
+def _maps(
+    rng: np.random.Generator, shape: tuple[int, ...], of: tuple[float, ...]
+) -> tuple[Array, Array]:
+    """Phase and transmission of a lens, one with errors, a screen of chance, or one
+    that is tilted and out of focus.
+    """
     pitch, wavelength, distance, source = of
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     half, r2 = max(y[-1], x[-1], pitch / 2), x**2 + y[:, None] ** 2
-    phase = -2 * np.pi / wavelength * (np.sqrt(r2 + distance**2) + np.sqrt(r2 + source**2))
+    phase = (
+        -2 * np.pi / wavelength * (np.sqrt(r2 + distance**2) + np.sqrt(r2 + source**2))
+    )
     kind = rng.integers(4)
     if kind == 1:
         phase = phase + rng.normal(0, rng.uniform(0.05, 1), shape)
@@ -106,12 +133,17 @@ def _maps(rng: np.random.Generator, shape: tuple[int, ...], of: tuple[float, ...
     return phase, (r2 <= rim**2) * rng.uniform(rng.uniform(0, 1), 1, shape)
 
 
-def _window(rng: np.random.Generator, kind: str, half: float, wavelength: float) -> dict[str, Any]:
+def _window(
+    rng: np.random.Generator, kind: str, half: float, wavelength: float
+) -> dict[str, Any]:
     """Where it lies and how large it is."""
     samples, width = int(rng.integers(2, 25)), half * 10 ** rng.uniform(-2, 0)
     away = 0.5 * width * rng.uniform(-1, 1, 2)
     if kind == "tiny windows":
-        samples, width = int(rng.integers(2, 5)), wavelength * 10 ** rng.uniform(-2, 0.3)
+        samples, width = (
+            int(rng.integers(2, 5)),
+            wavelength * 10 ** rng.uniform(-2, 0.3),
+        )
         away = rng.uniform(-1, 1, 2) * half * rng.choice([0.05, 1.0])
     if kind == "window wider than the lens":
         width, samples = 2 * half * rng.uniform(1, 4), int(rng.integers(8, 64))
@@ -121,12 +153,20 @@ def _window(rng: np.random.Generator, kind: str, half: float, wavelength: float)
         width = wavelength * rng.uniform(200, 300)
         samples = int(width / (wavelength * rng.uniform(1, 2)))
     if kind.endswith("beside the light"):
-        away = rng.uniform(-1, 1, 2) * half * rng.uniform(0.5, 1.5 if kind.startswith("wide") else 3)
+        away = (
+            rng.uniform(-1, 1, 2)
+            * half
+            * rng.uniform(0.5, 1.5 if kind.startswith("wide") else 3)
+        )
     return {"window_um": width, "samples": samples, "offset_um": tuple(away)}
 
 
-def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, float, str, bool]]:
-    """(estimate, true relative error, method, whether the estimate is above the tolerance) in every precision."""
+def judged(
+    case: Drawn, dtypes: tuple[torch.dtype, ...]
+) -> list[tuple[float, float, str, bool]]:
+    """(estimate, true relative error, method, whether the estimate is above the
+    tolerance) in every precision.
+    """
     found: list[tuple[float, float, str, bool]] = []
     drawing = np.random.default_rng(9)
     points: Any = None
@@ -134,23 +174,34 @@ def judged(case: Drawn, dtypes: tuple[torch.dtype, ...]) -> list[tuple[float, fl
     want: Any = None
     for dtype in dtypes:
         maps = [torch.tensor(one, dtype=dtype) for one in (case.phase_rad, case.level)]
-        maps[0].requires_grad_(case.kind not in UNPULLED)  # the exact sum, which has no derivatives, is not chosen
-        stack = psf.psf_stack(*maps, tolerance=case.tolerance, integrate=False, **case.about).numpy()
+        maps[0].requires_grad_(
+            case.kind not in UNPULLED
+        )  # the exact sum, which has no derivatives, is not chosen
+        stack = psf.psf_stack(
+            *maps, tolerance=case.tolerance, integrate=False, **case.about
+        ).numpy()
         light = np.asarray(stack.intensity, float).reshape(len(stack.depths_um), -1)
         if points is None:
             points, chance = _points(light, drawing)
             want = _plain(case, stack, points)
-        raw = light[:, points] * (np.asarray(stack.energy_um2, float) / stack.step_um**2)[:, None]
+        raw = (
+            light[:, points]
+            * (np.asarray(stack.energy_um2, float) / stack.step_um**2)[:, None]
+        )
         energy = np.asarray(stack.energy_um2, float)[:, None] / stack.step_um**2
         wrong = (raw - want) / energy
         wrong = wrong - light[:, points] * (wrong / chance).sum(1, keepdims=True)
         true = math.sqrt((wrong**2 / chance).sum() / (light**2).sum())
-        found.append((stack.error, true, stack.reason.split(":")[0], not stack.converged))
+        found.append(
+            (stack.error, true, stack.reason.split(":")[0], not stack.converged)
+        )
     return found
 
 
 def _points(light: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Flat samples of the window, and how often each is expected among them: all, or ``POINTS`` drawn by chance."""
+    """Flat samples of the window, and how often each is expected among them: all, or
+    ``POINTS`` drawn by chance.
+    """
     mean = (light / light.sum(1, keepdims=True)).mean(0)
     if len(mean) <= POINTS:
         return np.arange(len(mean)), np.ones(len(mean))
@@ -162,9 +213,15 @@ def _points(light: Array, rng: np.random.Generator) -> tuple[Array, Array]:
 def _plain(case: Drawn, stack: psf.PsfStack, points: Array) -> Array:
     """(depth, point) light by the plain sum at flat samples of the window."""
     y, x = np.divmod(points, len(stack.x_um))
-    about = {name: v for name, v in case.about.items() if name not in ("window_um", "samples", "offset_um")}
+    about = {
+        name: v
+        for name, v in case.about.items()
+        if name not in ("window_um", "samples", "offset_um")
+    }
     tangents = np.tan(case.about["angle_rad"])
-    where = case.about["sensor_distance_um"] * tangents + np.array(case.about["offset_um"])
+    where = case.about["sensor_distance_um"] * tangents + np.array(
+        case.about["offset_um"]
+    )
     step = case.about["window_um"] / case.about["samples"]
     middle = (case.about["samples"] - 1) / 2
     at = where + step * (np.stack([x, y], -1) - middle)
@@ -184,7 +241,10 @@ def study(count: int, seed: int) -> list[Row]:
             refused += 1
     seconds = (time.perf_counter() - start) / count
     about = seed, refused, seconds
-    return [_row(found, i, str(dtype).removeprefix("torch."), about) for i, dtype in enumerate(dtypes)]
+    return [
+        _row(found, i, str(dtype).removeprefix("torch."), about)
+        for i, dtype in enumerate(dtypes)
+    ]
 
 
 def _row(found: list[Any], i: int, dtype: str, about: tuple[int, int, float]) -> Row:

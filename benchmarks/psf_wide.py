@@ -1,8 +1,12 @@
-"""PSF engine on windows as wide as a sensor: time, memory and error beside the textbook, 1 mm lens, 21 depths.
+"""PSF engine on windows as wide as a sensor: time, memory and error beside the
+textbook, 1 mm lens, 21 depths.
 
-The last row of a window counts operations: what the textbook's transforms take, and what three transforms of the
-window's own samples take for every depth field that 21 depths need. Their ratio is what arithmetic leaves to win, since
-samples of the field can be no farther apart than Nyquist's step and the engine's own are.
+The last row of a window counts operations: what the textbook's transforms take, and
+what three transforms of the
+window's own samples take for every depth field that 21 depths need. Their ratio is what
+arithmetic leaves to win, since
+samples of the field can be no farther apart than Nyquist's step and the engine's own
+are.
 """
 
 import math
@@ -12,12 +16,24 @@ from collections.abc import Iterator
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks._psf_case import DEPTHS, GEOMETRY, WINDOW, error, forward, lens, peak_mb, textbook
+from benchmarks._psf_case import (
+    DEPTHS,
+    GEOMETRY,
+    WINDOW,
+    error,
+    forward,
+    lens,
+    peak_mb,
+    textbook,
+)
 from metalens import propagate
 from metalens.propagate.direct import transfer
 from metalens.propagate.grids import FIELDS
 
-WINDOWS = ((384.0, 512, 100), (1000.0, 1280, 30))  # um, samples, times the textbook that are asked for
+WINDOWS = (
+    (384.0, 512, 100),
+    (1000.0, 1280, 30),
+)  # um, samples, times the textbook that are asked for
 PADDED = 5000  # points of the textbook's transforms along an axis
 
 
@@ -27,17 +43,36 @@ def rows() -> Iterator[Row]:
     case = propagate.case(maps[0].shape, **GEOMETRY, depths_um=DEPTHS[10], **WINDOW)
     h = torch.tensor(transfer(case, (PADDED, PADDED), band_limited=False).astype("c8"))
     slow = fastest(lambda: textbook(maps, h, grad=False), repeats=1) * len(DEPTHS)
-    yield Row("1 mm free-form, 21 depths", "textbook angular spectrum, complex64", slow, math.nan, "none", threads)
-    forward(maps, window_um=300.0, samples=400, integrate=False, depths_um=DEPTHS[:2])  # compiled code is read
+    yield Row(
+        "1 mm free-form, 21 depths",
+        "textbook angular spectrum, complex64",
+        slow,
+        math.nan,
+        "none",
+        threads,
+    )
+    forward(
+        maps, window_um=300.0, samples=400, integrate=False, depths_um=DEPTHS[:2]
+    )  # compiled code is read
     for width, samples, goal in WINDOWS:
         about = {"window_um": width, "samples": samples, "integrate": False}
         start = time.perf_counter()
         stack = forward(maps, **about)
         first = time.perf_counter() - start
-        wrong, name = error(stack, maps), f"1 mm free-form, 21 depths, {width:g} um window"
+        wrong, name = (
+            error(stack, maps),
+            f"1 mm free-form, 21 depths, {width:g} um window",
+        )
         against = f"exact sum (estimate {stack.error:.1e})"
         del stack
-        yield Row(name, "windowed 1e-4, first call of the geometry", first, wrong, against, threads)
+        yield Row(
+            name,
+            "windowed 1e-4, first call of the geometry",
+            first,
+            wrong,
+            against,
+            threads,
+        )
         seconds = fastest(lambda a=about: forward(maps, **a), repeats=2)  # type: ignore[misc]
         memory = peak_mb(lambda a=about: forward(maps, **a))  # type: ignore[misc]
         said = f"{slow / seconds:.1f}x textbook ({goal}x); {_least(samples)}"

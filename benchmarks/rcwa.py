@@ -1,6 +1,7 @@
 """RCWA of round pillars: true error, honesty of the estimate, power and time per solve.
 
-References: the modal method on elements that follow the disc, an independent solver, at 1e-4; for films the
+References: the modal method on elements that follow the disc, an independent solver, at
+1e-4; for films the
 characteristic matrices of colour-science. ``peer_rows`` runs fmmax on the same pillars.
 """
 
@@ -28,12 +29,18 @@ def rows() -> list[Row]:
     found = []
     for wavelength_um, cell in CELLS.items():
         exact = reference(cell, wavelength_um)
-        found += [truncated_row(cell, wavelength_um, exact, harmonics) for harmonics in (7, 9, 11, 13, 16)]
+        found += [
+            truncated_row(cell, wavelength_um, exact, harmonics)
+            for harmonics in (7, 9, 11, 13, 16)
+        ]
     return [*found, oblique_row(), tilted_row(), film_row(), derivative_row()]
 
 
 def reference(cell: Cell, wavelength_um: float) -> np.ndarray[Any, np.dtype[Any]]:
-    found = [modal.solve(cell, d, wavelength_um, tolerance=REFERENCE_TOLERANCE).t for d in DIAMETERS]
+    found = [
+        modal.solve(cell, d, wavelength_um, tolerance=REFERENCE_TOLERANCE).t
+        for d in DIAMETERS
+    ]
     return np.array(found)
 
 
@@ -44,7 +51,9 @@ def truncated_row(cell: Cell, wavelength_um: float, exact: Any, harmonics: int) 
 
     found = rcwa.solve_many(cell, DIAMETERS, wavelength_um, harmonics=harmonics)
     this = case(cell, Light(wavelength_um))
-    seconds = fastest(lambda: truncated(this, DIAMETERS, harmonics), repeats=2) / len(DIAMETERS)
+    seconds = fastest(lambda: truncated(this, DIAMETERS, harmonics), repeats=2) / len(
+        DIAMETERS
+    )
     error = np.abs(np.array([one.t for one in found]) - exact)
     return Row(
         f"{len(DIAMETERS)} pillars 80-320 nm at {wavelength_um * 1e3:.0f} nm, each",
@@ -67,15 +76,32 @@ def defect(found: Sequence[Response]) -> float:
 
 
 def oblique_row() -> Row:
-    """A conical direction has no symmetry left; the reference is its mirror image in the diagonal."""
+    """A conical direction has no symmetry left; the reference is its mirror image in
+    the diagonal.
+    """
     cell, angle = CELLS[0.85], math.radians(10)
 
     def at(azimuth_rad: float) -> Response:
-        return rcwa.solve(cell, 0.2, 0.85, angle_rad=angle, azimuth_rad=azimuth_rad, polarization="s", harmonics=6)
+        return rcwa.solve(
+            cell,
+            0.2,
+            0.85,
+            angle_rad=angle,
+            azimuth_rad=azimuth_rad,
+            polarization="s",
+            harmonics=6,
+        )
 
     error = abs(at(0.3).t - at(math.pi / 2 - 0.3).t)
     seconds = fastest(lambda: at(0.3), repeats=1)
-    return Row("conical, 10 deg", "orders within 2 to 6", seconds, error, "mirror image in the diagonal", goal="1e-12")
+    return Row(
+        "conical, 10 deg",
+        "orders within 2 to 6",
+        seconds,
+        error,
+        "mirror image in the diagonal",
+        goal="1e-12",
+    )
 
 
 def tilted_row() -> Row:
@@ -83,12 +109,22 @@ def tilted_row() -> Row:
     from dataclasses import replace
 
     cell = replace(CELLS[0.85], sidewall_rad=math.radians(2))
-    back = replace(cell, substrate=cell.cover, cover=cell.substrate, sidewall_rad=-cell.sidewall_rad)
+    back = replace(
+        cell,
+        substrate=cell.cover,
+        cover=cell.substrate,
+        sidewall_rad=-cell.sidewall_rad,
+    )
     there = rcwa.solve(cell, 0.2, 0.85, harmonics=7)
     error = abs(there.t - rcwa.solve(back, 0.2, 0.85, harmonics=7).t)
     seconds = fastest(lambda: rcwa.solve(cell, 0.2, 0.85, harmonics=7), repeats=1)
     return Row(
-        "wall tilted by 2 deg", "orders within 3 to 7", seconds, error, "swap of sides", goal="reciprocity 1e-12"
+        "wall tilted by 2 deg",
+        "orders within 3 to 7",
+        seconds,
+        error,
+        "swap of sides",
+        goal="reciprocity 1e-12",
     )
 
 
@@ -97,14 +133,25 @@ def film_row() -> Row:
 
     under = (Film(Index(2.0), 0.12), Film(Index(1.38), 0.2))
     cell = Cell(0.4, 0.0, pillar="air", substrate=Index(1.4525), under=under)
-    R, _ = colour.phenomena.multilayer_tmm(np.array([1.4525, 2.0, 1.38, 1.0]), np.array([120.0, 200.0]), 850.0)[:2]
+    R, _ = colour.phenomena.multilayer_tmm(
+        np.array([1.4525, 2.0, 1.38, 1.0]), np.array([120.0, 200.0]), 850.0
+    )[:2]
     error = abs(abs(rcwa.solve(cell, 0.0, 0.85).r) ** 2 - float(np.ravel(R)[0]))
     seconds = fastest(lambda: rcwa.solve(cell, 0.0, 0.85))
-    return Row("two films", "film limit", seconds, error, "|r|^2 of colour-science multilayer_tmm", goal="1e-10")
+    return Row(
+        "two films",
+        "film limit",
+        seconds,
+        error,
+        "|r|^2 of colour-science multilayer_tmm",
+        goal="1e-10",
+    )
 
 
 def derivative_row() -> Row:
-    """All six derivatives, in one call; differences of eighth order check the one in the wavelength."""
+    """All six derivatives, in one call; differences of eighth order check the one in
+    the wavelength.
+    """
     cell, step = CELLS[0.85], 3e-4
     weights = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 
@@ -116,7 +163,14 @@ def derivative_row() -> Row:
     got = rcwa.derivatives(cell, 0.15, 0.85, harmonics=6).wavelength_um
     seconds = fastest(lambda: rcwa.derivatives(cell, 0.15, 0.85, harmonics=6))
     error = abs(got - want) / abs(want)
-    return Row("six derivatives of t", "orders within 6", seconds, error, "central differences, relative", goal="1e-8")
+    return Row(
+        "six derivatives of t",
+        "orders within 6",
+        seconds,
+        error,
+        "central differences, relative",
+        goal="1e-8",
+    )
 
 
 def peer_rows() -> list[Row]:
@@ -127,7 +181,9 @@ def peer_rows() -> list[Row]:
 
 def fmmax_row(exact: Any, harmonics: int) -> Row:
     solve = fmmax_solver(CELLS[0.85], 0.85, harmonics)
-    error = max(abs(complex(solve(d)) - t) for d, t in zip(DIAMETERS, exact, strict=True))
+    error = max(
+        abs(complex(solve(d)) - t) for d, t in zip(DIAMETERS, exact, strict=True)
+    )
     seconds = fastest(lambda: complex(solve(0.2)), repeats=2)
     return Row(
         f"{len(DIAMETERS)} pillars 80-320 nm at 850 nm, each",
@@ -138,7 +194,9 @@ def fmmax_row(exact: Any, harmonics: int) -> Row:
     )
 
 
-def fmmax_solver(cell: Cell, wavelength_um: float, harmonics: int) -> Callable[[float], Any]:
+def fmmax_solver(
+    cell: Cell, wavelength_um: float, harmonics: int
+) -> Callable[[float], Any]:
     """A compiled function from the diameter to the power-normalised transmission."""
     import fmmax
     import jax
@@ -164,11 +222,19 @@ def fmmax_solver(cell: Cell, wavelength_um: float, harmonics: int) -> Callable[[
 
     @jax.jit
     def transmission(permittivity: Any) -> Any:
-        layers = [modes(jnp.full((1, 1), n_substrate**2)), modes(permittivity), modes(jnp.full((1, 1), 1.0 + 0j))]
+        layers = [
+            modes(jnp.full((1, 1), n_substrate**2)),
+            modes(permittivity),
+            modes(jnp.full((1, 1), 1.0 + 0j)),
+        ]
         heights = [jnp.asarray(height) for height in (0.0, cell.height_um, 0.0)]
-        return fmmax.stack_s_matrix(layers, heights).s11[0, 0] * jnp.sqrt(n_substrate.real)
+        return fmmax.stack_s_matrix(layers, heights).s11[0, 0] * jnp.sqrt(
+            n_substrate.real
+        )
 
-    return lambda diameter_um: transmission(jnp.asarray(1 + (n_pillar**2 - 1) * disc(diameter_um / cell.pitch_um)))
+    return lambda diameter_um: transmission(
+        jnp.asarray(1 + (n_pillar**2 - 1) * disc(diameter_um / cell.pitch_um))
+    )
 
 
 def index(material: object) -> complex:

@@ -25,7 +25,12 @@ def rows() -> list[Row]:
     for threads in sorted({1, numba.config.NUMBA_NUM_THREADS}):
         numba.set_num_threads(threads)
         torch.set_num_threads(threads)
-        out += [*_rendering(threads), *_derivatives(threads), *_imaging(threads), *_sensor(threads)]
+        out += [
+            *_rendering(threads),
+            *_derivatives(threads),
+            *_imaging(threads),
+            *_sensor(threads),
+        ]
     numba.set_num_threads(before[0])
     torch.set_num_threads(before[1])
     return out
@@ -43,7 +48,9 @@ def _rendering(threads: int) -> list[Row]:
     out = []
     for pixels, pitch, goal in ((160, 9.0, 800), (400, 3.6, 100)):
         camera, states = Camera(pixels, pitch), dataset.states_at(torch.arange(32), 1)
-        seconds = fastest(lambda c=camera, s=states: renderer.render(s, camera=c), repeats=12) / len(states)
+        seconds = fastest(
+            lambda c=camera, s=states: renderer.render(s, camera=c), repeats=12
+        ) / len(states)
         row = Row(
             f"frame {pixels}²", "compiled, with depth, masks, labels", seconds, _twin_error(states, camera),
             "float64 twin, relative L2", threads, goal=f"{1 / seconds:.0f}/s; asked {goal}/s",
@@ -54,26 +61,52 @@ def _rendering(threads: int) -> list[Row]:
 
 def _derivatives(threads: int) -> list[Row]:
     camera, states = Camera(), dataset.states_at(torch.arange(16), 1)
-    plain = fastest(lambda: renderer.render(states, camera=camera), repeats=12) / len(states)
-    dual = fastest(lambda: renderer.sensitivities(states, camera=camera), repeats=12) / len(states)
+    plain = fastest(lambda: renderer.render(states, camera=camera), repeats=12) / len(
+        states
+    )
+    dual = fastest(
+        lambda: renderer.sensitivities(states, camera=camera), repeats=12
+    ) / len(states)
     few = states[:3]
     made = renderer.sensitivities(few, camera=camera)
-    p, first, second = renderer.parameter_tangents(few, ("gaze_x", "slip_z"), rig=Rig(), camera=camera)
-    triple = dataset.triplets(few, gaze_step_rad=np.radians(0.5), slip_step_um=200.0, camera=camera)
+    p, first, second = renderer.parameter_tangents(
+        few, ("gaze_x", "slip_z"), rig=Rig(), camera=camera
+    )
+    triple = dataset.triplets(
+        few, gaze_step_rad=np.radians(0.5), slip_step_um=200.0, camera=camera
+    )
     coarse = {
-        "gaze": (triple.gaze.pinhole() - triple.anchor.pinhole()) / triple.gaze_step_rad,
+        "gaze": (triple.gaze.pinhole() - triple.anchor.pinhole())
+        / triple.gaze_step_rad,
         "slip": (triple.slip.pinhole() - triple.anchor.pinhole()) / triple.slip_step_um,
     }
     out = []
-    for name, got, tangent in (("gaze", made.first, first), ("slip", made.second, second)):
-        _, want = torch.func.jvp(lambda q: renderer.twin(q, Rig(), camera)[0], (p,), (tangent,))
+    for name, got, tangent in (
+        ("gaze", made.first, first),
+        ("slip", made.second, second),
+    ):
+        _, want = torch.func.jvp(
+            lambda q: renderer.twin(q, Rig(), camera)[0], (p,), (tangent,)
+        )
         error = float((got.radiance - want).norm() / want.norm())
         goal = f"{dual / plain:.1f} x the primal for both tangents; asked 4 x at 1e-3"
-        out.append(Row(f"d frame / d {name}", "compiled dual numbers", dual, error, "float64 twin", threads, goal=goal))
+        out.append(
+            Row(
+                f"d frame / d {name}",
+                "compiled dual numbers",
+                dual,
+                error,
+                "float64 twin",
+                threads,
+                goal=goal,
+            )
+        )
         flat = want.sum(1)
         wrong = float((coarse[name] - flat).norm() / flat.norm())
         label = "difference over 0.5 deg / 0.2 mm"
-        out.append(Row(f"d frame / d {name}", label, 2 * plain, wrong, "float64 twin", threads))
+        out.append(
+            Row(f"d frame / d {name}", label, 2 * plain, wrong, "float64 twin", threads)
+        )
     return out
 
 
@@ -93,8 +126,12 @@ def _imaging(threads: int) -> list[Row]:
     all_layers = scene.Layers(empty, empty, depths, torch.zeros(21, dtype=torch.bool))
     plain = fastest(lambda: layered.published(all_layers, stack)) / 8
     start = time.perf_counter()
-    others = renderer.render(dataset.states_at(torch.arange(100, 104), 2), camera=Camera()).frames
-    basis = layered.trimmed(scene.basis(stack, depths, tolerance=2e-4), others, tolerance=1e-3, margin=16)
+    others = renderer.render(
+        dataset.states_at(torch.arange(100, 104), 2), camera=Camera()
+    ).frames
+    basis = layered.trimmed(
+        scene.basis(stack, depths, tolerance=2e-4), others, tolerance=1e-3, margin=16
+    )
     made = scene.uniform_imager(basis, (160, 160), margin=16)
     prepare = time.perf_counter() - start
     image = scene.image(frames, made, margin=16)
@@ -104,17 +141,44 @@ def _imaging(threads: int) -> list[Row]:
     constant = float((scene.image(flat, made) - 0.4).abs().max() / 0.4)
     sorted_ = torch.argsort(layers.depth_um)
     whole = scene.Layers(
-        layers.coverage[:, sorted_], layers.coverage[:, sorted_], layers.depth_um[sorted_], layers.near[sorted_]
+        layers.coverage[:, sorted_],
+        layers.coverage[:, sorted_],
+        layers.depth_um[sorted_],
+        layers.near[sorted_],
     )
     lost = 1 - layered.published(whole, stack[[order[i] for i in sorted_]])
     goal = f"{plain / fast:.1f} x plain; {1 / fast:.0f}/s; asked 5 x at 1e-3 and 400/s"
     kernels = f"{len(basis.kernels)} kernels (made in {1e3 * prepare:.0f} ms; expected error {basis.error:.1g})"
     against = "layer by layer, relative L2"
     return [
-        Row("image 128² of 21 depths", "plain: 21 layers by FFT", plain, NONE, "-", threads),
-        Row("image 128² of 21 depths", kernels, fast, error, against, threads, goal=goal),
-        Row("constant radiance", "two sheets", fast, constant, "the constant", threads, goal="asked 1e-5"),
-        Row("constant radiance", "published formula", plain, float(lost.abs().max()), "the constant", threads),
+        Row(
+            "image 128² of 21 depths",
+            "plain: 21 layers by FFT",
+            plain,
+            NONE,
+            "-",
+            threads,
+        ),
+        Row(
+            "image 128² of 21 depths", kernels, fast, error, against, threads, goal=goal
+        ),
+        Row(
+            "constant radiance",
+            "two sheets",
+            fast,
+            constant,
+            "the constant",
+            threads,
+            goal="asked 1e-5",
+        ),
+        Row(
+            "constant radiance",
+            "published formula",
+            plain,
+            float(lost.abs().max()),
+            "the constant",
+            threads,
+        ),
     ]
 
 
@@ -123,4 +187,13 @@ def _sensor(threads: int) -> list[Row]:
     seconds = fastest(lambda: sensor.integrate(image, 1.0, pitch_um=3.7)) / 8
     kept = torch.nn.functional.pad(image.double(), (12, 12, 12, 12))
     error = abs(float(sensor.integrate(kept, 1.0, pitch_um=3.7).sum() / kept.sum()) - 1)
-    return [Row("640² samples on 3.7 um pixels", "exact overlap", seconds, error, "energy", threads)]
+    return [
+        Row(
+            "640² samples on 3.7 um pixels",
+            "exact overlap",
+            seconds,
+            error,
+            "energy",
+            threads,
+        )
+    ]

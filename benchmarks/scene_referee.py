@@ -1,4 +1,6 @@
-"""The renderer beside a path tracer (Mitsuba 3, an extra of the project): radiance errors beside times."""
+"""The renderer beside a path tracer (Mitsuba 3, an extra of the project): radiance
+errors beside times.
+"""
 
 import time
 from pathlib import Path
@@ -19,16 +21,31 @@ NONE = float("nan")
 def rows() -> list[Row]:
     """Rows of this topic, and results/scene_referee.png; two to five minutes."""
     states = dataset.states_at(torch.tensor(STATES), 1)
-    made = [pathtraced.compare(states[k : k + 1], samples=SAMPLES) for k in range(len(STATES))]
+    made = [
+        pathtraced.compare(states[k : k + 1], samples=SAMPLES)
+        for k in range(len(STATES))
+    ]
     for k, one in enumerate(made):
-        pathtraced.picture(one, Path(__file__).parent / "results" / f"scene_referee_{k}.png")
+        pathtraced.picture(
+            one, Path(__file__).parent / "results" / f"scene_referee_{k}.png"
+        )
     against = f"{SAMPLES} paths a pixel, relative L2 without their noise"
     ours = min(one.seconds[0] for one in made)
-    out = [Row("frame 96², all but mirrored lamps", "renderer", ours, _mean(made, "all"), against)]
+    out = [
+        Row(
+            "frame 96², all but mirrored lamps",
+            "renderer",
+            ours,
+            _mean(made, "all"),
+            against,
+        )
+    ]
     for name in pathtraced.REGIONS:
         shown = [one for one in made if one.regions[name].any()]
         ratio = f"traced / ours {np.mean([one.ratio(name) for one in shown]):.2f}"
-        out.append(Row(f"  {name}", "renderer", ours, _mean(shown, name), against, goal=ratio))
+        out.append(
+            Row(f"  {name}", "renderer", ours, _mean(shown, name), against, goal=ratio)
+        )
     for samples in FEW:
         errors, seconds = [], []
         for k, one in enumerate(made):
@@ -37,9 +54,27 @@ def rows() -> list[Row]:
             seconds.append(time.perf_counter() - begin)
             errors.append(one.error(image=image))
         label = f"path tracer, {samples} paths a pixel"
-        out.append(Row("frame 96², all but mirrored lamps", label, min(seconds), float(np.mean(errors)), against))
+        out.append(
+            Row(
+                "frame 96², all but mirrored lamps",
+                label,
+                min(seconds),
+                float(np.mean(errors)),
+                against,
+            )
+        )
     full = min(one.seconds[1] for one in made)
-    return [*out, Row("frame 96²", f"path tracer, {SAMPLES} paths a pixel", full, NONE, "-", goal=made[0].variant)]
+    return [
+        *out,
+        Row(
+            "frame 96²",
+            f"path tracer, {SAMPLES} paths a pixel",
+            full,
+            NONE,
+            "-",
+            goal=made[0].variant,
+        ),
+    ]
 
 
 def _mean(made: list[pathtraced.Comparison], region: str) -> float:

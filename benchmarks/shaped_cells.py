@@ -1,8 +1,12 @@
-"""Error bars of cells that are no plain round pillars on a square lattice, drawn at random: do any lie below the error?
+"""Error bars of cells that are no plain round pillars on a square lattice, drawn at
+random: do any lie below the error?
 
-``python -m benchmarks shaped_cells`` draws 16 cells of each kind (an hour); ``python -m benchmarks.shaped_cells N [SEED
-[KIND ...]]`` another number. The referee is the same Fourier method at truncations that no bar has seen (orders within
-``FINEST``), the mean of the last three with their spread as its doubt; ``make test-peers`` holds shapes against fmmax,
+``python -m benchmarks shaped_cells`` draws 16 cells of each kind (an hour); ``python -m
+benchmarks.shaped_cells N [SEED
+[KIND ...]]`` another number. The referee is the same Fourier method at truncations that
+no bar has seen (orders within
+``FINEST``), the mean of the last three with their spread as its doubt; ``make
+test-peers`` holds shapes against fmmax,
 which shares no code. No times are taken.
 """
 
@@ -17,12 +21,23 @@ import numpy as np
 from benchmarks import Row
 from metalens import rcwa
 from metalens.cell import Cell, Index, Lattice, Layer
-from metalens.cell.shapes import Circle, Cross, Ellipse, Rectangle, RegularPolygon, Ring, Square
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Rectangle,
+    RegularPolygon,
+    Ring,
+    Square,
+)
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 
 COUNT, SEED = 16, 7411
-FINEST = {4: 19, 2: 13}  # orders of the referee, by the number of mirrors that the light leaves
+FINEST = {
+    4: 19,
+    2: 13,
+}  # orders of the referee, by the number of mirrors that the light leaves
 LAST = 3  # truncations that are averaged
 TOLERANCE = 2e-2
 LEAST_GAP = 0.005  # of the pitch
@@ -44,7 +59,9 @@ class Drawn:
         return rcwa.jones(self.cell, self.size_um, self.wavelength_um, **light, **how)
 
 
-def _about(rng: np.random.Generator, n: tuple[float, float] = (1.9, 3.7), k: float = 0.0) -> dict[str, Index]:
+def _about(
+    rng: np.random.Generator, n: tuple[float, float] = (1.9, 3.7), k: float = 0.0
+) -> dict[str, Index]:
     return {
         "pillar": Index(rng.uniform(*n), k),
         "substrate": Index(rng.uniform(1.35, 1.75)),
@@ -53,13 +70,19 @@ def _about(rng: np.random.Generator, n: tuple[float, float] = (1.9, 3.7), k: flo
     }
 
 
-def _plain(shape: Callable[[np.random.Generator], object], **more: object) -> Callable[[np.random.Generator], Drawn]:
+def _plain(
+    shape: Callable[[np.random.Generator], object], **more: object
+) -> Callable[[np.random.Generator], Drawn]:
     """Cells as lenses have them, of a shape, at normal incidence."""
 
     def draw(rng: np.random.Generator) -> Drawn:
         pitch = rng.uniform(0.25, 0.45)
-        cell = Cell(pitch, rng.uniform(0.3, 1.0), **_about(rng), shape=shape(rng), **more)  # type: ignore[arg-type]
-        return Drawn(cell, fitting(cell, pitch * rng.uniform(0.25, 0.85)), _longer(cell, rng))
+        cell = Cell(
+            pitch, rng.uniform(0.3, 1.0), **_about(rng), shape=shape(rng), **more
+        )  # type: ignore[arg-type]
+        return Drawn(
+            cell, fitting(cell, pitch * rng.uniform(0.25, 0.85)), _longer(cell, rng)
+        )
 
     return draw
 
@@ -67,7 +90,9 @@ def _plain(shape: Callable[[np.random.Generator], object], **more: object) -> Ca
 def _longer(cell: Cell, rng: np.random.Generator) -> float:
     """A wavelength at which no order but zero propagates."""
     most = max(cell.substrate.n, cell.cover.n)  # type: ignore[union-attr]
-    return float(most * cell.pitch_um / cell.lattice.least_order * rng.uniform(1.08, 1.8))
+    return float(
+        most * cell.pitch_um / cell.lattice.least_order * rng.uniform(1.08, 1.8)
+    )
 
 
 def fitting(cell: Cell, size_um: float, gap: float = 0.04) -> float:
@@ -84,13 +109,23 @@ def _layered(rng: np.random.Generator) -> Drawn:
     pitch = rng.uniform(0.28, 0.45)
     heights = rng.uniform(0.05, 0.15), rng.uniform(0.3, 0.7), rng.uniform(0.03, 0.1)
     layers = (
-        Layer(heights[0], grow_um=rng.uniform(0.0, 0.06), material=Index(rng.uniform(1.4, 2.0))),
+        Layer(
+            heights[0],
+            grow_um=rng.uniform(0.0, 0.06),
+            material=Index(rng.uniform(1.4, 2.0)),
+        ),
         Layer(heights[1], coat_um=0.012, coat=Index(rng.uniform(1.5, 2.2))),
-        Layer(heights[2], grow_um=-rng.uniform(0.0, 0.03), material=Index(rng.uniform(1.5, 3.0), 0.1)),
+        Layer(
+            heights[2],
+            grow_um=-rng.uniform(0.0, 0.03),
+            material=Index(rng.uniform(1.5, 3.0), 0.1),
+        ),
     )
     shape = rng.choice(np.array([Circle(), Square(), Rectangle(0.7)], dtype=object))
     cell = Cell(pitch, sum(heights), **_about(rng), shape=shape, layers=layers)
-    return Drawn(cell, fitting(cell, pitch * rng.uniform(0.35, 0.7)), _longer(cell, rng))
+    return Drawn(
+        cell, fitting(cell, pitch * rng.uniform(0.35, 0.7)), _longer(cell, rng)
+    )
 
 
 def _touching(rng: np.random.Generator) -> Drawn:
@@ -110,22 +145,40 @@ def _thin(rng: np.random.Generator) -> Drawn:
 
 def _tall(rng: np.random.Generator) -> Drawn:
     pitch = rng.uniform(0.28, 0.4)
-    cell = Cell(pitch, rng.uniform(1.2, 2.5), **_about(rng), shape=Rectangle(rng.uniform(0.5, 0.95)))
+    cell = Cell(
+        pitch,
+        rng.uniform(1.2, 2.5),
+        **_about(rng),
+        shape=Rectangle(rng.uniform(0.5, 0.95)),
+    )
     return Drawn(cell, pitch * rng.uniform(0.3, 0.8), _longer(cell, rng))
 
 
 def _resonant(rng: np.random.Generator) -> Drawn:
-    """High index, slightly oblique: resonances that normal incidence does not excite are sharp."""
+    """High index, slightly oblique: resonances that normal incidence does not excite
+    are sharp.
+    """
     pitch = rng.uniform(0.35, 0.42)
-    cell = Cell(pitch, rng.uniform(0.5, 1.0), **_about(rng, (3.2, 3.8)), shape=Rectangle(rng.uniform(0.6, 0.95)))
-    return Drawn(cell, pitch * rng.uniform(0.5, 0.85), 0.85, float(rng.uniform(0.01, 0.15)))
+    cell = Cell(
+        pitch,
+        rng.uniform(0.5, 1.0),
+        **_about(rng, (3.2, 3.8)),
+        shape=Rectangle(rng.uniform(0.6, 0.95)),
+    )
+    return Drawn(
+        cell, pitch * rng.uniform(0.5, 0.85), 0.85, float(rng.uniform(0.01, 0.15))
+    )
 
 
 def _cutoff(rng: np.random.Generator) -> Drawn:
-    """Within 1 % of the cutoff of the first orders of substrate or cover, on either side of it."""
+    """Within 1 % of the cutoff of the first orders of substrate or cover, on either
+    side of it.
+    """
     about, pitch = _about(rng), rng.uniform(0.3, 0.6)
     n = about[str(rng.choice(["substrate", "cover"]))].n
-    cell = Cell(pitch, rng.uniform(0.2, 1.0), **about, shape=Ellipse(rng.uniform(0.5, 0.95)))
+    cell = Cell(
+        pitch, rng.uniform(0.2, 1.0), **about, shape=Ellipse(rng.uniform(0.5, 0.95))
+    )
     offset = rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2)
     return Drawn(cell, pitch * rng.uniform(0.3, 0.85), float(pitch * n * (1 + offset)))
 
@@ -145,7 +198,9 @@ KINDS: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "crosses": _plain(lambda rng: Cross(rng.uniform(0.25, 0.6))),
     "in layers": _layered,
     "hexagonal lattice": _plain(lambda rng: Circle(), lattice=HEXAGONAL),
-    "rectangular lattice": _plain(lambda rng: Circle(), lattice=Lattice("rectangular", 1.3)),
+    "rectangular lattice": _plain(
+        lambda rng: Circle(), lattice=Lattice("rectangular", 1.3)
+    ),
     "nearly touching": _touching,
     "thin": _thin,
     "tall": _tall,
@@ -183,7 +238,9 @@ def judged(kind: str, count: int, seed: int) -> Row:
     for one in draws(kind, count, seed):
         got = one.jones(tolerance=TOLERANCE)
         want, doubt = referee(one)
-        ratios.append((got.t_error + doubt) / max(float(np.abs(got.t - want).max()), 1e-12))
+        ratios.append(
+            (got.t_error + doubt) / max(float(np.abs(got.t - want).max()), 1e-12)
+        )
     below = int(np.count_nonzero(np.array(ratios) < 1))
     text = f"{below} of {len(ratios)} bars below the error, median bar {np.median(ratios):.1f} errors"
     return Row(
@@ -196,7 +253,9 @@ def judged(kind: str, count: int, seed: int) -> Row:
     )
 
 
-def rows(count: int = COUNT, seed: int = SEED, kinds: tuple[str, ...] = tuple(KINDS)) -> list[Row]:
+def rows(
+    count: int = COUNT, seed: int = SEED, kinds: tuple[str, ...] = tuple(KINDS)
+) -> list[Row]:
     """Every kind."""
     return [judged(kind, count, seed) for kind in kinds]
 
@@ -205,4 +264,6 @@ if __name__ == "__main__":
     from benchmarks.__main__ import table
 
     numbers = [int(word) for word in sys.argv[1:3]]
-    sys.stdout.write(table(rows(*numbers, *([tuple(sys.argv[3:])] if sys.argv[3:] else []))) + "\n")  # type: ignore[arg-type]
+    sys.stdout.write(
+        table(rows(*numbers, *([tuple(sys.argv[3:])] if sys.argv[3:] else []))) + "\n"
+    )  # type: ignore[arg-type]

@@ -1,11 +1,16 @@
-"""The chain over random small designs: no crash, no number that is not finite, no failure without a word.
+"""The chain over random small designs: no crash, no number that is not finite, no
+failure without a word.
 
     python -m benchmarks.soak --designs 200 --seed 0 --work DIR      # goes on where it stopped
 
-Every design draws its cell, profile, size, distances, PSF window, process, hidden errors and light, and goes through
-design, PSF, mask, captures and fit as a user would send it. A verb may end in success (0), say that its result fails
-its own check (1) or refuse its input with a reason (2). Found at fault are: any other end, numbers that are not finite
-behind a success, artefacts that cannot be read, files left behind by a refusal, a refusal without a reason.
+Every design draws its cell, profile, size, distances, PSF window, process, hidden
+errors and light, and goes through
+design, PSF, mask, captures and fit as a user would send it. A verb may end in success
+(0), say that its result fails
+its own check (1) or refuse its input with a reason (2). Found at fault are: any other
+end, numbers that are not finite
+behind a success, artefacts that cannot be read, files left behind by a refusal, a
+refusal without a reason.
 """
 
 import argparse
@@ -37,11 +42,22 @@ from metalens.ground.errors import MetalensError
 from metalens.made import sensitivity
 
 RESULT = Path(__file__).parent / "results" / "soak_study.json"
-CELLS = (  # (wavelength in nm, text): silicon in the near infrared, titania in green, nitride in red
+# (wavelength in nm, text): silicon in the near infrared, titania in green, nitride in
+# red
+CELLS = (
     (850, 'pitch_um = 0.30\nheight_um = 0.7\npillar = {n = 3.6}\nsubstrate = "SiO2"'),
-    (850, "pitch_um = 0.28\nheight_um = 0.8\npillar = {n = 3.6, k = 0.001}\nsubstrate = {n = 1.45}"),
-    (532, "pitch_um = 0.25\nheight_um = 0.85\npillar = {n = 2.4}\nsubstrate = {n = 1.46}"),
-    (633, "pitch_um = 0.32\nheight_um = 1.4\npillar = {n = 2.0}\nsubstrate = {n = 1.46}"),
+    (
+        850,
+        "pitch_um = 0.28\nheight_um = 0.8\npillar = {n = 3.6, k = 0.001}\nsubstrate = {n = 1.45}",
+    ),
+    (
+        532,
+        "pitch_um = 0.25\nheight_um = 0.85\npillar = {n = 2.4}\nsubstrate = {n = 1.46}",
+    ),
+    (
+        633,
+        "pitch_um = 0.32\nheight_um = 1.4\npillar = {n = 2.0}\nsubstrate = {n = 1.46}",
+    ),
 )
 ALLOWED = (0, 1, 2)
 
@@ -68,7 +84,11 @@ def files(work: Path, seed: int, number: int) -> dict[str, str]:
     }
     near, far = np.sort(source * rng.uniform(0.5, 2.0, 2)) * 1e-3
     psf = {
-        "depths_mm": [float(near), float(far), float(max(far - near, 1e-4) / rng.integers(1, 4))],
+        "depths_mm": [
+            float(near),
+            float(far),
+            float(max(far - near, 1e-4) / rng.integers(1, 4)),
+        ],
         "angles_deg": rng.uniform(-25, 25, int(rng.integers(1, 3))).tolist(),
         "window_um": float(aperture * rng.uniform(0.2, 1.5)),
         "samples": int(rng.integers(8, 65)),
@@ -76,10 +96,16 @@ def files(work: Path, seed: int, number: int) -> dict[str, str]:
     }
     least, gap = int(rng.integers(50, 76)), int(rng.integers(30, 70))
     limits = f"[limits]\nmin_diameter_nm = {least}\nmin_gap_nm = {gap}\n"
-    return {"design.toml": _text(design) + limits, "psf.toml": _text(psf), **_bench(rng, source, least, gap)}
+    return {
+        "design.toml": _text(design) + limits,
+        "psf.toml": _text(psf),
+        **_bench(rng, source, least, gap),
+    }
 
 
-def _bench(rng: np.random.Generator, source: float, least: int, gap: int) -> dict[str, str]:
+def _bench(
+    rng: np.random.Generator, source: float, least: int, gap: int
+) -> dict[str, str]:
     """Process and hidden errors; most processes print what the design asks for."""
     grid = rng.choice([1, 2, 5])
     process = (
@@ -93,11 +119,23 @@ def _bench(rng: np.random.Generator, source: float, least: int, gap: int) -> dic
         "peak_e": float(10 ** rng.uniform(2, 4.3)),
         "seed": int(rng.integers(1000)),
     }
-    hidden = {"bias_nm": 5.0, "bias_r_nm": 3.0, "height_nm": 8.0, "coma_x_rad": 0.3, "astigmatism_rad": 0.3}
-    rows = [f'[[parameter]]\nname = "{n}"\nvalue = {s * rng.standard_normal():.4f}\n' for n, s in hidden.items()]
+    hidden = {
+        "bias_nm": 5.0,
+        "bias_r_nm": 3.0,
+        "height_nm": 8.0,
+        "coma_x_rad": 0.3,
+        "astigmatism_rad": 0.3,
+    }
+    rows = [
+        f'[[parameter]]\nname = "{n}"\nvalue = {s * rng.standard_normal():.4f}\n'
+        for n, s in hidden.items()
+    ]
     pixel = float(rng.uniform(0.8, 2.0))
     camera = f"[camera]\npixel_um = {pixel:.3f}\npixels = {rng.integers(10, 20)}\n"
-    return {"process.toml": process, "truth.toml": _text(truth) + camera + "".join(rows)}
+    return {
+        "process.toml": process,
+        "truth.toml": _text(truth) + camera + "".join(rows),
+    }
 
 
 def library(work: Path, kind: int) -> Path:
@@ -107,12 +145,16 @@ def library(work: Path, kind: int) -> Path:
         wavelength, text = CELLS[kind]
         sweep = f"[sweep]\nwavelengths_um = [{wavelength * 1e-3}]\ntolerance = 1e-2\n"
         store.write_text(work / f"cell_{kind}.toml", f"[cell]\n{text}\n{sweep}")
-        run_verb(["library", str(work / f"cell_{kind}.toml"), "-o", str(path), "--quiet"])
+        run_verb(
+            ["library", str(work / f"cell_{kind}.toml"), "-o", str(path), "--quiet"]
+        )
     return path
 
 
 def _captured() -> tuple[int, Any]:
-    """``metalens capture``, but with the pillars' response by effective index: rigorous slopes take a minute a cell."""
+    """``metalens capture``, but with the pillars' response by effective index: rigorous
+    slopes take a minute a cell.
+    """
     design, truth = lens.load("lens.h5"), config.load(Path("truth.toml"), Truth)
     shots = bench.shoot(design, truth, sensitivity(design))
     command_capture.write(Path("captures"), shots, truth, design)
@@ -122,7 +164,9 @@ def _captured() -> tuple[int, Any]:
 def _fitted() -> tuple[int, Any]:
     """``metalens fit``, with the same response."""
     design = lens.load("lens.h5")
-    found = fit(capture.load("captures"), design, Options(), response=sensitivity(design))
+    found = fit(
+        capture.load("captures"), design, Options(), response=sensitivity(design)
+    )
     asbuilt.save("asbuilt.h5", found)
     values = dict(zip(found.names, found.value.tolist(), strict=True))
     return 0 if found.trusted else 1, {**values, "chi2_per_dof": found.chi2_per_dof}
@@ -140,23 +184,41 @@ NEEDED = ("design", "capture")  # by the verbs behind them
 
 
 def one(folder: Path) -> Iterator[dict[str, Any]]:
-    """Every verb on the settings in a folder, until one is refused that the rest needs: ends and faults."""
+    """Every verb on the settings in a folder, until one is refused that the rest needs:
+    ends and faults.
+    """
     with contextlib.chdir(folder):
         for verb, words, target in STEPS:
             start = time.process_time()
-            status, values, said = _run(words if callable(words) else (verb, *words, "--json"))
+            status, values, said = _run(
+                words if callable(words) else (verb, *words, "--json")
+            )
             faults = list(_faults(verb, status, values, said, Path(target)))
             seconds = time.process_time() - start
-            yield {"verb": verb, "status": status, "seconds": seconds, "said": said[-300:], "faults": faults}
+            yield {
+                "verb": verb,
+                "status": status,
+                "seconds": seconds,
+                "said": said[-300:],
+                "faults": faults,
+            }
             if verb in NEEDED and not Path(target).exists():
                 return
 
 
-def _run(work: Sequence[str] | Callable[[], tuple[int, Any]]) -> tuple[int | str, Any, str]:
-    """(end, result, what was said) of a command line or a function; a warning about numbers counts as a crash."""
+def _run(
+    work: Sequence[str] | Callable[[], tuple[int, Any]],
+) -> tuple[int | str, Any, str]:
+    """(end, result, what was said) of a command line or a function; a warning about
+    numbers counts as a crash.
+    """
     shown, said = io.StringIO(), io.StringIO()
     try:
-        with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(said), warnings.catch_warnings():
+        with (
+            contextlib.redirect_stdout(shown),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("error", RuntimeWarning)
             if callable(work):
                 return *work(), ""
@@ -171,7 +233,9 @@ def _run(work: Sequence[str] | Callable[[], tuple[int, Any]]) -> tuple[int | str
     return status, json.loads(text) if text.strip() else None, said.getvalue().strip()
 
 
-def _faults(verb: str, status: int | str, values: Any, said: str, target: Path) -> Iterator[str]:
+def _faults(
+    verb: str, status: int | str, values: Any, said: str, target: Path
+) -> Iterator[str]:
     if status not in ALLOWED:
         yield f"crash: {status}"
     elif status == 2:
@@ -180,9 +244,13 @@ def _faults(verb: str, status: int | str, values: Any, said: str, target: Path) 
         if target.exists():
             yield f"refused, but {target} is there"
     else:
-        yield from (f"{verb}: {name} is not finite" for name in _odd(values) if status == 0)
+        yield from (
+            f"{verb}: {name} is not finite" for name in _odd(values) if status == 0
+        )
         if target.suffix == ".h5":
-            yield from (f"{target}: {name} is not finite" for name in _odd_arrays(target))
+            yield from (
+                f"{target}: {name} is not finite" for name in _odd_arrays(target)
+            )
 
 
 def _odd(values: Any, name: str = "result") -> Iterator[str]:
@@ -215,7 +283,9 @@ def soak(work: Path, designs: int, seed: int) -> None:
             entry: dict[str, Any] = {"number": number, "ends": list(one(folder))}
         keep_line(_lines(work, seed), entry)
         ends = " ".join(f"{e['verb']}:{e['status']}" for e in entry["ends"])
-        print(number, ends, *(f for e in entry["ends"] for f in e["faults"]), flush=True)
+        print(
+            number, ends, *(f for e in entry["ends"] for f in e["faults"]), flush=True
+        )
 
 
 def _lines(work: Path, seed: int) -> Path:
@@ -227,9 +297,20 @@ def summary(lines: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     verbs = {}
     for verb, *_ in STEPS:
         mine = [e for line in lines for e in line["ends"] if e["verb"] == verb]
-        ends = collections.Counter("crash" if e["status"] not in ALLOWED else str(e["status"]) for e in mine)
-        verbs[verb] = {"runs": len(mine), "ends": dict(ends), "cpu_s": sum(e["seconds"] for e in mine)}
-    faults = [{"design": n["number"], "fault": f} for n in lines for e in n["ends"] for f in e["faults"]]
+        ends = collections.Counter(
+            "crash" if e["status"] not in ALLOWED else str(e["status"]) for e in mine
+        )
+        verbs[verb] = {
+            "runs": len(mine),
+            "ends": dict(ends),
+            "cpu_s": sum(e["seconds"] for e in mine),
+        }
+    faults = [
+        {"design": n["number"], "fault": f}
+        for n in lines
+        for e in n["ends"]
+        for f in e["faults"]
+    ]
     refused = collections.Counter(
         f"{e['verb']}: {e['said'].splitlines()[0][:160]}"
         for n in lines
@@ -252,11 +333,22 @@ def rows() -> list[Row]:
     told = json.loads(RESULT.read_text("utf-8"))
     seconds = sum(v["cpu_s"] for v in told["verbs"].values()) / max(1, told["designs"])
     case = f"{told['designs']} random designs, seed {told['seed']}"
-    return [Row(case, "design, psf, layout, capture, fit", seconds, len(told["faults"]), "faults found", goal="0")]
+    return [
+        Row(
+            case,
+            "design, psf, layout, capture, fit",
+            seconds,
+            len(told["faults"]),
+            "faults found",
+            goal="0",
+        )
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--designs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, required=True)

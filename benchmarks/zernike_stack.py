@@ -1,4 +1,6 @@
-"""A plain through-focus stack of a round pupil, Zernike phase only: our maximum likelihood beside solvephase's."""
+"""A plain through-focus stack of a round pupil, Zernike phase only: our maximum
+likelihood beside solvephase's.
+"""
 
 import dataclasses
 import math
@@ -13,25 +15,47 @@ from characterize.inference.leastsquares import Data, Prior, Settings
 from characterize.pupil import zernike
 from characterize.pupil.record import PupilModel, PupilSpec
 
-WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = 0.85, 0.02, 2.0, 48, 24, 7, 2e5, 5
+WAVE_UM, NA, SAMPLING, SIDE, MIDDLE, ORDER, PHOTONS, SEEDS = (
+    0.85,
+    0.02,
+    2.0,
+    48,
+    24,
+    7,
+    2e5,
+    5,
+)
 DEFOCUS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0)  # rms of the defocus term
 
 
 def peer_rows() -> list[Row]:
-    """Five images, 33 Zernike modes of 1 rad rms, 2e5 photons each; none where solvephase is not installed."""
+    """Five images, 33 Zernike modes of 1 rad rms, 2e5 photons each; none where
+    solvephase is not installed.
+    """
     try:
         import solvephase
     except ImportError:
         return []
     cases = [_stack(seed) for seed in range(SEEDS)]
     peers = {"solvephase L-BFGS": "lbfgs", "solvephase multi-start": "auto"}
-    found: dict[str, list[tuple[float, float]]] = {"Levenberg-Marquardt, up to three starts": [_ours(c) for c in cases]}
+    found: dict[str, list[tuple[float, float]]] = {
+        "Levenberg-Marquardt, up to three starts": [_ours(c) for c in cases]
+    }
     for label, method in peers.items():
         found[label] = [_theirs(solvephase, case, method) for case in cases]
-    about = f"rad rms from the true phase, mean of {SEEDS} stacks; CPU time, least of them"
+    about = (
+        f"rad rms from the true phase, mean of {SEEDS} stacks; CPU time, least of them"
+    )
     goal = "no worse than L-BFGS in half its time, multi-start in a tenth"
     return [
-        Row("5 images, 33 modes, 2e5 photons", label, min(t for t, _ in runs), _mean(runs), about, goal=goal)
+        Row(
+            "5 images, 33 modes, 2e5 photons",
+            label,
+            min(t for t, _ in runs),
+            _mean(runs),
+            about,
+            goal=goal,
+        )
         for label, runs in found.items()
     ]
 
@@ -41,7 +65,9 @@ def _mean(runs: list[tuple[float, float]]) -> float:
 
 
 def spec() -> PupilSpec:
-    """The pupil: low aperture, point-sampled pixels at half the Nyquist step of the field."""
+    """The pupil: low aperture, point-sampled pixels at half the Nyquist step of the
+    field.
+    """
     pixel = WAVE_UM / (2 * NA * SAMPLING)
     return PupilSpec(
         NA, WAVE_UM, pixel, window=SIDE, phase_order=ORDER, amplitude_order=0, drift_order=0, model="scalar",
@@ -63,14 +89,18 @@ def _stack(seed: int) -> dict[str, Any]:
     random = np.random.default_rng(seed)
     model = _model()
     modes = len(model.phase_indices)
-    phase = random.standard_normal(modes) / np.array([n**1.5 for n, _ in model.phase_indices])
+    phase = random.standard_normal(modes) / np.array(
+        [n**1.5 for n, _ in model.phase_indices]
+    )
     phase /= np.linalg.norm(phase)
     x = _vector(model, phase, PHOTONS, 10.0)
     images = random.poisson(np.maximum(model.images(x, False)[0], 0)).astype(float)
     return {"phase": phase, "images": images}
 
 
-def _vector(model: PupilModel, phase: np.ndarray, light: float, level: float) -> np.ndarray:
+def _vector(
+    model: PupilModel, phase: np.ndarray, light: float, level: float
+) -> np.ndarray:
     layout = model.layout()
     x = np.zeros(layout.size)
     x[: layout.phase] = phase
@@ -81,16 +111,27 @@ def _vector(model: PupilModel, phase: np.ndarray, light: float, level: float) ->
 
 
 def _ours(case: dict[str, Any]) -> tuple[float, float]:
-    """The middle quarter of the images from each start, then all pixels: two steps are left to them."""
+    """The middle quarter of the images from each start, then all pixels: two steps are
+    left to them.
+    """
     start = time.process_time()
     images = case["images"]
     middle = (slice(None), *(slice((SIDE - MIDDLE) // 2, (SIDE + MIDDLE) // 2),) * 2)
     small, large = _model(MIDDLE), _model()
     level = float(np.median(images[:, 0]))
-    begin = _vector(small, np.zeros(small.layout().phase), float((images - level).sum((1, 2)).mean()), level)
+    begin = _vector(
+        small,
+        np.zeros(small.layout().phase),
+        float((images - level).sum((1, 2)).mean()),
+        level,
+    )
     settings = Settings(iterations=15, step_tolerance=1.0, near=3.0, finish=False)
     best = None
-    for astigmatism in (0.0, 0.7, -0.7):  # further starts only where the first leaves something unexplained
+    for astigmatism in (
+        0.0,
+        0.7,
+        -0.7,
+    ):  # further starts only where the first leaves something unexplained
         begin[small.phase_indices.index((2, 2))] = astigmatism
         rough = _fit(small, images[middle], begin, settings)
         found = _fit(large, images, rough.value, Settings(near=1.0, step_tolerance=0.1))
@@ -99,12 +140,22 @@ def _ours(case: dict[str, Any]) -> tuple[float, float]:
             break
     found = best or found
     seconds = time.process_time() - start
-    return seconds, float(np.linalg.norm(found.value[: large.layout().phase] - case["phase"]))
+    return seconds, float(
+        np.linalg.norm(found.value[: large.layout().phase] - case["phase"])
+    )
 
 
-def _fit(model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: Settings) -> leastsquares.Solution:
+def _fit(
+    model: PupilModel, images: np.ndarray, begin: np.ndarray, settings: Settings
+) -> leastsquares.Solution:
     everywhere = np.ones(images.shape, bool)
-    data = Data(images, everywhere, ~everywhere, np.full(images.shape, 1.0), np.ones(images.shape))
+    data = Data(
+        images,
+        everywhere,
+        ~everywhere,
+        np.full(images.shape, 1.0),
+        np.ones(images.shape),
+    )
     prior = Prior.none(begin)
     blur = len(begin) - 2 * len(images) - 1
     prior.low[blur] = prior.high[blur] = begin[blur]
@@ -117,7 +168,13 @@ def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, 
     amounts = [-a / length for a in DEFOCUS_RAD]
     start = time.process_time()
     found = solvephase.retrieve(
-        case["images"], pupil, WAVE_UM * 1e-6, sampling=SAMPLING, diversity=amounts, basis=35, method=method
+        case["images"],
+        pupil,
+        WAVE_UM * 1e-6,
+        sampling=SAMPLING,
+        diversity=amounts,
+        basis=35,
+        method=method,
     )
     seconds = time.process_time() - start
     inside = np.asarray(pupil.mask)
@@ -129,7 +186,10 @@ def _theirs(solvephase: Any, case: dict[str, Any], method: str) -> tuple[float, 
     for sign in (1, -1):  # their axes and sign of time may differ from ours
         for turn in (1, -1):
             for swap in (False, True):
-                a, b = (turn * (v if swap else u))[keep], (turn * (u if swap else v))[keep]
+                a, b = (
+                    (turn * (v if swap else u))[keep],
+                    (turn * (u if swap else v))[keep],
+                )
                 truth = case["phase"] @ zernike.basis(_model().phase_indices, a, b)
                 rest = sign * np.asarray(found.opd)[keep] * length - truth
                 rest = rest - np.linalg.lstsq(flat.T, rest, rcond=None)[0] @ flat

@@ -35,7 +35,9 @@ from metalens.image.sensor import Sensor
 # `slip_mm` is the label; `pool.light` is what a pinhole would see.
 
 # %%
-settings = SceneConfig(pixels=96, margin=16, slip_mm=(0.5, 0.5, 3.5), gaze_deg=(6.0, 5.0))
+settings = SceneConfig(
+    pixels=96, margin=16, slip_mm=(0.5, 0.5, 3.5), gaze_deg=(6.0, 5.0)
+)
 scenes = EyeScenes(settings, 9.0, 2000.0, seed=0)
 frames = pool.fill(scenes, 768)
 batches = PoolScenes(frames, settings.margin, settings.scale, seed=0)
@@ -49,7 +51,13 @@ for image, panel in zip(frames.light, axes, strict=False):
 # Multiply-accumulates are a smooth function of the pixel pitch (Eq. 9), so the pitch can be trained too.
 
 # %%
-space = Space(widths=(0.25, 0.5), depths=(2,), expansions=(3,), kernels=(5,), resolution=(1.0, 1.0))
+space = Space(
+    widths=(0.25, 0.5),
+    depths=(2,),
+    expansions=(3,),
+    kernels=(5,),
+    resolution=(1.0, 1.0),
+)
 member = Architecture((2,) * 5, (5,) * 10, (3,) * 10, 0.5, 1.0)
 for pitch in (9.0, 12.0, 18.0):
     macs = cost.macs(member, pitch, window_um=96 * 9.0, space=space)
@@ -66,9 +74,13 @@ sensor = Sensor(9.0, 9.0, 4000.0, 0.0, 8000.0, 5.0, 10)
 
 def train(polynomials, steps=200):
     # one PSF for the whole field: quick, and wrong by what `metalens codesign` prints of it
-    lens = OpticsConfig(focus_mm=33.0, polynomials=polynomials, depth_count=14, image="uniform")
+    lens = OpticsConfig(
+        focus_mm=33.0, polynomials=polynomials, depth_count=14, image="uniform"
+    )
     moving = Schedule(0.03 if polynomials else 0.0, 0.1, 0.8)
-    config = InnerConfig(steps=steps, batch=32, optics=moving, optics_weight=0.0, slip_weight=8.0)
+    config = InnerConfig(
+        steps=steps, batch=32, optics=moving, optics_weight=0.0, slip_weight=8.0
+    )
     made = inner.model(lens, pitch_um=9.0, seed=0, space=space)
     trainer = Trainer(config, lens, sensor, batches, made, architecture=member)
     losses = [record.task for record in trainer.run()]
@@ -96,7 +108,11 @@ test = EyeScenes(settings, 9.0, 2000.0, seed=0, stream=TEST)
 for name, (trainer, _) in runs.items():
     net = trainer.model.net
     seen = assess.frames(trainer, test, 6)
-    error = (assess.predict(net, member, seen, trainer.inner).slip_mm - seen.slip_mm).abs().mean(0)
+    error = (
+        (assess.predict(net, member, seen, trainer.inner).slip_mm - seen.slip_mm)
+        .abs()
+        .mean(0)
+    )
     response = depth_response(trainer, test, net, member, batches=4)
     print(
         f"{name}: axial {error[2]:.2f} mm, lateral {error[:2].mean():.2f} mm, {response.mean:.2f} mm per mm of PSF depth"
@@ -115,4 +131,8 @@ for row, phase in zip(axes, (0 * found, found), strict=True):
         panel.imshow(stack.intensity[index].clamp_min(0).sqrt(), cmap="magma")
         panel.set_title(f"{float(stack.depths_um[index]) * 1e-3:.0f} mm", fontsize=8)
         panel.set_axis_off()
-print("root-mean-square phase added:", round(float(torch.linalg.vector_norm(found)), 2), "rad")
+print(
+    "root-mean-square phase added:",
+    round(float(torch.linalg.vector_norm(found)), 2),
+    "rad",
+)

@@ -34,7 +34,9 @@ helix = torch.from_numpy(design_fisher.vortices(x, y, radius_um=500.0, zones=2))
 # gives 1.44, 1.84 and 2.11 times the better tuned simple lens at 1 x 1, 2 x 2 and 3 x 3 pixels (docs/fisher).
 
 # %%
-made = design_fisher.optimise(optics, Fisher(iterations=150, starts=1).about(aim, optics.radius_um))
+made = design_fisher.optimise(
+    optics, Fisher(iterations=150, starts=1).about(aim, optics.radius_um)
+)
 free = design_fisher.phase_on(optics, made)
 print(made.reason, "; information and least energy:", made.starts)
 
@@ -50,7 +52,11 @@ for binning, ax in zip((1, 2, 3), axes, strict=True):
         focus = made.focus_um if name == "free form" else 20e3
         binned = Fisher(pixel_um=3.0 * binning).about(aim, optics.radius_um)
         score = design_fisher.score(phase, optics, focus_um=focus, settings=binned)
-        ax.semilogy(depths, score.information, label=f"{name}: {float(score.information.mean()):.3f}")
+        ax.semilogy(
+            depths,
+            score.information,
+            label=f"{name}: {float(score.information.mean()):.3f}",
+        )
     ax.set(title=f"{binning} x {binning} pixels of 3 um", xlabel="depth, mm")
     ax.legend(fontsize=7)
 axes[0].set_ylabel("I(z), per mm²")
@@ -62,9 +68,16 @@ plt.show()
 
 # %%
 z = torch.arange(16e3, 26.01e3, 1e3, dtype=torch.float64)
-near, far = (pupil.psf(helix, optics, depths_um=d, focus_um=20e3, sample_um=3.0, samples=48) for d in (z, z + 200))
-claimed = fisher.pixel_information(near, far, step_um=200.0, sample_um=3.0, pixel_um=3.0, normalisation="l2").mean()
-honest = design_fisher.score(helix, optics, focus_um=20e3, settings=asked).information.mean()
+near, far = (
+    pupil.psf(helix, optics, depths_um=d, focus_um=20e3, sample_um=3.0, samples=48)
+    for d in (z, z + 200)
+)
+claimed = fisher.pixel_information(
+    near, far, step_um=200.0, sample_um=3.0, pixel_um=3.0, normalisation="l2"
+).mean()
+honest = design_fisher.score(
+    helix, optics, focus_um=20e3, settings=asked
+).information.mean()
 print(f"claimed {float(claimed):.2f}, honest {float(honest):.2f} per mm²")
 
 # %% [markdown]
@@ -74,7 +87,12 @@ print(f"claimed {float(claimed):.2f}, honest {float(honest):.2f} per mm²")
 figure, axes = plt.subplots(3, 6, figsize=(11, 5.6))
 for row, (name, phase) in zip(axes, lenses.items(), strict=True):
     planes = torch.linspace(16e3, 26e3, 6, dtype=torch.float64)
-    for ax, depth, image in zip(row, planes, pupil.psf(phase, optics, depths_um=planes, focus_um=20e3), strict=True):
+    for ax, depth, image in zip(
+        row,
+        planes,
+        pupil.psf(phase, optics, depths_um=planes, focus_um=20e3),
+        strict=True,
+    ):
         ax.imshow(image[66:126, 66:126] ** 0.5, cmap="inferno")
         ax.set_axis_off()
         ax.set_title(f"{name}, {depth / 1e3:.0f} mm", fontsize=7)

@@ -29,18 +29,30 @@ from metalens.pillars.proxy import Proxy
 
 # %%
 phase, level = np.zeros((2, 4)), np.zeros((2, 4))
-phase[0, :3], phase[1, :2], level[0] = (4.0, 3.9, 0.4), (-0.2, -0.15), (0.88, -0.03, 0.02, 0.03)
+phase[0, :3], phase[1, :2], level[0] = (
+    (4.0, 3.9, 0.4),
+    (-0.2, -0.15),
+    (0.88, -0.03, 0.02, 0.03),
+)
 proxy = Proxy(phase, level, (0.09, 0.26), (0.83, 0.87), 1e-3, 1e-3)
 focus = profiles.Focus(0.85, 110.0, 600.0)
 shape = design.phase_of(None, focus, radius_um=20.0)
-lens, quality = design.make(shape, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy)
+lens, quality = design.make(
+    shape, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy
+)
 
 # %% [markdown]
 # The bench: five source depths, pillars 3 nm too wide, a little coma, a stage that is off by 9 um.
 # Your own folder is read by `characterize.load("captures")`: frames, `stage.csv`, `dark.tif`, `flat.tif`, `capture.toml`.
 
 # %%
-hidden = {"bias_nm": 3.0, "coma_x_rad": 0.2, "stage_zero_um": 9.0, "crosstalk_px": 0.25, "background_e": 20.0}
+hidden = {
+    "bias_nm": 3.0,
+    "coma_x_rad": 0.2,
+    "stage_zero_um": 9.0,
+    "crosstalk_px": 0.25,
+    "background_e": 20.0,
+}
 truth = Truth(
     (380.0, 480.0, 600.0, 800.0, 1150.0),
     peak_e=6000.0,
@@ -71,7 +83,9 @@ captures = Capture(
 told = (Known("height_nm", 0.0, 3.0), Known("wavelength_nm", 0.0, 0.1))
 built = fit(captures, lens, Options(known=told, scan_um=60.0))
 for name, value, sigma in zip(built.names, built.value, built.sigma, strict=True):
-    true = "" if name == "log_gain" else f"true {hidden.get(name, 0.0):6.2f}"  # the light of the bench is its own
+    true = (
+        "" if name == "log_gain" else f"true {hidden.get(name, 0.0):6.2f}"
+    )  # the light of the bench is its own
     print(f"{name:<24} {value:9.3f} +- {sigma:.3f}   {true}")
 print(f"chi² / dof {built.chi2_per_dof:.3f}; {built.reason}")
 

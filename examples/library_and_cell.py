@@ -57,8 +57,12 @@ for solver, tolerances in ((modal, (5e-3, 1e-3, 1e-4)), (rcwa, (1e-1, 3e-2, 1e-2
         seconds.append(time.perf_counter() - start)
         error.append(abs(found.t - reference))
         estimate.append(found.t_error)
-    (line,) = axes.loglog(seconds, error, "o-", label=f"{solver.__name__.split('.')[-1]}: true error")
-    axes.loglog(seconds, estimate, "--", color=line.get_color(), label="its own estimate")
+    (line,) = axes.loglog(
+        seconds, error, "o-", label=f"{solver.__name__.split('.')[-1]}: true error"
+    )
+    axes.loglog(
+        seconds, estimate, "--", color=line.get_color(), label="its own estimate"
+    )
 axes.set(xlabel="time / s", ylabel="|Δt|", title="302 nm pillar, the steep flank")
 axes.legend()
 plt.show()
@@ -83,9 +87,18 @@ for note in default.notes:
 # %%
 t = default.t[0, 0, 0]
 smooth = np.linspace(*proxy.domain_um, 300)
-figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
-top.plot(default.diameter_um * 1e3, np.unwrap(np.angle(t)) / (2 * np.pi), label="library")
-top.plot(smooth * 1e3, proxy.phase_rad(smooth, WAVELENGTH_UM) / (2 * np.pi), "--", label="proxy on its domain")
+figure, (top, bottom) = plt.subplots(
+    2, 1, figsize=(7, 5), sharex=True, layout="constrained"
+)
+top.plot(
+    default.diameter_um * 1e3, np.unwrap(np.angle(t)) / (2 * np.pi), label="library"
+)
+top.plot(
+    smooth * 1e3,
+    proxy.phase_rad(smooth, WAVELENGTH_UM) / (2 * np.pi),
+    "--",
+    label="proxy on its domain",
+)
 top.set(ylabel="phase / turns")
 top.legend()
 bottom.errorbar(default.diameter_um * 1e3, np.abs(t), yerr=default.t_error[0, 0, 0])
@@ -103,9 +116,18 @@ plt.show()
 # %%
 figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
 for pitch in (0.30, 0.40):
-    made = library.sweep(Cell(pitch, 0.7, pillar=Index(3.6)), library.Sweep(diameters_um=(0.08, pitch - 0.06)))
-    axes.plot(made.diameter_um * 1e3, np.abs(made.t[0, 0, 0]), label=f"pitch {pitch * 1e3:.0f} nm")
+    made = library.sweep(
+        Cell(pitch, 0.7, pillar=Index(3.6)),
+        library.Sweep(diameters_um=(0.08, pitch - 0.06)),
+    )
+    axes.plot(
+        made.diameter_um * 1e3,
+        np.abs(made.t[0, 0, 0]),
+        label=f"pitch {pitch * 1e3:.0f} nm",
+    )
 axes.axhline(0.8, color="grey", lw=0.8)
-axes.set(xlabel="diameter / nm", ylabel="|t|", title="A resonance is a hole in the lens")
+axes.set(
+    xlabel="diameter / nm", ylabel="|t|", title="A resonance is a hole in the lens"
+)
 axes.legend()
 plt.show()

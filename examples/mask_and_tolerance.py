@@ -47,7 +47,9 @@ lens, quality = design.make(
     limits=design.Limits(min_diameter_nm=82.0, min_gap_nm=70.0),
     profile="hyperbolic",
 )
-print(f"{quality.pillars:,} pillars, NA {quality.numerical_aperture:.3f}, Strehl {quality.strehl:.4f}")
+print(
+    f"{quality.pillars:,} pillars, NA {quality.numerical_aperture:.3f}, Strehl {quality.strehl:.4f}"
+)
 
 # %% [markdown]
 # ## What is drawn is not what is made
@@ -82,7 +84,9 @@ print(report.summary)
 folder = Path(tempfile.mkdtemp())
 oasis_write.write(made.plan, folder / "mask.oas", form="small")
 same = verify.compare(made.plan, oasis_read.read(folder / "mask.oas"))
-print(f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as planned: {same.ok}")
+print(
+    f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as planned: {same.ok}"
+)
 
 # %% [markdown]
 # ## Dose: even exposure at every edge
@@ -95,14 +99,20 @@ print(f"{(folder / 'mask.oas').stat().st_size / 1e3:.0f} kB, reads back as plann
 table_um = np.r_[0, made.cells.diameters_nm] * 1e-3
 written = DiameterMap(table_um[made.cells.classes], lens.diameters.pitch_um)
 result = dose.correct(written, rules)
-print(f"one dose:   worst edge {100 * result.before.worst:5.1f} %, diameter error {result.before.diameter_nm:.2f} nm")
+print(
+    f"one dose:   worst edge {100 * result.before.worst:5.1f} %, diameter error {result.before.diameter_nm:.2f} nm"
+)
 print(
     f"{len(result.factors):2d} doses:   worst edge {100 * result.after.worst:5.1f} %, diameter error {result.after.diameter_nm:.2f} nm"
 )
 print(f"error of this calculation: {result.error:.0e}")
 
 given = np.where(
-    result.classes < 255, np.append(result.factors, np.full(256 - len(result.factors), np.nan))[result.classes], np.nan
+    result.classes < 255,
+    np.append(result.factors, np.full(256 - len(result.factors), np.nan))[
+        result.classes
+    ],
+    np.nan,
 )
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 side = lens.diameters.radius_um
@@ -110,7 +120,9 @@ shown = axes[0].imshow(given, extent=(-side, side, side, -side), cmap="viridis")
 axes[0].set(title="relative dose", xlabel="x / µm", ylabel="y / µm")
 figure.colorbar(shown, ax=axes[0])
 axes[1].bar(
-    result.dose_uC_cm2, np.bincount(result.classes[result.classes < 255], minlength=len(result.factors)), width=6
+    result.dose_uC_cm2,
+    np.bincount(result.classes[result.classes < 255], minlength=len(result.factors)),
+    width=6,
 )
 axes[1].set(xlabel="dose / (µC/cm²)", ylabel="pillars", title="dose classes")
 plt.show()
@@ -128,7 +140,9 @@ stitched = stitching.stitching(lens, plan, small)
 print(
     f"{plan.used} fields of {plan.size_um[0]:.1f} µm; borders left where they were would cut {plan.cut_before} pillars, now none"
 )
-print(f"peak of the PSF: {stitched.strehl.mean():.5f} on average, {stitched.strehl.min():.5f} at worst")
+print(
+    f"peak of the PSF: {stitched.strehl.mean():.5f} on average, {stitched.strehl.min():.5f} at worst"
+)
 print(
     f"change of the PSF (relative L2): {100 * stitched.change.mean():.2f} %, at worst {100 * stitched.change.max():.2f} %"
 )
@@ -165,16 +179,27 @@ low, middle, high = (resample(curve, len(fine)) for curve in study.band("psf"))
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
 axes[0].fill_between(fine, low, high, alpha=0.3, label="5 to 95 %")
 axes[0].plot(fine, middle, label="median")
-axes[0].plot(fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8, label="as designed")
-axes[0].set(xlabel="x / µm", ylabel="intensity", title="PSF at the design depth", xlim=(-4, 4))
+axes[0].plot(
+    fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8, label="as designed"
+)
+axes[0].set(
+    xlabel="x / µm", ylabel="intensity", title="PSF at the design depth", xlim=(-4, 4)
+)
 axes[0].legend(fontsize=7)
 axes[1].hist(study.draws.efficiency * 100, bins=15)
 axes[1].axvline(100 * study.nominal.efficiency[0], color="k", ls="--")
 axes[1].set(xlabel="efficiency / %", ylabel="draws")
 low, middle, high = study.band("information")
-axes[2].errorbar(study.depths_um / 1e3, middle, [middle - low, high - middle], fmt="o", capsize=4)
+axes[2].errorbar(
+    study.depths_um / 1e3, middle, [middle - low, high - middle], fmt="o", capsize=4
+)
 axes[2].plot(study.depths_um / 1e3, study.nominal.information[0], "k_", ms=14)
-axes[2].set(xlabel="depth / mm", ylabel="I(z) / µm⁻²", yscale="log", title="axial information (Eq. 11)")
+axes[2].set(
+    xlabel="depth / mm",
+    ylabel="I(z) / µm⁻²",
+    yscale="log",
+    title="axial information (Eq. 11)",
+)
 plt.show()
 
 # %% [markdown]
@@ -186,7 +211,9 @@ plt.show()
 # %%
 bias_only = process.Process(spread=Spread.only(bias_nm=8.0))
 plain = tolerance.analyse(lens, bias_only, sens=answers, draws=10).effects[0]
-print("phase tolerance   phase error   |T|     spread per nm    phase at ±8 nm   PSF change")
+print(
+    "phase tolerance   phase error   |T|     spread per nm    phase at ±8 nm   PSF change"
+)
 print(
     f"{'as designed':>15s}   {0:8.3f} rad  {quality.transmission:.3f}   {'':14s} {plain.phase_rad:8.3f} rad   {100 * plain.psf:8.2f} %"
 )
@@ -211,5 +238,7 @@ for c in gaps:
     print(f"{c.first} to {c.second}: {1e3 * c.distance_mm:.2f} µm")
 tile = solid.tile(lens, rules, side_um=6.0)
 solid.write_step(folder / "tile.step", tile)
-print(f"{len(tile.kind)} pillars in {(folder / 'tile.step').stat().st_size / 1e3:.0f} kB of STEP")
+print(
+    f"{len(tile.kind)} pillars in {(folder / 'tile.step').stat().st_size / 1e3:.0f} kB of STEP"
+)
 display(Image(solid.picture(solid.Module()), width=360))

@@ -25,7 +25,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-sys.path.insert(0, "..")  # the rivals that this page measures lie beside the folder of examples
+sys.path.insert(
+    0, ".."
+)  # the rivals that this page measures lie beside the folder of examples
 
 from benchmarks.rivals import lowrank
 from benchmarks.rivals.radial import Radial, field_radial
@@ -45,8 +47,16 @@ def profile(r):
 
 lens = Radial(profile, np.ones_like, RADIUS)
 phase, transmission = lens.maps((500, 500), PITCH)
-geometry = dict(pitch_um=PITCH, wavelength_um=WAVELENGTH, sensor_distance_um=D, window_um=24 * 2 * PITCH, samples=24)
-on_lattice = geometry | dict(offset_um=(PITCH / 2, PITCH / 2))  # where the angular spectrum has its samples
+geometry = dict(
+    pitch_um=PITCH,
+    wavelength_um=WAVELENGTH,
+    sensor_distance_um=D,
+    window_um=24 * 2 * PITCH,
+    samples=24,
+)
+on_lattice = geometry | dict(
+    offset_um=(PITCH / 2, PITCH / 2)
+)  # where the angular spectrum has its samples
 
 
 def timed(work, repeats=3):
@@ -87,11 +97,17 @@ for label, options in (
     ("angular spectrum, pad 4", dict(pad=4)),
 ):
     field, seconds = timed(
-        lambda o=options: propagate.angular_spectrum(phase, transmission, **on_lattice, depths_um=some, **o), 1
+        lambda o=options: propagate.angular_spectrum(
+            phase, transmission, **on_lattice, depths_um=some, **o
+        ),
+        1,
     )
     want = exact["lattice"][::10]
     points[label] = [
-        (seconds * len(DEPTHS) / len(some), np.linalg.norm(normalised(field) - want) / np.linalg.norm(want))
+        (
+            seconds * len(DEPTHS) / len(some),
+            np.linalg.norm(normalised(field) - want) / np.linalg.norm(want),
+        )
     ]
 
 maps = {torch.float32: torch.tensor(phase).float(), torch.float64: torch.tensor(phase)}
@@ -100,7 +116,9 @@ ladder = []
 for tolerance in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-9):
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     stack, seconds = timed(
-        lambda t=tolerance, d=dtype: psf.psf_stack(maps[d], level, **geometry, depths_um=DEPTHS, tolerance=t)
+        lambda t=tolerance, d=dtype: psf.psf_stack(
+            maps[d], level, **geometry, depths_um=DEPTHS, tolerance=t
+        )
     )
     ladder.append((tolerance, seconds, error(stack.numpy().intensity), stack.error))
 points["windowed, forward"] = [(seconds, wrong) for _, seconds, wrong, _ in ladder]
@@ -108,7 +126,9 @@ points["windowed, forward"] = [(seconds, wrong) for _, seconds, wrong, _ in ladd
 
 def gradient(tolerance):
     given = maps[torch.float32].clone().requires_grad_()
-    stack = psf.psf_stack(given, level, **geometry, depths_um=DEPTHS, tolerance=tolerance)
+    stack = psf.psf_stack(
+        given, level, **geometry, depths_um=DEPTHS, tolerance=tolerance
+    )
     (stack.intensity**2).sum().backward()
     return stack
 
@@ -116,7 +136,9 @@ def gradient(tolerance):
 points["windowed, forward and gradient"] = []
 for tolerance in (1e-3, 1e-4, 1e-6):
     stack, seconds = timed(lambda t=tolerance: gradient(t))
-    points["windowed, forward and gradient"].append((seconds, error(stack.numpy().intensity)))
+    points["windowed, forward and gradient"].append(
+        (seconds, error(stack.numpy().intensity))
+    )
 
 case = propagate.case(phase.shape, **geometry, depths_um=DEPTHS)
 hankel, seconds = timed(lambda: field_radial(lens, case, 1e-5))
@@ -131,14 +153,21 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.2), layout="constraine
 for label, values in points.items():
     seconds, wrong = np.array(values).T
     left.loglog(seconds * 1e3, wrong, "o-", label=label)
-left.set(xlabel="time for 21 depths / ms", ylabel="relative L2 error of the PSFs", title="speed against error")
+left.set(
+    xlabel="time for 21 depths / ms",
+    ylabel="relative L2 error of the PSFs",
+    title="speed against error",
+)
 left.legend(fontsize=7)
 left.grid(alpha=0.3)
 tolerance, _, wrong, estimate = np.array(ladder).T
 right.loglog(tolerance, tolerance, "k:", label="tolerance")
 right.loglog(tolerance, wrong, "o-", label="true error")
 right.loglog(tolerance, estimate, "s--", label="error estimate of the result")
-right.set(xlabel="tolerance asked for", title="the estimate stays above the truth, and within three times of it")
+right.set(
+    xlabel="tolerance asked for",
+    title="the estimate stays above the truth, and within three times of it",
+)
 right.legend(fontsize=8)
 right.grid(alpha=0.3)
 plt.show()
@@ -149,24 +178,35 @@ print("estimate / truth:", np.round(estimate / wrong, 2))
 
 # %%
 for shape, samples in (((8, 8), 4), ((500, 500), 24), ((2500, 2500), 64)):
-    picked = propagate.choose(propagate.case(shape, **geometry | dict(samples=samples), depths_um=DEPTHS), 1e-4)
-    print(f"{shape[0]} x {shape[1]} pillars, {samples} x {samples} samples: {picked.reason}")
+    picked = propagate.choose(
+        propagate.case(shape, **geometry | dict(samples=samples), depths_um=DEPTHS),
+        1e-4,
+    )
+    print(
+        f"{shape[0]} x {shape[1]} pillars, {samples} x {samples} samples: {picked.reason}"
+    )
 
 # %% [markdown]
 # **Depth as a few pictures.** Image formation needs many depths; a handful of basis PSFs carries them all.
 
 # %%
-stack = psf.psf_stack(phase, transmission, **geometry, depths_um=np.linspace(3200, 5200, 41))
+stack = psf.psf_stack(
+    phase, transmission, **geometry, depths_um=np.linspace(3200, 5200, 41)
+)
 for tolerance in (1e-1, 1e-2, 1e-3):
     small = lowrank.compress(stack, tolerance=tolerance)
-    print(f"tolerance {tolerance:g}: {small.rank} basis PSFs for 41 depths, measured error {small.errors.max():.1e}")
+    print(
+        f"tolerance {tolerance:g}: {small.rank} basis PSFs for 41 depths, measured error {small.errors.max():.1e}"
+    )
 
 # %% [markdown]
 # **The normalisation decides the ranking.** I(z) of Eq. 11 for this lens under two names.
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(10, 3), layout="constrained")
-for panel, (name, value) in zip(axes, psf_metrics.information_by_name(stack).items(), strict=True):
+for panel, (name, value) in zip(
+    axes, psf_metrics.information_by_name(stack).items(), strict=True
+):
     panel.plot((stack.depths_um[1:] + stack.depths_um[:-1]) / 2e3, value)
     panel.set(title=f"normalised by {name}", xlabel="depth / mm", ylabel="I(z) / mm⁻²")
 plt.show()

@@ -23,12 +23,21 @@ def main(words: list[str]) -> int:
     """Run the named notebooks, all of them without a name; the number that failed."""
     names = [word for word in words if not word.startswith("-")]
     TARGET.mkdir(parents=True, exist_ok=True)
-    known = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in ("run", "__init__"))
+    known = sorted(
+        path.stem
+        for path in FOLDER.glob("*.py")
+        if path.stem not in ("run", "__init__")
+    )
     failed = 0
     for name in names or known:
         start = time.monotonic()
         notebook = jupytext.read(FOLDER / f"{name}.py")
-        client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": FOLDER}})
+        client = NotebookClient(
+            notebook,
+            timeout=600,
+            kernel_name="python3",
+            resources={"metadata": {"path": FOLDER}},
+        )
         try:
             client.execute()
             word = "ok"
@@ -51,7 +60,9 @@ def write_page(notebook: nbformat.NotebookNode, name: str) -> None:
         if cell.cell_type == "markdown":
             parts.append(cell.source)
             continue
-        code = "\n".join(f"    {line}" for line in f"```python\n{cell.source}\n```".splitlines())
+        code = "\n".join(
+            f"    {line}" for line in f"```python\n{cell.source}\n```".splitlines()
+        )
         parts.append(f'??? note "code"\n{code}')
         for output in cell.outputs:
             data = output.get("data", {})
@@ -59,10 +70,14 @@ def write_page(notebook: nbformat.NotebookNode, name: str) -> None:
                 parts.append(f"```text\n{output.text.rstrip()}\n```")
             elif "image/png" in data:
                 pictures += 1
-                (GALLERY / f"{name}_{pictures}.png").write_bytes(base64.b64decode(data["image/png"]))
+                (GALLERY / f"{name}_{pictures}.png").write_bytes(
+                    base64.b64decode(data["image/png"])
+                )
                 parts.append(f"![{name}, picture {pictures}]({name}_{pictures}.png)")
     last = f"This page is `examples/{name}.py`, executed by `python -m examples.run {name} --gallery`."
-    (GALLERY / f"{name}.md").write_text("\n\n".join([*parts, last]) + "\n", encoding="utf-8")
+    (GALLERY / f"{name}.md").write_text(
+        "\n\n".join([*parts, last]) + "\n", encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

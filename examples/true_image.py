@@ -30,7 +30,12 @@ from metalens.lens import Layers
 from metalens.psf import Source
 
 torch.set_num_threads(2)
-WAVELENGTH, D, SOURCE, RADIUS = 0.85, 2000.0, 20e3, 500.0  # um: an eye tracker of 1 mm at NA 0.24
+WAVELENGTH, D, SOURCE, RADIUS = (
+    0.85,
+    2000.0,
+    20e3,
+    500.0,
+)  # um: an eye tracker of 1 mm at NA 0.24
 LED = Source(850.0, 30.0)  # nm: peak and full width at half maximum
 GLASS = Layers(behind=(Film("N-BK7", 400.0),))  # cover of the sensor
 GRID = Grid((96, 96), 12.0, (15e3, 28e3), margin=12, window=33)
@@ -42,9 +47,13 @@ print(f"±{half_deg:.0f} degrees on {GRID.samples[0]} samples of {GRID.step_um:g
 # **The scene.** A far wall that leans from 19 to 28 mm, and a near strip at 16 mm. Spots and spokes show blur best.
 
 # %%
-y, x = torch.meshgrid(*(torch.arange(SIDE) - (SIDE - 1) / 2 for _ in "yx"), indexing="ij")
+y, x = torch.meshgrid(
+    *(torch.arange(SIDE) - (SIDE - 1) / 2 for _ in "yx"), indexing="ij"
+)
 spots = (((x + 8) % 16 - 8).abs() < 1.0) & (((y + 5) % 16 - 8).abs() < 1.0)
-spokes = (torch.sin(14 * torch.atan2(y - 7, x + 4)) > 0) & (torch.hypot(x + 4, y - 7) < 30)
+spokes = (torch.sin(14 * torch.atan2(y - 7, x + 4)) > 0) & (
+    torch.hypot(x + 4, y - 7) < 30
+)
 wall = 0.1 + 0.8 * (spots | spokes)
 strip = torch.sigmoid(2 * (y - 0.2 * x - 36))
 stripes = 0.3 + 0.6 * ((x // 6) % 2)
@@ -58,18 +67,26 @@ scene = Frames(*(part.float()[None] for part in (radiance, cover, depth)))
 
 # %%
 lens = SmoothWave(Focus(WAVELENGTH, D, SOURCE), RADIUS)
-corrected = SmoothWave(Focus(WAVELENGTH, D, SOURCE, GLASS), RADIUS)  # designed for the glass
+corrected = SmoothWave(
+    Focus(WAVELENGTH, D, SOURCE, GLASS), RADIUS
+)  # designed for the glass
 cases = {
     "field": dict(lens=lens),
     "field and spectrum": dict(lens=lens, spectrum=LED),
-    "field, spectrum, glass unknown to the design": dict(lens=lens, spectrum=LED, layers=GLASS),
-    "field, spectrum, glass in the design": dict(lens=corrected, spectrum=LED, layers=GLASS),
+    "field, spectrum, glass unknown to the design": dict(
+        lens=lens, spectrum=LED, layers=GLASS
+    ),
+    "field, spectrum, glass in the design": dict(
+        lens=corrected, spectrum=LED, layers=GLASS
+    ),
 }
 made = {}
 for name, given in cases.items():
     made[name] = imager(given.pop("lens"), GRID, tolerance=1e-2, **given)
     nodes = f"{len(made[name].plan.y_um)}² field points, {len(made[name].plan.depths_um)} depths"
-    print(f"{name}: {nodes}, {len(made[name].plan.waves.weights)} wavelengths; error {made[name].error:.1e}")
+    print(
+        f"{name}: {nodes}, {len(made[name].plan.waves.weights)} wavelengths; error {made[name].error:.1e}"
+    )
 
 # %% [markdown]
 # **PSFs over the field**, all of one depth: sharp on the axis at one wavelength; a comet at 20 degrees; and the diode fills
@@ -104,7 +121,9 @@ flat = made["field"]
 middle = len(flat.plan.x_um) // 2
 centre = flat.stack[middle, middle]
 order = torch.argsort(flat.plan.depths_um)
-kernels = basis(centre[order].double(), flat.plan.depths_um[order].double(), tolerance=1e-4)
+kernels = basis(
+    centre[order].double(), flat.plan.depths_um[order].double(), tolerance=1e-4
+)
 one = uniform_imager(kernels, (SIDE, SIDE), margin=GRID.margin)
 with torch.no_grad():
     seen = {"one PSF": image(scene, one, margin=GRID.margin)[0].float()}
@@ -114,7 +133,11 @@ figure, axes = plt.subplots(1, len(seen), figsize=(14, 3.2), layout="constrained
 before = None
 for panel, (name, picture) in zip(axes, seen.items(), strict=True):
     panel.imshow(picture / picture.mean(), cmap="gray", vmin=0, vmax=2.2)
-    changed = "" if before is None else f"\nchanges {float((picture - before).norm() / before.norm()):.0%}"
+    changed = (
+        ""
+        if before is None
+        else f"\nchanges {float((picture - before).norm() / before.norm()):.0%}"
+    )
     panel.set_title(name.replace(", glass", ",\nglass") + changed, fontsize=9)
     panel.set(xticks=[], yticks=[])
     before = picture
@@ -140,7 +163,11 @@ row = level[level.shape[0] // 2].numpy()
 tangents = (np.arange(len(row)) - (len(row) - 1) / 2) * GRID.step_um / D
 figure, panel = plt.subplots(figsize=(5, 3), layout="constrained")
 panel.plot(np.degrees(np.arctan(tangents)), row / row.max(), label="imager")
-panel.plot(np.degrees(np.arctan(tangents)), np.cos(np.arctan(tangents)) ** 4, ":", label="cos⁴")
-panel.set(xlabel="field angle / degrees", ylabel="relative illumination", ylim=(0, 1.05))
+panel.plot(
+    np.degrees(np.arctan(tangents)), np.cos(np.arctan(tangents)) ** 4, ":", label="cos⁴"
+)
+panel.set(
+    xlabel="field angle / degrees", ylabel="relative illumination", ylim=(0, 1.05)
+)
 panel.legend()
 plt.show()

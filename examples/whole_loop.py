@@ -43,8 +43,14 @@ work = Path(tempfile.mkdtemp())
 # `laptop`.)
 
 # %%
-settings = resources.files("metalens").joinpath("data", "demo", "run.toml").read_text(encoding="utf-8")
-settings = settings.replace("steps = 400", "steps = 60").replace("pool = 512", "pool = 256")
+settings = (
+    resources.files("metalens")
+    .joinpath("data", "demo", "run.toml")
+    .read_text(encoding="utf-8")
+)
+settings = settings.replace("steps = 400", "steps = 60").replace(
+    "pool = 512", "pool = 256"
+)
 print(settings)
 (work / "run.toml").write_text(settings)
 main(["codesign", str(work / "run.toml"), "-o", str(work / "run"), "--quiet"])
@@ -57,7 +63,17 @@ print(f"{(design.diameters.diameter_um > 0).sum():,} pillars")
 
 # %%
 process = Path("process.toml").resolve()
-main(["layout", str(work / "run" / "lens.h5"), "--process", str(process), "-o", str(work / "mask"), "--oasis"])
+main(
+    [
+        "layout",
+        str(work / "run" / "lens.h5"),
+        "--process",
+        str(process),
+        "-o",
+        str(work / "mask"),
+        "--oasis",
+    ]
+)
 
 # %% [markdown]
 # ## 3. What the fab made, and its captures
@@ -91,7 +107,10 @@ asbuilt.save(work / "asbuilt.h5", made)
 
 # %%
 told = retraining.retrain(
-    work / "run", made, config=RetrainConfig(steps=20, draws=3, judge=1, test_batches=4), truth=truth
+    work / "run",
+    made,
+    config=RetrainConfig(steps=20, draws=3, judge=1, test_batches=4),
+    truth=truth,
 )
 for name, row in told.rows().items():
     print(
@@ -106,12 +125,19 @@ display(Image(retrain_report.bars(told)))
 # %%
 optics = retraining.load(work / "run").settings.optics
 engine = built.MadeLens(design, optics)
-plan = correction.propose(design, made.parameters(), response=engine.response, old=correction.present_bias(process))
+plan = correction.propose(
+    design,
+    made.parameters(),
+    response=engine.response,
+    old=correction.present_bias(process),
+)
 correction.write(work, plan)
 print(tomllib.loads((work / "bias.toml").read_text())["bias"]["table_nm"][::4])
 goal = engine.stack()
 for state in correction.next_lenses(engine, plan, made.parameters(), truth.vector()):
-    print(f"{state.name:<26} PSF error {built.psf_error(state.stack, goal):.3f}   Strehl {state.strehl:.3f}")
+    print(
+        f"{state.name:<26} PSF error {built.psf_error(state.stack, goal):.3f}   Strehl {state.strehl:.3f}"
+    )
 
 # %% [markdown]
 # From the shell, the last two steps are one command, with its own report:

@@ -1,6 +1,8 @@
-"""Diameter map to fabrication-tolerant mask: process, cells, polygons, writers, readers, checks, solids.
+"""Diameter map to fabrication-tolerant mask: process, cells, polygons, writers,
+readers, checks, solids.
 
-Names load when first used: ``import layout; layout.write_oasis(layout.plan(lens, process), path)``.
+Names load when first used: ``import layout; layout.write_oasis(layout.plan(lens,
+process), path)``.
 """
 
 from typing import TYPE_CHECKING

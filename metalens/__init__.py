@@ -1,4 +1,5 @@
-"""Optics core: pillar library, proxy, lenses, wave propagation, PSF stacks, image formation, information.
+"""Optics core: pillar library, proxy, lenses, wave propagation, PSF stacks, image
+formation, information.
 
 Submodules load when first used: ``import metalens; metalens.psf.psf_stack(...)``.
 """

@@ -9,7 +9,9 @@ if not sys.flags.safe_path and sys.path:
     with contextlib.suppress(OSError):
         here = os.getcwd()
     if sys.path[0] in ("", here):
-        sys.path.append(sys.path.pop(0))  # a file queue.py in the current folder must not become the module queue
+        sys.path.append(
+            sys.path.pop(0)
+        )  # a file queue.py in the current folder must not become the module queue
 
 from metalens.cli import main
 

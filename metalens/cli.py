@@ -1,8 +1,12 @@
-"""The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails its own check, 2 on bad input.
+"""The ``metalens`` command: one verb a stage. Exit 0 on success, 1 when a result fails
+its own check, 2 on bad input.
 
-A verb lives beside its stage, as a frozen dataclass of its options and a function ``run(options) -> int``; only
-the verb that is asked for is imported. Options may lie apart from the work, in a module that names that of ``run`` as
-``WORK``, so that help needs neither torch nor time. A module with a table ``PARTS`` in place of them has verbs of its
+A verb lives beside its stage, as a frozen dataclass of its options and a function
+``run(options) -> int``; only
+the verb that is asked for is imported. Options may lie apart from the work, in a module
+that names that of ``run`` as
+``WORK``, so that help needs neither torch nor time. A module with a table ``PARTS`` in
+place of them has verbs of its
 own; its ``part_of(word)`` may name the one that a path is meant for.
 """
 
@@ -22,18 +26,31 @@ from collections.abc import Sequence
 from typing import Any
 
 from metalens.ground import console, lock
-from metalens.ground.errors import ConfigError, FitRefused, MetalensError, missing_extra, nearest
+from metalens.ground.errors import (
+    ConfigError,
+    FitRefused,
+    MetalensError,
+    missing_extra,
+    nearest,
+)
 
 SUCCESS, FAILED_CHECK, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
-# verb: (module that holds ``Options``, and ``run`` or the name of the module that has it, ``WORK``; one line of help)
+# verb: (module that holds ``Options``, and ``run`` or the name of the module that has
+# it, ``WORK``; one line of help)
 VERBS: dict[str, tuple[str, str]] = {
     "library": (
         "metalens.commands.library",
         "CELL.toml -> library.h5: pillar sweep with an error bar on every entry",
     ),
-    "study": ("metalens.commands.study", "which pitch and height cover a full turn: table, JSON and figure"),
-    "field": ("metalens.commands.field", "CELL.toml -> field.h5: E and H in and around one pillar, with a picture"),
+    "study": (
+        "metalens.commands.study",
+        "which pitch and height cover a full turn: table, JSON and figure",
+    ),
+    "field": (
+        "metalens.commands.field",
+        "CELL.toml -> field.h5: E and H in and around one pillar, with a picture",
+    ),
     "design": (
         "metalens.commands.design",
         "DESIGN.toml -> lens.h5: hyperbolic, double helix, cubic, Fisher, own map",
@@ -42,11 +59,26 @@ VERBS: dict[str, tuple[str, str]] = {
         "metalens.commands.psf",
         "lens.h5 or asbuilt.h5 -> psf.h5: PSF stack over depth, angle, wavelength, with plots",
     ),
-    "export": ("metalens.commands.export", "lens.h5 -> NPZ, MATLAB or Zemax grid phase for other programs"),
-    "scene": ("codesign.commands.options.scene", "SCENE.toml -> rendered eyes: contact sheet, layers, labels"),
-    "evaluate": ("codesign.commands.evaluate", "optics and more: the paper's tables and figures for your own files"),
-    "layout": ("layout.commands.layout", "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report"),
-    "check": ("layout.commands.check", "MASK.gds|oas + PROCESS.toml -> design rules on a mask made anywhere"),
+    "export": (
+        "metalens.commands.export",
+        "lens.h5 -> NPZ, MATLAB or Zemax grid phase for other programs",
+    ),
+    "scene": (
+        "codesign.commands.options.scene",
+        "SCENE.toml -> rendered eyes: contact sheet, layers, labels",
+    ),
+    "evaluate": (
+        "codesign.commands.evaluate",
+        "optics and more: the paper's tables and figures for your own files",
+    ),
+    "layout": (
+        "layout.commands.layout",
+        "lens.h5 -> mask (OASIS, GDSII, DXF, STEP, STL), checked, with report",
+    ),
+    "check": (
+        "layout.commands.check",
+        "MASK.gds|oas + PROCESS.toml -> design rules on a mask made anywhere",
+    ),
     "capture": (
         "characterize.commands.capture_options",
         "lens.h5 -> capture folder of a hidden as-built lens on a virtual bench",
@@ -55,7 +87,10 @@ VERBS: dict[str, tuple[str, str]] = {
         "characterize.commands.measure",
         "CAPTURES or MICROGRAPH -> MTF, Strehl, spot sizes; or every pillar's diameter and a bias table",
     ),
-    "fit": ("characterize.commands.fit_options", "CAPTURE -> as-built lens or pupil with intervals, and a report"),
+    "fit": (
+        "characterize.commands.fit_options",
+        "CAPTURE -> as-built lens or pupil with intervals, and a report",
+    ),
     "codesign": (
         "codesign.commands.options.codesign",
         "RUN.toml -> RUN_DIR: lens, pixel pitch and network trained together",
@@ -64,18 +99,34 @@ VERBS: dict[str, tuple[str, str]] = {
         "codesign.commands.options.retrain",
         "RUN_DIR + asbuilt.h5 -> network for the lens as built, the next mask",
     ),
-    "budget": ("codesign.commands.options.budget", "lens.h5 -> error of every link of the chain: phase, PSF, gaze"),
-    "plan": ("codesign.commands.options.plan", "a gaze error -> the tolerances, depths and wavelengths that suffice"),
-    "demo": ("metalens.commands.demo", "the chain on a small lens, ending in report.html"),
-    "view": ("metalens.commands.view", "one self-contained page to explore any artefact"),
-    "info": ("metalens.commands.info", "kind, version, provenance and a small picture of any artefact"),
+    "budget": (
+        "codesign.commands.options.budget",
+        "lens.h5 -> error of every link of the chain: phase, PSF, gaze",
+    ),
+    "plan": (
+        "codesign.commands.options.plan",
+        "a gaze error -> the tolerances, depths and wavelengths that suffice",
+    ),
+    "demo": (
+        "metalens.commands.demo",
+        "the chain on a small lens, ending in report.html",
+    ),
+    "view": (
+        "metalens.commands.view",
+        "one self-contained page to explore any artefact",
+    ),
+    "info": (
+        "metalens.commands.info",
+        "kind, version, provenance and a small picture of any artefact",
+    ),
 }
 
 # objective of ``metalens design``: module with its ``SceneObjective(pupil, settings)``
 OBJECTIVES = {"scenes": "codesign.evaluate.scenes"}
 # and the module that turns PROCESS.toml into its limits
 OBJECTIVES["process"] = "layout.process.limits"
-# source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and its PSFs
+# source of ``metalens psf`` by kind of file: module whose ``load`` gives its design and
+# its PSFs
 PSF_SOURCES = {"asbuilt": "characterize.inference.asbuilt"}
 # what ``metalens view`` shows of a kind: "module:function" with its panels
 VIEWS = {
@@ -90,14 +141,21 @@ VIEWS = {
     "answers": "codesign.commands.view:answers",
     "budget": "codesign.commands.view:budget",
 }
-# and what ``metalens info`` says of files that are none of the core's: module with ``told`` and ``text``
+# and what ``metalens info`` says of files that are none of the core's: module with
+# ``told`` and ``text``
 TOLD = {"mask": "layout.commands.info"}
 
-# files that a verb reads a part of, and who knows the whole: "module:function" that refuses it
-WHOLE = {"budget": {"process": "layout.process.process:load"}, "retrain": {"process": "layout.process.process:load"}}
+# files that a verb reads a part of, and who knows the whole: "module:function" that
+# refuses it
+WHOLE = {
+    "budget": {"process": "layout.process.process:load"},
+    "retrain": {"process": "layout.process.process:load"},
+}
 
 _LARGEST = 1e9  # size of a number among options, in its unit
-_PARTED = re.compile(r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+")  # numbers of an option, with commas
+_PARTED = re.compile(
+    r"(--[a-z-]+=)?[-+.\deE]+(,[-+.\deE]*)+"
+)  # numbers of an option, with commas
 _AGAIN_S = 0.02  # after which a dropped interrupt comes again
 _OTHERWISE: list[Any] = []  # the hook for dropped exceptions before ours
 
@@ -117,14 +175,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Streams that were closed lead nowhere: the next file would take their number, and what libraries say with it."""
+    """Streams that were closed lead nowhere: the next file would take their number, and
+    what libraries say with it.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             nowhere = os.open(os.devnull, os.O_RDWR)
             if nowhere != number:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
-            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
+            setattr(
+                sys,
+                name,
+                os.fdopen(
+                    number, "w" if number else "r", encoding="utf-8", closefd=False
+                ),
+            )
 
 
 def _main(arguments: Sequence[str] | None) -> int:
@@ -154,14 +220,18 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 def _prepare() -> None:
     """What a command needs of the process that it runs in."""
-    for name in ("SIGTERM", "SIGHUP"):  # a lost terminal ends a command as Ctrl-C does, unless under nohup
+    for name in (
+        "SIGTERM",
+        "SIGHUP",
+    ):  # a lost terminal ends a command as Ctrl-C does, unless under nohup
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _stop)
     if sys.unraisablehook is not _not_lost:
         _OTHERWISE[:] = [sys.unraisablehook]
         sys.unraisablehook = _not_lost
-    # Threads of OpenMP that wait give their core away early: beside another busy program training is ten times slower
+    # Threads of OpenMP that wait give their core away early: beside another busy
+    # program training is ten times slower
     # where they spin as long as they do by default; alone it is a tenth slower so.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     _numba_cache()
@@ -186,13 +256,21 @@ def _guarded(words: list[str], *, debug: bool) -> int:
         return _refuse(told_of)
     except KeyboardInterrupt as error:
         return _refuse(
-            _said(error, "interrupted; the output is as it was before, or new if it was finished"), INTERRUPTED
+            _said(
+                error,
+                "interrupted; the output is as it was before, or new if it was finished",
+            ),
+            INTERRUPTED,
         )
     except Exception as error:  # noqa: BLE001 (the one handler at the top: an error that nobody foresaw)
-        return _refuse(f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}")
+        return _refuse(
+            f"{type(error).__name__}: {_line(error)}; not foreseen: {_reported(words)}"
+        )
     finally:
         if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_REAL, 0)  # an interrupt that was dropped and came otherwise comes no more
+            signal.setitimer(
+                signal.ITIMER_REAL, 0
+            )  # an interrupt that was dropped and came otherwise comes no more
         lock.COMMAND.reset(told)
 
 
@@ -210,20 +288,30 @@ def _line(error: BaseException) -> str:
 
 
 def _reported(words: list[str]) -> str:
-    """Write what a maintainer needs to a file in the folder for temporary files; where it lies."""
+    """Write what a maintainer needs to a file in the folder for temporary files; where
+    it lies.
+    """
     try:
         handle, name = tempfile.mkstemp(prefix="metalens-error-", suffix=".txt")
         with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(f"metalens {' '.join(words)}\npython {sys.version}\n\n{traceback.format_exc()}")
+            file.write(
+                f"metalens {' '.join(words)}\npython {sys.version}\n\n{traceback.format_exc()}"
+            )
     except OSError:
         return "run it again with --debug to see where"
     return f"please report {name} (--debug shows it)"
 
 
 def _numba_cache() -> None:
-    """Where neither the installation nor the home can be written, compiled loops are kept among temporary files."""
+    """Where neither the installation nor the home can be written, compiled loops are
+    kept among temporary files.
+    """
     here, home = os.path.dirname(__file__), os.path.expanduser("~")
-    if "NUMBA_CACHE_DIR" in os.environ or os.access(here, os.W_OK) or os.access(home, os.W_OK):
+    if (
+        "NUMBA_CACHE_DIR" in os.environ
+        or os.access(here, os.W_OK)
+        or os.access(home, os.W_OK)
+    ):
         return
     os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="metalens-numba-")
     atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
@@ -245,7 +333,9 @@ def _dispatch(verb: str, words: list[str]) -> int:
             return SUCCESS if words else BAD_INPUT
         meant = words[0] if words[0] in parts else module.part_of(words[0])
         if meant is None:
-            return _refuse(f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}")
+            return _refuse(
+                f"unknown command {verb} {words[0]!r}{nearest(words[0], parts)}"
+            )
         module = importlib.import_module(parts[meant][0])
         verb, words = f"{verb} {meant}", words[words[0] in parts :]
     if verb in ("design", "study"):
@@ -257,14 +347,21 @@ def _dispatch(verb: str, words: list[str]) -> int:
     if verb == "info":
         module.TOLD.update(TOLD)
     try:
-        options: Any = tyro.cli(module.Options, args=words, prog=f"metalens {verb}", description=module.__doc__)
+        options: Any = tyro.cli(
+            module.Options,
+            args=words,
+            prog=f"metalens {verb}",
+            description=module.__doc__,
+        )
     except BrokenPipeError:  # whoever was shown the help went away
         console.silence()
         return SUCCESS
     except SystemExit as end:
         if end.code and (parted := next(filter(_PARTED.fullmatch, words), "")):
             apart = parted.replace(",", " ").replace("=", " ")
-            return _refuse(f"{parted}: part the numbers of a list by blanks, as {apart}; a decimal has a point")
+            return _refuse(
+                f"{parted}: part the numbers of a list by blanks, as {apart}; a decimal has a point"
+            )
         raise
     _refuse_beyond_reach(options)
     for name, where in WHOLE.get(verb, {}).items():
@@ -276,7 +373,8 @@ def _dispatch(verb: str, words: list[str]) -> int:
 
 
 def _refuse_beyond_reach(options: Any) -> None:
-    """The rule of settings files (:func:`metalens.ground.config.load`) for the numbers among options.
+    """The rule of settings files (:func:`metalens.ground.config.load`) for the numbers
+    among options.
 
     Raises:
         ConfigError: one that is not finite, or too large to mean anything.
@@ -289,9 +387,15 @@ def _refuse_beyond_reach(options: Any) -> None:
             continue
         for number in value if isinstance(value, tuple) else (value,):
             collimated = number == math.inf and field.metadata.get("may_be_inf")
-            if isinstance(number, float) and not abs(number) <= _LARGEST and not collimated:
+            if (
+                isinstance(number, float)
+                and not abs(number) <= _LARGEST
+                and not collimated
+            ):
                 name = field.name.replace("_", "-")
-                raise ConfigError(f"--{name} {number:g}: need a finite number of at most {_LARGEST:g} in size")
+                raise ConfigError(
+                    f"--{name} {number:g}: need a finite number of at most {_LARGEST:g} in size"
+                )
 
 
 def _help(verbs: dict[str, tuple[str, str]], name: str = "metalens") -> str:
@@ -318,7 +422,9 @@ def _stop(number: int, frame: object) -> None:
 
 
 def _not_lost(told: Any) -> None:
-    """An interrupt that came where Python drops every exception (a callback of an import, a finaliser) comes again."""
+    """An interrupt that came where Python drops every exception (a callback of an
+    import, a finaliser) comes again.
+    """
     if issubclass(told.exc_type, KeyboardInterrupt) and hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _stop)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)

@@ -1,4 +1,6 @@
-"""Pillar libraries: sweep a cell over diameter, wavelength, angle and polarisation; keep it as a file."""
+"""Pillar libraries: sweep a cell over diameter, wavelength, angle and polarisation;
+keep it as a file.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,6 @@
-"""The proxy of a pillar: phase and transmission as polynomials of the diameter (paper Eq. 2)."""
+"""The proxy of a pillar: phase and transmission as polynomials of the diameter (paper
+Eq. 2).
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,10 +1,16 @@
-"""Numeric tests under other arithmetic: ``python tests/arithmetic.py [all | NAME ...]``; no name: a quick selection.
+"""Numeric tests under other arithmetic: ``python tests/arithmetic.py [all | NAME
+...]``; no name: a quick selection.
 
-A tolerance that holds on one processor only shows here. Each row of ``ARITHMETIC`` is a processor that this one can
-play by the documented switches of the libraries: OPENBLAS_CORETYPE (numpy's and scipy's kernels), ATEN_CPU_CAPABILITY,
-MKL_CBWR and ONEDNN_MAX_CPU_ISA (torch), NPY_DISABLE_CPU_FEATURES (numpy's loops), NUMBA_CPU_NAME and
-NUMBA_CPU_FEATURES (compiled loops, with a cache of their own), and the number of threads. ``interpreted`` runs the
-loops as they are written (NUMBA_DISABLE_JIT): a place beyond an array is an error there, as is a number that overflows.
+A tolerance that holds on one processor only shows here. Each row of ``ARITHMETIC`` is a
+processor that this one can
+play by the documented switches of the libraries: OPENBLAS_CORETYPE (numpy's and scipy's
+kernels), ATEN_CPU_CAPABILITY,
+MKL_CBWR and ONEDNN_MAX_CPU_ISA (torch), NPY_DISABLE_CPU_FEATURES (numpy's loops),
+NUMBA_CPU_NAME and
+NUMBA_CPU_FEATURES (compiled loops, with a cache of their own), and the number of
+threads. ``interpreted`` runs the
+loops as they are written (NUMBA_DISABLE_JIT): a place beyond an array is an error
+there, as is a number that overflows.
 """
 
 import os
@@ -37,7 +43,8 @@ ARITHMETIC = {
     "own-2": ({}, (), 2),
     "interpreted": ({"NUMBA_DISABLE_JIT": "1"}, (), 1),
 }
-# Where sums are long or ill-conditioned, and quick: eigenvalues, Fourier sums, windows, fits, compiled loops.
+# Where sums are long or ill-conditioned, and quick: eigenvalues, Fourier sums, windows,
+# fits, compiled loops.
 QUICK = (
     "tests/metalens/cell",
     "tests/metalens/ground/test_legendre.py",
@@ -55,7 +62,8 @@ QUICK = (
     "tests/codesign/gaze",
     "tests/codesign/optics",
 )
-# Small tests of compiled loops, 80 s of one processor. Sums modulo 2⁶⁴ (layout/files/digest) stay with machine code.
+# Small tests of compiled loops, 80 s of one processor. Sums modulo 2⁶⁴
+# (layout/files/digest) stay with machine code.
 INTERPRETED = (
     "tests/characterize/model/test_gather.py",
     "tests/codesign/batches/test_flat.py",
@@ -65,50 +73,94 @@ INTERPRETED = (
     "tests/layout/certify/test_background.py",
     "tests/layout/certify/test_neighbours.py",
     "tests/layout/certify/test_survey_numbers.py",
-    *(f"tests/layout/dose/test_{name}.py" for name in ("assign_numbers", "constants_of_doses", "dose", "exposure")),
-    *(f"tests/layout/dose/test_{name}.py" for name in ("exposure_core", "nodes", "pieces", "rects", "sampled_sites")),
+    *(
+        f"tests/layout/dose/test_{name}.py"
+        for name in ("assign_numbers", "constants_of_doses", "dose", "exposure")
+    ),
+    *(
+        f"tests/layout/dose/test_{name}.py"
+        for name in ("exposure_core", "nodes", "pieces", "rects", "sampled_sites")
+    ),
     "tests/layout/files/test_gdsii_numbers.py",
     "tests/layout/oasis",
-    *(f"tests/layout/rules/test_{name}.py" for name in ("apart", "check_foreign", "drc", "facing_edges", "near")),
+    *(
+        f"tests/layout/rules/test_{name}.py"
+        for name in ("apart", "check_foreign", "drc", "facing_edges", "near")
+    ),
     "tests/metalens/field/test_compiled_weights.py",
     "tests/metalens/field/test_shared_rays.py",
     "tests/metalens/image/test_scene_truths.py",
     "tests/metalens/image/test_sheet_weights.py",
-    *(f"tests/metalens/propagate/test_{name}.py" for name in ("estimate_parts", "gathered_light", "grid_truths")),
-    *(f"tests/metalens/propagate/test_{name}.py" for name in ("operator_parts", "propagate_exact", "pupil_error")),
+    *(
+        f"tests/metalens/propagate/test_{name}.py"
+        for name in ("estimate_parts", "gathered_light", "grid_truths")
+    ),
+    *(
+        f"tests/metalens/propagate/test_{name}.py"
+        for name in ("operator_parts", "propagate_exact", "pupil_error")
+    ),
     "tests/metalens/propagate/test_sincos_truths.py",
 )
-ALL = tuple(f"tests/{folder}" for folder in ("metalens", "characterize", "layout", "codesign"))
+ALL = tuple(
+    f"tests/{folder}" for folder in ("metalens", "characterize", "layout", "codesign")
+)
 
 
 def _without(prefixes: tuple[str, ...]) -> str:
-    """The features of this processor that numpy has loops for and that are to be left out."""
+    """The features of this processor that numpy has loops for and that are to be left
+    out.
+    """
     from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
-    return " ".join(name for name in __cpu_dispatch__ if name.startswith(prefixes) and __cpu_features__[name])
+    return " ".join(
+        name
+        for name in __cpu_dispatch__
+        if name.startswith(prefixes) and __cpu_features__[name]
+    )
 
 
 def environment(name: str) -> dict[str, str]:
     """The environment of a run under the arithmetic ``name``."""
     switches, prefixes, threads = ARITHMETIC[name]
     kind = switches.get("NUMBA_CPU_NAME", "own")
-    own = {"NUMBA_CACHE_DIR": str(ROOT / "build" / "arithmetic" / kind), "CI": "1", "OMP_WAIT_POLICY": "passive"}
-    own |= {key: str(threads) for key in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")}
+    own = {
+        "NUMBA_CACHE_DIR": str(ROOT / "build" / "arithmetic" / kind),
+        "CI": "1",
+        "OMP_WAIT_POLICY": "passive",
+    }
+    own |= {
+        key: str(threads)
+        for key in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
+    }
     features = {"NPY_DISABLE_CPU_FEATURES": _without(prefixes)} if prefixes else {}
     return os.environ | switches | features | own
 
 
 def main(words: list[str]) -> int:
     """Run pytest once per arithmetic; the worst of their exit codes."""
-    names = [w for w in words if w in ARITHMETIC] or (list(ARITHMETIC) if "all" in words else ["old", "interpreted"])
+    names = [w for w in words if w in ARITHMETIC] or (
+        list(ARITHMETIC) if "all" in words else ["old", "interpreted"]
+    )
     worst = 0
     for name in names:
         sys.stdout.write(f"arithmetic {name}\n")
         sys.stdout.flush()
         folders = INTERPRETED if name == "interpreted" else ALL if words else QUICK
         workers = "auto" if ARITHMETIC[name][2] == 1 else "1"
-        command = [sys.executable, "-m", "pytest", "-n", workers, "--dist", "loadfile", "-m", "not slow and not peers"]
-        done = subprocess.run([*command, *folders], cwd=ROOT, env=environment(name), check=False)
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-n",
+            workers,
+            "--dist",
+            "loadfile",
+            "-m",
+            "not slow and not peers",
+        ]
+        done = subprocess.run(
+            [*command, *folders], cwd=ROOT, env=environment(name), check=False
+        )
         worst = max(worst, done.returncode)
     return worst
 

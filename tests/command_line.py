@@ -1,4 +1,6 @@
-"""The command line as a user types it: in this process, which has its libraries loaded, or in one of its own."""
+"""The command line as a user types it: in this process, which has its libraries loaded,
+or in one of its own.
+"""
 
 import contextlib
 import io
@@ -25,7 +27,10 @@ def run(*words: object, cwd: Path | None = None) -> DONE:
 
 @contextlib.contextmanager
 def _streams() -> Iterator[tuple[io.StringIO, io.StringIO]]:
-    with contextlib.redirect_stdout(io.StringIO()) as shown, contextlib.redirect_stderr(io.StringIO()) as said:
+    with (
+        contextlib.redirect_stdout(io.StringIO()) as shown,
+        contextlib.redirect_stderr(io.StringIO()) as said,
+    ):
         yield shown, said
 
 

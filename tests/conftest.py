@@ -1,4 +1,6 @@
-"""Fixtures shared by all tests, the one hypothesis profile, and the order of files that several workers share."""
+"""Fixtures shared by all tests, the one hypothesis profile, and the order of files that
+several workers share.
+"""
 
 import os
 from collections import Counter
@@ -10,36 +12,57 @@ import pytest
 
 from metalens.ground import report
 
-# No clock decides a test: no deadline, no complaint of slow data. With CI set, as .ci/run does, every run draws alike.
+# No clock decides a test: no deadline, no complaint of slow data. With CI set, as
+# .ci/run does, every run draws alike.
 hypothesis.settings.register_profile(
     "house",
     deadline=None,
     derandomize="CI" in os.environ,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+    suppress_health_check=[
+        hypothesis.HealthCheck.too_slow,
+        hypothesis.HealthCheck.function_scoped_fixture,
+    ],
 )
 hypothesis.settings.load_profile("house")
 
 
-DEAR = Path(__file__).parent / "dear.txt"  # files of about ten seconds of processor time or more, the dearest first
+DEAR = (
+    Path(__file__).parent / "dear.txt"
+)  # files of about ten seconds of processor time or more, the dearest first
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Workers take files in the order of :func:`pytest_collection_modifyitems`, not by their number of tests."""
+    """Workers take files in the order of :func:`pytest_collection_modifyitems`, not by
+    their number of tests.
+    """
     config.option.loadscopereorder = False
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of several workers: dear files first, then by number of tests, so that none has a long one alone at the end."""
+    """Of several workers: dear files first, then by number of tests, so that none has a
+    long one alone at the end.
+    """
     if "PYTEST_XDIST_WORKER" in os.environ:
         tests = Path(__file__).parent
-        places = {tests / line: place for place, line in enumerate(DEAR.read_text(encoding="utf-8").split())}
+        places = {
+            tests / line: place
+            for place, line in enumerate(DEAR.read_text(encoding="utf-8").split())
+        }
         count = Counter(item.path for item in items)
-        items.sort(key=lambda item: (places.get(item.path, len(places)), -count[item.path], str(item.path)))
+        items.sort(
+            key=lambda item: (
+                places.get(item.path, len(places)),
+                -count[item.path],
+                str(item.path),
+            )
+        )
 
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What the code keeps for later runs goes to a folder of this run, one for all its workers."""
+    """What the code keeps for later runs goes to a folder of this run, one for all its
+    workers.
+    """
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
     with pytest.MonkeyPatch.context() as patch:
@@ -49,7 +72,9 @@ def cache_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 @pytest.fixture(scope="session", autouse=True)
 def pixels_of_pictures() -> Iterator[int]:
-    """Those of an inch as users have them. In tests a quarter of that: two thirds of the time, the same drawing."""
+    """Those of an inch as users have them. In tests a quarter of that: two thirds of
+    the time, the same drawing.
+    """
     usual = report.png.__kwdefaults__
     fine = usual["dpi"]
     with pytest.MonkeyPatch.context() as patch:
@@ -65,7 +90,9 @@ def fine_pictures(pixels_of_pictures: int, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference material beside the checkout; tests that need it are skipped where it is absent."""
+    """The folder of reference material beside the checkout; tests that need it are
+    skipped where it is absent.
+    """
     folder = Path(__file__).parents[2] / "shared"
     if not folder.is_dir():
         pytest.skip("reference material is not beside the checkout")

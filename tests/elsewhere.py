@@ -1,7 +1,10 @@
-"""A device that is not the processor, played by the processor: for code that must run on a GPU as it is.
+"""A device that is not the processor, played by the processor: for code that must run
+on a GPU as it is.
 
-Tensors on :data:`AWAY` hold true numbers and say that they lie on another device. What a GPU refuses is refused:
-tensors of two devices in one operation (numbers without axes aside), ``numpy()``, a generator of another device. What
+Tensors on :data:`AWAY` hold true numbers and say that they lie on another device. What
+a GPU refuses is refused:
+tensors of two devices in one operation (numbers without axes aside), ``numpy()``, a
+generator of another device. What
 code for the processor alone would read or write is therefore found here, without a GPU.
 """
 
@@ -26,8 +29,14 @@ class There(torch.Tensor):
 
     @staticmethod
     def __new__(cls, held):
-        about = {"dtype": held.dtype, "strides": held.stride(), "storage_offset": held.storage_offset()}
-        made = torch.Tensor._make_wrapper_subclass(cls, held.shape, device=AWAY, requires_grad=False, **about)
+        about = {
+            "dtype": held.dtype,
+            "strides": held.stride(),
+            "storage_offset": held.storage_offset(),
+        }
+        made = torch.Tensor._make_wrapper_subclass(
+            cls, held.shape, device=AWAY, requires_grad=False, **about
+        )
         made.held = held
         return made
 
@@ -38,12 +47,17 @@ class There(torch.Tensor):
 
 @contextlib.contextmanager
 def elsewhere():
-    """Within it ``device=AWAY`` gives tensors with numbers; yields the names of the operations that ran there.
+    """Within it ``device=AWAY`` gives tensors with numbers; yields the names of the
+    operations that ran there.
 
-    The other device is that of one thread and has fused steps of optimisers; parameters that move there stay the same
+    The other device is that of one thread and has fused steps of optimisers; parameters
+    that move there stay the same
     objects, as a GPU's do.
     """
-    threads, swapped = torch.get_num_threads(), torch.__future__.get_swap_module_params_on_conversion()
+    threads, swapped = (
+        torch.get_num_threads(),
+        torch.__future__.get_swap_module_params_on_conversion(),
+    )
     optimiser = importlib.import_module("torch.optim.optimizer")
     fused = optimiser._get_fused_kernels_supported_devices
     torch.set_num_threads(1)
@@ -73,7 +87,9 @@ class _Given(TorchFunctionMode):
             if func is torch.Tensor.tolist:
                 return args[0].cpu().detach().tolist()
             if func is torch.Tensor.new_tensor:
-                return torch.tensor(*args[1:], **{"dtype": args[0].dtype} | kwargs).to(AWAY)
+                return torch.tensor(*args[1:], **{"dtype": args[0].dtype} | kwargs).to(
+                    AWAY
+                )
         return func(*args, **kwargs)
 
 
@@ -83,7 +99,9 @@ class _Done(TorchDispatchMode):
 
 
 def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    tensors = [a for a in _leaves((*args, *kwargs.values())) if isinstance(a, torch.Tensor)]
+    tensors = [
+        a for a in _leaves((*args, *kwargs.values())) if isinstance(a, torch.Tensor)
+    ]
     there = [a for a in tensors if isinstance(a, There)]
     wanted = kwargs.get("device")
     if not there and wanted is None:
@@ -92,14 +110,21 @@ def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     stays = bool(there) if wanted is None else torch.device(wanted) == AWAY
     if name == "copy_":
         stays = isinstance(args[0], There)
-    elif there and name not in MOVES and any(a.ndim and not isinstance(a, There) for a in tensors):
+    elif (
+        there
+        and name not in MOVES
+        and any(a.ndim and not isinstance(a, There) for a in tensors)
+    ):
         raise RuntimeError(f"{func}: tensors of two devices")
     if stays and kwargs.get("generator") is not None:
         raise RuntimeError(f"{func}: a generator of the processor")
     if wanted is not None:
         kwargs = kwargs | {"device": torch.device("cpu")}
     held = {id(a): a.held for a in there}
-    out = func(*_mapped(held, args), **{key: _mapped(held, value) for key, value in kwargs.items()})
+    out = func(
+        *_mapped(held, args),
+        **{key: _mapped(held, value) for key, value in kwargs.items()},
+    )
     if not stays:
         return out
     DONE.add(name)
@@ -125,4 +150,8 @@ def _mapped(held: dict[int, Any], value: Any) -> Any:
 
 def _wrapped(value: Any) -> Any:
     """Signs that torch puts off are carried out: a wrapper has no room for them."""
-    return There(value.resolve_conj().resolve_neg()) if isinstance(value, torch.Tensor) else value
+    return (
+        There(value.resolve_conj().resolve_neg())
+        if isinstance(value, torch.Tensor)
+        else value
+    )

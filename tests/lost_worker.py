@@ -1,4 +1,6 @@
-"""A local cluster of two workers, one of which is killed as soon as the first task of a sweep is done."""
+"""A local cluster of two workers, one of which is killed as soon as the first task of a
+sweep is done.
+"""
 
 import contextlib
 import os
@@ -11,11 +13,16 @@ import pytest
 
 @contextlib.contextmanager
 def losing_one(folder: Path) -> Iterator[str]:
-    """The address of its scheduler; at the end of the block the loss must have happened."""
+    """The address of its scheduler; at the end of the block the loss must have
+    happened.
+    """
     distributed = pytest.importorskip("distributed")
     killed = []
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, local_directory=str(folder)
+        n_workers=2,
+        threads_per_worker=1,
+        dashboard_address=None,
+        local_directory=str(folder),
     ) as cluster:
 
         class Loss(distributed.SchedulerPlugin):

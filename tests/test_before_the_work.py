@@ -35,7 +35,9 @@ def untouched(monkeypatch):
     monkeypatch.setattr(design, "_phase", begin)
 
 
-def test_outputs_that_cannot_be_written_are_refused_before_inputs_are_read(tmp_path, untouched, capsys):
+def test_outputs_that_cannot_be_written_are_refused_before_inputs_are_read(
+    tmp_path, untouched, capsys
+):
     (tmp_path / "mask.gds").write_bytes(b"\0\6\0\2\0\7")
     (tmp_path / "taken").write_text("mine")
     for words in (
@@ -50,19 +52,30 @@ def test_outputs_that_cannot_be_written_are_refused_before_inputs_are_read(tmp_p
     assert (tmp_path / "taken").read_text() == "mine"
 
 
-def test_a_wavelength_outside_the_library_is_refused_before_the_search(tmp_path, untouched, monkeypatch, capsys):
-    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0)
+def test_a_wavelength_outside_the_library_is_refused_before_the_search(
+    tmp_path, untouched, monkeypatch, capsys
+):
+    proxy = Proxy(
+        np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0
+    )
     swept = SimpleNamespace(cell=Cell(0.3, pillar=Index(3.6)))
     monkeypatch.setattr(design, "_pillars", lambda *_: (swept, {}))
     monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
-    (tmp_path / "d.toml").write_text('profile = "fisher"\nwavelength_nm = 940.0\naperture_mm = 0.05\n')
-    assert main(["design", str(tmp_path / "d.toml"), "-o", str(tmp_path / "l.h5")]) == BAD_INPUT
+    (tmp_path / "d.toml").write_text(
+        'profile = "fisher"\nwavelength_nm = 940.0\naperture_mm = 0.05\n'
+    )
     assert (
-        "um, but the proxy holds from 0.84 to 0.86 um: sweep a library over the wavelengths" in capsys.readouterr().err
+        main(["design", str(tmp_path / "d.toml"), "-o", str(tmp_path / "l.h5")])
+        == BAD_INPUT
+    )
+    assert (
+        "um, but the proxy holds from 0.84 to 0.86 um: sweep a library over the wavelengths"
+        in capsys.readouterr().err
     )
 
 
-# verb: words that need an output, with inputs that are there; and what must not be called
+# verb: words that need an output, with inputs that are there; and what must not be
+# called
 NEEDS = {
     "library": ("cell.toml", "metalens.pillars.sweep:sweep"),
     "field": ("cell.toml --diameter-um 0.12", "metalens.commands.field:near_fields"),
@@ -90,9 +103,19 @@ NAMES = {"library": "o.h5", "field": "o.h5", "design": "o.h5", "psf": "o.h5", "e
 def inputs(tmp_path, monkeypatch):
     """Small good inputs of every verb, in the current folder."""
     monkeypatch.chdir(tmp_path)
-    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
+    )
     diameters = np.linspace(0.08, 0.21, 36, dtype=np.float32).reshape(6, 6)
-    made = Lens(DiameterMap(diameters, 0.3), Cell(0.3, pillar=Index(3.6)), proxy, 0.85, 2000.0, 20_000.0, "map")
+    made = Lens(
+        DiameterMap(diameters, 0.3),
+        Cell(0.3, pillar=Index(3.6)),
+        proxy,
+        0.85,
+        2000.0,
+        20_000.0,
+        "map",
+    )
     lens.save("lens.h5", made)
     layout.write_gdsii(layout.plan(made, Process()), "mask.gds")
     texts = {"cell": "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n", "design": "aperture_mm = 0.02\n", "scene": "",
@@ -103,27 +126,51 @@ def inputs(tmp_path, monkeypatch):
     frames = np.arange(3 * 12 * 14, dtype=np.uint16).reshape(3, 12, 14) % 97
     tifffile.imwrite(tmp_path / "captures" / "f.tif", frames, photometric="minisblack")
     rows = "".join(f"f.tif,{k},{18 + k},0.0,0.01\n" for k in range(3))
-    (tmp_path / "captures" / "stage.csv").write_text("file,page,depth_mm,angle_deg,exposure_s\n" + rows)
-    (tmp_path / "captures" / "capture.toml").write_text("pixel_um = 3.0\nwavelength_um = 0.85\nbits = 10\n")
+    (tmp_path / "captures" / "stage.csv").write_text(
+        "file,page,depth_mm,angle_deg,exposure_s\n" + rows
+    )
+    (tmp_path / "captures" / "capture.toml").write_text(
+        "pixel_um = 3.0\nwavelength_um = 0.85\nbits = 10\n"
+    )
     return tmp_path
 
 
 def tree(folder):
-    return {p.relative_to(folder).as_posix(): p.is_file() and p.read_bytes() for p in folder.rglob("*")}
+    return {
+        p.relative_to(folder).as_posix(): p.is_file() and p.read_bytes()
+        for p in folder.rglob("*")
+    }
 
 
 @pytest.mark.parametrize("verb", sorted(NEEDS))
-def test_no_command_begins_where_its_output_cannot_stand(inputs, monkeypatch, capsys, verb):
-    """No folder, a file for a folder, another's work, its own input by links, no name, the folder of its input."""
+def test_no_command_begins_where_its_output_cannot_stand(
+    inputs, monkeypatch, capsys, verb
+):
+    """No folder, a file for a folder, another's work, its own input by links, no name,
+    the folder of its input.
+    """
     words, work = NEEDS[verb]
     module, _, name = work.partition(":")
-    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(
+        importlib.import_module(module),
+        name,
+        lambda *_, **__: pytest.fail("the work began"),
+    )
     output = NAMES.get(verb, "o")
     (inputs / "thesis").mkdir()
     (inputs / "thesis" / output).write_text("years of work")
     (inputs / "file").write_text("mine")
-    first = next((w for w in words.split() if "." in w and not w.startswith("-")), "lens.h5")
-    targets = [f"no/{output}", f"file/{output}", f"thesis/{output}", ".", "/", f"{'x' * 300}{output}"]
+    first = next(
+        (w for w in words.split() if "." in w and not w.startswith("-")), "lens.h5"
+    )
+    targets = [
+        f"no/{output}",
+        f"file/{output}",
+        f"thesis/{output}",
+        ".",
+        "/",
+        f"{'x' * 300}{output}",
+    ]
     if verb in NAMES:
         (inputs / f"link{output}").symlink_to(inputs / first)
         (inputs / f"hard{output}").hardlink_to(inputs / first)
@@ -134,7 +181,9 @@ def test_no_command_begins_where_its_output_cannot_stand(inputs, monkeypatch, ca
         targets.remove(f"no/{output}")
     before = tree(inputs)
     for target in targets:
-        assert main([verb, *words.split(), "-o", target, "--force"]) == BAD_INPUT, target
+        assert main([verb, *words.split(), "-o", target, "--force"]) == BAD_INPUT, (
+            target
+        )
         told = capsys.readouterr().err
         assert "not foreseen" not in told
         assert told.count("\n") == 1, told
@@ -142,7 +191,9 @@ def test_no_command_begins_where_its_output_cannot_stand(inputs, monkeypatch, ca
 
 
 def numbers(options):
-    """(option, how many values it takes) of the numbers with a point, those of tables within left out."""
+    """(option, how many values it takes) of the numbers with a point, those of tables
+    within left out.
+    """
     for name, hint in typing.get_type_hints(options).items():
         text = str(hint)
         if "float" in text and not dataclasses.is_dataclass(hint):
@@ -151,10 +202,16 @@ def numbers(options):
 
 
 @pytest.mark.parametrize("verb", sorted(NEEDS))
-def test_no_command_begins_with_a_number_out_of_this_world(inputs, monkeypatch, capsys, verb):
+def test_no_command_begins_with_a_number_out_of_this_world(
+    inputs, monkeypatch, capsys, verb
+):
     words, work = NEEDS[verb]
     module, _, name = work.partition(":")
-    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr(
+        importlib.import_module(module),
+        name,
+        lambda *_, **__: pytest.fail("the work began"),
+    )
     module = importlib.import_module(cli.VERBS[verb][0])
     first, *rest = [verb, *words.split()]
     parts = getattr(module, "PARTS", {})
@@ -162,25 +219,44 @@ def test_no_command_begins_with_a_number_out_of_this_world(inputs, monkeypatch, 
     before = tree(inputs)
     for option, count in numbers(options):
         for bad in ("nan", "inf", "-inf", "1e20"):
-            if (option, bad) in {("--sources-mm", "inf"), ("--reference-e", "nan")}:  # a plane wave; the default
+            if (option, bad) in {
+                ("--sources-mm", "inf"),
+                ("--reference-e", "nan"),
+            }:  # a plane wave; the default
                 continue
-            assert main([first, *rest, option, *[bad] * count, "-o", NAMES.get(verb, "o")]) == BAD_INPUT
+            assert (
+                main([first, *rest, option, *[bad] * count, "-o", NAMES.get(verb, "o")])
+                == BAD_INPUT
+            )
             told = capsys.readouterr().err
             assert option in told, told
             assert "need a finite number" in told
             assert tree(inputs) == before
 
 
-def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(inputs, monkeypatch, capsys):
-    monkeypatch.setattr("codesign.budget.links.entries", lambda *_, **__: pytest.fail("the work began"))
+def test_a_diode_of_less_than_no_width_is_refused_before_the_budget(
+    inputs, monkeypatch, capsys
+):
+    monkeypatch.setattr(
+        "codesign.budget.links.entries", lambda *_, **__: pytest.fail("the work began")
+    )
     assert main(["budget", "lens.h5", "--led-fwhm-nm", "-1", "-o", "o.h5"]) == BAD_INPUT
     assert "--led-fwhm-nm -1: need 0 or more" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", ["budget lens.h5 -o o.h5", "retrain run --asbuilt asbuilt.h5 -o o"])
-def test_a_process_is_refused_whole_by_those_who_read_a_part_of_it(inputs, capsys, words):
-    """A misspelt table would be a budget without it; the matrix of bad values holds the rest."""
-    for text, told in (("[spraed]\n", "unknown key 'spraed'; did you mean 'spread'?"), ("tone = 7\n", "tone")):
+@pytest.mark.parametrize(
+    "words", ["budget lens.h5 -o o.h5", "retrain run --asbuilt asbuilt.h5 -o o"]
+)
+def test_a_process_is_refused_whole_by_those_who_read_a_part_of_it(
+    inputs, capsys, words
+):
+    """A misspelt table would be a budget without it; the matrix of bad values holds the
+    rest.
+    """
+    for text, told in (
+        ("[spraed]\n", "unknown key 'spraed'; did you mean 'spread'?"),
+        ("tone = 7\n", "tone"),
+    ):
         (inputs / "p.toml").write_text(text)
         assert main([*words.split(), "--process", "p.toml"]) == BAD_INPUT
         said = capsys.readouterr().err
@@ -196,11 +272,23 @@ def test_options_that_would_do_nothing_are_refused(inputs, capsys):
 
 
 @pytest.mark.parametrize("verb", ["library", "study", "capture", "layout"])
-def test_no_command_begins_where_its_workers_cannot_be_had(inputs, monkeypatch, capsys, verb):
+def test_no_command_begins_where_its_workers_cannot_be_had(
+    inputs, monkeypatch, capsys, verb
+):
     words, work = NEEDS[verb]
     module, _, name = work.partition(":")
-    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
-    words = [verb, *words.split(), *(["--study"] if verb == "layout" else []), "-o", NAMES.get(verb, "o")]
+    monkeypatch.setattr(
+        importlib.import_module(module),
+        name,
+        lambda *_, **__: pytest.fail("the work began"),
+    )
+    words = [
+        verb,
+        *words.split(),
+        *(["--study"] if verb == "layout" else []),
+        "-o",
+        NAMES.get(verb, "o"),
+    ]
     asked = {
         "--workers 0": "0 workers: need 1 to 1024",
         "--workers 4611686018427387904": "4611686018427387904 workers: need 1 to 1024",
@@ -228,7 +316,12 @@ def test_workers_with_nothing_to_do_are_refused(inputs, capsys, words, told):
 
 
 @pytest.mark.parametrize(
-    "words", ["library cell.toml -o o.png", "design design.toml -o o.png", "budget lens.h5 -o o.png"]
+    "words",
+    [
+        "library cell.toml -o o.png",
+        "design design.toml -o o.png",
+        "budget lens.h5 -o o.png",
+    ],
 )
 def test_a_result_does_not_take_the_name_of_its_own_picture(inputs, capsys, words):
     assert main(words.split()) == BAD_INPUT
@@ -240,8 +333,16 @@ def test_a_result_does_not_take_the_name_of_its_own_picture(inputs, capsys, word
 def test_no_command_begins_on_a_full_disk(inputs, monkeypatch, capsys, verb):
     words, work = NEEDS[verb]
     module, _, name = work.partition(":")
-    monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: pytest.fail("the work began"))
-    monkeypatch.setattr(transaction.shutil, "disk_usage", lambda _: SimpleNamespace(free=transaction.ROOM - 1))
+    monkeypatch.setattr(
+        importlib.import_module(module),
+        name,
+        lambda *_, **__: pytest.fail("the work began"),
+    )
+    monkeypatch.setattr(
+        transaction.shutil,
+        "disk_usage",
+        lambda _: SimpleNamespace(free=transaction.ROOM - 1),
+    )
     before = tree(inputs)
     assert main([verb, *words.split(), "-o", NAMES.get(verb, "o")]) == BAD_INPUT
     told = capsys.readouterr().err
@@ -259,18 +360,28 @@ def test_no_command_begins_on_a_full_disk(inputs, monkeypatch, capsys, verb):
         ("fit captures --design lens.h5 -o o.h5", 2 * 3 * 12 * 14),
     ],
 )
-def test_the_room_asked_for_is_that_of_the_result(inputs, monkeypatch, capsys, words, needed):
-    """Bytes of what is certainly written, beside what every output may need; one byte less is refused."""
-    (inputs / "psf.toml").write_text("depths_mm = [18.0, 22.0, 2.0]\nangles_deg = [0.0, 7.0]\nsamples = 60\n")
+def test_the_room_asked_for_is_that_of_the_result(
+    inputs, monkeypatch, capsys, words, needed
+):
+    """Bytes of what is certainly written, beside what every output may need; one byte
+    less is refused.
+    """
+    (inputs / "psf.toml").write_text(
+        "depths_mm = [18.0, 22.0, 2.0]\nangles_deg = [0.0, 7.0]\nsamples = 60\n"
+    )
     (inputs / "scene.toml").write_text("frames = 70\npixels = 90\n")
     camera = "dark_frames = 3\nflat_frames = 5\n[camera]\npixels = 80\n"
     (inputs / "truth.toml").write_text(f"depths_um = [20000.0, 24000.0]\n{camera}")
     for verb in ("psf", "scene", "capture", "fit"):
         module, _, name = NEEDS[verb][1].partition(":")
-        monkeypatch.setattr(importlib.import_module(module), name, lambda *_, **__: 1 / 0)
+        monkeypatch.setattr(
+            importlib.import_module(module), name, lambda *_, **__: 1 / 0
+        )
     for free, told in ((needed - 1, "make room first"), (needed, "ZeroDivisionError")):
         usage = SimpleNamespace(free=transaction.ROOM + free)
-        monkeypatch.setattr(transaction.shutil, "disk_usage", lambda _, usage=usage: usage)
+        monkeypatch.setattr(
+            transaction.shutil, "disk_usage", lambda _, usage=usage: usage
+        )
         assert main(words.split()) == BAD_INPUT
         assert told in capsys.readouterr().err
 
@@ -278,27 +389,45 @@ def test_the_room_asked_for_is_that_of_the_result(inputs, monkeypatch, capsys, w
 @pytest.mark.parametrize(
     ("words", "needed"),
     [
-        ("design design.toml -o o.h5", 20_000),  # 4 bytes for every site of a disc 0.023 mm wide at 0.288 um: 20 039
+        (
+            "design design.toml -o o.h5",
+            20_000,
+        ),  # 4 bytes for every site of a disc 0.023 mm wide at 0.288 um: 20 039
         ("layout lens.h5 --oasis -o o", 36),
         ("layout lens.h5 -o o", 36 + 28 * 36),  # a reference of GDSII for each pillar
         ("export lens.h5 -o o.npz", 144),
         ("export lens.h5 -o o.dat --samples 70", 12 * 70**2),
     ],
 )
-def test_room_is_asked_for_as_soon_as_the_size_is_known(inputs, monkeypatch, capsys, words, needed):
+def test_room_is_asked_for_as_soon_as_the_size_is_known(
+    inputs, monkeypatch, capsys, words, needed
+):
     """Here from the lens or the library, after the claim."""
-    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.84, 0.86), 0.0, 0.0
+    )
     swept = SimpleNamespace(cell=Cell(0.288, pillar=Index(3.6)))
     monkeypatch.setattr(design, "_pillars", lambda *_: (swept, {}))
     monkeypatch.setattr(design.library, "proxy_of", lambda _: proxy)
     (inputs / "design.toml").write_text("aperture_mm = 0.023\n")
-    for name in ("metalens.lens.export:write", "layout.mask.build:prepare", "metalens.commands.design:_phase"):
+    for name in (
+        "metalens.lens.export:write",
+        "layout.mask.build:prepare",
+        "metalens.commands.design:_phase",
+    ):
         module, _, word = name.partition(":")
-        monkeypatch.setattr(importlib.import_module(module), word, lambda *_, **__: 1 / 0)
-    for free, told in ((0.99 * needed, "make room first"), (1.01 * needed + 50, "ZeroDivisionError")):
+        monkeypatch.setattr(
+            importlib.import_module(module), word, lambda *_, **__: 1 / 0
+        )
+    for free, told in (
+        (0.99 * needed, "make room first"),
+        (1.01 * needed + 50, "ZeroDivisionError"),
+    ):
         seen = iter([transaction.ROOM])
         monkeypatch.setattr(
-            transaction.shutil, "disk_usage", lambda _, s=seen, free=free: SimpleNamespace(free=next(s, free))
+            transaction.shutil,
+            "disk_usage",
+            lambda _, s=seen, free=free: SimpleNamespace(free=next(s, free)),
         )
         assert main(words.split()) == BAD_INPUT
         assert told in capsys.readouterr().err
@@ -333,8 +462,12 @@ def test_a_comment_asks_for_the_defaults(tmp_path):
     assert config.load(tmp_path / "cell.toml", CellFile, empty=False) == CellFile()
 
 
-def test_folders_made_above_an_output_go_again_after_a_refusal(inputs, monkeypatch, capsys):
-    """What others put there in the meantime stays, and so does a folder that was there before."""
+def test_folders_made_above_an_output_go_again_after_a_refusal(
+    inputs, monkeypatch, capsys
+):
+    """What others put there in the meantime stays, and so does a folder that was there
+    before.
+    """
     monkeypatch.setattr("codesign.commands.codesign._work", lambda *_: 1 / 0)
     (inputs / "kept").mkdir()
     assert main(["codesign", "run.toml", "-o", "kept/new/deep/out"]) == BAD_INPUT

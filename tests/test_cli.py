@@ -1,4 +1,6 @@
-"""The command line: exit codes, refusals in one line, nothing half-written, and the main job end to end."""
+"""The command line: exit codes, refusals in one line, nothing half-written, and the
+main job end to end.
+"""
 
 import importlib
 import inspect
@@ -24,7 +26,14 @@ def test_help_lists_every_verb():
         assert f"  {verb}" in done.stdout
 
 
-@pytest.mark.parametrize("words", [("--heights-um", "0.1,0.25,0.4"), ("--heights-um=0,3",), ("--diameter-um", "0,15")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--heights-um", "0.1,0.25,0.4"),
+        ("--heights-um=0,3",),
+        ("--diameter-um", "0,15"),
+    ],
+)
 def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
     done = run("field", "cell.toml", *words)
     assert done.returncode == cli.BAD_INPUT
@@ -35,27 +44,42 @@ def test_a_list_with_commas_is_told_to_be_parted_by_blanks(words):
 
 def work(module):
     """Source of the module that does the work of a verb."""
-    return inspect.getsource(importlib.import_module(getattr(module, "WORK", module.__name__)))
+    return inspect.getsource(
+        importlib.import_module(getattr(module, "WORK", module.__name__))
+    )
 
 
 def test_the_help_says_truly_which_commands_go_on_after_an_interruption():
-    """Those with --resume, those that keep a journal beside their output; psf and fit say that they do not."""
+    """Those with --resume, those that keep a journal beside their output; psf and fit
+    say that they do not.
+    """
     said = " ".join(run("--help").stdout.split())
-    modules = {verb: importlib.import_module(where) for verb, (where, _) in cli.VERBS.items()}
+    modules = {
+        verb: importlib.import_module(where) for verb, (where, _) in cli.VERBS.items()
+    }
     parts = modules["evaluate"].PARTS
-    assert [name for name, (where, _) in parts.items() if "grow=True" in work(importlib.import_module(where))] == [
-        "paper"
-    ]
+    assert [
+        name
+        for name, (where, _) in parts.items()
+        if "grow=True" in work(importlib.import_module(where))
+    ] == ["paper"]
     with_option = {
-        v for v, m in modules.items() if "resume" in getattr(getattr(m, "Options", None), "__annotations__", ())
+        v
+        for v, m in modules.items()
+        if "resume" in getattr(getattr(m, "Options", None), "__annotations__", ())
     }
     assert with_option == {"codesign", "retrain", "demo"}
     journals = {verb for verb, module in modules.items() if '".resume"' in work(module)}
     assert journals == {"library", "study", "budget", "plan"}
-    assert "library, study, budget, plan and evaluate paper go on with the same command" in said
+    assert (
+        "library, study, budget, plan and evaluate paper go on with the same command"
+        in said
+    )
     assert "codesign, retrain and demo with --resume; all others begin anew" in said
     for verb in ("fit", "psf"):
-        assert "An interruption leaves what stood at the output" in modules[verb].__doc__
+        assert (
+            "An interruption leaves what stood at the output" in modules[verb].__doc__
+        )
 
 
 def test_no_command_and_unknown_command_are_bad_input():
@@ -65,7 +89,9 @@ def test_no_command_and_unknown_command_are_bad_input():
     assert "did you mean 'design'?" in done.stderr
 
 
-@pytest.mark.parametrize("verb", sorted(set(cli.VERBS) - {"evaluate"} | {"evaluate optics"}))
+@pytest.mark.parametrize(
+    "verb", sorted(set(cli.VERBS) - {"evaluate"} | {"evaluate optics"})
+)
 def test_every_verb_has_help_and_names_its_options(verb):
     done = run(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
@@ -102,7 +128,11 @@ def test_misspelt_key_names_the_nearest_and_writes_nothing(tmp_path):
 
 
 def test_missing_files_are_bad_input(tmp_path):
-    for words in (("design", "absent.toml"), ("info", "absent.h5"), ("library", "absent.toml")):
+    for words in (
+        ("design", "absent.toml"),
+        ("info", "absent.h5"),
+        ("library", "absent.toml"),
+    ):
         done = run(*words, cwd=tmp_path)
         assert done.returncode == cli.BAD_INPUT
         assert "no such file" in done.stderr
@@ -124,7 +154,13 @@ def test_info_shows_kind_and_provenance(tmp_path):
     from metalens.ground import store
 
     made = store.Provenance(config="x = 1\n", inputs={"a.toml": "0" * 64})
-    store.save(tmp_path / "f.h5", "psf", {"image": np.eye(20)}, attributes={"pitch_um": 0.4}, provenance=made)
+    store.save(
+        tmp_path / "f.h5",
+        "psf",
+        {"image": np.eye(20)},
+        attributes={"pitch_um": 0.4},
+        provenance=made,
+    )
     text = run("info", tmp_path / "f.h5").stdout
     assert "psf version 1" in text
     assert "config: x = 1" in text
@@ -134,7 +170,8 @@ def test_info_shows_kind_and_provenance(tmp_path):
     assert values["arrays"]["image"] == "float64 (20, 20)"
 
 
-# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.06 mm, a network that hardly trains.
+# The shipped chain trains and measures a lens of 1 mm for minutes; here one of 0.06 mm,
+# a network that hardly trains.
 CHAIN = {
     "run.toml": """
         preset = "smoke"
@@ -189,10 +226,20 @@ def demo(tmp_path_factory):
     """The whole chain on a 20 µm lens, run as a user would, with a small co-design run."""
     folder = tmp_path_factory.mktemp("demo")
     for name in ("cell.toml", "design.toml", "process.toml"):
-        (folder / name).write_text(resources.files("metalens").joinpath("data", "demo", name).read_text())
+        (folder / name).write_text(
+            resources.files("metalens").joinpath("data", "demo", name).read_text()
+        )
     for name, text in CHAIN.items():
         (folder / name).write_text(textwrap.dedent(text))
-    done = process("demo", folder / "out", "--config", folder / "chain.toml", "--aperture-mm", 0.02, "--json")
+    done = process(
+        "demo",
+        folder / "out",
+        "--config",
+        folder / "chain.toml",
+        "--aperture-mm",
+        0.02,
+        "--json",
+    )
     return folder / "out", done
 
 
@@ -206,7 +253,14 @@ def test_the_chain_runs_from_cell_to_checked_mask(demo):
     assert values["psf"]["converged"]
     assert values["layout"]["ok"]
     assert values["layout"]["pillars"] >= values["design"]["pillars"]
-    for name in ("library.h5", "lens.h5", "psf.h5", "mask/mask.oas", "mask/mask.gds", "mask/report.html"):
+    for name in (
+        "library.h5",
+        "lens.h5",
+        "psf.h5",
+        "mask/mask.oas",
+        "mask/mask.gds",
+        "mask/report.html",
+    ):
         assert (folder / name).stat().st_size > 0
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png") >= 8
@@ -215,7 +269,11 @@ def test_the_chain_runs_from_cell_to_checked_mask(demo):
 
 def test_every_artefact_of_the_chain_tells_where_it_comes_from(demo):
     folder, _ = demo
-    for name, kind in (("library.h5", "library"), ("lens.h5", "lens"), ("psf.h5", "psf")):
+    for name, kind in (
+        ("library.h5", "library"),
+        ("lens.h5", "lens"),
+        ("psf.h5", "psf"),
+    ):
         assert run("info", folder / name).stdout.startswith(f"{kind} version")
     assert "library.h5 (SHA-256" in run("info", folder / "lens.h5").stdout
 
@@ -239,8 +297,14 @@ def test_a_filled_folder_is_not_written_into_without_force(demo):
     ("text", "message"),
     [
         ("[cell]\npitch_um = 0.60\n", "diffraction orders"),
-        ("[cell]\npitch_um = 0.3\n[sweep]\ndiameters_um = [0.1, 0.31]\n", "pillars touch"),
-        ("[cell]\npitch_um = 0.3\npillar = 'a-Si'\n[sweep]\nwavelengths_um = [9.0]\n", "holds from"),
+        (
+            "[cell]\npitch_um = 0.3\n[sweep]\ndiameters_um = [0.1, 0.31]\n",
+            "pillars touch",
+        ),
+        (
+            "[cell]\npitch_um = 0.3\npillar = 'a-Si'\n[sweep]\nwavelengths_um = [9.0]\n",
+            "holds from",
+        ),
         ("[cell]\npitch_um = -1.0\n", "pitch_um"),
         ("[cell]\npitch_um = 0.3\npillar = 'unobtainium'\n", "unobtainium"),
     ],
@@ -258,10 +322,16 @@ def test_a_truncated_lens_is_refused_by_every_stage(demo, tmp_path):
     folder, _ = demo
     whole = (folder / "lens.h5").read_bytes()
     (tmp_path / "lens.h5").write_bytes(whole[: len(whole) // 2])
-    for words in (("psf", "lens.h5", "-o", "psf.h5"), ("layout", "lens.h5", "-o", "mask")):
+    for words in (
+        ("psf", "lens.h5", "-o", "psf.h5"),
+        ("layout", "lens.h5", "-o", "mask"),
+    ):
         done = run(*words, cwd=tmp_path)
         assert done.returncode == cli.BAD_INPUT, done.stdout
         assert "truncated" in done.stderr
     assert os.listdir(tmp_path) == ["lens.h5"]
     (tmp_path / "lens.h5").write_bytes((folder / "library.h5").read_bytes())
-    assert "holds 'library' version 1, need 'lens'" in run("psf", "lens.h5", "-o", "psf.h5", cwd=tmp_path).stderr
+    assert (
+        "holds 'library' version 1, need 'lens'"
+        in run("psf", "lens.h5", "-o", "psf.h5", cwd=tmp_path).stderr
+    )

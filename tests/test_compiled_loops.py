@@ -1,7 +1,10 @@
-"""Compiled loops give the same bytes in the process that compiles them and in those that find them in the cache.
+"""Compiled loops give the same bytes in the process that compiles them and in those
+that find them in the cache.
 
-A function that a loop calls is optimised by itself, and once more inside the library of the loop. The process that
-compiles both runs the first, one that loads the library the second; with sums in any order they round otherwise.
+A function that a loop calls is optimised by itself, and once more inside the library of
+the loop. The process that
+compiles both runs the first, one that loads the library the second; with sums in any
+order they round otherwise.
 """
 
 import importlib
@@ -23,7 +26,9 @@ MODULES = [
 
 
 def loops(module):
-    """Functions of a module that are compiled, kept in the cache, and may sum in any order."""
+    """Functions of a module that are compiled, kept in the cache, and may sum in any
+    order.
+    """
     for name, value in vars(importlib.import_module(module)).items():
         kept = isinstance(value, Dispatcher) and not isinstance(value._cache, NullCache)
         if kept and value.targetoptions.get("fastmath"):
@@ -33,7 +38,11 @@ def loops(module):
 def called(loop):
     """Compiled functions that a loop calls, by name."""
     known = loop.py_func.__globals__
-    return {name: known[name] for name in loop.py_func.__code__.co_names if isinstance(known.get(name), Dispatcher)}
+    return {
+        name: known[name]
+        for name in loop.py_func.__code__.co_names
+        if isinstance(known.get(name), Dispatcher)
+    }
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -41,7 +50,9 @@ def test_what_a_cached_loop_calls_is_put_into_it(module):
     for name, loop in loops(module):
         for callee, function in called(loop).items():
             put = function.targetoptions
-            assert put.get("forceinline") or put.get("inline") == "always", f"{module}.{name} calls {callee}"
+            assert put.get("forceinline") or put.get("inline") == "always", (
+                f"{module}.{name} calls {callee}"
+            )
 
 
 def test_the_loops_are_found():

@@ -1,4 +1,5 @@
-"""The example notebooks, read and not run: what they import is there, and every call of ours names known arguments.
+"""The example notebooks, read and not run: what they import is there, and every call of
+ours names known arguments.
 
 `make notebooks` runs them, which takes minutes.
 """
@@ -10,7 +11,11 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = sorted(p for p in (Path(__file__).parents[1] / "examples").glob("*.py") if p.stem not in ("run", "__init__"))
+EXAMPLES = sorted(
+    p
+    for p in (Path(__file__).parents[1] / "examples").glob("*.py")
+    if p.stem not in ("run", "__init__")
+)
 OURS = ("metalens", "layout", "characterize", "codesign", "benchmarks")
 
 
@@ -18,13 +23,18 @@ def _imported(tree):
     """{name in the script: what it is} of the imports of our packages."""
     found = {}
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in OURS:
+        if (
+            isinstance(node, ast.ImportFrom)
+            and (node.module or "").split(".")[0] in OURS
+        ):
             module = importlib.import_module(node.module)
             for name in node.names:
                 try:
                     found[name.asname or name.name] = getattr(module, name.name)
                 except AttributeError:
-                    found[name.asname or name.name] = importlib.import_module(f"{node.module}.{name.name}")
+                    found[name.asname or name.name] = importlib.import_module(
+                        f"{node.module}.{name.name}"
+                    )
     return found
 
 
@@ -48,8 +58,12 @@ def _wrong_calls(text):
         known = inspect.signature(called).parameters
         seen += 1
         given = {k.arg for k in node.keywords if k.arg}
-        if not any(p.kind is p.VAR_KEYWORD for p in known.values()) and given - set(known):
-            wrong.append((node.lineno, ast.unparse(node.func), sorted(given - set(known))))
+        if not any(p.kind is p.VAR_KEYWORD for p in known.values()) and given - set(
+            known
+        ):
+            wrong.append(
+                (node.lineno, ast.unparse(node.func), sorted(given - set(known)))
+            )
     return seen, wrong
 
 

@@ -1,4 +1,6 @@
-"""``metalens info`` on every kind of artefact that the toolchain writes, whole and cut short."""
+"""``metalens info`` on every kind of artefact that the toolchain writes, whole and cut
+short.
+"""
 
 import ast
 import functools
@@ -25,17 +27,37 @@ PACKAGES = ("metalens", "layout", "characterize", "codesign")
 @functools.cache
 def _kinds():
     """Second argument of every ``store.save`` in the packages."""
-    texts = [path.read_text(encoding="utf-8") for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    calls = [node for text in texts if "store.save" in text for node in ast.walk(ast.parse(text))]
-    calls = [node for node in calls if isinstance(node, ast.Call) and ast.unparse(node.func) == "store.save"]
-    return {node.args[1].value for node in calls if isinstance(node.args[1], ast.Constant)}
+    texts = [
+        path.read_text(encoding="utf-8")
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    calls = [
+        node
+        for text in texts
+        if "store.save" in text
+        for node in ast.walk(ast.parse(text))
+    ]
+    calls = [
+        node
+        for node in calls
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "store.save"
+    ]
+    return {
+        node.args[1].value for node in calls if isinstance(node.args[1], ast.Constant)
+    }
 
 
 def _write(kind, path):
     if kind in artefacts.KINDS:
         artefacts.KINDS[kind][0](path)
     else:  # info asks no more of a kind than that it was written by the store
-        store.save(path, kind, {"image": np.eye(12)}, provenance=store.Provenance(config="x = 1\n", seed=3))
+        store.save(
+            path,
+            kind,
+            {"image": np.eye(12)},
+            provenance=store.Provenance(config="x = 1\n", seed=3),
+        )
 
 
 @pytest.mark.parametrize("kind", sorted(_kinds()))
@@ -53,13 +75,28 @@ def test_every_kind_of_file_says_what_it_is_and_what_made_it(kind, tmp_path, cap
 
 
 def test_the_kinds_are_those_of_the_toolchain():
-    assert _kinds() >= {"library", "lens", "psf", "asbuilt", "pupil", "scene", "pool", "layers", "budget"}
+    assert _kinds() >= {
+        "library",
+        "lens",
+        "psf",
+        "asbuilt",
+        "pupil",
+        "scene",
+        "pool",
+        "layers",
+        "budget",
+    }
 
 
 def test_floats_are_told_without_the_dust_of_arithmetic(tmp_path, capsys):
     """0.1 + 0.2 is 0.30000000000000004; --json keeps what is stored."""
     path, power = tmp_path / "f.h5", 0.1 + 0.2
-    store.save(path, "lens", {"y": np.eye(2)}, attributes={"power": power, "pitch_um": 300.0, "sites": 8721433})
+    store.save(
+        path,
+        "lens",
+        {"y": np.eye(2)},
+        attributes={"power": power, "pitch_um": 300.0, "sites": 8721433},
+    )
     assert main(["info", str(path)]) == SUCCESS
     lines = capsys.readouterr().out.splitlines()
     assert {"  power = 0.3", "  pitch_um = 300.0", "  sites = 8721433"} <= set(lines)
@@ -69,26 +106,42 @@ def test_floats_are_told_without_the_dust_of_arithmetic(tmp_path, capsys):
 
 def test_checkpoints_and_networks_are_told_by_their_heads(tmp_path, capsys):
     path = tmp_path / "checkpoint.safetensors"
-    checkpoint.save(path, {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0]}, settings=InnerConfig(steps=7))
+    checkpoint.save(
+        path,
+        {"net": {"w": torch.ones(3, 2)}, "counters": [1, 0, 0]},
+        settings=InnerConfig(steps=7),
+    )
     assert main(["info", str(path)]) == SUCCESS
     text = capsys.readouterr().out
     assert text.startswith(f"checkpoint version {checkpoint.VERSION}")
     assert "F32 (3, 2)" in text
     assert "config: steps = 7" in text
     whole = path.read_bytes()
-    for damaged in (whole[:5], whole[:40], whole[:-1], b"", b"\xff" * 30, (2).to_bytes(8, "little") + b"[]"):
+    for damaged in (
+        whole[:5],
+        whole[:40],
+        whole[:-1],
+        b"",
+        b"\xff" * 30,
+        (2).to_bytes(8, "little") + b"[]",
+    ):
         path.write_bytes(damaged)
         assert main(["info", str(path)]) == BAD_INPUT
         assert "make it again" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "absent.safetensors")]) == BAD_INPUT
 
 
-def test_a_file_of_a_folder_is_told_by_its_manifest_as_long_as_it_is_as_written(tmp_path, capsys):
+def test_a_file_of_a_folder_is_told_by_its_manifest_as_long_as_it_is_as_written(
+    tmp_path, capsys
+):
     (tmp_path / "report.html").write_text("<p>as made</p>", encoding="utf-8")
     manifest.write(tmp_path, "layout lens.h5 -o mask")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     assert main(["info", str(tmp_path / "report.html")]) == SUCCESS
-    assert "14 bytes, as it was written by\n  metalens layout lens.h5 -o mask" in capsys.readouterr().out
+    assert (
+        "14 bytes, as it was written by\n  metalens layout lens.h5 -o mask"
+        in capsys.readouterr().out
+    )
     assert main(["info", str(tmp_path / "notes.txt")]) == BAD_INPUT  # not of the folder
     (tmp_path / "report.html").write_text("<p>changed</p>", encoding="utf-8")
     assert main(["info", str(tmp_path / "report.html")]) == BAD_INPUT

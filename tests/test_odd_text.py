@@ -1,4 +1,6 @@
-"""NUL bytes, a byte order mark, names of files in no encoding: every command takes them or refuses in one line."""
+"""NUL bytes, a byte order mark, names of files in no encoding: every command takes them
+or refuses in one line.
+"""
 
 import importlib
 import os
@@ -18,9 +20,12 @@ from metalens.ground.errors import MetalensError
 CELL = "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n"
 PUPIL = "numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\nstep_um = 0.5\n"
 CHAIN = "cell = 'cell.toml'\ndesign = 'design.toml'\nprocess = 'process.toml'\n"
-WORK = {verb: work for verb, (_, work) in NEEDS.items()} | {"layout": "layout.mask.build:prepare"}
+WORK = {verb: work for verb, (_, work) in NEEDS.items()} | {
+    "layout": "layout.mask.build:prepare"
+}
 LENS = "lens = [{file = 'lens.h5', name = 'A', at = [{x_um = 3.0}]}]\n"
-# what reads settings: words with the file's name, a good text, and the work that must begin with it
+# what reads settings: words with the file's name, a good text, and the work that must
+# begin with it
 SETTINGS = {
     "library": ("library s.toml -o o.h5", CELL, WORK["library"]),
     "study": ("study s.toml -o o", "pitches_um = [0.3]\n", WORK["study"]),
@@ -46,7 +51,9 @@ SETTINGS = {
 
 @pytest.fixture
 def begins(inputs, monkeypatch):  # noqa: F811
-    """Words of a command, and the work that is to say so in place of being done: whether it began."""
+    """Words of a command, and the work that is to say so in place of being done:
+    whether it began.
+    """
     (inputs / "process.toml").write_text("name = 'x'\n")
 
     def said(capsys, words, work):
@@ -66,16 +73,31 @@ def begins(inputs, monkeypatch):  # noqa: F811
 
 
 @pytest.mark.parametrize("case", sorted(SETTINGS))
-def test_a_byte_order_mark_before_settings_changes_nothing(inputs, begins, capsys, case):  # noqa: F811
+def test_a_byte_order_mark_before_settings_changes_nothing(
+    inputs,  # noqa: F811
+    begins,
+    capsys,
+    case,
+):
     words, text, work = SETTINGS[case]
     (inputs / "s.toml").write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
     assert begins(capsys, words.split(), work) is True
 
 
 @pytest.mark.parametrize("case", sorted(SETTINGS))
-def test_settings_with_nul_bytes_or_of_no_encoding_are_refused_by_name(inputs, begins, capsys, case):  # noqa: F811
+def test_settings_with_nul_bytes_or_of_no_encoding_are_refused_by_name(
+    inputs,  # noqa: F811
+    begins,
+    capsys,
+    case,
+):
     words, text, work = SETTINGS[case]
-    for odd in (text.encode().replace(b"=", b"=\0", 1), text.encode() + b"#\0\n", b"\0" * 9, text.encode("utf-16")):
+    for odd in (
+        text.encode().replace(b"=", b"=\0", 1),
+        text.encode() + b"#\0\n",
+        b"\0" * 9,
+        text.encode("utf-16"),
+    ):
         (inputs / "s.toml").write_bytes(odd)
         before = tree(inputs)
         assert "s.toml" in begins(capsys, words.split(), work)
@@ -92,7 +114,10 @@ def test_no_command_begins_with_nul_in_a_name(inputs, begins, capsys, verb):  # 
             trials.append([*given[:i], f"a\0{word}", *given[i + 1 :], "-o", output])
     before = tree(inputs)
     for trial in trials:
-        assert begins(capsys, trial, "" if verb in ("view", "measure") else work) is not True, trial  # work that reads
+        assert (
+            begins(capsys, trial, "" if verb in ("view", "measure") else work)
+            is not True
+        ), trial  # work that reads
         assert tree(inputs) == before
 
 
@@ -109,7 +134,9 @@ def test_a_name_in_bytes_of_no_encoding_is_a_name(inputs, begins, capsys, verb):
 
 
 def test_names_in_bytes_of_no_encoding_are_written_as_text(tmp_path):
-    """UTF-8 under a locale of ASCII becomes what it stands for, other bytes become codes."""
+    """UTF-8 under a locale of ASCII becomes what it stands for, other bytes become
+    codes.
+    """
     name = "gr\udcc3\udcb6sse \udcff"
     assert reading.shown(name) == "grösse \\xff"
     assert reading.shown("\ud800 ö") == "\\ud800 ö"
@@ -117,7 +144,17 @@ def test_names_in_bytes_of_no_encoding_are_written_as_text(tmp_path):
     store.append_line(tmp_path / "t.txt", name)
     assert (tmp_path / "t.txt").read_text("utf-8") == "grösse \\xff\n" * 2
     made = store.Provenance(config=name, inputs={name: "00"})
-    store.save(tmp_path / "f.h5", "psf", {"a": np.array([name, "b"])}, attributes={"x": name}, provenance=made)
+    store.save(
+        tmp_path / "f.h5",
+        "psf",
+        {"a": np.array([name, "b"])},
+        attributes={"x": name},
+        provenance=made,
+    )
     back = store.load(tmp_path / "f.h5", "psf")
-    assert [back.arrays["a"][0].decode(), back.attributes["x"], back.provenance.config] == ["grösse \\xff"] * 3
+    assert [
+        back.arrays["a"][0].decode(),
+        back.attributes["x"],
+        back.provenance.config,
+    ] == ["grösse \\xff"] * 3
     assert dict(back.provenance.inputs) == {"grösse \\xff": "00"}

@@ -1,4 +1,6 @@
-"""Nothing that exists is overwritten without --force by any command; half-written runs, other versions are named."""
+"""Nothing that exists is overwritten without --force by any command; half-written runs,
+other versions are named.
+"""
 
 import json
 import sys
@@ -45,10 +47,22 @@ READS_ONLY = {"info"}
 
 @pytest.fixture
 def folder(tmp_path):
-    """Inputs for every command: good enough to get as far as the question of the target."""
-    proxy = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    """Inputs for every command: good enough to get as far as the question of the
+    target.
+    """
+    proxy = Proxy(
+        np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
+    )
     diameters = np.linspace(0.08, 0.21, 64, dtype=np.float32).reshape(8, 8)
-    made = Lens(DiameterMap(diameters, 0.3), Cell(0.3, pillar=Index(3.6)), proxy, 0.85, 2000.0, 20_000.0, "map")
+    made = Lens(
+        DiameterMap(diameters, 0.3),
+        Cell(0.3, pillar=Index(3.6)),
+        proxy,
+        0.85,
+        2000.0,
+        20_000.0,
+        "map",
+    )
     lens.save(tmp_path / "lens.h5", made)
     layout.write_gdsii(layout.plan(made, Process()), tmp_path / "mask.gds")
     (tmp_path / "cell.toml").write_text("[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n")
@@ -81,7 +95,10 @@ def test_what_exists_is_kept(folder, verb):
     done = _run(folder, verb, words)
     assert done.returncode == cli.BAD_INPUT, done.stdout
     assert precious.read_text() == "precious"
-    assert sorted(p.name for p in precious.parent.rglob("*") if p.name.startswith(".")) == []
+    assert (
+        sorted(p.name for p in precious.parent.rglob("*") if p.name.startswith("."))
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,10 +113,14 @@ def test_what_exists_is_kept(folder, verb):
         ("view lens.h5", "out.html"),
     ],
 )
-def test_force_knows_every_format_that_a_command_writes(folder, monkeypatch, words, name):
+def test_force_knows_every_format_that_a_command_writes(
+    folder, monkeypatch, words, name
+):
     """A file of the same format that somebody else made stays."""
     monkeypatch.chdir(folder)
-    (folder / "psf.toml").write_text("depths_mm = [20.0, 20.0, 1.0]\nangles_deg = [0.0]\nsamples = 8\n")
+    (folder / "psf.toml").write_text(
+        "depths_mm = [20.0, 20.0, 1.0]\nangles_deg = [0.0]\nsamples = 8\n"
+    )
     command = [*words.split(), "-o", name]
     assert cli.main(command) in (0, 1)
     made = (folder / name).read_bytes()
@@ -115,7 +136,10 @@ def test_a_run_folder_half_written_is_named(folder):
     """Started but never finished: no result, and no checkpoint to resume from."""
     (folder / "half").mkdir()
     (folder / "half" / "run.toml").write_text('preset = "smoke"\n')
-    for verb, words in (("budget", "lens.h5 --run half -o b.h5"), ("codesign", "run.toml -o half --resume")):
+    for verb, words in (
+        ("budget", "lens.h5 --run half -o b.h5"),
+        ("codesign", "run.toml -o half --resume"),
+    ):
         done = _run(folder, verb, words)
         assert done.returncode == cli.BAD_INPUT
         assert "half" in done.stderr
@@ -124,8 +148,14 @@ def test_a_run_folder_half_written_is_named(folder):
 
 def test_an_artefact_of_another_version_is_named(folder):
     held = store.load(folder / "lens.h5")
-    store.save(folder / "old.h5", "lens", held.arrays, version=99, attributes=held.attributes)
-    for verb, words in (("psf", "old.h5 -o p.h5"), ("layout", "old.h5 -o m"), ("budget", "old.h5 -o b.h5")):
+    store.save(
+        folder / "old.h5", "lens", held.arrays, version=99, attributes=held.attributes
+    )
+    for verb, words in (
+        ("psf", "old.h5 -o p.h5"),
+        ("layout", "old.h5 -o m"),
+        ("budget", "old.h5 -o b.h5"),
+    ):
         done = _run(folder, verb, words)
         assert done.returncode == cli.BAD_INPUT
         assert "version 99, need 'lens' version 1" in done.stderr

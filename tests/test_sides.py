@@ -1,6 +1,8 @@
-"""A lens of rectangles whose width, length, edges or turn come out wrong: every pillar solved anew, and added up.
+"""A lens of rectangles whose width, length, edges or turn come out wrong: every pillar
+solved anew, and added up.
 
-The cell is solved at one truncation throughout, so that what is compared is the change and nothing else.
+The cell is solved at one truncation throughout, so that what is compared is the change
+and nothing else.
 """
 
 import dataclasses
@@ -24,13 +26,28 @@ from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle
 from metalens.ground.errors import ConfigError, FitError, ProcessError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Answers, Bias, Printed, Spread, State, lacking, named, sensitivity
+from metalens.made import (
+    Answers,
+    Bias,
+    Printed,
+    Spread,
+    State,
+    lacking,
+    named,
+    sensitivity,
+)
 from metalens.pillars import Proxy
 from metalens.rcwa import jones
 from tests.codesign.process_entry import process_entry
 
 WAVE, RATIO, HARMONICS = 0.633, 0.62, 8
-CELL = Cell(0.32, height_um=0.55, pillar=Index(2.38), substrate=Index(1.46), shape=Rectangle(RATIO))
+CELL = Cell(
+    0.32,
+    height_um=0.55,
+    pillar=Index(2.38),
+    substrate=Index(1.46),
+    shape=Rectangle(RATIO),
+)
 SIZES = np.array([0.142, 0.167, 0.19, 0.214, 0.233])
 LOW, HIGH = 0.12, 0.255
 
@@ -71,7 +88,9 @@ def seen(lens, t):
 
 
 def anew(lens, width=0.0, length=0.0, turn_deg=0.0, bias=0.0):
-    """(y, x) t of pillars that are so many um wider and longer, biased on all edges, and turned: each size solved."""
+    """(y, x) t of pillars that are so many um wider and longer, biased on all edges,
+    and turned: each size solved.
+    """
     out = np.zeros(lens.diameters.diameter_um.shape, complex)
     for d in SIZES.tolist():
         t = solved(d + bias + width, RATIO * d + bias + length, math.radians(turn_deg))
@@ -89,35 +108,56 @@ CHANGES = [
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_lens_as_made_sends_the_light_of_its_own_rectangles(lens, response, change):
-    """Second order is left out: (20 rad/um x 7 nm)² / 2 = 1 % of the change and of the light."""
+    """Second order is left out: (20 rad/um x 7 nm)² / 2 = 1 % of the change and of the
+    light.
+    """
     amounts = {"width": "width_nm", "length": "length_nm", "bias": "bias_nm"}
-    truth = anew(lens, **{name: 1e-3 * change.get(row, 0.0) for name, row in amounts.items()})
-    got, before = seen(lens, made.pillars(lens, response, vector(change))), seen(lens, anew(lens))
+    truth = anew(
+        lens, **{name: 1e-3 * change.get(row, 0.0) for name, row in amounts.items()}
+    )
+    got, before = (
+        seen(lens, made.pillars(lens, response, vector(change))),
+        seen(lens, anew(lens)),
+    )
     want = seen(lens, truth)
     assert np.abs(want - before).max() > 0.1 * np.abs(before).max()
     assert np.abs(got - want).max() < 0.02 * np.abs(before).max()
 
 
-def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_order(lens, response):
+def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_order(
+    lens, response
+):
     still = made.pillars(lens, response, vector({"turn_deg": 1.5}))
     assert np.abs(still - made.pillars(lens, response, vector())).max() < 1e-9
     assert np.abs(anew(lens, turn_deg=1.5) - anew(lens)).max() < 2e-3
-    oblique = dataclasses.replace(lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5)))
+    oblique = dataclasses.replace(
+        lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5))
+    )
     found = sensitivity(oblique)
     rate = found.at(np.array([0.19]))[named(Answers).index("turn_deg"), 0]
     up, down = (solved(0.19, RATIO * 0.19, 0.5 + step) for step in (0.02, -0.02))
-    # derivatives hold the field of normals that a truncation samples, differences move it: what truncations differ by
+    # derivatives hold the field of normals that a truncation samples, differences move
+    # it: what truncations differ by
     assert abs(rate / (np.log(up / down) / 0.04) - 1) < found.error < 0.15
 
 
 def test_the_mask_study_has_the_phase_of_rectangles_that_are_too_wide(lens):
-    found = tolerance.analyse(lens, Process(spread=Spread.only(width_nm=4.0)), depths_um=(90.0,), draws=10)
+    found = tolerance.analyse(
+        lens, Process(spread=Spread.only(width_nm=4.0)), depths_um=(90.0,), draws=10
+    )
     effect = {e.cause: e for e in found.effects}["width_nm"]
     there = lens.diameters.diameter_um > 0
-    turns = [(anew(lens, width=step) / np.where(there, anew(lens), 1))[there] for step in (4e-3, -4e-3)]
-    want = max(np.angle(turn / turn.mean()).std() for turn in turns)  # the worse of both signs
+    turns = [
+        (anew(lens, width=step) / np.where(there, anew(lens), 1))[there]
+        for step in (4e-3, -4e-3)
+    ]
+    want = max(
+        np.angle(turn / turn.mean()).std() for turn in turns
+    )  # the worse of both signs
     assert effect.deviation == 4.0
-    assert effect.phase_rad == pytest.approx(want, rel=0.05)  # the second order, and derivatives of 6 and 8 harmonics
+    assert effect.phase_rad == pytest.approx(
+        want, rel=0.05
+    )  # the second order, and derivatives of 6 and 8 harmonics
 
 
 def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens):
@@ -125,15 +165,24 @@ def test_the_budget_has_the_phase_of_rectangles_that_are_too_long(lens):
     there = lens.diameters.diameter_um > 0
     up, down = (anew(lens, length=step)[there] for step in (2e-3, -2e-3))
     rate = np.angle(up / down) / 4e-3
-    assert entry.phase_rad == pytest.approx(5e-3 * rate.std(), rel=4 / math.sqrt(2 * 60))  # four sigma of 60 draws
+    assert entry.phase_rad == pytest.approx(
+        5e-3 * rate.std(), rel=4 / math.sqrt(2 * 60)
+    )  # four sigma of 60 draws
 
 
 def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
-    """Mean over both polarisations, of first order: a pillar wider along x by a is one wider all round by a / 2."""
-    wide, all_round = LensError({"width_nm": 6.0}).state(), LensError({"bias_nm": 3.0}).state()
+    """Mean over both polarisations, of first order: a pillar wider along x by a is one
+    wider all round by a / 2.
+    """
+    wide, all_round = (
+        LensError({"width_nm": 6.0}).state(),
+        LensError({"bias_nm": 3.0}).state(),
+    )
     # the guide's slope is that of the proxy, smoothed
     assert variance_rad2(wide) == pytest.approx(variance_rad2(all_round), rel=0.05)
-    assert variance_rad2(LensError({"length_nm": 6.0}).state()) == pytest.approx(variance_rad2(wide), rel=1e-12)
+    assert variance_rad2(LensError({"length_nm": 6.0}).state()) == pytest.approx(
+        variance_rad2(wide), rel=1e-12
+    )
     for name in ("turn_deg", "pedestal_nm", "cap_nm"):
         with pytest.raises(ConfigError, match=name):
             LensErrors(**{name: 0.1})
@@ -141,7 +190,9 @@ def test_training_draws_widths_as_of_round_pillars_and_refuses_turns():
 
 
 def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response):
-    """As pillar by pillar, by a table over the diameter and another of what edges do beyond it."""
+    """As pillar by pillar, by a table over the diameter and another of what edges do
+    beyond it.
+    """
     known = vector({"bias_nm": 8.0, "bias_x_nm": -5.0, "width_nm": 3.0})
     ready = MadeLens(lens, OpticsConfig(), response=response)
     side = ready._block
@@ -155,8 +206,11 @@ def test_psfs_of_a_made_lens_are_gathered_from_its_own_rectangles(lens, response
     assert np.abs(cells - sums / np.maximum(counts, 1))[counts > 0].max() < 3e-4
 
 
-def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(lens, response):
-    """Rectangles come out 5 nm too narrow, 17 nm too long; with the edges moved as proposed, solved anew, they answer
+def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(
+    lens, response
+):
+    """Rectangles come out 5 nm too narrow, 17 nm too long; with the edges moved as
+    proposed, solved anew, they answer
     as designed up to a piston."""
     x = vector({"width_nm": -10.0, "length_nm": 12.0, "bias_nm": 5.0})
     plan = correction.propose(lens, x, response=response, old=Bias())
@@ -166,20 +220,36 @@ def test_the_next_mask_moves_edges_so_far_that_the_phase_is_the_designed_one(len
         moved = drawn - designed + 5e-3
         t = solved(designed + moved - 10e-3, RATIO * designed + moved + 12e-3)
         off.append(np.angle(t / solved(designed, RATIO * designed)))
-    as_is = [np.angle(solved(d - 5e-3, RATIO * d + 17e-3) / solved(d, RATIO * d)) for d in SIZES.tolist()]
+    as_is = [
+        np.angle(solved(d - 5e-3, RATIO * d + 17e-3) / solved(d, RATIO * d))
+        for d in SIZES.tolist()
+    ]
     assert np.ptp(as_is) > 0.05
-    assert np.ptp(off) < 0.15 * np.ptp(as_is), (off, as_is)  # second order, and 13 knots
+    assert np.ptp(off) < 0.15 * np.ptp(as_is), (
+        off,
+        as_is,
+    )  # second order, and 13 knots
 
 
 def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     plain = dataclasses.replace(lens, cell=dataclasses.replace(CELL, shape=Circle()))
-    assert lacking(plain.cell) == ("width_nm", "length_nm", "turn_deg", "pedestal_nm", "cap_nm")
+    assert lacking(plain.cell) == (
+        "width_nm",
+        "length_nm",
+        "turn_deg",
+        "pedestal_nm",
+        "cap_nm",
+    )
     assert lacking(CELL) == ("pedestal_nm", "cap_nm")
     with pytest.raises(FitError, match="length_nm"):
         pillar_slopes.slopes(plain, wanted={"length_nm"})
     with pytest.raises(ProcessError, match=r"spread\.turn_deg"):
         tolerance.analyse(plain, Process(spread=Spread.only(turn_deg=0.2)))
-    about = SimpleNamespace(given=Given(mask=Printed(spread=Spread.only(width_nm=1.0))), lens=plain)
+    about = SimpleNamespace(
+        given=Given(mask=Printed(spread=Spread.only(width_nm=1.0))), lens=plain
+    )
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
         list(links.process(about))
-    assert State.of({"width_nm": 3.0}).answers()[named(Answers).index("width_nm")] == pytest.approx(3e-3)
+    assert State.of({"width_nm": 3.0}).answers()[
+        named(Answers).index("width_nm")
+    ] == pytest.approx(3e-3)

@@ -1,4 +1,6 @@
-"""A read-only installation without a home, a lost terminal, an ASCII locale, a folder with its manifest."""
+"""A read-only installation without a home, a lost terminal, an ASCII locale, a folder
+with its manifest.
+"""
 
 import errno
 import json
@@ -20,7 +22,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_without_a_place_to_write_compiled_loops_go_to_temporary_files(monkeypatch):
-    """Where neither the installation nor the home can be written; where one can, numba's own choice stands."""
+    """Where neither the installation nor the home can be written; where one can,
+    numba's own choice stands.
+    """
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(cli.os, "access", lambda path, mode: False)
     assert main(["info", "absent.h5"]) == BAD_INPUT
@@ -28,22 +32,38 @@ def test_without_a_place_to_write_compiled_loops_go_to_temporary_files(monkeypat
     assert chosen.is_dir()
     chosen.rmdir()
     monkeypatch.delenv("NUMBA_CACHE_DIR")
-    monkeypatch.setattr(cli.os, "access", lambda path, mode: path == os.path.expanduser("~"))
+    monkeypatch.setattr(
+        cli.os, "access", lambda path, mode: path == os.path.expanduser("~")
+    )
     main(["info", "absent.h5"])
     assert "NUMBA_CACHE_DIR" not in os.environ
 
 
 def test_compiled_loops_of_a_read_only_copy_run_without_a_home(tmp_path):
-    """A copy that cannot be written, a home that does not exist; root may write anywhere, so it is skipped there."""
+    """A copy that cannot be written, a home that does not exist; root may write
+    anywhere, so it is skipped there.
+    """
     if os.geteuid() == 0:
         pytest.skip("root may write into a read-only folder")
     loops = tmp_path / "loops.py"
-    loops.write_text("import numba\n@numba.njit(cache=True)\ndef one(x):\n    return x + 1\n")
+    loops.write_text(
+        "import numba\n@numba.njit(cache=True)\ndef one(x):\n    return x + 1\n"
+    )
     tmp_path.chmod(0o555)
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from metalens import cli; cli.main(['info', 'x.h5'])"
     code += "; import loops; print(loops.one(2))"
-    words = {"PATH": os.environ["PATH"], "HOME": "/nonexistent", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=words, check=False)
+    words = {
+        "PATH": os.environ["PATH"],
+        "HOME": "/nonexistent",
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=words,
+        check=False,
+    )
     tmp_path.chmod(0o755)
     assert done.stdout.split()[-1:] == ["3"], done.stderr
 
@@ -57,18 +77,29 @@ def test_a_lost_terminal_ends_a_command_and_leaves_nothing_but_its_journal(tmp_p
     """Of a command that has claimed its output and would go on for minutes."""
     (tmp_path / "study.toml").write_text("pitches_um = [0.3]\nheights_um = [0.7]\n")
     words = [sys.executable, "-m", "metalens", "study", "study.toml", "-o", "out"]
-    told = tmp_path.with_name(tmp_path.name + ".told")  # not a pipe: workers hold its end while they last
+    told = tmp_path.with_name(
+        tmp_path.name + ".told"
+    )  # not a pipe: workers hold its end while they last
     with open(told, "w") as said:
-        child = subprocess.Popen(words, cwd=tmp_path, preexec_fn=_heard, stderr=said, stdout=subprocess.DEVNULL)
+        child = subprocess.Popen(
+            words,
+            cwd=tmp_path,
+            preexec_fn=_heard,
+            stderr=said,
+            stdout=subprocess.DEVNULL,
+        )
     while child.poll() is None and not list(tmp_path.glob(".out.part-*")):
         time.sleep(0.05)
     child.send_signal(signal.SIGHUP)
     child.wait()
     told = told.read_text()
-    # where the interrupt meets Python at certain places it ends itself by SIGINT when all is done: 130 to a shell, too
+    # where the interrupt meets Python at certain places it ends itself by SIGINT when
+    # all is done: 130 to a shell, too
     assert child.returncode in (130, -signal.SIGINT), told
     assert "interrupted; the output is as it was before" in told
-    assert {"study.toml"} <= set(os.listdir(tmp_path)) <= {"study.toml", "out.resume"}  # by where it was
+    assert (
+        {"study.toml"} <= set(os.listdir(tmp_path)) <= {"study.toml", "out.resume"}
+    )  # by where it was
 
 
 class _Interrupted:
@@ -84,7 +115,9 @@ def _dropped_and_waiting():
 
 
 def test_an_interrupt_that_python_drops_comes_again(monkeypatch):
-    """It may come inside a callback of an import, or a finaliser; other dropped exceptions go where they went."""
+    """It may come inside a callback of an import, or a finaliser; other dropped
+    exceptions go where they went.
+    """
     others = []
     monkeypatch.setattr(sys, "unraisablehook", others.append)
     before = signal.getsignal(signal.SIGALRM)
@@ -103,7 +136,10 @@ def test_an_interrupt_before_the_work_is_one_line_too(monkeypatch, capsys):
 
     monkeypatch.setattr(cli, "_prepare", interrupted)
     assert main(["info", "absent.h5"]) == cli.INTERRUPTED == 130
-    assert capsys.readouterr().err == "metalens: error: interrupted before the work began\n"
+    assert (
+        capsys.readouterr().err
+        == "metalens: error: interrupted before the work began\n"
+    )
 
 
 WORDS = f"{sys.executable} -m metalens info ."
@@ -120,14 +156,24 @@ def _made(tmp_path):
     [
         (">&-", SUCCESS, ""),
         ("<&- >&- 2>&-", SUCCESS, ""),
-        ("--json >/dev/full", BAD_INPUT, "metalens: error: standard output: No space left on device\n"),
+        (
+            "--json >/dev/full",
+            BAD_INPUT,
+            "metalens: error: standard output: No space left on device\n",
+        ),
         ("| true; exit ${PIPESTATUS[0]}", SUCCESS, ""),
     ],
 )
-def test_a_standard_stream_that_is_closed_full_or_left_is_no_traceback(tmp_path, streams, status, told):
-    """The work goes on where nobody listens; where the words cannot be written that is said."""
+def test_a_standard_stream_that_is_closed_full_or_left_is_no_traceback(
+    tmp_path, streams, status, told
+):
+    """The work goes on where nobody listens; where the words cannot be written that is
+    said.
+    """
     words = ["bash", "-c", f"{WORDS} {streams}"]
-    done = subprocess.run(words, cwd=_made(tmp_path), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=_made(tmp_path), capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (status, told)
 
 
@@ -135,9 +181,14 @@ def test_a_command_in_a_folder_that_was_removed_is_refused(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     words = f"rmdir {gone} && {sys.executable} -m metalens info absent.h5"
-    done = subprocess.run(words, shell=True, cwd=gone, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, shell=True, cwd=gone, capture_output=True, text=True, check=False
+    )
     assert done.returncode == BAD_INPUT
-    assert done.stderr == "metalens: error: the current folder does not exist any more; change to another\n"
+    assert (
+        done.stderr
+        == "metalens: error: the current folder does not exist any more; change to another\n"
+    )
 
 
 def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
@@ -149,7 +200,9 @@ def test_words_that_an_ascii_locale_lacks_are_shown_as_codes(tmp_path):
         "PYTHONIOENCODING": "ascii",
     }
     words = [sys.executable, "-m", "metalens", "info", "größe.h5"]
-    done = subprocess.run(words, cwd=tmp_path, env=ascii_only, capture_output=True, check=False)
+    done = subprocess.run(
+        words, cwd=tmp_path, env=ascii_only, capture_output=True, check=False
+    )
     assert done.returncode == BAD_INPUT
     assert b"Traceback" not in done.stderr
     assert b"no such file" in done.stderr
@@ -168,24 +221,39 @@ def test_info_shows_what_a_folder_holds_and_refuses_a_changed_one(tmp_path, caps
     assert "SHA-256 differs" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "evaluate --help", "info --help"])
+@pytest.mark.parametrize(
+    "words", ["--help", "--version", "evaluate --help", "info --help"]
+)
 def test_help_that_nobody_reads_to_its_end_is_no_error(words):
     line = f"{sys.executable} -m metalens {words} | true; exit ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", line], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (SUCCESS, "")
 
 
-@pytest.mark.parametrize("words", ["info", "export", "psf", "check", "layout", "view", "evaluate optics", "budget"])
-def test_a_pipe_in_place_of_an_artefact_is_refused_not_waited_for(tmp_path, monkeypatch, capsys, words):
+@pytest.mark.parametrize(
+    "words",
+    ["info", "export", "psf", "check", "layout", "view", "evaluate optics", "budget"],
+)
+def test_a_pipe_in_place_of_an_artefact_is_refused_not_waited_for(
+    tmp_path, monkeypatch, capsys, words
+):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe.h5")
-    output = [] if words == "info" else ["-o", {"export": "a.mat", "view": "a.html"}.get(words, "a.h5")]
+    output = (
+        []
+        if words == "info"
+        else ["-o", {"export": "a.mat", "view": "a.html"}.get(words, "a.h5")]
+    )
     assert main([*words.split(), "pipe.h5", *output]) == BAD_INPUT
     assert "pipe.h5: no plain file (a pipe or a device)" in capsys.readouterr().err
     assert os.listdir() == ["pipe.h5"]
 
 
-def test_an_output_that_cannot_be_made_is_named_with_the_cause(tmp_path, monkeypatch, capsys):
+def test_an_output_that_cannot_be_made_is_named_with_the_cause(
+    tmp_path, monkeypatch, capsys
+):
     """Not the lock beside it: its user never heard of that."""
     monkeypatch.chdir(tmp_path)
 

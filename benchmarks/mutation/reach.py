@@ -1,4 +1,6 @@
-"""Which tests run which lines of the library, as seen while they run: a mutant is asked of those tests alone."""
+"""Which tests run which lines of the library, as seen while they run: a mutant is asked
+of those tests alone.
+"""
 
 import ast
 import functools
@@ -20,13 +22,17 @@ import pytest
 PACKAGES = ("metalens", "layout", "characterize", "codesign")
 CALLS = 40  # of one function within one test that are followed line by line
 MODULE = ""  # the name of what stands outside every function
-_LOOPS = re.compile(r"(^|[_.])n?jit\b|^(inside|compiled|overload)\b|vectorize")  # decorators that compile
+_LOOPS = re.compile(
+    r"(^|[_.])n?jit\b|^(inside|compiled|overload)\b|vectorize"
+)  # decorators that compile
 Line = tuple[str, int]
 Seen = dict[str, tuple[float, list[Line]]]  # test -> its seconds, the lines that it ran
 
 
 class Watch:
-    """A pytest plugin: the lines of ``root``'s packages that each test runs, those of its fixtures included."""
+    """A pytest plugin: the lines of ``root``'s packages that each test runs, those of
+    its fixtures included.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = f"{root}/"
@@ -84,15 +90,20 @@ class Watch:
     def written(self, file: Path, failed: set[str]) -> None:
         """What was seen of the tests that passed, for the process that asked."""
         kept = self.tests.keys() - failed
-        seen = {test: [round(self.tests[test], 3), sorted(self.lines[test])] for test in kept}
+        seen = {
+            test: [round(self.tests[test], 3), sorted(self.lines[test])]
+            for test in kept
+        }
         file.write_text(json.dumps(seen), encoding="utf-8")
 
 
 @dataclass
 class Reach:
-    """Tests by function and line of it: a change elsewhere in a module leaves both as they are.
+    """Tests by function and line of it: a change elsewhere in a module leaves both as
+    they are.
 
-    files: digest of every measured test file. seconds: of every test that passed. hits: path -> function -> line of
+    files: digest of every measured test file. seconds: of every test that passed. hits:
+    path -> function -> line of
     that function -> tests.
     """
 
@@ -102,10 +113,16 @@ class Reach:
 
     def add(self, root: Path, file: str, seen: Seen) -> None:
         """What the tests of one file ran, in place of what was known of that file."""
-        for lines in (lines for functions in self.hits.values() for lines in functions.values()):
+        for lines in (
+            lines for functions in self.hits.values() for lines in functions.values()
+        ):
             for at in lines:
-                lines[at] = [test for test in lines[at] if test.partition("::")[0] != file]
-        self.seconds = {t: s for t, s in self.seconds.items() if t.partition("::")[0] != file}
+                lines[at] = [
+                    test for test in lines[at] if test.partition("::")[0] != file
+                ]
+        self.seconds = {
+            t: s for t, s in self.seconds.items() if t.partition("::")[0] != file
+        }
         self.files[file] = digest(root / file)
         for test, (spent, ran) in seen.items():
             self.seconds[test] = spent
@@ -117,16 +134,24 @@ class Reach:
                 lines.setdefault(str(number - first), []).append(test)
 
     def tests(self, root: Path, path: str, number: int, budget_s: float) -> list[str]:
-        """Tests that run line ``number`` of ``path``: of the test file named so first, then the quickest, then others
-        of the same files (what one test keeps, the next may judge); as many as the budget holds, one at least."""
+        """Tests that run line ``number`` of ``path``: of the test file named so first,
+        then the quickest, then others
+        of the same files (what one test keeps, the next may judge); as many as the
+        budget holds, one at least."""
         stem = Path(path).stem
 
         def order(test: str) -> tuple[bool, float]:
-            return re.search(rf"(^|_){stem}(_|$)", Path(test.partition("::")[0]).stem) is None, self.seconds[test]
+            return re.search(
+                rf"(^|_){stem}(_|$)", Path(test.partition("::")[0]).stem
+            ) is None, self.seconds[test]
 
-        direct = {test for test in self._direct(root, path, number) if test in self.seconds}
+        direct = {
+            test for test in self._direct(root, path, number) if test in self.seconds
+        }
         files = {test.partition("::")[0] for test in direct}
-        others = {test for test in self.seconds if test.partition("::")[0] in files} - direct
+        others = {
+            test for test in self.seconds if test.partition("::")[0] in files
+        } - direct
         chosen: list[str] = []
         spent = 0.0
         for test in (*sorted(direct, key=order), *sorted(others, key=order)):
@@ -152,7 +177,9 @@ class Reach:
         lines = functions.get(name, {})
         return set(lines.get(str(number - first), [])) or _all([lines])
 
-    def _lines_of(self, where: Iterable[tuple[str, str]]) -> Iterator[dict[str, list[str]]]:
+    def _lines_of(
+        self, where: Iterable[tuple[str, str]]
+    ) -> Iterator[dict[str, list[str]]]:
         for path, name in where:
             yield self.hits.get(path, {}).get(name, {})
 
@@ -167,7 +194,9 @@ def digest(file: Path) -> str:
 
 
 def home(path: Path, number: int) -> tuple[str, int]:
-    """(name, first line) of the innermost function around a line; ("", 0) outside of all."""
+    """(name, first line) of the innermost function around a line; ("", 0) outside of
+    all.
+    """
     around = [f for f in _functions(path) if f[1] <= number <= f[2]]
     return max(around, key=lambda f: f[1])[:2] if around else (MODULE, 0)
 
@@ -179,13 +208,21 @@ def compiled(path: Path) -> set[str]:
 
 @functools.cache
 def at_import(path: Path) -> set[str]:
-    """Functions that run while their module is read, called by its own lines: a change in memory comes too late."""
+    """Functions that run while their module is read, called by its own lines: a change
+    in memory comes too late.
+    """
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    bodies = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    bodies = {
+        node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)
+    }
     open_ = [node for node in tree.body if not isinstance(node, ast.FunctionDef)]
     found: set[str] = set()
     while open_:
-        names = {node.func.id for node in _called(open_.pop()) if isinstance(node.func, ast.Name)}
+        names = {
+            node.func.id
+            for node in _called(open_.pop())
+            if isinstance(node.func, ast.Name)
+        }
         open_ += [bodies[name] for name in names & bodies.keys() - found]
         found |= names & bodies.keys()
     return found
@@ -201,10 +238,17 @@ def _called(top: ast.AST) -> Iterator[ast.Call]:
 
 @functools.cache
 def callers(root: Path, name: str) -> set[tuple[str, str]]:
-    """(path, function) of the interpreted functions that lead to a compiled one, by their words."""
+    """(path, function) of the interpreted functions that lead to a compiled one, by
+    their words.
+    """
     names, found = {name}, set()
     texts = [
-        (path, f[0], f[3], "\n".join(path.read_text(encoding="utf-8").splitlines()[f[1] - 1 : f[2]]))
+        (
+            path,
+            f[0],
+            f[3],
+            "\n".join(path.read_text(encoding="utf-8").splitlines()[f[1] - 1 : f[2]]),
+        )
         for package in PACKAGES
         for path in sorted((root / package).rglob("*.py"))
         for f in _functions(path)
@@ -212,17 +256,23 @@ def callers(root: Path, name: str) -> set[tuple[str, str]]:
     before = 0
     while len(names) > before:
         before = len(names)
-        pattern = re.compile(rf"\b({'|'.join(sorted(n.rpartition('.')[2] for n in names))})\b")
+        pattern = re.compile(
+            rf"\b({'|'.join(sorted(n.rpartition('.')[2] for n in names))})\b"
+        )
         for path, function, loops, text in texts:
             if pattern.search(text):
                 names |= {function} if loops else set()
-                found |= set() if loops else {(path.relative_to(root).as_posix(), function)}
+                found |= (
+                    set() if loops else {(path.relative_to(root).as_posix(), function)}
+                )
     return found
 
 
 @functools.cache
 def _functions(path: Path) -> list[tuple[str, int, int, bool]]:
-    """(name, first line, last line, compiled) of every function of a module; an overload has its function's name."""
+    """(name, first line, last line, compiled) of every function of a module; an
+    overload has its function's name.
+    """
     found = []
 
     def walk(node: ast.AST, prefix: str) -> None:
@@ -232,8 +282,18 @@ def _functions(path: Path) -> list[tuple[str, int, int, bool]]:
                 inside = f"{prefix}{child.name}."
             if isinstance(child, ast.FunctionDef):
                 words = " ".join(ast.unparse(d) for d in child.decorator_list)
-                loops, other = _LOOPS.search(words) is not None, re.match(r"overload\((\w+)", words)
-                found.append((other[1] if other else inside[:-1], child.lineno, child.end_lineno or 0, loops))
+                loops, other = (
+                    _LOOPS.search(words) is not None,
+                    re.match(r"overload\((\w+)", words),
+                )
+                found.append(
+                    (
+                        other[1] if other else inside[:-1],
+                        child.lineno,
+                        child.end_lineno or 0,
+                        loops,
+                    )
+                )
                 if loops:  # what stands in it is compiled with it
                     continue
             walk(child, inside)

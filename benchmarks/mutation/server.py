@@ -1,4 +1,6 @@
-"""A process that has collected the suite once: each question is answered by a fork of it, so nothing is read again."""
+"""A process that has collected the suite once: each question is answered by a fork of
+it, so nothing is read again.
+"""
 
 import contextlib
 import gc
@@ -22,12 +24,23 @@ import pytest
 
 from benchmarks.mutation.reach import Seen, Watch
 
-QUIET = ("-q", "-m", "not slow and not peers", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no")
+QUIET = (
+    "-q",
+    "-m",
+    "not slow and not peers",
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "no:xdist",
+    "--tb=no",
+)
 UNPATCHED = 71  # exit status: no function in memory holds what was changed
 
 
 class Server:
-    """The suite of ``tree``, or some of it, collected in a child process that waits for questions."""
+    """The suite of ``tree``, or some of it, collected in a child process that waits for
+    questions.
+    """
 
     def __init__(self, tree: Path, tests: Sequence[str] = ("tests",)) -> None:
         self.tree = tree
@@ -42,13 +55,19 @@ class Server:
         theirs.close()
 
     def seen(self, file: str) -> Seen:
-        """Of the tests of one file that pass: their seconds, and the lines that they run."""
+        """Of the tests of one file that pass: their seconds, and the lines that they
+        run.
+        """
         self._pipe.send((None, [file], 600.0))
         found: Seen = self._pipe.recv()
         return found
 
-    def outcome(self, path: str, source: str, tests: list[str], limit_s: float) -> tuple[str, float] | None:
-        """What tests say of ``source`` in ``path``: passed, failed, time; None where no function in memory changes."""
+    def outcome(
+        self, path: str, source: str, tests: list[str], limit_s: float
+    ) -> tuple[str, float] | None:
+        """What tests say of ``source`` in ``path``: passed, failed, time; None where no
+        function in memory changes.
+        """
         self._pipe.send(((str(self.tree / path), source), tests, limit_s))
         answer: tuple[str, float] | None = self._pipe.recv()
         return answer
@@ -60,14 +79,18 @@ class Server:
 
 
 def may_have_children() -> None:
-    """Of a fork of a pool's worker: tests that start processes of their own fail where they are not allowed to."""
+    """Of a fork of a pool's worker: tests that start processes of their own fail where
+    they are not allowed to.
+    """
     multiprocessing.current_process().daemon = False
 
 
 def _serve(tree: Path, pipe: Connection, tests: Sequence[str]) -> None:
     may_have_children()
     os.chdir(tree)
-    null = os.open(os.environ.get("MUTANT_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    null = os.open(
+        os.environ.get("MUTANT_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    )
     os.dup2(null, 1)
     os.dup2(null, 2)
     sys.path[:] = [str(tree), *(p for p in sys.path if p and Path(p).resolve() != tree)]
@@ -102,8 +125,14 @@ class _Loop:
             by_name = {item.nodeid: item for item in session.items}
             items = [by_name[n] for n in wanted if n in by_name]
             files = list(wanted)
-            whole = [item for item in session.items if item.nodeid.partition("::")[0] in wanted]
-            items += sorted(whole, key=lambda item: files.index(item.nodeid.partition("::")[0]))
+            whole = [
+                item
+                for item in session.items
+                if item.nodeid.partition("::")[0] in wanted
+            ]
+            items += sorted(
+                whole, key=lambda item: files.index(item.nodeid.partition("::")[0])
+            )
             if change is None:
                 self.pipe.send(self._seen(items, limit_s))
                 continue
@@ -111,7 +140,9 @@ class _Loop:
                 parts = Path(change[0]).relative_to(Path.cwd()).with_suffix("").parts
                 importlib.import_module(".".join(parts))
                 functions = _functions(functions)
-            self.pipe.send(self._outcome(items, functions.get(change[0], []), change, limit_s))
+            self.pipe.send(
+                self._outcome(items, functions.get(change[0], []), change, limit_s)
+            )
 
     def _seen(self, items: list[pytest.Item], limit_s: float) -> Seen:
         with tempfile.TemporaryDirectory(prefix="seen-") as folder:
@@ -126,12 +157,22 @@ class _Loop:
 
             if items:
                 _forked(watched, limit_s)
-            return dict(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else {}
+            return (
+                dict(json.loads(file.read_text(encoding="utf-8")))
+                if file.exists()
+                else {}
+            )
 
     def _outcome(
-        self, items: list[pytest.Item], functions: list[FunctionType], change: tuple[str, str], limit_s: float
+        self,
+        items: list[pytest.Item],
+        functions: list[FunctionType],
+        change: tuple[str, str],
+        limit_s: float,
     ) -> tuple[str, float] | None:
-        """A test that the plain source fails as well has told nothing: what it would have stopped has survived."""
+        """A test that the plain source fails as well has told nothing: what it would
+        have stopped has survived.
+        """
         with tempfile.TemporaryDirectory(prefix="failed-") as folder:
             told = Path(folder) / "test"
 
@@ -145,14 +186,20 @@ class _Loop:
 
             status, spent = _forked(mutated, limit_s)
             if os.WIFSIGNALED(status):
-                slow = os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGALRM, signal.SIGKILL)
+                slow = os.WTERMSIG(status) in (
+                    signal.SIGXCPU,
+                    signal.SIGALRM,
+                    signal.SIGKILL,
+                )
                 return "time" if slow else "failed", spent
             code = os.WEXITSTATUS(status)
             if code == UNPATCHED:
                 return None
             name = told.read_text(encoding="utf-8") if told.exists() else ""
         telling = [item for item in items if item.nodeid == name]
-        return "failed" if code and telling and self._passes(telling, limit_s) else "passed", spent
+        return "failed" if code and telling and self._passes(
+            telling, limit_s
+        ) else "passed", spent
 
     def _passes(self, items: list[pytest.Item], limit_s: float) -> bool:
         """Whether the source as it is passes tests."""
@@ -174,13 +221,18 @@ def _functions(known: dict[str, list[FunctionType]]) -> dict[str, list[FunctionT
     """Those in memory by the file of their code, of files that are not known."""
     found: defaultdict[str, list[FunctionType]] = defaultdict(list)
     for function in gc.get_objects():
-        if type(function) is FunctionType and function.__code__.co_filename not in known:
+        if (
+            type(function) is FunctionType
+            and function.__code__.co_filename not in known
+        ):
             found[function.__code__.co_filename].append(function)
     return known | dict(found)
 
 
 def _forked(work: Any, limit_s: float) -> tuple[int, float]:
-    """(exit status, seconds) of ``work`` in a fork with its own folder for temporary files."""
+    """(exit status, seconds) of ``work`` in a fork with its own folder for temporary
+    files.
+    """
     start = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         child = os.fork()
@@ -188,7 +240,9 @@ def _forked(work: Any, limit_s: float) -> tuple[int, float]:
             code = 1
             with contextlib.suppress(BaseException):
                 os.environ["PYTEST_DEBUG_TEMPROOT"] = folder
-                resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 6))
+                resource.setrlimit(
+                    resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 6)
+                )
                 signal.alarm(int(8 * limit_s) + 8)
                 code = work()
             os._exit(code)
@@ -197,12 +251,16 @@ def _forked(work: Any, limit_s: float) -> tuple[int, float]:
 
 
 def patched(functions: list[FunctionType], path: str, source: str) -> int:
-    """How many functions in memory, of module ``path``, ``source`` changes; they run the new code from now on.
+    """How many functions in memory, of module ``path``, ``source`` changes; they run
+    the new code from now on.
 
-    What is evaluated once while a module is read (constants, defaults, decorators, compiled loops) is not among them.
+    What is evaluated once while a module is read (constants, defaults, decorators,
+    compiled loops) is not among them.
     """
     new = dict(_outermost(compile(source, path, "exec")))
-    changed = [f for f in functions if new.get(_key(f.__code__), f.__code__) != f.__code__]
+    changed = [
+        f for f in functions if new.get(_key(f.__code__), f.__code__) != f.__code__
+    ]
     for function in changed:
         function.__code__ = new[_key(function.__code__)]
     return len(changed)

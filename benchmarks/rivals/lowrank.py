@@ -1,4 +1,6 @@
-"""Low-rank PSF fields: a stack over depth (and field angle) as a few basis PSFs with weights, and a certified error."""
+"""Low-rank PSF fields: a stack over depth (and field angle) as a few basis PSFs with
+weights, and a certified error.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -35,17 +37,23 @@ class LowRank:
         return flat.reshape(*self.weights.shape[:-1], *self.basis.shape[1:])
 
     def at(self, weights: Any) -> Any:
-        """(…, y, x) PSF for weights (…, r), such as those mixed from two neighbouring depths."""
+        """(…, y, x) PSF for weights (…, r), such as those mixed from two neighbouring
+        depths.
+        """
         flat = weights @ self.basis.reshape(self.rank, -1)
         return flat.reshape(*weights.shape[:-1], *self.basis.shape[1:])
 
 
 def compress(stack: PsfStack, *, tolerance: float = 1e-3) -> LowRank:
-    """The fewest basis PSFs that bring every PSF of the stack within ``tolerance`` (relative L2).
+    """The fewest basis PSFs that bring every PSF of the stack within ``tolerance``
+    (relative L2).
 
-    Singular value decomposition of the PSFs, each scaled to unit norm so that blurred ones count as much as sharp
-    ones. Sums stay right too: the weights reproduce Σ PSF = 1 within tolerance · √pixels / (PSF norm) at worst; the
-    returned errors are measured on the very weights and basis returned. The basis carries no gradient; the weights
+    Singular value decomposition of the PSFs, each scaled to unit norm so that blurred
+    ones count as much as sharp
+    ones. Sums stay right too: the weights reproduce Σ PSF = 1 within tolerance ·
+    √pixels / (PSF norm) at worst; the
+    returned errors are measured on the very weights and basis returned. The basis
+    carries no gradient; the weights
     (and through them ``psf()``) do, as the projection of a differentiable stack.
 
     Raises:

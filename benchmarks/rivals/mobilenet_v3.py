@@ -1,20 +1,36 @@
-"""MobileNetV3 (Howard et al. 2019, Tables 1 and 2) by the rules that count our networks: its count is published."""
+"""MobileNetV3 (Howard et al. 2019, Tables 1 and 2) by the rules that count our
+networks: its count is published.
+"""
 
 from codesign.network.architecture import Block, divisible
 from codesign.network.cost import Cost, backbone
 
 
 def counted(variant: str, *, size: int = 224, classes: int = 1000) -> int:
-    """Multiply-accumulates of the variant small or large for square pictures of ``size`` pixels in three colours."""
+    """Multiply-accumulates of the variant small or large for square pictures of
+    ``size`` pixels in three colours.
+    """
     rows, last, hidden = _MOBILENETS[variant]
     inputs, chain = 16, []
     for kernel, wide, outputs, squeeze, stride in rows:
-        chain.append(Block(kernel, inputs, wide, outputs, stride, divisible(wide / 4) if squeeze else 0, "relu"))
+        chain.append(
+            Block(
+                kernel,
+                inputs,
+                wide,
+                outputs,
+                stride,
+                divisible(wide / 4) if squeeze else 0,
+                "relu",
+            )
+        )
         inputs = outputs
     body = backbone(16, chain, inputs=3)
     end = max(body.per_pixel)
     per_pixel = dict(body.per_pixel) | {end: body.per_pixel[end] + inputs * last}
-    return int(Cost(per_pixel, body.constant + last * hidden + hidden * classes).at(size))
+    return int(
+        Cost(per_pixel, body.constant + last * hidden + hidden * classes).at(size)
+    )
 
 
 # kernel, expanded channels, output channels, squeeze-and-excitation, stride

@@ -1,6 +1,8 @@
-"""A virtual bench: frames of a hidden as-built lens by the sum over every pillar, with the noise of a real sensor.
+"""A virtual bench: frames of a hidden as-built lens by the sum over every pillar, with
+the noise of a real sensor.
 
-Nothing of the fit's reduced model is used: pillars are changed one by one, the field comes from
+Nothing of the fit's reduced model is used: pillars are changed one by one, the field
+comes from
 :func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
 """
 
@@ -11,7 +13,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage, signal
 
-from characterize.model import LIGHT, PLACE, Films, Known, Spectrum, extra_path, incidence_rad, light_maps, made, vector
+from characterize.model import (
+    LIGHT,
+    PLACE,
+    Films,
+    Known,
+    Spectrum,
+    extra_path,
+    incidence_rad,
+    light_maps,
+    made,
+    vector,
+)
 from metalens import psf
 from metalens.ground import executor
 from metalens.ground.arrays import Array
@@ -22,15 +35,20 @@ from metalens.made import Sensitivity
 FINE = 9
 _SPECTRUM = 1e-5  # of a mean over it: a fiftieth of what the fit allows itself
 _MARGIN = 4  # pixels about the window that blur may reach in from
-_TOGETHER = 1_000_000  # fine samples of the frames that are computed together, by one worker
+_TOGETHER = (
+    1_000_000  # fine samples of the frames that are computed together, by one worker
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Sensor of the virtual bench; read noise in electrons, gain in electrons a count, offset in counts.
+    """Sensor of the virtual bench; read noise in electrons, gain in electrons a count,
+    offset in counts.
 
-    pixel_um: pitch of the pixels. pixels: along a side of a frame. bits: of the converter. gain_e: electrons a count.
-    read_noise_e: electrons, root-mean-square. offset: counts without light. hot_share: share of hot pixels.
+    pixel_um: pitch of the pixels. pixels: along a side of a frame. bits: of the
+    converter. gain_e: electrons a count.
+    read_noise_e: electrons, root-mean-square. offset: counts without light. hot_share:
+    share of hot pixels.
     """
 
     pixel_um: float = 3.0
@@ -43,25 +61,40 @@ class Camera:
 
     def __post_init__(self) -> None:
         top = 2 ** min(max(self.bits, 1), 16) - 2
-        for name, least, most in (("pixels", 4, 4096), ("bits", 1, 16), ("offset", 0, top)):
+        for name, least, most in (
+            ("pixels", 4, 4096),
+            ("bits", 1, 16),
+            ("offset", 0, top),
+        ):
             if not least <= getattr(self, name) <= most:
-                raise FitError(f"camera.{name} = {getattr(self, name)}: need {least} to {most}")
+                raise FitError(
+                    f"camera.{name} = {getattr(self, name)}: need {least} to {most}"
+                )
         for name in ("pixel_um", "gain_e"):
             if not 0 < getattr(self, name) < math.inf:
-                raise FitError(f"camera.{name} = {getattr(self, name)}: need a number above 0")
+                raise FitError(
+                    f"camera.{name} = {getattr(self, name)}: need a number above 0"
+                )
         if not 0 <= self.read_noise_e < math.inf:
-            raise FitError(f"camera.read_noise_e = {self.read_noise_e}: need 0 or more electrons")
+            raise FitError(
+                f"camera.read_noise_e = {self.read_noise_e}: need 0 or more electrons"
+            )
         if not 0 <= self.hot_share < 1:
-            raise FitError(f"camera.hot_share = {self.hot_share}: need a share of the pixels, 0 to below 1")
+            raise FitError(
+                f"camera.hot_share = {self.hot_share}: need a share of the pixels, 0 to below 1"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
     """A hidden as-built lens and its captures; TOML of ``metalens capture``.
 
-    depths_um: stated source depths of the frames. angles_deg: field angles along x, each taken at every depth.
-    peak_e: electrons in the brightest pixel. parameter: true values by name, as of ``characterize.model.parameters``.
-    diameter_noise_nm: of every pillar by itself. dark_frames, flat_frames: how many to take.
+    depths_um: stated source depths of the frames. angles_deg: field angles along x,
+    each taken at every depth.
+    peak_e: electrons in the brightest pixel. parameter: true values by name, as of
+    ``characterize.model.parameters``.
+    diameter_noise_nm: of every pillar by itself. dark_frames, flat_frames: how many to
+    take.
     camera: of the bench. seed: of noise and of what is drawn.
     """
 
@@ -77,7 +110,9 @@ class Truth:
 
     def __post_init__(self) -> None:
         if not self.depths_um or min(self.depths_um) <= 0 or not self.peak_e > 0:
-            raise FitError("need depths_um with at least one source depth above 0, and peak_e above 0")
+            raise FitError(
+                "need depths_um with at least one source depth above 0, and peak_e above 0"
+            )
 
     def vector(self) -> Array:
         """True parameters; log_gain is set by ``peak_e``."""
@@ -92,7 +127,9 @@ class Truth:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Shots:
-    """What the bench hands over: frames, dark, flat (counts), and the noise-free electrons that the fit never sees."""
+    """What the bench hands over: frames, dark, flat (counts), and the noise-free
+    electrons that the fit never sees.
+    """
 
     frames: Array
     dark: Array
@@ -109,57 +146,97 @@ def shoot(lens: Lens, truth: Truth, response: Sensitivity) -> Shots:
     hot = random.random(electrons.shape[1:]) < camera.hot_share
     frames = np.stack([_read(frame, camera, random, hot) for frame in electrons])
     nothing = np.zeros(electrons.shape[1:])
-    half = np.full(electrons.shape[1:], 0.5 * (2**camera.bits - camera.offset) * camera.gain_e)
-    dark = np.stack([_read(nothing, camera, random, hot) for _ in range(max(truth.dark_frames, 1))])
-    flat = np.stack([_read(half, camera, random, hot) for _ in range(max(truth.flat_frames, 2))])
+    half = np.full(
+        electrons.shape[1:], 0.5 * (2**camera.bits - camera.offset) * camera.gain_e
+    )
+    dark = np.stack(
+        [_read(nothing, camera, random, hot) for _ in range(max(truth.dark_frames, 1))]
+    )
+    flat = np.stack(
+        [_read(half, camera, random, hot) for _ in range(max(truth.flat_frames, 2))]
+    )
     return Shots(frames, dark, flat, electrons)
 
 
 def irradiance(lens: Lens, truth: Truth, response: Sensitivity) -> Array:
-    """(n, y, x) noise-free light in the pixels, in units of its own; background left out."""
+    """(n, y, x) noise-free light in the pixels, in units of its own; background left
+    out.
+    """
     x = truth.vector()
     stated, angles = truth.stated
     middle = float(stated.mean())
-    depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - middle)
+    depth = (
+        stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - middle)
+    )
     if depth.min() <= 0:
-        raise FitError(f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens")
+        raise FitError(
+            f"true source depth {depth.min():.0f} um: stage_zero_um puts the source behind the lens"
+        )
     tasks = []
     line = Spectrum.of(lens, depth, angles, tolerance=_SPECTRUM)
     for offset_nm, weight in line.colours(x[PLACE["bandwidth_nm"]]):
         colour = x.copy()
         colour[PLACE["wavelength_nm"]] += offset_nm
         tasks += [
-            _Task(colour, weight, way, index, depth[index]) for way, index in _alike(lens, truth, colour, depth, angles)
+            _Task(colour, weight, way, index, depth[index])
+            for way, index in _alike(lens, truth, colour, depth, angles)
         ]
     frames = np.zeros((len(depth), truth.camera.pixels, truth.camera.pixels))
     seen = executor.gather(_shown, _Made(lens, truth, response), tasks, beside=False)
     for task, light in zip(tasks, seen, strict=True):
         frames[task.index] += task.weight * light
-    return np.asarray(frames / Films.of(lens.layers, lens.wavelength_um).apparent_um(depth[:, None, None]) ** 2)
+    return np.asarray(
+        frames
+        / Films.of(lens.layers, lens.wavelength_um).apparent_um(depth[:, None, None])
+        ** 2
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Way:
-    """How light comes in and where the window lies: tangents (x, y) of the source, window off its chief ray, um."""
+    """How light comes in and where the window lies: tangents (x, y) of the source,
+    window off its chief ray, um.
+    """
 
     source: tuple[float, float]
     shift_um: tuple[float, float]
     incidence_rad: float
 
 
-def _alike(lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Array) -> Iterator[tuple[_Way, list[int]]]:
-    """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold; through glass one by one."""
-    distance, films = lens.sensor_distance_um + x[PLACE["distance_um"]], Films.of(lens.layers, lens.wavelength_um)
+def _alike(
+    lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Array
+) -> Iterator[tuple[_Way, list[int]]]:
+    """Frames whose light comes the same way, as many as ``_TOGETHER`` samples hold;
+    through glass one by one.
+    """
+    distance, films = (
+        lens.sensor_distance_um + x[PLACE["distance_um"]],
+        Films.of(lens.layers, lens.wavelength_um),
+    )
     ways: dict[_Way, list[int]] = {}
-    for i, (z, angle) in enumerate(zip(depth_um.tolist(), angles_rad.tolist(), strict=True)):
+    for i, (z, angle) in enumerate(
+        zip(depth_um.tolist(), angles_rad.tolist(), strict=True)
+    ):
         chief = [
-            math.tan(a) + math.tan(math.radians(x[PLACE[f"tilt_{n}_deg"]])) for a, n in zip(angle, "xy", strict=True)
+            math.tan(a) + math.tan(math.radians(x[PLACE[f"tilt_{n}_deg"]]))
+            for a, n in zip(angle, "xy", strict=True)
         ]
-        source = [c - x[PLACE[f"source_{a}_um"]] / films.apparent_um(z) for c, a in zip(chief, "xy", strict=True)]
-        ends = zip(*(films.chief_um(distance, (one[0], one[1])) for one in (chief, source)), strict=True)
-        shift = [c - s + x[PLACE[f"decentre_{a}_um"]] for (c, s), a in zip(ends, "xy", strict=True)]
+        source = [
+            c - x[PLACE[f"source_{a}_um"]] / films.apparent_um(z)
+            for c, a in zip(chief, "xy", strict=True)
+        ]
+        ends = zip(
+            *(films.chief_um(distance, (one[0], one[1])) for one in (chief, source)),
+            strict=True,
+        )
+        shift = [
+            c - s + x[PLACE[f"decentre_{a}_um"]]
+            for (c, s), a in zip(ends, "xy", strict=True)
+        ]
         incidence = incidence_rad(lens.proxy, [math.atan(s) for s in source])
-        ways.setdefault(_Way((source[0], source[1]), (shift[0], shift[1]), incidence), []).append(i)
+        ways.setdefault(
+            _Way((source[0], source[1]), (shift[0], shift[1]), incidence), []
+        ).append(i)
     fine = ((truth.camera.pixels + 2 * _MARGIN) * FINE) ** 2
     most = 1 if x[PLACE["glass_um"]] else max(1, _TOGETHER // fine)
     for way, index in ways.items():
@@ -169,7 +246,9 @@ def _alike(lens: Lens, truth: Truth, x: Array, depth_um: Array, angles_rad: Arra
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Task:
-    """Frames of one colour, (parameters, weight in the spectrum), whose light comes the same way; their (n,) depths."""
+    """Frames of one colour, (parameters, weight in the spectrum), whose light comes the
+    same way; their (n,) depths.
+    """
 
     x: Array
     weight: float
@@ -180,9 +259,11 @@ class _Task:
 
 @dataclass(eq=False, slots=True)
 class _Made:
-    """The hidden lens; light of its pillars for the colour and incidence that were asked for last is kept.
+    """The hidden lens; light of its pillars for the colour and incidence that were
+    asked for last is kept.
 
-    noise_um: (y, x) errors of the diameters, drawn by whoever needs them first: a seed travels lighter than a map.
+    noise_um: (y, x) errors of the diameters, drawn by whoever needs them first: a seed
+    travels lighter than a map.
     """
 
     lens: Lens
@@ -198,8 +279,16 @@ class _Made:
             if self.noise_um is None:
                 random = np.random.default_rng(self.truth.seed + 1)
                 noise = random.standard_normal(self.lens.diameters.diameter_um.shape)
-                self.noise_um = np.asarray(noise) * (self.truth.diameter_noise_nm * 1e-3)
-            t = made.pillars(self.lens, self.response, x, noise_um=self.noise_um, angle_rad=incidence_rad)
+                self.noise_um = np.asarray(noise) * (
+                    self.truth.diameter_noise_nm * 1e-3
+                )
+            t = made.pillars(
+                self.lens,
+                self.response,
+                x,
+                noise_um=self.noise_um,
+                angle_rad=incidence_rad,
+            )
             self.kept = key, t
         return self.kept[1]
 
@@ -210,7 +299,9 @@ def _shown(hidden: _Made, task: _Task) -> Array:
     return _frames(hidden.lens, hidden.truth, task.x, t, task.way, task.depth_um)
 
 
-def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: Array) -> Array:
+def _frames(
+    lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: Array
+) -> Array:
     """(n, y, x) frames at one wavelength: every pillar, then blur, then pixels."""
     camera, distance = truth.camera, lens.sensor_distance_um + x[PLACE["distance_um"]]
     wavelength_um = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
@@ -218,14 +309,20 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
     uneven = x[[PLACE[name] for name in LIGHT]]
     if uneven.any():
         radius = lens.diameters.radius_um
-        t = t * np.exp(np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2)
+        t = t * np.exp(
+            np.tensordot(uneven, light_maps(across / radius, down / radius), 1) / 2
+        )
     films = Films.of(lens.layers, wavelength_um)
     near, far = films.reduced_um(distance), films.apparent_um(depth_um)
     if x[PLACE["glass_um"]]:
-        path = extra_path(across, down, tangents=way.source, depth_um=float(far[0]), values=x)
+        path = extra_path(
+            across, down, tangents=way.source, depth_um=float(far[0]), values=x
+        )
         t = t * np.exp(2j * math.pi / wavelength_um * path)
     side = camera.pixels + 2 * _MARGIN
-    middle = 0.0 if camera.pixels % 2 else -camera.pixel_um / 2  # the chief ray meets pixel (n // 2, n // 2)
+    middle = (
+        0.0 if camera.pixels % 2 else -camera.pixel_um / 2
+    )  # the chief ray meets pixel (n // 2, n // 2)
     stack = psf.psf_stack(
         np.angle(t),
         np.abs(t),
@@ -243,19 +340,29 @@ def _frames(lens: Lens, truth: Truth, x: Array, t: Array, way: _Way, depth_um: A
     step, out = camera.pixel_um / FINE, []
     for light, energy, z in zip(stack.intensity, stack.energy_um2, far, strict=True):
         disc_px = x[PLACE["pinhole_um"]] * near / z / step
-        light = _cell_means(_blur(light * energy, disc_px, x[PLACE["crosstalk_px"]] * FINE))
-        out.append(light.reshape(side, FINE, side, FINE).sum((1, 3))[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
+        light = _cell_means(
+            _blur(light * energy, disc_px, x[PLACE["crosstalk_px"]] * FINE)
+        )
+        out.append(
+            light.reshape(side, FINE, side, FINE).sum((1, 3))[
+                _MARGIN:-_MARGIN, _MARGIN:-_MARGIN
+            ]
+        )
     return np.stack(out)
 
 
 def _cell_means(light: Array) -> Array:
-    """Means over fine cells from samples at their middles, f + h² f'' / 24 along each axis; the rest is of order h⁴.
+    """Means over fine cells from samples at their middles, f + h² f'' / 24 along each
+    axis; the rest is of order h⁴.
 
-    Sums of the samples themselves would make light of f cycles/um too strong by (pi f h)² / 6 in a pixel: 0.3 % of the
+    Sums of the samples themselves would make light of f cycles/um too strong by (pi f
+    h)² / 6 in a pixel: 0.3 % of the
     peak for a lens of NA 0.24 on 3 um pixels.
     """
     for axis in (-2, -1):
-        light = ndimage.convolve1d(light, np.array([1, 22, 1]) / 24, axis=axis, mode="nearest")
+        light = ndimage.convolve1d(
+            light, np.array([1, 22, 1]) / 24, axis=axis, mode="nearest"
+        )
     return light
 
 
@@ -266,7 +373,9 @@ def _blur(light: Array, disc_px: float, gauss_px: float) -> Array:
         inside = (fine[:, None] ** 2 + fine**2 <= disc_px**2 / 4).astype(float)
         kernel = inside.reshape(2 * reach + 1, 8, 2 * reach + 1, 8).sum((1, 3))
         light = signal.fftconvolve(light, kernel / kernel.sum(), mode="same")
-    return np.asarray(ndimage.gaussian_filter(light, gauss_px, truncate=6) if gauss_px > 0 else light)
+    return np.asarray(
+        ndimage.gaussian_filter(light, gauss_px, truncate=6) if gauss_px > 0 else light
+    )
 
 
 def background(truth: Truth) -> Array:
@@ -274,13 +383,21 @@ def background(truth: Truth) -> Array:
     x, camera = truth.vector(), truth.camera
     n = camera.pixels
     edge = (np.arange(n) - n // 2) / (n / 2)
-    plane = x[PLACE["background_e"]] + x[PLACE["background_x_e"]] * edge + x[PLACE["background_y_e"]] * edge[:, None]
+    plane = (
+        x[PLACE["background_e"]]
+        + x[PLACE["background_x_e"]] * edge
+        + x[PLACE["background_y_e"]] * edge[:, None]
+    )
     return np.asarray(np.maximum(plane, 0))
 
 
-def _read(electrons: Array, camera: Camera, random: np.random.Generator, hot: Array) -> Array:
+def _read(
+    electrons: Array, camera: Camera, random: np.random.Generator, hot: Array
+) -> Array:
     """Counts of one read-out: photon noise, read noise, offset, quantisation, clipping."""
     top = 2**camera.bits - 1
-    seen = random.poisson(np.maximum(electrons, 0)) + random.normal(0, camera.read_noise_e, electrons.shape)
+    seen = random.poisson(np.maximum(electrons, 0)) + random.normal(
+        0, camera.read_noise_e, electrons.shape
+    )
     counts = np.clip(np.round(seen / camera.gain_e + camera.offset), 0, top)
     return np.asarray(np.where(hot, 0.97 * top, counts).astype(np.uint16))

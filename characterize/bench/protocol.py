@@ -1,8 +1,12 @@
-"""Which frames to take: source depths, field angles and exposures that tell most about the lens (optimal design).
+"""Which frames to take: source depths, field angles and exposures that tell most about
+the lens (optimal design).
 
-Every candidate frame has a Fisher information J^T W J at the nominal lens; that of a set of frames is the sum, on
-top of what metrology says. Frames are picked greedily for the largest determinant (D) or the least trace of the
-covariance in typical units (A), then exchanged one by one as long as that helps (Fedorov 1972).
+Every candidate frame has a Fisher information J^T W J at the nominal lens; that of a
+set of frames is the sum, on
+top of what metrology says. Frames are picked greedily for the largest determinant (D)
+or the least trace of the
+covariance in typical units (A), then exchanged one by one as long as that helps
+(Fedorov 1972).
 """
 
 import math
@@ -13,22 +17,38 @@ from typing import Literal
 import numpy as np
 
 from characterize.inference import Data, Task, Unstated, invert, missing, posterior
-from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, Setting, unfitted, usual, vector
+from characterize.model import (
+    NAMES,
+    PARAMETERS,
+    PLACE,
+    ForwardModel,
+    Known,
+    Setting,
+    unfitted,
+    usual,
+    vector,
+)
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
 from metalens.made import Sensitivity
 
 REACH = posterior.REACH
-_LEAST_PLACES = 4  # depths and angles, from which on a fit is tested on frames left out; one frame is refused
-_DEFOCUS_WAVES = 0.5  # at the rim: below, images are those of the focus, in which even errors act in second order
+# depths and angles, from which on a fit is tested on frames left out; one frame is
+# refused
+_LEAST_PLACES = 4
+# at the rim: below, images are those of the focus, in which even errors act in second
+# order
+_DEFOCUS_WAVES = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """An interval that the session is to give: half of the 95 % interval of a parameter, in its unit.
+    """An interval that the session is to give: half of the 95 % interval of a
+    parameter, in its unit.
 
-    name: of the parameter. within: half of its 95 % interval, with what the session cannot tell.
+    name: of the parameter. within: half of its 95 % interval, with what the session
+    cannot tell.
     """
 
     name: str
@@ -36,22 +56,30 @@ class Wanted:
 
     def __post_init__(self) -> None:
         if self.name not in PLACE:
-            raise FitError(f"wanted {self.name!r}: no such parameter{nearest(self.name, NAMES)}")
+            raise FitError(
+                f"wanted {self.name!r}: no such parameter{nearest(self.name, NAMES)}"
+            )
         if not (self.within > 0 and math.isfinite(self.within)):
-            raise FitError(f"wanted {self.name}: within = {self.within}; need a finite number above 0")
+            raise FitError(
+                f"wanted {self.name}: within = {self.within}; need a finite number above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
     """What the bench can do; TOML of ``metalens capture --protocol``.
 
-    depths_um: (nearest, farthest) source depth; depth_count: candidates between them, even in 1/z.
+    depths_um: (nearest, farthest) source depth; depth_count: candidates between them,
+    even in 1/z.
     angles_deg: field angles along x. exposures: relative exposure times.
     frames: how many may be taken. criterion: D (determinant) or A (mean variance).
-    peak_e: electrons in the brightest pixel of all candidates at exposure 1. full_well_e, read_noise_e: of the sensor.
+    peak_e: electrons in the brightest pixel of all candidates at exposure 1.
+    full_well_e, read_noise_e: of the sensor.
     pixel_um, pixels: of the sensor and of the window about the image.
-    free, known: as in the metrology of ``metalens fit``; what ``capture.toml`` will state, with sigma = 0, too.
-    wanted: intervals (name, within): no more frames are taken than they need (of four depths and angles at least), and
+    free, known: as in the metrology of ``metalens fit``; what ``capture.toml`` will
+    state, with sigma = 0, too.
+    wanted: intervals (name, within): no more frames are taken than they need (of four
+    depths and angles at least), and
     what falls short is said.
     """
 
@@ -77,17 +105,27 @@ class Protocol:
                 f"depths_um {self.depths_um}, depth_count {self.depth_count}, frames {self.frames}: need "
                 "0 < nearest < farthest, two depths or more and one frame or more"
             )
-        if not (self.angles_deg and self.exposures and min(self.exposures) > 0 and min(self.peak_e, self.pixel_um) > 0):
-            raise FitError("need at least one of angles_deg and exposures; exposures, peak_e and pixel_um above 0")
+        if not (
+            self.angles_deg
+            and self.exposures
+            and min(self.exposures) > 0
+            and min(self.peak_e, self.pixel_um) > 0
+        ):
+            raise FitError(
+                "need at least one of angles_deg and exposures; exposures, peak_e and pixel_um above 0"
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Plan:
     """Frames to take, in the order of what each adds.
 
-    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,) expected standard errors with them,
-    within the model. untold: (p,) standard deviation of what causes that nobody states may add.
-    even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and the first angle.
+    depth_um, angle_deg, exposure: (n,) of the chosen frames. names, sigma: (p,)
+    expected standard errors with them,
+    within the model. untold: (p,) standard deviation of what causes that nobody states
+    may add.
+    even_sigma: (p,) with as many frames evenly spread over the depths at exposure 1 and
+    the first angle.
     gain: (n,) criterion after each frame, relative to the last (1 at the end).
     warnings: what these frames will not tell, in words.
     """
@@ -106,7 +144,8 @@ class Plan:
 def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     """The best frames for a lens and what they will tell.
 
-    Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change the weights in second order.
+    Accuracy: of the Fisher matrix at the nominal lens; errors of the real one change
+    the weights in second order.
 
     Raises:
         FitError: as :class:`ForwardModel`.
@@ -114,12 +153,26 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
     names, prior = _parameters(lens, protocol)
     candidates, information = candidate_information(lens, protocol, response, names)
     place = np.unique(candidates[:, :2], axis=0, return_inverse=True)[1].ravel()
-    chosen = choose(information, prior, protocol.frames, criterion=protocol.criterion, names=names, place=place)
+    chosen = choose(
+        information,
+        prior,
+        protocol.frames,
+        criterion=protocol.criterion,
+        names=names,
+        place=place,
+    )
     unstated = _unstated(lens, protocol, response, candidates[chosen])
     wanted = _left(names, unstated.sigma, protocol.wanted)
-    chosen = chosen[: _needed(information, prior, chosen, names, wanted, least=_least(candidates[chosen]))]
+    chosen = chosen[
+        : _needed(
+            information, prior, chosen, names, wanted, least=_least(candidates[chosen])
+        )
+    ]
     even = _even(candidates, protocol, len(chosen))
-    values = [score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names) for i in range(len(chosen))]
+    values = [
+        score(prior + information[chosen[: i + 1]].sum(0), protocol.criterion, names)
+        for i in range(len(chosen))
+    ]
     covariances = [invert(prior + information[pick].sum(0)) for pick in (chosen, even)]
     sigma, even_sigma = (np.sqrt(np.diag(c)) for c in covariances)
     depth, angle, exposure = candidates[chosen].T
@@ -129,15 +182,28 @@ def plan(lens: Lens, protocol: Protocol, response: Sensitivity) -> Plan:
         *_blind(lens, protocol, depth),
     )
     gain = np.array(values) / values[-1]
-    return Plan(depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, words)
+    return Plan(
+        depth, angle, exposure, names, sigma, even_sigma, unstated.sigma, gain, words
+    )
 
 
-def _unstated(lens: Lens, protocol: Protocol, response: Sensitivity, frames: Array) -> Unstated:
-    """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as asked for, will reckon with."""
+def _unstated(
+    lens: Lens, protocol: Protocol, response: Sensitivity, frames: Array
+) -> Unstated:
+    """What a fit of (n, 3) frames (depth, angle in degrees, exposure), as bright as
+    asked for, will reckon with.
+    """
     known = {k.name: k for k in protocol.known}
     sizes = unfitted(known, lens)
     angles = np.stack([np.radians(frames[:, 1]), np.zeros(len(frames))], 1)
-    setting = Setting(frames[:, 0], angles, frames[:, 2], protocol.pixel_um, protocol.pixels, protocol.pixels)
+    setting = Setting(
+        frames[:, 0],
+        angles,
+        frames[:, 2],
+        protocol.pixel_um,
+        protocol.pixels,
+        protocol.pixels,
+    )
     model = ForwardModel(lens, setting, response)
     x = vector({name: k.value for name, k in known.items()})
     brightest = (model.images(x)[0] / frames[:, 2, None, None]).max()
@@ -145,30 +211,53 @@ def _unstated(lens: Lens, protocol: Protocol, response: Sensitivity, frames: Arr
     image = model.images(x)[0]
     full, ones = image >= protocol.full_well_e, np.ones_like(image)
     data = Data(image, ones > 0, full, ones * protocol.read_noise_e**2, ones)
-    free = tuple(name for name in protocol.free if name not in known or known[name].sigma > 0)
+    free = tuple(
+        name for name in protocol.free if name not in known or known[name].sigma > 0
+    )
     return missing.expected(Task(model, data, x, known, None, free, sizes))
 
 
-def _left(names: tuple[str, ...], untold: Array, wanted: Sequence[Wanted]) -> list[Wanted]:
-    """What the model's own errors may take of the wanted intervals; all where what cannot be told takes more."""
+def _left(
+    names: tuple[str, ...], untold: Array, wanted: Sequence[Wanted]
+) -> list[Wanted]:
+    """What the model's own errors may take of the wanted intervals; all where what
+    cannot be told takes more.
+    """
     left = []
     for one in wanted:
-        beside = REACH * float(untold[names.index(one.name)]) if one.name in names else 0.0
+        beside = (
+            REACH * float(untold[names.index(one.name)]) if one.name in names else 0.0
+        )
         rest = one.within**2 - beside**2
         left.append(Wanted(one.name, math.sqrt(rest)) if rest > 0 else one)
     return left
 
 
 def _least(frames: Array) -> int:
-    """How many of (n, 3) frames, in their order, lie at ``_LEAST_PLACES`` depths and angles; all where none do."""
-    places = [len({tuple(place) for place in frames[: n + 1, :2].tolist()}) for n in range(len(frames))]
-    return next((n + 1 for n, count in enumerate(places) if count >= _LEAST_PLACES), len(frames))
+    """How many of (n, 3) frames, in their order, lie at ``_LEAST_PLACES`` depths and
+    angles; all where none do.
+    """
+    places = [
+        len({tuple(place) for place in frames[: n + 1, :2].tolist()})
+        for n in range(len(frames))
+    ]
+    return next(
+        (n + 1 for n, count in enumerate(places) if count >= _LEAST_PLACES), len(frames)
+    )
 
 
 def _needed(
-    information: Array, prior: Array, chosen: list[int], names: tuple[str, ...], wanted: Sequence[Wanted], *, least: int
+    information: Array,
+    prior: Array,
+    chosen: list[int],
+    names: tuple[str, ...],
+    wanted: Sequence[Wanted],
+    *,
+    least: int,
 ) -> int:
-    """How many of the chosen frames, in their order, give all intervals that are wanted; all of them where none do."""
+    """How many of the chosen frames, in their order, give all intervals that are
+    wanted; all of them where none do.
+    """
     places = [(names.index(w.name), w.within) for w in wanted if w.name in names]
     if not places:
         return len(chosen)
@@ -179,18 +268,30 @@ def _needed(
     return len(chosen)
 
 
-def _short(names: tuple[str, ...], sigma: Array, unstated: Unstated, wanted: Sequence[Wanted], count: int) -> list[str]:
-    """Intervals that are wanted and not reached, with the light that they would take, or what must be stated."""
+def _short(
+    names: tuple[str, ...],
+    sigma: Array,
+    unstated: Unstated,
+    wanted: Sequence[Wanted],
+    count: int,
+) -> list[str]:
+    """Intervals that are wanted and not reached, with the light that they would take,
+    or what must be stated.
+    """
     words = []
     for one in wanted:
         if one.name not in names:
-            words.append(f"{one.name} is held, not fitted: no frame changes its interval")
+            words.append(
+                f"{one.name} is held, not fitted: no frame changes its interval"
+            )
             continue
         i = names.index(one.name)
         own, untold = REACH * float(sigma[i]), REACH * float(unstated.sigma[i])
         told = f"{one.name} will be known to +- {math.hypot(own, untold):.2g}, wanted +- {one.within:.2g}"
         if untold >= one.within:
-            most = [unstated.causes[k] for k in np.argsort(-unstated.by_cause[:, i])[:3]]
+            most = [
+                unstated.causes[k] for k in np.argsort(-unstated.by_cause[:, i])[:3]
+            ]
             words.append(
                 f"{told}: within the model it is +- {own:.2g}, more frames do not help; state what else there is or is "
                 f"not, first of all {', '.join(most)} (capture.toml, [[known]])"
@@ -205,7 +306,9 @@ def _short(names: tuple[str, ...], sigma: Array, unstated: Unstated, wanted: Seq
 
 
 def _few(frames: Array) -> list[str]:
-    """That (n, 3) frames lie at too few depths and angles for a fit to test itself, or for one at all."""
+    """That (n, 3) frames lie at too few depths and angles for a fit to test itself, or
+    for one at all.
+    """
     places = len({tuple(place) for place in frames[:, :2].tolist()})
     if places >= _LEAST_PLACES:
         return []
@@ -217,12 +320,19 @@ def _few(frames: Array) -> list[str]:
 
 
 def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
-    """Ranges of depth whose images hide what is to be found: all in focus, or on one side of it."""
+    """Ranges of depth whose images hide what is to be found: all in focus, or on one
+    side of it.
+    """
     focus = lens.source_distance_um
     if not (math.isfinite(focus) and focus > 0):
         return []
     ends = np.array([*protocol.depths_um, chosen_um.min(), chosen_um.max()])
-    waves = lens.diameters.radius_um**2 / 2 * np.abs(1 / ends - 1 / focus) / lens.wavelength_um
+    waves = (
+        lens.diameters.radius_um**2
+        / 2
+        * np.abs(1 / ends - 1 / focus)
+        / lens.wavelength_um
+    )
     words = []
     if waves.max() < _DEFOCUS_WAVES:
         words.append(
@@ -241,12 +351,21 @@ def _blind(lens: Lens, protocol: Protocol, chosen_um: Array) -> list[str]:
 def candidate_information(
     lens: Lens, protocol: Protocol, response: Sensitivity, names: tuple[str, ...]
 ) -> tuple[Array, Array]:
-    """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every candidate frame."""
+    """((c, 3) depth, angle in degrees, exposure; (c, p, p) Fisher information) of every
+    candidate frame.
+    """
     near, far = protocol.depths_um
     depths = 1 / np.linspace(1 / near, 1 / far, protocol.depth_count)
     pairs = np.array([(z, a) for a in protocol.angles_deg for z in depths])
     angles = np.stack([np.radians(pairs[:, 1]), np.zeros(len(pairs))], 1)
-    setting = Setting(pairs[:, 0], angles, np.ones(len(pairs)), protocol.pixel_um, protocol.pixels, protocol.pixels)
+    setting = Setting(
+        pairs[:, 0],
+        angles,
+        np.ones(len(pairs)),
+        protocol.pixel_um,
+        protocol.pixels,
+        protocol.pixels,
+    )
     model = ForwardModel(lens, setting, response)
     x = vector({k.name: k.value for k in protocol.known if k.name in PLACE})
     x[PLACE["log_gain"]] = math.log(protocol.peak_e / model.images(x)[0].max())
@@ -256,19 +375,34 @@ def candidate_information(
     rows, information = [], []
     for exposure in protocol.exposures:
         light = np.maximum(images * exposure, 0)
-        weight = (light < protocol.full_well_e) / (light + protocol.read_noise_e**2) * exposure**2
-        information.append(np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True))
+        weight = (
+            (light < protocol.full_well_e)
+            / (light + protocol.read_noise_e**2)
+            * exposure**2
+        )
+        information.append(
+            np.einsum("inyx,nyx,jnyx->nij", slopes, weight, slopes, optimize=True)
+        )
         rows.append(np.column_stack([pairs, np.full(len(pairs), exposure)]))
     return np.concatenate(rows), np.concatenate(information)
 
 
 def choose(
-    information: Array, prior: Array, count: int, *, criterion: str, names: tuple[str, ...], place: Array | None = None
+    information: Array,
+    prior: Array,
+    count: int,
+    *,
+    criterion: str,
+    names: tuple[str, ...],
+    place: Array | None = None,
 ) -> list[int]:
-    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as long as they help.
+    """Indices of ``count`` candidates (any may come again): greedy, then exchanges as
+    long as they help.
 
-    place: (c,) equal for candidates of one depth and angle; ``_LEAST_PLACES`` of them are kept, where there are so
-    many. An optimum has hardly more places than its model needs, and nothing to test that model with.
+    place: (c,) equal for candidates of one depth and angle; ``_LEAST_PLACES`` of them
+    are kept, where there are so
+    many. An optimum has hardly more places than its model needs, and nothing to test
+    that model with.
     """
     chosen: list[int] = []
     total = prior.copy()
@@ -277,7 +411,9 @@ def choose(
 
     def best(base: Array, others: list[int]) -> int:
         taken = np.unique(where[others])
-        new = ~np.isin(where, taken) if len(taken) < least else np.ones(len(where), bool)
+        new = (
+            ~np.isin(where, taken) if len(taken) < least else np.ones(len(where), bool)
+        )
         return int(
             np.argmax(
                 [
@@ -302,22 +438,40 @@ def choose(
 
 
 def score(information: Array, criterion: str, names: tuple[str, ...]) -> float:
-    """What is to be large: det^(1/p) in typical units (D), or p over the sum of variances in typical units (A)."""
+    """What is to be large: det^(1/p) in typical units (D), or p over the sum of
+    variances in typical units (A).
+    """
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values = np.maximum(np.linalg.eigvalsh(information * np.outer(unit, unit)), 1e-12)
-    return float(np.exp(np.log(values).mean()) if criterion == "D" else len(values) / (1 / values).sum())
+    return float(
+        np.exp(np.log(values).mean())
+        if criterion == "D"
+        else len(values) / (1 / values).sum()
+    )
 
 
 def _parameters(lens: Lens, protocol: Protocol) -> tuple[tuple[str, ...], Array]:
-    """Names of what will be fitted, and what is known of it beforehand as (p, p) information."""
+    """Names of what will be fitted, and what is known of it beforehand as (p, p)
+    information.
+    """
     known = {k.name: k for k in protocol.known}
     held = {k.name for k in protocol.known if k.sigma == 0}
-    wanted = {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)  # the unfitted are in no NAMES
+    wanted = (
+        {p.name for p in PARAMETERS if p.free} | set(protocol.free) | set(known)
+    )  # the unfitted are in no NAMES
     names = tuple(name for name in NAMES if name in wanted - held)
-    sigma = [known[row.name].sigma if row.name in known else row.sigma for row in usual(names, lens)]
+    sigma = [
+        known[row.name].sigma if row.name in known else row.sigma
+        for row in usual(names, lens)
+    ]
     return names, np.diag([s**-2.0 for s in sigma])
 
 
 def _even(candidates: Array, protocol: Protocol, count: int) -> list[int]:
-    usual = np.flatnonzero((candidates[:, 1] == protocol.angles_deg[0]) & (candidates[:, 2] == protocol.exposures[0]))
-    return [int(usual[i]) for i in np.linspace(0, len(usual) - 1, count).round().astype(int)]
+    usual = np.flatnonzero(
+        (candidates[:, 1] == protocol.angles_deg[0])
+        & (candidates[:, 2] == protocol.exposures[0])
+    )
+    return [
+        int(usual[i]) for i in np.linspace(0, len(usual) - 1, count).round().astype(int)
+    ]

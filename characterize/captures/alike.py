@@ -30,9 +30,11 @@ def _norm(frames: Array, noise: Array | float) -> Array:
 
 
 def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a against b in pixels.
+    """Largest normalised cross-correlation over all shifts, and the shift (y, x) of a
+    against b in pixels.
 
-    The norm of a is freed of that of its noise, so that weak light is not taken for another lens.
+    The norm of a is freed of that of its noise, so that weak light is not taken for
+    another lens.
     """
     norm = float(_norm(a, noise)) * float(np.linalg.norm(b))
     if norm == 0:
@@ -40,13 +42,18 @@ def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, floa
     shape = [2 * s for s in a.shape]
     cross = fft.irfft2(fft.rfft2(a, shape) * np.conj(fft.rfft2(b, shape)), shape)
     row, column = np.unravel_index(int(cross.argmax()), cross.shape)
-    shift = [int(i) - s if i >= s // 2 else int(i) for i, s in ((row, shape[0]), (column, shape[1]))]
+    shift = [
+        int(i) - s if i >= s // 2 else int(i)
+        for i, s in ((row, shape[0]), (column, shape[1]))
+    ]
     return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Spectra:
-    """Frames as :func:`likeness` correlates them: spectra (n, u, v) of twice the side, norms (n,) freed of noise."""
+    """Frames as :func:`likeness` correlates them: spectra (n, u, v) of twice the side,
+    norms (n,) freed of noise.
+    """
 
     spectrum: Array
     norm: Array
@@ -60,6 +67,12 @@ class Spectra:
 
     def alike(self, expected: "Spectra", index: Array) -> float:
         """Mean likeness of the frames, taken in some order, to those expected."""
-        cross = fft.irfft2(self.spectrum[index] * np.conj(expected.spectrum), self.sides).max((1, 2))
+        cross = fft.irfft2(
+            self.spectrum[index] * np.conj(expected.spectrum), self.sides
+        ).max((1, 2))
         norm = self.norm[index] * expected.norm
-        return float(np.minimum(np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0).mean())
+        return float(
+            np.minimum(
+                np.divide(cross, norm, out=np.zeros_like(cross), where=norm > 0), 1.0
+            ).mean()
+        )

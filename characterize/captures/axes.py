@@ -1,4 +1,6 @@
-"""Which axis of a stack its frames run along: the first, or the last, as cameras' and MATLAB's own files have it."""
+"""Which axis of a stack its frames run along: the first, or the last, as cameras' and
+MATLAB's own files have it.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,14 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
 ORDERS = ("nyx", "yxn")
-_SHORT = 2.0  # a frame whose rows are shorter than its columns by more, in a stack that is as long, reads like rows
+# a frame whose rows are shorter than its columns by more, in a stack that is as long,
+# reads like rows
+_SHORT = 2.0
 
 
 def stated(about: dict[str, Any], where: str) -> str | None:
-    """``axes`` of the capture's description, which is taken out; None where it says nothing.
+    """``axes`` of the capture's description, which is taken out; None where it says
+    nothing.
 
     Raises:
         CaptureError: none of ``ORDERS``.
@@ -28,12 +33,20 @@ def stated(about: dict[str, Any], where: str) -> str | None:
 
 
 def frames_first(
-    stack: Array, path: Path, order: str | None, *, count: int | None = None, pages: int = 0
+    stack: Array,
+    path: Path,
+    order: str | None,
+    *,
+    count: int | None = None,
+    pages: int = 0,
 ) -> tuple[Array, str]:
-    """A stack as (n, y, x), and what to say where it lay otherwise; a single frame as it is.
+    """A stack as (n, y, x), and what to say where it lay otherwise; a single frame as
+    it is.
 
-    What is stated decides; else the number of frames, the first axis where both fit; a number that fits neither is
-    left to the caller. Where nothing tells and the other way is as likely, how it was taken is said.
+    What is stated decides; else the number of frames, the first axis where both fit; a
+    number that fits neither is
+    left to the caller. Where nothing tells and the other way is as likely, how it was
+    taken is said.
 
     Args:
         stack: (n, y, x) or (y, x, n), of colour images with these behind.
@@ -42,8 +55,10 @@ def frames_first(
         pages: frames that it must hold, from the first on, where no more is known.
 
     Raises:
-        CaptureError: nothing is known, and read as (n, y, x) the frames would be narrow strips or the picture's columns
-            the frames: the last axis is below half of both others, or below both and these alike.
+        CaptureError: nothing is known, and read as (n, y, x) the frames would be narrow
+            strips or the picture's columns
+            the frames: the last axis is below half of both others, or below both and
+                these alike.
     """
     if stack.ndim < 3 or len(stack) == 1 or order == "nyx":
         return stack, ""
@@ -52,7 +67,11 @@ def frames_first(
         return _moved(stack, path, "as stated")
     if count is not None:
         fits = count == last and count != first
-        return _moved(stack, path, f"since {count} frames of it are listed") if fits else (stack, "")
+        return (
+            _moved(stack, path, f"since {count} frames of it are listed")
+            if fits
+            else (stack, "")
+        )
     if pages == last and pages != first:
         return _moved(stack, path, f"since its pages 0 to {pages - 1} are listed")
     if _SHORT * last < min(first, second) or last < first == second:
@@ -62,16 +81,26 @@ def frames_first(
             'axes = "yxn" in capture.toml (of a single file, in the TOML of its name beside it)'
         )
     if last < min(first, second) or second == first:
-        name, taken = reading.shown(path.name), f"taken as (n, y, x), {first} frames of {second} x {last} pixels"
-        return stack, f'{name} {taken}; if it is {last} frames of {first} x {second}, say axes = "yxn"'
+        name, taken = (
+            reading.shown(path.name),
+            f"taken as (n, y, x), {first} frames of {second} x {last} pixels",
+        )
+        return (
+            stack,
+            f'{name} {taken}; if it is {last} frames of {first} x {second}, say axes = "yxn"',
+        )
     return stack, ""
 
 
-def as_large(stack: Array, path: Path, size: tuple[int, ...], *, pitch: int = 1) -> tuple[Array, str]:
-    """Dark or flat as (n, y, x), known by the size of the frames, and what to say where it lay otherwise.
+def as_large(
+    stack: Array, path: Path, size: tuple[int, ...], *, pitch: int = 1
+) -> tuple[Array, str]:
+    """Dark or flat as (n, y, x), known by the size of the frames, and what to say where
+    it lay otherwise.
 
     Args:
-        size: (y, x) of the frames as they are used, one pixel in ``pitch`` each way of those on disk.
+        size: (y, x) of the frames as they are used, one pixel in ``pitch`` each way of
+            those on disk.
     """
 
     def alike(shape: tuple[int, ...]) -> bool:
@@ -85,5 +114,7 @@ def as_large(stack: Array, path: Path, size: tuple[int, ...], *, pitch: int = 1)
 def _moved(stack: Array, path: Path, why: str) -> tuple[Array, str]:
     first, second, last = stack.shape[:3]
     name = reading.shown(path.name)
-    note = f"{name} taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
+    note = (
+        f"{name} taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
+    )
     return np.ascontiguousarray(np.moveaxis(stack, 2, 0)), note

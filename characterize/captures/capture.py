@@ -1,4 +1,6 @@
-"""Bench captures as they lie on disk: frames, stage positions, dark and flat, with their bit depth found out."""
+"""Bench captures as they lie on disk: frames, stage positions, dark and flat, with
+their bit depth found out.
+"""
 
 import dataclasses
 import logging
@@ -29,16 +31,19 @@ Stack = tuple[Array, str]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Capture:
-    """Frames of a bench run in counts, right-aligned, and all that was written down with them.
+    """Frames of a bench run in counts, right-aligned, and all that was written down
+    with them.
 
     frames: (n, y, x) counts, +x right, +y down.
-    position_um: (n,) of the stage as read (the depth of the source on a lens bench); nan where unknown.
+    position_um: (n,) of the stage as read (the depth of the source on a lens bench);
+    nan where unknown.
     angle_rad: (n, 2) field angle of the source towards (+x, +y).
     exposure_s: (n,) nan where unknown.
     names: of every frame, for messages.
     bits: of the converter; the largest count is 2**bits - 1.
     pixel_um, wavelength_um: nan where unknown; the first is the pitch of the frames.
-    fill: width of a pixel over that pitch: a half where frames are one colour of a mosaic.
+    fill: width of a pixel over that pitch: a half where frames are one colour of a
+    mosaic.
     dark, flat: (k, y, x) counts, or None.
     about: further entries of the capture's description (numbers and words).
     corrections: what was changed on the way in, in words.
@@ -61,14 +66,24 @@ class Capture:
     def __post_init__(self) -> None:
         n, shape = len(self.frames), self.frames.shape[1:]
         if self.frames.ndim != 3 or n == 0 or min(shape) < 3:
-            raise CaptureError(f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3")
-        for name, wanted in (("position_um", (n,)), ("angle_rad", (n, 2)), ("exposure_s", (n,))):
+            raise CaptureError(
+                f"frames of shape {self.frames.shape}: need (n, y, x) with at least one frame of 3 x 3"
+            )
+        for name, wanted in (
+            ("position_um", (n,)),
+            ("angle_rad", (n, 2)),
+            ("exposure_s", (n,)),
+        ):
             if getattr(self, name).shape != wanted:
-                raise CaptureError(f"{name} has shape {getattr(self, name).shape}, need {wanted} for {n} frames")
+                raise CaptureError(
+                    f"{name} has shape {getattr(self, name).shape}, need {wanted} for {n} frames"
+                )
         for name in ("dark", "flat"):
             image = getattr(self, name)
             if image is not None and image.shape[1:] != shape:
-                raise CaptureError(f"{name} frames are {image.shape[1:]}, the frames {shape}; crop them alike")
+                raise CaptureError(
+                    f"{name} frames are {image.shape[1:]}, the frames {shape}; crop them alike"
+                )
 
     @property
     def full_scale(self) -> int:
@@ -79,26 +94,44 @@ class Capture:
 def load(path: str | Path) -> Capture:
     """Read a capture: a TIFF, PNG or HDF5 file, or a folder of them.
 
-    A folder holds frames (named in ``stage.csv`` or ``stage.json``, else every image that is not dark or flat, in
-    the order of their names, numbers counted), and may hold ``dark.tif``, ``flat.tif`` and ``capture.toml`` or
-    ``capture.json`` (pixel_um, step_um, wavelength_um, bits, and what else is known; ``voxel_um`` as z, y, x). A single
-    file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its ImageJ or OME tags.
+    A folder holds frames (named in ``stage.csv`` or ``stage.json``, else every image
+    that is not dark or flat, in
+    the order of their names, numbers counted), and may hold ``dark.tif``, ``flat.tif``
+    and ``capture.toml`` or
+    ``capture.json`` (pixel_um, step_um, wavelength_um, bits, and what else is known;
+    ``voxel_um`` as z, y, x). A single
+    file takes the same from ``NAME.toml`` or ``NAME.json`` beside it, else from its
+    ImageJ or OME tags.
 
     Raises:
-        CaptureError: nothing there, lossy or truncated images, frames of different size, non-finite values,
-            stage rows that do not match the frames; file, row and frame are named. StoreError: changed while read.
+        CaptureError: nothing there, lossy or truncated images, frames of different
+            size, non-finite values,
+            stage rows that do not match the frames; file, row and frame are named.
+            StoreError: changed while read.
     """
     path = Path(path)
     if not path.exists():
-        raise CaptureError(f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)")
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what it makes of a damaged file is said in one error
+        raise CaptureError(
+            f"{path}: no such file or folder; need a capture (TIFF, PNG, HDF5 or a folder of them)"
+        )
+    logging.getLogger("tifffile").setLevel(
+        logging.CRITICAL
+    )  # what it makes of a damaged file is said in one error
     try:
         with reading.steady(path):
             return _load_folder(path) if path.is_dir() else _load_file(path)
     except MetalensError:
         raise
-    except (*store.DAMAGE, IndexError, ArithmeticError, RecursionError, struct.error) as error:
-        raise CaptureError(f"{path}: damaged, or entries of the wrong kind ({error})") from None
+    except (
+        *store.DAMAGE,
+        IndexError,
+        ArithmeticError,
+        RecursionError,
+        struct.error,
+    ) as error:
+        raise CaptureError(
+            f"{path}: damaged, or entries of the wrong kind ({error})"
+        ) from None
 
 
 def read_images(path: Path) -> Array:
@@ -110,7 +143,14 @@ def read_images(path: Path) -> Array:
     return sound(_PLAIN.pick(read_all(path), path), path)
 
 
-def _stack(path: Path, colours: Colours, order: str | None, *, count: int | None = None, pages: int = 0) -> Stack:
+def _stack(
+    path: Path,
+    colours: Colours,
+    order: str | None,
+    *,
+    count: int | None = None,
+    pages: int = 0,
+) -> Stack:
     """Frames of one file and what to say of their axes."""
     images = read_all(path, colours)
     if order is None and path.suffix.lower() in TIFF:
@@ -121,7 +161,9 @@ def _stack(path: Path, colours: Colours, order: str | None, *, count: int | None
 
 def _beside(path: Path, colours: Colours, size: tuple[int, ...]) -> Stack:
     """Dark or flat of frames of a size, and what to say of its axes."""
-    images, note = axes.as_large(read_all(path, colours), path, size, pitch=colours.pitch)
+    images, note = axes.as_large(
+        read_all(path, colours), path, size, pitch=colours.pitch
+    )
     return sound(colours.pick(images, path, grey=True), path), note
 
 
@@ -138,20 +180,35 @@ def sound(images: Array, path: Path) -> Array:
 
 
 def read_all(path: Path, colours: Colours = _PLAIN) -> Array:
-    """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they lie there.
+    """(n, y, x) or (n, y, x, red green blue [alpha]): the images of one file as they
+    lie there.
 
     Raises:
         CaptureError: unknown, lossy or truncated.
     """
     suffix = path.suffix.lower()
     if suffix in LOSSY:
-        raise CaptureError(f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5")
-    read_tiff = partial(tiff_pages.read, coloured=colours.channel is not None, mosaic=bool(colours.mosaic))
-    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {TIFF: read_tiff, PNG: png.read, HDF5: _read_hdf5}
-    reader = next((read for suffixes, read in readers.items() if suffix in suffixes), None)
+        raise CaptureError(
+            f"{path}: {suffix} is lossy and gamma-coded, its noise says nothing; save TIFF, PNG or HDF5"
+        )
+    read_tiff = partial(
+        tiff_pages.read,
+        coloured=colours.channel is not None,
+        mosaic=bool(colours.mosaic),
+    )
+    readers: dict[tuple[str, ...], Callable[[Path], Array]] = {
+        TIFF: read_tiff,
+        PNG: png.read,
+        HDF5: _read_hdf5,
+    }
+    reader = next(
+        (read for suffixes, read in readers.items() if suffix in suffixes), None
+    )
     if reader is None:
         kind = suffix or "a file without suffix"
-        raise CaptureError(f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.cure(suffix)}")
+        raise CaptureError(
+            f"{path}: cannot read {kind}; need TIFF, PNG or HDF5{folder.cure(suffix)}"
+        )
     images = reader(path)
     return images[None] if images.ndim == 2 else images
 
@@ -189,21 +246,35 @@ def _load_folder(at: Path) -> Capture:
     special = {p.stem.lower(): p for p in files if p.stem.lower() in ("dark", "flat")}
     files = [p for p in files if p not in special.values()]
     colours, order = Colours.of(about, str(at)), axes.stated(about, str(at))
-    said = [*(stage.left_out(files, rows) if rows else ()), *stage.unread(about), *folder.unread(at, special)]
+    said = [
+        *(stage.left_out(files, rows) if rows else ()),
+        *stage.unread(about),
+        *folder.unread(at, special),
+    ]
     if rows is None:
         names, frames, notes = _all_frames(files, at, colours, order)
         rows = stage.Rows.unknown(names)
     else:
-        frames, notes = _listed_frames({stage.spelt(p.name): p for p in files}, at, rows, colours, order)
-    beside = {name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()}
+        frames, notes = _listed_frames(
+            {stage.spelt(p.name): p for p in files}, at, rows, colours, order
+        )
+    beside = {
+        name: _beside(p, colours, frames.shape[1:]) for name, p in special.items()
+    }
     stacks = {name: images for name, (images, _) in beside.items()}
-    said += [words for words in (*notes, *(words for _, words in beside.values())) if words]
+    said += [
+        words for words in (*notes, *(words for _, words in beside.values())) if words
+    ]
     bits = about.pop("bits", None)
-    frames, depth, note, aligned = right_align(frames, bits, str(at), beside=tuple(stacks.values()))
+    frames, depth, note, aligned = right_align(
+        frames, bits, str(at), beside=tuple(stacks.values())
+    )
     extra = dict(zip(stacks, aligned, strict=True))
     if "step_um" in about and not np.isfinite(rows.position_um).any():
         folder.check_steps(files if not rows.source else (), at)
-        rows = dataclasses.replace(rows, position_um=np.arange(len(frames)) * float(about["step_um"]))
+        rows = dataclasses.replace(
+            rows, position_um=np.arange(len(frames)) * float(about["step_um"])
+        )
     return Capture(
         frames,
         rows.position_um,
@@ -232,15 +303,24 @@ def _all_frames(
     for path in files:
         images, note = _stack(path, colours, order)
         notes.append(note)
-        names += [f"{path.name}[{i}]" for i in range(len(images))] if len(images) > 1 else [path.name]
+        names += (
+            [f"{path.name}[{i}]" for i in range(len(images))]
+            if len(images) > 1
+            else [path.name]
+        )
         stacks.append(images)
     return tuple(map(reading.shown, names)), _join(stacks, files), notes
 
 
 def _listed_frames(
-    there: Mapping[str, Path], at: Path, rows: stage.Rows, colours: Colours, order: str | None
+    there: Mapping[str, Path],
+    at: Path,
+    rows: stage.Rows,
+    colours: Colours,
+    order: str | None,
 ) -> tuple[Array, list[str]]:
-    """The frames that the stage file names, in its order; without a column of pages, those of a stack in turn.
+    """The frames that the stage file names, in its order; without a column of pages,
+    those of a stack in turn.
 
     With them what to say of their axes.
     """
@@ -250,10 +330,14 @@ def _listed_frames(
     for row, (name, stated) in enumerate(zip(rows.files, rows.page, strict=True), 2):
         path = there.get(stage.spelt(name), at / name)
         if not path.is_file():
-            raise CaptureError(f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.like(name, there)}")
+            raise CaptureError(
+                f"{rows.source}, row {row}: frame {name!r} is not in {at}{folder.like(name, there)}"
+            )
         if name not in stacks:
             count = rows_of[name] if stated is None else None
-            stacks[name] = _stack(path, colours, order, count=count, pages=rows.pages(name))
+            stacks[name] = _stack(
+                path, colours, order, count=count, pages=rows.pages(name)
+            )
         stack = stacks[name][0]
         page = min(met[name], len(stack) - 1) if stated is None else stated
         met[name] += 1
@@ -264,9 +348,13 @@ def _listed_frames(
                 '(y, x, n), axes = "yxn" in capture.toml'
             )
         if not 0 <= page < len(stack):
-            raise CaptureError(f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which holds {len(stack)}")
+            raise CaptureError(
+                f"{rows.source}, row {row}: page {page} (from 0) of {name!r}, which holds {len(stack)}"
+            )
         images.append(stack[page][None])
-    return _join(images, [at / name for name in rows.files]), [note for _, note in stacks.values()]
+    return _join(images, [at / name for name in rows.files]), [
+        note for _, note in stacks.values()
+    ]
 
 
 def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
@@ -284,13 +372,17 @@ def _read_hdf5(path: Path) -> Array:
     except MetalensError:
         raise
     except store.DAMAGE as error:
-        raise CaptureError(f"{path}: truncated or not an HDF5 file ({error})") from error
+        raise CaptureError(
+            f"{path}: truncated or not an HDF5 file ({error})"
+        ) from error
 
 
 def _frames_of(path: Path, file: h5py.File) -> Array:
     """The data set ``frames``."""
     if "frames" not in file:
-        raise CaptureError(f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}")
+        raise CaptureError(
+            f"{path}: no data set 'frames' (n, y, x); found {', '.join(sorted(file)) or 'nothing'}"
+        )
     if not isinstance(file.get("frames", getlink=True), h5py.HardLink):
         raise CaptureError(f"{path}: 'frames' is a link; need the data set itself")
     frames = file["frames"]
@@ -302,9 +394,15 @@ def _frames_of(path: Path, file: h5py.File) -> Array:
 
 def _check_values(images: Array, path: Path) -> None:
     if images.dtype.kind not in "uif" or images.dtype.itemsize > 8:
-        raise CaptureError(f"{path}: values of type {images.dtype}; need whole or real numbers")
+        raise CaptureError(
+            f"{path}: values of type {images.dtype}; need whole or real numbers"
+        )
     if images.dtype.kind == "f" and images.dtype.itemsize < 4:
-        raise CaptureError(f"{path}: values of type {images.dtype} round counts above 2048; save whole numbers")
+        raise CaptureError(
+            f"{path}: values of type {images.dtype} round counts above 2048; save whole numbers"
+        )
     if images.dtype.kind == "f" and not np.isfinite(images).all():
         frame, row, column = (int(i) for i in np.argwhere(~np.isfinite(images))[0])
-        raise CaptureError(f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}")
+        raise CaptureError(
+            f"{path}: {images[frame, row, column]} in frame {frame}, row {row}, column {column}"
+        )

@@ -1,4 +1,6 @@
-"""Frames that a camera wrote in colour: one channel of them, where the bench says which."""
+"""Frames that a camera wrote in colour: one channel of them, where the bench says
+which.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +13,9 @@ CHANNELS = ("red", "green", "blue")
 
 
 def red_first(image: Array) -> Array:
-    """(y, x, red green blue [alpha]) of an image as OpenCV has it, blue first; grey (y, x) as it is."""
+    """(y, x, red green blue [alpha]) of an image as OpenCV has it, blue first; grey (y,
+    x) as it is.
+    """
     return image[..., [2, 1, 0, 3][: image.shape[-1]]] if image.ndim == 3 else image
 
 
@@ -19,8 +23,10 @@ def red_first(image: Array) -> Array:
 class Colours:
     """Which colour is lit, and how a raw mosaic holds it.
 
-    channel: one of ``CHANNELS``, or None. mosaic: letters of the 2 x 2 pixels that repeat, row by row from the first
-    pixel of a frame (RGGB, BGGR, GRBG, GBRG); empty where every pixel holds all colours or none.
+    channel: one of ``CHANNELS``, or None. mosaic: letters of the 2 x 2 pixels that
+    repeat, row by row from the first
+    pixel of a frame (RGGB, BGGR, GRBG, GBRG); empty where every pixel holds all colours
+    or none.
     """
 
     channel: str | None = None
@@ -35,10 +41,14 @@ class Colours:
         """
         channel, mosaic = about.pop("channel", None), about.pop("mosaic", "")
         if channel is not None and channel not in CHANNELS:
-            raise CaptureError(f"{where}: channel = {channel!r} in the capture's description; need one of {CHANNELS}")
+            raise CaptureError(
+                f"{where}: channel = {channel!r} in the capture's description; need one of {CHANNELS}"
+            )
         letters = str(mosaic).upper()
         if mosaic and (len(letters) != 4 or sorted(letters) != ["B", "G", "G", "R"]):
-            raise CaptureError(f'{where}: mosaic = {mosaic!r}; need the 2 x 2 pixels row by row, as "RGGB"')
+            raise CaptureError(
+                f'{where}: mosaic = {mosaic!r}; need the 2 x 2 pixels row by row, as "RGGB"'
+            )
         if mosaic and channel is None:
             raise CaptureError(
                 f'{where}: a mosaic without the colour that is lit; say channel = "green" (red, blue) too'
@@ -51,7 +61,8 @@ class Colours:
         return 2 if self.mosaic else 1
 
     def pick(self, images: Array, path: Path, *, grey: bool = True) -> Array:
-        """One channel of (n, y, x, red green blue [alpha]) or of a raw mosaic (n, y, x); grey images as they are.
+        """One channel of (n, y, x, red green blue [alpha]) or of a raw mosaic (n, y,
+        x); grey images as they are.
 
         Of two green pixels that of the upper row: their lattices lie a pixel apart.
 
@@ -59,7 +70,8 @@ class Colours:
             grey: False where a channel can only be that of colour images.
 
         Raises:
-            CaptureError: colour without a channel, or where a mosaic was stated; a channel of grey images where they
+            CaptureError: colour without a channel, or where a mosaic was stated; a
+                channel of grey images where they
                 cannot be.
         """
         if images.ndim == 3:
@@ -94,7 +106,11 @@ class Colours:
     def notes(self) -> list[str]:
         """What to say of frames that were a channel."""
         if self.mosaic:
-            return [f"channel {self.channel} used: one pixel in four of a mosaic {self.mosaic}, at twice the pitch"]
+            return [
+                f"channel {self.channel} used: one pixel in four of a mosaic {self.mosaic}, at twice the pitch"
+            ]
         if self.channel is None:
             return []
-        return [f"channel {self.channel} used: where colours were interpolated, neighbouring pixels share their noise"]
+        return [
+            f"channel {self.channel} used: where colours were interpolated, neighbouring pixels share their noise"
+        ]

@@ -1,4 +1,6 @@
-"""What lies in a capture folder by its names: frames in their order, tables, and what other programs left there."""
+"""What lies in a capture folder by its names: frames in their order, tables, and what
+other programs left there.
+"""
 
 import difflib
 import re
@@ -8,75 +10,128 @@ from pathlib import Path
 from metalens.ground import reading
 from metalens.ground.errors import CaptureError
 
-_TABLES = {  # suffixes of the description's two files, and of what is saved in their place
+# suffixes of the description's two files, and of what is saved in their place
+_TABLES = {
     "stage": ((".csv", ".json"), (".tsv", ".txt", ".dat", ".xlsx", ".xls", ".ods")),
     "capture": ((".toml", ".json"), (".yaml", ".yml", ".ini", ".cfg")),
 }
 _NUMPY = 'in Python: tifffile.imwrite("frames.tif", frames)'
-_MATLAB = 'in MATLAB: imwrite(frames(:,:,k), "frames.tif", WriteMode="append") for each k'
+_MATLAB = (
+    'in MATLAB: imwrite(frames(:,:,k), "frames.tif", WriteMode="append") for each k'
+)
 _PROGRAM = "as TIFF, from the program that wrote it or from ImageJ"
 _CURES = {
     **dict.fromkeys((".npy", ".npz"), _NUMPY),
     ".mat": _MATLAB,
-    **dict.fromkeys((".fits", ".fit", ".fts"), "in Python: tifffile.imwrite of astropy's data, as uint16"),
-    **dict.fromkeys((".bmp", ".gif", ".pgm", ".dng", ".czi", ".nd2", ".lif", ".ims", ".spe", ".sif"), _PROGRAM),
     **dict.fromkeys(
-        (".raw", ".bin"), 'in Python: tifffile.imwrite("frame.tif", numpy.fromfile(...).reshape(rows, columns))'
+        (".fits", ".fit", ".fts"),
+        "in Python: tifffile.imwrite of astropy's data, as uint16",
     ),
-    **dict.fromkeys((".nxs", ".cxi", ".he5"), "as HDF5 named .h5, with the frames in a data set 'frames'"),
+    **dict.fromkeys(
+        (
+            ".bmp",
+            ".gif",
+            ".pgm",
+            ".dng",
+            ".czi",
+            ".nd2",
+            ".lif",
+            ".ims",
+            ".spe",
+            ".sif",
+        ),
+        _PROGRAM,
+    ),
+    **dict.fromkeys(
+        (".raw", ".bin"),
+        'in Python: tifffile.imwrite("frame.tif", numpy.fromfile(...).reshape(rows, columns))',
+    ),
+    **dict.fromkeys(
+        (".nxs", ".cxi", ".he5"),
+        "as HDF5 named .h5, with the frames in a data set 'frames'",
+    ),
 }
 
 
 def cure(suffix: str) -> str:
-    """How to save anew what is held in a kind of file that is not read; empty where that is not known."""
+    """How to save anew what is held in a kind of file that is not read; empty where
+    that is not known.
+    """
     return f": save it {_CURES[suffix]}" if suffix in _CURES else ""
 
 
 def images(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Image files of a folder in the order of their names, numbers counted (frame_2 before frame_10).
+    """Image files of a folder in the order of their names, numbers counted (frame_2
+    before frame_10).
 
-    Files that a system keeps hidden (._frame.tif of a disk that a Mac wrote to) are none.
+    Files that a system keeps hidden (._frame.tif of a disk that a Mac wrote to) are
+    none.
     """
-    found = (path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith("."))
+    found = (
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in suffixes and not path.name.startswith(".")
+    )
     return sorted(found, key=lambda path: [part[::-1] for part in _parts(path.name)])
 
 
 def table(folder: Path, kind: str) -> Path | None:
-    """The file ``stage`` or ``capture`` of a folder, in capital letters or small ones; None where there is none.
+    """The file ``stage`` or ``capture`` of a folder, in capital letters or small ones;
+    None where there is none.
 
     Raises:
-        CaptureError: there is one in another format (``stage.xlsx``), which nothing would read.
+        CaptureError: there is one in another format (``stage.xlsx``), which nothing
+            would read.
     """
     right, others = _TABLES[kind]
-    named = {path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()}
-    if found := next((named[kind + suffix] for suffix in right if kind + suffix in named), None):
+    named = {
+        path.name.lower(): path for path in sorted(folder.iterdir()) if path.is_file()
+    }
+    if found := next(
+        (named[kind + suffix] for suffix in right if kind + suffix in named), None
+    ):
         return found
-    if strange := next((named[kind + suffix] for suffix in others if kind + suffix in named), None):
-        raise CaptureError(f"{strange}: not read, and nothing else says what it may say; save it as {kind}{right[0]}")
+    if strange := next(
+        (named[kind + suffix] for suffix in others if kind + suffix in named), None
+    ):
+        raise CaptureError(
+            f"{strange}: not read, and nothing else says what it may say; save it as {kind}{right[0]}"
+        )
     return None
 
 
 def unread(folder: Path, beside: Collection[str]) -> tuple[str, ...]:
-    """What to say of images in kinds of file that are not read; ``beside``: dark and flat, where they are there.
+    """What to say of images in kinds of file that are not read; ``beside``: dark and
+    flat, where they are there.
 
     Raises:
         CaptureError: a dark frame or a flat is among them.
     """
-    rest = sorted(path for path in folder.iterdir() if path.suffix.lower() in _CURES and not path.name.startswith("."))
+    rest = sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in _CURES and not path.name.startswith(".")
+    )
     for path in rest:
         if path.stem.lower() in {"dark", "flat"} - set(beside):
             raise CaptureError(
                 f"{path}: cannot read {path.suffix}, and it would not be used{cure(path.suffix.lower())}"
             )
     names = ", ".join(reading.shown(path.name) for path in rest[:5])
-    return (f"{len(rest)} files left out, of kinds that are not read: {names}",) if rest else ()
+    return (
+        (f"{len(rest)} files left out, of kinds that are not read: {names}",)
+        if rest
+        else ()
+    )
 
 
 def check_steps(files: Sequence[Path], folder: Path) -> None:
-    """Refuse numbered frames of which one is missing, where their order alone would say their depths.
+    """Refuse numbered frames of which one is missing, where their order alone would say
+    their depths.
 
     Raises:
-        CaptureError: numbers that go by unlike steps, in files that differ in one number alone.
+        CaptureError: numbers that go by unlike steps, in files that differ in one
+            number alone.
     """
     parts = [_parts(path.stem) for path in files]
     if len({tuple(word for word, _ in of) for of in parts}) != 1:
@@ -88,7 +143,10 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
     ]
     if len(counted) != 1:
         return
-    steps = [after - before for before, after in zip(counted[0], counted[0][1:], strict=False)]
+    steps = [
+        after - before
+        for before, after in zip(counted[0], counted[0][1:], strict=False)
+    ]
     least = min(steps)
     if max(steps) > least:
         gap = steps.index(max(steps))
@@ -100,10 +158,22 @@ def check_steps(files: Sequence[Path], folder: Path) -> None:
 
 def like(name: str, there: Collection[str]) -> str:
     """A hint for the name of a file that is not there: the one that is most like it."""
-    close = difflib.get_close_matches(name.lower(), [other.lower() for other in there], n=1)
-    return next((f"; did you mean {other!r}?" for other in there if close and other.lower() == close[0]), "")
+    close = difflib.get_close_matches(
+        name.lower(), [other.lower() for other in there], n=1
+    )
+    return next(
+        (
+            f"; did you mean {other!r}?"
+            for other in there
+            if close and other.lower() == close[0]
+        ),
+        "",
+    )
 
 
 def _parts(name: str) -> list[tuple[str, int]]:
     """A name as words (small letters) and numbers in turn: (word, -1) or ("", number)."""
-    return [("", int(part)) if part.isdigit() else (part, -1) for part in re.split(r"(\d+)", name.lower())]
+    return [
+        ("", int(part)) if part.isdigit() else (part, -1)
+        for part in re.split(r"(\d+)", name.lower())
+    ]

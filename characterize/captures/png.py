@@ -16,7 +16,8 @@ def read(path: Path) -> Array:
     """(y, x) image of a file, or (1, y, x, red green blue [alpha]).
 
     Raises:
-        CaptureError: truncated, no PNG file, or its head claims more than the file holds.
+        CaptureError: truncated, no PNG file, or its head claims more than the file
+            holds.
     """
     import cv2
 
@@ -32,17 +33,26 @@ def read(path: Path) -> Array:
 
 
 def _check(path: Path) -> None:
-    """Refuse what claims more than the file holds: its pixels, or a block that the library would make room for."""
+    """Refuse what claims more than the file holds: its pixels, or a block that the
+    library would make room for.
+    """
     size, ends, begun = path.stat().st_size, 8, b""
     with open(path, "rb") as file:
         while size >= _LEAST and ends + 8 <= size and begun != b"IEND":
             file.seek(ends)
             head = file.read(24 if not begun else 8)
             length, name = int.from_bytes(head[:4], "big"), head[4:8]
-            if not begun and (name != b"IHDR" or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size):
-                raise CaptureError(f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)")
+            if not begun and (
+                name != b"IHDR"
+                or math.prod(struct.unpack(">2I", head[8:16])) > DENSEST * 8 * size
+            ):
+                raise CaptureError(
+                    f"{path}: truncated or not a PNG file ({size} bytes, its head claims more or fails)"
+                )
             if begun and name == b"IHDR":
                 raise CaptureError(f"{path}: not a PNG file (a second head)")
             ends, begun = ends + 12 + length, name
     if begun != b"IEND" or ends > size:
-        raise CaptureError(f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})")
+        raise CaptureError(
+            f"{path}: truncated or not a PNG file (a block ends at byte {ends}, the file at {size})"
+        )

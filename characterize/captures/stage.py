@@ -1,4 +1,6 @@
-"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or .json with what else is known."""
+"""Where the stage stood: stage.csv or stage.json beside the frames, capture.toml or
+.json with what else is known.
+"""
 
 import csv
 import difflib
@@ -22,7 +24,9 @@ from metalens.ground.errors import CaptureError, nearest
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _BARE = ("depth", "z", "position")
-_POSITIONS = {f"{name}_{unit}": scale for name in _BARE for unit, scale in _LENGTHS.items()}
+_POSITIONS = {
+    f"{name}_{unit}": scale for name in _BARE for unit, scale in _LENGTHS.items()
+}
 _ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
 _ANGLES_Y = ("angle_y_deg", "angle_y_rad")
 _ALIASES = {
@@ -48,7 +52,16 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     "offset": ("of counts", lambda v: True),
     "glass_tilt_x_deg": _TILT,
     "glass_tilt_y_deg": _TILT,
-    **dict.fromkeys(("read_noise_e", "wavelength_sigma_nm", "pixel_sigma_um", "pinhole_um", "glass_um"), _FROM_0),
+    **dict.fromkeys(
+        (
+            "read_noise_e",
+            "wavelength_sigma_nm",
+            "pixel_sigma_um",
+            "pinhole_um",
+            "glass_um",
+        ),
+        _FROM_0,
+    ),
 }
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MICRO = str.maketrans("\u00b5\u03bc", "uu")
@@ -60,7 +73,8 @@ _COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_A
 class Rows:
     """One row a frame, as listed in the stage file.
 
-    files: image names; page: index inside that image file, None where the table has no such column; source: the stage
+    files: image names; page: index inside that image file, None where the table has no
+    such column; source: the stage
     file, for messages.
     """
 
@@ -72,36 +86,56 @@ class Rows:
     source: str
 
     def pages(self, name: str) -> int:
-        """How many pages of a file are listed, from the first on without a gap; 0 where they are not."""
-        listed = {page for file, page in zip(self.files, self.page, strict=True) if file == name and page is not None}
+        """How many pages of a file are listed, from the first on without a gap; 0 where
+        they are not.
+        """
+        listed = {
+            page
+            for file, page in zip(self.files, self.page, strict=True)
+            if file == name and page is not None
+        }
         return len(listed) if listed == set(range(len(listed))) else 0
 
     @classmethod
     def unknown(cls, names: tuple[str, ...]) -> "Rows":
         """Rows for frames of which nothing but the name is known."""
         n = len(names)
-        return cls(names, (None,) * n, np.full(n, np.nan), np.zeros((n, 2)), np.full(n, np.nan), "")
+        return cls(
+            names,
+            (None,) * n,
+            np.full(n, np.nan),
+            np.zeros((n, 2)),
+            np.full(n, np.nan),
+            "",
+        )
 
 
 def read_stage(folder: Path) -> Rows | None:
     """The stage file of a capture folder; None where there is none.
 
-    Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in turn), one of depth/z/position
-    with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``, ``angle_y_deg``, ``exposure_s``.
+    Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in
+    turn), one of depth/z/position
+    with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``,
+    ``angle_y_deg``, ``exposure_s``.
     JSON: a list of such objects.
 
     Raises:
-        CaptureError: unknown column, one without its unit, two of depth or of one angle, no column ``file``, columns
-            not parted by commas, more values than columns, a value that is no number, a page that is not whole; file
+        CaptureError: unknown column, one without its unit, two of depth or of one
+            angle, no column ``file``, columns
+            not parted by commas, more values than columns, a value that is no number, a
+            page that is not whole; file
             and row are named. A table in another format (``stage.xlsx``).
     """
     if path := naming.table(folder, "stage"):
-        return _rows(_read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path)
+        return _rows(
+            _read_csv(path) if path.suffix.lower() == ".csv" else _read_json(path), path
+        )
     return None
 
 
 def read_about(folder: Path) -> dict[str, Any]:
-    """Entries of ``capture.toml`` or ``capture.json`` in a capture folder; empty where there is none.
+    """Entries of ``capture.toml`` or ``capture.json`` in a capture folder; empty where
+    there is none.
 
     Raises:
         CaptureError: not TOML or JSON, a misspelt name, or an impossible number.
@@ -110,7 +144,8 @@ def read_about(folder: Path) -> dict[str, Any]:
 
 
 def read_beside(path: Path) -> dict[str, Any]:
-    """Entries of the TOML or JSON file of the same name beside an image file; empty where there is none.
+    """Entries of the TOML or JSON file of the same name beside an image file; empty
+    where there is none.
 
     Raises:
         CaptureError: as :func:`read_about`.
@@ -124,11 +159,20 @@ def _about(path: Path | None) -> dict[str, Any]:
         return {}
     try:
         text = path.read_text(encoding="utf-8-sig")
-        about = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
-    except (ValueError, RecursionError) as error:  # of the format, of the text, or an integer of thousands of digits
-        raise CaptureError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
+        about = (
+            tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+        )
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # of the format, of the text, or an integer of thousands of digits
+        raise CaptureError(
+            f"{path}: not valid {path.suffix[1:].upper()}: {error}"
+        ) from None
     if not isinstance(about, dict):
-        raise CaptureError(f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)")
+        raise CaptureError(
+            f"{path}: need entries by name (pixel_um, step_um, wavelength_um ...)"
+        )
     for name, (entry, scale) in _ALIASES.items():
         if name in about and entry not in about:
             value = about.pop(name)
@@ -142,15 +186,23 @@ def _about(path: Path | None) -> dict[str, Any]:
 
 
 def _checked(about: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Entries as they are, whole bits; misspelt names and impossible numbers refused, notes of the user's own kept."""
+    """Entries as they are, whole bits; misspelt names and impossible numbers refused,
+    notes of the user's own kept.
+    """
     for name, value in about.items():
         close = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=_MISSPELT)
         if name not in _KNOWN and close:
-            raise CaptureError(f"{path}: unknown entry {name!r}; did you mean {close[0]!r}?")
+            raise CaptureError(
+                f"{path}: unknown entry {name!r}; did you mean {close[0]!r}?"
+            )
         if name not in _NUMBERS:
             continue
         need, right = _NUMBERS[name]
-        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        number = (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and math.isfinite(value)
+        )
         if not number or not right(value):
             raise CaptureError(f"{path}: {name} = {value!r}, need a number {need}")
     return about | ({"bits": int(about["bits"])} if "bits" in about else {})
@@ -163,31 +215,51 @@ def ome_entries(xml: str, name: str) -> Iterator[dict[str, str]]:
         ElementTree.ParseError: no XML.
     """
     every = ElementTree.fromstring(xml).iter()
-    return (entry.attrib for entry in every if str(entry.tag).rpartition("}")[2] == name)
+    return (
+        entry.attrib for entry in every if str(entry.tag).rpartition("}")[2] == name
+    )
 
 
 def ome_positions(xml: str) -> Array:
-    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default um), in the order of the pages.
+    """Stage positions of the planes in OME-XML, um (PositionZ with its unit, default
+    um), in the order of the pages.
 
-    Planes carry their place in the stack (TheZ, TheT), which need not be the order in which they are written down;
-    empty where one has no position or one in a unit that is no length ("reference frame").
+    Planes carry their place in the stack (TheZ, TheT), which need not be the order in
+    which they are written down;
+    empty where one has no position or one in a unit that is no length ("reference
+    frame").
 
     Raises:
         ElementTree.ParseError: no XML.
     """
     order = next(ome_entries(xml, "Pixels"), {}).get("DimensionOrder", "XYZCT")
-    slow, fast = ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
-    planes = sorted(ome_entries(xml, "Plane"), key=lambda plane: (int(plane.get(slow, 0)), int(plane.get(fast, 0))))
+    slow, fast = (
+        ("TheT", "TheZ") if order.index("Z") < order.index("T") else ("TheZ", "TheT")
+    )
+    planes = sorted(
+        ome_entries(xml, "Plane"),
+        key=lambda plane: (int(plane.get(slow, 0)), int(plane.get(fast, 0))),
+    )
     units = [plane.get("PositionZUnit", "um").translate(_MICRO) for plane in planes]
-    if not all("PositionZ" in plane and unit in _LENGTHS for plane, unit in zip(planes, units, strict=True)):
+    if not all(
+        "PositionZ" in plane and unit in _LENGTHS
+        for plane, unit in zip(planes, units, strict=True)
+    ):
         return np.empty(0)
-    return np.array([float(plane["PositionZ"]) * _LENGTHS[unit] for plane, unit in zip(planes, units, strict=True)])
+    return np.array(
+        [
+            float(plane["PositionZ"]) * _LENGTHS[unit]
+            for plane, unit in zip(planes, units, strict=True)
+        ]
+    )
 
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            table: list[dict[str, Any]] = list(csv.DictReader(file, skipinitialspace=True))
+            table: list[dict[str, Any]] = list(
+                csv.DictReader(file, skipinitialspace=True)
+            )
     except (csv.Error, UnicodeDecodeError) as error:
         raise CaptureError(f"{path}: not a table in UTF-8 text: {error}") from None
     while table and not any(table[-1].values()):  # as spreadsheets leave below theirs
@@ -210,44 +282,68 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
         raise CaptureError(f"{path}: no rows; need one a frame")
     parted = next((mark for mark in ";\t|" if mark in next(iter(table[0]), "")), None)
     if parted:
-        raise CaptureError(f"{path}: columns parted by {parted!r}; save it with commas, and points in the numbers")
+        raise CaptureError(
+            f"{path}: columns parted by {parted!r}; save it with commas, and points in the numbers"
+        )
     table = [_plain_keys(entries, path, row) for row, entries in enumerate(table, 2)]
     for row, entries in enumerate(table, 2):
         for key in entries:
             if key in _BARE:
-                raise CaptureError(f"{path}: column {key!r} without a unit; name it {key}_um (or _nm, _mm, _cm, _m)")
+                raise CaptureError(
+                    f"{path}: column {key!r} without a unit; name it {key}_um (or _nm, _mm, _cm, _m)"
+                )
             if key not in _COLUMNS:
-                raise CaptureError(f"{path}, row {row}: unknown column {key!r}{nearest(str(key), _COLUMNS)}")
+                raise CaptureError(
+                    f"{path}, row {row}: unknown column {key!r}{nearest(str(key), _COLUMNS)}"
+                )
         if not entries.get("file"):
-            raise CaptureError(f"{path}, row {row}: no 'file'; name the image of every row")
+            raise CaptureError(
+                f"{path}, row {row}: no 'file'; name the image of every row"
+            )
     head = table[0].keys()
     for kind in (_POSITIONS, _ANGLES, _ANGLES_Y):
         if len(stated := [key for key in kind if key in head]) > 1:
-            raise CaptureError(f"{path}: columns {' and '.join(stated)} say the same; leave the one that holds")
+            raise CaptureError(
+                f"{path}: columns {' and '.join(stated)} say the same; leave the one that holds"
+            )
     place = next((key for key in _POSITIONS if key in head), None)
-    angle = [next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)]
+    angle = [
+        next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)
+    ]
     scales = [_ANGLES.get((key or "").replace("_y_", "_"), 1.0) for key in angle]
-    columns = [_column(table, key, path) * s for key, s in zip(angle, scales, strict=True)]
+    columns = [
+        _column(table, key, path) * s for key, s in zip(angle, scales, strict=True)
+    ]
     return Rows(
         files=tuple(str(entries["file"]) for entries in table),
         page=_pages(table, path) if "page" in head else (None,) * len(table),
-        position_um=_column(table, place, path, np.nan) * _POSITIONS.get(place or "", 1.0),
+        position_um=_column(table, place, path, np.nan)
+        * _POSITIONS.get(place or "", 1.0),
         angle_rad=np.stack(columns, 1),
-        exposure_s=_exposures(table, path) if "exposure_s" in head else np.full(len(table), np.nan),
+        exposure_s=_exposures(table, path)
+        if "exposure_s" in head
+        else np.full(len(table), np.nan),
         source=str(path),
     )
 
 
 def _plain_keys(entries: dict[str, Any], path: Path, row: int) -> dict[str, Any]:
-    """A row by column names in small letters, without blanks about them, the micro sign or a Greek letter as u."""
+    """A row by column names in small letters, without blanks about them, the micro sign
+    or a Greek letter as u.
+    """
     if None in entries:
         raise CaptureError(
             f"{path}, row {row}: more values than columns ({', '.join(map(str, list(entries)[:-1]))}); a comma inside "
             "a number? write it with a point (0.73)"
         )
-    plain = {str(key).strip().lower().translate(_MICRO): value for key, value in entries.items()}
+    plain = {
+        str(key).strip().lower().translate(_MICRO): value
+        for key, value in entries.items()
+    }
     if len(plain) < len(entries):
-        raise CaptureError(f"{path}: columns {', '.join(entries)} are not all different; leave the ones that hold")
+        raise CaptureError(
+            f"{path}: columns {', '.join(entries)} are not all different; leave the ones that hold"
+        )
     return plain
 
 
@@ -265,17 +361,31 @@ def left_out(files: Sequence[Path], rows: Rows) -> tuple[str, ...]:
                 f"{rows.source}: {name!r} is not named there and would not be used; put all {kind[1]} frames into one "
                 f"stack {kind[1]}.tif"
             )
-    return (f"{len(rest)} images that {rows.source} does not name left out: {', '.join(rest[:5])}",) if rest else ()
+    return (
+        (
+            f"{len(rest)} images that {rows.source} does not name left out: {', '.join(rest[:5])}",
+        )
+        if rest
+        else ()
+    )
 
 
 def unread(about: dict[str, Any]) -> tuple[str, ...]:
     """What to say of entries of a capture's description that nothing reads."""
     rest = [reading.shown(name) for name in about if name not in _KNOWN]
-    return (f"entries of the description that change nothing, kept as notes: {', '.join(rest[:8])}",) if rest else ()
+    return (
+        (
+            f"entries of the description that change nothing, kept as notes: {', '.join(rest[:8])}",
+        )
+        if rest
+        else ()
+    )
 
 
 def spelt(name: str) -> str:
-    """A file name in one spelling: some systems write an umlaut as a letter and its dots."""
+    """A file name in one spelling: some systems write an umlaut as a letter and its
+    dots.
+    """
     return unicodedata.normalize("NFC", name)
 
 
@@ -283,7 +393,9 @@ def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
     pages = _column(table, "page", path)
     for row, page in enumerate(pages, 2):
         if page != round(page):
-            raise CaptureError(f"{path}, row {row}: page is {page:g}, need a whole number from 0 on")
+            raise CaptureError(
+                f"{path}, row {row}: page is {page:g}, need a whole number from 0 on"
+            )
     return tuple(int(page) for page in pages)
 
 
@@ -297,7 +409,9 @@ def _exposures(table: list[dict[str, Any]], path: Path) -> Array:
     return times
 
 
-def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0) -> Array:
+def _column(
+    table: list[dict[str, Any]], key: str | None, path: Path, default: float = 0.0
+) -> Array:
     if key is None:
         return np.full(len(table), default)
     values = []
@@ -306,9 +420,17 @@ def _column(table: list[dict[str, Any]], key: str | None, path: Path, default: f
             value = float(entries[key])
         except (TypeError, ValueError, KeyError):
             found = entries.get(key)
-            hint = " with a point, as 0.73" if isinstance(found, str) and "," in found else ""
-            raise CaptureError(f"{path}, row {row}: {key} is {found!r}, need a number{hint}") from None
+            hint = (
+                " with a point, as 0.73"
+                if isinstance(found, str) and "," in found
+                else ""
+            )
+            raise CaptureError(
+                f"{path}, row {row}: {key} is {found!r}, need a number{hint}"
+            ) from None
         if not math.isfinite(value):
-            raise CaptureError(f"{path}, row {row}: {key} is {value}, need a finite number")
+            raise CaptureError(
+                f"{path}, row {row}: {key} is {value}, need a finite number"
+            )
         values.append(value)
     return np.array(values)

@@ -1,4 +1,6 @@
-"""The images of a TIFF file, refused where it is damaged, lossy or claims more than it holds."""
+"""The images of a TIFF file, refused where it is damaged, lossy or claims more than it
+holds.
+"""
 
 import importlib.util
 import math
@@ -20,8 +22,14 @@ DENSEST = 1040  # values' bytes for a byte of the file, at best
 _MOST_BYTES = 1 << 34  # of all frames of a file
 _LOSSY = (6, 7, 33003, 33005, 34712)  # compressions: JPEG, JPEG 2000
 _CFA = 32803  # what its values mean: a raw mosaic of colours
-_MEANING = {0: "says that white is 0 (photometric 0)", 3: "holds places in a table of colours"}
-_OPENCV = {5: "LZW", 32773: "PackBits"}  # what OpenCV's reader unpacks and tifffile leaves to a package of its own
+_MEANING = {
+    0: "says that white is 0 (photometric 0)",
+    3: "holds places in a table of colours",
+}
+_OPENCV = {
+    5: "LZW",
+    32773: "PackBits",
+}  # what OpenCV's reader unpacks and tifffile leaves to a package of its own
 _ELSEWHERE = {34925: "LZMA", 50000: "Zstandard"}  # only that package
 _TURNED = 274  # the tag that says which way up an image is
 
@@ -30,14 +38,18 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
     """(n, y, x) images of a file, or (n, y, x, colours).
 
     Args:
-        coloured: separate planes are the colours of an image; else they are images, since some writers take a stack of
+        coloured: separate planes are the colours of an image; else they are images,
+            since some writers take a stack of
             three or four for colours.
         mosaic: whether it is known how a raw mosaic of colours lies.
 
     Raises:
-        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be read, values packed without
-            gaps, pages of different size or type; values where more is less light, places in a table of colours (a
-            table of greys in order gives light), a raw mosaic of which nothing is known.
+        CaptureError: truncated, no TIFF file, JPEG inside, a compression that cannot be
+            read, values packed without
+            gaps, pages of different size or type; values where more is less light,
+            places in a table of colours (a
+            table of greys in order gives light), a raw mosaic of which nothing is
+            known.
     """
     import tifffile
 
@@ -50,28 +62,48 @@ def read(path: Path, *, coloured: bool = False, mosaic: bool = False) -> Array:
             planar = file.pages.first.planarconfig == 2
             if planar and coloured and images.ndim == 4:
                 return np.moveaxis(images, 1, -1)
-            return np.asarray(images.reshape(-1, *images.shape[-2:]) if planar else images)
+            return np.asarray(
+                images.reshape(-1, *images.shape[-2:]) if planar else images
+            )
     except CaptureError:
         raise
-    except (tifffile.TiffFileError, *store.DAMAGE, IndexError, ArithmeticError, struct.error, zlib.error) as error:
+    except (
+        tifffile.TiffFileError,
+        *store.DAMAGE,
+        IndexError,
+        ArithmeticError,
+        struct.error,
+        zlib.error,
+    ) as error:
         raise CaptureError(f"{path}: truncated or not a TIFF file ({error})") from error
 
 
 def stacked(file: Any) -> int:
-    """How many images a file holds: its pages, or what ImageJ laid behind the head of one (stacks above 4 GB)."""
+    """How many images a file holds: its pages, or what ImageJ laid behind the head of
+    one (stacks above 4 GB).
+    """
     told = (file.imagej_metadata or {}) if file.is_imagej else {}
-    return max(int(str(told.get("images", 1))), 1) if len(file.pages) == 1 else len(file.pages)
+    return (
+        max(int(str(told.get("images", 1))), 1)
+        if len(file.pages) == 1
+        else len(file.pages)
+    )
 
 
 def order(path: Path) -> str | None:
-    """How the images of a file lie where that is sure: "nyx" of pages written one by one, as cameras and image programs
-    do; None of an array that was written at once (tifffile), whose axes may be any, unless it says them.
+    """How the images of a file lie where that is sure: "nyx" of pages written one by
+    one, as cameras and image programs
+    do; None of an array that was written at once (tifffile), whose axes may be any,
+    unless it says them.
     """
     import tifffile
 
     with tifffile.TiffFile(path) as file:
         about = file.shaped_metadata or ({},)
-        at_once = str(file.pages.first.tags.valueof(305, "")).startswith("tifffile") or file.is_shaped
+        at_once = (
+            str(file.pages.first.tags.valueof(305, "")).startswith("tifffile")
+            or file.is_shaped
+        )
         axes = str(about[0].get("axes", ""))
         if not at_once or (len(axes) > 2 and axes.endswith("YX")):
             return "nyx"
@@ -95,7 +127,9 @@ def _images(path: Path, file: Any) -> Array:
 
 def _pages(path: Path, file: Any) -> list[Array]:
     """The image of every page, in the file's own order of colours."""
-    packed = {n for n, page in enumerate(file.pages) if int(page.compression) in _OPENCV}
+    packed = {
+        n for n, page in enumerate(file.pages) if int(page.compression) in _OPENCV
+    }
     if not packed or importlib.util.find_spec("imagecodecs") is not None:
         return [page.asarray() for page in file.pages]
     found = _unpacked(path)
@@ -116,7 +150,9 @@ def _pages(path: Path, file: Any) -> list[Array]:
 
 
 def _unpacked(path: Path) -> Sequence[Array]:
-    """All images of a file as OpenCV reads them, without its own words on what it cannot."""
+    """All images of a file as OpenCV reads them, without its own words on what it
+    cannot.
+    """
     import cv2
 
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -132,22 +168,39 @@ def _check(path: Path, file: Any) -> None:
     for number, page in enumerate(file.pages):
         claimed += page.nbytes
         if page.offset in begun:  # the library would go round for ever
-            raise CaptureError(f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring")
+            raise CaptureError(
+                f"{path}: damaged: frame {number} is an earlier one, its list of frames is a ring"
+            )
         begun.add(page.offset)
-        if page.nbytes > DENSEST * sum(page.databytecounts) + 65536 or claimed > _MOST_BYTES:
-            raise CaptureError(f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes")
-        end = max((a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
+        if (
+            page.nbytes > DENSEST * sum(page.databytecounts) + 65536
+            or claimed > _MOST_BYTES
+        ):
+            raise CaptureError(
+                f"{path}: frame {number} claims {page.shape} values, the file has {size} bytes"
+            )
+        end = max(
+            (a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)),
+            default=0,
+        )
         if not 0 < end <= size:
-            raise CaptureError(f"{path}: truncated in frame {number} ({size} bytes, need {end})")
+            raise CaptureError(
+                f"{path}: truncated in frame {number} ({size} bytes, need {end})"
+            )
         packed = int(page.compression)
         if packed in _LOSSY:
-            raise CaptureError(f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain")
+            raise CaptureError(
+                f"{path}: frame {number} is JPEG-compressed, its noise says nothing; save plain"
+            )
         if packed in _ELSEWHERE and importlib.util.find_spec("imagecodecs") is None:
             raise CaptureError(
                 f"{path}: frame {number} is compressed ({_ELSEWHERE[packed]}); save it plain or deflated, or install "
                 "imagecodecs"
             )
-        if page.bitspersample not in (8, 16, 32, 64) and importlib.util.find_spec("imagecodecs") is None:
+        if (
+            page.bitspersample not in (8, 16, 32, 64)
+            and importlib.util.find_spec("imagecodecs") is None
+        ):
             raise CaptureError(
                 f"{path}: values of frame {number} are {page.bitspersample} bits wide, packed without gaps; save them "
                 "in words of 16 bits, or install imagecodecs"
@@ -171,7 +224,9 @@ def _check_meaning(path: Path, file: Any, *, mosaic: bool) -> None:
 
 
 def _grey_table(page: Any) -> bool:
-    """Whether a table of colours gives every value the grey in proportion to it, as some microscopes write theirs."""
+    """Whether a table of colours gives every value the grey in proportion to it, as
+    some microscopes write theirs.
+    """
     table = getattr(page, "colormap", None)
     if table is None:
         return False

@@ -1,4 +1,6 @@
-"""What the tags of a TIFF file say of stage and pixel: ImageJ (spacing, resolution) and OME-XML."""
+"""What the tags of a TIFF file say of stage and pixel: ImageJ (spacing, resolution) and
+OME-XML.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -11,13 +13,29 @@ from characterize.captures import stage, tiff_pages
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-_MICRONS = ("um", "\u00b5m", "\u03bcm", "\\u00b5m", "\\u03bcm", "micron", "microns")  # a micro sign or a Greek letter
-_UNITS = {"nm": 1e-3, **dict.fromkeys(_MICRONS, 1.0), "mm": 1e3, "cm": 1e4, "inch": 25400.0}
+_MICRONS = (
+    "um",
+    "\u00b5m",
+    "\u03bcm",
+    "\\u00b5m",
+    "\\u03bcm",
+    "micron",
+    "microns",
+)  # a micro sign or a Greek letter
+_UNITS = {
+    "nm": 1e-3,
+    **dict.fromkeys(_MICRONS, 1.0),
+    "mm": 1e3,
+    "cm": 1e4,
+    "inch": 25400.0,
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tags:
-    """position_um: (n,) of the frames, empty where not told. pixel_um: nan where not told; notes: in words."""
+    """position_um: (n,) of the frames, empty where not told. pixel_um: nan where not
+    told; notes: in words.
+    """
 
     position_um: Array = field(default_factory=lambda: np.empty(0))
     pixel_um: float = math.nan
@@ -34,21 +52,36 @@ def read(path: Path) -> Tags:
 
     with tifffile.TiffFile(path) as file:
         if file.is_imagej and file.imagej_metadata:
-            return _imagej(path, file.imagej_metadata, _resolution(file.pages[0]), tiff_pages.stacked(file))
+            return _imagej(
+                path,
+                file.imagej_metadata,
+                _resolution(file.pages[0]),
+                tiff_pages.stacked(file),
+            )
         if file.is_ome and file.ome_metadata:
             return _ome(path, file.ome_metadata, len(file.pages))
     return Tags()
 
 
 def _ome(path: Path, xml: str, pages: int) -> Tags:
-    """Positions of the planes, else steps of the voxel's height; nothing of a text that is no XML."""
+    """Positions of the planes, else steps of the voxel's height; nothing of a text that
+    is no XML.
+    """
     try:
         pixels = next(stage.ome_entries(xml, "Pixels"), {})
     except ElementTree.ParseError:
-        return Tags(notes=("the OME tags are no XML: what they say of stage and pixel is not read",))
+        return Tags(
+            notes=(
+                "the OME tags are no XML: what they say of stage and pixel is not read",
+            )
+        )
     samples = next(stage.ome_entries(xml, "Channel"), {}).get("SamplesPerPixel", "1")
     _one_channel(path, int(pixels.get("SizeC", 1)) // int(samples))
-    pixel, step, position = _ome_size(pixels, "X"), _ome_size(pixels, "Z"), stage.ome_positions(xml)
+    pixel, step, position = (
+        _ome_size(pixels, "X"),
+        _ome_size(pixels, "Z"),
+        stage.ome_positions(xml),
+    )
     planes, times = (max(int(pixels.get(f"Size{axis}", 1)), 1) for axis in "ZT")
     if len(position) or not math.isfinite(step) or step == 0 or planes == 1 < pages:
         return Tags(position, pixel, _words(pixel))
@@ -60,18 +93,24 @@ def _ome(path: Path, xml: str, pages: int) -> Tags:
 
 def _ome_size(pixels: dict[str, str], axis: str) -> float:
     name = f"PhysicalSize{axis}"
-    return float(pixels.get(name, "nan")) * _UNITS.get(pixels.get(f"{name}Unit", "um"), math.nan)
+    return float(pixels.get(name, "nan")) * _UNITS.get(
+        pixels.get(f"{name}Unit", "um"), math.nan
+    )
 
 
 def _one_channel(path: Path, channels: int) -> None:
     if channels > 1:
-        raise CaptureError(f"{path}: {channels} channels in one file; save the one that is to be fitted")
+        raise CaptureError(
+            f"{path}: {channels} channels in one file; save the one that is to be fitted"
+        )
 
 
 def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) -> Tags:
-    """Steps without a unit are in um; of a unit that is no length (pixels) neither steps nor a pixel are told.
+    """Steps without a unit are in um; of a unit that is no length (pixels) neither
+    steps nor a pixel are told.
 
-    A stack that is seen several times steps through its slices each time; times alone tell no step.
+    A stack that is seen several times steps through its slices each time; times alone
+    tell no step.
     """
     _one_channel(path, int(str(about.get("channels", 1))))
     unit = str(about.get("unit", "")).lower()
@@ -82,7 +121,9 @@ def _imagej(path: Path, about: dict[str, object], per_pixel: float, pages: int) 
     slices = max(int(str(about.get("slices", pages if times == 1 else 1))), 1)
     stepped = math.isfinite(step) and step != 0 and (slices > 1 or pages == 1)
     position = np.arange(pages) % slices * step if stepped else np.empty(0)
-    notes = (f"stage step of {step:.4g} um from the ImageJ tags",) if len(position) else ()
+    notes = (
+        (f"stage step of {step:.4g} um from the ImageJ tags",) if len(position) else ()
+    )
     return Tags(position, pixel, notes + _words(pixel))
 
 
@@ -95,4 +136,8 @@ def _resolution(page: object) -> float:
 
 
 def _words(pixel_um: float) -> tuple[str, ...]:
-    return (f"pixel of {pixel_um:.4g} um from the tags of the file",) if math.isfinite(pixel_um) else ()
+    return (
+        (f"pixel of {pixel_um:.4g} um from the tags of the file",)
+        if math.isfinite(pixel_um)
+        else ()
+    )

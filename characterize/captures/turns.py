@@ -9,16 +9,23 @@ MIRRORED = ("mirrored", *(f"mirrored and {words}" for words in TURNS[1:]))
 
 
 def turn(frames: Array, orientation: int) -> Array:
-    """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation mod 4) times."""
+    """(n, y, x) frames mirrored left-right for 4 to 7, then turned by 90° (orientation
+    mod 4) times.
+    """
     turned = frames[..., ::-1] if orientation >= 4 else frames
     return np.rot90(turned, orientation % 4, axes=(-2, -1))
 
 
 def between(first: int, second: int) -> int:
-    """The orientation that makes of frames turned by the first those turned by the second.
+    """The orientation that makes of frames turned by the first those turned by the
+    second.
 
     >>> between(3, 1), between(4, 6), between(5, 0)
     (2, 2, 5)
     """
     frame = np.arange(4).reshape(1, 2, 2)
-    return next(k for k in range(8) if np.array_equal(turn(turn(frame, first), k), turn(frame, second)))
+    return next(
+        k
+        for k in range(8)
+        if np.array_equal(turn(turn(frame, first), k), turn(frame, second))
+    )

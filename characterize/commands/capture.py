@@ -1,4 +1,6 @@
-"""Virtual bench: lens.h5 and a hidden truth -> a capture folder (TIFF frames, stage.csv, dark, flat, capture.toml)."""
+"""Virtual bench: lens.h5 and a hidden truth -> a capture folder (TIFF frames,
+stage.csv, dark, flat, capture.toml).
+"""
 
 from pathlib import Path
 
@@ -18,7 +20,9 @@ _STATED = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
 def run(options: Options) -> int:
     """Shoot and write, or plan; exit 0."""
     if (options.truth is None) == (options.protocol is None):
-        raise ConfigError("give either --truth truth.toml (a virtual bench) or --protocol protocol.toml (a plan)")
+        raise ConfigError(
+            "give either --truth truth.toml (a virtual bench) or --protocol protocol.toml (a plan)"
+        )
     if options.protocol is not None:
         return _plan(options, options.protocol)
     return _shoot(options, options.truth or Path())
@@ -26,8 +30,14 @@ def run(options: Options) -> int:
 
 def _plan(options: Options, path: Path) -> int:
     if options.spread:
-        raise ConfigError("--workers and --scheduler share out the frames of --truth; a plan takes none")
-    target, wanted, design = options.output, config.load(path, Protocol), lenses.load(options.lens)
+        raise ConfigError(
+            "--workers and --scheduler share out the frames of --truth; a plan takes none"
+        )
+    target, wanted, design = (
+        options.output,
+        config.load(path, Protocol),
+        lenses.load(options.lens),
+    )
     with options.claim(target) as draft:
         found = protocol.plan(design, wanted, slopes(design))
         store.write_text(draft.path, _listed(found))
@@ -35,28 +45,53 @@ def _plan(options: Options, path: Path) -> int:
     values = {"file": str(target), "frames": rows, "gain": found.gain.tolist()}
     values |= {"sigma": dict(zip(found.names, found.sigma.tolist(), strict=True))}
     values |= {"warnings": list(found.warnings)}
-    values |= {"even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))}
-    values |= {"untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))}
-    told = [f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}" for z, angle, time in rows]
+    values |= {
+        "even_sigma": dict(zip(found.names, found.even_sigma.tolist(), strict=True))
+    }
+    values |= {
+        "untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))
+    }
+    told = [
+        f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}"
+        for z, angle, time in rows
+    ]
     whole = np.hypot(found.sigma, found.untold)
-    told.append("  half of a 95 % interval, with what cannot be told; within the model; so with frames evenly spread")
+    told.append(
+        "  half of a 95 % interval, with what cannot be told; within the model; so with frames evenly spread"
+    )
     columns = (protocol.REACH * part for part in (whole, found.sigma, found.even_sigma))
     table = zip(found.names, *columns, strict=True)
-    told += [f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}" for n, total, own, even in table]
+    told += [
+        f"  {n:<24} +- {total:<8.2g} {own:<8.2g} {even:.2g}"
+        for n, total, own, even in table
+    ]
     told += [f"  note: {words}" for words in found.warnings]
-    options.console.result(values, "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]))
+    options.console.result(
+        values,
+        "\n".join([f"{target}: {len(rows)} frames, the most telling first", *told]),
+    )
     return 0
 
 
 def _rows(found: Plan) -> list[tuple[float, float, float]]:
     """Depth, angle and exposure of the frames to take."""
-    return list(zip(found.depth_um.tolist(), found.angle_deg.tolist(), found.exposure.tolist(), strict=True))
+    return list(
+        zip(
+            found.depth_um.tolist(),
+            found.angle_deg.tolist(),
+            found.exposure.tolist(),
+            strict=True,
+        )
+    )
 
 
 def _listed(found: Plan) -> str:
     """The frames to take as a stage.csv."""
     lines = ["file,depth_um,angle_deg,exposure_s"]
-    lines += [f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}" for i, (z, angle, time) in enumerate(_rows(found))]
+    lines += [
+        f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}"
+        for i, (z, angle, time) in enumerate(_rows(found))
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -67,15 +102,28 @@ def _shoot(options: Options, path: Path) -> int:
     frames = len(truth.stated[0]) + truth.dark_frames + truth.flat_frames
     room = transaction.ROOM + 2 * frames * truth.camera.pixels**2
     with options.claim_folder(target, room=room) as draft, options.shared():
-        shots = bench.shoot(design, truth, slopes(design, wanted=[k.name for k in truth.parameter if k.value]))
+        shots = bench.shoot(
+            design,
+            truth,
+            slopes(design, wanted=[k.name for k in truth.parameter if k.value]),
+        )
         _fill(draft.path, shots, truth, design)
-    values = {"folder": str(target), "frames": len(shots.frames), "peak_e": float(shots.electrons.max())}
-    options.console.result(values, f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons")
+    values = {
+        "folder": str(target),
+        "frames": len(shots.frames),
+        "peak_e": float(shots.electrons.max()),
+    }
+    options.console.result(
+        values,
+        f"{target}: {len(shots.frames)} frames, peak {shots.electrons.max():.0f} electrons",
+    )
     return 0
 
 
 def write(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
-    """A capture folder as :func:`characterize.load` reads it, whole or not at all; one of ours is replaced."""
+    """A capture folder as :func:`characterize.load` reads it, whole or not at all; one
+    of ours is replaced.
+    """
     with transaction.folder(folder, terms=transaction.Terms(force=True)) as draft:
         _fill(draft.path, shots, truth, lens)
 
@@ -85,15 +133,26 @@ def _fill(folder: Path, shots: Shots, truth: Truth, lens: Lens) -> None:
 
     depths, angles = truth.stated
     lines = ["file,depth_um,angle_deg"]
-    for i, (frame, z, angle) in enumerate(zip(shots.frames, depths, angles, strict=True)):
+    for i, (frame, z, angle) in enumerate(
+        zip(shots.frames, depths, angles, strict=True)
+    ):
         name = f"frame_{i:03d}.tif"
         tifffile.imwrite(folder / name, frame, photometric="minisblack", metadata=None)
         lines.append(f"{name},{z:.10g},{np.degrees(angle[0]):.10g}")
     (folder / "stage.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for name, stack in (("dark", shots.dark), ("flat", shots.flat)):
-        tifffile.imwrite(folder / f"{name}.tif", stack, photometric="minisblack", metadata=None)
-    about = {"pixel_um": truth.camera.pixel_um, "wavelength_um": lens.wavelength_um, "bits": truth.camera.bits}
-    about |= {"pixel_sigma_um": 0.0, **dict.fromkeys(_STATED, 0.0)}  # a bench knows what stands on it
+        tifffile.imwrite(
+            folder / f"{name}.tif", stack, photometric="minisblack", metadata=None
+        )
+    about = {
+        "pixel_um": truth.camera.pixel_um,
+        "wavelength_um": lens.wavelength_um,
+        "bits": truth.camera.bits,
+    }
+    about |= {
+        "pixel_sigma_um": 0.0,
+        **dict.fromkeys(_STATED, 0.0),
+    }  # a bench knows what stands on it
     about |= {k.name: k.value for k in truth.parameter if k.name in _STATED}
     text = "".join(f"{name} = {value!r}\n" for name, value in about.items())
     (folder / "capture.toml").write_text(text, encoding="utf-8")

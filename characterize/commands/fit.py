@@ -1,6 +1,8 @@
-"""Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report.
+"""Bench captures -> the lens (or the pupil) that made them, with intervals,
+degeneracies and a report.
 
-An interruption leaves what stood at the output; the same command begins the fit (minutes) anew, but for its pillars,
+An interruption leaves what stood at the output; the same command begins the fit
+(minutes) anew, but for its pillars,
 which are kept in the cache folder of the user.
 """
 
@@ -23,10 +25,13 @@ from metalens.ground.errors import ConfigError
 
 @dataclass(frozen=True)
 class Metrology:
-    """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma), and of how to fit.
+    """TOML of what was measured otherwise (``[[known]]`` tables of name, value, sigma),
+    and of how to fit.
 
-    known: what was measured otherwise. free: further parameters to fit, by name. window: pixels along a side that are
-    fitted. scan_um: half of the range in which the zero of the stage is looked for; left out: chosen from the depths.
+    known: what was measured otherwise. free: further parameters to fit, by name.
+    window: pixels along a side that are
+    fitted. scan_um: half of the range in which the zero of the stage is looked for;
+    left out: chosen from the depths.
     """
 
     known: tuple[Known, ...] = ()
@@ -41,9 +46,13 @@ def run(options: Options) -> int:
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
     if (options.design is None) == (options.pupil is None):
-        raise ConfigError("give either --design lens.h5 (a metalens) or --pupil pupil.toml (any other lens)")
+        raise ConfigError(
+            "give either --design lens.h5 (a metalens) or --pupil pupil.toml (any other lens)"
+        )
     if options.truth is not None and options.pupil is not None:
-        raise ConfigError("--truth is of a virtual bench of a metalens: it goes with --design, not with --pupil")
+        raise ConfigError(
+            "--truth is of a virtual bench of a metalens: it goes with --design, not with --pupil"
+        )
     if options.pupil is not None:
         return _run_pupil(options, options.pupil, target)
     return _run_lens(options, options.design or Path(), target)
@@ -51,16 +60,24 @@ def run(options: Options) -> int:
 
 def _run_lens(options: Options, design: Path, target: Path) -> int:
     lens, shots = lenses.load(design), captures.load(options.capture)
-    told = config.load(options.metrology, Metrology) if options.metrology else Metrology()
-    choice = FitOptions(told.free, told.known, told.window, told.scan_um, insist=options.insist)
+    told = (
+        config.load(options.metrology, Metrology) if options.metrology else Metrology()
+    )
+    choice = FitOptions(
+        told.free, told.known, told.window, told.scan_um, insist=options.insist
+    )
     truth = config.load(options.truth, Truth) if options.truth else None
     hidden = {k.name: k.value for k in truth.parameter} if truth else None
     about = _provenance(options, design)
-    with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
+    with options.claim(
+        target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+    ) as draft:
         result = dataclasses.replace(fit(shots, lens, choice), provenance=about)
         asbuilt.save(draft.path, result)
         report.asbuilt_report(draft.path.with_suffix(".html"), result, truth=hidden)
-    return options.console.judged(_lens_values(result), _lens_text(result, target), result.problems)
+    return options.console.judged(
+        _lens_values(result), _lens_text(result, target), result.problems
+    )
 
 
 def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
@@ -69,7 +86,9 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
         spec = dataclasses.replace(spec, mask=pupil.parent / spec.mask)
     shots = captures.load(options.capture)
     about = _provenance(options, pupil, *([spec.mask] if spec.mask else []))
-    with options.claim(target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes) as draft:
+    with options.claim(
+        target, beside=report.BESIDE, room=transaction.ROOM + shots.frames.nbytes
+    ) as draft:
         found = fit_pupil(shots, spec, insist=options.insist)
         save(draft.path, found, about)
         report.pupil_report(draft.path.with_suffix(".html"), found)
@@ -78,10 +97,18 @@ def _run_pupil(options: Options, pupil: Path, target: Path) -> int:
 
 def _provenance(options: Options, *sources: Path) -> store.Provenance:
     path = options.capture
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    files = (
+        sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    )
     files += [*sources] + ([options.metrology] if options.metrology else [])
-    texts = [p.read_text(encoding="utf-8") for p in (options.pupil, options.metrology) if p is not None]
-    return store.Provenance(config="\n".join(texts), inputs={p.name: reading.sha256(p) for p in files})
+    texts = [
+        p.read_text(encoding="utf-8")
+        for p in (options.pupil, options.metrology)
+        if p is not None
+    ]
+    return store.Provenance(
+        config="\n".join(texts), inputs={p.name: reading.sha256(p) for p in files}
+    )
 
 
 def _lens_values(result: AsBuilt) -> dict[str, object]:
@@ -93,7 +120,9 @@ def _lens_values(result: AsBuilt) -> dict[str, object]:
     return {
         "parameters": {name: [float(v), float(s)] for name, v, s in rows},
         "intervals": {name: list(result.interval(name)) for name in result.names},
-        "intervals_within_model": {name: list(result.within_model(name)) for name in result.names},
+        "intervals_within_model": {
+            name: list(result.within_model(name)) for name in result.names
+        },
         "chi2_per_dof": result.chi2_per_dof,
         "converged": result.converged,
         "reason": result.reason,
@@ -108,28 +137,48 @@ def _lens_text(result: AsBuilt, target: Path) -> str:
     lines += [f"  {words}" for words in result.verdicts]
     for name, v in zip(result.names, result.value, strict=True):
         low, high = result.interval(name)
-        lines.append(f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_within(result, name)}")
-    for label, words in (("cannot tell", result.degeneracies), ("note", result.cautions)):
+        lines.append(
+            f"  {name:<24} {v:10.4g}   95 % {low:.4g} to {high:.4g}{_within(result, name)}"
+        )
+    for label, words in (
+        ("cannot tell", result.degeneracies),
+        ("note", result.cautions),
+    ):
         lines += [f"  {label}: {text}" for text in words]
     return "\n".join(lines)
 
 
 def _within(result: AsBuilt, name: str) -> str:
-    """The interval that would hold without what the captures cannot tell; nothing where that adds little."""
+    """The interval that would hold without what the captures cannot tell; nothing where
+    that adds little.
+    """
     causes = result.most(name)
     low, high = result.within_model(name)
-    return f"; {low:.4g} to {high:.4g} only without {', '.join(causes)}" if causes else ""
+    return (
+        f"; {low:.4g} to {high:.4g} only without {', '.join(causes)}" if causes else ""
+    )
 
 
 def _values(found: PupilFit) -> dict[str, object]:
-    scores = {"agreement": found.agreement, "held_out": found.held_out, "spline": found.between}
+    scores = {
+        "agreement": found.agreement,
+        "held_out": found.held_out,
+        "spline": found.between,
+    }
     return {
-        **{key: dataclasses.asdict(score) for key, score in scores.items() if score is not None},
+        **{
+            key: dataclasses.asdict(score)
+            for key, score in scores.items()
+            if score is not None
+        },
         "chi2_per_dof": found.chi2_per_dof,
         "converged": found.converged,
         "reason": found.reason,
         "optics": {name: [value, sigma] for name, value, sigma in found.optics},
-        "parameters": {n: [float(v), float(s)] for n, v, s in zip(found.names, found.value, found.sigma, strict=True)},
+        "parameters": {
+            n: [float(v), float(s)]
+            for n, v, s in zip(found.names, found.value, found.sigma, strict=True)
+        },
         "cautions": list(found.cautions),
         "problems": list(found.problems),
     }
@@ -137,12 +186,19 @@ def _values(found: PupilFit) -> dict[str, object]:
 
 def _text(found: PupilFit, target: Path) -> str:
     lines = [f"{target}: pupil fitted to {len(found.measured)} planes; {found.reason}"]
-    scores = ("all planes fitted", found.agreement), ("odd planes predicted from even", found.held_out)
-    for label, score in (*scores, ("the same by a cubic spline, without physics", found.between)):
+    scores = (
+        ("all planes fitted", found.agreement),
+        ("odd planes predicted from even", found.held_out),
+    )
+    for label, score in (
+        *scores,
+        ("the same by a cubic spline, without physics", found.between),
+    ):
         if score is not None:
             numbers = f"NCC {score.ncc:.4f} (mean of planes {score.plane_ncc:.4f}), NRMSE {score.nrmse:.4f}"
             lines.append(f"  {label}: {numbers}")
     lines += [
-        f"  {n} = {v:.4g} +- {s:.2g}" for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
+        f"  {n} = {v:.4g} +- {s:.2g}"
+        for n, v, s in zip(found.names[:12], found.value, found.sigma, strict=False)
     ]
     return "\n".join(lines + ["  note: " + words for words in found.cautions])

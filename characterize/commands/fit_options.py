@@ -1,6 +1,8 @@
-"""Bench captures -> the lens (or the pupil) that made them, with intervals, degeneracies and a report.
+"""Bench captures -> the lens (or the pupil) that made them, with intervals,
+degeneracies and a report.
 
-An interruption leaves what stood at the output; the same command begins the fit (minutes) anew, but for its pillars,
+An interruption leaves what stood at the output; the same command begins the fit
+(minutes) anew, but for its pillars,
 which are kept in the cache folder of the user.
 """
 
@@ -21,9 +23,12 @@ class Options(Common):
     Attributes:
         capture: folder, or TIFF, PNG or HDF5 stack.
         design: lens file of the metalens that was captured.
-        metrology: TOML of other measurements (``[[known]]`` name, value, sigma) and of what to fit beyond the usual.
-        pupil: TOML of what is known of a generic lens (numerical_aperture, wavelength_um, pixel_um, step_um ...).
-        truth: TOML of a virtual bench (that of ``capture --truth``): its hidden values are drawn in the report.
+        metrology: TOML of other measurements (``[[known]]`` name, value, sigma) and of
+            what to fit beyond the usual.
+        pupil: TOML of what is known of a generic lens (numerical_aperture,
+            wavelength_um, pixel_um, step_um ...).
+        truth: TOML of a virtual bench (that of ``capture --truth``): its hidden values
+            are drawn in the report.
         insist: write a result that fails its checks too (exit 1, problems listed).
         output: file to write; a report lies beside it as .html.
     """

@@ -1,4 +1,6 @@
-"""Captures -> MTF, Strehl, spot sizes, distortion; an edge -> MTF; a micrograph -> every diameter and a bias table."""
+"""Captures -> MTF, Strehl, spot sizes, distortion; an edge -> MTF; a micrograph ->
+every diameter and a bias table.
+"""
 
 import csv
 import dataclasses
@@ -26,21 +28,29 @@ from metalens.lens import DiameterMap
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Options of ``metalens measure``: a micrograph or an edge where its pixel is given, else captures.
+    """Options of ``metalens measure``: a micrograph or an edge where its pixel is
+    given, else captures.
 
     Attributes:
-        source: capture folder or stack; or one picture of pillars from above (TIFF, PNG), with --pixel-nm or --bar-nm;
+        source: capture folder or stack; or one picture of pillars from above (TIFF,
+            PNG), with --pixel-nm or --bar-nm;
             or one of a straight edge tilted by 2 to 20 degrees, with --edge-um.
-        output: folder to write: measure.json, a table of frames or pillars, a page; of a micrograph that clearly lies
+        output: folder to write: measure.json, a table of frames or pillars, a page; of
+            a micrograph that clearly lies
             in one place of a design the bias table of PROCESS.toml too.
-        design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a micrograph.
-        reference_e: electrons of the beam through an empty aperture of the lens's size, for the focusing efficiency.
-        edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation transfer across it (ISO 12233).
+        design: lens.h5: aperture for the Strehl ratio; the drawn diameters for a
+            micrograph.
+        reference_e: electrons of the beam through an empty aperture of the lens's size,
+            for the focusing efficiency.
+        edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation
+            transfer across it (ISO 12233).
         pixel_nm: size of a micrograph's pixel.
         bar_nm: length of a micrograph's white scale bar, where the pixel is unknown.
         pitch_nm: distance of neighbouring pillars; found in the picture without it.
-        edge_bias_nm: by which edges appear outside the true ones, from a calibration sample.
-        crop: rows and columns of the picture to look at (top, bottom, left, right), to leave out what is no pillar
+        edge_bias_nm: by which edges appear outside the true ones, from a calibration
+            sample.
+        crop: rows and columns of the picture to look at (top, bottom, left, right), to
+            leave out what is no pillar
             (a strip of writing below the picture is left out by itself).
     """
 
@@ -57,13 +67,19 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Measure and write; exit 0, or 1 where no pillar could be measured or most sites hold what is no round one."""
+    """Measure and write; exit 0, or 1 where no pillar could be measured or most sites
+    hold what is no round one.
+    """
     of_pillars = options.pixel_nm is not None or options.bar_nm is not None
     if of_pillars and options.edge_um is not None:
-        raise ConfigError("give --edge-um (a slanted edge), or --pixel-nm or --bar-nm (pillars), not both")
+        raise ConfigError(
+            "give --edge-um (a slanted edge), or --pixel-nm or --bar-nm (pillars), not both"
+        )
     if options.edge_um is not None and not 0 < options.edge_um < math.inf:
         raise ConfigError(f"--edge-um {options.edge_um}: need the pixel in um, above 0")
-    measure = _micrograph if of_pillars else _frames if options.edge_um is None else _edge
+    measure = (
+        _micrograph if of_pillars else _frames if options.edge_um is None else _edge
+    )
     with options.claim_folder(options.output) as draft:
         values, text, failures = measure(options, draft.path)
     return options.console.judged(values, text, failures)
@@ -90,24 +106,45 @@ def _frames(options: Options, folder: Path) -> tuple[dict[str, object], str, lis
         f"{r.mtf50_y_per_um:.3g} per um, Strehl {r.strehl:.3f}"
         for r in found.frames
     ]
-    lines += [f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um" for (x, y), z in found.best_depth_um.items()]
-    lines += [f"  distortion at {x:g}, {y:g} deg: {d:+.3%}" for (x, y), d in found.distortion.items()]
+    lines += [
+        f"  sharpest at {x:g}, {y:g} deg: {z:.5g} um"
+        for (x, y), z in found.best_depth_um.items()
+    ]
+    lines += [
+        f"  distortion at {x:g}, {y:g} deg: {d:+.3%}"
+        for (x, y), d in found.distortion.items()
+    ]
     lines += [f"  note: {words}" for words in found.notes]
     return values, "\n".join(lines), []
 
 
 def _by_field(values: dict[frames.Field, float], name: str) -> list[dict[str, float]]:
-    return [{"angle_deg": x, "angle_y_deg": y, name: value} for (x, y), value in values.items()]
+    return [
+        {"angle_deg": x, "angle_y_deg": y, name: value}
+        for (x, y), value in values.items()
+    ]
 
 
 def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
-    """Measure the modulation across an edge into the folder: numbers, text, and no failure."""
-    image, pixel = _cropped(picture.read(options.source), options.crop), float(options.edge_um or 0)
+    """Measure the modulation across an edge into the folder: numbers, text, and no
+    failure.
+    """
+    image, pixel = (
+        _cropped(picture.read(options.source), options.crop),
+        float(options.edge_um or 0),
+    )
     found = metrics.mtf_of_edge(image, pixel_um=pixel)
     curve = np.stack([found.frequency_per_um, found.modulation], 1)
     keep = found.frequency_per_um <= 1 / pixel
-    values: dict[str, object] = {"mtf50_per_um": found.mtf50_per_um, "nyquist_per_um": 0.5 / pixel, "pixel_um": pixel}
-    rows: list[dict[str, object]] = [{"frequency_per_um": f, "modulation": m} for f, m in curve[keep].round(6).tolist()]
+    values: dict[str, object] = {
+        "mtf50_per_um": found.mtf50_per_um,
+        "nyquist_per_um": 0.5 / pixel,
+        "pixel_um": pixel,
+    }
+    rows: list[dict[str, object]] = [
+        {"frequency_per_um": f, "modulation": m}
+        for f, m in curve[keep].round(6).tolist()
+    ]
     store.write_text(folder / "edge.csv", _table(rows))
     store.write_text(folder / "measure.json", _json(values))
     measure_page.edge_page(folder / "measure.html", image, found, pixel_um=pixel)
@@ -115,33 +152,54 @@ def _edge(options: Options, folder: Path) -> tuple[dict[str, object], str, list[
     return values, text, []
 
 
-def _micrograph(options: Options, folder: Path) -> tuple[dict[str, object], str, list[str]]:
-    """Measure a picture of pillars into the folder: numbers, text, and why its pillars are not measured."""
+def _micrograph(
+    options: Options, folder: Path
+) -> tuple[dict[str, object], str, list[str]]:
+    """Measure a picture of pillars into the folder: numbers, text, and why its pillars
+    are not measured.
+    """
     whole = picture.read(options.source)
     pixel = options.pixel_nm or sem.scale_from_bar(whole, float(options.bar_nm or 0))
-    image = _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
-    found = sem.measure(image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm))
+    image = (
+        _cropped(whole, options.crop) if options.crop else picture.without_strip(whole)
+    )
+    found = sem.measure(
+        image, sem.Micrograph(pixel, options.pitch_nm, options.edge_bias_nm)
+    )
     laid: overlay.Overlay | None = None
     table: overlay.Table = []
     scale = 1.0
     if options.design is not None:
         design = _drawn_round(options.design)
-        laid, scale = overlay.overlay(found, design), overlay.scale(found, pixel, design)
-        sure = laid.clearly and abs(scale - 1) < overlay.SCALE  # elsewhere, other diameters were drawn
+        laid, scale = (
+            overlay.overlay(found, design),
+            overlay.scale(found, pixel, design),
+        )
+        sure = (
+            laid.clearly and abs(scale - 1) < overlay.SCALE
+        )  # elsewhere, other diameters were drawn
         table = overlay.bias_table(laid) if sure else []
         found = overlay.numbered(found, laid)
-    values = _summary(found, laid, table, pixel) | ({"pitch_over_design": scale} if laid is not None else {})
+    values = _summary(found, laid, table, pixel) | (
+        {"pitch_over_design": scale} if laid is not None else {}
+    )
     store.write_text(folder / "pillars.csv", _table(_pillars(found, laid)))
     store.write_text(folder / "measure.json", _json(values))
     if table:
         pairs = ", ".join(f"[{drawn:.3f}, {bias:.3f}]" for drawn, bias, *_ in table)
         store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
-    measure_page.micrograph_page(folder / "measure.html", image, found, laid, table, pixel_nm=pixel)
+    measure_page.micrograph_page(
+        folder / "measure.html", image, found, laid, table, pixel_nm=pixel
+    )
     lines = [_words(found, laid, table, options.output), *_scale_words(scale, pixel)]
     if not options.crop and len(image) < len(whole):
-        lines.append(f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise")
+        lines.append(
+            f"  {len(whole) - len(image)} rows of writing below the picture left out; --crop says otherwise"
+        )
     if table and not options.edge_bias_nm:
-        lines.append("  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds")
+        lines.append(
+            "  edges as they appear: without --edge-bias-nm the table's mean holds what the microscope adds"
+        )
     return values, "\n".join(lines), _unmeasured(found, pixel)
 
 
@@ -153,14 +211,18 @@ def _unmeasured(found: sem.Diameters, pixel_nm: float) -> list[str]:
             "--pitch-nm states it (tops may be dark, but rims must stand out from the ground by more than noise and "
             "blur leave)"
         ]
-    return [] if np.isfinite(found.diameter_nm).any() else ["no pillar could be measured"]
+    return (
+        [] if np.isfinite(found.diameter_nm).any() else ["no pillar could be measured"]
+    )
 
 
 def _drawn_round(path: Path) -> DiameterMap:
     """What the mask of a lens draws, where its pillars are round."""
     design = lenses.load(path)
     if not isinstance(design.cell.shape, Circle) or design.cell.shape.hole:
-        raise CaptureError(f"{path}: {design.cell.described}; --design takes round pillars, whose diameter is measured")
+        raise CaptureError(
+            f"{path}: {design.cell.described}; --design takes round pillars, whose diameter is measured"
+        )
     return design.diameters
 
 
@@ -170,12 +232,17 @@ def _cropped(image: Array, crop: tuple[int, int, int, int] | None) -> Array:
     top, bottom, left, right = crop
     part = image[top:bottom, left:right]
     if min(part.shape) < 20:
-        raise ConfigError(f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 pixels or more")
+        raise ConfigError(
+            f"crop {crop} of a picture of {image.shape} leaves {part.shape}; need 20 pixels or more"
+        )
     return part
 
 
 def _summary(
-    found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Table, pixel: float
+    found: sem.Diameters,
+    laid: overlay.Overlay | None,
+    table: overlay.Table,
+    pixel: float,
 ) -> dict[str, object]:
     values: dict[str, object] = {
         "pillars": len(found.diameter_nm),
@@ -199,7 +266,9 @@ def _summary(
     return values
 
 
-def _pillars(found: sem.Diameters, laid: overlay.Overlay | None) -> list[dict[str, object]]:
+def _pillars(
+    found: sem.Diameters, laid: overlay.Overlay | None
+) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     of = {"missing": found.missing, "collapsed": found.collapsed, "oval": found.oval}
     for k in range(len(found.diameter_nm)):
@@ -223,18 +292,30 @@ def _pillars(found: sem.Diameters, laid: overlay.Overlay | None) -> list[dict[st
     return rows
 
 
-def _words(found: sem.Diameters, laid: overlay.Overlay | None, table: overlay.Table, target: Path) -> str:
+def _words(
+    found: sem.Diameters,
+    laid: overlay.Overlay | None,
+    table: overlay.Table,
+    target: Path,
+) -> str:
     gone, fallen = int(found.missing.sum()), int(found.collapsed.sum())
     lines = [
         f"{target}: {len(found.diameter_nm)} sites of a {found.lattice.kind} lattice, {gone} missing, {fallen} "
         f"collapsed; mean {found.mean_nm:.2f} nm, 3 sigma {found.three_sigma_nm:.2f} nm"
     ]
     if found.oval.any():
-        lines.append(f"  {int(found.oval.sum())} are oval, longer than wide by more than 15 %: not measured")
+        lines.append(
+            f"  {int(found.oval.sum())} are oval, longer than wide by more than 15 %: not measured"
+        )
     if laid is not None:
         unsure = " (not clear: other places fit nearly as well; no bias table; take a wider picture)"
-        lines.append(f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}")
-        lines += [f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)" for d, b, s, n in table]
+        lines.append(
+            f"  on the mask from row {laid.row}, column {laid.column}{'' if laid.clearly else unsure}"
+        )
+        lines += [
+            f"  drawn {d:7.2f} nm: {b:+.2f} +- {s:.2f} nm ({n} pillars)"
+            for d, b, s, n in table
+        ]
     return "\n".join(lines)
 
 

@@ -1,4 +1,6 @@
-"""Pages of ``metalens measure``: frames with their numbers, and a micrograph with every pillar drawn on it."""
+"""Pages of ``metalens measure``: frames with their numbers, and a micrograph with every
+pillar drawn on it.
+"""
 
 from operator import attrgetter
 from pathlib import Path
@@ -27,21 +29,44 @@ _NAMED = 8  # lines that a legend holds
 
 def frames_page(path: Path, found: frames.Quality) -> None:
     """Every frame with its numbers, and encircled energy over the radius."""
-    columns = {words: [attrgetter(name)(row) for row in found.frames] for name, words in COLUMNS.items()}
-    known = {words: column for words, column in columns.items() if any(value == value for value in column)}  # not nan
+    columns = {
+        words: [attrgetter(name)(row) for row in found.frames]
+        for name, words in COLUMNS.items()
+    }
+    known = {
+        words: column
+        for words, column in columns.items()
+        if any(value == value for value in column)
+    }  # not nan
     sections = [
-        report.Section("Frames", "", [report.Table(tuple(known), list(zip(*known.values(), strict=True)))]),
-        report.Section("Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]),
+        report.Section(
+            "Frames",
+            "",
+            [report.Table(tuple(known), list(zip(*known.values(), strict=True)))],
+        ),
+        report.Section(
+            "Curves", "", [report.Figure(_curves(found), CURVES, wide=True)]
+        ),
     ]
     fields = [(x, y, depth) for (x, y), depth in found.best_depth_um.items()]
     if fields:
-        head = ("angle along x / deg", "angle along y / deg", "depth of the sharpest frame / µm")
-        sections.append(report.Section("Field curvature", "", [report.Table(head, fields)]))
+        head = (
+            "angle along x / deg",
+            "angle along y / deg",
+            "depth of the sharpest frame / µm",
+        )
+        sections.append(
+            report.Section("Field curvature", "", [report.Table(head, fields)])
+        )
     if found.distortion:
         head = ("angle along x / deg", "angle along y / deg", "distortion")
-        table = report.Table(head, [(x, y, f"{d:+.3%}") for (x, y), d in found.distortion.items()])
+        table = report.Table(
+            head, [(x, y, f"{d:+.3%}") for (x, y), d in found.distortion.items()]
+        )
         sections.append(report.Section("Distortion", "", [table]))
-    sections.append(report.Section("Put right or assumed on the way", "\n\n".join(found.notes)))
+    sections.append(
+        report.Section("Put right or assumed on the way", "\n\n".join(found.notes))
+    )
     report.write(path, "Image quality of the captures", sections)
 
 
@@ -53,7 +78,11 @@ def _curves(found: frames.Quality) -> bytes:
         curve = metrics.mtf_of_psf(image, step_um=found.step_um)
         keep = curve.frequency_per_um <= 0.5 / found.step_um
         mtf.plot(curve.frequency_per_um[keep], curve.modulation[keep], linewidth=0.8)
-        energy.plot(radius, metrics.encircled_energy(image, step_um=found.step_um, radius_um=radius), label=row.name)
+        energy.plot(
+            radius,
+            metrics.encircled_energy(image, step_um=found.step_um, radius_um=radius),
+            label=row.name,
+        )
     mtf.set_xlabel("cycles / µm")
     mtf.set_ylabel("modulation along x")
     energy.set_xlabel("radius / µm")
@@ -72,10 +101,12 @@ def edge_page(path: Path, image: Array, found: metrics.Mtf, *, pixel_um: float) 
     curve.axvline(0.5 / pixel_um, color="0.6", linestyle=":")
     curve.set_xlabel("cycles / µm")
     curve.set_ylabel("modulation")
-    caption = (
-        f"Modulation one half at {found.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
+    caption = f"Modulation one half at {found.mtf50_per_um:.4g} cycles per µm; dotted: Nyquist's frequency of the pixels."
+    report.write(
+        path,
+        "Slanted edge",
+        [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])],
     )
-    report.write(path, "Slanted edge", [report.Section("Edge", "", [report.Figure(report.png(figure), caption)])])
 
 
 def micrograph_page(
@@ -91,15 +122,25 @@ def micrograph_page(
     caption = "Circles: measured edges, coloured by the error against the design (diameter where there is none); "
     caption += "crosses: missing; squares: collapsed; thick: outliers."
     sections = [
-        report.Section("Pillars", "", [report.Figure(_drawn(image, found, laid, pixel_nm), caption, wide=True)])
+        report.Section(
+            "Pillars",
+            "",
+            [report.Figure(_drawn(image, found, laid, pixel_nm), caption, wide=True)],
+        )
     ]
     if table:
         head = ("drawn / nm", "made less drawn / nm", "standard error / nm", "pillars")
-        sections.append(report.Section("Bias table", "", [report.Table(head, [tuple(row) for row in table])]))
+        sections.append(
+            report.Section(
+                "Bias table", "", [report.Table(head, [tuple(row) for row in table])]
+            )
+        )
     report.write(path, "Diameters of the pillars", sections)
 
 
-def _drawn(image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pixel_nm: float) -> bytes:
+def _drawn(
+    image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pixel_nm: float
+) -> bytes:
     from matplotlib.collections import EllipseCollection
     from matplotlib.figure import Figure
 
@@ -110,7 +151,11 @@ def _drawn(image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pix
     good = np.isfinite(found.diameter_nm)
     values = (found.diameter_nm if laid is None else laid.error_nm)[good]
     wide = found.diameter_nm[good] / pixel_nm
-    thick = np.where(laid.outlier[good], 3.0, 1.0) if laid is not None else np.ones(int(good.sum()))
+    thick = (
+        np.where(laid.outlier[good], 3.0, 1.0)
+        if laid is not None
+        else np.ones(int(good.sum()))
+    )
     rings = EllipseCollection(
         wide,
         wide,
@@ -125,7 +170,20 @@ def _drawn(image: Array, found: sem.Diameters, laid: overlay.Overlay | None, pix
     rings.set_array(values)
     axis.add_collection(rings)
     rings.set_facecolor("none")
-    axis.plot(found.column[found.missing], found.row[found.missing], "x", color="yellow")
-    axis.plot(found.column[found.collapsed], found.row[found.collapsed], "s", color="yellow", fillstyle="none")
-    figure.colorbar(rings, ax=axis, label="diameter / nm" if laid is None else "error / nm", shrink=0.8)
+    axis.plot(
+        found.column[found.missing], found.row[found.missing], "x", color="yellow"
+    )
+    axis.plot(
+        found.column[found.collapsed],
+        found.row[found.collapsed],
+        "s",
+        color="yellow",
+        fillstyle="none",
+    )
+    figure.colorbar(
+        rings,
+        ax=axis,
+        label="diameter / nm" if laid is None else "error / nm",
+        shrink=0.8,
+    )
     return report.png(figure)

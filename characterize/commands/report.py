@@ -1,4 +1,6 @@
-"""One page on a fit: pictures of measured, predicted and residual, parameters with intervals, cautions in words."""
+"""One page on a fit: pictures of measured, predicted and residual, parameters with
+intervals, cautions in words.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,27 +13,43 @@ from characterize.pupil import PupilFit
 from metalens.ground import report, store
 from metalens.ground.arrays import Array
 
-BESIDE = (".html", "_frames.png", "_parameters.png", "_posterior.png")  # endings of what lies beside a fit
+BESIDE = (
+    ".html",
+    "_frames.png",
+    "_parameters.png",
+    "_posterior.png",
+)  # endings of what lies beside a fit
 
 
 def pupil_report(path: Path, fit: PupilFit) -> None:
     """Write the page of a generic pupil fit."""
     score = fit.held_out or fit.agreement
     keys = [
-        report.KeyFigure("NCC, " + ("held-out" if fit.held_out else "fitted"), f"{score.ncc:.4f}", score.ncc >= 0.975),
+        report.KeyFigure(
+            "NCC, " + ("held-out" if fit.held_out else "fitted"),
+            f"{score.ncc:.4f}",
+            score.ncc >= 0.975,
+        ),
         report.KeyFigure("NRMSE", f"{score.nrmse:.3f}", score.nrmse <= 0.2),
         report.KeyFigure("chi² / dof", f"{fit.chi2_per_dof:.2f}"),
     ]
     images = report.Figure(
-        frames_figure((fit.measured, fit.predicted), fit.residual_sigma, ("measured", "fitted")),
+        frames_figure(
+            (fit.measured, fit.predicted), fit.residual_sigma, ("measured", "fitted")
+        ),
         "Every plane: measured, fitted (square root of the light), residual in standard deviations.",
         wide=True,
     )
     maps = report.Figure(_maps(fit), "Phase (rad) and amplitude of the pupil.")
-    rows = [(n, float(v), float(s)) for n, v, s in zip(fit.names, fit.value, fit.sigma, strict=True)]
+    rows = [
+        (n, float(v), float(s))
+        for n, v, s in zip(fit.names, fit.value, fit.sigma, strict=True)
+    ]
     sections = [
         report.Section("Images", f"{fit.reason}.", [images]),
-        report.Section("Pupil", "", [maps, report.Table(("parameter", "value", "1 sigma"), rows)]),
+        report.Section(
+            "Pupil", "", [maps, report.Table(("parameter", "value", "1 sigma"), rows)]
+        ),
         report.Section("Read with care", "\n\n".join(fit.cautions)),
     ]
     if fit.problems:
@@ -39,16 +57,34 @@ def pupil_report(path: Path, fit: PupilFit) -> None:
     report.write(path, "Pupil from a through-focus stack", sections, key_figures=keys)
 
 
-def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | None = None) -> None:
-    """Write the page of an as-built lens, and its pictures beside it: frames, parameters, posterior (``_NAME.png``).
+def asbuilt_report(
+    path: Path, result: AsBuilt, *, truth: Mapping[str, float] | None = None
+) -> None:
+    """Write the page of an as-built lens, and its pictures beside it: frames,
+    parameters, posterior (``_NAME.png``).
 
-    As designed, measured, built and residual of every frame; intervals; the posterior of each parameter as a curve;
-    correlations; what to measure next. ``truth``: hidden values by name, where they are known, drawn beside the fit.
+    As designed, measured, built and residual of every frame; intervals; the posterior
+    of each parameter as a curve;
+    correlations; what to measure next. ``truth``: hidden values by name, where they are
+    known, drawn beside the fit.
     """
-    sure = float(np.mean([s < 0.5 * scale(name) for name, s in zip(result.names, result.sigma, strict=True)]))
+    sure = float(
+        np.mean(
+            [
+                s < 0.5 * scale(name)
+                for name, s in zip(result.names, result.sigma, strict=True)
+            ]
+        )
+    )
     keys = [
-        report.KeyFigure("verdict", "trusted" if result.trusted else "refused by its checks", result.trusted),
-        report.KeyFigure("chi² / dof", f"{result.chi2_per_dof:.3f}", 0.9 < result.chi2_per_dof < 1.15),
+        report.KeyFigure(
+            "verdict",
+            "trusted" if result.trusted else "refused by its checks",
+            result.trusted,
+        ),
+        report.KeyFigure(
+            "chi² / dof", f"{result.chi2_per_dof:.3f}", 0.9 < result.chi2_per_dof < 1.15
+        ),
         report.KeyFigure("frames", str(len(result.measured))),
         report.KeyFigure("parameters", f"{len(result.names)}, {sure:.0%} well known"),
     ]
@@ -65,17 +101,30 @@ def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | 
         "pale: what would be left if all causes that nobody stated were absent; grey: what was known beforehand."
     )
     correlated = report.Figure(
-        _correlation(result), "Correlation of the parameters: deep colours cannot be told apart."
+        _correlation(result),
+        "Correlation of the parameters: deep colours cannot be told apart.",
     )
     sections = [
         report.Section("What is known", "\n\n".join(result.verdicts)),
-        report.Section("Frames", result.reason + ".", [report.Figure(pictures["frames"], seen, wide=True)]),
-        report.Section("Parameters", "", [report.Figure(pictures["parameters"], bars, wide=True), _parameters(result)]),
+        report.Section(
+            "Frames",
+            result.reason + ".",
+            [report.Figure(pictures["frames"], seen, wide=True)],
+        ),
+        report.Section(
+            "Parameters",
+            "",
+            [
+                report.Figure(pictures["parameters"], bars, wide=True),
+                _parameters(result),
+            ],
+        ),
         *_curves(pictures, truth),
         report.Section("What goes together", "", [correlated]),
         report.Section("What the frames fix", "\n\n".join(result.identifiable)),
         report.Section(
-            "What they cannot tell, and what to measure next", "\n\n".join(result.degeneracies) or "Nothing."
+            "What they cannot tell, and what to measure next",
+            "\n\n".join(result.degeneracies) or "Nothing.",
         ),
         report.Section("Put right or assumed on the way", "\n\n".join(result.cautions)),
     ]
@@ -85,7 +134,9 @@ def asbuilt_report(path: Path, result: AsBuilt, *, truth: Mapping[str, float] | 
     report.write(path, "The lens as built", sections, lead=lead, key_figures=keys)
 
 
-def _curves(pictures: dict[str, bytes], truth: Mapping[str, float] | None) -> list[report.Section]:
+def _curves(
+    pictures: dict[str, bytes], truth: Mapping[str, float] | None
+) -> list[report.Section]:
     if "posterior" not in pictures:
         return []
     caption = (
@@ -95,18 +146,26 @@ def _curves(pictures: dict[str, bytes], truth: Mapping[str, float] | None) -> li
     caption += "draws, where the posterior is bent or double. Grey line: the design."
     caption += " Red line: the hidden truth." if truth is not None else ""
     return [
-        report.Section("Posterior of each parameter", "", [report.Figure(pictures["posterior"], caption, wide=True)])
+        report.Section(
+            "Posterior of each parameter",
+            "",
+            [report.Figure(pictures["posterior"], caption, wide=True)],
+        )
     ]
 
 
 def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
-    """Small curves, four in a row: density by profile, draws where there are any, interval, design and truth."""
+    """Small curves, four in a row: density by profile, draws where there are any,
+    interval, design and truth.
+    """
     from matplotlib.figure import Figure
 
     names = [name for name in result.names if name in result.curves]
     rows = -(-len(names) // 4)
     figure = Figure(figsize=(9, 1.35 * rows + 0.2))
-    axes = figure.subplots(rows, 4, squeeze=False, gridspec_kw={"hspace": 0.9, "wspace": 0.12}).ravel()
+    axes = figure.subplots(
+        rows, 4, squeeze=False, gridspec_kw={"hspace": 0.9, "wspace": 0.12}
+    ).ravel()
     for axis in axes:
         axis.set_axis_off()
     for axis, name in zip(axes, names, strict=False):
@@ -118,11 +177,29 @@ def _posterior(result: AsBuilt, truth: Mapping[str, float]) -> bytes:
         within = result.curves[name]
         axis.set_axis_on()
         axis.axvspan(low, high, color="#1f6feb", alpha=0.12, linewidth=0)
-        axis.plot(at, knowable.density(_stretched(result, name, within), at), color="#1f6feb", linewidth=1.2)
-        axis.plot(at, knowable.density(within, at), color="#1f6feb", linewidth=0.6, linestyle=(0, (3, 2)))
+        axis.plot(
+            at,
+            knowable.density(_stretched(result, name, within), at),
+            color="#1f6feb",
+            linewidth=1.2,
+        )
+        axis.plot(
+            at,
+            knowable.density(within, at),
+            color="#1f6feb",
+            linewidth=0.6,
+            linestyle=(0, (3, 2)),
+        )
         if len(result.draws):
             drawn = result.draws[:, result.names.index(name)]
-            axis.hist(drawn, bins=24, range=(at[0], at[-1]), density=True, color="#999", alpha=0.5)
+            axis.hist(
+                drawn,
+                bins=24,
+                range=(at[0], at[-1]),
+                density=True,
+                color="#999",
+                alpha=0.5,
+            )
         if at[0] < 0 < at[-1]:
             axis.axvline(0, color="#888", linewidth=0.7)
         for value in hidden:
@@ -139,15 +216,32 @@ def _stretched(result: AsBuilt, name: str, curve: Array) -> Array:
     """A profile as wide as the interval with what cannot be told, each side by itself."""
     value = float(result.value[result.names.index(name)])
     sides = zip(result.interval(name), result.within_model(name), strict=True)
-    low, high = ((outer - value) / (inner - value) if inner != value else 1.0 for outer, inner in sides)
-    return np.stack([value + np.where(curve[0] < value, low, high) * (curve[0] - value), curve[1]])
+    low, high = (
+        (outer - value) / (inner - value) if inner != value else 1.0
+        for outer, inner in sides
+    )
+    return np.stack(
+        [value + np.where(curve[0] < value, low, high) * (curve[0] - value), curve[1]]
+    )
 
 
 def _parameters(result: AsBuilt) -> report.Table:
     rows = []
     for name, v, s in zip(result.names, result.value, result.sigma, strict=True):
-        ends = ("{:.4g} to {:.4g}".format(*of(name)) for of in (result.interval, result.within_model))
-        rows.append((name, float(v), float(s), *ends, ", ".join(result.most(name)), PARAMETERS[PLACE[name]].meaning))
+        ends = (
+            "{:.4g} to {:.4g}".format(*of(name))
+            for of in (result.interval, result.within_model)
+        )
+        rows.append(
+            (
+                name,
+                float(v),
+                float(s),
+                *ends,
+                ", ".join(result.most(name)),
+                PARAMETERS[PLACE[name]].meaning,
+            )
+        )
     heads = "95 %", "if nothing unstated is there", "widened mostly by"
     return report.Table(("parameter", "value", "1 sigma", *heads, "meaning"), rows)
 
@@ -159,16 +253,30 @@ def scale(name: str) -> float:
 
 def _every_frame(result: AsBuilt) -> bytes:
     stacks = result.nominal, result.measured, result.predicted
-    titles = [f"{z / 1e3:.3g} mm" if z >= 1e3 else f"{z:.3g} um" for z in result.depth_um]
+    titles = [
+        f"{z / 1e3:.3g} mm" if z >= 1e3 else f"{z:.3g} um" for z in result.depth_um
+    ]
     if np.ptp(result.angle_rad) > 0:
-        titles = [f"{t}\n{np.degrees(a[0]):.3g}°" for t, a in zip(titles, result.angle_rad, strict=True)]
-    return frames_figure(stacks, result.residual_sigma, ("as designed", "measured", "as built"), titles=titles)
+        titles = [
+            f"{t}\n{np.degrees(a[0]):.3g}°"
+            for t, a in zip(titles, result.angle_rad, strict=True)
+        ]
+    return frames_figure(
+        stacks,
+        result.residual_sigma,
+        ("as designed", "measured", "as built"),
+        titles=titles,
+    )
 
 
 def _intervals(result: AsBuilt) -> bytes:
     from matplotlib.figure import Figure
 
-    shown = [i for i, name in enumerate(result.names) if name != "log_gain" and not name.startswith("background")]
+    shown = [
+        i
+        for i, name in enumerate(result.names)
+        if name != "log_gain" and not name.startswith("background")
+    ]
     names = [result.names[i] for i in shown]
     unit = np.array([scale(name) for name in names])
     value = result.value[shown] / unit
@@ -177,18 +285,40 @@ def _intervals(result: AsBuilt) -> bytes:
     figure = Figure(figsize=(7, 0.22 * len(names) + 0.8))
     axis = figure.add_subplot()
     rows = np.arange(len(names))[::-1]
-    axis.barh(rows, 2 * 1.96 * np.minimum(prior, 1e3), left=-1.96 * np.minimum(prior, 1e3), color="#e4e4e4")
+    axis.barh(
+        rows,
+        2 * 1.96 * np.minimum(prior, 1e3),
+        left=-1.96 * np.minimum(prior, 1e3),
+        color="#e4e4e4",
+    )
     whole, within = (
-        np.abs(np.array([of(name) for name in names]) / unit[:, None] - value[:, None]).T
+        np.abs(
+            np.array([of(name) for name in names]) / unit[:, None] - value[:, None]
+        ).T
         for of in (result.interval, result.within_model)
     )
     axis.errorbar(value, rows, xerr=within, fmt="none", ecolor="#9ec1f7", linewidth=3.5)
-    axis.errorbar(value, rows, xerr=whole, fmt="o", markersize=3, color="#1f6feb", capsize=2, linewidth=1.2)
+    axis.errorbar(
+        value,
+        rows,
+        xerr=whole,
+        fmt="o",
+        markersize=3,
+        color="#1f6feb",
+        capsize=2,
+        linewidth=1.2,
+    )
     axis.axvline(0, color="#444", linewidth=0.8)
-    axis.set_yticks(rows, [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)], fontsize=7)
+    axis.set_yticks(
+        rows,
+        [f"{name}  (1 = {u:g})" for name, u in zip(names, unit, strict=True)],
+        fontsize=7,
+    )
     axis.set_xscale("symlog", linthresh=1)
     axis.set_xlim(-60, 60)
-    axis.set_xlabel("value less design, in typical uncertainties (linear inside +-1)", fontsize=8)
+    axis.set_xlabel(
+        "value less design, in typical uncertainties (linear inside +-1)", fontsize=8
+    )
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
     return report.png(figure)
@@ -199,38 +329,70 @@ def _correlation(result: AsBuilt) -> bytes:
 
     figure = Figure(figsize=(6, 5.4))
     axis = figure.add_subplot()
-    figure.colorbar(axis.imshow(result.correlation, cmap="RdBu_r", vmin=-1, vmax=1), ax=axis)
+    figure.colorbar(
+        axis.imshow(result.correlation, cmap="RdBu_r", vmin=-1, vmax=1), ax=axis
+    )
     axis.set_xticks(range(len(result.names)), result.names, rotation=90, fontsize=6)
     axis.set_yticks(range(len(result.names)), result.names, fontsize=6)
     return report.png(figure)
 
 
 def frames_figure(
-    stacks: tuple[Array, ...], residual_sigma: Array, labels: tuple[str, ...], *, titles: Sequence[str] = ()
+    stacks: tuple[Array, ...],
+    residual_sigma: Array,
+    labels: tuple[str, ...],
+    *,
+    titles: Sequence[str] = (),
 ) -> bytes:
-    """PNG of all frames, twelve to a band: one row for each stack, the last for the residual in sigma (-5 to 5)."""
+    """PNG of all frames, twelve to a band: one row for each stack, the last for the
+    residual in sigma (-5 to 5).
+    """
     from matplotlib.figure import Figure
 
     total, each = len(residual_sigma), len(stacks) + 1
     columns = min(12, total)
     bands = -(-total // columns)
     tall = residual_sigma.shape[1] / residual_sigma.shape[2]
-    figure = Figure(figsize=(1.15 * columns + 0.4, 1.2 * tall * each * bands + 0.25 * bands))
-    axes = figure.subplots(each * bands, columns, squeeze=False, gridspec_kw={"wspace": 0.04, "hspace": 0.06})
+    figure = Figure(
+        figsize=(1.15 * columns + 0.4, 1.2 * tall * each * bands + 0.25 * bands)
+    )
+    axes = figure.subplots(
+        each * bands,
+        columns,
+        squeeze=False,
+        gridspec_kw={"wspace": 0.04, "hspace": 0.06},
+    )
     for axis in axes.flat:
         axis.set_axis_off()
     for frame in range(total):
         band, column = divmod(frame, columns)
         cells = axes[band * each : (band + 1) * each, column]
         floor = [float(np.median(stack[frame])) for stack in stacks]
-        top = max(float(stack[frame].max()) - low for stack, low in zip(stacks, floor, strict=True))
+        top = max(
+            float(stack[frame].max()) - low
+            for stack, low in zip(stacks, floor, strict=True)
+        )
         for cell, stack, low in zip(cells, stacks, floor, strict=False):
-            cell.imshow(np.sqrt(np.maximum(stack[frame] - low, 0)), cmap="magma", vmin=0, vmax=max(top, 1e-9) ** 0.5)
+            cell.imshow(
+                np.sqrt(np.maximum(stack[frame] - low, 0)),
+                cmap="magma",
+                vmin=0,
+                vmax=max(top, 1e-9) ** 0.5,
+            )
         cells[-1].imshow(residual_sigma[frame], cmap="RdBu_r", vmin=-5, vmax=5)
         cells[0].set_title(titles[frame] if titles else f"{frame}", fontsize=7, pad=3)
         if column == 0:
             for cell, label in zip(cells, (*labels, "residual / sigma"), strict=True):
-                cell.text(-0.06, 0.5, label, transform=cell.transAxes, rotation=90, ha="right", va="center", fontsize=7)
+                cell.text(
+                    -0.06,
+                    0.5,
+                    label,
+                    transform=cell.transAxes,
+                    rotation=90,
+                    ha="right",
+                    va="center",
+                    fontsize=7,
+                )
     return report.png(figure)
 
 
@@ -239,7 +401,11 @@ def _maps(fit: PupilFit) -> bytes:
 
     figure = Figure(figsize=(6, 2.7))
     for place, (values, title, colours) in enumerate(
-        ((fit.phase_rad, "phase / rad", "twilight"), (fit.amplitude, "amplitude", "viridis")), 1
+        (
+            (fit.phase_rad, "phase / rad", "twilight"),
+            (fit.amplitude, "amplitude", "viridis"),
+        ),
+        1,
     ):
         axis = figure.add_subplot(1, 2, place)
         figure.colorbar(axis.imshow(values, cmap=colours), ax=axis)

@@ -1,4 +1,6 @@
-"""Panels of a capture (its frames) and of an as-built lens: frames, fit and residual; parameters; PSFs."""
+"""Panels of a capture (its frames) and of an as-built lens: frames, fit and residual;
+parameters; PSFs.
+"""
 
 from pathlib import Path
 
@@ -22,7 +24,10 @@ def capture(path: Path) -> list[Panel]:
     rows = [
         (
             name,
-            *(round(float(v), 6) if np.isfinite(v) else "not stated" for v in (position, *np.degrees(angle), exposure)),
+            *(
+                round(float(v), 6) if np.isfinite(v) else "not stated"
+                for v in (position, *np.degrees(angle), exposure)
+            ),
         )
         for name, position, angle, exposure in zip(
             read.names, read.position_um, read.angle_rad, read.exposure_s, strict=True
@@ -37,15 +42,32 @@ def capture(path: Path) -> list[Panel]:
     about += [("put right", text) for text in read.corrections]
     return [
         Images("Frames", frames, [Axis("frame", list(read.names))], step, "counts"),
-        Numbers("Stage", ("frame", "position / µm", "x angle / deg", "y angle / deg", "exposure / s"), rows),
+        Numbers(
+            "Stage",
+            (
+                "frame",
+                "position / µm",
+                "x angle / deg",
+                "y angle / deg",
+                "exposure / s",
+            ),
+            rows,
+        ),
         Numbers("As captured", ("name", "value"), about),
     ]
 
 
 def asbuilt(path: Path) -> list[Panel]:
-    """The lens as built: its parameters with intervals, frames beside fit and residual, and its PSFs."""
+    """The lens as built: its parameters with intervals, frames beside fit and residual,
+    and its PSFs.
+    """
     made = AsBuilt.load(path)
-    axis = [Axis("frame", [_said(d, a) for d, a in zip(made.depth_um, made.angle_rad, strict=True)])]
+    axis = [
+        Axis(
+            "frame",
+            [_said(d, a) for d, a in zip(made.depth_um, made.angle_rad, strict=True)],
+        )
+    ]
     peak = float(made.measured.max())
     panels: list[Panel] = [
         Numbers(
@@ -63,25 +85,52 @@ def asbuilt(path: Path) -> list[Panel]:
             made.pixel_um,
             "of the brightest pixel",
         ),
-        Images("Captured less fitted", made.residual_sigma, axis, made.pixel_um, "sigma", signed=True),
+        Images(
+            "Captured less fitted",
+            made.residual_sigma,
+            axis,
+            made.pixel_um,
+            "sigma",
+            signed=True,
+        ),
         Numbers("What is known", ("", "in words"), _words(made)),
     ]
     return [*panels, _psf(made.psf())]
 
 
 def pupil(path: Path) -> list[Panel]:
-    """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the numbers."""
+    """Any microscope pupil: its phase and amplitude, the stack beside the fit, and the
+    numbers.
+    """
     stored = store.load(path, "pupil")
     held, about = stored.arrays, stored.attributes
-    names = [name.decode() if isinstance(name, bytes) else str(name) for name in held["names"].tolist()]
+    names = [
+        name.decode() if isinstance(name, bytes) else str(name)
+        for name in held["names"].tolist()
+    ]
     rows = list(zip(names, held["value"].tolist(), held["sigma"].tolist(), strict=True))
     planes = [Axis("plane", held["position_um"].tolist(), "µm")]
     both = np.stack([held["measured"], held["predicted"]])
     step = 2 / held["phase_rad"].shape[-1]
     said = [(in_words(key), str(about[key])) for key in sorted(about) if key != "spec"]
     return [
-        Images("Phase in the pupil", np.nan_to_num(held["phase_rad"]), [], step, "rad", signed=True, across="radius"),
-        Images("Amplitude in the pupil", np.nan_to_num(held["amplitude"]), [], step, "of its mean", across="radius"),
+        Images(
+            "Phase in the pupil",
+            np.nan_to_num(held["phase_rad"]),
+            [],
+            step,
+            "rad",
+            signed=True,
+            across="radius",
+        ),
+        Images(
+            "Amplitude in the pupil",
+            np.nan_to_num(held["amplitude"]),
+            [],
+            step,
+            "of its mean",
+            across="radius",
+        ),
         Images(
             "Stack as measured and as fitted",
             both / both.max(),
@@ -90,7 +139,15 @@ def pupil(path: Path) -> list[Panel]:
             "of the brightest pixel",
             across="pixels",
         ),
-        Images("Measured less fitted", held["residual_sigma"], planes, 1.0, "sigma", signed=True, across="pixels"),
+        Images(
+            "Measured less fitted",
+            held["residual_sigma"],
+            planes,
+            1.0,
+            "sigma",
+            signed=True,
+            across="pixels",
+        ),
         Numbers("Parameters", ("parameter", "value", "standard error"), rows),
         Numbers("How good it is", ("", "value"), said),
     ]
@@ -102,10 +159,17 @@ def _psf(stack: PsfStack) -> Panel:
         Axis("field angle", [_said(None, pair) for pair in stack.angles_rad]),
         Axis("depth", (1e-3 * stack.depths_um).tolist(), "mm"),
     ]
-    values = values.reshape(len(axes[0].values), len(axes[1].values), *values.shape[-2:])
+    values = values.reshape(
+        len(axes[0].values), len(axes[1].values), *values.shape[-2:]
+    )
     peak = float(values.max())
     return Images(
-        "PSF as built", values / peak, at_brightest(axes, values), stack.step_um, "of the highest peak", optics=True
+        "PSF as built",
+        values / peak,
+        at_brightest(axes, values),
+        stack.step_um,
+        "of the highest peak",
+        optics=True,
     )
 
 
@@ -117,6 +181,12 @@ def _said(depth_um: float | None, angle_rad: Array) -> str:
 
 def _words(made: AsBuilt) -> list[tuple[str, str]]:
     found = [("verdict", text) for text in made.verdicts]
-    found += [("problem", text) for text in made.problems] + [("caution", text) for text in made.cautions]
+    found += [("problem", text) for text in made.problems] + [
+        ("caution", text) for text in made.cautions
+    ]
     found += [("cannot be told apart", text) for text in made.degeneracies]
-    return [*found, ("chi² per degree of freedom", f"{made.chi2_per_dof:.3f}"), ("search", made.reason)]
+    return [
+        *found,
+        ("chi² per degree of freedom", f"{made.chi2_per_dof:.3f}"),
+        ("search", made.reason),
+    ]

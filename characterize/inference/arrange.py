@@ -1,4 +1,6 @@
-"""Before the fit: how the frames lie. Orientation, order and stage zero, judged against the nominal lens."""
+"""Before the fit: how the frames lie. Orientation, order and stage zero, judged against
+the nominal lens.
+"""
 
 import itertools
 import math
@@ -7,7 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from characterize.captures import MIRRORED, TURNS, Spectra, above_rim, between, likeness, turn
+from characterize.captures import (
+    MIRRORED,
+    TURNS,
+    Spectra,
+    above_rim,
+    between,
+    likeness,
+    turn,
+)
 from characterize.inference.leastsquares import Data
 from characterize.model import PLACE, ForwardModel, Setting, vector
 from metalens.ground import threads
@@ -18,25 +28,37 @@ Way = tuple[bool, int]  # reordered, orientation
 Shift = tuple[float, float]
 Both = tuple[Array, Array]
 """Images as they are, and those of a camera on its side: the same where frames are square."""
-_TWIN = 0.05  # of the likeness by which reversed frames must do better: defocus looks much alike on both sides
-_NEAR = 0.02  # of the likeness: by ten times less errors of a made lens were seen to exchange two orientations
+# of the likeness by which reversed frames must do better: defocus looks much alike on
+# both sides
+_TWIN = 0.05
+# of the likeness: by ten times less errors of a made lens were seen to exchange two
+# orientations
+_NEAR = 0.02
 _TOLD = 40.0  # chi-square between orientations from which on fits may tell them apart
 _SURE = 0.9  # likeness from which on the nominal lens explains the frames
 _ZEROS = 17
-_DISTANCES = 17  # of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at NA 0.25
+# of the scan: 25 um apart over two sigma of the prior, a tenth of a wave of defocus at
+# NA 0.25
+_DISTANCES = 17
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Arrangement:
     """What the nominal lens says about the frames.
 
-    stage_zero_um, distance_um: best of the scan; shift_px: (y, x) mean displacement of the light.
-    likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage zero.
-    order: (n,) frame that fits the i-th stated depth best; reordered: whether it clearly differs from the stated one.
+    stage_zero_um, distance_um: best of the scan; shift_px: (y, x) mean displacement of
+    the light.
+    likeness: mean over frames of the best normalised correlation, 0 to 1, at that stage
+    zero.
+    order: (n,) frame that fits the i-th stated depth best; reordered: whether it
+    clearly differs from the stated one.
     order_seen: whether the nominal images differ enough with depth to tell.
-    orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the stated one beyond doubt.
-    alike: turns (1 to 7) under which the nominal images do not change: these cannot be told from the chosen one.
-    others: the same in other ways about as much alike: as a lens is made, any may be the one; fits tell.
+    orientation: (0 to 7) turn that suits the frames best; clearly: whether it beats the
+    stated one beyond doubt.
+    alike: turns (1 to 7) under which the nominal images do not change: these cannot be
+    told from the chosen one.
+    others: the same in other ways about as much alike: as a lens is made, any may be
+    the one; fits tell.
     """
 
     stage_zero_um: float
@@ -58,45 +80,70 @@ class Arrangement:
 
 
 def few_frames(setting: Setting) -> Array:
-    """Frames that tell the starts apart: the ends and the middle of the depths at every angle."""
+    """Frames that tell the starts apart: the ends and the middle of the depths at every
+    angle.
+    """
     chosen: list[int] = []
     for angle in np.unique(setting.angle_rad, axis=0):
         index = np.flatnonzero((setting.angle_rad == angle).all(1))
         by_depth = index[np.argsort(setting.depth_um[index], kind="stable")]
-        chosen += by_depth[np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))].tolist()
+        chosen += by_depth[
+            np.unique(np.linspace(0, len(index) - 1, 4).round().astype(int))
+        ].tolist()
     return np.unique(chosen)
 
 
 def arrange(
-    model: ForwardModel, data: Data, *, scan_um: float, start: Array | None = None, reach_um: float = 0.0
+    model: ForwardModel,
+    data: Data,
+    *,
+    scan_um: float,
+    start: Array | None = None,
+    reach_um: float = 0.0,
 ) -> Arrangement:
-    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth, in all eight orientations.
+    """Scan the stage zero over +-``scan_um`` and compare every frame with every depth,
+    in all eight orientations.
 
-    Where the frames then seem out of order or hardly alike, the lens-sensor distance is scanned over +-``reach_um``
-    too: it shifts the whole stack through focus, as no stage zero does, and a stack shifted by a depth or two looks
-    like one in another order. What needs less putting right and is as much alike is taken.
+    Where the frames then seem out of order or hardly alike, the lens-sensor distance is
+    scanned over +-``reach_um``
+    too: it shifts the whole stack through focus, as no stage zero does, and a stack
+    shifted by a depth or two looks
+    like one in another order. What needs less putting right and is as much alike is
+    taken.
     """
     frames = _Frames.of(model, data)
     start = vector() if start is None else start.copy()
     nearest = float(model.setting.depth_um.min())
-    zeros = np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS) if scan_um > 0 else np.zeros(1)
+    zeros = (
+        np.linspace(-min(scan_um, 0.6 * nearest), scan_um, _ZEROS)
+        if scan_um > 0
+        else np.zeros(1)
+    )
     zeros = np.unique(np.append(zeros, start[PLACE["stage_zero_um"]]))
     plain, score = frames.scanned(start, zeros)
     found = _laid(frames, plain, score)
     if reach_um > 0 and (found.reordered or found.clearly or score < _SURE):
-        distances = start[PLACE["distance_um"]] + reach_um * np.linspace(-1, 1, _DISTANCES)
-        moved, _ = frames.some(few_frames(model.setting)).scanned(start, zeros[:: _ZEROS // 4], distances)
+        distances = start[PLACE["distance_um"]] + reach_um * np.linspace(
+            -1, 1, _DISTANCES
+        )
+        moved, _ = frames.some(few_frames(model.setting)).scanned(
+            start, zeros[:: _ZEROS // 4], distances
+        )
         moved, better = frames.scanned(moved, zeros)
         other = _laid(frames, moved, better)
         simpler = (other.reordered, other.clearly) < (found.reordered, found.clearly)
-        if better >= score and (simpler or (better > score + _TWIN and not other.reordered)):
+        if better >= score and (
+            simpler or (better > score + _TWIN and not other.reordered)
+        ):
             return other
     return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Frames:
-    """What is compared: light (n, y, x) less its rim, noise and share of clipped pixels (n,), frames end to end."""
+    """What is compared: light (n, y, x) less its rim, noise and share of clipped pixels
+    (n,), frames end to end.
+    """
 
     model: ForwardModel
     rough: ForwardModel
@@ -109,41 +156,77 @@ class _Frames:
     def of(cls, model: ForwardModel, data: Data) -> "_Frames":
         light = above_rim(np.where(data.usable, data.electrons, np.nan))
         noise = np.sqrt((data.variance(data.electrons) * data.usable).sum((1, 2)))
-        return cls(model, model.quick(), light, noise, data.saturated.mean((1, 2)), _reversed(model))
+        return cls(
+            model,
+            model.quick(),
+            light,
+            noise,
+            data.saturated.mean((1, 2)),
+            _reversed(model),
+        )
 
     def some(self, index: Array) -> "_Frames":
         """Some of the frames."""
         model, rough = self.model.only(index), self.rough.only(index)
-        return _Frames(model, rough, self.light[index], self.noise[index], self.clipped[index], _reversed(model))
+        return _Frames(
+            model,
+            rough,
+            self.light[index],
+            self.noise[index],
+            self.clipped[index],
+            _reversed(model),
+        )
 
-    def scanned(self, start: Array, zeros: Array, distances_um: Array | None = None) -> tuple[Array, float]:
-        """Parameters at the best stage zero (and distance) of the way that the frames lie; likeness there.
+    def scanned(
+        self, start: Array, zeros: Array, distances_um: Array | None = None
+    ) -> tuple[Array, float]:
+        """Parameters at the best stage zero (and distance) of the way that the frames
+        lie; likeness there.
 
-        Each way has its own best: images that twist with depth are mirrored ones at another depth.
+        Each way has its own best: images that twist with depth are mirrored ones at
+        another depth.
         """
-        distances = start[PLACE["distance_um"], None] if distances_um is None else distances_um
+        distances = (
+            start[PLACE["distance_um"], None] if distances_um is None else distances_um
+        )
         places = np.repeat(start[None], len(distances) * len(zeros), 0)
         places[:, PLACE["distance_um"]], places[:, PLACE["stage_zero_um"]] = (
             part.ravel() for part in np.meshgrid(distances, zeros, indexing="ij")
         )
         turned = [Spectra.of(turn(self.light, k), self.noise) for k in _EVERY]
-        scores = np.nan_to_num(threads.each(lambda x: self._scores(x, turned), places), nan=-math.inf)
+        scores = np.nan_to_num(
+            threads.each(lambda x: self._scores(x, turned), places), nan=-math.inf
+        )
         stated, back = scores.max(0)
         orientation, back_first = _way(stated, back)
         place = int(np.argmax(scores[:, int(back_first), orientation]))
-        return places[place], float(scores[place, int(back_first), orientation]) - _TWIN * back_first
+        return places[place], float(
+            scores[place, int(back_first), orientation]
+        ) - _TWIN * back_first
 
     def _scores(self, x: Array, turned: list[Spectra]) -> Array:
-        """(2, orientations) likeness at some parameters: of frames as stated, and end to end."""
+        """(2, orientations) likeness at some parameters: of frames as stated, and end
+        to end.
+        """
         upright, aside = _expected(self.rough, x, self.clipped)
         first = Spectra.of(upright, 0 * self.noise)
-        expected = first, first if aside is upright else Spectra.of(aside, 0 * self.noise)
+        expected = (
+            first,
+            first if aside is upright else Spectra.of(aside, 0 * self.noise),
+        )
         orders = np.arange(len(self.light)), self.back
-        return np.array([[turned[k].alike(expected[k % 2], index) for k in _EVERY] for index in orders])
+        return np.array(
+            [
+                [turned[k].alike(expected[k % 2], index) for k in _EVERY]
+                for index in orders
+            ]
+        )
 
 
 def _way(stated: Array, back: Array) -> tuple[int, bool]:
-    """Place of the orientation, and whether frames lie end to end, by their likeness: the least that explains them."""
+    """Place of the orientation, and whether frames lie end to end, by their likeness:
+    the least that explains them.
+    """
     orientation, clearly = _plainest_turn(stated)
     orientation = orientation if clearly else 0
     if back[0] <= stated[0] + _TWIN or back.max() < stated[orientation]:
@@ -152,14 +235,18 @@ def _way(stated: Array, back: Array) -> tuple[int, bool]:
 
 
 def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
-    """Order and orientation of the frames, judged against the images at some parameters."""
+    """Order and orientation of the frames, judged against the images at some
+    parameters.
+    """
     light, noise = frames.light, frames.noise
     expected = _expected(frames.model, x, frames.clipped)
     order, reordered, seen = _order(light, expected[0], noise, frames.model)
     orders = {False: np.arange(len(light)), **({True: order} if reordered else {})}
     alike, shifts = _ways(frames, expected, orders)
     orientation, clearly = _orientation(light, expected, noise)
-    if reordered and clearly:  # a twin: images that twist with depth look mirrored when reversed
+    if (
+        reordered and clearly
+    ):  # a twin: images that twist with depth look mirrored when reversed
         reordered, clearly = _plainest(light, expected, noise, order, orientation)
     chosen = reordered, orientation if clearly else 0
     apart = {k: _apart(k, expected, light, noise) for k in _EVERY}
@@ -175,22 +262,40 @@ def _laid(frames: _Frames, x: Array, likeness: float) -> Arrangement:
         clearly=clearly,
         alike=tuple(k for k in apart if k and apart[k] < _TOLD),
     )
-    told = [way for way in alike if way[0] == reordered and apart[between(chosen[1], way[1])] >= _TOLD]
-    twin = sorted((way for way in alike if way[0] != reordered), key=lambda way: -alike[way])[:1]
+    told = [
+        way
+        for way in alike
+        if way[0] == reordered and apart[between(chosen[1], way[1])] >= _TOLD
+    ]
+    twin = sorted(
+        (way for way in alike if way[0] != reordered), key=lambda way: -alike[way]
+    )[:1]
     others = [
-        replace(found, reordered=way[0], orientation=way[1], clearly=way[1] > 0, shift_px=shifts[way])
+        replace(
+            found,
+            reordered=way[0],
+            orientation=way[1],
+            clearly=way[1] > 0,
+            shift_px=shifts[way],
+        )
         for way in [*told, *twin]
         if alike[way] > alike[chosen] - _NEAR
     ]
     return replace(found, others=tuple(others))
 
 
-def _ways(frames: _Frames, expected: Both, orders: dict[bool, Array]) -> tuple[dict[Way, float], dict[Way, Shift]]:
-    """Mean likeness and shift (y, x) of the frames, by whether they are reordered and by orientation."""
+def _ways(
+    frames: _Frames, expected: Both, orders: dict[bool, Array]
+) -> tuple[dict[Way, float], dict[Way, Shift]]:
+    """Mean likeness and shift (y, x) of the frames, by whether they are reordered and
+    by orientation.
+    """
     alike, shifts = {}, {}
     for way in itertools.product(orders, _EVERY):
         index = orders[way[0]]
-        found = _compare(turn(frames.light[index], way[1]), expected[way[1] % 2], frames.noise[index])
+        found = _compare(
+            turn(frames.light[index], way[1]), expected[way[1] % 2], frames.noise[index]
+        )
         alike[way] = float(np.mean([score for score, _ in found]))
         y, x = np.median([shift for _, shift in found], axis=0).tolist()
         shifts[way] = y, x
@@ -198,9 +303,15 @@ def _ways(frames: _Frames, expected: Both, orders: dict[bool, Array]) -> tuple[d
 
 
 def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
-    """Chi-square between the nominal images, as bright as the light, and these turned about the chief ray."""
-    odd = [one[:, 1 - one.shape[1] % 2 :, 1 - one.shape[2] % 2 :] for one in expected]  # pixel n // 2 is its middle
-    unlike = ((turn(odd[0], k) - odd[k % 2]) ** 2).sum((1, 2)) * _brightness(light, expected[0], noise) ** 2
+    """Chi-square between the nominal images, as bright as the light, and these turned
+    about the chief ray.
+    """
+    odd = [
+        one[:, 1 - one.shape[1] % 2 :, 1 - one.shape[2] % 2 :] for one in expected
+    ]  # pixel n // 2 is its middle
+    unlike = ((turn(odd[0], k) - odd[k % 2]) ** 2).sum((1, 2)) * _brightness(
+        light, expected[0], noise
+    ) ** 2
     return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
 
 
@@ -208,13 +319,17 @@ def _reversed(model: ForwardModel) -> Array:
     """(n,) frames from the other end of the stage, at each field angle."""
     back = np.arange(len(model.setting.depth_um))
     for group in model.groups:
-        by_depth = group.index[np.argsort(model.setting.depth_um[group.index], kind="stable")]
+        by_depth = group.index[
+            np.argsort(model.setting.depth_um[group.index], kind="stable")
+        ]
         back[by_depth] = by_depth[::-1]
     return back
 
 
 def _expected(model: ForwardModel, x: Array, clipped: Array) -> Both:
-    """Nominal frames without background, clipped in as large a share of their pixels as the measured ones."""
+    """Nominal frames without background, clipped in as large a share of their pixels as
+    the measured ones.
+    """
     upright = _clipped(model, x, clipped)
     square = model.setting.rows == model.setting.columns
     return upright, upright if square else _clipped(model.exchanged(), x, clipped)
@@ -222,20 +337,31 @@ def _expected(model: ForwardModel, x: Array, clipped: Array) -> Both:
 
 def _clipped(model: ForwardModel, x: Array, clipped: Array) -> Array:
     images = model.images(_bare(x))[0]
-    tops = [np.quantile(image, 1 - share) for image, share in zip(images, clipped, strict=True)]
+    tops = [
+        np.quantile(image, 1 - share)
+        for image, share in zip(images, clipped, strict=True)
+    ]
     return above_rim(np.minimum(images, np.array(tops)[:, None, None]))
 
 
-def _compare(light: Array, expected: Array, noise: Array) -> list[tuple[float, tuple[float, float]]]:
-    return [likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)]
+def _compare(
+    light: Array, expected: Array, noise: Array
+) -> list[tuple[float, tuple[float, float]]]:
+    return [
+        likeness(a, b, float(s)) for a, b, s in zip(light, expected, noise, strict=True)
+    ]
 
 
 def _mean_likeness(light: Array, expected: Array, noise: Array) -> float:
     return float(np.mean([score for score, _ in _compare(light, expected, noise)]))
 
 
-def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> tuple[Array, bool, bool]:
-    """Assignment of frames to depths by shape and brightness: (order, clearly different, observable at all)."""
+def _order(
+    light: Array, expected: Array, noise: Array, model: ForwardModel
+) -> tuple[Array, bool, bool]:
+    """Assignment of frames to depths by shape and brightness: (order, clearly
+    different, observable at all).
+    """
     n = len(light)
     bright = expected * _brightness(light, expected, noise)
     apart = np.full((n, n), np.inf)
@@ -250,11 +376,17 @@ def _order(light: Array, expected: Array, noise: Array, model: ForwardModel) -> 
     stated, best = float(np.trace(apart)), float(finite[rows, columns].sum())
     neighbours = np.where(np.eye(n, dtype=bool), np.inf, unlike).min(1)
     distinct = bool(n > 1 and np.median(neighbours) > 0.2)
-    return columns, bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct), distinct
+    return (
+        columns,
+        bool((columns != rows).sum() >= 2 and best < 0.7 * stated and distinct),
+        distinct,
+    )
 
 
 def _brightness(light: Array, expected: Array, noise: Array) -> float:
-    """Of the light over that expected, by their power: the sum of frames less a plane may be 0, or below."""
+    """Of the light over that expected, by their power: the sum of frames less a plane
+    may be 0, or below.
+    """
     power = float((light**2).sum())
     seen = max(power - float((noise**2).sum()), 0.1 * power)
     return math.sqrt(seen / max(float((expected**2).sum()), 1e-300))
@@ -266,23 +398,45 @@ def _distance(a: Array, b: Array) -> float:
     return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
 
 
-def _plainest(light: Array, expected: Both, noise: Array, order: Array, orientation: int) -> tuple[bool, bool]:
-    """(reordered, turned): the least that explains the frames, of reordering, turning and both."""
+def _plainest(
+    light: Array, expected: Both, noise: Array, order: Array, orientation: int
+) -> tuple[bool, bool]:
+    """(reordered, turned): the least that explains the frames, of reordering, turning
+    and both.
+    """
     turned = turn(light, orientation)
-    ways = {(True, False): light[order], (False, True): turned, (True, True): turned[order]}
+    ways = {
+        (True, False): light[order],
+        (False, True): turned,
+        (True, True): turned[order],
+    }
     seen = {way: expected[orientation % 2 if way[1] else 0] for way in ways}
-    scores = {way: _mean_likeness(frames, seen[way], noise) for way, frames in ways.items()}
-    return next(way for way, score in scores.items() if score > max(scores.values()) - 5e-3)
+    scores = {
+        way: _mean_likeness(frames, seen[way], noise) for way, frames in ways.items()
+    }
+    return next(
+        way for way, score in scores.items() if score > max(scores.values()) - 5e-3
+    )
 
 
 def _orientation(light: Array, expected: Both, noise: Array) -> tuple[int, bool]:
-    return _plainest_turn(np.array([_mean_likeness(turn(light, k), expected[k % 2], noise) for k in _EVERY]))
+    return _plainest_turn(
+        np.array(
+            [_mean_likeness(turn(light, k), expected[k % 2], noise) for k in _EVERY]
+        )
+    )
 
 
 def _plainest_turn(scores: Array) -> tuple[int, bool]:
-    """Of equal likenesses the plainest turn; whether it beats the first, that of frames as stated, beyond doubt."""
+    """Of equal likenesses the plainest turn; whether it beats the first, that of frames
+    as stated, beyond doubt.
+    """
     best = int(np.flatnonzero(scores >= scores.max() - 2e-3)[0])
-    return best, bool(best != 0 and (1 - scores[best]) < 0.5 * (1 - scores[0]) and scores[best] - scores[0] > 0.02)
+    return best, bool(
+        best != 0
+        and (1 - scores[best]) < 0.5 * (1 - scores[0])
+        and scores[best] - scores[0] > 0.02
+    )
 
 
 def _bare(x: Array) -> Array:
@@ -300,12 +454,16 @@ def rearranged(values: Array, arrangement: Arrangement) -> Array:
 
 
 def laid_words(found: Arrangement) -> list[str]:
-    """What to say of how the frames lie: turned or reordered, and what of that cannot be seen."""
+    """What to say of how the frames lie: turned or reordered, and what of that cannot
+    be seen.
+    """
     words = []
     if found.clearly:
         words.append(f"frames fit the design only {found.words}: used so")
     if found.reordered:
-        words.append(f"frames fit the stated depths only in the order {found.order.tolist()}: used so")
+        words.append(
+            f"frames fit the stated depths only in the order {found.order.tolist()}: used so"
+        )
     if found.alike:
         which = ", ".join((TURNS + MIRRORED)[k] for k in found.alike)
         words.append(

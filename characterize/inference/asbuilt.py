@@ -1,4 +1,5 @@
-"""The lens that was made, as a record and as a file: values, covariance, what can and what cannot be known.
+"""The lens that was made, as a record and as a file: values, covariance, what can and
+what cannot be known.
 
 For those who build on it (retraining, mask correction)::
 
@@ -16,7 +17,8 @@ For those who build on it (retraining, mask correction)::
     built.psf_stack(view, draws[3])                # ... and the lens, pillars and PSFs of each:
     built.lens(draws[3]), built.pillars(draws[3])
 
-PSFs hold all that belongs to the lens (pillars, process, aberrations, distance, wavelength), nothing of the bench.
+PSFs hold all that belongs to the lens (pillars, process, aberrations, distance,
+wavelength), nothing of the bench.
 """
 
 import math
@@ -26,7 +28,15 @@ from typing import Any
 
 import numpy as np
 
-from characterize.model import PLACE, Setting, made, oversampling, true_depth, usual, vector
+from characterize.model import (
+    PLACE,
+    Setting,
+    made,
+    oversampling,
+    true_depth,
+    usual,
+    vector,
+)
 from metalens import lens as lenses
 from metalens import psf as psfs
 from metalens.ground import store
@@ -39,9 +49,11 @@ from metalens.made import PairSensitivities, Sensitivity, Solved
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WithinModel:
-    """What holds where the bench has nothing but what is fitted and stated; all empty where it is not told apart.
+    """What holds where the bench has nothing but what is fitted and stated; all empty
+    where it is not told apart.
 
-    covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by profile over all valleys.
+    covariance: (p, p) of the fitted parameters. low, high: (p,) 95 % intervals by
+    profile over all valleys.
     draws: (m, p) of the posterior where it is no parabola.
     """
 
@@ -55,27 +67,40 @@ class WithinModel:
 class AsBuilt:
     """Result of :func:`characterize.fit`.
 
-    ``covariance``, ``sigma``, ``interval``, ``draws`` and ``samples`` reckon with what the captures cannot tell and
-    nobody stated (glass, source, side wall ...): they hold on a bench that is not known. ``within`` does not.
+    ``covariance``, ``sigma``, ``interval``, ``draws`` and ``samples`` reckon with what
+    the captures cannot tell and
+    nobody stated (glass, source, side wall ...): they hold on a bench that is not
+    known. ``within`` does not.
 
-    design: the lens as designed. response: what height, index and sidewall do to its pillars.
-    names, value, covariance: of the fitted parameters, priors and what cannot be told included.
+    design: the lens as designed. response: what height, index and sidewall do to its
+    pillars.
+    names, value, covariance: of the fitted parameters, priors and what cannot be told
+    included.
     held: {name: value} of parameters that were not fitted.
     information: Fisher information of the frames alone.
-    depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the sensor.
-    measured, predicted, nominal: (n, y, x) electrons: seen, as built, as designed (with fitted gain and background).
+    depth_um, angle_rad: stated, of every frame in the order used. pixel_um: of the
+    sensor.
+    measured, predicted, nominal: (n, y, x) electrons: seen, as built, as designed (with
+    fitted gain and background).
     residual_sigma: (n, y, x), 0 where masked.
-    identifiable: combinations of parameters that the frames alone fix, with their 1 sigma, best first, in words.
-    degeneracies: what cannot be told apart, in words. cautions: everything that was put right or assumed.
+    identifiable: combinations of parameters that the frames alone fix, with their 1
+    sigma, best first, in words.
+    degeneracies: what cannot be told apart, in words. cautions: everything that was put
+    right or assumed.
     trusted: every check passed; problems: those that did not.
-    residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty where none was kept.
-    low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no parabola.
+    residual_modes: of a smooth phase beyond the parameters (:mod:`thinplate`); empty
+    where none was kept.
+    low, high: (p,) 95 % intervals; draws: (m, p) of the posterior where it is no
+    parabola.
     within: the same within the model, narrower.
     verdicts: how well the PSF is known, and how well the process, in words.
-    causes, by_cause: what the captures cannot tell apart and nobody stated: names (c,), (c, p) shift of every parameter
-        by each of plausible size, standard deviations. bench: (p, p) second moment of the shifts by those of the bench
+    causes, by_cause: what the captures cannot tell apart and nobody stated: names (c,),
+    (c, p) shift of every parameter
+        by each of plausible size, standard deviations. bench: (p, p) second moment of
+        the shifts by those of the bench
         alone, which the lens leaves behind.
-    curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there with all others fitted.
+    curves: {name: (2, points)} values of a parameter, and the rise of -2 ln L there
+    with all others fitted.
     """
 
     design: Lens
@@ -124,7 +149,9 @@ class AsBuilt:
     @property
     def within_covariance(self) -> Array:
         """(p, p) within the model; the whole where it is not told apart."""
-        return self.within.covariance if len(self.within.covariance) else self.covariance
+        return (
+            self.within.covariance if len(self.within.covariance) else self.covariance
+        )
 
     @property
     def correlation(self) -> Array:
@@ -133,19 +160,33 @@ class AsBuilt:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval on a bench that is not known: the profile and what the captures cannot tell, in quadrature."""
-        return _ends(self.names.index(name), self.value, self.covariance, self.low, self.high)
+        """95 % interval on a bench that is not known: the profile and what the captures
+        cannot tell, in quadrature.
+        """
+        return _ends(
+            self.names.index(name), self.value, self.covariance, self.low, self.high
+        )
 
     def within_model(self, name: str) -> tuple[float, float]:
-        """95 % interval where what the model lacks is absent, or stated: too narrow where it is not."""
+        """95 % interval where what the model lacks is absent, or stated: too narrow
+        where it is not.
+        """
         if not len(self.within.covariance):
             return self.interval(name)
-        return _ends(self.names.index(name), self.value, self.within.covariance, self.within.low, self.within.high)
+        return _ends(
+            self.names.index(name),
+            self.value,
+            self.within.covariance,
+            self.within.low,
+            self.within.high,
+        )
 
     def most(self, name: str) -> tuple[str, ...]:
-        """Causes that nobody stated and that widen the interval of a parameter, the most telling first.
+        """Causes that nobody stated and that widen the interval of a parameter, the
+        most telling first.
 
-        Those that alone move it by a quarter of its standard error and by a third of what the worst does.
+        Those that alone move it by a quarter of its standard error and by a third of
+        what the worst does.
         """
         i = self.names.index(name)
         own = self.by_cause[:, i] if len(self.causes) else np.empty(0)
@@ -154,24 +195,38 @@ class AsBuilt:
         return tuple(self.causes[k] for k in np.argsort(-own) if own[k] > least)
 
     def parameters(self, value: Array | None = None) -> Array:
-        """All parameters in the order of ``parameters.NAMES``; ``value``: of the fitted ones, the best without it."""
+        """All parameters in the order of ``parameters.NAMES``; ``value``: of the fitted
+        ones, the best without it.
+        """
         fitted = self.value if value is None else value
-        return vector(self.held | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True)))
+        return vector(
+            self.held
+            | dict(zip(self.names, np.asarray(fitted, float).tolist(), strict=True))
+        )
 
     def samples(self, count: int, seed: int = 0) -> Array:
-        """(count, p) draws of the fitted parameters from their posterior: of the process, for the next mask.
+        """(count, p) draws of the fitted parameters from their posterior: of the
+        process, for the next mask.
 
-        Those of ``draws`` where the posterior is bent or double (again from the first where more are asked for), else
+        Those of ``draws`` where the posterior is bent or double (again from the first
+        where more are asked for), else
         Gaussian.
         """
         rng = np.random.default_rng(seed)
-        return _bounded(self.names, self.design, _drawn(rng, count, self.value, self.covariance, self.draws))
+        return _bounded(
+            self.names,
+            self.design,
+            _drawn(rng, count, self.value, self.covariance, self.draws),
+        )
 
     def lens_samples(self, count: int, seed: int = 0) -> Array:
-        """(count, p) draws of what the lens does to light, for training and PSFs under uncertainty.
+        """(count, p) draws of what the lens does to light, for training and PSFs under
+        uncertainty.
 
-        Narrower than :meth:`samples`: a leaning wall or a shifted write field that was taken for height or trefoil goes
-        with the lens, and does there what it did on the bench. What was the bench's (glass, source, light) does not.
+        Narrower than :meth:`samples`: a leaning wall or a shifted write field that was
+        taken for height or trefoil goes
+        with the lens, and does there what it did on the bench. What was the bench's
+        (glass, source, light) does not.
         """
         if not len(self.within.covariance):
             return self.samples(count, seed)
@@ -180,7 +235,9 @@ class AsBuilt:
         return _bounded(self.names, self.design, own + spread(rng, count, self.bench))
 
     def lens(self, value: Array | None = None) -> Lens:
-        """The lens with as-built diameters and distance; ``value`` as one row of :meth:`samples`."""
+        """The lens with as-built diameters and distance; ``value`` as one row of
+        :meth:`samples`.
+        """
         return made.built_lens(self.design, self.parameters(value))
 
     @property
@@ -189,35 +246,68 @@ class AsBuilt:
         return self.lens().diameters
 
     def pillars(self, value: Array | None = None) -> Array:
-        """(y, x) complex transmission of every as-built pillar at normal incidence, wave-front errors included."""
-        return made.pillars(self.design, self.response, self.parameters(value), modes=self.residual_modes)
+        """(y, x) complex transmission of every as-built pillar at normal incidence,
+        wave-front errors included.
+        """
+        return made.pillars(
+            self.design,
+            self.response,
+            self.parameters(value),
+            modes=self.residual_modes,
+        )
 
     def psf(self) -> "psfs.PsfStack":
-        """PSFs (angle, depth, y, x) at the true depths of the captures, as fine as the light, on the fitted window.
+        """PSFs (angle, depth, y, x) at the true depths of the captures, as fine as the
+        light, on the fitted window.
 
         Computed anew by each call: seconds for a lens of a millimetre.
         """
         side = max(self.measured.shape[1:])
-        setting = Setting(self.depth_um, self.angle_rad, np.ones(len(self.depth_um)), self.pixel_um, side, side)
-        depths = np.unique(np.round(true_depth(self.parameters(), setting, float(self.depth_um.mean())), 3))
-        angles = tuple((float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0))
+        setting = Setting(
+            self.depth_um,
+            self.angle_rad,
+            np.ones(len(self.depth_um)),
+            self.pixel_um,
+            side,
+            side,
+        )
+        depths = np.unique(
+            np.round(
+                true_depth(self.parameters(), setting, float(self.depth_um.mean())), 3
+            )
+        )
+        angles = tuple(
+            (float(a), float(b)) for a, b in np.unique(self.angle_rad, axis=0)
+        )
         samples = side * oversampling(self.design, self.pixel_um)
         view = psfs.View(tuple(depths.tolist()), angles, side * self.pixel_um, samples)
         return self.psf_stack(view, tolerance=1e-3)
 
-    def psf_stack(self, view: "psfs.View", value: Array | None = None, *, tolerance: float = 1e-4) -> "psfs.PsfStack":
-        """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of :meth:`samples`.
+    def psf_stack(
+        self, view: "psfs.View", value: Array | None = None, *, tolerance: float = 1e-4
+    ) -> "psfs.PsfStack":
+        """PSFs (angle, depth, y, x) of the lens as built; ``value`` as one row of
+        :meth:`samples`.
 
-        Windows are centred on the chief ray of the best fit. A draw's own is moved by the difference of the two
-        decentres, so that draws differ by what the frames leave open and not by a gradient of the bias that
+        Windows are centred on the chief ray of the best fit. A draw's own is moved by
+        the difference of the two
+        decentres, so that draws differ by what the frames leave open and not by a
+        gradient of the bias that
         the decentre makes up for.
 
         Raises:
             PropagationError: as :func:`metalens.psf.psf_stack`.
         """
         x, best = self.parameters(value), self.parameters()
-        dx, dy = (float(x[PLACE[name]] - best[PLACE[name]]) for name in ("decentre_x_um", "decentre_y_um"))
-        more: dict[str, Any] = {"modes": self.residual_modes, "offset_um": (dx, dy), "tolerance": tolerance}
+        dx, dy = (
+            float(x[PLACE[name]] - best[PLACE[name]])
+            for name in ("decentre_x_um", "decentre_y_um")
+        )
+        more: dict[str, Any] = {
+            "modes": self.residual_modes,
+            "offset_um": (dx, dy),
+            "tolerance": tolerance,
+        }
         return made.psf_stack(self.design, self.response, x, view, **more)
 
     def save(self, path: str | Path) -> None:
@@ -230,7 +320,9 @@ class AsBuilt:
         return load(path)
 
 
-def _ends(i: int, value: Array, covariance: Array, low: Array, high: Array) -> tuple[float, float]:
+def _ends(
+    i: int, value: Array, covariance: Array, low: Array, high: Array
+) -> tuple[float, float]:
     """Of a profile where there is one, else 1.96 sigma to either side."""
     if len(low):
         return float(low[i]), float(high[i])
@@ -238,8 +330,12 @@ def _ends(i: int, value: Array, covariance: Array, low: Array, high: Array) -> t
     return float(value[i]) - reach, float(value[i]) + reach
 
 
-def _drawn(rng: np.random.Generator, count: int, value: Array, covariance: Array, draws: Array) -> Array:
-    """(count, p) of ``draws``, again from the first where more are asked for; Gaussian ones where there are none."""
+def _drawn(
+    rng: np.random.Generator, count: int, value: Array, covariance: Array, draws: Array
+) -> Array:
+    """(count, p) of ``draws``, again from the first where more are asked for; Gaussian
+    ones where there are none.
+    """
     if not len(draws):
         return np.asarray(value + spread(rng, count, covariance))
     order = [rng.permutation(len(draws)) for _ in range(-(-count // len(draws)))]
@@ -248,31 +344,56 @@ def _drawn(rng: np.random.Generator, count: int, value: Array, covariance: Array
 
 def _bounded(names: tuple[str, ...], lens: Lens, draws: Array) -> Array:
     rows = usual(names, lens)
-    return np.asarray(np.clip(draws, [row.low for row in rows], [row.high for row in rows]))
+    return np.asarray(
+        np.clip(draws, [row.low for row in rows], [row.high for row in rows])
+    )
 
 
 def spread(rng: np.random.Generator, count: int, covariance: Array) -> Array:
     """(count, p) Gaussian draws about 0."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(rng.standard_normal((count, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+    return np.asarray(
+        rng.standard_normal((count, len(values)))
+        * np.sqrt(np.maximum(values, 0))
+        @ vectors.T
+    )
 
 
 _ARRAYS = (
     "value", "covariance", "information", "depth_um", "angle_rad", "measured", "predicted", "nominal", "residual_sigma",
 )  # fmt: skip
 _PAIRS = "width_um", "length_um", "rates"
-_OPTIONAL, _WITHIN = ("low", "high", "draws", "by_cause", "bench"), ("covariance", "low", "high", "draws")
-_WORDS = ("names", "identifiable", "degeneracies", "cautions", "problems", "verdicts", "causes")
+_OPTIONAL, _WITHIN = (
+    ("low", "high", "draws", "by_cause", "bench"),
+    ("covariance", "low", "high", "draws"),
+)
+_WORDS = (
+    "names",
+    "identifiable",
+    "degeneracies",
+    "cautions",
+    "problems",
+    "verdicts",
+    "causes",
+)
 
 
 def save(path: str | Path, result: AsBuilt) -> None:
-    """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it can be used alone."""
+    """Write an as-built file (kind ``asbuilt``); the design lies inside, so that it can
+    be used alone.
+    """
     arrays: dict[str, Array] = {name: getattr(result, name) for name in _ARRAYS}
     arrays |= {name: np.array(getattr(result, name) or ("",)) for name in _WORDS}
     arrays["held_names"] = np.array(list(result.held))
     arrays["held"] = np.array(list(result.held.values()), float)
-    arrays |= {name: getattr(result, name) for name in _OPTIONAL if len(getattr(result, name))}
-    arrays |= {f"within/{name}": getattr(result.within, name) for name in _WITHIN if len(getattr(result.within, name))}
+    arrays |= {
+        name: getattr(result, name) for name in _OPTIONAL if len(getattr(result, name))
+    }
+    arrays |= {
+        f"within/{name}": getattr(result.within, name)
+        for name in _WITHIN
+        if len(getattr(result.within, name))
+    }
     if len(result.residual_modes):
         arrays["residual_modes"] = result.residual_modes
     arrays |= {f"curves/{name}": curve for name, curve in result.curves.items()}
@@ -282,11 +403,16 @@ def save(path: str | Path, result: AsBuilt) -> None:
     if (pairs := result.response.pairs) is not None:
         arrays |= {f"response/{name}": getattr(pairs, name) for name in _PAIRS}
     if (solved := result.response.solved) is not None:
-        arrays |= {"response/diameter_um": solved.diameter_um, "response/powers": solved.powers}
+        arrays |= {
+            "response/diameter_um": solved.diameter_um,
+            "response/powers": solved.powers,
+        }
         arrays |= {"response/wavelength_um": np.array(solved.wavelength_um)}
     arrays["diameter_um"] = np.asarray(result.diameters.diameter_um, float)
     design, about = lenses.parts(result.design, group="design/")
-    arrays |= design | {"design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)}
+    arrays |= design | {
+        "design/diameter_um": np.asarray(result.design.diameters.diameter_um, float)
+    }
     about |= {
         "pixel_um": result.pixel_um,
         "chi2_per_dof": result.chi2_per_dof,
@@ -311,14 +437,22 @@ def load(path: str | Path) -> AsBuilt:
     a, about = stored.arrays, stored.attributes
     design = lenses.from_parts(a, about, where=str(path), group="design/")
     fields: dict[str, Any] = {name: a[name] for name in _ARRAYS}
-    fields |= {name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS}
+    fields |= {
+        name: tuple(w for w in _text(a.get(name, np.empty(0))) if w) for name in _WORDS
+    }
     fields |= {name: a[name] for name in _OPTIONAL if name in a}
-    fields["within"] = WithinModel(**{name: a[f"within/{name}"] for name in _WITHIN if f"within/{name}" in a})
+    fields["within"] = WithinModel(
+        **{name: a[f"within/{name}"] for name in _WITHIN if f"within/{name}" in a}
+    )
     return AsBuilt(
         design=design,
         response=_response(a, about),
         residual_modes=a.get("residual_modes", np.empty(0)),
-        curves={name.removeprefix("curves/"): a[name] for name in a if name.startswith("curves/")},
+        curves={
+            name.removeprefix("curves/"): a[name]
+            for name in a
+            if name.startswith("curves/")
+        },
         held=dict(zip(_text(a["held_names"]), a["held"].tolist(), strict=True)),
         pixel_um=about["pixel_um"],
         chi2_per_dof=about["chi2_per_dof"],
@@ -330,15 +464,26 @@ def load(path: str | Path) -> AsBuilt:
 
 
 def _response(arrays: dict[str, Array], about: dict[str, Any]) -> Sensitivity:
-    ends = about.get("response_low_um", -math.inf), about.get("response_high_um", math.inf)
+    ends = (
+        about.get("response_low_um", -math.inf),
+        about.get("response_high_um", math.inf),
+    )
     if "response/rates" in arrays:
         width, length, rates = (arrays[f"response/{name}"] for name in _PAIRS)
-        return Sensitivity.of_pairs(PairSensitivities(width, length, rates, about["response_error"]))
+        return Sensitivity.of_pairs(
+            PairSensitivities(width, length, rates, about["response_error"])
+        )
     solved = None
     if "response/powers" in arrays:
         wave = float(arrays["response/wavelength_um"])
         solved = Solved(wave, arrays["response/diameter_um"], arrays["response/powers"])
-    more = about["response_center_um"], about["response_error"], *ends, solved, arrays.get("response/edges")
+    more = (
+        about["response_center_um"],
+        about["response_error"],
+        *ends,
+        solved,
+        arrays.get("response/edges"),
+    )
     return Sensitivity(arrays["response/coefficients"], *more)
 
 

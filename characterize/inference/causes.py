@@ -1,4 +1,6 @@
-"""Causes that the fit leaves out, each by what it does to the images, and how large it may be where nobody says."""
+"""Causes that the fit leaves out, each by what it does to the images, and how large it
+may be where nobody says.
+"""
 
 import contextlib
 import copy
@@ -36,11 +38,15 @@ _CAMERA_DEG, _TALL = 0.5, 0.01
 _DENSE = 3  # samples a pixel's side between which turned frames are interpolated
 LAMP = "a lamp or exposure that changes from frame to frame"
 WINDOWS = "a window off the chief ray at a field angle"
-_ROUND = 1e-4  # of the peak: round light does not turn, what is left is of the interpolation
+_ROUND = (
+    1e-4  # of the peak: round light does not turn, what is left is of the interpolation
+)
 _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
-_OF_MODEL: tuple[tuple[str, str, float], ...] = (  # cause, name and amount that is added
+_OF_MODEL: tuple[
+    tuple[str, str, float], ...
+] = (  # cause, name and amount that is added
     ("a source of finite size", "pinhole_um", 6),
     ("a spectrum of finite width", "bandwidth_nm", 2),
     ("a tilt of the lens about y", "tilt_x_deg", 0.3),
@@ -61,11 +67,15 @@ _OF_MASK = ("bias_a_nm", "bias_o_nm", "sidewall_deg", "index")
 class Change:
     """A cause that is not fitted, and (k, n, y, x) changes of the images by it.
 
-    amount, told: of the first, in words with a place for the number; empty where no amount is said.
-    sigma: of every change, one for all or each its own, how much of it is reckoned with where nobody states it: a
+    amount, told: of the first, in words with a place for the number; empty where no
+    amount is said.
+    sigma: of every change, one for all or each its own, how much of it is reckoned with
+    where nobody states it: a
     standard deviation, 0 for none.
-    frees: parameters that describe it, but those that are stated exactly. sought: whether it is looked for alone.
-    roughly: the change is of the right kind but of an unknown pattern, so that the frames cannot bound it by what they
+    frees: parameters that describe it, but those that are stated exactly. sought:
+    whether it is looked for alone.
+    roughly: the change is of the right kind but of an unknown pattern, so that the
+    frames cannot bound it by what they
     show of it. of_mask: of the lens itself.
     """
 
@@ -83,9 +93,12 @@ class Change:
 def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
     """Every cause that is not among the fitted parameters; ``slopes``: of these.
 
-    From differences of images that leave ``_ENOUGH`` of a field out: what causes are taken for moves by a percent.
+    From differences of images that leave ``_ENOUGH`` of a field out: what causes are
+    taken for moves by a percent.
     """
-    task = dataclasses.replace(task, model=task.model.rough(max(task.model.cut, _ENOUGH)))
+    task = dataclasses.replace(
+        task, model=task.model.rough(max(task.model.cut, _ENOUGH))
+    )
     image = task.model.images(x)[0]
     yield from _of_model(task, x, image)
     if "sidewall_deg" not in task.names or task.model.lens.cell.sidewall_rad == 0:
@@ -94,16 +107,29 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         sigma = (_size(task, "sidewall_deg") / _WALL_DEG) ** 2
         words = "a side wall that leans about half height"
         # resonances are left out of it
-        yield Change(words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True)
+        yield Change(
+            words, leaning[None], _WALL_DEG**2, told, sigma, roughly=True, of_mask=True
+        )
     light = image - background(x, task.model.setting)
     yield Change("vibration or blur along one direction", _along_one(light))
-    yield Change("pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)", _of_mosaic(light))
-    yield Change("counts that are not in proportion to the light (a gamma)", _of_gamma(light))
+    yield Change(
+        "pixels of 2 x 2 that see unlike shares of the light (a raw colour mosaic)",
+        _of_mosaic(light),
+    )
+    yield Change(
+        "counts that are not in proportion to the light (a gamma)", _of_gamma(light)
+    )
     if len(image) > 2:
         yield from _of_frames(light, slopes)
     yield from _of_windows(task, slopes)
     stretched = (on_pixels(task.model, 1.01).images(x)[0] - image)[None]
-    yield Change("a wrong pixel pitch", stretched, 1.0, "{:.3g} % of the pitch", _size(task, "pixel_percent"))
+    yield Change(
+        "a wrong pixel pitch",
+        stretched,
+        1.0,
+        "{:.3g} % of the pitch",
+        _size(task, "pixel_percent"),
+    )
     yield from _of_camera(task, x, light)
     yield from _of_stop(task, x, image)
     held = tuple(name for name in LIGHT if name not in task.names)
@@ -111,7 +137,14 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
         uneven = _LIGHT_STEP * np.asarray(task.model.images(x, held)[1])
         sizes = np.array([_size(task, name) for name in held]) / _LIGHT_STEP
         frees = tuple(name for name in held if not _exactly(task, name))
-        yield Change("uneven illumination", uneven, _LIGHT_STEP, held[0] + " {:.3g}", sizes, frees)
+        yield Change(
+            "uneven illumination",
+            uneven,
+            _LIGHT_STEP,
+            held[0] + " {:.3g}",
+            sizes,
+            frees,
+        )
     if not len(task.model.modes):
         yield from _of_phase(task, x, image, slopes)
 
@@ -130,13 +163,23 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
         for key, value in base.items():
             before[PLACE[key]] = after[PLACE[key]] = value
         after[PLACE[name]] += amount
-        with contextlib.suppress(FitError):  # a spectrum wider than the proxy knows, a plate with no room
+        with contextlib.suppress(
+            FitError
+        ):  # a spectrum wider than the proxy knows, a plate with no room
             first = task.model.images(before)[0] if base else image
             change = (task.model.images(after)[0] - first)[None]
             sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
             words = cause.format(before[PLACE["glass_um"]])
             frees = () if base or _exactly(task, name) else (name,)
-            yield Change(words, change, amount, name + " {:.3g}", sigma, frees, of_mask=name in _OF_MASK)
+            yield Change(
+                words,
+                change,
+                amount,
+                name + " {:.3g}",
+                sigma,
+                frees,
+                of_mask=name in _OF_MASK,
+            )
 
 
 def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
@@ -154,86 +197,145 @@ def _of_frames(light: Array, slopes: dict[str, Array]) -> Iterator[Change]:
 def _of_camera(task: Task, x: Array, light: Array) -> Iterator[Change]:
     """Pixels that lie elsewhere: along turned axes, or farther apart along y.
 
-    Pixels that are higher too blur by a share of their own width more, which is left out.
+    Pixels that are higher too blur by a share of their own width more, which is left
+    out.
     """
     places = np.eye(2), _turn(_CAMERA_DEG), np.diag([1 + _TALL, 1.0])
     upright, *moved = seen_at(task.model, x, places)
     turned, tall = (frames - upright for frames in moved)
     if np.abs(turned).max() > _ROUND * light.max():
         sigma = _size(task, "camera_turn_deg") / _CAMERA_DEG
-        yield Change("a camera that is turned", turned[None], _CAMERA_DEG, "{:.3g} deg against the lens", sigma)
+        yield Change(
+            "a camera that is turned",
+            turned[None],
+            _CAMERA_DEG,
+            "{:.3g} deg against the lens",
+            sigma,
+        )
     yield Change("pixels that are not as high as wide", tall[None])
 
 
 def _of_windows(task: Task, slopes: dict[str, Array]) -> Iterator[Change]:
-    """Windows of one field angle moved along x and along y, at every angle but the first: decentre moves them all."""
+    """Windows of one field angle moved along x and along y, at every angle but the
+    first: decentre moves them all.
+    """
     s = task.model.setting
-    sideways = [slopes[name] * s.pixel_um for name in ("decentre_x_um", "decentre_y_um") if name in slopes]
+    sideways = [
+        slopes[name] * s.pixel_um
+        for name in ("decentre_x_um", "decentre_y_um")
+        if name in slopes
+    ]
     aside = [one.index for one in task.model.groups[1:]]
     if aside and sideways:
         moved = np.zeros((len(aside), len(sideways), *sideways[0].shape))
         for k, index in enumerate(aside):
             moved[k, :, index] = np.stack(sideways, 1)[index]
         told = "{:.3g} px at one of the angles"
-        yield Change(WINDOWS, moved.reshape(-1, *sideways[0].shape), 1.0, told, _size(task, "window_px"))
+        yield Change(
+            WINDOWS,
+            moved.reshape(-1, *sideways[0].shape),
+            1.0,
+            told,
+            _size(task, "window_px"),
+        )
 
 
 def _of_stop(task: Task, x: Array, image: Array) -> Iterator[Change]:
-    """An aperture stop beside its place: the part of the lens that the light meets moves, as by a lean of the lens."""
+    """An aperture stop beside its place: the part of the lens that the light meets
+    moves, as by a lean of the lens.
+    """
     model, stop = task.model, task.model.lens.layers.stop
     if stop is None:
         return
     for along in (0, 1):
         centre = np.add(stop.centre_um, _STOP_UM * np.eye(2)[along])
-        moved = behind(model, dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1])))).images(x)[0]
+        moved = behind(
+            model,
+            dataclasses.replace(stop, centre_um=(float(centre[0]), float(centre[1]))),
+        ).images(x)[0]
         told, sigma = "{:.3g} um", _size(task, "stop_um") / _STOP_UM
-        yield Change(f"an aperture stop off along {'xy'[along]}", (moved - image)[None], _STOP_UM, told, sigma)
+        yield Change(
+            f"an aperture stop off along {'xy'[along]}",
+            (moved - image)[None],
+            _STOP_UM,
+            told,
+            sigma,
+        )
 
 
 def behind(model: ForwardModel, stop: Stop) -> ForwardModel:
     """The model of the same lens behind another stop."""
     part = copy.copy(model)
-    part.lens = dataclasses.replace(model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop))
-    part.groups = [group.shaded(part.lens, model.setting.depth_um) for group in model.groups]
+    part.lens = dataclasses.replace(
+        model.lens, layers=dataclasses.replace(model.lens.layers, stop=stop)
+    )
+    part.groups = [
+        group.shaded(part.lens, model.setting.depth_um) for group in model.groups
+    ]
     return part
 
 
-def _of_phase(task: Task, x: Array, image: Array, slopes: dict[str, Array]) -> Iterator[Change]:
-    """Phases that no parameter describes: half of the mask off, smooth ones, write fields."""
+def _of_phase(
+    task: Task, x: Array, image: Array, slopes: dict[str, Array]
+) -> Iterator[Change]:
+    """Phases that no parameter describes: half of the mask off, smooth ones, write
+    fields.
+    """
     model = task.model
     for along, name in enumerate("xy"):
         shape = _field_off(model.lens, along)
         moved = model.with_residual(np.array([_STITCH_UM]), shape).images(x)[0] - image
         told = "{:.3g} nm of the right half"
-        yield Change(f"a write field off along {name}", moved[None], _STITCH_UM * 1e3, told)
+        yield Change(
+            f"a write field off along {name}", moved[None], _STITCH_UM * 1e3, told
+        )
     names = [f"residual_{k}" for k in range(MODES + 3)]
-    bent = np.asarray(model.with_residual(np.zeros(MODES + 3), smooth).images(x, names)[1])
+    bent = np.asarray(
+        model.with_residual(np.zeros(MODES + 3), smooth).images(x, names)[1]
+    )
     sized = bent[:MODES] * prior_rad()[:, None, None, None]
     yield Change("a smooth phase that no parameter describes", sized)
     known = [slopes.get(name, np.zeros_like(image)) for name in named(Bends)]
     every = np.concatenate([bent, np.stack(known)])
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
-    yield Change("write fields out of place", fields, sigma=sigma, sought=False, roughly=True, of_mask=True)
+    yield Change(
+        "write fields out of place",
+        fields,
+        sigma=sigma,
+        sought=False,
+        roughly=True,
+        of_mask=True,
+    )
 
 
 def _exactly(task: Task, name: str) -> bool:
-    """Whether a parameter is stated without an error: it stays as stated, whatever the residuals lean to."""
+    """Whether a parameter is stated without an error: it stays as stated, whatever the
+    residuals lean to.
+    """
     return name in task.known and task.known[name].sigma == 0
 
 
 def _size(task: Task, name: str) -> float:
-    """Standard deviation of a cause that is reckoned with: as it is stated, 0 where it is held as stated."""
+    """Standard deviation of a cause that is reckoned with: as it is stated, 0 where it
+    is held as stated.
+    """
     if name in task.unfitted:
         return task.unfitted[name]
     known = task.known.get(name)
     if known is not None:
-        return math.hypot(known.sigma, known.value) if name == "sidewall_deg" else known.sigma
+        return (
+            math.hypot(known.sigma, known.value)
+            if name == "sidewall_deg"
+            else known.sigma
+        )
     return unstated(name, task.model.lens)
 
 
 def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
-    """Phase for 1 um by which the pillars right of the axis are moved along x (0) or y (1)."""
+    """Phase for 1 um by which the pillars right of the axis are moved along x (0) or y
+    (1).
+    """
 
     def phase(u: Array, v: Array, count: int) -> Array:
         return np.asarray((_moved_phase(lens, u, v, along) * (u > 0))[None])
@@ -242,24 +344,44 @@ def _field_off(lens: Lens, along: int) -> Callable[[Array, Array, int], Array]:
 
 
 def _moved_phase(lens: Lens, u: Array, v: Array, along: int) -> Array:
-    """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus there."""
-    k, radius, d = 2 * math.pi / lens.wavelength_um, lens.diameters.radius_um, lens.reduced_um
+    """Phase for 1 um by which pillars are moved along x (0) or y (1): that of the focus
+    there.
+    """
+    k, radius, d = (
+        2 * math.pi / lens.wavelength_um,
+        lens.diameters.radius_um,
+        lens.reduced_um,
+    )
     r = radius * np.hypot(u, v)
-    sine = 1 / np.hypot(r, d) + (1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0)
+    sine = 1 / np.hypot(r, d) + (
+        1 / np.hypot(r, lens.source_distance_um) if lens.source_distance_um > 0 else 0.0
+    )
     return np.asarray(k * radius * (u, v)[along] * sine)
 
 
 def write_fields(lens: Lens) -> Array:
-    """(fields, modes and known phases) of :func:`smooth` and the wave-front parameters for 1 um along x, then y.
+    """(fields, modes and known phases) of :func:`smooth` and the wave-front parameters
+    for 1 um along x, then y.
 
-    Four fields across the lens each way. What is no smooth phase is left out: it scatters light and moves nothing.
+    Four fields across the lens each way. What is no smooth phase is left out: it
+    scatters light and moves nothing.
     """
     t = np.linspace(-1, 1, _GRID)
     u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 1] for part in np.meshgrid(t, t))
-    shapes = np.concatenate([smooth(u, v, MODES + 3), maps(Bends, u, v), np.ones((1, len(u)))])
-    field = (np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)).astype(int)
-    parts = [phase * (field == k) for phase in (_moved_phase(lens, u, v, a) for a in (0, 1)) for k in range(16)]
-    return np.asarray(np.linalg.lstsq(shapes.T, np.array(parts).T, rcond=None)[0][:-1].T)
+    shapes = np.concatenate(
+        [smooth(u, v, MODES + 3), maps(Bends, u, v), np.ones((1, len(u)))]
+    )
+    field = (
+        np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)
+    ).astype(int)
+    parts = [
+        phase * (field == k)
+        for phase in (_moved_phase(lens, u, v, a) for a in (0, 1))
+        for k in range(16)
+    ]
+    return np.asarray(
+        np.linalg.lstsq(shapes.T, np.array(parts).T, rcond=None)[0][:-1].T
+    )
 
 
 def smooth(u: Array, v: Array, count: int) -> Array:
@@ -275,11 +397,16 @@ def _each(change: Array) -> Array:
 
 
 def _along_one(light: Array) -> Array:
-    """(2, n, y, x): a blur s² wider along x than along y, and along one diagonal than the other, is s²/2 of these.
+    """(2, n, y, x): a blur s² wider along x than along y, and along one diagonal than
+    the other, is s²/2 of these.
 
-    Second differences of the light, xx - yy and 2 xy: the blur that parameters describe is round.
+    Second differences of the light, xx - yy and 2 xy: the blur that parameters describe
+    is round.
     """
-    xx, yy = (ndimage.correlate1d(light, [1.0, -2.0, 1.0], axis, mode="nearest") for axis in (2, 1))
+    xx, yy = (
+        ndimage.correlate1d(light, [1.0, -2.0, 1.0], axis, mode="nearest")
+        for axis in (2, 1)
+    )
     return np.stack([xx - yy, 2 * np.gradient(np.gradient(light, axis=1), axis=2)])
 
 
@@ -290,7 +417,9 @@ def _of_gamma(light: Array) -> Array:
 
 
 def _of_mosaic(light: Array) -> Array:
-    """(3, n, y, x): light of every second pixel, as waves over rows, columns and both; the fourth share is the gain."""
+    """(3, n, y, x): light of every second pixel, as waves over rows, columns and both;
+    the fourth share is the gain.
+    """
     y, x = ((-1.0) ** np.arange(n) for n in light.shape[1:])
     return np.stack([light * y[:, None], light * x, light * y[:, None] * x])
 
@@ -309,24 +438,35 @@ def on_pixels(model: ForwardModel, share: float) -> ForwardModel:
 
 
 def seen_at(model: ForwardModel, x: Array, places: Sequence[Array]) -> Array:
-    """(k, n, y, x) light, less the background, of pixels as wide as ever that lie elsewhere.
+    """(k, n, y, x) light, less the background, of pixels as wide as ever that lie
+    elsewhere.
 
     Of frames on samples ``_DENSE`` times as close as pixels, splines of fifth order.
 
     Args:
-        places: k matrices (2, 2) from (y, x) of a pixel, counted from the window's middle, to where it lies.
+        places: k matrices (2, 2) from (y, x) of a pixel, counted from the window's
+            middle, to where it lies.
     """
     s, dense = model.setting, _sampled(model, _DENSE)
     close = dense.images(x)[0] - background(x, dense.setting)
-    pixels = np.stack(np.meshgrid(*(np.arange(n) - n // 2 for n in (s.rows, s.columns)), indexing="ij"))
+    pixels = np.stack(
+        np.meshgrid(
+            *(np.arange(n) - n // 2 for n in (s.rows, s.columns)), indexing="ij"
+        )
+    )
     middle = np.array([n // 2 for n in close.shape[1:]])[:, None, None]
     seen = (middle + _DENSE * np.tensordot(one, pixels, 1) for one in places)
-    frames = [[ndimage.map_coordinates(frame, at, order=5, mode="nearest") for frame in close] for at in seen]
+    frames = [
+        [ndimage.map_coordinates(frame, at, order=5, mode="nearest") for frame in close]
+        for at in seen
+    ]
     return np.array(frames)
 
 
 def _turn(turn_deg: float) -> Array:
-    """(2, 2) of :func:`seen_at` for a camera turned from +x to +y about its window's middle."""
+    """(2, 2) of :func:`seen_at` for a camera turned from +x to +y about its window's
+    middle.
+    """
     cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     return np.array([[cosine, sine], [-sine, cosine]])
 

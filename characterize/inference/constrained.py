@@ -1,4 +1,6 @@
-"""The least of a quadratic inside limits: between bounds by active sets, inside a ball by SLSQP (NLopt); one led."""
+"""The least of a quadratic inside limits: between bounds by active sets, inside a ball
+by SLSQP (NLopt); one led.
+"""
 
 import contextlib
 import math
@@ -10,14 +12,21 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 
-_KNOWN, _PLAIN = 1e-14, 1e-12  # of the largest eigenvalue: what is known, and where elimination solves as it stands
+_KNOWN, _PLAIN = (
+    1e-14,
+    1e-12,
+)  # of the largest eigenvalue: what is known, and where elimination solves as it stands
 _ROUNDING = 2 * float(np.finfo(float).eps)  # of each term of a sum
-_RELEASES = 3  # of each parameter: each is lower than the last, so that no active set comes back but by rounding
+# of each parameter: each is lower than the last, so that no active set comes back but
+# by rounding
+_RELEASES = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ball:
-    """Limit of the root sum of squares of some parameters: ``index`` of them, ``radius`` in their unit."""
+    """Limit of the root sum of squares of some parameters: ``index`` of them,
+    ``radius`` in their unit.
+    """
 
     index: Array
     radius: float
@@ -27,7 +36,9 @@ class Ball:
         return float(np.linalg.norm(x[self.index])) <= self.radius * (1 + 1e-9)
 
     def share(self, x: Array, step: Array) -> float:
-        """Of a step from x, inside, to where the limit no longer holds: the larger t with |x + t step| = radius."""
+        """Of a step from x, inside, to where the limit no longer holds: the larger t
+        with |x + t step| = radius.
+        """
         at, way = x[self.index], step[self.index]
         along, long = float(at @ way), float(way @ way)
         room = max(self.radius**2 - float(at @ at), 0.0)
@@ -35,16 +46,21 @@ class Ball:
 
 
 def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those that stop it.
+    """The s with least sᵀCs / 2 + gᵀs between ``low`` and ``high``, exactly on those
+    that stop it.
 
-    By active sets (Lawson and Hanson 1974, ch. 23; both sides: Stark and Parker 1995): the least over what is free,
+    By active sets (Lawson and Hanson 1974, ch. 23; both sides: Stark and Parker 1995):
+    the least over what is free,
     until no held one is drawn inside, to rounding.
 
-    Clipping the free minimum to the bounds is not it where parameters go together: what one may not do, others do. Nor
-    is what stays when all that the free minimum violates are held at once: some of them leave for others alone.
+    Clipping the free minimum to the bounds is not it where parameters go together: what
+    one may not do, others do. Nor
+    is what stays when all that the free minimum violates are held at once: some of them
+    leave for others alone.
 
     Args:
-        curvature: (p, p) positive; combinations that it knows to less than 1e-14 of the rest do not move.
+        curvature: (p, p) positive; combinations that it knows to less than 1e-14 of the
+            rest do not move.
         gradient, low, high: (p,); bounds may be infinite, and touch.
     """
     own = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
@@ -52,24 +68,45 @@ def between(curvature: Array, gradient: Array, low: Array, high: Array) -> Array
     values, vectors = np.linalg.eigh(equal)
     unknown = vectors[:, values <= _KNOWN * values[-1]]
     plain = values[0] > _PLAIN * values[-1]
-    x = _Bounded(equal, slope - unknown @ (unknown.T @ slope), low * own, high * own, plain).least()
-    return np.where(x == low * own, low, np.where(x == high * own, high, np.clip(x / own, low, high)))
+    x = _Bounded(
+        equal, slope - unknown @ (unknown.T @ slope), low * own, high * own, plain
+    ).least()
+    return np.where(
+        x == low * own,
+        low,
+        np.where(x == high * own, high, np.clip(x / own, low, high)),
+    )
 
 
 class _Bounded:
-    """The least xᵀKx / 2 + qᵀx between bounds, K of unit diagonal: where x (p,) is, and which of it are free."""
+    """The least xᵀKx / 2 + qᵀx between bounds, K of unit diagonal: where x (p,) is, and
+    which of it are free.
+    """
 
-    def __init__(self, curvature: Array, gradient: Array, low: Array, high: Array, plain: bool) -> None:
-        self._curvature, self._gradient, self._low, self._high, self._plain = curvature, gradient, low, high, plain
+    def __init__(
+        self, curvature: Array, gradient: Array, low: Array, high: Array, plain: bool
+    ) -> None:
+        self._curvature, self._gradient, self._low, self._high, self._plain = (
+            curvature,
+            gradient,
+            low,
+            high,
+            plain,
+        )
         self._x, self._free = np.clip(np.zeros(len(low)), low, high), high > low
 
     def least(self) -> Array:
-        """Begun with all held that would leave; one at a time is released, the one that is drawn inside the most."""
+        """Begun with all held that would leave; one at a time is released, the one that
+        is drawn inside the most.
+        """
         leave = self._free
         while leave.any():
             goal = self._x + self._move()
             leave = self._free & ((goal < self._low) | (goal > self._high))
-            self._x, self._free = np.clip(goal, self._low, self._high), self._free & ~leave
+            self._x, self._free = (
+                np.clip(goal, self._low, self._high),
+                self._free & ~leave,
+            )
         tried, settled = np.zeros(len(self._x), bool), False
         for _ in range(_RELEASES * len(tried)):
             inward = np.where(tried, 0, self._inward())
@@ -77,7 +114,11 @@ class _Bounded:
             release = inward[i] > 0
             if settled and not release:
                 break
-            before, pull, settled = self._x, self._pull(), not release  # once more: the rounding of a long way
+            before, pull, settled = (
+                self._x,
+                self._pull(),
+                not release,
+            )  # once more: the rounding of a long way
             self._free[i] |= release
             self._settle()
             way = self._x - before
@@ -90,16 +131,27 @@ class _Bounded:
         return np.asarray(-self._gradient - self._curvature @ self._x)
 
     def _inward(self) -> Array:
-        """(p,) pull towards the inside, beyond its rounding, of those on one of their two bounds."""
-        held, terms = ~self._free & (self._high > self._low), np.abs(self._curvature) @ np.abs(self._x)
+        """(p,) pull towards the inside, beyond its rounding, of those on one of their
+        two bounds.
+        """
+        held, terms = (
+            ~self._free & (self._high > self._low),
+            np.abs(self._curvature) @ np.abs(self._x),
+        )
         rounding = (np.abs(self._gradient) + terms) * _ROUNDING * len(terms)
-        return np.where(held, np.where(self._x == self._low, 1, -1) * self._pull() - rounding, 0)
+        return np.where(
+            held, np.where(self._x == self._low, 1, -1) * self._pull() - rounding, 0
+        )
 
     def _move(self) -> Array:
         """(p,) to the least over what is free, with no regard to bounds."""
         move, free = np.zeros(len(self._x)), self._free
         inner, pull = self._curvature[np.ix_(free, free)], self._pull()[free]
-        move[free] = np.linalg.solve(inner, pull) if self._plain else np.linalg.lstsq(inner, pull, rcond=_KNOWN)[0]
+        move[free] = (
+            np.linalg.solve(inner, pull)
+            if self._plain
+            else np.linalg.lstsq(inner, pull, rcond=_KNOWN)[0]
+        )
         return move
 
     def _settle(self) -> None:
@@ -107,9 +159,13 @@ class _Bounded:
         while self._free.any():
             move = self._move()
             room = np.where(move > 0, self._high, self._low) - self._x
-            share = np.divide(room, move, out=np.full(len(move), np.inf), where=move != 0)
+            share = np.divide(
+                room, move, out=np.full(len(move), np.inf), where=move != 0
+            )
             first = int(np.argmin(share))
-            self._x = np.clip(self._x + min(share[first], 1.0) * move, self._low, self._high)
+            self._x = np.clip(
+                self._x + min(share[first], 1.0) * move, self._low, self._high
+            )
             if share[first] >= 1:
                 return
             self._x[first] = (self._high if move[first] > 0 else self._low)[first]
@@ -117,9 +173,13 @@ class _Bounded:
 
 
 class Led:
-    """The quadratic sᵀCs + 2 gᵀs, one of s led and the others at their least between bounds (p,)."""
+    """The quadratic sᵀCs + 2 gᵀs, one of s led and the others at their least between
+    bounds (p,).
+    """
 
-    def __init__(self, curvature: Array, gradient: Array, i: int, *, low: Array, high: Array) -> None:
+    def __init__(
+        self, curvature: Array, gradient: Array, i: int, *, low: Array, high: Array
+    ) -> None:
         self.curvature, self._gradient, self._i = curvature, gradient, i
         self._low, self._high = low, high
         self._rest = np.flatnonzero(np.arange(len(gradient)) != i)
@@ -154,7 +214,8 @@ class Led:
         return step
 
     def way(self, sign: int, room: float, step: Array, held: Array) -> float:
-        """How far the one led goes until the quadratic has changed by ``room``, the ``held`` of a step kept there.
+        """How far the one led goes until the quadratic has changed by ``room``, the
+        ``held`` of a step kept there.
 
         Where it is more everywhere, to the least.
         """
@@ -179,15 +240,19 @@ def step(
     ball: Ball | None = None,
     tolerance: float = 1e-3,
 ) -> Array:
-    """The s with least sᵀCs / 2 + gᵀs for which x + s lies between ``low`` and ``high`` and inside the ball.
+    """The s with least sᵀCs / 2 + gᵀs for which x + s lies between ``low`` and ``high``
+    and inside the ball.
 
     Args:
-        curvature: (p, p) positive definite. gradient, x, low, high: (p,); x inside all limits, bounds may be infinite.
+        curvature: (p, p) positive definite. gradient, x, low, high: (p,); x inside all
+            limits, bounds may be infinite.
         tolerance: of the step, in each parameter's own sigma.
     """
     own = np.sqrt(np.diag(curvature))
     matrix, slope = curvature / np.outer(own, own), gradient / own
-    length = max(float(np.linalg.norm(slope)), 1e-12)  # of the step along the gradient, in sigma: makes it of order 1
+    length = max(
+        float(np.linalg.norm(slope)), 1e-12
+    )  # of the step along the gradient, in sigma: makes it of order 1
     size, slope = own / length, slope / length
 
     def value(s: Array, out: Array) -> float:
@@ -198,7 +263,9 @@ def step(
 
     solver = nlopt.opt(nlopt.LD_SLSQP, len(x))
     solver.set_min_objective(value)
-    solver.set_lower_bounds(np.minimum((low - x) * size, 0))  # x may sit on a limit to within rounding
+    solver.set_lower_bounds(
+        np.minimum((low - x) * size, 0)
+    )  # x may sit on a limit to within rounding
     solver.set_upper_bounds(np.maximum((high - x) * size, 0))
     if ball is not None:
         solver.add_inequality_constraint(_limit(ball, x, size), 1e-10)

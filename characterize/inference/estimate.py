@@ -1,4 +1,6 @@
-"""Bench captures and a design to the lens that was made: every valley of the likelihood, checked, explained."""
+"""Bench captures and a design to the lens that was made: every valley of the
+likelihood, checked, explained.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -43,10 +45,21 @@ from metalens.lens import Lens
 from metalens.made import Sensitivity
 
 LIKENESS = 0.45
-MORE = ("pinhole_um", "bandwidth_nm", "bias_a_nm", "bias_o_nm", "tilt_x_deg", "tilt_y_deg")
+MORE = (
+    "pinhole_um",
+    "bandwidth_nm",
+    "bias_a_nm",
+    "bias_o_nm",
+    "tilt_x_deg",
+    "tilt_y_deg",
+)
 _CAUSES = 2  # that are found in the residuals, one after the other
-_ROUNDS, _STAYS = 5, 0.1  # of rounded counts; sigma by which the last moves nothing farther
-_LEFT_OUT = 1.25  # chi-square a pixel of frames left out, with what their prediction is uncertain by
+_ROUNDS, _STAYS = (
+    5,
+    0.1,
+)  # of rounded counts; sigma by which the last moves nothing farther
+# chi-square a pixel of frames left out, with what their prediction is uncertain by
+_LEFT_OUT = 1.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +67,10 @@ class Options:
     """How to fit.
 
     free: parameters to fit beyond the usual ones. known: metrology, as priors.
-    window: largest side in pixels of what is fitted. scan_um: half range of the stage-zero search.
-    insist: return a result that fails its checks (problems filled) instead of refusing it.
+    window: largest side in pixels of what is fitted. scan_um: half range of the
+    stage-zero search.
+    insist: return a result that fails its checks (problems filled) instead of refusing
+    it.
     """
 
     free: tuple[str, ...] = ()
@@ -66,23 +81,33 @@ class Options:
 
 
 def fit(
-    capture: Capture, lens: Lens, options: Options | None = None, *, response: Sensitivity | None = None
+    capture: Capture,
+    lens: Lens,
+    options: Options | None = None,
+    *,
+    response: Sensitivity | None = None,
 ) -> AsBuilt:
     """The as-built lens behind a capture.
 
     Args:
-        response: what height, index and sidewall do to the pillars; from the cell solvers without it.
+        response: what height, index and sidewall do to the pillars; from the cell
+            solvers without it.
 
     Raises:
         CaptureError: depths, pixel or wavelength missing, or frames unusable.
-        FitError: refused, with the cause: another lens, a model that cannot explain the frames, a parameter at its
+        FitError: refused, with the cause: another lens, a model that cannot explain the
+            frames, a parameter at its
             bound, no convergence.
     """
-    with threads.one_blas_thread():  # matrices are small: a second thread of BLAS takes a core to wait on
+    with (
+        threads.one_blas_thread()
+    ):  # matrices are small: a second thread of BLAS takes a core to wait on
         return _fit(capture, lens, options or Options(), response)
 
 
-def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity | None) -> AsBuilt:
+def _fit(
+    capture: Capture, lens: Lens, options: Options, response: Sensitivity | None
+) -> AsBuilt:
     capture, frames = merged(capture, clean(capture))
     setting, window = setting_of(capture, options.window)
     check_depths(setting.depth_um, lens)
@@ -90,24 +115,49 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
     known = {k.name: k for k in (*stated(capture, lens), *options.known)}
     sizes = unfitted(known, lens)
     check_enough(data, search.names_of(known, options.free))
-    model = ForwardModel(lens, setting, response or slopes(lens, wanted=_spoken_of(options)))
+    model = ForwardModel(
+        lens, setting, response or slopes(lens, wanted=_spoken_of(options))
+    )
     start = vector({name: k.value for name, k in known.items()})
-    scan_um = 0.12 * float(np.median(setting.depth_um)) if options.scan_um is None else options.scan_um
-    found = arrange(model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens))
+    scan_um = (
+        0.12 * float(np.median(setting.depth_um))
+        if options.scan_um is None
+        else options.scan_um
+    )
+    found = arrange(
+        model, data, scan_um=scan_um, start=start, reach_um=_reach_um(known, lens)
+    )
     _check_likeness(found, lens)
     whole = Task(model, data, start, known, found, options.free, sizes)
     task = search.oriented([_as_laid(whole, one) for one in (found, *found.others)])
-    cautions = [*frames.corrections, *laid_words(task.found or found), *verdict.colours(lens, known)]
+    cautions = [
+        *frames.corrections,
+        *laid_words(task.found or found),
+        *verdict.colours(lens, known),
+    ]
     cautions += roughly_known(lens, model.response)
     unbiased = search.starts(task, biases_nm=(0.0,))[0]
-    task = dataclasses.replace(task, model=quick_enough(task.model, task.data, unbiased))
-    task, ends = _unrounded(*search.placed(*_ends(task, frames.gain, cautions)), frames.gain)
+    task = dataclasses.replace(
+        task, model=quick_enough(task.model, task.data, unbiased)
+    )
+    task, ends = _unrounded(
+        *search.placed(*_ends(task, frames.gain, cautions)), frames.gain
+    )
     task, ends, looked = _with_what_is_there(task, ends, frames.gain, cautions)
     leans = looked[1].leans if looked else []
     if frames.gain.known and verdict.left_over(ends[0]):
-        rest = residual.attempt(task.model, task.data, task.names, ends[0].value, base=start, prior=task.prior)
+        rest = residual.attempt(
+            task.model,
+            task.data,
+            task.names,
+            ends[0].value,
+            base=start,
+            prior=task.prior,
+        )
         if rest is not None:
-            task = dataclasses.replace(task, model=task.model.with_residual(rest.modes, thinplate.basis))
+            task = dataclasses.replace(
+                task, model=task.model.with_residual(rest.modes, thinplate.basis)
+            )
             ends, looked = [rest.solution], None
             cautions.append(
                 f"a smooth phase of {rest.rms_rad:.2g} rad rms beyond the parameters is kept: chi-square of frames "
@@ -124,19 +174,27 @@ def _fit(capture: Capture, lens: Lens, options: Options, response: Sensitivity |
 
 
 def _reach_um(known: dict[str, Known], lens: Lens) -> float:
-    """Half the range of distances that is looked at: two sigma of what is known, within the bounds."""
+    """Half the range of distances that is looked at: two sigma of what is known, within
+    the bounds.
+    """
     prior = search.prior_of(("distance_um",), known, lens)
     return float(min(2 * prior.sigma[0], prior.high[0]))
 
 
 def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> None:
-    """Refuse by the problems, with what the residuals lean to: where to look on the bench."""
+    """Refuse by the problems, with what the residuals lean to: where to look on the
+    bench.
+    """
     if problems and not options.insist:
-        raise FitRefused("fit refused: " + "; ".join([*problems, *missing.words(leans)]))
+        raise FitRefused(
+            "fit refused: " + "; ".join([*problems, *missing.words(leans)])
+        )
 
 
 def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solution]]:
-    """The valleys of the usual parameters, or of more where these do not explain the frames."""
+    """The valleys of the usual parameters, or of more where these do not explain the
+    frames.
+    """
     task, ends = search.search(task)
     if verdict.explained(ends[0], gain) or set(MORE) <= set(task.names):
         return task, ends
@@ -144,18 +202,27 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
     wide = search.wider(more, task.all_of(ends[0].value))
     if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
-    cautions.append(f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too")
+    cautions.append(
+        f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too"
+    )
     return wide
 
 
-def _unrounded(task: Task, ends: list[Solution], gain: Gain) -> tuple[Task, list[Solution]]:
-    """The fit by the likelihood of rounded counts, where these are too coarse for their noise."""
+def _unrounded(
+    task: Task, ends: list[Solution], gain: Gain
+) -> tuple[Task, list[Solution]]:
+    """The fit by the likelihood of rounded counts, where these are too coarse for their
+    noise.
+    """
     if not (gain.coarse and task.data.count_e):
         return task, ends
     counts = task.data
     for _ in range(_ROUNDS):
         task = dataclasses.replace(task, data=unrounded(counts, ends[0].image))
-        before, ends = ends[0], search.distinct([search.refine(task, end.value) for end in ends])
+        before, ends = (
+            ends[0],
+            search.distinct([search.refine(task, end.value) for end in ends]),
+        )
         off = (ends[0].value - before.value) / np.sqrt(np.diag(ends[0].covariance))
         if np.abs(off).max() < _STAYS:
             break
@@ -165,9 +232,11 @@ def _unrounded(task: Task, ends: list[Solution], gain: Gain) -> tuple[Task, list
 def _with_what_is_there(
     task: Task, ends: list[Solution], gain: Gain, cautions: list[str]
 ) -> tuple[Task, list[Solution], tuple[Solution, Looked] | None]:
-    """The task with parameters of causes that are likely there (:func:`missing.to_fit`) and explain the frames better.
+    """The task with parameters of causes that are likely there (:func:`missing.to_fit`)
+    and explain the frames better.
 
-    With the last look beside the fit and the solution it was at; None without a known gain.
+    With the last look beside the fit and the solution it was at; None without a known
+    gain.
     """
     if not gain.known:
         return task, ends, None
@@ -180,7 +249,11 @@ def _with_what_is_there(
         wide = search.wider(more, task.all_of(ends[0].value))
         if wide is None or wide[1][0].merit > ends[0].merit - first.chi2 / 2:
             break
-        seen = "shows in the residuals" if first.chance < missing.CHANCE else f"is likely there ({first.odds:.0f} to 1)"
+        seen = (
+            "shows in the residuals"
+            if first.chance < missing.CHANCE
+            else f"is likely there ({first.odds:.0f} to 1)"
+        )
         cautions.append(f"{first.cause} {seen}: {', '.join(first.frees)} fitted too")
         task, ends = wide
         looked = missing.look(task, ends[0])
@@ -201,18 +274,33 @@ def _check_likeness(found: Arrangement, lens: Lens) -> None:
 
 
 def _as_laid(task: Task, found: Arrangement) -> Task:
-    """The task with its frames laid as found, and its windows held where the light then lies."""
+    """The task with its frames laid as found, and its windows held where the light then
+    lies.
+    """
     aside = found.clearly and found.orientation % 2 == 1
     model = task.model.exchanged() if aside else task.model
     model = model.about(search.window_um(found, model))
     return dataclasses.replace(
-        task, model=model, data=task.data.arranged(lambda part: rearranged(part, found)), found=found
+        task,
+        model=model,
+        data=task.data.arranged(lambda part: rearranged(part, found)),
+        found=found,
     )
 
 
-def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str], gain: Gain, looked: Looked) -> AsBuilt:
+def _result(
+    capture: Capture,
+    task: Task,
+    found: Posterior,
+    cautions: list[str],
+    gain: Gain,
+    looked: Looked,
+) -> AsBuilt:
     model, data, solution, names = task.model, task.data, found.best, task.names
-    fitted, unseen = dict(zip(names, solution.value.tolist(), strict=True)), verdict.left_out(task, solution)
+    fitted, unseen = (
+        dict(zip(names, solution.value.tolist(), strict=True)),
+        verdict.left_out(task, solution),
+    )
     covariance = _with_gain(names, found, gain)
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
@@ -224,7 +312,9 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         value=value,
         covariance=covariance + unstated.covariance,
         information=solution.information,
-        held={name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted},
+        held={
+            name: float(task.start[PLACE[name]]) for name in NAMES if name not in fitted
+        },
         depth_um=model.setting.depth_um,
         angle_rad=model.setting.angle_rad,
         pixel_um=capture.pixel_um,
@@ -236,15 +326,26 @@ def _result(capture: Capture, task: Task, found: Posterior, cautions: list[str],
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        identifiable=tuple(knowable.identifiable(names, solution.information, task.prior.sigma)),
+        identifiable=tuple(
+            knowable.identifiable(names, solution.information, task.prior.sigma)
+        ),
         degeneracies=_open(task, found, covariance, looked if gain.known else None),
-        cautions=(*cautions, *(_seen(task, solution, looked, unseen) if gain.known else ())),
-        problems=(*_problems(task, solution, gain, looked.leans), *verdict.held_back(names, solution, task.prior)),
+        cautions=(
+            *cautions,
+            *(_seen(task, solution, looked, unseen) if gain.known else ()),
+        ),
+        problems=(
+            *_problems(task, solution, gain, looked.leans),
+            *verdict.held_back(names, solution, task.prior),
+        ),
         low=value - np.hypot(value - within.low, more),
         high=value + np.hypot(within.high - value, more),
         draws=_drawn(task, found.draws, unstated),
         within=within,
-        curves={name: np.stack([one.value, one.rise]) for name, one in found.profiles.items()},
+        curves={
+            name: np.stack([one.value, one.rise])
+            for name, one in found.profiles.items()
+        },
         verdicts=_verdicts(task, found, unseen, unstated),
         causes=unstated.causes,
         by_cause=unstated.by_cause,
@@ -256,7 +357,10 @@ def _within(found: Posterior, covariance: Array, names: tuple[str, ...]) -> With
     """The posterior with the error of the gain in what is counted in electrons."""
     value = found.best.value
     counted = explore.REACH * np.sqrt(np.diag(covariance)) * ~_named(names)
-    low, high = np.minimum(found.low, value - counted), np.maximum(found.high, value + counted)
+    low, high = (
+        np.minimum(found.low, value - counted),
+        np.maximum(found.high, value + counted),
+    )
     return WithinModel(covariance, low, high, found.draws)
 
 
@@ -269,33 +373,58 @@ def _drawn(task: Task, draws: Array, unstated: Unstated) -> Array:
 
 
 def _nominal(task: Task, fitted: dict[str, float]) -> Array:
-    """(n, y, x) electrons as designed, with the fitted gain, background, place and blur."""
-    bench = {k: v for k, v in fitted.items() if k.startswith(("log_gain", "background", "decentre", "crosstalk"))}
+    """(n, y, x) electrons as designed, with the fitted gain, background, place and
+    blur.
+    """
+    bench = {
+        k: v
+        for k, v in fitted.items()
+        if k.startswith(("log_gain", "background", "decentre", "crosstalk"))
+    }
     plain = task.model.with_residual(np.empty(0), thinplate.basis)
     return plain.images(with_values(task.start, bench))[0]
 
 
-def _verdicts(task: Task, found: Posterior, unseen: float, unstated: Unstated) -> tuple[str, str]:
+def _verdicts(
+    task: Task, found: Posterior, unseen: float, unstated: Unstated
+) -> tuple[str, str]:
     rows = usual(task.names, task.model.lens)
-    known = verdict.process_verdict(rows, found.low, found.high, _told(task, found), unstated)
+    known = verdict.process_verdict(
+        rows, found.low, found.high, _told(task, found), unstated
+    )
     errors = verdict.predicted_error(task, found), verdict.predicted_aside(task, found)
     return _psf_verdict(*errors, unseen, len(task.model.groups)), known
 
 
 def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:
-    """What is in the frames and in no parameter: structure of the residuals, causes, frames left out."""
+    """What is in the frames and in no parameter: structure of the residuals, causes,
+    frames left out.
+    """
     noise = np.sqrt(task.data.variance(solution.image))
     shared = task.data.shared(solution.image) / noise
-    words = [*verdict.structure(solution.residual_sigma, shared), *missing.words(looked.leans)]
+    words = [
+        *verdict.structure(solution.residual_sigma, shared),
+        *missing.words(looked.leans),
+    ]
     if unseen > _LEFT_OUT:
-        words.append(f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate")
+        words.append(
+            f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate"
+        )
     return words
 
 
-def _open(task: Task, found: Posterior, covariance: Array, looked: Looked | None) -> tuple[str, ...]:
-    """What cannot be told apart: bent and double posteriors, pairs, and causes that nobody fitted."""
+def _open(
+    task: Task, found: Posterior, covariance: Array, looked: Looked | None
+) -> tuple[str, ...]:
+    """What cannot be told apart: bent and double posteriors, pairs, and causes that
+    nobody fitted.
+    """
     pairs = knowable.degeneracies(task.names, covariance, task.prior.sigma)
-    return (*explore.words(task, found), *pairs, *(missing.untold(looked.leans) if looked else ()))
+    return (
+        *explore.words(task, found),
+        *pairs,
+        *(missing.untold(looked.leans) if looked else ()),
+    )
 
 
 def _named(names: tuple[str, ...]) -> Array:
@@ -307,28 +436,49 @@ def _told(task: Task, found: Posterior) -> Array:
     return np.asarray((found.high - found.low) / (2 * explore.REACH) / task.prior.sigma)
 
 
-def _psf_verdict(known: tuple[float, float], aside: tuple[float, float] | None, unseen: float, angles: int) -> str:
+def _psf_verdict(
+    known: tuple[float, float],
+    aside: tuple[float, float] | None,
+    unseen: float,
+    angles: int,
+) -> str:
     captured, between = known
-    tested = "" if np.isnan(unseen) else f"; frames left out agree within {unseen:.2f} times their noise"
+    tested = (
+        ""
+        if np.isnan(unseen)
+        else f"; frames left out agree within {unseen:.2f} times their noise"
+    )
     at = "at one angle" if angles == 1 else f"at the {angles} captured angles"
     if aside is not None:
         at += f" ({aside[0]:.1%} between these, {aside[1]:.1%} half a step beyond)"
     return f"the PSF is known to {captured:.1%} at the captured depths and {between:.1%} between them, {at}{tested}"
 
 
-def _problems(task: Task, solution: Solution, gain: Gain, leans: list[Lean]) -> list[str]:
-    problems = [*verdict.problems(task.names, solution, gain), *(missing.misplaced(leans) if gain.known else ())]
+def _problems(
+    task: Task, solution: Solution, gain: Gain, leans: list[Lean]
+) -> list[str]:
+    problems = [
+        *verdict.problems(task.names, solution, gain),
+        *(missing.misplaced(leans) if gain.known else ()),
+    ]
     clipped = float(task.data.saturated.mean())
     if problems and clipped > 0.1:
-        problems.insert(0, f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter")
+        problems.insert(
+            0,
+            f"{clipped:.0%} of the pixels are saturated: too little is left to fit; expose shorter",
+        )
     left = float(np.linalg.norm(task.model.modes))
     if left > residual.MOST_RAD:
-        problems.append(f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens")
+        problems.append(
+            f"a phase of {left:.2f} rad rms is left that no parameter explains: captures of another lens"
+        )
     return problems
 
 
 def _with_gain(names: tuple[str, ...], found: Posterior, gain: Gain) -> Array:
-    """Covariance with the error of the sensor's gain, which scales everything that is counted in electrons."""
+    """Covariance with the error of the sensor's gain, which scales everything that is
+    counted in electrons.
+    """
     relative = min(gain.gain_sigma_e / gain.gain_e, 1.0)
     by_gain = np.zeros(len(names))
     for i, name in enumerate(names):

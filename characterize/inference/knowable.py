@@ -1,4 +1,6 @@
-"""What the frames can tell and what they cannot: identifiable combinations, degeneracies in words, densities."""
+"""What the frames can tell and what they cannot: identifiable combinations,
+degeneracies in words, densities.
+"""
 
 import numpy as np
 
@@ -10,13 +12,19 @@ _SIDE = (
     "measure the lamp's profile without the lens"
 )
 _WHY = {
-    frozenset({"wavelength_nm", "distance_um"}): "a longer wavelength and a longer distance refocus alike; "
+    frozenset(
+        {"wavelength_nm", "distance_um"}
+    ): "a longer wavelength and a longer distance refocus alike; "
     "measure the wavelength with a spectrometer",
-    frozenset({"wavelength_nm", "stage_zero_um"}): "chromatic and geometric defocus look alike; measure the wavelength",
+    frozenset(
+        {"wavelength_nm", "stage_zero_um"}
+    ): "chromatic and geometric defocus look alike; measure the wavelength",
     frozenset(
         {"distance_um", "stage_zero_um"}
     ): "moving the sensor and moving the source refocus alike; widen the depth range",
-    frozenset({"distance_um", "stage_scale"}): "both change how fast the image goes out of focus; calibrate the stage",
+    frozenset(
+        {"distance_um", "stage_scale"}
+    ): "both change how fast the image goes out of focus; calibrate the stage",
     frozenset(
         {"height_nm", "log_gain"}
     ): "height acts mainly through efficiency; measure the power or the height (AFM)",
@@ -25,21 +33,36 @@ _WHY = {
     ): "both shift the phase and efficiency of all pillars; measure CDs (SEM) or height (AFM)",
     frozenset({"bias_x_nm", "light_x"}): _SIDE,
     frozenset({"bias_y_nm", "light_y"}): _SIDE,
-    frozenset({"bias_x_nm", "decentre_x_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
-    frozenset({"bias_y_nm", "decentre_y_um"}): "a gradient of the bias tilts the wave front; measure CDs at both rims",
-    frozenset({"pinhole_um", "crosstalk_px"}): "both blur; measure the pinhole, or take frames at more distant depths",
+    frozenset(
+        {"bias_x_nm", "decentre_x_um"}
+    ): "a gradient of the bias tilts the wave front; measure CDs at both rims",
+    frozenset(
+        {"bias_y_nm", "decentre_y_um"}
+    ): "a gradient of the bias tilts the wave front; measure CDs at both rims",
+    frozenset(
+        {"pinhole_um", "crosstalk_px"}
+    ): "both blur; measure the pinhole, or take frames at more distant depths",
     frozenset(
         {"bias_r_nm", "spherical_rad"}
     ): "a radial bias is nearly a spherical wave-front error; measure CDs along a radius",
-    frozenset({"bias_r_nm", "distance_um"}): "a radial bias adds power to the lens; measure CDs along a radius",
-    frozenset({"tilt_x_deg", "coma_x_rad"}): "tilt makes coma; take frames at opposite field angles",
-    frozenset({"tilt_y_deg", "coma_y_rad"}): "tilt makes coma; take frames at opposite field angles",
+    frozenset(
+        {"bias_r_nm", "distance_um"}
+    ): "a radial bias adds power to the lens; measure CDs along a radius",
+    frozenset(
+        {"tilt_x_deg", "coma_x_rad"}
+    ): "tilt makes coma; take frames at opposite field angles",
+    frozenset(
+        {"tilt_y_deg", "coma_y_rad"}
+    ): "tilt makes coma; take frames at opposite field angles",
     frozenset({"bandwidth_nm", "crosstalk_px"}): "both blur; measure the spectrum",
 }
 
 
-def degeneracies(names: tuple[str, ...], covariance: Array, sigma_prior: Array) -> list[str]:
-    """Pairs that are correlated beyond 0.9, and parameters that the frames tell little about.
+def degeneracies(
+    names: tuple[str, ...], covariance: Array, sigma_prior: Array
+) -> list[str]:
+    """Pairs that are correlated beyond 0.9, and parameters that the frames tell little
+    about.
 
     Args:
         sigma_prior: (p,) prior standard deviation of each, inf where none.
@@ -47,49 +70,77 @@ def degeneracies(names: tuple[str, ...], covariance: Array, sigma_prior: Array) 
     sigma = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sigma, sigma)
     words = []
-    pairs = [(abs(correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
+    pairs = [
+        (abs(correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)
+    ]
     for size, i, j in sorted(pairs, reverse=True):
         if size > 0.9:
-            why = _WHY.get(frozenset({names[i], names[j]}), "an independent measurement of either settles both")
-            words.append(f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): {why}")
+            why = _WHY.get(
+                frozenset({names[i], names[j]}),
+                "an independent measurement of either settles both",
+            )
+            words.append(
+                f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): {why}"
+            )
     for name, s, prior in zip(names, sigma, sigma_prior, strict=True):
         if np.isfinite(prior) and s > 0.8 * prior:
-            words.append(f"{name} comes from prior knowledge ({prior:g}), the frames add little (now {s:.3g})")
+            words.append(
+                f"{name} comes from prior knowledge ({prior:g}), the frames add little (now {s:.3g})"
+            )
     return words
 
 
-def identifiable(names: tuple[str, ...], information: Array, sigma_prior: Array) -> list[str]:
-    """Combinations (in typical units) that the frames alone fix better than prior knowledge, best first, in words."""
+def identifiable(
+    names: tuple[str, ...], information: Array, sigma_prior: Array
+) -> list[str]:
+    """Combinations (in typical units) that the frames alone fix better than prior
+    knowledge, best first, in words.
+    """
     values, vectors = directions(names, information)
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     prior = np.where(np.isfinite(sigma_prior), sigma_prior / unit, np.inf)
     lines = []
-    for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda t: -t[0]):
+    for value, vector in sorted(
+        zip(values, vectors.T, strict=True), key=lambda t: -t[0]
+    ):
         known = 1 / np.sqrt(max(value, 1e-30))
-        before = np.sqrt((np.where(np.isfinite(prior), prior, 1e9) ** 2 * vector**2).sum())
+        before = np.sqrt(
+            (np.where(np.isfinite(prior), prior, 1e9) ** 2 * vector**2).sum()
+        )
         if known < 0.5 * before:
             main = np.argsort(-np.abs(vector))[:3]
-            parts = [f"{vector[i]:+.2f} {names[i]}/{unit[i]:g}" for i in main if abs(vector[i]) > 0.15]
+            parts = [
+                f"{vector[i]:+.2f} {names[i]}/{unit[i]:g}"
+                for i in main
+                if abs(vector[i]) > 0.15
+            ]
             lines.append(f"{' '.join(parts)} to {known:.2g}")
     return lines
 
 
 def directions(names: tuple[str, ...], information: Array) -> tuple[Array, Array]:
-    """Eigenvalues and eigenvectors of the information in units of each parameter's typical scale."""
+    """Eigenvalues and eigenvectors of the information in units of each parameter's
+    typical scale.
+    """
     unit = np.array([PARAMETERS[PLACE[name]].scale for name in names])
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     return np.maximum(values, 0), vectors
 
 
 def density(curve: Array, at: Array) -> Array:
-    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its profile (2, points) by value.
+    """(*shape) probability density exp(-rise / 2) at values of a parameter, from its
+    profile (2, points) by value.
 
-    The signed root of the rise, straight where the valley is a parabola, runs linearly between the points and beyond.
+    The signed root of the rise, straight where the valley is a parabola, runs linearly
+    between the points and beyond.
     """
     value, keep = np.unique(curve[0], return_index=True)
     root = np.sqrt(np.maximum(curve[1][keep], 0.0))
     root = np.where(np.arange(len(value)) < int(np.argmin(root)), -root, root)
-    ends = (root[1] - root[0]) / (value[1] - value[0]), (root[-1] - root[-2]) / (value[-1] - value[-2])
+    ends = (
+        (root[1] - root[0]) / (value[1] - value[0]),
+        (root[-1] - root[-2]) / (value[-1] - value[-2]),
+    )
     seen = np.interp(at, value, root)
     seen = np.where(at < value[0], root[0] + ends[0] * (at - value[0]), seen)
     seen = np.where(at > value[-1], root[-1] + ends[1] * (at - value[-1]), seen)

@@ -1,12 +1,19 @@
-"""Causes that the fit leaves out: each leans the residuals its own way, and is looked for along that (score test).
+"""Causes that the fit leaves out: each leans the residuals its own way, and is looked
+for along that (score test).
 
-With residuals r over their noise at the mode, the fitted slopes A (priors included) and the change of the images by
-a cause G, both over the noise, what the fit cannot make up for is G' = G - A (AᵀA)⁻¹ AᵀG. Then s = Gᵀr scatters with
-covariance I = GᵀG' where the cause is absent, and sᵀI⁻¹s follows chi-square of as many degrees (Rao 1948). One number
-for each cause: more telling than the chi-square of all pixels, in which a twentieth of a sigma a pixel drowns.
+With residuals r over their noise at the mode, the fitted slopes A (priors included) and
+the change of the images by
+a cause G, both over the noise, what the fit cannot make up for is G' = G - A (AᵀA)⁻¹
+AᵀG. Then s = Gᵀr scatters with
+covariance I = GᵀG' where the cause is absent, and sᵀI⁻¹s follows chi-square of as many
+degrees (Rao 1948). One number
+for each cause: more telling than the chi-square of all pixels, in which a twentieth of
+a sigma a pixel drowns.
 
-What the frames cannot tell goes into the intervals as considered parameters (Schmidt 1966), c of plausible size each:
-the fit moves by M c with M = (AᵀA)⁻¹ AᵀG, and the frames know of c what its score says and no more.
+What the frames cannot tell goes into the intervals as considered parameters (Schmidt
+1966), c of plausible size each:
+the fit moves by M c with M = (AᵀA)⁻¹ AᵀG, and the frames know of c what its score says
+and no more.
 """
 
 import dataclasses
@@ -23,19 +30,29 @@ from characterize.inference.search import Task
 from characterize.model import PLACE, background
 from metalens.ground.arrays import Array
 
-CHANCE = 1e-4  # of one cause to be spoken of where there is none: one fit in 350 with the 28 of a small lens
-ODDS = 10.0  # for a cause of plausible size from which on it is fitted: by chance in one fit of 100 or fewer
+# of one cause to be spoken of where there is none: one fit in 350 with the 28 of a
+# small lens
+CHANCE = 1e-4
+# for a cause of plausible size from which on it is fitted: by chance in one fit of 100
+# or fewer
+ODDS = 10.0
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
-_PATCHY, _SPOT = 3.0, 0.2  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
+_PATCHY, _SPOT = (
+    3.0,
+    0.2,
+)  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
 
 
 @dataclass(frozen=True, slots=True)
 class Lean:
-    """One cause: its words, chi-square by which the residuals lean along it, its degrees, and the chance of that.
+    """One cause: its words, chi-square by which the residuals lean along it, its
+    degrees, and the chance of that.
 
-    taken: what takes it up, in words, where the fit cannot tell it from what is fitted; empty where it can.
-    frees: parameters that describe it and that nobody states exactly. odds: for it, as large as is reckoned with,
+    taken: what takes it up, in words, where the fit cannot tell it from what is fitted;
+    empty where it can.
+    frees: parameters that describe it and that nobody states exactly. odds: for it, as
+    large as is reckoned with,
     against its absence; 0 where no size is known.
     """
 
@@ -50,9 +67,12 @@ class Lean:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Looked:
-    """What was looked for beside the fit: leans, the most telling first, of every cause that can be told apart or is
-    taken for something else; the fit, and the causes that are reckoned with as changes (k, pixels) over the noise, of
-    one standard deviation each. roughly: those whose change is known too roughly for the frames to bound them.
+    """What was looked for beside the fit: leans, the most telling first, of every cause
+    that can be told apart or is
+    taken for something else; the fit, and the causes that are reckoned with as changes
+    (k, pixels) over the noise, of
+    one standard deviation each. roughly: those whose change is known too roughly for
+    the frames to bound them.
     of_mask: those that stay with the lens when it leaves the bench."""
 
     leans: list[Lean]
@@ -68,22 +88,39 @@ class Looked:
             return Unstated.none(p)
         every = np.concatenate([self.unstated[name] for name in names])
         moved, second = self.fit.moved_by(every), np.eye(len(every))
-        exact = np.concatenate([np.full(len(part), name not in self.roughly) for name, part in self.unstated.items()])
+        exact = np.concatenate(
+            [
+                np.full(len(part), name not in self.roughly)
+                for name, part in self.unstated.items()
+            ]
+        )
         if exact.any():
             second[np.ix_(exact, exact)] = self.fit.likely(every[exact])
         first = np.cumsum([0, *(len(self.unstated[name]) for name in names)])
         own = [slice(a, b) for a, b in itertools.pairwise(first.tolist())]
-        by_cause = [np.einsum("pi,ij,pj->p", moved[:, some], second[some, some], moved[:, some]) for some in own]
-        off = np.concatenate([np.full(len(part), name not in self.of_mask) for name, part in self.unstated.items()])
+        by_cause = [
+            np.einsum("pi,ij,pj->p", moved[:, some], second[some, some], moved[:, some])
+            for some in own
+        ]
+        off = np.concatenate(
+            [
+                np.full(len(part), name not in self.of_mask)
+                for name, part in self.unstated.items()
+            ]
+        )
         bench = moved[:, off] @ second[np.ix_(off, off)] @ moved[:, off].T
-        return Unstated(names, np.sqrt(np.maximum(by_cause, 0)), moved @ second @ moved.T, bench)
+        return Unstated(
+            names, np.sqrt(np.maximum(by_cause, 0)), moved @ second @ moved.T, bench
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Unstated:
-    """What the captures cannot tell: causes, (c, p) root mean square shift of every parameter by each.
+    """What the captures cannot tell: causes, (c, p) root mean square shift of every
+    parameter by each.
 
-    covariance: (p, p) second moment of the shifts by all of them. bench: the same by those that the lens leaves behind
+    covariance: (p, p) second moment of the shifts by all of them. bench: the same by
+    those that the lens leaves behind
     with the bench; the others act on its light as the parameters do that took them up.
     """
 
@@ -104,16 +141,29 @@ class Unstated:
 
 
 def look(task: Task, mode: Solution) -> Looked:
-    """Look for every cause that is not fitted, by the image and the slopes that a fit ended with."""
+    """Look for every cause that is not fitted, by the image and the slopes that a fit
+    ended with.
+    """
     x, image, slopes = task.all_of(mode.value), mode.image, mode.slopes
-    root = np.where(task.data.usable & ~task.data.saturated, 1 / np.sqrt(task.data.variance(image)), 0.0)
+    root = np.where(
+        task.data.usable & ~task.data.saturated,
+        1 / np.sqrt(task.data.variance(image)),
+        0.0,
+    )
     rest = (np.clip(mode.residual_sigma, -6, 6) * (root > 0)).ravel()
     fitted = (slopes * root).reshape(len(task.names), -1)
     known = fitted @ fitted.T + np.diag(task.prior.sigma**-2.0)
     spread = max(1.0, mode.chi2_per_dof)
     pull = (mode.value - task.prior.mean) * task.prior.sigma**-2.0
     over = math.sqrt(spread)
-    fit = Fitted(task.names, fitted, known, rest / over, task.data.shared(image) * root, pull / over)
+    fit = Fitted(
+        task.names,
+        fitted,
+        known,
+        rest / over,
+        task.data.shared(image) * root,
+        pull / over,
+    )
     found, unstated = [], {}
     roughly: set[str] = set()
     of_mask: set[str] = set()
@@ -125,37 +175,72 @@ def look(task: Task, mode: Solution) -> Looked:
             of_mask |= {one.cause} if one.of_mask else set()
         if one.sought:
             taken = fit.taken(change[0], one.amount, one.told) if one.told else ""
-            odds = fit.odds(unstated[one.cause]) if one.cause in unstated and one.frees else 0.0
-            found.append(dataclasses.replace(fit.lean(one.cause, change), taken=taken, frees=one.frees, odds=odds))
+            odds = (
+                fit.odds(unstated[one.cause])
+                if one.cause in unstated and one.frees
+                else 0.0
+            )
+            found.append(
+                dataclasses.replace(
+                    fit.lean(one.cause, change), taken=taken, frees=one.frees, odds=odds
+                )
+            )
     found.append(_ghost(task, x, image, root, fit))
-    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(2 / max(float((root > 0).sum()), 1.0)):
+    if mode.chi2_per_dof > 1 + _PATCHY * math.sqrt(
+        2 / max(float((root > 0).sum()), 1.0)
+    ):
         found.append(_patch(task, x, root, fit))
-    told = sorted((one for one in found if one.degrees or one.taken), key=lambda one: (one.chance, -one.chi2))
+    told = sorted(
+        (one for one in found if one.degrees or one.taken),
+        key=lambda one: (one.chance, -one.chi2),
+    )
     return Looked(told, fit, unstated, frozenset(roughly), frozenset(of_mask))
 
 
 def expected(task: Task) -> Unstated:
-    """What a fit of frames to come will reckon with: at the task's start, of frames that are as expected there."""
+    """What a fit of frames to come will reckon with: at the task's start, of frames
+    that are as expected there.
+    """
     image, slopes = task.model.images(task.start, task.names)
     p, value = len(task.names), task.start[[PLACE[name] for name in task.names]]
     none = np.zeros_like(image)
-    mode = Solution(value, np.eye(p), np.eye(p), image, none, 1.0, 0.0, True, "", 0, np.zeros(p), np.asarray(slopes))
+    mode = Solution(
+        value,
+        np.eye(p),
+        np.eye(p),
+        image,
+        none,
+        1.0,
+        0.0,
+        True,
+        "",
+        0,
+        np.zeros(p),
+        np.asarray(slopes),
+    )
     return look(task, mode).reckoned()
 
 
 def to_fit(found: list[Lean]) -> Lean | None:
-    """The cause to fit next: what the residuals lean to beyond chance, or else what is likelier there than not.
+    """The cause to fit next: what the residuals lean to beyond chance, or else what is
+    likelier there than not.
 
     None where no free parameters describe the first, or nothing is likely.
     """
     told = [one for one in found if one.chance < CHANCE]
     if told:
         return told[0] if told[0].frees else None
-    return max((one for one in found if one.frees and one.odds > ODDS), key=lambda one: one.odds, default=None)
+    return max(
+        (one for one in found if one.frees and one.odds > ODDS),
+        key=lambda one: one.odds,
+        default=None,
+    )
 
 
 def words(found: list[Lean]) -> list[str]:
-    """The cause that the residuals lean to most, with those that are as likely; nothing where all is chance."""
+    """The cause that the residuals lean to most, with those that are as likely; nothing
+    where all is chance.
+    """
     told = [one for one in found if one.chance < CHANCE]
     if not told:
         return []
@@ -172,9 +257,11 @@ def words(found: list[Lean]) -> list[str]:
 
 
 def misplaced(found: list[Lean]) -> list[str]:
-    """Whether windows of single field angles lie off, in words: what they explain is half of what any cause does.
+    """Whether windows of single field angles lie off, in words: what they explain is
+    half of what any cause does.
 
-    The fit then bends the lens, or turns the frames, until the spots of all angles lie where their windows are.
+    The fit then bends the lens, or turns the frames, until the spots of all angles lie
+    where their windows are.
     """
     most = max((one.chi2 - one.degrees for one in found), default=0.0)
     return [
@@ -182,20 +269,26 @@ def misplaced(found: list[Lean]) -> list[str]:
         "fitted for all angles; cut the frames of every angle about its chief ray, distance times tan(angle) off that "
         "on the axis, or fit the angles one by one"
         for one in found
-        if one.cause == causes.WINDOWS and one.chance < CHANCE and one.chi2 - one.degrees >= most / 2
+        if one.cause == causes.WINDOWS
+        and one.chance < CHANCE
+        and one.chi2 - one.degrees >= most / 2
     ]
 
 
 def untold(found: list[Lean]) -> list[str]:
-    """Causes that are not fitted and cannot be told from what is, with what they would be taken for."""
+    """Causes that are not fitted and cannot be told from what is, with what they would
+    be taken for.
+    """
     return [f"{one.cause} is not fitted: {one.taken}" for one in found if one.taken]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fitted:
-    """The fit at its mode: slopes (p, pixels) over the noise, their information with the priors, and the residuals.
+    """The fit at its mode: slopes (p, pixels) over the noise, their information with
+    the priors, and the residuals.
 
-    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the noise. pull: (p,) of the
+    shared: (2, n, y, x) errors of dark and of flat that are one in all frames, over the
+    noise. pull: (p,) of the
     priors, which the residuals along the slopes balance at the mode.
     """
 
@@ -207,7 +300,9 @@ class Fitted:
     pull: Array
 
     def lean(self, cause: str, changes: Array) -> Lean:
-        """Score test of (k, pixels) changes; directions of which the fit takes up all but a thousandth are left out."""
+        """Score test of (k, pixels) changes; directions of which the fit takes up all
+        but a thousandth are left out.
+        """
         size = np.sqrt((changes**2).sum(1))
         changes = changes[size > 0] / size[size > 0, None]
         if not len(changes):
@@ -223,9 +318,11 @@ class Fitted:
         return Lean(cause, chi2, degrees, float(stats.chi2.sf(chi2, degrees)))
 
     def left(self, changes: Array) -> tuple[Array, Array]:
-        """(k, pixels) what the fit does not take up of changes G, and (k,) their scores Gᵀr.
+        """(k, pixels) what the fit does not take up of changes G, and (k,) their scores
+        Gᵀr.
 
-        As G'ᵀr + Mᵀ pull, which is the same at the mode and feels no small step that the fit is off it.
+        As G'ᵀr + Mᵀ pull, which is the same at the mode and feels no small step that
+        the fit is off it.
         """
         moved = self.moved_by(changes).T
         left = changes - moved @ self.slopes
@@ -236,26 +333,33 @@ class Fitted:
         return np.asarray(np.linalg.solve(self.known, self.slopes @ changes.T))
 
     def likely(self, changes: Array) -> Array:
-        """(k, k) second moment of the factors c of (k, pixels) changes of one standard deviation each, by the frames.
+        """(k, k) second moment of the factors c of (k, pixels) changes of one standard
+        deviation each, by the frames.
 
-        With H = GᵀG' and S the scatter of their scores s, c is (1 + H S⁻¹ H)⁻¹ H S⁻¹ s, known to (1 + H S⁻¹ H)⁻¹. As
-        the error is counted from the fit, a cause that seems to be there widens intervals to where they would be.
+        With H = GᵀG' and S the scatter of their scores s, c is (1 + H S⁻¹ H)⁻¹ H S⁻¹ s,
+        known to (1 + H S⁻¹ H)⁻¹. As
+        the error is counted from the fit, a cause that seems to be there widens
+        intervals to where they would be.
         """
         open_, told = self._open(changes)
         likely = open_ @ told
         return np.asarray(open_ + np.outer(likely, likely))
 
     def odds(self, changes: Array) -> float:
-        """For (k, pixels) changes of one standard deviation each, in some amount, against their absence (Bayes factor).
+        """For (k, pixels) changes of one standard deviation each, in some amount,
+        against their absence (Bayes factor).
 
-        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to exp(tᵀC t / 2) (det C)^½.
+        With t = H S⁻¹ s and C = (1 + H S⁻¹ H)⁻¹ the amounts c, N(0, 1), integrate to
+        exp(tᵀC t / 2) (det C)^½.
         """
         open_, told = self._open(changes)
         size = float(told @ open_ @ told) / 2 + float(np.linalg.slogdet(open_)[1]) / 2
         return math.exp(min(size, 100.0))
 
     def _open(self, changes: Array) -> tuple[Array, Array]:
-        """(k, k) C = (1 + H S⁻¹ H)⁻¹ and (k,) H S⁻¹ s of changes whose amounts scatter by one about 0."""
+        """(k, k) C = (1 + H S⁻¹ H)⁻¹ and (k,) H S⁻¹ s of changes whose amounts scatter
+        by one about 0.
+        """
         left, score = self.left(changes)
         seen = changes @ left.T
         scatter = seen + self.in_common(left)
@@ -264,32 +368,53 @@ class Fitted:
         return np.linalg.inv(np.eye(len(seen)) + seen @ weight), weight.T @ score
 
     def in_common(self, left: Array) -> Array:
-        """(k, k) by which scores scatter more since errors of dark and flat are one in all frames."""
+        """(k, k) by which scores scatter more since errors of dark and flat are one in
+        all frames.
+        """
         shape = self.shared.shape[1:]
-        dark, flat = ((left.reshape(-1, *shape) * one).sum(1).reshape(len(left), -1) for one in self.shared)
+        dark, flat = (
+            (left.reshape(-1, *shape) * one).sum(1).reshape(len(left), -1)
+            for one in self.shared
+        )
         counted = left * self.shared[0].ravel()
         return np.asarray(dark @ dark.T + flat @ flat.T - counted @ counted.T)
 
     def taken(self, change: Array, amount: float, told: str) -> str:
-        """What the parameters would do with a change of the images; empty where it does nothing.
+        """What the parameters would do with a change of the images; empty where it does
+        nothing.
 
-        Of ``amount``, or as much of it as would not be seen: of what they leave ``_SEEN`` sigma or less. Nothing: no
-        parameter moves by one sigma. ``told``: the cause's amount in words, with a place for the number.
+        Of ``amount``, or as much of it as would not be seen: of what they leave
+        ``_SEEN`` sigma or less. Nothing: no
+        parameter moves by one sigma. ``told``: the cause's amount in words, with a
+        place for the number.
         """
         moved = np.linalg.solve(self.known, self.slopes @ change)
-        left = math.sqrt(max(float(change @ change - (self.slopes @ change) @ moved), 0.0))
+        left = math.sqrt(
+            max(float(change @ change - (self.slopes @ change) @ moved), 0.0)
+        )
         share = min(1.0, _SEEN / max(left, 1e-12))
         step = share * moved / np.sqrt(np.diag(np.linalg.inv(self.known)))
         most = [i for i in np.argsort(-np.abs(step))[:3] if abs(step[i]) > 1]
-        parts = ", ".join(f"{self.names[i]} {share * moved[i]:+.2g} ({abs(step[i]):.1f} sigma)" for i in most)
-        return f"{told.format(share * amount)} would be taken for {parts}; state it if there is any" if most else ""
+        parts = ", ".join(
+            f"{self.names[i]} {share * moved[i]:+.2g} ({abs(step[i]):.1f} sigma)"
+            for i in most
+        )
+        return (
+            f"{told.format(share * amount)} would be taken for {parts}; state it if there is any"
+            if most
+            else ""
+        )
 
 
 def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean:
-    """The shift of the light at which a fainter copy of it explains most; its chance is that of the best of many."""
+    """The shift of the light at which a fainter copy of it explains most; its chance is
+    that of the best of many.
+    """
     light = image - background(x, task.model.setting)
     reach = min(_FARTHEST_PX, min(light.shape[1:]) // 2 - 1)
-    places = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
+    places = [
+        (i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)
+    ]
     places = [p for p in places if max(abs(p[0]), abs(p[1])) >= _NEAREST_PX]
     places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
     best = 0.0
@@ -298,19 +423,27 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
         left, score = fit.left(copy)
         seen = float((copy * left).sum())
         if seen > 1e-3 * float((copy**2).sum()) and score[0] > 0:
-            best = max(best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0])))
+            best = max(
+                best, float(score[0]) ** 2 / (seen + float(fit.in_common(left)[0, 0]))
+            )
     chance = min(1.0, len(places) * float(stats.chi2.sf(best, 1)) / 2)
-    return Lean("a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance)
+    return Lean(
+        "a ghost: a fainter, shifted copy of the light", best, int(bool(places)), chance
+    )
 
 
 def _patch(task: Task, x: Array, root: Array, fit: Fitted) -> Lean:
-    """The place on the lens whose light, left out, explains most; its chance is that of the best of many.
+    """The place on the lens whose light, left out, explains most; its chance is that of
+    the best of many.
 
-    The light that is left out of a spot is linear in its depth, as long as it is a small share of all: -2 Re(E* E_s).
+    The light that is left out of a spot is linear in its depth, as long as it is a
+    small share of all: -2 Re(E* E_s).
     """
     u, v = _places()
     names = [f"residual_{k}" for k in range(len(u))]
-    dark = np.asarray(task.model.with_residual(np.zeros(len(u)), _spots).images(x, names)[1])
+    dark = np.asarray(
+        task.model.with_residual(np.zeros(len(u)), _spots).images(x, names)[1]
+    )
     best, place = 0.0, 0
     for k, one in enumerate((dark * root).reshape(len(u), 1, -1)):
         left, score = fit.left(one)
@@ -320,7 +453,12 @@ def _patch(task: Task, x: Array, root: Array, fit: Fitted) -> Lean:
             best, place = max((best, place), (chi2, k))
     x_um, y_um = (task.model.lens.diameters.radius_um * part[place] for part in (u, v))
     chance = min(1.0, len(u) * float(stats.chi2.sf(best, 1)) / 2)
-    return Lean(f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the lens", best, 1, chance)
+    return Lean(
+        f"a patch without light or pillars about x {x_um:.0f}, y {y_um:.0f} um of the lens",
+        best,
+        1,
+        chance,
+    )
 
 
 def _places() -> tuple[Array, Array]:
@@ -332,9 +470,16 @@ def _places() -> tuple[Array, Array]:
 
 
 def _spots(u: Array, v: Array, count: int) -> Array:
-    """(count, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1) of its amplitude there."""
+    """(count, *shape) i times Gaussian spots: as a phase, light that falls to exp(-1)
+    of its amplitude there.
+    """
     places = zip(*_places(), strict=True)
-    return np.stack([1j * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (_SPOT / 1.5) ** 2) for a, b in places][:count])
+    return np.stack(
+        [
+            1j * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (_SPOT / 1.5) ** 2)
+            for a, b in places
+        ][:count]
+    )
 
 
 def _moved(light: Array, shift: tuple[int, int]) -> Array:

@@ -1,4 +1,5 @@
-"""From a capture to what a fit needs: brackets merged, the window about the light, what the capture itself states, and
+"""From a capture to what a fit needs: brackets merged, the window about the light, what
+the capture itself states, and
 how little of the model is enough."""
 
 import dataclasses
@@ -17,7 +18,8 @@ from metalens.lens import Lens
 from metalens.made import Kinds, Sensitivity
 
 MOST_OF_ONE_FRAME = 8
-_DARK = 3e-5  # share of what light tells that may lie where a quick model knows nothing of it
+# share of what light tells that may lie where a quick model knows nothing of it
+_DARK = 3e-5
 _STILL = 0.05  # counts of noise at least that levels of pixels add, whatever is stated
 _FEW_BEYOND, _ROUGH = 0.01, 0.1  # share of the pillars, of slopes
 _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
@@ -26,7 +28,8 @@ _CUTS, _NOTHING = (2e-2, 8e-3, 3e-3, 1e-3), 0.02
 def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
     """Exposures of one depth and angle as one frame each, by inverse variance.
 
-    As they are where exposures are not known, or differ and nobody says what is counted without light.
+    As they are where exposures are not known, or differ and nobody says what is counted
+    without light.
     """
     place = np.column_stack([capture.position_um, capture.angle_rad])
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
@@ -34,9 +37,13 @@ def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
     known = _timed(capture) and np.isfinite(place).all()
     if not known or len(set(group.tolist())) == len(group):
         return capture, frames
-    if not _dark_known(capture) and any(np.ptp(exposure[group == one]) for one in set(group.tolist())):
+    if not _dark_known(capture) and any(
+        np.ptp(exposure[group == one]) for one in set(group.tolist())
+    ):
         said = "exposures of one depth are fitted one by one: no dark frame tells what is added to all of them"
-        return capture, dataclasses.replace(frames, corrections=(*frames.corrections, said))
+        return capture, dataclasses.replace(
+            frames, corrections=(*frames.corrections, said)
+        )
     merged, first = merge_brackets(frames, exposure, group)
     longest = np.array([exposure[group == group[i]].max() for i in first])
     kept = dataclasses.replace(
@@ -51,17 +58,25 @@ def merged(capture: Capture, frames: Frames) -> tuple[Capture, Frames]:
 
 
 def setting_of(capture: Capture, largest: int) -> tuple[Setting, tuple[slice, slice]]:
-    """The frames to predict, and the window (rows, columns) of at most ``largest`` pixels that is fitted.
+    """The frames to predict, and the window (rows, columns) of at most ``largest``
+    pixels that is fitted.
 
     Raises:
-        CaptureError: depths, pixel or wavelength missing; windows at field angles that stand still on the sensor.
+        CaptureError: depths, pixel or wavelength missing; windows at field angles that
+            stand still on the sensor.
     """
     if not np.isfinite(capture.position_um).all():
-        raise CaptureError("source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)")
+        raise CaptureError(
+            "source depths are missing: list every frame in stage.csv with depth_um (or depth_mm)"
+        )
     if math.isnan(capture.pixel_um):
-        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+        raise CaptureError(
+            "pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted"
+        )
     if math.isnan(capture.wavelength_um):
-        raise CaptureError("wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted")
+        raise CaptureError(
+            "wavelength_um is missing: give the light's wavelength in capture.toml; it cannot be fitted"
+        )
     if capture.about.get("window") == "fixed" and capture.angle_rad.any():
         raise CaptureError(
             'window = "fixed" in capture.toml: at a field angle the middle pixel stands for the chief ray; cut the '
@@ -115,22 +130,38 @@ def data_of(frames: Frames, window: tuple[slice, slice]) -> Data:
     wide = frames.variance_e2, frames.scale, frames.common_floor
     floor, scale, dark = (np.broadcast_to(a, shape)[cut] for a in wide)
     seen = frames.electrons[cut], frames.usable[cut], frames.saturated[cut]
-    return Data(*seen, floor, scale, common_floor=dark, common_light=frames.common_light, count_e=frames.count_e)
+    return Data(
+        *seen,
+        floor,
+        scale,
+        common_floor=dark,
+        common_light=frames.common_light,
+        count_e=frames.count_e,
+    )
 
 
 def unrounded(data: Data, image: Array) -> Data:
-    """Rounded counts as the means and variances that say the same of light near ``image`` (n, y, x).
+    """Rounded counts as the means and variances that say the same of light near
+    ``image`` (n, y, x).
 
-    Fisher's scoring, of a pixel: I + score / information with a variance of 1 / information, so that a fit to them ends
-    where the likelihood of the counts (:mod:`characterize.captures.rounding`) is greatest, once ``image`` is of it.
+    Fisher's scoring, of a pixel: I + score / information with a variance of 1 /
+    information, so that a fit to them ends
+    where the likelihood of the counts (:mod:`characterize.captures.rounding`) is
+    greatest, once ``image`` is of it.
     """
     step, variance = data.count_e / data.scale, data.variance(image)
     noise = np.sqrt(np.maximum(variance / step**2 - 1 / 12, _STILL**2))
     score, information = told((data.electrons - image) / step, noise)
-    floor = np.where(data.saturated, data.variance_e2, data.variance_e2 + step**2 / information - variance)
+    floor = np.where(
+        data.saturated,
+        data.variance_e2,
+        data.variance_e2 + step**2 / information - variance,
+    )
     return dataclasses.replace(
         data,
-        electrons=np.where(data.saturated, data.electrons, image + step * score / information),
+        electrons=np.where(
+            data.saturated, data.electrons, image + step * score / information
+        ),
         variance_e2=floor,
         common_floor=data.common_floor * data.variance_e2 / floor,
         count_e=0.0,
@@ -138,24 +169,31 @@ def unrounded(data: Data, image: Array) -> Data:
 
 
 def quick_enough(model: ForwardModel, data: Data, x: Array) -> ForwardModel:
-    """The model with the fewest terms of its fields that change the misfit by nothing that counts.
+    """The model with the fewest terms of its fields that change the misfit by nothing
+    that counts.
 
-    Judged at parameters ``x``, against all terms: a rise of chi-square of ``_NOTHING`` over all pixels.
+    Judged at parameters ``x``, against all terms: a rise of chi-square of ``_NOTHING``
+    over all pixels.
     """
     exact = model.images(x)[0]
     noise = np.sqrt(data.variance(exact))
     for cut in _CUTS:
         rough = model.rough(cut)
-        if float((((rough.images(x)[0] - exact) / noise)[data.usable] ** 2).sum()) < _NOTHING:
+        if (
+            float((((rough.images(x)[0] - exact) / noise)[data.usable] ** 2).sum())
+            < _NOTHING
+        ):
             return rough
     return model
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LeftOut:
-    """What a quick model leaves out at (p,) ``value``: (n, y, x) of the images, (p, n, y, x) of the slopes.
+    """What a quick model leaves out at (p,) ``value``: (n, y, x) of the images, (p, n,
+    y, x) of the slopes.
 
-    beside: (y, x) pixels that it knows nothing of; there images go straight on from ``value``.
+    beside: (y, x) pixels that it knows nothing of; there images go straight on from
+    ``value``.
     """
 
     value: Array
@@ -178,8 +216,11 @@ class LeftOut:
         return images
 
 
-def lit_part(model: ForwardModel, data: Data, x: Array, image: Array) -> tuple[slice, slice]:
-    """Rows and columns beside which there is next to nothing of what the light of all frames tells over its noise.
+def lit_part(
+    model: ForwardModel, data: Data, x: Array, image: Array
+) -> tuple[slice, slice]:
+    """Rows and columns beside which there is next to nothing of what the light of all
+    frames tells over its noise.
 
     Args:
         x: all parameters, of ``image`` (n, y, x).
@@ -197,9 +238,14 @@ def check_enough(data: Data, names: Sequence[str]) -> None:
     """Refuse what cannot fix its parameters however good the frames are.
 
     Raises:
-        CaptureError: one frame for more parameters than one image can tell apart, or fewer pixels than parameters.
+        CaptureError: one frame for more parameters than one image can tell apart, or
+            fewer pixels than parameters.
     """
-    lens = [name for name in names if not name.startswith(("log_gain", "background", "crosstalk", "decentre"))]
+    lens = [
+        name
+        for name in names
+        if not name.startswith(("log_gain", "background", "crosstalk", "decentre"))
+    ]
     frames, pixels = len(data.electrons), int((data.usable & ~data.saturated).sum())
     if frames < 2 and len(lens) > MOST_OF_ONE_FRAME:
         raise CaptureError(
@@ -208,11 +254,14 @@ def check_enough(data: Data, names: Sequence[str]) -> None:
             f"{MOST_OF_ONE_FRAME} parameters with [[known]] (sigma = 0)"
         )
     if pixels < 3 * len(names):
-        raise CaptureError(f"{pixels} usable pixels for {len(names)} parameters; need three each: a larger window")
+        raise CaptureError(
+            f"{pixels} usable pixels for {len(names)} parameters; need three each: a larger window"
+        )
 
 
 def check_depths(depth_um: Array, lens: Lens) -> None:
-    """Refuse depths that are no micrometres: a thousand times nearer or farther than the lens is focused on.
+    """Refuse depths that are no micrometres: a thousand times nearer or farther than
+    the lens is focused on.
 
     Raises:
         CaptureError: with the column that would be right.
@@ -221,7 +270,10 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
     if not math.isfinite(wanted):
         wanted = 10 * lens.sensor_distance_um
     for factor, column in ((1e3, "depth_mm"), (1e-3, "depth_nm")):
-        if abs(math.log10(max(middle, 1e-9) * factor / wanted)) < 0.7 and abs(math.log10(factor)) > 2:
+        if (
+            abs(math.log10(max(middle, 1e-9) * factor / wanted)) < 0.7
+            and abs(math.log10(factor)) > 2
+        ):
             raise CaptureError(
                 f"depths about {middle:g} um, the design is focused on {wanted:g} um: they look like "
                 f"{column.removeprefix('depth_')}; rename the column depth_um of stage.csv to {column}"
@@ -229,38 +281,73 @@ def check_depths(depth_um: Array, lens: Lens) -> None:
 
 
 def stated(capture: Capture, lens: Lens) -> list[Known]:
-    """Priors that the capture itself states: wavelength (as usual unless wavelength_sigma_nm), pinhole, glass."""
-    offset, usual_nm = (capture.wavelength_um - lens.wavelength_um) * 1e3, usual(["wavelength_nm"], lens)[0].sigma
-    known = [Known("wavelength_nm", offset, float(capture.about.get("wavelength_sigma_nm", usual_nm)))]
+    """Priors that the capture itself states: wavelength (as usual unless
+    wavelength_sigma_nm), pinhole, glass.
+    """
+    offset, usual_nm = (
+        (capture.wavelength_um - lens.wavelength_um) * 1e3,
+        usual(["wavelength_nm"], lens)[0].sigma,
+    )
+    known = [
+        Known(
+            "wavelength_nm",
+            offset,
+            float(capture.about.get("wavelength_sigma_nm", usual_nm)),
+        )
+    ]
     held = ("pinhole_um", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg")
-    known += [Known(name, _number(capture, name), 0.0) for name in held if name in capture.about]
+    known += [
+        Known(name, _number(capture, name), 0.0)
+        for name in held
+        if name in capture.about
+    ]
     if "pixel_sigma_um" in capture.about:
         known.append(
-            Known("pixel_percent", 0.0, 100 * _number(capture, "pixel_sigma_um") / (capture.fill * capture.pixel_um))
+            Known(
+                "pixel_percent",
+                0.0,
+                100
+                * _number(capture, "pixel_sigma_um")
+                / (capture.fill * capture.pixel_um),
+            )
         )
     return known
 
 
 def _number(capture: Capture, name: str) -> float:
     value = capture.about[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not math.isfinite(value)
+    ):
         raise CaptureError(f"capture.toml: {name} = {value!r}; need a finite number")
     return float(value)
 
 
 def roughly_known(lens: Lens, response: Sensitivity) -> list[str]:
-    """What is known of the pillars to a tenth of it at best, or to a bias less than is reckoned with, in words."""
+    """What is known of the pillars to a tenth of it at best, or to a bias less than is
+    reckoned with, in words.
+    """
     rough = f"slopes of the pillars by height and index are known to {response.error:.0%} only"
     return [*_beyond_table(lens), *([rough] if response.error > _ROUGH else [])]
 
 
 def _beyond_table(lens: Lens) -> list[str]:
-    """Whether the bias to be reckoned with leads pillars of two sizes beyond the table of their lens, in words."""
+    """Whether the bias to be reckoned with leads pillars of two sizes beyond the table
+    of their lens, in words.
+    """
     if lens.pairs is None:
         return []
-    kinds, reach_um = Kinds.of(lens.diameters), usual(("bias_nm",), lens)[0].sigma * 1e-3
+    kinds, reach_um = (
+        Kinds.of(lens.diameters),
+        usual(("bias_nm",), lens)[0].sigma * 1e-3,
+    )
     near = np.zeros(len(kinds.count), bool)
-    for size, axis in ((kinds.width_um, lens.pairs.x_um), (kinds.length_um, lens.pairs.y_um)):
+    for size, axis in (
+        (kinds.width_um, lens.pairs.x_um),
+        (kinds.length_um, lens.pairs.y_um),
+    ):
         near |= (size < axis[0] + reach_um) | (size > axis[-1] - reach_um)
     share = float(kinds.count[near].sum() / kinds.count.sum())
     if share < _FEW_BEYOND:

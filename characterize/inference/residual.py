@@ -1,6 +1,8 @@
-"""What physics leaves over: a smooth phase over the aperture, without a formula, kept only where unseen frames improve.
+"""What physics leaves over: a smooth phase over the aperture, without a formula, kept
+only where unseen frames improve.
 
-The phase is a sum of thin-plate modes (:mod:`thinplate`), each held towards zero by its bending energy.
+The phase is a sum of thin-plate modes (:mod:`thinplate`), each held towards zero by its
+bending energy.
 """
 
 import dataclasses
@@ -38,11 +40,19 @@ class Attempt:
 
 
 def attempt(
-    model: ForwardModel, data: Data, names: Sequence[str], start: Array, *, base: Array, prior: Prior
+    model: ForwardModel,
+    data: Data,
+    names: Sequence[str],
+    start: Array,
+    *,
+    base: Array,
+    prior: Prior,
 ) -> Attempt | None:
-    """The fit with a residual phase; None unless frames left out improve by more than chance allows.
+    """The fit with a residual phase; None unless frames left out improve by more than
+    chance allows.
 
-    Every second depth is left out, then the others: fitted without and with the phase from ``start`` (p,), the
+    Every second depth is left out, then the others: fitted without and with the phase
+    from ``start`` (p,), the
     physical parameters alone. ``base``: all parameters.
     """
     n = len(data.electrons)
@@ -52,18 +62,26 @@ def attempt(
     joint = _with_modes(prior)
     wide = np.concatenate([start, np.zeros(MODES)])
     scores = np.zeros(2)
-    settings = Settings(iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False)
+    settings = Settings(
+        iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
+    )
     for seen, hidden in ((order[::2], order[1::2]), (order[1::2], order[::2])):
         part, rest = data.planes(np.sort(seen)), data.planes(np.sort(hidden))
         here, there = model.only(np.sort(seen)), model.only(np.sort(hidden))
         for i, (begin, known) in enumerate(((start, prior), (wide, joint))):
-            found = leastsquares.fit(problem(here, names, base), part, begin, prior=known, settings=settings)
+            found = leastsquares.fit(
+                problem(here, names, base), part, begin, prior=known, settings=settings
+            )
             scores[i] += _misfit(problem(there, names, base), rest, found.value)
     count = float((data.usable & ~data.saturated).sum())
     if scores[1] > scores[0] - max(4 * math.sqrt(2 * count), 0.02 * scores[0]):
         return None
-    settings = dataclasses.replace(settings, iterations=40, step_tolerance=0.02, near=0.3, finish=True)
-    found = leastsquares.fit(problem(model, names, base), data, wide, prior=joint, settings=settings)
+    settings = dataclasses.replace(
+        settings, iterations=40, step_tolerance=0.02, near=0.3, finish=True
+    )
+    found = leastsquares.fit(
+        problem(model, names, base), data, wide, prior=joint, settings=settings
+    )
     p = len(names)
     physical = dataclasses.replace(
         found,
@@ -76,8 +94,12 @@ def attempt(
     return Attempt(physical, found.value[p:], scores[0] / count, scores[1] / count)
 
 
-def problem(model: ForwardModel, names: Sequence[str], base: Array) -> leastsquares.Model:
-    """Images by the named parameters, and by the modes where values are left behind them; the others as in ``base``."""
+def problem(
+    model: ForwardModel, names: Sequence[str], base: Array
+) -> leastsquares.Model:
+    """Images by the named parameters, and by the modes where values are left behind
+    them; the others as in ``base``.
+    """
     place, p = [PLACE[name] for name in names], len(names)
 
     def images(values: Array, jacobian: bool) -> tuple[Array, Array | None]:
@@ -92,18 +114,32 @@ def problem(model: ForwardModel, names: Sequence[str], base: Array) -> leastsqua
 
 def _with_modes(prior: Prior) -> Prior:
     wide, zero = np.full(MODES, np.inf), np.zeros(MODES)
-    parts = (prior.mean, zero), (prior.sigma, prior_rad()), (prior.low, -wide), (prior.high, wide)
+    parts = (
+        (prior.mean, zero),
+        (prior.sigma, prior_rad()),
+        (prior.low, -wide),
+        (prior.high, wide),
+    )
     mean, sigma, low, high = (np.concatenate(part) for part in parts)
     return Prior(mean, sigma, low, high)
 
 
 def _without_modes(information: Array, p: int) -> Array:
-    """(p, p) information on the first parameters when the modes, known to their prior, are unknown too."""
+    """(p, p) information on the first parameters when the modes, known to their prior,
+    are unknown too.
+    """
     inner = information[p:, p:] + np.diag(prior_rad() ** -2.0)
-    return np.asarray(information[:p, :p] - information[:p, p:] @ np.linalg.solve(inner, information[p:, :p]))
+    return np.asarray(
+        information[:p, :p]
+        - information[:p, p:] @ np.linalg.solve(inner, information[p:, :p])
+    )
 
 
 def _misfit(model: leastsquares.Model, data: Data, value: Array) -> float:
     image, _ = model(value, False)
     keep = data.usable & ~data.saturated
-    return float(np.minimum((data.electrons - image) ** 2 / data.variance(image), 36.0)[keep].sum())
+    return float(
+        np.minimum((data.electrons - image) ** 2 / data.variance(image), 36.0)[
+            keep
+        ].sum()
+    )

@@ -1,4 +1,6 @@
-"""Where a fit may end: short fits from many starts, the best of them to the end, and every other valley as good."""
+"""Where a fit may end: short fits from many starts, the best of them to the end, and
+every other valley as good.
+"""
 
 import dataclasses
 import math
@@ -13,7 +15,15 @@ from characterize.inference.arrange import Arrangement, few_frames
 from characterize.inference.constrained import Ball
 from characterize.inference.leastsquares import Data, Prior, Settings, Solution
 from characterize.inference.prepare import LeftOut, lit_part
-from characterize.model import NAMES, PARAMETERS, PLACE, ForwardModel, Known, usual, vector
+from characterize.model import (
+    NAMES,
+    PARAMETERS,
+    PLACE,
+    ForwardModel,
+    Known,
+    usual,
+    vector,
+)
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
@@ -23,20 +33,28 @@ from metalens.made import coarser
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
 _LEANING_RAD = 0.3  # of the starts that look for a twin
-_ALONG_NM, _ASIDE_UM = 9.0, 50.0  # bias by which starts are moved along the valley; where windows begin at most
+_ALONG_NM, _ASIDE_UM = (
+    9.0,
+    50.0,
+)  # bias by which starts are moved along the valley; where windows begin at most
 _REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
-_ONWARD = Settings(iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False)
-_WORTH = 10.0  # beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
+_ONWARD = Settings(
+    iterations=25, step_tolerance=0.3, secant=True, near=1.0, finish=False
+)
+# beyond MODES_WITHIN: rise up to which an unfinished fit is followed to its end
+_WORTH = 10.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Task:
-    """What is searched: the model and its data, all start values, what is known, how the frames lie, what is free.
+    """What is searched: the model and its data, all start values, what is known, how
+    the frames lie, what is free.
 
     found: None before frames are there: no search begins without it.
-    unfitted: how large is stated to be what no parameter describes (``characterize.model.UNFITTED``).
+    unfitted: how large is stated to be what no parameter describes
+    (``characterize.model.UNFITTED``).
     left_out: what is added to images and slopes of the model; see :func:`anchored`.
     """
 
@@ -63,19 +81,28 @@ class Task:
         """Images of all frames, or roughly of some."""
         model = self.model if frames is None else self.model.only(frames)
         if self.left_out is None:
-            return residual.problem(model if frames is None else model.quick(), self.names, self.start)
-        return self.left_out.added(residual.problem(model, self.names, self.start), frames)
+            return residual.problem(
+                model if frames is None else model.quick(), self.names, self.start
+            )
+        return self.left_out.added(
+            residual.problem(model, self.names, self.start), frames
+        )
 
     def all_of(self, value: Array) -> Array:
         """All parameters where the fitted ones have a value."""
-        return with_values(self.start, dict(zip(self.names, value.tolist(), strict=True)))
+        return with_values(
+            self.start, dict(zip(self.names, value.tolist(), strict=True))
+        )
 
 
 def anchored(task: Task, at: Solution) -> Task:
-    """The task by a quick model put right at a fit, where there is light: a third of the work for an image, or less.
+    """The task by a quick model put right at a fit, where there is light: a third of
+    the work for an image, or less.
 
-    Few terms leave out a percent or two of the light, and of a change of the light. All lenses that explain the frames
-    give images a few sigma apart: what is left out differs among them by about a tenth of one (a test holds it on a
+    Few terms leave out a percent or two of the light, and of a change of the light. All
+    lenses that explain the frames
+    give images a few sigma apart: what is left out differs among them by about a tenth
+    of one (a test holds it on a
     small lens; on 1 mm, two tenths were met where images are 20 sigma apart).
     """
     lit = lit_part(task.model, task.data, task.all_of(at.value), at.image)
@@ -84,14 +111,19 @@ def anchored(task: Task, at: Solution) -> Task:
     beside = np.ones(at.image.shape[1:], bool)
     beside[lit] = False
     return dataclasses.replace(
-        quick, left_out=LeftOut(at.value, at.image - image, at.slopes - np.asarray(slopes), beside)
+        quick,
+        left_out=LeftOut(
+            at.value, at.image - image, at.slopes - np.asarray(slopes), beside
+        ),
     )
 
 
 def oriented(tasks: Sequence[Task]) -> Task:
-    """Of tasks that differ by how the frames lie the one that a short fit to some of them makes likeliest.
+    """Of tasks that differ by how the frames lie the one that a short fit to some of
+    them makes likeliest.
 
-    The first unless another is better by what a short fit may be off, and still is once both go on; those within that
+    The first unless another is better by what a short fit may be off, and still is once
+    both go on; those within that
     cannot be told from it.
     """
     if len(tasks) == 1:
@@ -101,25 +133,44 @@ def oriented(tasks: Sequence[Task]) -> Task:
     merits = np.array([one.merit for one in tries])
     if merits[0] >= merits.min() + _PROMISING:
         for k in (0, int(merits.argmin())):
-            part, begin, prior = tasks[k].data.planes(few), tries[k].value, tasks[k].prior
-            merits[k] = leastsquares.fit(tasks[k].problem(few), part, begin, prior=prior, settings=_ONWARD).merit
+            part, begin, prior = (
+                tasks[k].data.planes(few),
+                tries[k].value,
+                tasks[k].prior,
+            )
+            merits[k] = leastsquares.fit(
+                tasks[k].problem(few), part, begin, prior=prior, settings=_ONWARD
+            ).merit
     best = 0 if merits[0] < merits.min() + _PROMISING else int(merits.argmin())
     found = [task.found for task in tasks if task.found is not None]
-    near = [one for one, merit in zip(found, merits, strict=True) if merit < merits[best] + _PROMISING]
-    turns = {between(found[best].orientation, o.orientation) for o in near if o.reordered == found[best].reordered}
+    near = [
+        one
+        for one, merit in zip(found, merits, strict=True)
+        if merit < merits[best] + _PROMISING
+    ]
+    turns = {
+        between(found[best].orientation, o.orientation)
+        for o in near
+        if o.reordered == found[best].reordered
+    }
     alike = {*found[best].alike, *turns} - {0}
     return dataclasses.replace(
-        tasks[best], found=dataclasses.replace(found[best], alike=tuple(sorted(alike)), others=())
+        tasks[best],
+        found=dataclasses.replace(found[best], alike=tuple(sorted(alike)), others=()),
     )
 
 
 def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solution]]:
-    """The valleys that explain the frames, best first, the others within ``MODES_WITHIN`` of it; and the task with its
+    """The valleys that explain the frames, best first, the others within
+    ``MODES_WITHIN`` of it; and the task with its
     windows held where the best has them.
 
-    Short fits on a few frames from the nominal lens, the twins of its bias and leaning wave fronts, or from ``begins``;
-    the best to the end, most of the way by the quick model. Then from what it found with even aberrations reversed and
-    moved along its weakest valley: whatever of all these promises as much is fitted to the end too.
+    Short fits on a few frames from the nominal lens, the twins of its bias and leaning
+    wave fronts, or from ``begins``;
+    the best to the end, most of the way by the quick model. Then from what it found
+    with even aberrations reversed and
+    moved along its weakest valley: whatever of all these promises as much is fitted to
+    the end too.
     """
     few = few_frames(task.model.setting)
     plain = starts(task)
@@ -127,21 +178,30 @@ def search(task: Task, *, begins: Sequence[Array] = ()) -> tuple[Task, list[Solu
     task = held(task, first[0].value)
     near = _nearer(task, first[0].value)
     best = _long(task, near.value, near.slopes)
-    tries = sorted([*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit)
+    tries = sorted(
+        [*first[1:], *_short(task, few, _twins(task, best))], key=lambda t: t.merit
+    )
     floor = min(tries[0].merit, first[0].merit)
     promising = [t.value for t in tries if t.merit < floor + _PROMISING]
     about = anchored(task, best)
-    return task, mirrored(about, distinct([best, *followed(about, best, promising[: 2 * _MOST])]))
+    return task, mirrored(
+        about, distinct([best, *followed(about, best, promising[: 2 * _MOST])])
+    )
 
 
 def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
-    """The ends, and where their biases reversed lead: frames near focus look much alike with a gradient of either sign.
+    """The ends, and where their biases reversed lead: frames near focus look much alike
+    with a gradient of either sign.
 
     Again from a new best.
     """
     for _ in range(_AGAIN):
         best = ends[0]
-        begins = [b for b in reversals(task, best) if all(_apart(b, end) > 2.0 for end in ends)]
+        begins = [
+            b
+            for b in reversals(task, best)
+            if all(_apart(b, end) > 2.0 for end in ends)
+        ]
         ends = distinct([*ends, *followed(task, best, begins)])
         if ends[0].merit > best.merit - 1:
             break
@@ -149,33 +209,51 @@ def mirrored(task: Task, ends: list[Solution]) -> list[Solution]:
 
 
 def followed(task: Task, best: Solution, begins: Sequence[Array]) -> list[Solution]:
-    """Where some starts lead: a few steps on all frames, and to the end what promises as much as the best.
+    """Where some starts lead: a few steps on all frames, and to the end what promises
+    as much as the best.
 
     At most ``_MOST`` ends, none that leads to the best itself or to another.
     """
-    settings = Settings(iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False)
+    settings = Settings(
+        iterations=6, step_tolerance=0.5, secant=True, near=1.0, finish=False
+    )
     ends: list[Solution] = []
     for begin in begins:
         if len(ends) == _MOST:
             break
         if any(_apart(begin, end) < 2.0 for end in [best, *ends]):
             continue
-        one = leastsquares.fit(task.problem(), task.data, begin, prior=task.prior, settings=settings)
-        if one.merit < best.merit + MODES_WITHIN + _WORTH and all(_apart(one.value, e) > 2.0 for e in [best, *ends]):
+        one = leastsquares.fit(
+            task.problem(), task.data, begin, prior=task.prior, settings=settings
+        )
+        if one.merit < best.merit + MODES_WITHIN + _WORTH and all(
+            _apart(one.value, e) > 2.0 for e in [best, *ends]
+        ):
             ends.append(_long(task, one.value, one.slopes))
     return ends
 
 
 def reversals(task: Task, best: Solution) -> list[Array]:
-    """Starts with the sign of some biases turned round, all other parameters going along as the parabola says.
+    """Starts with the sign of some biases turned round, all other parameters going
+    along as the parabola says.
 
-    The whole field of the bias first, where it stands off 0 by its sigma: near focus images show products of its parts
-    nearly alone, which are the same for a field of the other sign. Then each gradient that does, and these together.
+    The whole field of the bias first, where it stands off 0 by its sigma: near focus
+    images show products of its parts
+    nearly alone, which are the same for a field of the other sign. Then each gradient
+    that does, and these together.
     """
     value, covariance = best.value, best.covariance
     places = [task.names.index(name) for name in _REVERSED if name in task.names]
     whole = [i for i, name in enumerate(task.names) if name == "bias_nm"] + places
-    off = float(value[whole] @ leastsquares.invert(covariance[np.ix_(whole, whole)]) @ value[whole]) if whole else 0.0
+    off = (
+        float(
+            value[whole]
+            @ leastsquares.invert(covariance[np.ix_(whole, whole)])
+            @ value[whole]
+        )
+        if whole
+        else 0.0
+    )
     far = [i for i in places if abs(value[i]) > math.sqrt(covariance[i, i])]
     turned = [whole if off > 1 else [], *([i] for i in far), far]
     out = []
@@ -194,27 +272,38 @@ def refine(task: Task, value: Array) -> Solution:
 def held(task: Task, value: Array) -> Task:
     """The task with its windows held where values of the fitted parameters have them.
 
-    Frames begin where the light lies, up to a pixel off the decentre (a prism of the bias moves light too): at NA 0.2
+    Frames begin where the light lies, up to a pixel off the decentre (a prism of the
+    bias moves light too): at NA 0.2
     and 6000 electrons half a pixel each way moves trefoil by 0.7 sigma.
     """
     model, x = task.model, task.all_of(value)
     middle = float(x[PLACE["decentre_x_um"]]), float(x[PLACE["decentre_y_um"]])
     off = max(abs(a - b) for a, b in zip(middle, model.grid.middle_um, strict=True))
-    return task if off < _HELD_PX * model.setting.pixel_um else dataclasses.replace(task, model=model.about(middle))
+    return (
+        task
+        if off < _HELD_PX * model.setting.pixel_um
+        else dataclasses.replace(task, model=model.about(middle))
+    )
 
 
 def placed(task: Task, ends: list[Solution]) -> tuple[Task, list[Solution]]:
-    """The task with its windows held where the best end has them, and the ends followed there."""
+    """The task with its windows held where the best end has them, and the ends followed
+    there.
+    """
     there = held(task, ends[0].value)
     if there is task:
         return task, ends
     best = _long(there, ends[0].value, ends[0].slopes)
     about = anchored(there, best)
-    return there, distinct([best, *(_long(about, end.value, end.slopes) for end in ends[1:])])
+    return there, distinct(
+        [best, *(_long(about, end.value, end.slopes) for end in ends[1:])]
+    )
 
 
 def wider(task: Task, begin: Array) -> tuple[Task, list[Solution]] | None:
-    """A search with more parameters from where the usual ones led; None where they lead out of the model's range."""
+    """A search with more parameters from where the usual ones led; None where they lead
+    out of the model's range.
+    """
     try:
         return search(task, begins=[begin])
     except FitError:
@@ -239,15 +328,26 @@ def _apart(value: Array, end: Solution) -> float:
 
 def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
     place = [PLACE[name] for name in task.names]
-    waves = Ball(np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]), WAVES_RAD)
+    waves = Ball(
+        np.array([i for i, name in enumerate(task.names) if name.endswith("_rad")]),
+        WAVES_RAD,
+    )
     short = Settings(
-        iterations=4, step_tolerance=1.0, secant=True, near=math.inf, finish=False, bounded=True, ball=waves
+        iterations=4,
+        step_tolerance=1.0,
+        secant=True,
+        near=math.inf,
+        finish=False,
+        bounded=True,
+        ball=waves,
     )
     part, seen = task.problem(few), task.data.planes(few)
 
     def one(begin: Array) -> Solution:
         opened = with_values(begin, _opened(task, begin))
-        return leastsquares.fit(part, seen, opened[place], prior=task.prior, settings=short)
+        return leastsquares.fit(
+            part, seen, opened[place], prior=task.prior, settings=short
+        )
 
     return sorted(threads.each(one, begins), key=lambda t: t.merit)
 
@@ -255,21 +355,49 @@ def _short(task: Task, few: Array, begins: Sequence[Array]) -> list[Solution]:
 def _long(task: Task, value: Array, slopes: Array | None = None) -> Solution:
     """A fit to the end; ``slopes`` (p, n, y, x): of a place close by."""
     settings = Settings(iterations=80, secant=True)
-    return leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=settings, slopes=slopes)
+    return leastsquares.fit(
+        task.problem(),
+        task.data,
+        value,
+        prior=task.prior,
+        settings=settings,
+        slopes=slopes,
+    )
 
 
 def _nearer(task: Task, value: Array) -> Solution:
-    """Near the lowest place on all frames, by a quick model put right where a short fit ended."""
-    at = leastsquares.fit(task.problem(), task.data, value, prior=task.prior, settings=Settings(iterations=0))
+    """Near the lowest place on all frames, by a quick model put right where a short fit
+    ended.
+    """
+    at = leastsquares.fit(
+        task.problem(),
+        task.data,
+        value,
+        prior=task.prior,
+        settings=Settings(iterations=0),
+    )
     images = anchored(task, at).problem()
-    settings = Settings(iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False)
-    return leastsquares.fit(images, task.data, at.value, prior=task.prior, settings=settings, slopes=at.slopes)
+    settings = Settings(
+        iterations=20, step_tolerance=0.3, secant=True, near=1.0, finish=False
+    )
+    return leastsquares.fit(
+        images,
+        task.data,
+        at.value,
+        prior=task.prior,
+        settings=settings,
+        slopes=at.slopes,
+    )
 
 
 def _opened(task: Task, x: Array) -> dict[str, float]:
     """Sizes that have no slope at 0 start off it."""
     off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5}
-    return {name: size for name, size in off.items() if name in task.names and x[PLACE[name]] == 0}
+    return {
+        name: size
+        for name, size in off.items()
+        if name in task.names and x[PLACE[name]] == 0
+    }
 
 
 def names_of(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
@@ -283,12 +411,22 @@ def names_of(known: dict[str, Known], free: Sequence[str]) -> tuple[str, ...]:
 
 
 def prior_of(names: Sequence[str], known: dict[str, Known], lens: Lens) -> Prior:
-    """Priors of the fitted parameters: metrology where there is, else what is usual for such a lens."""
+    """Priors of the fitted parameters: metrology where there is, else what is usual for
+    such a lens.
+    """
     table = usual(names, lens)
     entries = [known.get(name) for name in names]
     mean = [k.value if k else p.start for k, p in zip(entries, table, strict=True)]
-    sigma = [k.sigma if k and k.sigma > 0 else p.sigma for k, p in zip(entries, table, strict=True)]
-    return Prior(np.array(mean), np.array(sigma), np.array([p.low for p in table]), np.array([p.high for p in table]))
+    sigma = [
+        k.sigma if k and k.sigma > 0 else p.sigma
+        for k, p in zip(entries, table, strict=True)
+    ]
+    return Prior(
+        np.array(mean),
+        np.array(sigma),
+        np.array([p.low for p in table]),
+        np.array([p.high for p in table]),
+    )
 
 
 def with_values(x: Array, values: dict[str, float]) -> Array:
@@ -300,42 +438,71 @@ def with_values(x: Array, values: dict[str, float]) -> Array:
 
 
 def window_um(found: Arrangement, model: ForwardModel) -> tuple[float, float]:
-    """(x, y) of the window's middle from the chief ray, as the light lies in the frames."""
+    """(x, y) of the window's middle from the chief ray, as the light lies in the
+    frames.
+    """
     most = _ASIDE_UM * coarser(model.lens.wavelength_um)
-    x, y = (float(np.clip(-shift * model.setting.pixel_um, -most, most)) for shift in found.shift_px[::-1])
+    x, y = (
+        float(np.clip(-shift * model.setting.pixel_um, -most, most))
+        for shift in found.shift_px[::-1]
+    )
     return x, y
 
 
 def starts(task: Task, *, biases_nm: Sequence[float] = (0.0, 8.0, -8.0)) -> list[Array]:
-    """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain, background off the frames."""
+    """Nominal, and the twins of the global bias (for 0.85 um); stage zero, place, gain,
+    background off the frames.
+    """
     model, data, found = task.model, task.data, task.found
     if found is None:
         raise FitError("a search begins where the frames lie; arrange them first")
     place = window_um(found, model)
     level = float(np.median((data.electrons / model.setting.glow)[data.usable]))
-    lies = {"stage_zero_um": found.stage_zero_um, "distance_um": found.distance_um, "background_e": level}
-    base = with_values(task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]})
+    lies = {
+        "stage_zero_um": found.stage_zero_um,
+        "distance_um": found.distance_um,
+        "background_e": level,
+    }
+    base = with_values(
+        task.start, lies | {"decentre_x_um": place[0], "decentre_y_um": place[1]}
+    )
     out = []
     for bias in biases_nm:
-        x = with_values(base, {"bias_nm": base[PLACE["bias_nm"]] + bias * coarser(model.lens.wavelength_um)})
+        x = with_values(
+            base,
+            {
+                "bias_nm": base[PLACE["bias_nm"]]
+                + bias * coarser(model.lens.wavelength_um)
+            },
+        )
         light = model.images(with_values(x, {"background_e": 0.0}))[0]
         keep = data.usable & ~data.saturated
-        gain = float((light * (data.electrons - level * model.setting.glow))[keep].sum() / (light[keep] ** 2).sum())
+        gain = float(
+            (light * (data.electrons - level * model.setting.glow))[keep].sum()
+            / (light[keep] ** 2).sum()
+        )
         out.append(with_values(x, {"log_gain": math.log(max(gain, 1e-12))}))
     return out
 
 
 def _leaning(plain: Array) -> list[Array]:
-    """About its focus a lens with the opposite even aberrations gives nearly the same images.
+    """About its focus a lens with the opposite even aberrations gives nearly the same
+    images.
 
     The plain start lies between the two: either sign of both astigmatisms.
     """
     even = ("astigmatism_rad", "oblique_astigmatism_rad")
-    return [with_values(plain, {name: size}) for name in even for size in (_LEANING_RAD, -_LEANING_RAD)]
+    return [
+        with_values(plain, {name: size})
+        for name in even
+        for size in (_LEANING_RAD, -_LEANING_RAD)
+    ]
 
 
 def _twins(task: Task, best: Solution) -> list[Array]:
-    """What was found with its even aberrations reversed, and moved along the valley of the bias to either side."""
+    """What was found with its even aberrations reversed, and moved along the valley of
+    the bias to either side.
+    """
     found = task.all_of(best.value)
     even = ("astigmatism_rad", "oblique_astigmatism_rad", "spherical_rad")
     out = [with_values(found, {name: -float(found[PLACE[name]]) for name in even})]

@@ -1,4 +1,6 @@
-"""What a finished fit is worth: checks with their causes, structure in the residuals, and two verdicts in words."""
+"""What a finished fit is worth: checks with their causes, structure in the residuals,
+and two verdicts in words.
+"""
 
 import copy
 import dataclasses
@@ -25,19 +27,27 @@ from metalens.made import coarser
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed
 _SHOWN = 24  # draws whose images give the predicted error at depths in between
-_ONE_COLOUR_NM = 2.0  # over which pillars turn by 0.02 rad, those of a library at one wavelength too
-_STRUCTURE = 4.5  # sigma by which residuals of neighbours may go together; a thousand frames of noise reach 4
+_ONE_COLOUR_NM = (
+    2.0  # over which pillars turn by 0.02 rad, those of a library at one wavelength too
+)
+# sigma by which residuals of neighbours may go together; a thousand frames of noise
+# reach 4
+_STRUCTURE = 4.5
 
 
 def explained(solution: Solution, gain: Gain) -> bool:
-    """Whether chi-square is that of noise: within 15 %, or four of its own sigma where pixels or flats are few."""
+    """Whether chi-square is that of noise: within 15 %, or four of its own sigma where
+    pixels or flats are few.
+    """
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
 
 
 def quiet(solution: Solution, gain: Gain, *, whole: bool) -> list[str]:
-    """What to say of frames with less noise than stated: chi-square as far below 1 as it may not be above.
+    """What to say of frames with less noise than stated: chi-square as far below 1 as
+    it may not be above.
 
-    Of counts too coarse for their noise how they were fitted: in the middle of a count most pixels tell nothing.
+    Of counts too coarse for their noise how they were fitted: in the middle of a count
+    most pixels tell nothing.
 
     Args:
         whole: the frames are counts and no means of them: fitted as rounded.
@@ -48,9 +58,7 @@ def quiet(solution: Solution, gain: Gain, *, whole: bool) -> list[str]:
             "is no noise there, but one error wherever light is alike, and "
         )
         exact = "they are fitted as rounded counts; more bits, or a higher gain of the camera, tell more"
-        rough = (
-            "of merged exposures intervals within the model are too narrow; save more bits, or raise the camera's gain"
-        )
+        rough = "of merged exposures intervals within the model are too narrow; save more bits, or raise the camera's gain"
         return [said + (exact if whole else rough)]
     if not gain.known or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
         return []
@@ -66,17 +74,23 @@ def _allowed(solution: Solution, gain: Gain) -> float:
 
 
 def left_over(solution: Solution) -> bool:
-    """Whether the frames hold more than noise, but not so much that they are of something else."""
+    """Whether the frames hold more than noise, but not so much that they are of
+    something else.
+    """
     return 3 * chance_of(solution) < solution.chi2_per_dof - 1 < 30
 
 
 def chance_of(solution: Solution) -> float:
-    """Standard deviation of chi-square per degree of freedom over the pixels that count."""
+    """Standard deviation of chi-square per degree of freedom over the pixels that
+    count.
+    """
     return math.sqrt(2 / max(float((solution.residual_sigma != 0).sum()), 1.0))
 
 
 def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str]:
-    """Checks of a finished fit, each with the cause it points to; bounds are judged by :func:`held_back`."""
+    """Checks of a finished fit, each with the cause it points to; bounds are judged by
+    :func:`held_back`.
+    """
     words = []
     if not solution.converged:
         words.append(f"not converged ({solution.reason})")
@@ -97,7 +111,13 @@ def problems(names: tuple[str, ...], solution: Solution, gain: Gain) -> list[str
         words.append(
             f"{outliers:.1%} of the pixels lie beyond 6 sigma: a ghost, wrong saturation level or misplaced frame"
         )
-    wave = math.hypot(*(v for n, v in zip(names, solution.value.tolist(), strict=True) if n.endswith("_rad")))
+    wave = math.hypot(
+        *(
+            v
+            for n, v in zip(names, solution.value.tolist(), strict=True)
+            if n.endswith("_rad")
+        )
+    )
     if wave > WAVES_RAD:
         words.append(
             f"aberrations of {wave:.2f} rad rms are no tolerance of this design: captures of another lens, or counts "
@@ -114,23 +134,36 @@ def held_back(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[
     ]
 
 
-def at_bounds(names: tuple[str, ...], solution: Solution, prior: Prior) -> list[tuple[str, float]]:
+def at_bounds(
+    names: tuple[str, ...], solution: Solution, prior: Prior
+) -> list[tuple[str, float]]:
     """Parameters that a bound holds back, one which is not the natural zero of a blur.
 
-    The frames want them beyond it by more than ``_BEYOND`` sigma; where they say so little that a value inside is
+    The frames want them beyond it by more than ``_BEYOND`` sigma; where they say so
+    little that a value inside is
     nearly as good, the bound is the end of an interval and no fault.
     """
-    ends = zip(names, solution.value.tolist(), solution.beyond.tolist(), prior.low, prior.high, strict=True)
+    ends = zip(
+        names,
+        solution.value.tolist(),
+        solution.beyond.tolist(),
+        prior.low,
+        prior.high,
+        strict=True,
+    )
     blurs = ("pinhole_um", "bandwidth_nm", "crosstalk_px", "glass_um")
     return [
         (n, v)
         for n, v, out, low, high in ends
-        if (v >= high and out > _BEYOND) or (v <= low and out < -_BEYOND and n not in blurs)
+        if (v >= high and out > _BEYOND)
+        or (v <= low and out < -_BEYOND and n not in blurs)
     ]
 
 
 def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
-    """Whether pillars were solved for the colours of a stated spectrum, in words; beyond, ``designed`` holds them."""
+    """Whether pillars were solved for the colours of a stated spectrum, in words;
+    beyond, ``designed`` holds them.
+    """
     bandwidth_nm = known["bandwidth_nm"].value if "bandwidth_nm" in known else 0.0
     low, high = (edge * 1e3 for edge in lens.proxy.wavelengths_um)
     first, last = (lens.wavelength_um * 1e3 + reach * bandwidth_nm for reach in (-2, 2))
@@ -144,20 +177,25 @@ def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
 
 
 def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
-    """What chi-square does not see, in words: residuals that go together from pixel to pixel or from frame to frame.
+    """What chi-square does not see, in words: residuals that go together from pixel to
+    pixel or from frame to frame.
 
-    Of noise, the mean product of neighbours scatters about 0 by one over the root of their number. Errors of dark and
+    Of noise, the mean product of neighbours scatters about 0 by one over the root of
+    their number. Errors of dark and
     flat are the same in every frame: their part of the products is expected.
 
     Args:
-        shared: (2, n, y, x) standard deviations of such errors over the noise, by dark and by flat, see
+        shared: (2, n, y, x) standard deviations of such errors over the noise, by dark
+            and by flat, see
             :meth:`characterize.inference.leastsquares.Data.shared`.
     """
     r = np.clip(residual_sigma, -6, 6)
     dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
     r = r / np.sqrt(1 + flat**2)
     words = []
-    sides = np.array([_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])])
+    sides = np.array(
+        [_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])]
+    )
     worst = int(np.argmax(sides.max(0)))
     if sides.max() > _STRUCTURE:
         words.append(
@@ -165,9 +203,13 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
             "is there than the parameters describe; see the residual map"
         )
     if len(r) > 1:
-        frames = _from_frame_to_frame(r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2))
+        frames = _from_frame_to_frame(
+            r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2)
+        )
         if frames > _STRUCTURE:
-            words.append(f"residuals go together from frame to frame ({frames:.1f} sigma): the same is missed in each")
+            words.append(
+                f"residuals go together from frame to frame ({frames:.1f} sigma): the same is missed in each"
+            )
     levels = r.mean((1, 2)) * math.sqrt(max(r[0].size, 1))
     if np.abs(levels).max() > _STRUCTURE + 0.5:
         at = int(np.argmax(np.abs(levels)))
@@ -178,9 +220,11 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
 
 
 def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
-    """Sum of products of neighbouring frames less what is expected of it, over its standard deviation.
+    """Sum of products of neighbouring frames less what is expected of it, over its
+    standard deviation.
 
-    Of T = rᵀ A r with A = 1/2 beside the diagonal and covariance K in each pixel: tr AK and 2 tr AKAK.
+    Of T = rᵀ A r with A = 1/2 beside the diagonal and covariance K in each pixel: tr AK
+    and 2 tr AKAK.
     """
     expected, variance = 0.0, 0.0
     for row in range(r.shape[1]):
@@ -198,18 +242,29 @@ def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:
 def _together(one: Array, other: Array) -> Array:
     """(n,) mean product of neighbours over its standard deviation."""
     product = one * other
-    return np.asarray(product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1)))
+    return np.asarray(
+        product.sum((1, 2)) / np.sqrt(np.maximum((product != 0).sum((1, 2)), 1))
+    )
 
 
-def process_verdict(rows: Sequence[Parameter], low: Array, high: Array, told: Array, unstated: Unstated) -> str:
-    """Which causes the frames fix, and which come from prior knowledge or only with others.
+def process_verdict(
+    rows: Sequence[Parameter], low: Array, high: Array, told: Array, unstated: Unstated
+) -> str:
+    """Which causes the frames fix, and which come from prior knowledge or only with
+    others.
 
-    ``rows``: (p,) of the fitted, for this lens. ``told``: (p,) interval over that of the prior alone, 1 where the
-    frames say nothing. Numbers are those with what ``unstated`` causes may have moved; where these are too large, a
+    ``rows``: (p,) of the fitted, for this lens. ``told``: (p,) interval over that of
+    the prior alone, 1 where the
+    frames say nothing. Numbers are those with what ``unstated`` causes may have moved;
+    where these are too large, a
     cause is known in the model alone, and so said.
     """
     names = [row.name for row in rows]
-    causes = [i for i, n in enumerate(names) if n.endswith(("_nm", "_rad", "_deg")) or n == "index"]
+    causes = [
+        i
+        for i, n in enumerate(names)
+        if n.endswith(("_nm", "_rad", "_deg")) or n == "index"
+    ]
     own = (high - low) / 3.92
     close = [i for i in causes if own[i] <= rows[i].scale]
     whole = np.hypot(own, unstated.sigma)
@@ -220,35 +275,57 @@ def process_verdict(rows: Sequence[Parameter], low: Array, high: Array, told: Ar
     moved = [i for i in close if i not in good]
     if moved:
         worst = np.argsort(-(unstated.by_cause[:, moved] / own[moved]).max(1))[:3]
-        parts = ", ".join(f"{names[i]} +- {own[i]:.2g} (else +- {whole[i]:.2g})" for i in moved)
-        without = ", ".join(unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst)
+        parts = ", ".join(
+            f"{names[i]} +- {own[i]:.2g} (else +- {whole[i]:.2g})" for i in moved
+        )
+        without = ", ".join(
+            unstated.causes[k].removeprefix("a ").removeprefix("an ") for k in worst
+        )
         more = f"; within the model only, that is without {without}: {parts}" + more
     open_ = [i for i in causes if i not in close and told[i] <= 0.7]
     middle, reach = (low + high) / 2, 1.96 * whole
-    wide = ", ".join(f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}" for i in open_)
-    return f"the process is known to {known}" + (f"; loosely: {wide}" if wide else "") + more
+    wide = ", ".join(
+        f"{names[i]} {middle[i] - reach[i]:.3g} to {middle[i] + reach[i]:.3g}"
+        for i in open_
+    )
+    return (
+        f"the process is known to {known}"
+        + (f"; loosely: {wide}" if wide else "")
+        + more
+    )
 
 
 def predicted_error(task: Task, found: Posterior) -> tuple[float, float]:
-    """Expected NRMSE of the as-built images: at the captured depths, and half-way between them."""
-    model, values = task.model.quick(), _shown(task, found)  # differences of images, to a few percent
-    return _spread(task, model, found.best.value, values), _spread(task, between(model), found.best.value, values)
+    """Expected NRMSE of the as-built images: at the captured depths, and half-way
+    between them.
+    """
+    model, values = (
+        task.model.quick(),
+        _shown(task, found),
+    )  # differences of images, to a few percent
+    return _spread(task, model, found.best.value, values), _spread(
+        task, between(model), found.best.value, values
+    )
 
 
 def predicted_aside(task: Task, found: Posterior) -> tuple[float, float] | None:
-    """As :func:`predicted_error` at the captured depths: half-way between neighbouring field angles, and half a step
+    """As :func:`predicted_error` at the captured depths: half-way between neighbouring
+    field angles, and half a step
     beyond the outermost; None of frames at one angle."""
     angles = aside(task.model.setting.angle_rad)
     if angles is None:
         return None
     values = _shown(task, found)
     models = [_at_angle(task.model, angle).quick() for angle in angles]
-    between_them, beyond = (_spread(task, model, found.best.value, values) for model in models)
+    between_them, beyond = (
+        _spread(task, model, found.best.value, values) for model in models
+    )
     return between_them, beyond
 
 
 def aside(angle_rad: Array) -> tuple[Array, Array] | None:
-    """(x, y) half-way between the two neighbours that lie farthest apart among field angles (n, 2), and as far beyond
+    """(x, y) half-way between the two neighbours that lie farthest apart among field
+    angles (n, 2), and as far beyond
     the outermost as half of its step from its neighbour; None where all are one."""
     angles = np.unique(angle_rad, axis=0)
     if len(angles) < 2:
@@ -256,14 +333,21 @@ def aside(angle_rad: Array) -> tuple[Array, Array] | None:
     apart = np.hypot(*(angles[:, None] - angles).T)
     np.fill_diagonal(apart, np.inf)
     nearest = angles[apart.argmin(1)]
-    wide, outer = int(apart.min(1).argmax()), int(np.hypot(*(angles - angles.mean(0)).T).argmax())
-    return (angles[wide] + nearest[wide]) / 2, angles[outer] + (angles[outer] - nearest[outer]) / 2
+    wide, outer = (
+        int(apart.min(1).argmax()),
+        int(np.hypot(*(angles - angles.mean(0)).T).argmax()),
+    )
+    return (angles[wide] + nearest[wide]) / 2, angles[outer] + (
+        angles[outer] - nearest[outer]
+    ) / 2
 
 
 def _at_angle(model: ForwardModel, angle_rad: Array) -> ForwardModel:
     """The model of all its depths at one field angle."""
     s = model.setting
-    there = dataclasses.replace(s, angle_rad=np.broadcast_to(angle_rad, s.angle_rad.shape))
+    there = dataclasses.replace(
+        s, angle_rad=np.broadcast_to(angle_rad, s.angle_rad.shape)
+    )
     return (
         ForwardModel(model.lens, there, model.response)
         .about(model.grid.middle_um)
@@ -277,7 +361,9 @@ def _shown(task: Task, found: Posterior) -> Array:
         values = found.draws[:_SHOWN]
     else:
         size, vectors = np.linalg.eigh(found.covariance)
-        normal = np.random.default_rng(0).standard_normal((_SHOWN, len(size))) * np.sqrt(np.maximum(size, 0))
+        normal = np.random.default_rng(0).standard_normal(
+            (_SHOWN, len(size))
+        ) * np.sqrt(np.maximum(size, 0))
         values = found.best.value + normal @ vectors.T
     return np.clip(values, task.prior.low, task.prior.high)
 
@@ -299,11 +385,15 @@ def _spread(task: Task, model: ForwardModel, best: Array, values: Array) -> floa
         one *= (one * mean).sum() / max(float((one**2).sum()), 1e-300)
         return float(((one - mean) ** 2).sum())
 
-    return float(np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum()))
+    return float(
+        np.sqrt(sum(threads.each(away, values)) / len(values) / (mean**2).sum())
+    )
 
 
 def between(model: ForwardModel) -> ForwardModel:
-    """The model half-way, in 1/z, between neighbouring depths at each angle; the farthest frame moves inwards."""
+    """The model half-way, in 1/z, between neighbouring depths at each angle; the
+    farthest frame moves inwards.
+    """
     part, s = copy.copy(model), model.setting
     depth = s.depth_um.copy()
     for group in model.groups:
@@ -317,16 +407,23 @@ def between(model: ForwardModel) -> ForwardModel:
 
 
 def left_out(task: Task, mode: Solution) -> float:
-    """Chi-square a pixel of frames left out, every second depth and then the others, over that of the full fit.
+    """Chi-square a pixel of frames left out, every second depth and then the others,
+    over that of the full fit.
 
-    About 1 + parameters over pixels where model and intervals hold; nan with fewer than four frames.
+    About 1 + parameters over pixels where model and intervals hold; nan with fewer than
+    four frames.
     """
     n = len(task.data.electrons)
     if n < 4:
         return float("nan")
     order = np.argsort(task.model.setting.depth_um, kind="stable")
-    halves = [(np.sort(seen), np.sort(hidden)) for seen, hidden in itertools.permutations((order[::2], order[1::2]))]
-    total, count = np.sum(threads.each(functools.partial(_unseen, task, mode), halves), 0)
+    halves = [
+        (np.sort(seen), np.sort(hidden))
+        for seen, hidden in itertools.permutations((order[::2], order[1::2]))
+    ]
+    total, count = np.sum(
+        threads.each(functools.partial(_unseen, task, mode), halves), 0
+    )
     return float(total / max(count, 1))
 
 
@@ -338,9 +435,15 @@ def _unseen(task: Task, mode: Solution, part: tuple[Array, Array]) -> tuple[floa
     valley = Valley(images, task.data.planes(seen), mode.value, task.prior, known=known)
     value, _ = valley.descend(mode.value, rounds=6)
     rest = task.data.planes(hidden)
-    image = residual.problem(task.model.only(hidden), task.names, task.start)(value, False)[0]
+    image = residual.problem(task.model.only(hidden), task.names, task.start)(
+        value, False
+    )[0]
     keep = rest.usable & ~rest.saturated
     slopes = mode.slopes[:, hidden][:, keep]
-    known_e2 = np.einsum("iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True)
+    known_e2 = np.einsum(
+        "iN,ij,jN->N", slopes, valley.covariance, slopes, optimize=True
+    )
     variance = rest.variance(image)[keep] + known_e2
-    return float(np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()), int(keep.sum())
+    return float(
+        np.minimum((rest.electrons - image)[keep] ** 2 / variance, 36.0).sum()
+    ), int(keep.sum())

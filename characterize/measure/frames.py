@@ -1,7 +1,10 @@
-"""Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths; distortion, field curvature.
+"""Image quality of captured frames: MTF, Strehl ratio, encircled energy, widths;
+distortion, field curvature.
 
-The Strehl ratio compares like with like: the Airy pattern of the design's aperture is laid under the pixels where the
-spot lies (a pixel as wide as the spot's core holds from half to all of its peak as that may be), and loses the median
+The Strehl ratio compares like with like: the Airy pattern of the design's aperture is
+laid under the pixels where the
+spot lies (a pixel as wide as the spot's core holds from half to all of its peak as that
+may be), and loses the median
 of its border as the frame does.
 """
 
@@ -19,18 +22,24 @@ from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
 
 _FINE = 15  # samples a pixel side under the ideal spot
-_CUBIC = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6  # to a pixel from its second and first neighbours
-_CORE = 5  # pixels on each side of the brightest one, over which the ideal spot is laid on a frame's
+_CUBIC = (
+    np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6
+)  # to a pixel from its second and first neighbours
+# pixels on each side of the brightest one, over which the ideal spot is laid on a
+# frame's
+_CORE = 5
 _SAME = 1e-9  # of a depth, which went through its inverse
 Field = tuple[float, float]  # angle along x and y, degrees
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a design. peak_e: background off.
+    """One frame. strehl: against the Airy pattern of the lens's aperture, nan without a
+    design. peak_e: background off.
 
     angle_deg, angle_y_deg: of the field along x and y.
-    mtf50_x_per_um, mtf50_y_per_um: of the spot, pixel included. efficiency: share of the reference's light within
+    mtf50_x_per_um, mtf50_y_per_um: of the spot, pixel included. efficiency: share of
+    the reference's light within
     ``circle_um`` (three times the FWHM) about the centroid, nan without a reference.
     """
 
@@ -56,9 +65,12 @@ class Frame:
 class Quality:
     """All frames, and what they say together.
 
-    best_depth_um: {field angles (x, y) in degrees: source depth of the sharpest spot}: field curvature.
-    distortion: {field angles: (place on the sensor along the field over d tan(angle)) - 1}, relative to the smallest
-    angle; empty where frames were taken at one angle, or windows move with the chief ray (``window`` in the capture's
+    best_depth_um: {field angles (x, y) in degrees: source depth of the sharpest spot}:
+    field curvature.
+    distortion: {field angles: (place on the sensor along the field over d tan(angle)) -
+    1}, relative to the smallest
+    angle; empty where frames were taken at one angle, or windows move with the chief
+    ray (``window`` in the capture's
     description).
     light: (n, y, x) electrons above background. step_um: of a pixel.
     """
@@ -71,38 +83,57 @@ class Quality:
     notes: tuple[str, ...]
 
 
-def measure(capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan) -> Quality:
+def measure(
+    capture: Capture, *, design: Lens | None = None, reference_e: float = math.nan
+) -> Quality:
     """Quality of the frames as they are.
 
     Args:
         design: gives the aperture for the Strehl ratio.
-        reference_e: electrons of the same beam through an empty aperture of the lens's size, for the efficiency.
+        reference_e: electrons of the same beam through an empty aperture of the lens's
+            size, for the efficiency.
 
     Raises:
         CaptureError: pixel unknown, or a frame without light above its background.
     """
     if math.isnan(capture.pixel_um):
-        raise CaptureError("pixel_um is missing: give the sensor's pixel in capture.toml")
+        raise CaptureError(
+            "pixel_um is missing: give the sensor's pixel in capture.toml"
+        )
     frames = clean(capture)
     step = capture.pixel_um
     shots = zip(frames.electrons, frames.usable, _places(capture), strict=True)
     light = np.stack([_above(*shot) for shot in shots])
     notes = [*frames.corrections, *_masked_words(light, frames.usable)]
     if frames.saturated.any():
-        notes.append("saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad")
-    rows = [_row(capture, i, image, design, reference_e) for i, image in enumerate(light)]
+        notes.append(
+            "saturated pixels: Strehl ratio, widths and MTF of their frames are too good or too bad"
+        )
+    rows = [
+        _row(capture, i, image, design, reference_e) for i, image in enumerate(light)
+    ]
     best = _best(rows)
-    notes += [_open_end(field, depth) for field, depth in best.items() if _at_an_end(rows, field, depth)]
-    return Quality(tuple(rows), best, _distortion(rows, capture, design), light, step, tuple(notes))
+    notes += [
+        _open_end(field, depth)
+        for field, depth in best.items()
+        if _at_an_end(rows, field, depth)
+    ]
+    return Quality(
+        tuple(rows), best, _distortion(rows, capture, design), light, step, tuple(notes)
+    )
 
 
-def _row(capture: Capture, i: int, image: Array, design: Lens | None, reference_e: float) -> Frame:
+def _row(
+    capture: Capture, i: int, image: Array, design: Lens | None, reference_e: float
+) -> Frame:
     step = capture.pixel_um
     spot = metrics.spot(image, step_um=step)
     circle = 3 * spot.fwhm_um
     share = math.nan
     if math.isfinite(reference_e) and math.isfinite(circle):
-        share = metrics.focusing_efficiency(image, reference_e, step_um=step, aperture_um=circle)
+        share = metrics.focusing_efficiency(
+            image, reference_e, step_um=step, aperture_um=circle
+        )
     return Frame(
         capture.names[i],
         float(capture.position_um[i]),
@@ -118,16 +149,30 @@ def _row(capture: Capture, i: int, image: Array, design: Lens | None, reference_
     )
 
 
-def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Field = (0.0, 0.0)) -> Array:
-    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's pixels.
+def airy(
+    design: Lens,
+    capture: Capture,
+    shape: tuple[int, ...],
+    *,
+    place_px: Field = (0.0, 0.0),
+) -> Array:
+    """(y, x) Airy pattern of the lens's aperture at its sensor, in the capture's
+    pixels.
 
     place_px: (x, y) of its middle from the window's.
     """
-    wave = capture.wavelength_um if math.isfinite(capture.wavelength_um) else design.wavelength_um
-    sine = design.diameters.radius_um / math.hypot(design.diameters.radius_um, design.reduced_um)
+    wave = (
+        capture.wavelength_um
+        if math.isfinite(capture.wavelength_um)
+        else design.wavelength_um
+    )
+    sine = design.diameters.radius_um / math.hypot(
+        design.diameters.radius_um, design.reduced_um
+    )
     within = capture.fill * ((np.arange(_FINE) + 0.5) / _FINE - 0.5)
     y, x = (
-        (np.arange(n)[:, None] - (n - 1) / 2 - p + within).ravel() for n, p in zip(shape, place_px[::-1], strict=True)
+        (np.arange(n)[:, None] - (n - 1) / 2 - p + within).ravel()
+        for n, p in zip(shape, place_px[::-1], strict=True)
     )
     u = 2 * math.pi * sine / wave * capture.pixel_um * np.hypot(x[None], y[:, None])
     safe = np.maximum(u, 1e-9)
@@ -136,10 +181,14 @@ def airy(design: Lens, capture: Capture, shape: tuple[int, ...], *, place_px: Fi
 
 
 def _strehl(image: Array, design: Lens, capture: Capture) -> float:
-    """Strehl ratio against the Airy pattern where it is most like the spot (largest normalised correlation)."""
+    """Strehl ratio against the Airy pattern where it is most like the spot (largest
+    normalised correlation).
+    """
     peak = [int(i) for i in np.unravel_index(int(image.argmax()), image.shape)]
     half = min(_CORE, (min(image.shape) - 1) // 2)
-    middle = [min(max(i, half), n - 1 - half) for i, n in zip(peak, image.shape, strict=True)]
+    middle = [
+        min(max(i, half), n - 1 - half) for i, n in zip(peak, image.shape, strict=True)
+    ]
     core = image[tuple(slice(i - half, i + half + 1) for i in middle)]
 
     def unlike(at: Array) -> float:
@@ -148,16 +197,26 @@ def _strehl(image: Array, design: Lens, capture: Capture) -> float:
 
     start = np.array([peak[1] - middle[1], peak[0] - middle[0]], float)
     simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4]])
-    options = {"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-9 * float(np.abs(core).sum())}
+    options = {
+        "initial_simplex": simplex,
+        "xatol": 2e-3,
+        "fatol": 1e-9 * float(np.abs(core).sum()),
+    }
     found = optimize.minimize(unlike, start, method="Nelder-Mead", options=options).x
-    x, y = (float(f) + m - (n - 1) / 2 for f, m, n in zip(found, middle[::-1], image.shape[::-1], strict=True))
+    x, y = (
+        float(f) + m - (n - 1) / 2
+        for f, m, n in zip(found, middle[::-1], image.shape[::-1], strict=True)
+    )
     ideal = airy(design, capture, image.shape, place_px=(x, y))
     return metrics.strehl(image, ideal - np.median(_rim(ideal)))
 
 
 def _places(capture: Capture) -> list[str]:
     """Name and depth of every frame."""
-    depths = (f" at {depth:g} um" if math.isfinite(depth) else "" for depth in capture.position_um)
+    depths = (
+        f" at {depth:g} um" if math.isfinite(depth) else ""
+        for depth in capture.position_um
+    )
     return [f"{name}{depth}" for name, depth in zip(capture.names, depths, strict=True)]
 
 
@@ -179,9 +238,11 @@ def _above(electrons: Array, usable: Array, place: str) -> Array:
 
 
 def _filled(light: Array, usable: Array) -> Array:
-    """Masked pixels by the cubic through two pixels on either side, (4 (f₁ + f₋₁) - f₂ - f₋₂) / 6.
+    """Masked pixels by the cubic through two pixels on either side, (4 (f₁ + f₋₁) - f₂
+    - f₋₂) / 6.
 
-    Mean of that along rows and along columns where all four are usable, else mean of the usable ones of the eight
+    Mean of that along rows and along columns where all four are usable, else mean of
+    the usable ones of the eight
     neighbours (0 without any). A hole in the core of a spot would narrow it.
     """
     known, some = np.where(usable, light, 0.0), usable.astype(float)
@@ -190,13 +251,20 @@ def _filled(light: Array, usable: Array) -> Array:
         whole = ndimage.correlate1d(some, [1, 1, 0, 1, 1], axis, mode="constant") > 3.5
         cubic += whole * ndimage.correlate1d(known, _CUBIC, axis, mode="constant")
         lines += whole
-    near, count = (ndimage.correlate(part, np.ones((3, 3)), mode="constant") for part in (known, some))
-    filled = np.where(lines > 0, cubic / np.maximum(lines, 1), near / np.maximum(count, 1))
+    near, count = (
+        ndimage.correlate(part, np.ones((3, 3)), mode="constant")
+        for part in (known, some)
+    )
+    filled = np.where(
+        lines > 0, cubic / np.maximum(lines, 1), near / np.maximum(count, 1)
+    )
     return np.where(usable, light, filled)
 
 
 def _masked_words(light: Array, usable: Array) -> list[str]:
-    """What masked pixels in the core of a spot, above a tenth of its peak, mean for its numbers."""
+    """What masked pixels in the core of a spot, above a tenth of its peak, mean for its
+    numbers.
+    """
     inside = (~usable & (light > 0.1 * light.max((1, 2), keepdims=True))).sum((1, 2))
     if not inside.any():
         return []
@@ -212,7 +280,9 @@ def _rim(image: Array) -> Array:
 
 
 def _best(rows: list[Frame]) -> dict[Field, float]:
-    """Depth of the highest peak share at each angle, by a parabola in 1/z through the best three."""
+    """Depth of the highest peak share at each angle, by a parabola in 1/z through the
+    best three.
+    """
     out = {}
     for field in sorted({r.field for r in rows}):
         own = sorted((r for r in rows if r.field == field), key=lambda r: r.depth_um)
@@ -238,8 +308,12 @@ def _open_end(field: Field, depth_um: float) -> str:
     return f"sharpest at {x:g}, {y:g} deg at an end of the captured depths, {depth_um:.5g} um: focus may lie beyond it"
 
 
-def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dict[Field, float]:
-    """Only where the window stands still (``window = "fixed"`` in capture.toml) and the design gives the distance."""
+def _distortion(
+    rows: list[Frame], capture: Capture, design: Lens | None
+) -> dict[Field, float]:
+    """Only where the window stands still (``window = "fixed"`` in capture.toml) and the
+    design gives the distance.
+    """
     if design is None or capture.about.get("window") != "fixed":
         return {}
     places: dict[Field, list[Field]] = {}
@@ -252,6 +326,8 @@ def _distortion(rows: list[Frame], capture: Capture, design: Lens | None) -> dic
         if not tangent.any():
             continue
         straight = design.reduced_um * tangent
-        ratio[field] = float((np.mean(places[field], axis=0) - zero) @ straight / (straight @ straight))
+        ratio[field] = float(
+            (np.mean(places[field], axis=0) - zero) @ straight / (straight @ straight)
+        )
         least = ratio[field] if math.isinf(least) else least
     return {field: value / least - 1 for field, value in sorted(ratio.items())}

@@ -1,4 +1,6 @@
-"""Quality of a PSF or an edge as numbers: MTF, Strehl ratio, encircled energy, ISO 11146 width, efficiency."""
+"""Quality of a PSF or an edge as numbers: MTF, Strehl ratio, encircled energy, ISO
+11146 width, efficiency.
+"""
 
 import math
 from dataclasses import dataclass
@@ -22,14 +24,19 @@ class Mtf:
 
     @property
     def mtf50_per_um(self) -> float:
-        """Lowest frequency at which the modulation falls through 1/2; nan where it does not."""
+        """Lowest frequency at which the modulation falls through 1/2; nan where it does
+        not.
+        """
         below = np.flatnonzero(self.modulation < 0.5)
         if len(below) == 0 or below[0] == 0:
             return math.nan
         i = int(below[0])
         high, low = self.modulation[i - 1], self.modulation[i]
         share = (high - 0.5) / (high - low)
-        return float(self.frequency_per_um[i - 1] + share * (self.frequency_per_um[i] - self.frequency_per_um[i - 1]))
+        return float(
+            self.frequency_per_um[i - 1]
+            + share * (self.frequency_per_um[i] - self.frequency_per_um[i - 1])
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +45,14 @@ class Spot:
 
     fwhm_um: full width at half maximum of the radial mean about the peak.
     ee80_um: radius about the centroid that holds 80 % of the light in the window.
-    d4sigma_um: (major, minor) beam widths of ISO 11146-1, window iterated to three times the width.
+    d4sigma_um: (major, minor) beam widths of ISO 11146-1, window iterated to three
+    times the width.
     centroid_um: (x, y) from the window's centre.
 
-    Accuracy: pixels count as evenly lit, a second blur. Of an Airy disc, by where it lies on its pixels, FWHM and EE80
-    are up to 6 and 9 % wider than on the sensor at 2.3 pixels a FWHM, 0.4 and 2 % at 4.6.
+    Accuracy: pixels count as evenly lit, a second blur. Of an Airy disc, by where it
+    lies on its pixels, FWHM and EE80
+    are up to 6 and 9 % wider than on the sensor at 2.3 pixels a FWHM, 0.4 and 2 % at
+    4.6.
     """
 
     fwhm_um: float
@@ -52,7 +62,8 @@ class Spot:
 
 
 def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> Mtf:
-    """MTF along x or y of a sampled PSF (background taken off): |FFT of the line spread| / its zero frequency.
+    """MTF along x or y of a sampled PSF (background taken off): |FFT of the line
+    spread| / its zero frequency.
 
     Raises:
         CaptureError: no light.
@@ -66,12 +77,14 @@ def mtf_of_psf(psf: Array, *, step_um: float, axis: str = "x") -> Mtf:
 
 
 def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> Mtf:
-    """Slanted-edge MTF (ISO 12233): edge found by line centroids, profile oversampled, derivative windowed.
+    """Slanted-edge MTF (ISO 12233): edge found by line centroids, profile oversampled,
+    derivative windowed.
 
     Args:
         image: one straight edge, tilted 2 to 20 degrees from the rows or columns.
 
-    Accuracy: the finite difference and the bins are divided out; 1-2 % on noise-free edges to 0.7 Nyquist.
+    Accuracy: the finite difference and the bins are divided out; 1-2 % on noise-free
+    edges to 0.7 Nyquist.
 
     Raises:
         CaptureError: no edge, or a tilt that leaves the phases of the pixels uncovered.
@@ -83,31 +96,47 @@ def mtf_of_edge(image: Array, *, pixel_um: float, oversample: int = 4) -> Mtf:
     slope, offset = _edge_line(pixels, rows)
     angle = math.degrees(math.atan(abs(slope)))
     if not 1.5 <= angle <= 25:
-        raise CaptureError(f"edge tilted by {angle:.1f} degrees; need 2 to 20 to sample between the pixels")
-    distance = (np.arange(pixels.shape[1])[None] - (slope * rows + offset)[:, None]) * math.cos(math.atan(slope))
+        raise CaptureError(
+            f"edge tilted by {angle:.1f} degrees; need 2 to 20 to sample between the pixels"
+        )
+    distance = (
+        np.arange(pixels.shape[1])[None] - (slope * rows + offset)[:, None]
+    ) * math.cos(math.atan(slope))
     reach = int(min(distance.max(), -distance.min()))
     place = np.round(distance * oversample).astype(int) + reach * oversample
     keep = (place >= 0) & (place <= 2 * reach * oversample)
     count = np.bincount(place[keep], minlength=2 * reach * oversample + 1)
     total = np.bincount(place[keep], pixels[keep], minlength=2 * reach * oversample + 1)
-    profile = np.interp(np.arange(len(count)), np.flatnonzero(count), total[count > 0] / count[count > 0])
+    profile = np.interp(
+        np.arange(len(count)),
+        np.flatnonzero(count),
+        total[count > 0] / count[count > 0],
+    )
     spread = np.diff(profile)
     peak = int(np.argmax(np.abs(ndimage.gaussian_filter1d(spread, oversample))))
     half = min(peak, len(spread) - 1 - peak)
     spread = spread[peak - half : peak + half + 1] * np.hanning(2 * half + 3)[1:-1]
     spectrum = np.abs(fft.rfft(spread, 8 * len(spread)))
     frequency = fft.rfftfreq(8 * len(spread), pixel_um / oversample)
-    fold = np.sinc(frequency * pixel_um / oversample) ** 2  # difference of neighbours, and bins
+    fold = (
+        np.sinc(frequency * pixel_um / oversample) ** 2
+    )  # difference of neighbours, and bins
     keep_f = frequency <= 1 / pixel_um
-    return Mtf(frequency[keep_f], (spectrum / spectrum[0] / np.maximum(fold, 0.1))[keep_f])
+    return Mtf(
+        frequency[keep_f], (spectrum / spectrum[0] / np.maximum(fold, 0.1))[keep_f]
+    )
 
 
 def strehl(psf: Array, ideal: Array) -> float:
-    """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled alike.
+    """Peak of a PSF over that of the ideal one of equal light: both of sum 1, sampled
+    alike.
 
-    Peaks come from parabolas through the highest samples, so that their place under the grid does not matter.
+    Peaks come from parabolas through the highest samples, so that their place under the
+    grid does not matter.
     """
-    return _peak(np.asarray(psf, float) / np.sum(psf)) / _peak(np.asarray(ideal, float) / np.sum(ideal))
+    return _peak(np.asarray(psf, float) / np.sum(psf)) / _peak(
+        np.asarray(ideal, float) / np.sum(ideal)
+    )
 
 
 def spot(psf: Array, *, step_um: float) -> Spot:
@@ -130,46 +159,71 @@ def spot(psf: Array, *, step_um: float) -> Spot:
 
 
 def encircled_energy(psf: Array, *, step_um: float, radius_um: Array) -> Array:
-    """Share of the window's light within radii about the centroid; pixels cut by the circle count by their part.
+    """Share of the window's light within radii about the centroid; pixels cut by the
+    circle count by their part.
 
-    Noise below the background counts as it is, below 0: cut off, that above would be light of its own.
+    Noise below the background counts as it is, below 0: cut off, that above would be
+    light of its own.
     """
     light = np.asarray(psf, float)
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     _, (cx, cy) = _second_moments(light, x, y)
     radii = np.asarray(radius_um, float) / step_um
-    return np.asarray([_within(light, x - cx, y - cy, float(r)) for r in radii] / light.sum())
+    return np.asarray(
+        [_within(light, x - cx, y - cy, float(r)) for r in radii] / light.sum()
+    )
 
 
 def focusing_efficiency(
-    image_e: Array, reference_e: Array | float, *, step_um: float, aperture_um: float, exposure_ratio: float = 1.0
+    image_e: Array,
+    reference_e: Array | float,
+    *,
+    step_um: float,
+    aperture_um: float,
+    exposure_ratio: float = 1.0,
 ) -> float:
-    """Light within a stated circle about the centroid over the light through an open aperture of the lens's size.
+    """Light within a stated circle about the centroid over the light through an open
+    aperture of the lens's size.
 
     Args:
-        image_e, reference_e: electrons, background taken off; the reference is a frame of the same beam through an
+        image_e, reference_e: electrons, background taken off; the reference is a frame
+            of the same beam through an
             empty aperture, whole on the sensor, or the sum of it.
-        aperture_um: diameter of the circle (often three times the FWHM): always state it with the number.
+        aperture_um: diameter of the circle (often three times the FWHM): always state
+            it with the number.
         exposure_ratio: exposure of the image over that of the reference.
     """
-    share = encircled_energy(image_e, step_um=step_um, radius_um=np.array([aperture_um / 2]))[0]
+    share = encircled_energy(
+        image_e, step_um=step_um, radius_um=np.array([aperture_um / 2])
+    )[0]
     return float(share * np.sum(image_e) / np.sum(reference_e) / exposure_ratio)
 
 
-def _second_moments(light: Array, x: Array, y: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """ISO 11146-1: widths 4 sigma along the principal axes, over a window three widths wide, iterated."""
+def _second_moments(
+    light: Array, x: Array, y: Array
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """ISO 11146-1: widths 4 sigma along the principal axes, over a window three widths
+    wide, iterated.
+    """
     cx = cy = 0.0
     width = 2.0 * max(light.shape)
     major = minor = 0.0
     for _ in range(30):
-        mask = (np.abs(x[None] - cx) <= 1.5 * width) & (np.abs(y[:, None] - cy) <= 1.5 * width)
+        mask = (np.abs(x[None] - cx) <= 1.5 * width) & (
+            np.abs(y[:, None] - cy) <= 1.5 * width
+        )
         w = light * mask
         total = w.sum()
-        cx, cy = float((w * x[None]).sum() / total), float((w * y[:, None]).sum() / total)
+        cx, cy = (
+            float((w * x[None]).sum() / total),
+            float((w * y[:, None]).sum() / total),
+        )
         dx, dy = x[None] - cx, y[:, None] - cy
         xx, yy, xy = ((w * m).sum() / total for m in (dx * dx, dy * dy, dx * dy))
         root = math.hypot(xx - yy, 2 * xy)
-        major, minor = (4 * math.sqrt(max((xx + yy + s * root) / 2, 0)) for s in (1, -1))
+        major, minor = (
+            4 * math.sqrt(max((xx + yy + s * root) / 2, 0)) for s in (1, -1)
+        )
         if abs(major - width) < 1e-6 * width:
             break
         width = max(major, 1.0)
@@ -186,13 +240,21 @@ def _fwhm(light: Array) -> float:
 
     def mean_at(r: float) -> float:
         points = row + dy + r * np.sin(angle), column + dx + r * np.cos(angle)
-        return float(ndimage.map_coordinates(spline, points, prefilter=False, mode="nearest").mean())
+        return float(
+            ndimage.map_coordinates(
+                spline, points, prefilter=False, mode="nearest"
+            ).mean()
+        )
 
     radii = np.linspace(0, radius.max() / 2, 400)
     below = next((r for r in radii if mean_at(float(r)) < peak / 2), None)
     if below is None:
         return math.nan
-    return 2 * float(optimize.brentq(lambda r: mean_at(r) - peak / 2, max(below - radii[1], 0), below))
+    return 2 * float(
+        optimize.brentq(
+            lambda r: mean_at(r) - peak / 2, max(below - radii[1], 0), below
+        )
+    )
 
 
 def _encircled(light: Array, x: Array, y: Array, share: float) -> float:
@@ -205,20 +267,29 @@ def _encircled(light: Array, x: Array, y: Array, share: float) -> float:
     radii = np.linspace(max(about - 2, 0), about + 2, 41)
     held = np.array([_within(light, x, y, float(r)) for r in radii]) - wanted
     k = max(int(np.argmax(held >= 0)), 1)
-    return float(optimize.brentq(lambda r: _within(light, x, y, r) - wanted, radii[k - 1], radii[k]))
+    return float(
+        optimize.brentq(
+            lambda r: _within(light, x, y, r) - wanted, radii[k - 1], radii[k]
+        )
+    )
 
 
 def _within(light: Array, x: Array, y: Array, radius: float) -> float:
-    """Light within a circle about (0, 0) of square pixels of side 1 at (x, y), even over each pixel.
+    """Light within a circle about (0, 0) of square pixels of side 1 at (x, y), even
+    over each pixel.
 
-    A pixel that the rim crosses counts by the chords of 16 lines across it: to 0.2 % of a pixel.
+    A pixel that the rim crosses counts by the chords of 16 lines across it: to 0.2 % of
+    a pixel.
     """
     distance = np.hypot(x[None], y[:, None])
     whole = float(light[distance <= radius - math.sqrt(0.5)].sum())
     row, column = np.nonzero(np.abs(distance - radius) < math.sqrt(0.5))
     lines = y[row, None] + (np.arange(16) - 7.5) / 16
     chord = np.sqrt(np.maximum(radius**2 - lines**2, 0))
-    low, high = np.maximum(x[column, None] - 0.5, -chord), np.minimum(x[column, None] + 0.5, chord)
+    low, high = (
+        np.maximum(x[column, None] - 0.5, -chord),
+        np.minimum(x[column, None] + 0.5, chord),
+    )
     return whole + float((light[row, column] * np.maximum(high - low, 0).mean(1)).sum())
 
 
@@ -228,7 +299,9 @@ def _peak(light: Array) -> float:
 
 
 def _parabola(light: Array, row: int, column: int) -> tuple[float, tuple[float, float]]:
-    """Height and place (dy, dx) of the top of parabolas along y and x through the highest sample."""
+    """Height and place (dy, dx) of the top of parabolas along y and x through the
+    highest sample.
+    """
     top, place = float(light[row, column]), []
     height = top
     for axis, (i, n) in enumerate(((row, light.shape[0]), (column, light.shape[1]))):
@@ -236,7 +309,9 @@ def _parabola(light: Array, row: int, column: int) -> tuple[float, tuple[float, 
             place.append(0.0)
             continue
         before, after = (
-            (light[i - 1, column], light[i + 1, column]) if axis == 0 else (light[row, i - 1], light[row, i + 1])
+            (light[i - 1, column], light[i + 1, column])
+            if axis == 0
+            else (light[row, i - 1], light[row, i + 1])
         )
         bend = before - 2 * top + after
         shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
@@ -246,14 +321,18 @@ def _parabola(light: Array, row: int, column: int) -> tuple[float, tuple[float, 
 
 
 def _edge_line(pixels: Array, rows: Array) -> tuple[float, float]:
-    """Slope and offset of the edge from the centroids of each row's derivative, fitted twice about the line."""
+    """Slope and offset of the edge from the centroids of each row's derivative, fitted
+    twice about the line.
+    """
     slope, offset = 0.0, pixels.shape[1] / 2
     derivative = np.abs(ndimage.gaussian_filter1d(pixels, 1.0, axis=1, order=1))
     columns = np.arange(pixels.shape[1])
     near = np.ones_like(derivative)
     for reach in (None, 12.0, 8.0, 6.0):
         if reach is not None:
-            near = np.exp(-0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / reach) ** 2)
+            near = np.exp(
+                -0.5 * ((columns[None] - (slope * rows + offset)[:, None]) / reach) ** 2
+            )
         weight = near * np.maximum(derivative - np.median(derivative), 0) ** 2
         total = weight.sum(1)
         if not total.max() > 0:

@@ -1,4 +1,6 @@
-"""Micrograph on design: which pillar of the mask each measured one is, its error, and the bias table of the process."""
+"""Micrograph on design: which pillar of the mask each measured one is, its error, and
+the bias table of the process.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -12,8 +14,11 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 from metalens.lens import DiameterMap
 
-Table = list[tuple[float, float, float, int]]  # drawn nm, made less drawn nm, its standard error, pillars
-_CLEAR = 0.7  # scatter of the best place over that of the next best: below, the place is sure
+Table = list[
+    tuple[float, float, float, int]
+]  # drawn nm, made less drawn nm, its standard error, pillars
+# scatter of the best place over that of the next best: below, the place is sure
+_CLEAR = 0.7
 _LEAST = 12  # pillars
 OUTLIER = 4.0  # robust sigma
 SCALE = 0.005  # of the lattice against the mask's: 1 nm on a pillar of 200
@@ -23,8 +28,10 @@ SCALE = 0.005  # of the lattice against the mask's: 1 nm on a pillar of 200
 class Overlay:
     """Measured pillars beside the design.
 
-    designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0, 0) of the lattice on the mask.
-    site: (p, 2) row and column of every pillar on the mask. clearly: whether the place on the mask is beyond doubt.
+    designed_nm, error_nm: (p,) nan where unknown. row, column: index of the pillar (0,
+    0) of the lattice on the mask.
+    site: (p, 2) row and column of every pillar on the mask. clearly: whether the place
+    on the mask is beyond doubt.
     outlier: (p,) error beyond ``OUTLIER`` robust sigma.
     """
 
@@ -38,18 +45,23 @@ class Overlay:
 
 
 def overlay(found: Diameters, design: DiameterMap) -> Overlay:
-    """Lay measured pillars on the design: the shift of whole sites where design and measurement differ most evenly.
+    """Lay measured pillars on the design: the shift of whole sites where design and
+    measurement differ most evenly.
 
     A bias that is the same everywhere, or goes with the diameter, plays no part.
-    The picture's +x is taken as the mask's, to half the angle between two rows of the lattice.
+    The picture's +x is taken as the mask's, to half the angle between two rows of the
+    lattice.
 
     Raises:
-        CaptureError: fewer than twelve good pillars, a lattice that is not the design's or lies across it, or more
+        CaptureError: fewer than twelve good pillars, a lattice that is not the design's
+            or lies across it, or more
             pillars than it has.
     """
     good = np.isfinite(found.diameter_nm)
     if good.sum() < _LEAST:
-        raise CaptureError(f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design")
+        raise CaptureError(
+            f"{int(good.sum())} good pillars; need {_LEAST} or more to find them on the design"
+        )
     on_mask = found.site @ _steps(found.lattice, design)
     first = on_mask.min(0)
     site = on_mask - first
@@ -58,29 +70,52 @@ def overlay(found: Diameters, design: DiameterMap) -> Overlay:
     patch[tuple(site[good].T)], mask[tuple(site[good].T)] = found.diameter_nm[good], 1.0
     drawn = np.asarray(design.diameter_um, float) * 1e3
     if (np.array(patch.shape) > drawn.shape).any():
-        raise CaptureError(f"the picture holds {patch.shape} sites, the design {drawn.shape}")
-    for _ in range(2):  # again without what went wrong: one fallen pillar is as much as all noise
+        raise CaptureError(
+            f"the picture holds {patch.shape} sites, the design {drawn.shape}"
+        )
+    for _ in range(
+        2
+    ):  # again without what went wrong: one fallen pillar is as much as all noise
         scatter = _scatter(patch, mask, drawn)
-        row, column = (int(i) for i in np.unravel_index(int(np.argmin(scatter)), scatter.shape))
+        row, column = (
+            int(i) for i in np.unravel_index(int(np.argmin(scatter)), scatter.shape)
+        )
         designed = drawn[site[:, 0] + row, site[:, 1] + column]
         designed = np.where(designed > 0, designed, np.nan)
         error = found.diameter_nm - designed
         middle = np.nanmedian(error)
         spread = 1.4826 * float(np.nanmedian(np.abs(error - middle)))
-        outlier = np.nan_to_num(np.abs(error - middle), nan=0.0) > OUTLIER * max(spread, 0.5)
+        outlier = np.nan_to_num(np.abs(error - middle), nan=0.0) > OUTLIER * max(
+            spread, 0.5
+        )
         mask[tuple(site[outlier].T)] = 0.0
     ordered = np.sort(scatter[np.isfinite(scatter)])
     sure = len(ordered) == 1 or float(ordered[0]) < _CLEAR * float(ordered[1])
     row, column = row - int(first[0]), column - int(first[1])
-    return Overlay(designed, error, row, column, on_mask + np.array([row, column]), bool(sure), outlier)
+    return Overlay(
+        designed,
+        error,
+        row,
+        column,
+        on_mask + np.array([row, column]),
+        bool(sure),
+        outlier,
+    )
 
 
 def _steps(lattice: Lattice, design: DiameterMap) -> Array:
-    """(2, 2) rows and columns of the mask's map that a step along j, and one along i, of a picture's lattice goes."""
+    """(2, 2) rows and columns of the mask's map that a step along j, and one along i,
+    of a picture's lattice goes.
+    """
     kind = design.lattice.kind
     if lattice.kind != kind:
-        raise CaptureError(f"the picture shows a {lattice.kind} lattice, the design is {kind}")
-    vectors, steps_um = np.stack([lattice.b, lattice.a]), np.array(design.steps_um[::-1])
+        raise CaptureError(
+            f"the picture shows a {lattice.kind} lattice, the design is {kind}"
+        )
+    vectors, steps_um = (
+        np.stack([lattice.b, lattice.a]),
+        np.array(design.steps_um[::-1]),
+    )
     vectors = vectors * np.sqrt(design.site_um2 / abs(np.linalg.det(vectors)))
     steps = np.rint(vectors / steps_um)
     long, expected = (np.linalg.norm(v, axis=1) for v in (vectors, steps * steps_um))
@@ -93,33 +128,50 @@ def _steps(lattice: Lattice, design: DiameterMap) -> Array:
 
 
 def scale(found: Diameters, pixel_nm: float, design: DiameterMap) -> float:
-    """Lattice constant in the picture over that of the mask: by how much the stated pixel is too large.
+    """Lattice constant in the picture over that of the mask: by how much the stated
+    pixel is too large.
 
-    Of the plane places (row, column) = origin + J (j, i) through the good pillars, sqrt |det J|, so that a scan
-    stretched along one axis counts half. Masks are written true to scale to a few parts in a million, pixels of
+    Of the plane places (row, column) = origin + J (j, i) through the good pillars, sqrt
+    |det J|, so that a scan
+    stretched along one axis counts half. Masks are written true to scale to a few parts
+    in a million, pixels of
     microscopes are known to some per cent. Accuracy: 4e-4 for five pillars a side.
     """
     good = np.isfinite(found.diameter_nm)
     sites = np.column_stack([found.site[good], np.ones(int(good.sum()))])
-    turn = np.linalg.lstsq(sites, np.column_stack([found.row[good], found.column[good]]), rcond=None)[0][:2]
+    turn = np.linalg.lstsq(
+        sites, np.column_stack([found.row[good], found.column[good]]), rcond=None
+    )[0][:2]
     return float(np.sqrt(abs(np.linalg.det(turn)) / design.site_um2) * pixel_nm / 1e3)
 
 
 def bias_table(laid: Overlay, *, knots: int = 7) -> Table:
-    """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of the pillars, outliers left out.
+    """(drawn nm, made less drawn nm, its standard error, pillars) over equal shares of
+    the pillars, outliers left out.
 
     Raises:
         CaptureError: fewer than twelve pillars to take it from.
     """
     good = np.isfinite(laid.error_nm) & ~laid.outlier
     if good.sum() < _LEAST:
-        raise CaptureError(f"{int(good.sum())} pillars on the design; need {_LEAST} or more for a bias table")
+        raise CaptureError(
+            f"{int(good.sum())} pillars on the design; need {_LEAST} or more for a bias table"
+        )
     order = np.argsort(laid.designed_nm[good], kind="stable")
     drawn, error = laid.designed_nm[good][order], laid.error_nm[good][order]
     rows = []
-    for part in np.array_split(np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))):
+    for part in np.array_split(
+        np.arange(len(drawn)), max(1, min(knots, len(drawn) // 6))
+    ):
         spread = float(error[part].std(ddof=1))  # of six pillars at least
-        rows.append((float(drawn[part].mean()), float(error[part].mean()), spread / len(part) ** 0.5, len(part)))
+        rows.append(
+            (
+                float(drawn[part].mean()),
+                float(error[part].mean()),
+                spread / len(part) ** 0.5,
+                len(part),
+            )
+        )
     return rows
 
 
@@ -129,9 +181,11 @@ def numbered(found: Diameters, laid: Overlay) -> Diameters:
 
 
 def _scatter(patch: Array, mask: Array, drawn: Array) -> Array:
-    """Variance of the patch about a line in the drawn diameters at every shift; inf where no line of a process fits.
+    """Variance of the patch about a line in the drawn diameters at every shift; inf
+    where no line of a process fits.
 
-    Least squares of made = a + b drawn under the mask, b within a third of 1; inf too where a pillar has no design.
+    Least squares of made = a + b drawn under the mask, b within a third of 1; inf too
+    where a pillar has no design.
     """
     turned, weight, count = (patch * mask)[::-1, ::-1], mask[::-1, ::-1], mask.sum()
 

@@ -1,4 +1,6 @@
-"""One grey picture of a file: a micrograph or an edge, as microscopes and image programs save them."""
+"""One grey picture of a file: a micrograph or an edge, as microscopes and image
+programs save them.
+"""
 
 from pathlib import Path
 
@@ -8,17 +10,24 @@ from characterize.captures import capture
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-_ALIKE = 0.9  # share of pixels whose colours are one grey: the rest is writing in the picture
-_FLAT, _NOISY = 0.5, 0.25  # share of a row's pixels of one value: of a strip, from; of a picture, to
+# share of pixels whose colours are one grey: the rest is writing in the picture
+_ALIKE = 0.9
+_FLAT, _NOISY = (
+    0.5,
+    0.25,
+)  # share of a row's pixels of one value: of a strip, from; of a picture, to
 
 
 def read(path: Path) -> Array:
-    """(y, x) the one picture of a TIFF, PNG or HDF5 file; of colours that are alike, red.
+    """(y, x) the one picture of a TIFF, PNG or HDF5 file; of colours that are alike,
+    red.
 
-    Microscopes save grey pictures with three equal colours, and write into them in yellow or green.
+    Microscopes save grey pictures with three equal colours, and write into them in
+    yellow or green.
 
     Raises:
-        CaptureError: as :func:`characterize.captures.capture.read_images`; several pictures, or one in colours.
+        CaptureError: as :func:`characterize.captures.capture.read_images`; several
+            pictures, or one in colours.
     """
     images = capture.read_all(path)
     if len(images) != 1:
@@ -28,14 +37,17 @@ def read(path: Path) -> Array:
     colours = images[0, ..., :3]
     grey = (colours == colours[..., :1]).all(-1).mean()
     if grey < _ALIKE:
-        raise CaptureError(f"{path}: in colours ({1 - grey:.0%} of the pixels are not grey); save it in grey")
+        raise CaptureError(
+            f"{path}: in colours ({1 - grey:.0%} of the pixels are not grey); save it in grey"
+        )
     return np.asarray(colours[..., 0])
 
 
 def without_strip(image: Array) -> Array:
     """The picture without the strip of writing that a microscope adds below it.
 
-    Rows of it are of one value but for letters and a bar, where noise gives a picture's rows many. A picture whose own
+    Rows of it are of one value but for letters and a bar, where noise gives a picture's
+    rows many. A picture whose own
     rows are of few values stays as it is.
     """
     share = (image == np.median(image, axis=1, keepdims=True)).mean(1)

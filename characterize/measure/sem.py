@@ -1,10 +1,15 @@
-"""Electron micrographs to pillar diameters: radial edges to a fraction of a pixel, missing and collapsed pillars.
+"""Electron micrographs to pillar diameters: radial edges to a fraction of a pixel,
+missing and collapsed pillars.
 
-Edges are found along many rays from each pillar's centre, as the place where the smoothed profile falls through half of
-the step from the pillar's rim to the gap, whether its top is bright or dark; the diameter is that of the area within,
-and what the picture's blur takes of a disc (s² / R of its diameter, Gaussian of s; of one that is not wide beside it,
+Edges are found along many rays from each pillar's centre, as the place where the
+smoothed profile falls through half of
+the step from the pillar's rim to the gap, whether its top is bright or dark; the
+diameter is that of the area within,
+and what the picture's blur takes of a disc (s² / R of its diameter, Gaussian of s; of
+one that is not wide beside it,
 what is read of such a disc: ``radial``) is given back. Charging
-(slow shades), noise and drift of the scan are taken off or averaged over the rays. The lattice may be of any kind.
+(slow shades), noise and drift of the scan are taken off or averaged over the rays. The
+lattice may be of any kind.
 """
 
 import dataclasses
@@ -21,13 +26,24 @@ from characterize.model import Known
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 
-_ROUND = 2 / 3  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
-_TRIED = 25  # sites of a lattice that is only tried, discs of which the blur of a picture is told
-_TELLS = 3.0  # radius over blur from which on a disc tells its blur as well as all together do
-MOST = 0.5  # share of sites above which what is there decides of a lattice, or of a picture
-_OVAL = 1.15  # length over width from which on a pillar is none of round ones: a circle's radius is off by 0.4 % there
-_LEVELS = 1.2  # errors of narrow discs (7 to 12 pixels, noise of a tenth) over those of edges: their tops are one place
-_UNSURE = 0.1  # share of what blur does to a radius by which clean discs (7 to 30 pixels, blur 0.5 to 2.5) are off
+_ROUND = (
+    2 / 3
+)  # share of rays whose edges lie on one circle: of a bar twice as long as wide a half do
+# sites of a lattice that is only tried, discs of which the blur of a picture is told
+_TRIED = 25
+# radius over blur from which on a disc tells its blur as well as all together do
+_TELLS = 3.0
+# share of sites above which what is there decides of a lattice, or of a picture
+MOST = 0.5
+# length over width from which on a pillar is none of round ones: a circle's radius is
+# off by 0.4 % there
+_OVAL = 1.15
+# errors of narrow discs (7 to 12 pixels, noise of a tenth) over those of edges: their
+# tops are one place
+_LEVELS = 1.2
+# share of what blur does to a radius by which clean discs (7 to 30 pixels, blur 0.5 to
+# 2.5) are off
+_UNSURE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +51,8 @@ class Micrograph:
     """What is known of a picture.
 
     pixel_nm: size of a pixel. pitch_nm: lattice constant of the pillars.
-    edge_bias_nm: constant by which edges appear outside (above 0) the true ones, from a calibration sample.
+    edge_bias_nm: constant by which edges appear outside (above 0) the true ones, from a
+    calibration sample.
     """
 
     pixel_nm: float
@@ -45,17 +62,23 @@ class Micrograph:
     def __post_init__(self) -> None:
         known = self.pitch_nm >= 6 * self.pixel_nm or self.pitch_nm == 0
         if not (self.pixel_nm > 0 and known):
-            raise CaptureError(f"pixel_nm {self.pixel_nm}, pitch_nm {self.pitch_nm}: need 6 or more pixels in a pitch")
+            raise CaptureError(
+                f"pixel_nm {self.pixel_nm}, pitch_nm {self.pitch_nm}: need 6 or more pixels in a pitch"
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Diameters:
     """Pillars found in a micrograph.
 
-    row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is missing or collapsed.
-    sigma_nm: (p,) standard error of each diameter: noise of its edges, rim and gap, and a tenth of what blur did. It
-        holds 95 % of drawn discs without a bright rim; a rim adds a constant (edge_bias_nm).
-    missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far from round.
+    row, column: (p,) centres in pixels. diameter_nm: (p,) nan where the pillar is
+    missing or collapsed.
+    sigma_nm: (p,) standard error of each diameter: noise of its edges, rim and gap, and
+    a tenth of what blur did. It
+        holds 95 % of drawn discs without a bright rim; a rim adds a constant
+        (edge_bias_nm).
+    missing, collapsed: (p,) no pillar at a lattice site; a pillar off its site or far
+    from round.
     oval: (p,) longer than wide by more than 15 %, beyond noise; not measured.
     site: (p, 2) lattice index j and i of each; lattice: where the sites are, in pixels.
     """
@@ -76,7 +99,9 @@ class Diameters:
 
     @property
     def doubtful(self) -> bool:
-        """Whether most sites hold what is no round pillar: then the lattice may be another."""
+        """Whether most sites hold what is no round pillar: then the lattice may be
+        another.
+        """
         return bool(self.collapsed.mean() > MOST)
 
     @property
@@ -91,48 +116,76 @@ class Diameters:
 
     @property
     def three_sigma_nm(self) -> float:
-        """Three standard deviations of the good pillars (CD uniformity); nan without one."""
+        """Three standard deviations of the good pillars (CD uniformity); nan without
+        one.
+        """
         return float(3 * self._good_nm.std()) if self._good_nm.size else math.nan
 
     def bias(self, designed_nm: Array | float) -> Known:
-        """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with its standard error."""
+        """Mean difference to the design as prior knowledge for a fit: ``bias_nm`` with
+        its standard error.
+        """
         difference = self.diameter_nm - np.asarray(designed_nm)
         good = difference[np.isfinite(difference)]
         if len(good) < 3:
-            raise CaptureError(f"{len(good)} good pillars: need three or more for a bias")
-        return Known("bias_nm", float(good.mean()), float(max(good.std(ddof=1) / math.sqrt(len(good)), 0.05)))
+            raise CaptureError(
+                f"{len(good)} good pillars: need three or more for a bias"
+            )
+        return Known(
+            "bias_nm",
+            float(good.mean()),
+            float(max(good.std(ddof=1) / math.sqrt(len(good)), 0.05)),
+        )
 
 
 def measure(image: Array, about: Micrograph) -> Diameters:
-    """Diameters of all whole pillars on the lattice of a top-down micrograph, rims brighter than the gaps.
+    """Diameters of all whole pillars on the lattice of a top-down micrograph, rims
+    brighter than the gaps.
 
     Raises:
         CaptureError: no lattice (of the stated pitch), or no picture of one channel.
     """
     picture = np.asarray(image, float)
     if picture.ndim != 2 or not np.isfinite(picture).all():
-        raise CaptureError(f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values")
+        raise CaptureError(
+            f"micrograph of shape {picture.shape}: need one grey picture (y, x) of finite values"
+        )
     pitch = about.pitch_nm / about.pixel_nm if about.pitch_nm else None
     rough = _flattened(picture, pitch or min(picture.shape) / 4)
     lattice = find(rough, pitch)
     flat = _flattened(picture, lattice.pitch_px) if pitch is None else rough
     found = _on(flat, lattice, about)
-    if not found.doubtful:  # the brightest places of a cell are its pillars, but for dark tops
+    if (
+        not found.doubtful
+    ):  # the brightest places of a cell are its pillars, but for dark tops
         return found
     others = [one for one in _others(lattice) if len(one.sites(flat.shape)[0])]
     tried = [_on(flat, one, about, most=_TRIED).whole for one in others]
-    return _on(flat, others[int(np.argmax(tried))], about) if max(tried, default=0.0) > MOST else found
+    return (
+        _on(flat, others[int(np.argmax(tried))], about)
+        if max(tried, default=0.0) > MOST
+        else found
+    )
 
 
 def _others(lattice: Lattice) -> list[Lattice]:
     """The same lattice with pillars where its gaps are."""
     a, b = lattice.a / 2, lattice.b / 2
-    return [dataclasses.replace(lattice, origin=lattice.origin + step) for step in (a + b, a, b)]
+    return [
+        dataclasses.replace(lattice, origin=lattice.origin + step)
+        for step in (a + b, a, b)
+    ]
 
 
-def _on(flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0) -> Diameters:
-    """Pillars on a lattice that is known, in a levelled picture; of some ``most`` sites, evenly from all, if stated."""
-    place, site = (v[:: max(len(v) // most, 1) if most else 1] for v in lattice.sites(flat.shape))
+def _on(
+    flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0
+) -> Diameters:
+    """Pillars on a lattice that is known, in a levelled picture; of some ``most``
+    sites, evenly from all, if stated.
+    """
+    place, site = (
+        v[:: max(len(v) // most, 1) if most else 1] for v in lattice.sites(flat.shape)
+    )
     steps = [_step(flat, row, column, lattice.pitch_px) for row, column in place]
     usual = float(np.median(steps)) if steps else 0.0
     results = [
@@ -141,16 +194,37 @@ def _on(flat: Array, lattice: Lattice, about: Micrograph, *, most: int = 0) -> D
     ]
     if not results:
         raise CaptureError("no whole pillar in the picture; need a wider picture")
-    row, column, radius, sigma, missing, collapsed = (np.array(v) for v in zip(*results, strict=True))
+    row, column, radius, sigma, missing, collapsed = (
+        np.array(v) for v in zip(*results, strict=True)
+    )
     whole = np.where(collapsed.astype(bool), np.nan, radius)
-    radius, sigma = _sharper(flat, np.stack([row, column], 1), whole, sigma, lattice.pitch_px)
+    radius, sigma = _sharper(
+        flat, np.stack([row, column], 1), whole, sigma, lattice.pitch_px
+    )
     diameter = 2 * radius * about.pixel_nm - 2 * about.edge_bias_nm
     missing, collapsed = missing.astype(bool), collapsed.astype(bool)
-    near = ~missing & (np.hypot(*(np.stack([row, column], 1) - place).T) < 0.2 * lattice.pitch_px)
-    oval = np.array([n and _is_oval(flat, y, x, lattice.pitch_px) for n, y, x in zip(near, row, column, strict=True)])
+    near = ~missing & (
+        np.hypot(*(np.stack([row, column], 1) - place).T) < 0.2 * lattice.pitch_px
+    )
+    oval = np.array(
+        [
+            n and _is_oval(flat, y, x, lattice.pitch_px)
+            for n, y, x in zip(near, row, column, strict=True)
+        ]
+    )
     collapsed = collapsed & ~oval
     diameter = np.where(missing | collapsed | oval, np.nan, diameter)
-    return Diameters(row, column, diameter, 2 * sigma * about.pixel_nm, missing, collapsed, site, lattice, oval)
+    return Diameters(
+        row,
+        column,
+        diameter,
+        2 * sigma * about.pixel_nm,
+        missing,
+        collapsed,
+        site,
+        lattice,
+        oval,
+    )
 
 
 def _flattened(image: Array, pitch: float) -> Array:
@@ -162,7 +236,8 @@ def _flattened(image: Array, pitch: float) -> Array:
 
 
 def scale_from_bar(image: Array, bar_nm: float) -> float:
-    """pixel_nm from a scale bar: the longest run of saturated pixels in a row of the lowest quarter.
+    """pixel_nm from a scale bar: the longest run of saturated pixels in a row of the
+    lowest quarter.
 
     Raises:
         CaptureError: no bar of at least 20 pixels.
@@ -174,25 +249,42 @@ def scale_from_bar(image: Array, bar_nm: float) -> float:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
         longest = max(longest, int((edges[1::2] - edges[::2]).max(initial=0)))
     if longest < 20:
-        raise CaptureError(f"no scale bar: longest bright run is {longest} pixels; give pixel_nm instead")
+        raise CaptureError(
+            f"no scale bar: longest bright run is {longest} pixels; give pixel_nm instead"
+        )
     return bar_nm / longest
 
 
-def _rays(flat: Array, row: float, column: float, pitch: float) -> tuple[Array, Array, Array]:
-    """(distance, angle, (distance, angle) levels smoothed along and across) about a place."""
+def _rays(
+    flat: Array, row: float, column: float, pitch: float
+) -> tuple[Array, Array, Array]:
+    """(distance, angle, (distance, angle) levels smoothed along and across) about a
+    place.
+    """
     angle = (np.arange(RAYS) + 0.5) * 2 * math.pi / RAYS
     fine = min(0.25, pitch / 120)
     reach = np.arange(0, 0.5 * pitch + 1, fine)
-    points = row + reach[:, None] * np.sin(angle), column + reach[:, None] * np.cos(angle)
+    points = (
+        row + reach[:, None] * np.sin(angle),
+        column + reach[:, None] * np.cos(angle),
+    )
     rays = ndimage.map_coordinates(flat, points, order=1, mode="nearest")
     smooth = radial.smoothing(pitch) / fine
-    return reach, angle, ndimage.gaussian_filter(rays, (smooth, 1.0), mode=("nearest", "wrap"))
+    return (
+        reach,
+        angle,
+        ndimage.gaussian_filter(rays, (smooth, 1.0), mode=("nearest", "wrap")),
+    )
 
 
-def _sharper(flat: Array, place: Array, radius: Array, sigma: Array, pitch: float) -> tuple[Array, Array]:
-    """Radii and their errors, those of solid discs that are not wide beside the blur found anew.
+def _sharper(
+    flat: Array, place: Array, radius: Array, sigma: Array, pitch: float
+) -> tuple[Array, Array]:
+    """Radii and their errors, those of solid discs that are not wide beside the blur
+    found anew.
 
-    Blur is one of the picture: the median over ``_TRIED`` discs or a few more. A disc wider than a few blurs tells its
+    Blur is one of the picture: the median over ``_TRIED`` discs or a few more. A disc
+    wider than a few blurs tells its
     own, whose noise offsets that of the levels of its rim and gap.
     """
     radius, sigma, smooth = radius.copy(), sigma.copy(), radial.smoothing(pitch)
@@ -228,12 +320,16 @@ def _step(flat: Array, row: float, column: float, pitch: float) -> float:
 def _pillar(
     flat: Array, row: float, column: float, pitch: float, *, there: bool
 ) -> tuple[float, float, float, float, bool, bool]:
-    """(row, column, radius, its error, missing, collapsed) at a lattice site, in pixels."""
+    """(row, column, radius, its error, missing, collapsed) at a lattice site, in
+    pixels.
+    """
     half = int(pitch / 2)
     r0, c0 = int(round(row)), int(round(column))
     patch = flat[max(r0 - half, 0) : r0 + half + 1, max(c0 - half, 0) : c0 + half + 1]
     if not there:
-        fallen = bool((ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08)  # it lies elsewhere in its cell
+        fallen = bool(
+            (ndimage.uniform_filter(patch, 5) > 0.6).mean() > 0.08
+        )  # it lies elsewhere in its cell
         return row, column, math.nan, math.nan, not fallen, fallen
     y, x, radius, sigma, scatter = row, column, math.nan, math.nan, math.inf
     for _ in range(4):
@@ -251,11 +347,15 @@ def _pillar(
 def _edges(
     flat: Array, row: float, column: float, pitch: float, blur: float | None = None
 ) -> tuple[float, float, float, float, float] | None:
-    """Disc through the half-rise places of all rays: (dy, dx, radius, error of it, scatter); None without edges.
+    """Disc through the half-rise places of all rays: (dy, dx, radius, error of it,
+    scatter); None without edges.
 
-    Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t; the radius is that of the same area, less what blur
-    takes; with the variance of a ``blur`` that is known, less what that does to a solid disc which is not wide beside
-    it. The scatter is about the circle alone, and infinite where too many rays have their edges elsewhere.
+    Edges are r(t) = R + dy sin t + dx cos t + S sin 2t + C cos 2t; the radius is that
+    of the same area, less what blur
+    takes; with the variance of a ``blur`` that is known, less what that does to a solid
+    disc which is not wide beside
+    it. The scatter is about the circle alone, and infinite where too many rays have
+    their edges elsewhere.
     """
     reach, angle, rays = _rays(flat, row, column, pitch)
     inner, outer, rim = radial.plateaus(reach, rays)
@@ -265,38 +365,56 @@ def _edges(
         return None
     middle = np.median(found[good])
     good &= np.abs(found - middle) < max(0.2 * middle, 2.0)
-    terms = np.stack([np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos))], 1)
+    terms = np.stack(
+        [np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos))], 1
+    )
     design = terms[good]
     (mean, dy, dx, *oval), *_ = np.linalg.lstsq(design, found[good], rcond=None)
     rest = found[good] - design @ np.array([mean, dy, dx, *oval])
     wide = 0.5 * float(np.square(oval).sum())  # mean square of what is oval
     independent = _independent(mean)
-    noise = rest.var() / max(1 - len(terms[0]) / (independent * good.mean()), 0.1)  # of an edge; the terms took some
+    noise = rest.var() / max(
+        1 - len(terms[0]) / (independent * good.mean()), 0.1
+    )  # of an edge; the terms took some
     own = float(np.linalg.pinv(design.T @ design)[0, 0]) * RAYS / independent
-    # half of the rim's level and half of the gap's, as noisy as edges, are in every edge
-    shared = 0.25 / _independent(float(reach[rim])) + 0.25 / _independent(0.5 * (mean + 0.5 * pitch))
+    # half of the rim's level and half of the gap's, as noisy as edges, are in every
+    # edge
+    shared = 0.25 / _independent(float(reach[rim])) + 0.25 / _independent(
+        0.5 * (mean + 0.5 * pitch)
+    )
     edge, radius = terms @ np.array([mean, dy, dx, *oval]), math.sqrt(mean**2 + wide)
     smooth, noise = radial.smoothing(pitch), math.sqrt(noise * (own + shared))
     taken = radial.drawn_in(reach, rays, edge, radius, smooth)
     true, unsure = radius + taken, _UNSURE * taken
     if blur is not None and not radial.wide(radius, blur, smooth):
-        (true, gain), plain = radial.unblurred(reach, radius, blur, smooth), blur / (2 * radius)
-        noise, unsure = noise * gain * _LEVELS, _UNSURE * (plain + abs(true - radius - plain))
+        (true, gain), plain = (
+            radial.unblurred(reach, radius, blur, smooth),
+            blur / (2 * radius),
+        )
+        noise, unsure = (
+            noise * gain * _LEVELS,
+            _UNSURE * (plain + abs(true - radius - plain)),
+        )
     error = math.hypot(noise, unsure)
     scatter = math.sqrt(rest.var() + wide) if good.mean() > _ROUND else math.inf
     return float(dy), float(dx), true, error, scatter
 
 
 def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
-    """Whether a pillar is longer than wide by more than ``_OVAL``, and by four sigma of its edges' scatter.
+    """Whether a pillar is longer than wide by more than ``_OVAL``, and by four sigma of
+    its edges' scatter.
 
-    About its middle an ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t, of a² / b² = (A + D) / (A - D),
-    D² = B² + C². Edges are where each ray falls the most: levels of the mean over all rays are of no ray's own.
+    About its middle an ellipse of half axes a, b is 1 / r² = A + B cos 2t + C sin 2t,
+    of a² / b² = (A + D) / (A - D),
+    D² = B² + C². Edges are where each ray falls the most: levels of the mean over all
+    rays are of no ray's own.
     """
     reach, angle, rays = _rays(flat, row, column, pitch)
     first = int(np.searchsorted(reach, 0.1 * pitch))
     edge = reach[first + np.argmin(np.diff(rays[first:], axis=0), axis=0)]
-    design = np.stack([np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], 1)
+    design = np.stack(
+        [np.ones(RAYS), *(f(k * angle) for k in (1, 2) for f in (np.cos, np.sin))], 1
+    )
     good = np.ones(RAYS, bool)
     for _ in range(4):
         powers = np.linalg.lstsq(design[good], edge[good] ** -2, rcond=None)[0]
@@ -312,9 +430,11 @@ def _is_oval(flat: Array, row: float, column: float, pitch: float) -> bool:
 
 
 def _independent(radius: float) -> float:
-    """How many of the rays at a radius in pixels tell something of their own, the circle's three numbers among them.
+    """How many of the rays at a radius in pixels tell something of their own, the
+    circle's three numbers among them.
 
-    Noise of single pixels, smoothed over rays (a Gaussian of one ray) and between pixels (a variance of 1/6 across).
+    Noise of single pixels, smoothed over rays (a Gaussian of one ray) and between
+    pixels (a variance of 1/6 across).
     """
     step = 2 * math.pi * max(radius, 0.5) / RAYS
     return RAYS / (2 * math.sqrt(math.pi) * math.sqrt(1 + 1 / (6 * step**2)))

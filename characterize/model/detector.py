@@ -1,4 +1,6 @@
-"""From the intensity in front of the sensor to expected electrons: source size, blur, pixel area, gain, background."""
+"""From the intensity in front of the sensor to expected electrons: source size, blur,
+pixel area, gain, background.
+"""
 
 import dataclasses
 import functools
@@ -13,12 +15,16 @@ from metalens.ground.arrays import Array
 from metalens.lens import Lens
 
 _ROOM_UM = 20.0  # for decentre
-_LEAST_DISC = 0.3  # pixels: a point has no slope by its size, so a search would see nothing to hold it there
+# pixels: a point has no slope by its size, so a search would see nothing to hold it
+# there
+_LEAST_DISC = 0.3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sums:
-    """A blur that acts along each axis by itself, or a sum of such: pairs of (rows, y) and (columns, x) weights."""
+    """A blur that acts along each axis by itself, or a sum of such: pairs of (rows, y)
+    and (columns, x) weights.
+    """
 
     pairs: tuple[tuple[Array, Array], ...]
 
@@ -32,11 +38,14 @@ Blur = Array | Sums
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Fine samples under the pixels of a window, with a margin that keeps blur from wrapping around.
+    """Fine samples under the pixels of a window, with a margin that keeps blur from
+    wrapping around.
 
     rows, columns: pixels of the window. oversample: fine samples per pixel side.
-    margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief ray.
-    fill: width of a pixel over the pitch. aside: (y, x) pixels from the window's middle to that of a part of it.
+    margin: pixels on each side. middle_um: (x, y) of the window's middle from the chief
+    ray.
+    fill: width of a pixel over the pitch. aside: (y, x) pixels from the window's middle
+    to that of a part of it.
     """
 
     rows: int
@@ -59,28 +68,44 @@ class Grid:
         return self.fill * self.pixel_um
 
     def axes_um(self) -> tuple[Array, Array]:
-        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows // 2, columns // 2)."""
+        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows
+        // 2, columns // 2).
+        """
         y, x = self._centre_um()
         return self._axis(self.rows) + y, self._axis(self.columns) + x
 
     def ends_um(self) -> tuple[Array, Array]:
         """(y, x) of the first and last pixels from the chief ray."""
-        ends = [(np.array([0, n - 1]) - n // 2) * self.pixel_um for n in (self.rows, self.columns)]
+        ends = [
+            (np.array([0, n - 1]) - n // 2) * self.pixel_um
+            for n in (self.rows, self.columns)
+        ]
         y, x = self._centre_um()
         return ends[0] + y, ends[1] + x
 
     def across_um(self, near_um: float) -> float:
-        """Side of a square about the chief ray that holds all that is seen; of what is farther off than ``near_um``."""
+        """Side of a square about the chief ray that holds all that is seen; of what is
+        farther off than ``near_um``.
+        """
         off = max(0.0, *(abs(v) - near_um for v in self._centre_um()))
-        return (max(self.rows, self.columns) + self.margin) * self.pixel_um + _ROOM_UM + 2 * off
+        return (
+            (max(self.rows, self.columns) + self.margin) * self.pixel_um
+            + _ROOM_UM
+            + 2 * off
+        )
 
     def part(self, rows: slice, columns: slice, margin: int) -> "Grid":
         """Of neighbouring rows and columns, with so many pixels at most around them."""
         some = range(self.rows)[rows], range(self.columns)[columns]
-        moved = (one[len(one) // 2] - n // 2 for one, n in zip(some, (self.rows, self.columns), strict=True))
+        moved = (
+            one[len(one) // 2] - n // 2
+            for one, n in zip(some, (self.rows, self.columns), strict=True)
+        )
         y, x = (off + by for off, by in zip(self.aside, moved, strict=True))
         margin = min(margin, self.margin)
-        return dataclasses.replace(self, rows=len(some[0]), columns=len(some[1]), margin=margin, aside=(y, x))
+        return dataclasses.replace(
+            self, rows=len(some[0]), columns=len(some[1]), margin=margin, aside=(y, x)
+        )
 
     def _centre_um(self) -> tuple[float, float]:
         """(y, x) of the middle pixel from the chief ray."""
@@ -89,50 +114,83 @@ class Grid:
 
     def _axis(self, pixels: int) -> Array:
         fine = np.arange((pixels + 2 * self.margin) * self.oversample)
-        first = -(pixels // 2 + self.margin) * self.oversample - (self.oversample - 1) / 2
+        first = (
+            -(pixels // 2 + self.margin) * self.oversample - (self.oversample - 1) / 2
+        )
         return (fine + first) * self.fine_um
 
     def frequencies(self) -> tuple[Array, Array]:
-        """Cycles/um of the fine grid: (y, 1) and (1, x / 2 + 1), as :func:`scipy.fft.rfft2` orders them."""
-        rows, columns = ((p + 2 * self.margin) * self.oversample for p in (self.rows, self.columns))
-        return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(columns, self.fine_um)[None]
+        """Cycles/um of the fine grid: (y, 1) and (1, x / 2 + 1), as
+        :func:`scipy.fft.rfft2` orders them.
+        """
+        rows, columns = (
+            (p + 2 * self.margin) * self.oversample for p in (self.rows, self.columns)
+        )
+        return fft.fftfreq(rows, self.fine_um)[:, None], fft.rfftfreq(
+            columns, self.fine_um
+        )[None]
 
     def sample(self, intensity: Array, transfer: Blur) -> Array:
-        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through ``transfer``, at pixel centres."""
+        """(..., rows, columns): ``intensity`` (..., y, x) on the fine grid through
+        ``transfer``, at pixel centres.
+        """
         if isinstance(transfer, Sums):
             return np.asarray(sum(y @ (intensity @ x.T) for y, x in transfer.pairs))
         shifted = transfer if self.oversample % 2 else transfer * _half_step(self)
         blurred = fft.irfft2(fft.rfft2(intensity) * shifted, s=intensity.shape[-2:])
         o, m = self.oversample, self.margin
-        y, x = (slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns))
+        y, x = (
+            slice(m * o + o // 2, (m + p) * o, o) for p in (self.rows, self.columns)
+        )
         return np.asarray(blurred[..., y, x])
 
     def sums(self, sigma_um: float, kind: Any = float) -> tuple[Sums, Sums]:
-        """Square pixel and Gaussian blur as sums along each axis, and their derivative by ``sigma_um``: two small
+        """Square pixel and Gaussian blur as sums along each axis, and their derivative
+        by ``sigma_um``: two small
         products in place of two transforms, the same to rounding."""
-        (y, by_y), (x, by_x) = (self._along(count, sigma_um, kind) for count in (self.rows, self.columns))
+        (y, by_y), (x, by_x) = (
+            self._along(count, sigma_um, kind) for count in (self.rows, self.columns)
+        )
         return Sums(((y, x),)), Sums(((by_y, x), (y, by_x)))
 
     def _along(self, pixels: int, sigma_um: float, kind: Any) -> tuple[Array, Array]:
-        """(pixels, fine samples) weights of pixel and blur along one axis, and their derivative."""
+        """(pixels, fine samples) weights of pixel and blur along one axis, and their
+        derivative.
+        """
         o, m = self.oversample, self.margin
         count = (pixels + 2 * m) * o
         f = fft.fftfreq(count, self.fine_um)
         at = np.exp(-1j * np.pi * f * self.fine_um) if o % 2 == 0 else 1.0
-        place = np.arange(m * o + o // 2, (m + pixels) * o, o)[:, None] - np.arange(count)
-        parts = [fft.ifft(np.sinc(f * self.wide_um) * at * part).real for part in gauss(f, np.zeros(1), sigma_um)]
-        return parts[0][place % count].astype(kind), parts[1][place % count].astype(kind)
+        place = np.arange(m * o + o // 2, (m + pixels) * o, o)[:, None] - np.arange(
+            count
+        )
+        parts = [
+            fft.ifft(np.sinc(f * self.wide_um) * at * part).real
+            for part in gauss(f, np.zeros(1), sigma_um)
+        ]
+        return parts[0][place % count].astype(kind), parts[1][place % count].astype(
+            kind
+        )
 
 
 def transfers(
-    grid: Grid, crosstalk_px: float, sizes_um: Array, shrink: Array, *, sized: bool, kind: Any = float
+    grid: Grid,
+    crosstalk_px: float,
+    sizes_um: Array,
+    shrink: Array,
+    *,
+    sized: bool,
+    kind: Any = float,
 ) -> tuple[Blur, dict[str, Blur]]:
-    """Of pixel, crosstalk and the image of a round source in every frame, and derivatives by name.
+    """Of pixel, crosstalk and the image of a round source in every frame, and
+    derivatives by name.
 
-    Sums along the axes for a point source; else (frames, fy, fx), and by the source's diameter where that is ``sized``.
+    Sums along the axes for a point source; else (frames, fy, fx), and by the source's
+    diameter where that is ``sized``.
 
     Args:
-        sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over the source's. kind: of the sums.
+        sizes_um: (frames,) diameter of the source's image. shrink: (frames,) that over
+            the source's. kind: of the sums.
     """
     wide_um = grid.wide_um
     if not sizes_um.any() and not sized:
@@ -148,26 +206,34 @@ def transfers(
     slopes: dict[str, Blur] = {
         "crosstalk_px": square * by_sigma * wide_um * whole,
         "pinhole_um": shared * seen,
-        "growth": shared * np.stack([slope for _, slope in image]) * shrink[:, None, None],
+        "growth": shared
+        * np.stack([slope for _, slope in image])
+        * shrink[:, None, None],
     }
     return shared * whole, slopes
 
 
 @functools.lru_cache(maxsize=4)
 def _half_step(grid: Grid) -> Array:
-    """Transfer that moves the light by half a fine sample, where no fine sample sits at a pixel's centre."""
+    """Transfer that moves the light by half a fine sample, where no fine sample sits at
+    a pixel's centre.
+    """
     fy, fx = grid.frequencies()
     return np.asarray(np.exp(-1j * np.pi * (fy + fx) * grid.fine_um))
 
 
 def fine_enough(pixel_um: float, highest: float) -> int:
-    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled at twice that or above."""
+    """Least oversampling at which intensity of up to ``highest`` cycles/um is sampled
+    at twice that or above.
+    """
     return max(1, math.ceil(2 * highest * pixel_um * (1 - 1e-9)))
 
 
 def oversampling(lens: Lens, pixel_um: float) -> int:
     """Samples along a pixel's side that are fine enough for the light of a lens."""
-    sine = lens.diameters.radius_um / math.hypot(lens.diameters.radius_um, lens.reduced_um)
+    sine = lens.diameters.radius_um / math.hypot(
+        lens.diameters.radius_um, lens.reduced_um
+    )
     return fine_enough(pixel_um, 2 * sine / lens.wavelength_um)
 
 
@@ -184,14 +250,20 @@ def gauss(fy: Array, fx: Array, sigma_um: float) -> tuple[Array, Array]:
 
 
 def disc(fy: Array, fx: Array, diameter_um: float) -> tuple[Array, Array]:
-    """Transfer 2 J1(u) / u, u = pi f D, of an evenly lit disc, and its derivative by D: -2 J2(u) / D."""
+    """Transfer 2 J1(u) / u, u = pi f D, of an evenly lit disc, and its derivative by D:
+    -2 J2(u) / D.
+    """
     u = np.pi * np.hypot(fx, fy) * diameter_um
     safe = np.maximum(u, 1e-6)
     slope = -2 * special.jv(2, safe) / max(abs(diameter_um), 1e-12)
-    return np.where(u > 1e-6, 2 * special.j1(safe) / safe, 1.0), np.where(u > 1e-6, slope, 0.0)
+    return np.where(u > 1e-6, 2 * special.j1(safe) / safe, 1.0), np.where(
+        u > 1e-6, slope, 0.0
+    )
 
 
 def ball(fy: Array, fx: Array, diameter_um: float) -> Array:
-    """Transfer 3 (sin u - u cos u) / u³, u = pi f D, of an evenly glowing ball seen in projection."""
+    """Transfer 3 (sin u - u cos u) / u³, u = pi f D, of an evenly glowing ball seen in
+    projection.
+    """
     u = np.maximum(np.pi * np.hypot(fx, fy) * diameter_um, 1e-3)
     return np.asarray(3 * (np.sin(u) - u * np.cos(u)) / u**3)

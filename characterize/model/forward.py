@@ -1,4 +1,6 @@
-"""Expected frames of an as-built lens on its bench, with derivatives by every parameter, on coarse nodes."""
+"""Expected frames of an as-built lens on its bench, with derivatives by every
+parameter, on coarse nodes.
+"""
 
 import copy
 import dataclasses
@@ -38,95 +40,180 @@ GEOMETRY = (
     "distance_um", "wavelength_nm", "decentre_x_um", "decentre_y_um", "tilt_x_deg", "tilt_y_deg", "source_x_um",
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
-WIDENING, ANSWERING = ({name: n for n, name in enumerate(named(kind))} for kind in (Widens, Answers))
+WIDENING, ANSWERING = (
+    {name: n for n, name in enumerate(named(kind))} for kind in (Widens, Answers)
+)
 EVERY = slice(None)
 Light = tuple[Array, dict[str, Array]]  # and its derivatives by name
-_SLOPE_TOLERANCE = 8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
-_WINDOW = {"distance_um": ("distance", 1.0), "wavelength_nm": ("wave", 1e-3)}  # what moves the window, um in its unit
+_SLOPE_TOLERANCE = (
+    8e-3  # of derivatives: it slows the last steps of a fit, and moves nothing
+)
+_WINDOW = {
+    "distance_um": ("distance", 1.0),
+    "wavelength_nm": ("wave", 1e-3),
+}  # what moves the window, um in its unit
 _WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
-_NEAR_UM = 5.0  # off the chief ray, within which windows need no more directions than those of the middle
-_FEW, _FEWER, _SMOOTHER = 2e-2, 0.85, 10.0  # in a quick model: terms left out, samples, what a slope may miss, by ratio
-_NARROW = 2  # pixels around a part of a window: what blur brings from farther off changes little
+# off the chief ray, within which windows need no more directions than those of the
+# middle
+_NEAR_UM = 5.0
+_FEW, _FEWER, _SMOOTHER = (
+    2e-2,
+    0.85,
+    10.0,
+)  # in a quick model: terms left out, samples, what a slope may miss, by ratio
+# pixels around a part of a window: what blur brings from farther off changes little
+_NARROW = 2
 
 
 class ForwardModel:
-    """Frames (n, rows, columns) in electrons as a function of :data:`parameters.PARAMETERS`.
+    """Frames (n, rows, columns) in electrons as a function of
+    :data:`parameters.PARAMETERS`.
 
-    Accuracy: of the pillars ``Pillars.error`` in t, of the geometry ``setting.tolerance`` in the field; a test and the
-    benchmark hold both against the sum over all pillars. ``cut``: what :meth:`rough` leaves out of it.
+    Accuracy: of the pillars ``Pillars.error`` in t, of the geometry
+    ``setting.tolerance`` in the field; a test and the
+    benchmark hold both against the sum over all pillars. ``cut``: what :meth:`rough`
+    leaves out of it.
     """
 
-    def __init__(self, lens: Lens, setting: Setting, response: Sensitivity, *, span: Range | None = None) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        setting: Setting,
+        response: Sensitivity,
+        *,
+        span: Range | None = None,
+    ) -> None:
         self.lens, self.setting, s = lens, setting, setting
-        self.reference_um = float(2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max()))
-        over, self._over = (detector.oversampling(lens, share * setting.pixel_um) for share in (1.0, _FEWER))
-        self.grid = detector.Grid(s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill)
+        self.reference_um = float(
+            2 / (1 / setting.depth_um.min() + 1 / setting.depth_um.max())
+        )
+        over, self._over = (
+            detector.oversampling(lens, share * setting.pixel_um)
+            for share in (1.0, _FEWER)
+        )
+        self.grid = detector.Grid(
+            s.rows, s.columns, s.pixel_um, over, s.margin, fill=s.fill
+        )
         self.response, self._span, self.cut, self._lean_um = response, span, 0.0, 0.0
         self.modes, self._missed = np.empty(0), moments.MISSED
         self._lit = EVERY, EVERY
-        self._kept: dict[tuple[Reduced, Callable[[Array, Array, int], Array], int], Array] = {}
+        self._kept: dict[
+            tuple[Reduced, Callable[[Array, Array, int], Array], int], Array
+        ] = {}
         self._pillars: dict[float, Pillars] = {}
         self.films = Films.of(lens.layers, lens.wavelength_um)
-        self.area_um2 = float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
+        self.area_um2 = (
+            float((lens.diameters.diameter_um > 0).sum()) * lens.diameters.site_um2
+        )
         self.stage_centre_um = float(setting.depth_um.mean())
-        self.spectrum = Spectrum.of(lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance)
-        self.groups = [self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)]
+        self.spectrum = Spectrum.of(
+            lens, setting.depth_um, setting.angle_rad, tolerance=setting.tolerance
+        )
+        self.groups = [
+            self._group(angle) for angle in np.unique(setting.angle_rad, axis=0)
+        ]
 
     def _group(self, angle_rad: Array) -> Group:
         """Of the frames at one field angle."""
         setting = self.setting
         index = np.flatnonzero((setting.angle_rad == angle_rad).all(1))
         tangents = math.tan(angle_rad[0]), math.tan(angle_rad[1])
-        bench = Bench(self.lens.sensor_distance_um, self.lens.wavelength_um, self.reference_um, tangents)
+        bench = Bench(
+            self.lens.sensor_distance_um,
+            self.lens.wavelength_um,
+            self.reference_um,
+            tangents,
+        )
         window = self.grid.across_um(_NEAR_UM)
-        depths = np.array([0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()])
+        depths = np.array(
+            [0.85 * setting.depth_um.min(), 1.15 * setting.depth_um.max()]
+        )
         incidence = incidence_rad(self.lens.proxy, angle_rad)
         if incidence not in self._pillars:
-            self._pillars[incidence] = of_lens(self.lens, self.response, span=self._span, angle_rad=incidence)
+            self._pillars[incidence] = of_lens(
+                self.lens, self.response, span=self._span, angle_rad=incidence
+            )
         pillars = self._pillars[incidence]
-        reduced = Reduced(self.lens, pillars, bench, window_um=window, depths_um=depths, tolerance=setting.tolerance)
+        reduced = Reduced(
+            self.lens,
+            pillars,
+            bench,
+            window_um=window,
+            depths_um=depths,
+            tolerance=setting.tolerance,
+        )
         return Group.of(index, pillars, reduced).shaded(self.lens, setting.depth_um)
 
     def only(self, frames: Array) -> "ForwardModel":
-        """The model of some of the frames, in rising order of their index; it shares all that was gathered."""
+        """The model of some of the frames, in rising order of their index; it shares
+        all that was gathered.
+        """
         part, s = copy.copy(self), self.setting
         part.setting = dataclasses.replace(
-            s, depth_um=s.depth_um[frames], angle_rad=s.angle_rad[frames], exposure=s.exposure[frames]
+            s,
+            depth_um=s.depth_um[frames],
+            angle_rad=s.angle_rad[frames],
+            exposure=s.exposure[frames],
         )
-        part.groups = [one for one in (group.only(frames) for group in self.groups) if one is not None]
+        part.groups = [
+            one
+            for one in (group.only(frames) for group in self.groups)
+            if one is not None
+        ]
         return part
 
     def about(self, middle_um: tuple[float, float]) -> "ForwardModel":
         """The same model with the window's middle held at (x, y) from the chief ray.
 
-        Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5 sin² / d is missed at X off it.
+        Decentre beyond it acts as the phase that it gives the middle: k decentre X 1.5
+        sin² / d is missed at X off it.
         """
-        part, reach = copy.copy(self), max(_NEAR_UM, *(abs(v) + self.setting.pixel_um for v in self.grid.middle_um))
-        part.grid = dataclasses.replace(self.grid, middle_um=(float(middle_um[0]), float(middle_um[1])))
+        part, reach = (
+            copy.copy(self),
+            max(
+                _NEAR_UM, *(abs(v) + self.setting.pixel_um for v in self.grid.middle_um)
+            ),
+        )
+        part.grid = dataclasses.replace(
+            self.grid, middle_um=(float(middle_um[0]), float(middle_um[1]))
+        )
         if max(abs(v) for v in middle_um) > reach:  # wants more directions
-            part._kept, part.groups = {}, [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)]
+            part._kept, part.groups = (
+                {},
+                [part._group(a) for a in np.unique(self.setting.angle_rad, axis=0)],
+            )
         return part
 
     def exchanged(self) -> "ForwardModel":
-        """The same model of frames with rows and columns exchanged: those of a camera on its side."""
+        """The same model of frames with rows and columns exchanged: those of a camera
+        on its side.
+        """
         part, s = copy.copy(self), self.setting
         part.setting = dataclasses.replace(s, rows=s.columns, columns=s.rows)
         part.grid = dataclasses.replace(self.grid, rows=s.columns, columns=s.rows)
         return part
 
     def rough(self, tolerance: float) -> "ForwardModel":
-        """The same model with fields to a relative ``tolerance``: quick enough to scan with."""
+        """The same model with fields to a relative ``tolerance``: quick enough to scan
+        with.
+        """
         part = copy.copy(self)
         part.cut = tolerance
         return part
 
     def quick(self, rows: slice = EVERY, columns: slice = EVERY) -> "ForwardModel":
-        """The same model by few terms of every field and on fewer samples: for differences to images of this one.
+        """The same model by few terms of every field and on fewer samples: for
+        differences to images of this one.
 
-        rows, columns: of the window, where there is light enough to differ; its images are background alone beside it.
+        rows, columns: of the window, where there is light enough to differ; its images
+            are background alone beside it.
         """
         part, window_um = self.rough(_FEW), None
-        part._missed, part.grid, part._lit = _SMOOTHER * moments.MISSED, self._sparser(), (rows, columns)
+        part._missed, part.grid, part._lit = (
+            _SMOOTHER * moments.MISSED,
+            self._sparser(),
+            (rows, columns),
+        )
         narrow = part.grid.part(rows, columns, _NARROW)
         if narrow.rows < self.grid.rows or narrow.columns < self.grid.columns:
             part.grid, window_um = narrow, narrow.across_um(_NEAR_UM)
@@ -134,44 +221,71 @@ class ForwardModel:
         return part
 
     def _sparser(self) -> detector.Grid:
-        """Samples for differences of images: of derivatives they miss less than a third of ``_SLOPE_TOLERANCE``."""
+        """Samples for differences of images: of derivatives they miss less than a third
+        of ``_SLOPE_TOLERANCE``.
+        """
         return dataclasses.replace(self.grid, oversample=self._over)
 
     def with_walls(self, angle_rad: float) -> "ForwardModel":
-        """The same lens with side walls that lean by an angle about half height; its derivatives are those without."""
+        """The same lens with side walls that lean by an angle about half height; its
+        derivatives are those without.
+        """
         part = copy.copy(self)
         part._lean_um = math.tan(angle_rad) * self.lens.cell.height_um
         return part
 
-    def with_residual(self, modes: Array, basis: Callable[[Array, Array, int], Array]) -> "ForwardModel":
-        """The same lens with a phase of ``modes`` (m,) times ``basis`` (u, v, m) -> (m, *shape); see :mod:`thinplate`.
+    def with_residual(
+        self, modes: Array, basis: Callable[[Array, Array, int], Array]
+    ) -> "ForwardModel":
+        """The same lens with a phase of ``modes`` (m,) times ``basis`` (u, v, m) -> (m,
+        *shape); see :mod:`thinplate`.
 
         Their derivatives are wanted as ``residual_0`` and so on.
         """
         part = copy.copy(self)
         part.modes = np.asarray(modes)
         if len(modes):
-            part.groups = [g.bent(self._shapes(g, len(modes), basis)) for g in self.groups]
+            part.groups = [
+                g.bent(self._shapes(g, len(modes), basis)) for g in self.groups
+            ]
         return part
 
-    def _shapes(self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]) -> Array:
-        """(count, q, p) of a basis on the nodes of a group; kept, since a search asks again for every step."""
+    def _shapes(
+        self, group: Group, count: int, basis: Callable[[Array, Array, int], Array]
+    ) -> Array:
+        """(count, q, p) of a basis on the nodes of a group; kept, since a search asks
+        again for every step.
+        """
         key = group.reduced, basis, count
         if key not in self._kept:
             self._kept[key] = basis(group.reduced.u, group.reduced.v, count)
         return self._kept[key]
 
-    def images(self, x: Array, wanted: Sequence[str] | None = None) -> tuple[Array, Array | None]:
-        """Frames, and with ``wanted`` their derivatives by those parameters (len(wanted), n, rows, columns)."""
+    def images(
+        self, x: Array, wanted: Sequence[str] | None = None
+    ) -> tuple[Array, Array | None]:
+        """Frames, and with ``wanted`` their derivatives by those parameters
+        (len(wanted), n, rows, columns).
+        """
         light, slopes = self._light(x, wanted)
         s, films, about = self.setting, self.films, {"centre_um": self.stage_centre_um}
-        scale = brightness(x, s, reference_um=self.reference_um, films=films, **about)[:, None, None] / self.area_um2
+        scale = (
+            brightness(x, s, reference_um=self.reference_um, films=films, **about)[
+                :, None, None
+            ]
+            / self.area_um2
+        )
         sampled = scale * light
         if wanted is None:
             return sampled + background(x, s), None
         out = np.zeros((len(wanted), *light.shape))
         plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
-        plain |= {name: s.glow * edge for name, edge in zip(("background_y_e", "background_x_e"), s.edges, strict=True)}
+        plain |= {
+            name: s.glow * edge
+            for name, edge in zip(
+                ("background_y_e", "background_x_e"), s.edges, strict=True
+            )
+        }
         for j, name in enumerate(wanted):
             out[j] = plain[name] if name in plain else scale * slopes[name]
         for name, rate in dimming(x, s, films=films, **about).items():
@@ -179,10 +293,20 @@ class ForwardModel:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return sampled + background(x, s), out
 
-    def _light(self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None) -> Light:
+    def _light(
+        self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None
+    ) -> Light:
         """(n, rows, columns) |E|² seen by the pixels, and its derivatives by name."""
-        s, wanted, wide_nm = self.setting, list(wanted or ()), float(x[PLACE["bandwidth_nm"]])
-        names = list(dict.fromkeys("stage_zero_um" if name == "stage_scale" else name for name in wanted))
+        s, wanted, wide_nm = (
+            self.setting,
+            list(wanted or ()),
+            float(x[PLACE["bandwidth_nm"]]),
+        )
+        names = list(
+            dict.fromkeys(
+                "stage_zero_um" if name == "stage_scale" else name for name in wanted
+            )
+        )
         light = np.zeros((len(s.depth_um), s.rows, s.columns))
         slopes = {name: np.zeros_like(light) for name in names}
         for offset_nm, weight in self.spectrum.colours(wide_nm, like_nm):
@@ -194,12 +318,21 @@ class ForwardModel:
                         slopes[name][group.index, *self._lit] += weight * more[name]
         if "bandwidth_nm" in names:
             up = x + _WIDER_NM * (np.arange(len(x)) == PLACE["bandwidth_nm"])
-            slopes["bandwidth_nm"] = (self._light(up, None, wide_nm)[0] - light) / _WIDER_NM
-        if "stage_scale" in wanted:  # of one frame as its stage zero's, by how far it is from the middle
-            slopes["stage_scale"] = slopes["stage_zero_um"] * (s.depth_um - self.stage_centre_um)[:, None, None]
+            slopes["bandwidth_nm"] = (
+                self._light(up, None, wide_nm)[0] - light
+            ) / _WIDER_NM
+        if (
+            "stage_scale" in wanted
+        ):  # of one frame as its stage zero's, by how far it is from the middle
+            slopes["stage_scale"] = (
+                slopes["stage_zero_um"]
+                * (s.depth_um - self.stage_centre_um)[:, None, None]
+            )
         return light, slopes
 
-    def _group_light(self, x: Array, group: Group, offset_nm: float, names: list[str]) -> Light:
+    def _group_light(
+        self, x: Array, group: Group, offset_nm: float, names: list[str]
+    ) -> Light:
         x = x.copy()
         x[PLACE["wavelength_nm"]] += offset_nm
         operators, phasor, lens = threads.beside(
@@ -213,45 +346,94 @@ class ForwardModel:
         intensity = field.real**2 + field.imag**2
         transfer, blurs = self._transfer(x, group, names)
         light = self.grid.sample(intensity, transfer)
-        by = {"bias": lens[1], **dict(zip(ANSWERING, lens[2], strict=False)), "wave": lens[3]}
+        by = {
+            "bias": lens[1],
+            **dict(zip(ANSWERING, lens[2], strict=False)),
+            "wave": lens[3],
+        }
         factors, bases = dict(self._factors(x, group, names)), Bases(lit, phasor, by)
         out = self._quick(x, (operators, coarse), group, bases, factors)
-        conjugate, power, rough = field.conj(), np.vdot(lit, lit).real, max(self.cut, _SLOPE_TOLERANCE)
+        conjugate, power, rough = (
+            field.conj(),
+            np.vdot(lit, lit).real,
+            max(self.cut, _SLOPE_TOLERANCE),
+        )
         for name in factors.keys() - out.keys():
-            # the part of a change that is the light itself needs no sum, nor loses digits
+            # the part of a change that is the light itself needs no sum, nor loses
+            # digits
             changed = bases.changed(factors[name])
             same = np.vdot(lit, changed) / power
             changed = changed - same * lit
             rate = operators.envelope(operators.coarse(changed, rough))
             if moves := factors[name].moves:
-                beside = float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
-                rate = rate + factors[name].um * operators.rates(lit, moves, rough, beside=beside)
-            out[name] = self.grid.sample(2 * (conjugate * rate).real, transfer) + 2 * same.real * light
+                beside = (
+                    float(np.linalg.norm(changed)) / math.sqrt(power) / factors[name].um
+                )
+                rate = rate + factors[name].um * operators.rates(
+                    lit, moves, rough, beside=beside
+                )
+            out[name] = (
+                self.grid.sample(2 * (conjugate * rate).real, transfer)
+                + 2 * same.real * light
+            )
         growth = self._growth(x, group) if x[PLACE["pinhole_um"]] > 0 else {}
-        for name in growth.keys() & out.keys():  # the source's image grows or shrinks too
-            disc = np.asarray(blurs["growth"]) * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+        for name in (
+            growth.keys() & out.keys()
+        ):  # the source's image grows or shrinks too
+            disc = (
+                np.asarray(blurs["growth"])
+                * (x[PLACE["pinhole_um"]] * growth[name])[:, None, None]
+            )
             out[name] = out[name] + self.grid.sample(intensity, disc)
         for name in blurs.keys() & set(names):
             out[name] = self.grid.sample(intensity, blurs[name])
         return light, out
 
     def _quick(
-        self, x: Array, seen: tuple[Operators, Array], group: Group, bases: Bases, factors: dict[str, Factor]
+        self,
+        x: Array,
+        seen: tuple[Operators, Array],
+        group: Group,
+        bases: Bases,
+        factors: dict[str, Factor],
     ) -> dict[str, Array]:
-        """Derivatives that are had from those of the field: what smooth factors make of a point, on small pixels."""
+        """Derivatives that are had from those of the field: what smooth factors make of
+        a point, on small pixels.
+        """
         (operators, coarse), turned, grid = seen, seen[0].turned, self._sparser()
         small = bool(factors) and moments.fine_enough(grid, group.reduced.radius_um)
-        blur = self._transfer(x, group, [], grid)[0] if turned is not None and small else None
+        blur = (
+            self._transfer(x, group, [], grid)[0]
+            if turned is not None and small
+            else None
+        )
         if turned is None or not isinstance(blur, detector.Sums):
             return {}
 
         def field(base: str, light: Array) -> Array:
-            return coarse if base == LIT else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
+            return (
+                coarse
+                if base == LIT
+                else operators.coarse(light, max(self.cut, _SLOPE_TOLERANCE))
+            )
 
-        return moments.rates(turned, grid, blur, group.reduced.seen(), bases, field, factors, self._missed)
+        return moments.rates(
+            turned,
+            grid,
+            blur,
+            group.reduced.seen(),
+            bases,
+            field,
+            factors,
+            self._missed,
+        )
 
-    def _factors(self, x: Array, group: Group, names: list[str]) -> Iterator[tuple[str, Factor]]:
-        """(name, what one unit does to the light on the nodes) of all parameters that change it."""
+    def _factors(
+        self, x: Array, group: Group, names: list[str]
+    ) -> Iterator[tuple[str, Factor]]:
+        """(name, what one unit does to the light on the nodes) of all parameters that
+        change it.
+        """
         for name in names:
             if name in WIDENING:
                 yield name, Factor.fixed("bias", group.widening[WIDENING[name]])
@@ -265,8 +447,11 @@ class ForwardModel:
                 slope = functools.partial(self._phase_slope, x, group, name)
                 yield name, Factor(LIT, slope, moves, um, added)
 
-    def _pupil(self, x: Array, group: Group, slopes: bool) -> tuple[Array, Array, Array, Array]:
-        """(q, p) complex lens on the nodes, its derivative by the bias per um, by units of the answering causes, and by
+    def _pupil(
+        self, x: Array, group: Group, slopes: bool
+    ) -> tuple[Array, Array, Array, Array]:
+        """(q, p) complex lens on the nodes, its derivative by the bias per um, by units
+        of the answering causes, and by
         the wavelength per nm."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
@@ -281,12 +466,21 @@ class ForwardModel:
         by = [group.reduced.combined(weight, c * row.unit) for c, row in slopes_of]
         up = x.copy()
         up[PLACE["wavelength_nm"]] += _WAVE_STEP_NM
-        by_wave = (group.pillars.coefficients(change(up), self._lean_um) - values) / _WAVE_STEP_NM
+        by_wave = (
+            group.pillars.coefficients(change(up), self._lean_um) - values
+        ) / _WAVE_STEP_NM
         rate = group.pillars.rates(bias, weight)
-        return pupil, group.reduced.combined(rate, values), np.stack(by), group.reduced.combined(weight, by_wave)
+        return (
+            pupil,
+            group.reduced.combined(rate, values),
+            np.stack(by),
+            group.reduced.combined(weight, by_wave),
+        )
 
     def _phase(self, x: Array, group: Group, cut: Cut = WHOLE) -> Array:
-        """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken off, aberrations; light."""
+        """(frames, q, p) smooth phase on some nodes: bench geometry less what was taken
+        off, aberrations; light.
+        """
         reduced, index, nominal = group.reduced, group.index, group.reduced.bench
         here, every = (reduced.x_um[cut], reduced.y_um[cut]), (slice(None), *cut)
         wavelength_um = nominal.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
@@ -296,24 +490,49 @@ class ForwardModel:
         tx, ty = nominal.tangents[0] + lean[0], nominal.tangents[1] + lean[1]
         held = self.grid.middle_um
         chief = reduced.films.chief_um(d, (tx, ty))
-        centre = chief[0] + x[PLACE["decentre_x_um"]] - held[0], chief[1] + x[PLACE["decentre_y_um"]] - held[1]
+        centre = (
+            chief[0] + x[PLACE["decentre_x_um"]] - held[0],
+            chief[1] + x[PLACE["decentre_y_um"]] - held[1],
+        )
         films = Films.of(self.lens.layers, wavelength_um)
         exit_path = films.sensor_path(*here, centre, d)
         depth = true_depth(x, self.setting, self.stage_centre_um)[index]
-        out = source_paths(*here, depth_um=depth, tangents=(tx, ty), values=x, films=films)
+        out = source_paths(
+            *here, depth_um=depth, tangents=(tx, ty), values=x, films=films
+        )
         out += exit_path
         out *= k
         out -= reduced.known[cut]
-        out += np.tensordot([x[PLACE[name]] for name in BENDING], group.bending[every], 1)
+        out += np.tensordot(
+            [x[PLACE[name]] for name in BENDING], group.bending[every], 1
+        )
         uneven = x[[PLACE[name] for name in LIGHT]]
-        light = -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1) if uneven.any() else 0.0
-        return out + light + (np.tensordot(self.modes, group.residual[every], 1) if len(self.modes) else 0.0)
+        light = (
+            -0.5j * np.tensordot(uneven, light_maps(reduced.u[cut], reduced.v[cut]), 1)
+            if uneven.any()
+            else 0.0
+        )
+        return (
+            out
+            + light
+            + (
+                np.tensordot(self.modes, group.residual[every], 1)
+                if len(self.modes)
+                else 0.0
+            )
+        )
 
     def _phase_slope(self, x: Array, group: Group, name: str, cut: Cut) -> Array:
-        """Derivative of i times :meth:`_phase` by a geometric parameter: central difference of a smooth function."""
+        """Derivative of i times :meth:`_phase` by a geometric parameter: central
+        difference of a smooth function.
+        """
         step = {"stage_zero_um": 0.5, "wavelength_nm": 1e-3}.get(name, 1e-2)
         way = step * (np.arange(len(x)) == PLACE[name])
-        return 0.5j / step * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
+        return (
+            0.5j
+            / step
+            * (self._phase(x + way, group, cut) - self._phase(x - way, group, cut))
+        )
 
     def _operators(self, x: Array, group: Group) -> Operators:
         nominal = group.reduced.bench
@@ -326,20 +545,51 @@ class ForwardModel:
         )
 
     def _growth(self, x: Array, group: Group) -> dict[str, Array]:
-        """(frames,) relative growth of the source's image with the parameters that change its magnification."""
+        """(frames,) relative growth of the source's image with the parameters that
+        change its magnification.
+        """
         near, far = self._reduced(x, group)
-        return {"distance_um": 1 / (self.films.filling * near), "stage_zero_um": -1 / far}
+        return {
+            "distance_um": 1 / (self.films.filling * near),
+            "stage_zero_um": -1 / far,
+        }
 
     def _reduced(self, x: Array, group: Group) -> tuple[Array, Array]:
-        """(frames,) distances to sensor and source in air that bend paraxial light as much."""
-        far = self.films.apparent_um(true_depth(x, self.setting, self.stage_centre_um)[group.index])
-        return np.full(len(far), self.films.reduced_um(group.reduced.bench.distance_um + x[PLACE["distance_um"]])), far
+        """(frames,) distances to sensor and source in air that bend paraxial light as
+        much.
+        """
+        far = self.films.apparent_um(
+            true_depth(x, self.setting, self.stage_centre_um)[group.index]
+        )
+        return np.full(
+            len(far),
+            self.films.reduced_um(
+                group.reduced.bench.distance_um + x[PLACE["distance_um"]]
+            ),
+        ), far
 
     def _transfer(
-        self, x: Array, group: Group, names: list[str], grid: detector.Grid | None = None
+        self,
+        x: Array,
+        group: Group,
+        names: list[str],
+        grid: detector.Grid | None = None,
     ) -> tuple[detector.Blur, dict[str, detector.Blur]]:
-        """Transfer of pixel, crosstalk and source disc, and its derivatives; see :func:`detector.transfers`."""
+        """Transfer of pixel, crosstalk and source disc, and its derivatives; see
+        :func:`detector.transfers`.
+        """
         near, far = self._reduced(x, group)
         shrink = near / far
-        blur, sizes, kind = x[PLACE["crosstalk_px"]], x[PLACE["pinhole_um"]] * shrink, real_of(group.reduced.kind)
-        return detector.transfers(grid or self.grid, blur, sizes, shrink, sized="pinhole_um" in names, kind=kind)
+        blur, sizes, kind = (
+            x[PLACE["crosstalk_px"]],
+            x[PLACE["pinhole_um"]] * shrink,
+            real_of(group.reduced.kind),
+        )
+        return detector.transfers(
+            grid or self.grid,
+            blur,
+            sizes,
+            shrink,
+            sized="pinhole_um" in names,
+            kind=kind,
+        )

@@ -1,4 +1,6 @@
-"""Pillars onto even nodes: the functions of every one times its phasor, in a compiled loop, and the nodes."""
+"""Pillars onto even nodes: the functions of every one times its phasor, in a compiled
+loop, and the nodes.
+"""
 
 import math
 
@@ -11,9 +13,11 @@ from metalens.lens import DiameterMap, Stop
 
 
 def even(count: int, pull: float, low: float, high: float) -> Array:
-    """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre nodes t (Kosloff and Tal-Ezer 1993).
+    """(count,) nearly even places on [low, high]: arcsin(pull t) of Gauss-Legendre
+    nodes t (Kosloff and Tal-Ezer 1993).
 
-    A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at the ends; pulled apart, 0.7 n.
+    A wave of n radians a half span needs n + O(n^(1/3)) Legendre nodes, which crowd at
+    the ends; pulled apart, 0.7 n.
     """
     t = np.arcsin(pull * legendre.nodes(count)[0]) / math.asin(pull)
     return np.asarray((low + high) / 2 + (high - low) / 2 * t)
@@ -27,7 +31,9 @@ def at(count: int, pull: float, span: tuple[float, float], values: Array) -> Arr
 
 
 def pull(count: int, tolerance: float) -> float:
-    """Of :func:`even`: how near its branch may come to the ends of the nodes, for a wave as steep as they hold."""
+    """Of :func:`even`: how near its branch may come to the ends of the nodes, for a
+    wave as steep as they hold.
+    """
     return 1 / math.cosh((math.log(1e5 / tolerance) + count / 60) / count)
 
 
@@ -37,16 +43,29 @@ def density(count: int, tolerance: float) -> float:
     return math.asin(pulled) / pulled
 
 
-def mirrored(diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None) -> bool:
-    """Whether pillars, the path of a chief ray and the shadow of a stop are alike to both sides of both axes: a quarter
+def mirrored(
+    diameters: DiameterMap, tangents: tuple[float, float], stop: Stop | None = None
+) -> bool:
+    """Whether pillars, the path of a chief ray and the shadow of a stop are alike to
+    both sides of both axes: a quarter
     of them tells all."""
     d = diameters.diameter_um
-    plain = diameters.angle_rad is None and diameters.length_um is None and not any(tangents)
-    return plain and (stop is None or stop.centred) and np.array_equal(d, d[::-1]) and np.array_equal(d, d[:, ::-1])
+    plain = (
+        diameters.angle_rad is None
+        and diameters.length_um is None
+        and not any(tangents)
+    )
+    return (
+        plain
+        and (stop is None or stop.centred)
+        and np.array_equal(d, d[::-1])
+        and np.array_equal(d, d[:, ::-1])
+    )
 
 
 def folded(weights: Array, first: int) -> Array:
-    """(n, m) weights of places of which those from ``first``, the middle one, on are asked for: each with its mirror
+    """(n, m) weights of places of which those from ``first``, the middle one, on are
+    asked for: each with its mirror
     image's. As they are where that is 0."""
     if not first:
         return weights
@@ -56,16 +75,25 @@ def folded(weights: Array, first: int) -> Array:
 
 
 def lit(table: Array, place: Array, turns: Array) -> Array:
-    """(columns, rows, 2 r) real parts, then imaginary parts, of table[:, place] times turns.
+    """(columns, rows, 2 r) real parts, then imaginary parts, of table[:, place] times
+    turns.
 
-    All r numbers of a pillar lie together: one look-up each, where r arrays would be walked through. Columns come
+    All r numbers of a pillar lie together: one look-up each, where r arrays would be
+    walked through. Columns come
     first, so that a sum along them is one product of matrices.
 
     Args:
-        table: (entries, r) complex. place: (rows, columns) entries. turns: (rows, columns), of the table's kind.
+        table: (entries, r) complex. place: (rows, columns) entries. turns: (rows,
+            columns), of the table's kind.
     """
     out = np.empty((*place.shape[::-1], 2 * table.shape[1]), table.real.dtype)
-    _lit(np.ascontiguousarray(table.real), np.ascontiguousarray(table.imag), place, turns, out)
+    _lit(
+        np.ascontiguousarray(table.real),
+        np.ascontiguousarray(table.imag),
+        place,
+        turns,
+        out,
+    )
     return out
 
 
@@ -74,7 +102,12 @@ def _lit(real: Array, imaginary: Array, place: Array, turns: Array, out: Array) 
     r = real.shape[1]
     for j in range(place.shape[1]):
         for i in range(place.shape[0]):
-            a, b, c, s = real[place[i, j]], imaginary[place[i, j]], turns[i, j].real, turns[i, j].imag
+            a, b, c, s = (
+                real[place[i, j]],
+                imaginary[place[i, j]],
+                turns[i, j].real,
+                turns[i, j].imag,
+            )
             for k in range(r):
                 out[j, i, k] = a[k] * c - b[k] * s
                 out[j, i, r + k] = a[k] * s + b[k] * c

@@ -1,4 +1,5 @@
-"""From the source to the lens and on to the sensor: in air, through the films of the lens, through a plate of glass,
+"""From the source to the lens and on to the sensor: in air, through the films of the
+lens, through a plate of glass,
 tilted or not, that stands before it."""
 
 import functools
@@ -17,7 +18,10 @@ from metalens.lens import Layers, media
 
 INDEX = 1.51  # of crown glass from 0.6 to 1.1 um: 1.515 to 1.506
 _TOGETHER = 20_000  # numbers of an array that stays in the cache
-_TERMS, _ROUNDING = 24, 1e-14  # of a series: reaches as long as the distance leave 1e-15 of it, shorter ones less
+_TERMS, _ROUNDING = (
+    24,
+    1e-14,
+)  # of a series: reaches as long as the distance leave 1e-15 of it, shorter ones less
 Pairs = tuple[tuple[float, float], ...]  # (index, thickness, um)
 
 
@@ -39,7 +43,8 @@ class Bench:
 class Films:
     """Plane-parallel films of a lens at one wavelength.
 
-    front: between source and lens, air apart. behind: between lens and sensor in the light's order, the gap apart,
+    front: between source and lens, air apart. behind: between lens and sensor in the
+    light's order, the gap apart,
     which is of index ``filling`` and takes all that the distance gains.
     """
 
@@ -56,9 +61,17 @@ class Films:
         """
         if layers.plain:
             return AIR
-        sides = layers.before(math.inf, wavelength_um), layers.after(math.inf, wavelength_um)
+        sides = (
+            layers.before(math.inf, wavelength_um),
+            layers.after(math.inf, wavelength_um),
+        )
         front, behind = (
-            tuple((n, t) for n, t in zip(side.index[1:], side.thickness_um[1:], strict=True) if t > 0) for side in sides
+            tuple(
+                (n, t)
+                for n, t in zip(side.index[1:], side.thickness_um[1:], strict=True)
+                if t > 0
+            )
+            for side in sides
         )
         return cls(front, behind, sides[1].index[0])
 
@@ -68,19 +81,36 @@ class Films:
         return not self.behind and self.filling == 1
 
     def pairs(self, distance_um: float) -> Pairs:
-        """Media from lens to sensor, the gap first: of less than no thickness where films are longer than that."""
-        return (self.filling, distance_um - sum(t for _, t in self.behind)), *self.behind
+        """Media from lens to sensor, the gap first: of less than no thickness where
+        films are longer than that.
+        """
+        return (
+            self.filling,
+            distance_um - sum(t for _, t in self.behind),
+        ), *self.behind
 
     def reduced_um(self, distance_um: float) -> float:
-        """The distance in air that bends paraxial light as much as the way from lens to sensor."""
-        return distance_um if self.none_behind else sum(t / n for n, t in self.pairs(distance_um))
+        """The distance in air that bends paraxial light as much as the way from lens to
+        sensor.
+        """
+        return (
+            distance_um
+            if self.none_behind
+            else sum(t / n for n, t in self.pairs(distance_um))
+        )
 
     def apparent_um(self, depth_um: Any) -> Any:
-        """Depths in air from which paraxial light spreads as it does from sources at these depths."""
+        """Depths in air from which paraxial light spreads as it does from sources at
+        these depths.
+        """
         return depth_um - sum(t - t / n for n, t in self.front)
 
-    def chief_um(self, distance_um: float, tangents: tuple[float, float]) -> tuple[float, float]:
-        """(x, y) where the ray of these tangents in air, through the middle of the lens, meets the sensor."""
+    def chief_um(
+        self, distance_um: float, tangents: tuple[float, float]
+    ) -> tuple[float, float]:
+        """(x, y) where the ray of these tangents in air, through the middle of the
+        lens, meets the sensor.
+        """
         steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
         sine2 = 1 - 1 / steep
         far = distance_um
@@ -91,15 +121,31 @@ class Films:
     def drift(self, tangents: tuple[float, float]) -> tuple[float, float]:
         """Change of :meth:`chief_um` by the distance: tangents in the gap."""
         steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
-        share = 1.0 if self.filling == 1 else 1 / math.sqrt((self.filling**2 - 1) * steep + 1)
+        share = (
+            1.0
+            if self.filling == 1
+            else 1 / math.sqrt((self.filling**2 - 1) * steep + 1)
+        )
         return share * tangents[0], share * tangents[1]
 
     def rays(self, distance_um: float, reach2_um2: float) -> "Rays":
         """Those from lens to sensor up to this reach²."""
-        return _rays(self, distance_um, 2.0 ** (math.ceil(4 * math.log2(max(reach2_um2, 1e-12))) / 4))
+        return _rays(
+            self,
+            distance_um,
+            2.0 ** (math.ceil(4 * math.log2(max(reach2_um2, 1e-12))) / 4),
+        )
 
-    def sensor_path(self, x_um: Array, y_um: Array, centre_um: tuple[float, float], distance_um: float) -> Array:
-        """(*shape) path from (x, y) on the lens to a place of the sensor, um, less that from the lens centre."""
+    def sensor_path(
+        self,
+        x_um: Array,
+        y_um: Array,
+        centre_um: tuple[float, float],
+        distance_um: float,
+    ) -> Array:
+        """(*shape) path from (x, y) on the lens to a place of the sensor, um, less that
+        from the lens centre.
+        """
         if self.none_behind:
             return np.asarray(sensor_path(x_um, y_um, centre_um, distance_um))
         start = centre_um[0] ** 2 + centre_um[1] ** 2
@@ -113,9 +159,11 @@ AIR = Films()
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rays:
-    """Rays through plane-parallel media up to a reach, as Chebyshev series in reach², to rounding.
+    """Rays through plane-parallel media up to a reach, as Chebyshev series in reach²,
+    to rounding.
 
-    series: of the optical path less that along the normal, ``along_um``; of reach over n sin θ; of √(passed / spread).
+    series: of the optical path less that along the normal, ``along_um``; of reach over
+    n sin θ; of √(passed / spread).
     """
 
     most_um2: float
@@ -135,17 +183,29 @@ class Rays:
         return self._at(2, reach2_um2)
 
     def _at(self, which: int, reach2_um2: Any) -> Any:
-        return chebyshev.chebval((2 / self.most_um2) * reach2_um2 - 1, self.series[which])
+        return chebyshev.chebval(
+            (2 / self.most_um2) * reach2_um2 - 1, self.series[which]
+        )
 
 
 @functools.lru_cache(maxsize=256)
 def _rays(films: Films, distance_um: float, most_um2: float) -> Rays:
-    pairs, order = films.pairs(distance_um), (films.filling, *(n for n, _ in films.behind))
+    pairs, order = (
+        films.pairs(distance_um),
+        (films.filling, *(n for n, _ in films.behind)),
+    )
     node, to_series = _nodes()
-    w, along_um = media.square(pairs, most_um2 / 2 * (1 + node)), sum(n * t for n, t in pairs)
+    w, along_um = (
+        media.square(pairs, most_um2 / 2 * (1 + node)),
+        sum(n * t for n, t in pairs),
+    )
     level = np.sqrt(media.passed_at(order, w) / media.widening(pairs, w))
-    found = to_series @ np.stack([media.whole_path(pairs, w) - along_um, media.bend(pairs, w), level], 1)
-    chord, bend, level = (chebyshev.chebtrim(one, _ROUNDING * np.abs(one).max()) for one in found.T)
+    found = to_series @ np.stack(
+        [media.whole_path(pairs, w) - along_um, media.bend(pairs, w), level], 1
+    )
+    chord, bend, level = (
+        chebyshev.chebtrim(one, _ROUNDING * np.abs(one).max()) for one in found.T
+    )
     return Rays(most_um2, (chord, bend, level), along_um)
 
 
@@ -157,14 +217,23 @@ def _nodes() -> tuple[Array, Array]:
 
 
 def source_paths(
-    x_um: Array, y_um: Array, *, depth_um: Array, tangents: tuple[float, float], values: Array, films: Films = AIR
+    x_um: Array,
+    y_um: Array,
+    *,
+    depth_um: Array,
+    tangents: tuple[float, float],
+    values: Array,
+    films: Films = AIR,
 ) -> Array:
-    """(frames, *shape) path to (x, y) on the lens from sources at ``depth_um`` (frames,), um, less that to its centre.
+    """(frames, *shape) path to (x, y) on the lens from sources at ``depth_um``
+    (frames,), um, less that to its centre.
 
     Args:
         tangents: (x, y) of the chief ray of a source on the axis, in air.
-        values: all parameters, of which source_x_um, source_y_um, glass_um and the tilts of the glass are used.
-        films: of which those in front are gone through; beside them the plate of glass acts as in air alone.
+        values: all parameters, of which source_x_um, source_y_um, glass_um and the
+            tilts of the glass are used.
+        films: of which those in front are gone through; beside them the plate of glass
+            acts as in air alone.
 
     Raises:
         FitError: the plate does not fit between source and lens.
@@ -176,7 +245,9 @@ def source_paths(
         z = depth_um[first : first + step].reshape(-1, *(1,) * x_um.ndim)
         seen = films.apparent_um(z)
         leaning = tangents[0] - lateral[0] / seen, tangents[1] - lateral[1] / seen
-        out[first : first + step] = media.source_path(films.front, x_um, y_um, leaning, 1 / z)
+        out[first : first + step] = media.source_path(
+            films.front, x_um, y_um, leaning, 1 / z
+        )
     if values[PLACE["glass_um"]] != 0:
         for one, z in zip(out, films.apparent_um(depth_um).tolist(), strict=True):
             leaning = tangents[0] - lateral[0] / z, tangents[1] - lateral[1] / z
@@ -184,10 +255,19 @@ def source_paths(
     return out
 
 
-def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth_um: float, values: Array) -> Array:
-    """(*shape) path to (x, y) on the lens with the plate less that without it, um, and less that at the lens centre.
+def extra_path(
+    x_um: Array,
+    y_um: Array,
+    *,
+    tangents: tuple[float, float],
+    depth_um: float,
+    values: Array,
+) -> Array:
+    """(*shape) path to (x, y) on the lens with the plate less that without it, um, and
+    less that at the lens centre.
 
-    Along the plate's normal the source lies L away, across it rho. The path is the stationary value over the
+    Along the plate's normal the source lies L away, across it rho. The path is the
+    stationary value over the
     invariant sine s (Hamilton's characteristic function; Snell's law)
 
         W = rho s + (L - t) sqrt(1 - s²) + t sqrt(n² - s²)
@@ -195,7 +275,8 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth
     and three of Newton's steps from the straight ray leave less than 1e-9 um.
 
     Args:
-        tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z = ``depth_um``.
+        tangents: (x, y) of the chief ray; the source is at (-z tx, -z ty, -z), z =
+            ``depth_um``.
         values: all parameters, of which glass_um and its tilts are used.
 
     Raises:
@@ -210,7 +291,9 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth
         r2 = ray[0] ** 2 + ray[1] ** 2 + depth_um**2
         along = ray[0] * normal[0] + ray[1] * normal[1] + depth_um * normal[2]
         if along.min() <= t:
-            raise FitError(f"{t:.4g} um of glass between lens and source, which leave {along.min():.4g} um for it")
+            raise FitError(
+                f"{t:.4g} um of glass between lens and source, which leave {along.min():.4g} um for it"
+            )
         across = np.sqrt(np.maximum(r2 - along**2, 0.0))
         s = across / np.sqrt(r2)
         for _ in range(3):
@@ -220,4 +303,6 @@ def extra_path(x_um: Array, y_um: Array, *, tangents: tuple[float, float], depth
         outside, inside = np.sqrt(1 - s * s), np.sqrt(INDEX**2 - s * s)
         return np.asarray(across * s + (along - t) * outside + t * inside - np.sqrt(r2))
 
-    return np.asarray(longer(np.asarray(x_um), np.asarray(y_um)) - longer(np.zeros(1), np.zeros(1)))
+    return np.asarray(
+        longer(np.asarray(x_um), np.asarray(y_um)) - longer(np.zeros(1), np.zeros(1))
+    )

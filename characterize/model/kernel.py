@@ -1,9 +1,14 @@
-"""The kernel from a lens to a sensor window, split into factors of two coordinates and a rest as smooth as can be.
+"""The kernel from a lens to a sensor window, split into factors of two coordinates and
+a rest as smooth as can be.
 
-With the path F(p, q, X, Y) = r - r_w, seen from the window's centre, and the lens's middle direction (a, b):
-F = F(p, b, X, 0) + F(a, q, 0, Y) + H(X, Y) + rest, where H makes the rest vanish at p = a, q = b, and wherever X = 0
-and q = b, or Y = 0 and p = a. The three factors are put on exactly; what the window bends by itself, and along each
-axis with the direction, is in them. The rest begins with X² q²: a window as wide as the lens is far needs few nodes.
+With the path F(p, q, X, Y) = r - r_w, seen from the window's centre, and the lens's
+middle direction (a, b):
+F = F(p, b, X, 0) + F(a, q, 0, Y) + H(X, Y) + rest, where H makes the rest vanish at p =
+a, q = b, and wherever X = 0
+and q = b, or Y = 0 and p = a. The three factors are put on exactly; what the window
+bends by itself, and along each
+axis with the direction, is in them. The rest begins with X² q²: a window as wide as the
+lens is far needs few nodes.
 """
 
 import dataclasses
@@ -19,7 +24,9 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.ground.paths import longer
 
-SINGLE = 1e-4  # least tolerance of a field that single precision holds: :func:`least_tolerance` of 4000 columns is 4e-5
+# least tolerance of a field that single precision holds: :func:`least_tolerance` of
+# 4000 columns is 4e-5
+SINGLE = 1e-4
 _USUAL = 5e-4  # tolerance that the counts of nodes below are written for
 _COARSE = 9  # places a coordinate at which the rest's slopes are sampled
 _BLOCK = 24  # columns by which a range grows
@@ -31,10 +38,13 @@ Span = tuple[float, float]
 class Kernel:
     """d / (2 pi r²) (1/r - ik) exp(ik(r - r_w)) of one wavelength and distance.
 
-    Through films r is the path of the ray, and d / r² is √(passed / spread) of :mod:`metalens.lens.media`.
+    Through films r is the path of the ray, and d / r² is √(passed / spread) of
+    :mod:`metalens.lens.media`.
 
-    p, q: spans of direction cosines of the lens seen from the window's centre, at the nominal distance.
-    nominal_um, distance_um: lens to sensor. tangents: (x, y) of the chief ray, in air. films: between them.
+    p, q: spans of direction cosines of the lens seen from the window's centre, at the
+    nominal distance.
+    nominal_um, distance_um: lens to sensor. tangents: (x, y) of the chief ray, in air.
+    films: between them.
     nodes_um: distance in air that p and q are counted at; None for the nominal one.
     """
 
@@ -47,8 +57,11 @@ class Kernel:
     films: Films = AIR
     nodes_um: float | None = None
 
-    def path(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
-        """r - r_w, um, to a point of the window and to its centre, without cancellation; and what tells the ray: r in
+    def path(
+        self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float
+    ) -> tuple[Array, Array]:
+        """r - r_w, um, to a point of the window and to its centre, without
+        cancellation; and what tells the ray: r in
         air, its reach² through films."""
         d, (dx, dy) = self.distance_um, self._across(p, q)
         more = X * X + Y * Y + 2 * (X * dx + Y * dy)
@@ -63,8 +76,13 @@ class Kernel:
 
     def _across(self, p: Array | float, q: Array | float) -> tuple[Any, Any]:
         """(x, y) from the nodes to the window's centre, um."""
-        off, (tx, ty) = self.distance_um - self.nominal_um, self.films.drift(self.tangents)
-        r_0 = (self.nodes_um or self.nominal_um) / np.sqrt(1 - np.square(p) - np.square(q))
+        off, (tx, ty) = (
+            self.distance_um - self.nominal_um,
+            self.films.drift(self.tangents),
+        )
+        r_0 = (self.nodes_um or self.nominal_um) / np.sqrt(
+            1 - np.square(p) - np.square(q)
+        )
         return off * tx - r_0 * p, off * ty - r_0 * q
 
     def amplitude(self, ray: Array) -> tuple[Array, Array]:
@@ -72,71 +90,115 @@ class Kernel:
         if self.films.none_behind:
             return self.distance_um / (2 * np.pi * ray**2), ray
         rays = self.films.rays(self.distance_um, ray.max())
-        return np.asarray(rays.level(ray) / (2 * np.pi)), np.asarray(rays.along_um + rays.chord(ray))
+        return np.asarray(rays.level(ray) / (2 * np.pi)), np.asarray(
+            rays.along_um + rays.chord(ray)
+        )
 
     def window(self, X: Array, Y: Array) -> Array:
         """exp(ik H(X, Y)); arguments broadcast."""
         return np.asarray(np.exp(1j * self.k * self._by_window(X, Y)))
 
     def by_x(self, p: Array | float, X: Array, off_um: float = 0.0) -> Array:
-        """F(p, b, X, 0), um, with the sensor ``off_um`` farther away; arguments broadcast."""
+        """F(p, b, X, 0), um, with the sensor ``off_um`` farther away; arguments
+        broadcast.
+        """
         return self._off(off_um).path(p, _middle(self.q), X, 0.0)[0]
 
     def by_y(self, q: Array | float, Y: Array, off_um: float = 0.0) -> Array:
-        """F(a, q, 0, Y), um, with the sensor ``off_um`` farther away; arguments broadcast."""
+        """F(a, q, 0, Y), um, with the sensor ``off_um`` farther away; arguments
+        broadcast.
+        """
         return self._off(off_um).path(_middle(self.p), q, 0.0, Y)[0]
 
     def _off(self, off_um: float) -> "Kernel":
-        return dataclasses.replace(self, distance_um=self.distance_um + off_um) if off_um else self
+        return (
+            dataclasses.replace(self, distance_um=self.distance_um + off_um)
+            if off_um
+            else self
+        )
 
     def bands(self, wy: float, wx: float) -> tuple[float, float]:
-        """(along y, along x) highest frequency, rad/um, on a window of half sides (wy, wx) of the field less the turns
-        of the middle direction (a, b): k times the most by which dF/dX and dF/dY differ from those of it."""
+        """(along y, along x) highest frequency, rad/um, on a window of half sides (wy,
+        wx) of the field less the turns
+        of the middle direction (a, b): k times the most by which dF/dX and dF/dY differ
+        from those of it."""
         t = np.linspace(-1, 1, _COARSE)
-        Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
+        Y, X, q, p = np.meshgrid(
+            wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True
+        )
         off_x, off_y = self.turning(p, q, X, Y)
         return self.k * float(np.abs(off_y).max()), self.k * float(np.abs(off_x).max())
 
-    def turning(self, p: Array, q: Array, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
-        """(dF/dX, dF/dY) less those of the middle direction (a, b) along its own axis: the field's less its carrier."""
+    def turning(
+        self, p: Array, q: Array, X: Array | float, Y: Array | float
+    ) -> tuple[Array, Array]:
+        """(dF/dX, dF/dY) less those of the middle direction (a, b) along its own axis:
+        the field's less its carrier.
+        """
         a, b = _middle(self.p), _middle(self.q)
         by_x, by_y = self._steep(p, q, X, Y)
         return by_x - self._steep(a, b, X, 0.0)[0], by_y - self._steep(a, b, 0.0, Y)[1]
 
     def moved(self, name: str, share: float) -> "Kernel":
-        """With the ``distance`` or the wavelength (``wave``) longer by a share of itself."""
+        """With the ``distance`` or the wavelength (``wave``) longer by a share of
+        itself.
+        """
         if name == "distance":
             return dataclasses.replace(self, distance_um=self.distance_um * (1 + share))
         return dataclasses.replace(self, k=self.k / (1 + share))
 
-    def _steep(self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float) -> tuple[Array, Array]:
+    def _steep(
+        self, p: Array | float, q: Array | float, X: Array | float, Y: Array | float
+    ) -> tuple[Array, Array]:
         """dF/dX and dF/dY: the direction cosines seen from (X, Y)."""
         (dx, dy), ray = self._across(p, q), self.path(p, q, X, Y)[1]
-        bend = ray if self.films.none_behind else self.films.rays(self.distance_um, ray.max()).bend(ray)
+        bend = (
+            ray
+            if self.films.none_behind
+            else self.films.rays(self.distance_um, ray.max()).bend(ray)
+        )
         return np.asarray((X + dx) / bend), np.asarray((Y + dy) / bend)
 
-    def rest(self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64) -> Array:
-        """What the three factors leave, with the amplitude, as ``kind`` complex numbers; arguments broadcast."""
+    def rest(
+        self, p: Array, q: Array, X: Array, Y: Array, kind: Any = np.complex64
+    ) -> Array:
+        """What the three factors leave, with the amplitude, as ``kind`` complex
+        numbers; arguments broadcast.
+        """
         path, ray = self._left(p, q, X, Y)
         size, r = self.amplitude(ray)
         fade = (1 / r).astype(real_of(kind)) - np.dtype(kind).type(1j * self.k)
-        return np.asarray(size.astype(real_of(kind)) * fade * turns(self.k * path, kind))
+        return np.asarray(
+            size.astype(real_of(kind)) * fade * turns(self.k * path, kind)
+        )
 
-    def counts(self, wy: float, wx: float, tolerance: float = _USUAL) -> tuple[int, int]:
-        """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx): of the window, of the directions.
+    def counts(
+        self, wy: float, wx: float, tolerance: float = _USUAL
+    ) -> tuple[int, int]:
+        """Legendre nodes an axis for :meth:`rest` on a window of half sides (wy, wx):
+        of the window, of the directions.
 
-        exp(ist) needs s + O(s^(1/3)) terms, s the slope of the phase a half span. Path and amplitude branch where
-        r = 0, at imaginary X of about the distance, and at p² + q² = 1: there terms fall as exp(-n / branch).
+        exp(ist) needs s + O(s^(1/3)) terms, s the slope of the phase a half span. Path
+        and amplitude branch where
+        r = 0, at imaginary X of about the distance, and at p² + q² = 1: there terms
+        fall as exp(-n / branch).
         """
         more = digits(tolerance)
         t = np.linspace(-1, 1, _COARSE)
-        Y, X, q, p = np.meshgrid(wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True)
+        Y, X, q, p = np.meshgrid(
+            wy * t, wx * t, _on(self.q, t), _on(self.p, t), indexing="ij", sparse=True
+        )
         turn = self.k * self._left(p, q, X, Y)[0]
-        slopes = [float(np.abs(np.diff(turn, axis=axis)).max()) / (t[1] - t[0]) for axis in range(4)]
+        slopes = [
+            float(np.abs(np.diff(turn, axis=axis)).max()) / (t[1] - t[0])
+            for axis in range(4)
+        ]
         branch = 1 / math.asinh(self.films.reduced_um(self.distance_um) / max(wy, wx))
         beyond = _terms(max(slopes[:2]), tolerance) + (6 + more) * branch
         window = max(12, math.ceil((14 + more) * branch), math.ceil(beyond))
-        aperture = int((10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + more / 8))
+        aperture = int(
+            (10 + 16 * float(np.abs([self.p, self.q]).max())) * (1 + more / 8)
+        )
         return window, max(aperture, _terms(max(slopes[2:]), tolerance))
 
     def _left(self, p: Array, q: Array, X: Array, Y: Array) -> tuple[Array, Array]:
@@ -149,12 +211,16 @@ class Kernel:
 
 
 def turns(phase: Array, kind: Any = np.complex64) -> Array:
-    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex one makes light fade."""
+    """exp(i phase) as ``kind`` complex numbers, the phase wrapped in double; a complex
+    one makes light fade.
+    """
     if np.iscomplexobj(phase):
         return np.exp(1j * phase).astype(kind)
     out = np.empty(np.shape(phase), kind)
     whole = phase * (1 / (2 * np.pi))
-    small = (whole - np.rint(whole)).astype(out.real.dtype) * out.real.dtype.type(2 * np.pi)
+    small = (whole - np.rint(whole)).astype(out.real.dtype) * out.real.dtype.type(
+        2 * np.pi
+    )
     out.real, out.imag = np.cos(small), np.sin(small)
     return out
 
@@ -171,7 +237,9 @@ def precision(tolerance: float) -> Any:
         FitError: not even double precision does.
     """
     if not 1e-9 <= tolerance < 1:
-        raise FitError(f"tolerance {tolerance:g} of the field: need 1e-9 to 1; the pillars are not known better")
+        raise FitError(
+            f"tolerance {tolerance:g} of the field: need 1e-9 to 1; the pillars are not known better"
+        )
     return np.complex64 if tolerance >= SINGLE else np.complex128
 
 
@@ -181,41 +249,65 @@ def real_of(kind: Any) -> Any:
 
 
 def least_tolerance(table: Array) -> float:
-    """Tolerance that :func:`factors` can tell from rounding in the table's own precision.
+    """Tolerance that :func:`factors` can tell from rounding in the table's own
+    precision.
 
-    A block of the range less what is found of it is a sum over a column, rounded to eps sqrt(rows) of the norm; the
-    search would take that noise for more range, and what is orthogonal to noise is not orthogonal to the range.
+    A block of the range less what is found of it is a sum over a column, rounded to eps
+    sqrt(rows) of the norm; the
+    search would take that noise for more range, and what is orthogonal to noise is not
+    orthogonal to the range.
     """
     return float(np.finfo(table.dtype).eps) * math.sqrt(max(table.shape)) / _STOP
 
 
 def factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
-    """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but for ``tolerance`` of its norm.
+    """The least columns (m, r) and rows (r, n) whose product is ``table`` (m, n) but
+    for ``tolerance`` of its norm.
 
-    Their number need not be known: the range is found by random blocks (Halko, Martinsson and Tropp 2011) until what
-    is left is a fifth of the tolerance. Third: (r,) share of the norm that is left out before each term.
+    Their number need not be known: the range is found by random blocks (Halko,
+    Martinsson and Tropp 2011) until what
+    is left is a fifth of the tolerance. Third: (r,) share of the norm that is left out
+    before each term.
 
     Raises:
-        FitError: the tolerance is below what the table's precision holds; see :func:`least_tolerance`.
+        FitError: the tolerance is below what the table's precision holds; see
+            :func:`least_tolerance`.
     """
     least = least_tolerance(table)
     if tolerance < least:
-        raise FitError(f"{table.dtype} tables of {table.shape} hold {least:.1g} of their norm, not {tolerance:g}")
+        raise FitError(
+            f"{table.dtype} tables of {table.shape} hold {least:.1g} of their norm, not {tolerance:g}"
+        )
     rng, total = np.random.default_rng(0), float(np.linalg.norm(table)) ** 2
-    found, most, missing = np.empty((len(table), 0), table.dtype), min(table.shape), total
+    found, most, missing = (
+        np.empty((len(table), 0), table.dtype),
+        min(table.shape),
+        total,
+    )
     while found.shape[1] < most:
         count = min(_BLOCK, most - found.shape[1])
-        block = table @ rng.standard_normal((table.shape[1], count)).astype(table.real.dtype)
+        block = table @ rng.standard_normal((table.shape[1], count)).astype(
+            table.real.dtype
+        )
         block -= found @ (found.conj().T @ block)
-        missing = float(np.linalg.norm(block)) ** 2 / count  # its expectation is the power that is left
+        missing = (
+            float(np.linalg.norm(block)) ** 2 / count
+        )  # its expectation is the power that is left
         if missing < (_STOP * tolerance) ** 2 * total:
             break
-        block = np.linalg.qr(block)[0]  # twice is enough to be orthogonal to what is there
-        found = np.concatenate([found, np.linalg.qr(block - found @ (found.conj().T @ block))[0]], 1)
+        block = np.linalg.qr(block)[
+            0
+        ]  # twice is enough to be orthogonal to what is there
+        found = np.concatenate(
+            [found, np.linalg.qr(block - found @ (found.conj().T @ block))[0]], 1
+        )
         missing = 0.0
     rows = found.conj().T @ table
-    # singular values from their own, not from their squares, which would lose half of the digits
-    size, turn = np.linalg.svd(np.linalg.qr(rows.conj().T.astype(complex))[1].conj().T)[1::-1]
+    # singular values from their own, not from their squares, which would lose half of
+    # the digits
+    size, turn = np.linalg.svd(np.linalg.qr(rows.conj().T.astype(complex))[1].conj().T)[
+        1::-1
+    ]
     remainder = np.sqrt((np.cumsum(size[::-1] ** 2)[::-1] + missing) / total)
     rank = max(1, int((remainder > tolerance).sum()))
     turn = turn[:, :rank].astype(table.dtype)
@@ -223,7 +315,9 @@ def factors(table: Array, tolerance: float) -> tuple[Array, Array, Array]:
 
 
 def _terms(slope: float, tolerance: float) -> int:
-    """Legendre terms of exp(i slope t) on [-1, 1] to a fiftieth of ``tolerance``: its modes are (2n+1) j_n(slope)²."""
+    """Legendre terms of exp(i slope t) on [-1, 1] to a fiftieth of ``tolerance``: its
+    modes are (2n+1) j_n(slope)².
+    """
     n = np.arange(int(slope + 60 + 8 * slope ** (1 / 3)))
     power = (2 * n + 1) * spherical_jn(n, slope) ** 2
     return 1 + int((np.sqrt(np.cumsum(power[::-1])[::-1]) > tolerance / 50).sum())

@@ -1,4 +1,6 @@
-"""Every pillar of an as-built lens: its transmission, the lens it makes, and the PSFs of that lens."""
+"""Every pillar of an as-built lens: its transmission, the lens it makes, and the PSFs
+of that lens.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,7 +15,16 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Bends, Kinds, PairTable, Sensitivity, Widens, biased, causes, transmission
+from metalens.made import (
+    Bends,
+    Kinds,
+    PairTable,
+    Sensitivity,
+    Widens,
+    biased,
+    causes,
+    transmission,
+)
 
 _TABLE = 1 << 16
 _NODES = max(causes.polynomials(kind).shape[-1] for kind in (Widens, Bends))
@@ -31,14 +42,17 @@ def pillars(
     angle_rad: float = 0.0,
     modes: Array | None = None,
 ) -> Array:
-    """(y, x) complex transmission of every as-built pillar: diameter, process and wave-front aberrations.
+    """(y, x) complex transmission of every as-built pillar: diameter, process and
+    wave-front aberrations.
 
     Args:
         x: all parameters, in the order of ``parameters.NAMES``.
-        noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence, where the proxy knows angles.
+        noise_um: added to the diameters, pillar by pillar. angle_rad: of incidence,
+            where the proxy knows angles.
         modes: of a residual phase (:mod:`thinplate`).
 
-    Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9 for 50 rad/um.
+    Accuracy: t is a table over the diameters met, linear between its 2^16 entries: 1e-9
+    for 50 rad/um.
     """
     d, made = lens.diameters, state(x)
     bias = _on_pillars(d, made.bias_um) + noise_um
@@ -49,22 +63,36 @@ def pillars(
     if made.bends():
         t = t * np.exp(1j * _on_pillars(d, made.phase_rad))
     if modes is not None and len(modes):
-        t = t * np.exp(1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um))
-    return np.asarray(np.where(d.diameter_um > 0, t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))), 0))
+        t = t * np.exp(
+            1j * thinplate.phase_rad(modes, d.x_um / d.radius_um, d.y_um / d.radius_um)
+        )
+    return np.asarray(
+        np.where(
+            d.diameter_um > 0,
+            t * np.exp(1j * np.asarray(lens.geometric_rad(slice(None)))),
+            0,
+        )
+    )
 
 
-def _of_two_sizes(lens: Lens, response: Sensitivity, bias_um: Array, answers: Array) -> Array:
+def _of_two_sizes(
+    lens: Lens, response: Sensitivity, bias_um: Array, answers: Array
+) -> Array:
     """(y, x) t by the table of the lens; what is no pillar is that of some."""
     d, kinds, pairs = lens.diameters, Kinds.of(lens.diameters), response.pairs
     if pairs is None:
         raise FitError("pillars of two sizes: slopes of such pillars are needed")
     index = np.minimum(kinds.index(d), len(kinds.count) - 1)
     change = np.exp(np.tensordot(answers, pairs.at(kinds.width_um, kinds.length_um), 1))
-    width, length = (size[index] + bias_um for size in (kinds.width_um, kinds.length_um))
+    width, length = (
+        size[index] + bias_um for size in (kinds.width_um, kinds.length_um)
+    )
     return np.asarray(PairTable.of(lens).t(width, length) * change[index])
 
 
-def _of_one_size(lens: Lens, response: Sensitivity, x: Array, bias_um: Array, angle_rad: float) -> Array:
+def _of_one_size(
+    lens: Lens, response: Sensitivity, x: Array, bias_um: Array, angle_rad: float
+) -> Array:
     """(y, x) t by the proxy of the lens; what is no pillar is that of some."""
     d, made = lens.diameters, state(x)
     wave = lens.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3
@@ -72,14 +100,20 @@ def _of_one_size(lens: Lens, response: Sensitivity, x: Array, bias_um: Array, an
     low, high = float(np.nanmin(grown)), float(np.nanmax(grown)) + 1e-9
     place = np.nan_to_num((grown - low) * ((_TABLE - 2) / (high - low)))
     diameter = low + np.arange(_TABLE) * ((high - low) / (_TABLE - 2))
-    t = transmission(lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad)
+    t = transmission(
+        lens.proxy, response, diameter, wave, made.answers(), angle_rad=angle_rad
+    )
     below = place.astype(np.int32)
     t = t[below] + (place - below) * np.diff(t)[below]
     return np.asarray(t * biased(response, np.nan_to_num(grown, nan=low), bias_um))
 
 
-def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Array]) -> Array:
-    """(y, x) values at every pillar of a polynomial in (u, v): exact from one node more than its degree in each."""
+def _on_pillars(
+    diameters: DiameterMap, low_order: Callable[[Array, Array], Array]
+) -> Array:
+    """(y, x) values at every pillar of a polynomial in (u, v): exact from one node more
+    than its degree in each.
+    """
     node = legendre.nodes(_NODES)[0]
     axes = (axis / diameters.radius_um for axis in (diameters.x_um, diameters.y_um))
     along_x, along_y = (legendre.interpolation(len(node), axis) for axis in axes)
@@ -87,18 +121,26 @@ def _on_pillars(diameters: DiameterMap, low_order: Callable[[Array, Array], Arra
 
 
 def built_lens(design: Lens, x: Array) -> Lens:
-    """The design with the as-built diameters, wavelength and distance; they are clipped to the proxy's domain.
+    """The design with the as-built diameters, wavelength and distance; they are clipped
+    to the proxy's domain.
 
-    Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and :func:`psf_stack` hold them.
+    Height, index, sidewall and wave-front errors are no diameters: :func:`pillars` and
+    :func:`psf_stack` hold them.
     """
     d = design.diameters
     bias = _on_pillars(d, state(x).bias_um)
     low, high = design.proxy.domain_um
     grown = np.clip(d.diameter_um + bias, low, min(high, 0.999 * d.pitch_um))
-    longer = None if d.length_um is None else np.where(d.diameter_um > 0, np.maximum(d.length_um + bias, 0.0), 0.0)
+    longer = (
+        None
+        if d.length_um is None
+        else np.where(d.diameter_um > 0, np.maximum(d.length_um + bias, 0.0), 0.0)
+    )
     return dataclasses.replace(
         design,
-        diameters=dataclasses.replace(d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0), length_um=longer),
+        diameters=dataclasses.replace(
+            d, diameter_um=np.where(d.diameter_um > 0, grown, 0.0), length_um=longer
+        ),
         wavelength_um=design.wavelength_um + x[PLACE["wavelength_nm"]] * 1e-3,
         sensor_distance_um=design.sensor_distance_um + x[PLACE["distance_um"]],
         profile="as-built",
@@ -116,17 +158,22 @@ def psf_stack(
     offset_um: tuple[float, float] = (0.0, 0.0),
     tolerance: float = 1e-4,
 ) -> "PsfStack":
-    """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs: :func:`metalens.psf.psf_stack`.
+    """PSFs (angle, depth, y, x) of the lens as built, by the engine that designs:
+    :func:`metalens.psf.psf_stack`.
 
-    Pillars, process, aberrations and distance enter; what belongs to one bench (stage, decentre, source size,
-    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the chief ray, beside that of the
+    Pillars, process, aberrations and distance enter; what belongs to one bench (stage,
+    decentre, source size,
+    crosstalk, gain, background) does not. ``offset_um``: (x, y) of the window from the
+    chief ray, beside that of the
     view. Accuracy: ``error`` of the record, relative L2.
     """
     from metalens import psf
 
     parts = []
     for angle in view.angles_rad:
-        t = pillars(lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes)
+        t = pillars(
+            lens, response, x, angle_rad=incidence_rad(lens.proxy, angle), modes=modes
+        )
         parts.append(
             psf.psf_stack(
                 np.angle(t).astype(np.float32),
@@ -136,11 +183,14 @@ def psf_stack(
                 sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
                 angle_rad=[list(angle)],
                 tolerance=tolerance,
-                **view.seen | {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())},
+                **view.seen
+                | {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())},
                 layers=lens.layers,
             )
         )
     worst = max(parts, key=lambda part: part.error)
     fields = ("intensity", "energy_um2", "angles_rad", "centres_um")
-    join: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+    join: Any = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in fields
+    }
     return dataclasses.replace(worst, **join)

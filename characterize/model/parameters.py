@@ -1,6 +1,8 @@
-"""The parameters of an as-built lens and its bench: what each means, in which unit, and what is known beforehand.
+"""The parameters of an as-built lens and its bench: what each means, in which unit, and
+what is known beforehand.
 
-Those of the lens are the table of :mod:`metalens.made.causes`; those of the bench stand here.
+Those of the lens are the table of :mod:`metalens.made.causes`; those of the bench stand
+here.
 """
 
 import dataclasses
@@ -13,15 +15,27 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, nearest
 from metalens.lens import Lens
-from metalens.made import CAUSES, Answers, Bends, Cause, State, Widens, coarser, larger, named
+from metalens.made import (
+    CAUSES,
+    Answers,
+    Bends,
+    Cause,
+    State,
+    Widens,
+    coarser,
+    larger,
+    named,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One number that describes lens or bench.
 
-    scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without any metrology (inf: none).
-    low, high: bounds. free: fitted unless told otherwise. plausible: standard deviation that is reckoned with where
+    scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without
+    any metrology (inf: none).
+    low, high: bounds. free: fitted unless told otherwise. plausible: standard deviation
+    that is reckoned with where
     it is neither fitted nor stated; sigma where 0.
     """
 
@@ -43,9 +57,11 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Unfitted:
-    """What bench or mask may add that no parameter describes: never fitted, reckoned with in the intervals.
+    """What bench or mask may add that no parameter describes: never fitted, reckoned
+    with in the intervals.
 
-    sigma: its size (standard deviation) where nobody states it; ``[[known]]`` with value 0 and a sigma states it.
+    sigma: its size (standard deviation) where nobody states it; ``[[known]]`` with
+    value 0 and a sigma states it.
     """
 
     name: str
@@ -55,7 +71,15 @@ class Unfitted:
 
 def _of(row: Cause) -> Parameter:
     bounds = row.low, row.high
-    return Parameter(row.name, row.meaning, row.scale, row.sigma, *bounds, free=row.free, plausible=row.plausible)
+    return Parameter(
+        row.name,
+        row.meaning,
+        row.scale,
+        row.sigma,
+        *bounds,
+        free=row.free,
+        plausible=row.plausible,
+    )
 
 
 def _light(name: str, meaning: str) -> Parameter:
@@ -94,24 +118,43 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("background_y_e", "background at the lower edge less that at the centre", 2.0),
 )  # fmt: skip
 UNFITTED: tuple[Unfitted, ...] = (
-    Unfitted("stitching_nm", "shift of each write field of the mask, four across the lens", 60.0),
+    Unfitted(
+        "stitching_nm",
+        "shift of each write field of the mask, four across the lens",
+        60.0,
+    ),
     Unfitted("pixel_percent", "true pixel pitch over the stated one, less 1", 1.0),
-    Unfitted("camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0),
-    Unfitted("window_px", "window of a field angle off the chief ray there, each way, beside the common decentre", 0.3),
-    Unfitted("stop_um", "aperture stop of the lens beside its place in the design, each way", 3.0),
+    Unfitted(
+        "camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0
+    ),
+    Unfitted(
+        "window_px",
+        "window of a field angle off the chief ray there, each way, beside the common decentre",
+        0.3,
+    ),
+    Unfitted(
+        "stop_um",
+        "aperture stop of the lens beside its place in the design, each way",
+        3.0,
+    ),
 )
 NAMES = tuple(p.name for p in PARAMETERS)
 PLACE = {name: i for i, name in enumerate(NAMES)}
-_IN_PIXELS = "decentre_x_um", "decentre_y_um"  # which are as wide as the blur, and that as the wave is long
+_IN_PIXELS = (
+    "decentre_x_um",
+    "decentre_y_um",
+)  # which are as wide as the blur, and that as the wave is long
 _UNFITTED = tuple(row.name for row in UNFITTED)
 _CAUSES = [PLACE[row.name] for row in CAUSES]
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What metrology says of a parameter: spectrometer (wavelength), AFM (height), SEM (bias), ellipsometer (index).
+    """What metrology says of a parameter: spectrometer (wavelength), AFM (height), SEM
+    (bias), ellipsometer (index).
 
-    sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely. Of what is never fitted
+    sigma: standard error; 0 holds the parameter at ``value``, inf frees it entirely. Of
+    what is never fitted
     (:data:`UNFITTED`) ``value`` is 0 and ``sigma`` says how large it may be.
     name: of the parameter, its unit included. value: as measured, in that unit.
     """
@@ -122,31 +165,51 @@ class Known:
 
     def __post_init__(self) -> None:
         if self.name not in PLACE and self.name not in _UNFITTED:
-            raise ConfigError(f"unknown parameter {self.name!r}{nearest(self.name, (*NAMES, *_UNFITTED))}")
-        if self.name in _UNFITTED and not (self.value == 0 and math.isfinite(self.sigma)):
+            raise ConfigError(
+                f"unknown parameter {self.name!r}{nearest(self.name, (*NAMES, *_UNFITTED))}"
+            )
+        if self.name in _UNFITTED and not (
+            self.value == 0 and math.isfinite(self.sigma)
+        ):
             raise ConfigError(
                 f"{self.name} = {self.value} +- {self.sigma}: it is never fitted; need value = 0, and how large it may "
                 "be as sigma"
             )
         if not math.isfinite(self.value) or not self.sigma >= 0:
-            raise ConfigError(f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0")
+            raise ConfigError(
+                f"{self.name}: value {self.value}, sigma {self.sigma}; need finite, and sigma >= 0"
+            )
 
 
 def usual(names: Sequence[str], lens: Lens) -> list[Parameter]:
-    """The rows of some parameters for a lens: what is in nm, and decentre, grow with long waves (``made.coarser``).
+    """The rows of some parameters for a lens: what is in nm, and decentre, grow with
+    long waves (``made.coarser``).
 
     The distance may be wrong by a quarter, so that no search runs into the lens.
     """
     wave = lens.wavelength_um
-    factors = [coarser(wave) if name in _IN_PIXELS else larger(name, wave) for name in names]
-    rows = [_times(PARAMETERS[PLACE[name]], factor) for name, factor in zip(names, factors, strict=True)]
-    reach = [lens.sensor_distance_um / 4 if row.name == "distance_um" else math.inf for row in rows]
+    factors = [
+        coarser(wave) if name in _IN_PIXELS else larger(name, wave) for name in names
+    ]
+    rows = [
+        _times(PARAMETERS[PLACE[name]], factor)
+        for name, factor in zip(names, factors, strict=True)
+    ]
+    reach = [
+        lens.sensor_distance_um / 4 if row.name == "distance_um" else math.inf
+        for row in rows
+    ]
     pairs = zip(rows, reach, strict=True)
-    return [dataclasses.replace(row, low=max(row.low, -most), high=min(row.high, most)) for row, most in pairs]
+    return [
+        dataclasses.replace(row, low=max(row.low, -most), high=min(row.high, most))
+        for row, most in pairs
+    ]
 
 
 def unstated(name: str, lens: Lens) -> float:
-    """Standard deviation of a parameter, or of what none describes, that is reckoned with where nobody states it."""
+    """Standard deviation of a parameter, or of what none describes, that is reckoned
+    with where nobody states it.
+    """
     if name in PLACE:
         return usual([name], lens)[0].unstated
     row = next(row for row in UNFITTED if row.name == name)
@@ -154,7 +217,10 @@ def unstated(name: str, lens: Lens) -> float:
 
 
 def _times(row: Parameter, factor: float) -> Parameter:
-    sizes = {name: factor * getattr(row, name) for name in ("scale", "sigma", "low", "high", "plausible")}
+    sizes = {
+        name: factor * getattr(row, name)
+        for name in ("scale", "sigma", "low", "high", "plausible")
+    }
     return dataclasses.replace(row, **sizes)
 
 
@@ -165,8 +231,12 @@ def unfitted(known: dict[str, Known], lens: Lens) -> dict[str, float]:
         ConfigError: that of a stop, which the lens does not have.
     """
     if "stop_um" in known and lens.layers.stop is None:
-        raise ConfigError("stop_um: the lens has no aperture stop; leave it out of [[known]]")
-    return {row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known}
+        raise ConfigError(
+            "stop_um: the lens has no aperture stop; leave it out of [[known]]"
+        )
+    return {
+        row.name: known.pop(row.name).sigma for row in UNFITTED if row.name in known
+    }
 
 
 def vector(values: Mapping[str, float] | None = None) -> Array:
@@ -178,7 +248,9 @@ def vector(values: Mapping[str, float] | None = None) -> Array:
     out = np.array([p.start for p in PARAMETERS])
     for name, value in (values or {}).items():
         if name in _UNFITTED:
-            raise ConfigError(f"{name} is never fitted: it belongs in [[known]] of --metrology alone")
+            raise ConfigError(
+                f"{name} is never fitted: it belongs in [[known]] of --metrology alone"
+            )
         if name not in PLACE:
             raise ConfigError(f"unknown parameter {name!r}{nearest(name, NAMES)}")
         out[PLACE[name]] = value

@@ -1,7 +1,10 @@
-"""What a change of the pillars does to their transmission, as few functions of the designed diameter.
+"""What a change of the pillars does to their transmission, as few functions of the
+designed diameter.
 
-t(D + b; height, index, sidewall, wavelength) for all small changes lies close to a space of a few functions u_k(D);
-summing the lens once for each u_k makes every change of process act on coarse nodes (see :mod:`reduced`).
+t(D + b; height, index, sidewall, wavelength) for all small changes lies close to a
+space of a few functions u_k(D);
+summing the lens once for each u_k makes every change of process act on coarse nodes
+(see :mod:`reduced`).
 """
 
 import dataclasses
@@ -36,7 +39,9 @@ from metalens.made import (
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
-_COLOURS = 12  # wavelengths that t is interpolated between: it turns by less than one radian over the span
+# wavelengths that t is interpolated between: it turns by less than one radian over the
+# span
+_COLOURS = 12
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
 _ROWS = [row for _, row in of_kind(Answers)]
@@ -44,7 +49,8 @@ _ROWS = [row for _, row in of_kind(Answers)]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change of the pillars that is the same all over the lens: the answering causes in base units, and the wavelength.
+    """Change of the pillars that is the same all over the lens: the answering causes in
+    base units, and the wavelength.
 
     Zeros are the design.
     """
@@ -55,37 +61,53 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Largest change of each kind that a low-rank basis must hold; beyond it the fit is refused.
+    """Largest change of each kind that a low-rank basis must hold; beyond it the fit is
+    refused.
 
     What is here is of lenses for 0.85 um; see :meth:`of`.
     """
 
     bias_um: float = 0.03
-    answers: tuple[float, ...] = tuple(_ROOM * max(-row.low, row.high) * row.unit for row in _ROWS)
+    answers: tuple[float, ...] = tuple(
+        _ROOM * max(-row.low, row.high) * row.unit for row in _ROWS
+    )
     wavelength_um: float = 0.006
 
     @classmethod
     def of(cls, wavelength_um: float) -> "Range":
-        """Of lenses for a wavelength: lengths are larger where it is longer (``made.coarser``)."""
+        """Of lenses for a wavelength: lengths are larger where it is longer
+        (``made.coarser``).
+        """
         more, rows = coarser(wavelength_um), zip(_ROWS, cls().answers, strict=True)
-        answers = tuple(amount * larger(row.name, wavelength_um) for row, amount in rows)
+        answers = tuple(
+            amount * larger(row.name, wavelength_um) for row, amount in rows
+        )
         return cls(more * cls().bias_um, answers, more * cls().wavelength_um)
 
     def within(self, cell: Cell) -> "Range":
         """Without what pillars of this cell cannot have."""
         none = lacking(cell)
-        kept = (0.0 if row.name in none else amount for row, amount in zip(_ROWS, self.answers, strict=True))
+        kept = (
+            0.0 if row.name in none else amount
+            for row, amount in zip(_ROWS, self.answers, strict=True)
+        )
         return dataclasses.replace(self, answers=tuple(kept))
 
 
 class Pillars:
     """Transmission of pillars under change, exact and in its low-rank basis.
 
-    basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,) biases where t is
-    formed. error: largest |t - low-rank| met on random changes inside the range, that the basis was not made from.
+    basis: (r, grid) orthonormal functions on ``diameter_um`` (grid,). nodes_um: (b,)
+    biases where t is
+    formed. error: largest |t - low-rank| met on random changes inside the range, that
+    the basis was not made from.
     """
 
-    _laid: tuple[int, ...] = (1, 2, 3)  # times the usual intervals between bias nodes that are tried
+    _laid: tuple[int, ...] = (
+        1,
+        2,
+        3,
+    )  # times the usual intervals between bias nodes that are tried
 
     def __init__(
         self,
@@ -97,9 +119,16 @@ class Pillars:
         angle_rad: float = 0.0,
     ) -> None:
         span = (span or Range.of(lens.wavelength_um)).within(lens.cell)
-        self.lens, self.response, self.span, self.angle_rad = lens, response, span, angle_rad
+        self.lens, self.response, self.span, self.angle_rad = (
+            lens,
+            response,
+            span,
+            angle_rad,
+        )
         self.diameter_um = self._kinds()
-        b = max(7, 2 * math.ceil(span.bias_um / (0.006 * coarser(lens.wavelength_um))) + 1)
+        b = max(
+            7, 2 * math.ceil(span.bias_um / (0.006 * coarser(lens.wavelength_um))) + 1
+        )
         for times in self._laid:  # resonances want more
             self._lay(times * (b - 1) + 1, tolerance)
             self.error = self._measure()
@@ -122,25 +151,44 @@ class Pillars:
         self._colours = self._through_colours()
         columns = np.concatenate([self._at_nodes(p) for p in self._training()])
         u, size, _ = np.linalg.svd(columns.T, full_matrices=False)
-        tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um))
-        self.basis = np.ascontiguousarray(u[:, : max(1, int((tail > tolerance).sum()))].T.conj())
+        tail = np.sqrt(
+            np.cumsum(size[::-1] ** 2)[::-1] / len(columns) / len(self.diameter_um)
+        )
+        self.basis = np.ascontiguousarray(
+            u[:, : max(1, int((tail > tolerance).sum()))].T.conj()
+        )
 
     def _answers(self, nodes: Array) -> tuple[Answer, Array | float]:
-        """Of the pillars at (b, 1) bias nodes: under the answering causes, and what the edges add to the size."""
+        """Of the pillars at (b, 1) bias nodes: under the answering causes, and what the
+        edges add to the size.
+        """
         d = self.diameter_um + nodes
-        return answer(self.lens.proxy, self.response, d), biased(self.response, d, nodes)
+        return answer(self.lens.proxy, self.response, d), biased(
+            self.response, d, nodes
+        )
 
     def exact(self, bias_um: Array | float, change: Change) -> Array:
-        """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under a change."""
+        """(..., grid) complex t at ``diameter_um`` + bias (a number, or (..., 1)) under
+        a change.
+        """
         d = self.diameter_um + bias_um
         wave = self.lens.wavelength_um + change.wavelength_um
         amounts = np.array(change.answers)
-        return transmission(self.lens.proxy, self.response, d, wave, amounts, bias_um=bias_um, angle_rad=self.angle_rad)
+        return transmission(
+            self.lens.proxy,
+            self.response,
+            d,
+            wave,
+            amounts,
+            bias_um=bias_um,
+            angle_rad=self.angle_rad,
+        )
 
     def coefficients(self, change: Change, lean_um: float = 0.0) -> Array:
         """(b, r) coefficients of t in the basis, as Chebyshev series of the bias.
 
-        lean_um: diameter at the foot of the pillars less that at half height, which is that at half height less that at
+        lean_um: diameter at the foot of the pillars less that at half height, which is
+            that at half height less that at
         the top. The mean of ln t over the height, by Gauss's two points.
         """
         t = self._at_nodes(change)
@@ -148,42 +196,68 @@ class Pillars:
             off = lean_um / math.sqrt(3)
             reach = max(self.span.bias_um - off, 0.0)
             bias = np.clip(self.nodes_um, -reach, reach)[:, None]
-            low, middle, high = (self.exact(bias + step, Change()) for step in (-off, 0.0, off))
+            low, middle, high = (
+                self.exact(bias + step, Change()) for step in (-off, 0.0, off)
+            )
             t = t * np.sqrt(low * high / middle**2)
         return np.asarray(self._to_series @ (t @ self.basis.T))
 
     def slopes(self, change: Change) -> Array:
-        """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering causes, in base units."""
+        """(answering causes, b, r) derivatives of :meth:`coefficients` by the answering
+        causes, in base units.
+        """
         rates = self._answer.rates(np.array(change.answers)) * self._at_nodes(change)
         return np.asarray(self._to_series @ (rates @ self.basis.T))
 
     def _at_nodes(self, change: Change) -> Array:
-        """:meth:`exact` at the bias nodes; what the last few wavelengths made of the design is kept."""
+        """:meth:`exact` at the bias nodes; what the last few wavelengths made of the
+        design is kept.
+        """
         wave = self.lens.wavelength_um + change.wavelength_um
         if wave not in self._designed:
             if len(self._designed) >= 8:
                 self._designed.pop(next(iter(self._designed)))
-            self._designed[wave] = self._designed_at(wave, change.wavelength_um / self.span.wavelength_um)
-        return np.asarray(self._designed[wave] * self._answer.factor(np.array(change.answers)) * self._biased)
+            self._designed[wave] = self._designed_at(
+                wave, change.wavelength_um / self.span.wavelength_um
+            )
+        return np.asarray(
+            self._designed[wave]
+            * self._answer.factor(np.array(change.answers))
+            * self._biased
+        )
 
     def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
-        """(b, grid) t as designed at the bias nodes; between wavelengths that are known where ``share`` of the span is
+        """(b, grid) t as designed at the bias nodes; between wavelengths that are known
+        where ``share`` of the span is
         inside it."""
         if abs(share) <= 1 and len(self._colours):
-            return np.asarray(np.tensordot(legendre.interpolation(_COLOURS, np.array(share)), self._colours, 1))
+            return np.asarray(
+                np.tensordot(
+                    legendre.interpolation(_COLOURS, np.array(share)), self._colours, 1
+                )
+            )
         d = self.diameter_um + self.nodes_um[:, None]
         return designed(self.lens.proxy, d, wave_um, angle_rad=self.angle_rad)
 
     def _through_colours(self) -> Array:
-        """(colours, b, grid) :meth:`_designed_at` over the span of wavelengths; none where the proxy ends before."""
+        """(colours, b, grid) :meth:`_designed_at` over the span of wavelengths; none
+        where the proxy ends before.
+        """
         middle, reach = self.lens.wavelength_um, self.span.wavelength_um
         low, high = self.lens.proxy.wavelengths_um
         if not low <= middle - reach < middle + reach <= high:
             return np.empty(0)
-        return np.stack([self._designed_at(w) for w in legendre.mapped(_COLOURS, middle - reach, middle + reach)])
+        return np.stack(
+            [
+                self._designed_at(w)
+                for w in legendre.mapped(_COLOURS, middle - reach, middle + reach)
+            ]
+        )
 
     def table(self) -> Array:
-        """(r, entries): the conjugate basis on a fine grid of diameters; the last entry is no pillar."""
+        """(r, entries): the conjugate basis on a fine grid of diameters; the last entry
+        is no pillar.
+        """
         place = np.linspace(0, len(self.diameter_um) - 1, _ENTRIES)
         rows = [_cubic(row.conj(), place) for row in self.basis]
         return np.concatenate([rows, np.zeros((len(rows), 1))], axis=1)
@@ -195,11 +269,15 @@ class Pillars:
     def place(self, diameter_um: Array) -> Array:
         """Entry of :meth:`table` nearest to designed diameters (any shape)."""
         low, high = self.diameter_um[0], self.diameter_um[-1]
-        entry = np.rint((np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))).astype(np.int32)
+        entry = np.rint(
+            (np.maximum(diameter_um, low) - low) * ((_ENTRIES - 1) / (high - low))
+        ).astype(np.int32)
         return np.where(diameter_um > 0, entry, _ENTRIES)
 
     def weights(self, bias_um: Array) -> Array:
-        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, in its precision."""
+        """(b, *shape) Chebyshev polynomials of ``bias_um`` over the range, in its
+        precision.
+        """
         x = np.asarray(bias_um) / self.span.bias_um
         value = np.empty((len(self.nodes_um), *x.shape), x.dtype)
         value[0], value[1] = 1.0, x
@@ -208,7 +286,9 @@ class Pillars:
         return value
 
     def rates(self, bias_um: Array, weights: Array) -> Array:
-        """(b, *shape) derivatives of :meth:`weights` by the bias, from their values there."""
+        """(b, *shape) derivatives of :meth:`weights` by the bias, from their values
+        there.
+        """
         x, reach = np.asarray(bias_um) / self.span.bias_um, self.span.bias_um
         slope = np.empty_like(weights)
         slope[0], slope[1] = 0.0, 1.0
@@ -219,8 +299,17 @@ class Pillars:
     def _training(self) -> list[Change]:
         s, waves = self.span, self._waves()
         single = np.diag([*s.answers, s.wavelength_um])[: len(s.answers) + waves]
-        both = [Change(tuple(sign * one[:-1]), sign * one[-1]) for one in single if one.any() for sign in (1, -1)]
-        return [Change(), *both, *(_draw(np.random.default_rng(i), s, waves) for i in range(6))]
+        both = [
+            Change(tuple(sign * one[:-1]), sign * one[-1])
+            for one in single
+            if one.any()
+            for sign in (1, -1)
+        ]
+        return [
+            Change(),
+            *both,
+            *(_draw(np.random.default_rng(i), s, waves) for i in range(6)),
+        ]
 
     def _waves(self) -> bool:
         return bool(np.ptp(self.lens.proxy.wavelengths_um) > 0)
@@ -229,17 +318,26 @@ class Pillars:
         random = np.random.default_rng(99)
         worst = 0.0
         for _ in range(40):
-            change, bias = _draw(random, self.span, self._waves()), random.uniform(-0.7, 0.7) * self.span.bias_um
+            change, bias = (
+                _draw(random, self.span, self._waves()),
+                random.uniform(-0.7, 0.7) * self.span.bias_um,
+            )
             c = self.weights(np.array(bias)) @ self.coefficients(change)
-            worst = max(worst, float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()))
+            worst = max(
+                worst,
+                float(np.abs(self.basis.conj().T @ c - self.exact(bias, change)).max()),
+            )
         return worst
 
 
 class PairedPillars(Pillars):
-    """As :class:`Pillars`, of two sizes: functions of the kinds of pillars that the lens has, one after the other.
+    """As :class:`Pillars`, of two sizes: functions of the kinds of pillars that the
+    lens has, one after the other.
 
-    A bias moves all edges, so both sizes alike, along the table of the lens; the answers are those of the designed
-    sizes. t is taken to be that of the design's wavelength: the table knows single ones. ``diameter_um``: width of
+    A bias moves all edges, so both sizes alike, along the table of the lens; the
+    answers are those of the designed
+    sizes. t is taken to be that of the design's wavelength: the table knows single
+    ones. ``diameter_um``: width of
     every kind.
     """
 
@@ -259,7 +357,9 @@ class PairedPillars(Pillars):
     def exact(self, bias_um: Array | float, change: Change) -> Array:
         """(..., kinds) complex t of both sizes + bias under a change."""
         t = self._table.t(self._own.width_um + bias_um, self._own.length_um + bias_um)
-        return np.asarray(t * np.exp(np.tensordot(np.array(change.answers), self._rates, 1)))
+        return np.asarray(
+            t * np.exp(np.tensordot(np.array(change.answers), self._rates, 1))
+        )
 
     def _designed_at(self, wave_um: float, share: float = math.inf) -> Array:
         return self.exact(self.nodes_um[:, None], Change())
@@ -272,14 +372,22 @@ class PairedPillars(Pillars):
 
     def table(self) -> Array:
         """(r, kinds + 1): the conjugate basis; the last entry is no pillar."""
-        return np.concatenate([self.basis.conj(), np.zeros((len(self.basis), 1))], axis=1)
+        return np.concatenate(
+            [self.basis.conj(), np.zeros((len(self.basis), 1))], axis=1
+        )
 
     def entries(self, diameters: DiameterMap, rows: slice, columns: slice) -> Array:
         """(y, x) kinds of the pillars of some rows and columns."""
         return self._own.index(diameters, rows, columns)
 
 
-def of_lens(lens: Lens, response: Sensitivity, *, span: Range | None = None, angle_rad: float = 0.0) -> Pillars:
+def of_lens(
+    lens: Lens,
+    response: Sensitivity,
+    *,
+    span: Range | None = None,
+    angle_rad: float = 0.0,
+) -> Pillars:
     """The pillars of a lens, of one size or of two."""
     kind = Pillars if lens.pairs is None else PairedPillars
     return kind(lens, response, span=span, angle_rad=angle_rad)
@@ -287,11 +395,15 @@ def of_lens(lens: Lens, response: Sensitivity, *, span: Range | None = None, ang
 
 def change(x: Array) -> Change:
     """The pillars' change that the parameters mean."""
-    return Change(tuple(state(x).answers().tolist()), float(x[PLACE["wavelength_nm"]]) * 1e-3)
+    return Change(
+        tuple(state(x).answers().tolist()), float(x[PLACE["wavelength_nm"]]) * 1e-3
+    )
 
 
 def incidence_rad(proxy: Proxy, angle_rad: Iterable[float]) -> float:
-    """Angle of incidence for a field angle (x, y): 0 where the proxy holds at normal incidence only."""
+    """Angle of incidence for a field angle (x, y): 0 where the proxy holds at normal
+    incidence only.
+    """
     tilt = math.atan(math.hypot(*(math.tan(a) for a in angle_rad)))
     return tilt if proxy.max_angle_rad > 0 else 0.0
 
@@ -305,7 +417,9 @@ def _draw(random: np.random.Generator, span: Range, waves: bool) -> Change:
 
 
 def _cubic(values: Array, place: Array) -> Array:
-    """The cubic through the four samples nearest to each place of an even grid, at its ends through the last four."""
+    """The cubic through the four samples nearest to each place of an even grid, at its
+    ends through the last four.
+    """
     i = np.clip(place.astype(int), 1, len(values) - 3)
     t = place - i
     a, b, c, d = values[i - 1], values[i], values[i + 1], values[i + 2]

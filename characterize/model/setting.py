@@ -1,4 +1,6 @@
-"""Which frames are predicted: depths, angles, exposures, window, groups; where the source stood, and its spectrum."""
+"""Which frames are predicted: depths, angles, exposures, window, groups; where the
+source stood, and its spectrum.
+"""
 
 import dataclasses
 import functools
@@ -16,7 +18,9 @@ from metalens.ground.errors import FitError
 from metalens.lens import Lens
 from metalens.made import Bends, Widens, maps, named
 
-LEAST_NM = 0.02  # of a spectrum that colours are chosen for: none has no slope by its width
+LEAST_NM = (
+    0.02  # of a spectrum that colours are chosen for: none has no slope by its width
+)
 _RIM, _TURN_STEP, _MOST_COLOURS = 48, 0.05, 64
 
 
@@ -26,9 +30,11 @@ class Setting:
 
     depth_um: (n,) stated source depths. angle_rad: (n, 2). exposure: (n,) relative.
     pixel_um: of the sensor; rows, columns: of the window about the chief ray.
-    margin: pixels around it that blur may reach in from. fill: width of a pixel over the pitch.
+    margin: pixels around it that blur may reach in from. fill: width of a pixel over
+    the pitch.
     tolerance: relative error of the field allowed to the reduction.
-    dark_known: the dark level is subtracted, so that the background is light and grows with the exposure.
+    dark_known: the dark level is subtracted, so that the background is light and grows
+    with the exposure.
     """
 
     depth_um: Array
@@ -44,38 +50,67 @@ class Setting:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.depth_um).all() and (self.depth_um > 0).all()):
-            raise FitError("source depths must be finite and above 0; give them in stage.csv (depth_um)")
+            raise FitError(
+                "source depths must be finite and above 0; give them in stage.csv (depth_um)"
+            )
         if not (math.isfinite(self.pixel_um) and self.pixel_um > 0):
-            raise FitError("pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted")
+            raise FitError(
+                "pixel_um is missing: give the sensor's pixel in capture.toml; it cannot be fitted"
+            )
 
     @property
     def edges(self) -> tuple[Array, Array]:
-        """(rows, 1) and (1, columns) of the pixels, -1 to 1 from edge to edge about the middle one."""
+        """(rows, 1) and (1, columns) of the pixels, -1 to 1 from edge to edge about the
+        middle one.
+        """
         y, x = ((np.arange(n) - n // 2) / (n / 2) for n in (self.rows, self.columns))
         return y[:, None], x[None]
 
     @property
     def glow(self) -> Array:
-        """(n, 1, 1) background of every frame over that of exposure 1; what nobody subtracted is alike in all."""
+        """(n, 1, 1) background of every frame over that of exposure 1; what nobody
+        subtracted is alike in all.
+        """
         return np.where(self.dark_known, self.exposure, 1.0)[:, None, None]
 
 
 def true_depth(x: Array, setting: Setting, centre_um: float) -> Array:
-    """(n,) source depths after stage zero and scale; the scale acts about the middle of the stage."""
+    """(n,) source depths after stage zero and scale; the scale acts about the middle of
+    the stage.
+    """
     stated = setting.depth_um
-    depth = stated + x[PLACE["stage_zero_um"]] + x[PLACE["stage_scale"]] * (stated - centre_um)
+    depth = (
+        stated
+        + x[PLACE["stage_zero_um"]]
+        + x[PLACE["stage_scale"]] * (stated - centre_um)
+    )
     return np.asarray(np.maximum(depth, 0.2 * stated))
 
 
-def brightness(x: Array, setting: Setting, *, centre_um: float, reference_um: float, films: Films = AIR) -> Array:
-    """(n,) electrons in a pixel for light of unit density from ``reference_um``, by gain, exposure and depth."""
+def brightness(
+    x: Array,
+    setting: Setting,
+    *,
+    centre_um: float,
+    reference_um: float,
+    films: Films = AIR,
+) -> Array:
+    """(n,) electrons in a pixel for light of unit density from ``reference_um``, by
+    gain, exposure and depth.
+    """
     depth = films.apparent_um(true_depth(x, setting, centre_um))
     gain = np.exp(x[PLACE["log_gain"]]) * (setting.fill * setting.pixel_um) ** 2
-    return np.asarray(gain * setting.exposure * (films.apparent_um(reference_um) / depth) ** 2)
+    return np.asarray(
+        gain * setting.exposure * (films.apparent_um(reference_um) / depth) ** 2
+    )
 
 
-def dimming(x: Array, setting: Setting, centre_um: float, films: Films = AIR) -> dict[str, Array]:
-    """(n,) relative changes of :func:`brightness` by the stage: light falls as the square of the depth."""
+def dimming(
+    x: Array, setting: Setting, centre_um: float, films: Films = AIR
+) -> dict[str, Array]:
+    """(n,) relative changes of :func:`brightness` by the stage: light falls as the
+    square of the depth.
+    """
     rate = -2 / films.apparent_um(true_depth(x, setting, centre_um))
     return {"stage_zero_um": rate, "stage_scale": rate * (setting.depth_um - centre_um)}
 
@@ -92,7 +127,9 @@ LIGHT = ("light_x", "light_y", "light_r")
 
 
 def light_maps(u: Array, v: Array) -> Array:
-    """(3, *shape) ln of the irradiance at lens places over the radius, for one unit of each of ``LIGHT``."""
+    """(3, *shape) ln of the irradiance at lens places over the radius, for one unit of
+    each of ``LIGHT``.
+    """
     return np.stack([u, v, u * u + v * v - 0.5])
 
 
@@ -100,8 +137,10 @@ def light_maps(u: Array, v: Array) -> Array:
 class Group:
     """Frames of one field angle, by their ``index``, and the lens as they see it.
 
-    bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the diameters, of a residual phase.
-    apart: the same frames behind a stop, depth by depth where it stands before the pillars: others of them are lit.
+    bending, widening, residual: (m, q, p) on the nodes: of the wave front, of the
+    diameters, of a residual phase.
+    apart: the same frames behind a stop, depth by depth where it stands before the
+    pillars: others of them are lit.
     """
 
     index: Array
@@ -120,15 +159,23 @@ class Group:
     @classmethod
     def of(cls, index: Array, pillars: Pillars, reduced: Reduced) -> "Group":
         """Without a residual phase."""
-        bending, widening = (maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens))
-        return cls(index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape)))
+        bending, widening = (
+            maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens)
+        )
+        return cls(
+            index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape))
+        )
 
     def shaded(self, lens: Lens, depth_um: Array) -> "Group":
         """The same behind the lens' stop; (frames,) depths of all."""
         if lens.layers.stop is None:
             return self
         at = depth_um[self.index]
-        alike = [at == z for z in np.unique(at)] if lens.layers.stop.distance_um else [slice(None)]
+        alike = (
+            [at == z for z in np.unique(at)]
+            if lens.layers.stop.distance_um
+            else [slice(None)]
+        )
         apart = tuple(
             dataclasses.replace(
                 self,
@@ -141,10 +188,16 @@ class Group:
         return dataclasses.replace(self, apart=apart)
 
     def only(self, frames: Array) -> "Group | None":
-        """Of some frames, in rising order of their index, which are counted anew; None without any."""
+        """Of some frames, in rising order of their index, which are counted anew; None
+        without any.
+        """
         place = np.flatnonzero(np.isin(frames, self.index))
-        apart = tuple(one for one in (part.only(frames) for part in self.apart) if one is not None)
-        return dataclasses.replace(self, index=place, apart=apart) if len(place) else None
+        apart = tuple(
+            one for one in (part.only(frames) for part in self.apart) if one is not None
+        )
+        return (
+            dataclasses.replace(self, index=place, apart=apart) if len(place) else None
+        )
 
     def bent(self, residual: Array) -> "Group":
         """With the shapes of a residual phase; groups apart have the same nodes."""
@@ -156,14 +209,20 @@ class Group:
         reduced = self.reduced.quick(window_um)
         residual = self.reduced.seen_by(reduced, self.residual)
         apart = tuple(one.quick(window_um) for one in self.apart)
-        return dataclasses.replace(Group.of(self.index, self.pillars, reduced), residual=residual, apart=apart)
+        return dataclasses.replace(
+            Group.of(self.index, self.pillars, reduced), residual=residual, apart=apart
+        )
 
     def turning(self, name: str) -> Array | None:
-        """Phase on the nodes for one unit of a wave-front parameter, imaginary of uneven light; None for any other."""
+        """Phase on the nodes for one unit of a wave-front parameter, imaginary of
+        uneven light; None for any other.
+        """
         if name.startswith("residual_"):
             return np.asarray(self.residual[int(name.removeprefix("residual_"))])
         if name in LIGHT:
-            return np.asarray(-0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)])
+            return np.asarray(
+                -0.5j * light_maps(self.reduced.u, self.reduced.v)[LIGHT.index(name)]
+            )
         return np.asarray(self.bending[BENDING[name]]) if name in BENDING else None
 
 
@@ -171,10 +230,12 @@ class Group:
 class Spectrum:
     """A Gaussian line as the fewest colours that stand for it to a lens.
 
-    Intensities turn with the wavelength as the paths through the lens differ: by up to t = 2 pi path sigma over
+    Intensities turn with the wavelength as the paths through the lens differ: by up to
+    t = 2 pi path sigma over
     wavelength² in a standard deviation sigma of the line, and no faster.
 
-    path_um: largest difference in optical path between two parts of the lens. wavelength_um: of the design.
+    path_um: largest difference in optical path between two parts of the lens.
+    wavelength_um: of the design.
     tolerance: of the mean of exp(i s) over the line, exp(-s²/2), for every s up to t.
     """
 
@@ -183,25 +244,39 @@ class Spectrum:
     tolerance: float
 
     @classmethod
-    def of(cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float) -> "Spectrum":
-        """Paths from axis and rim to sources and chief ray's places, through films as through as much air as bends
+    def of(
+        cls, lens: Lens, depth_um: Array, angle_rad: Array, *, tolerance: float
+    ) -> "Spectrum":
+        """Paths from axis and rim to sources and chief ray's places, through films as
+        through as much air as bends
         light like them; a wavelength more for the pillars.
 
         Args:
             depth_um: (n,) of the sources. angle_rad: (n, 2) their field angles.
         """
         turn = np.linspace(0, 2 * math.pi, _RIM, endpoint=False)
-        x, y = (np.append(lens.diameters.radius_um * part, 0.0) for part in (np.cos(turn), np.sin(turn)))
+        x, y = (
+            np.append(lens.diameters.radius_um * part, 0.0)
+            for part in (np.cos(turn), np.sin(turn))
+        )
         z = Films.of(lens.layers, lens.wavelength_um).apparent_um(depth_um[:, None])
         d, (tx, ty) = lens.reduced_um, np.tan(angle_rad.T)[..., None]
         paths = np.sqrt((x + z * tx) ** 2 + (y + z * ty) ** 2 + z**2)
         paths = paths + np.sqrt((x - d * tx) ** 2 + (y - d * ty) ** 2 + d**2)
-        return cls(float(np.ptp(paths, axis=1).max()) + lens.wavelength_um, lens.wavelength_um, tolerance)
+        return cls(
+            float(np.ptp(paths, axis=1).max()) + lens.wavelength_um,
+            lens.wavelength_um,
+            tolerance,
+        )
 
-    def colours(self, bandwidth_nm: float, like_nm: float | None = None) -> list[tuple[float, float]]:
-        """(offset in nm, weight) of a line of this standard deviation; one for no width.
+    def colours(
+        self, bandwidth_nm: float, like_nm: float | None = None
+    ) -> list[tuple[float, float]]:
+        """(offset in nm, weight) of a line of this standard deviation; one for no
+        width.
 
-        Gauss-Hermite nodes, or even ones of Gaussian weight, of which fewer do where t is above 2.
+        Gauss-Hermite nodes, or even ones of Gaussian weight, of which fewer do where t
+        is above 2.
 
         Args:
             like_nm: another width, by which they are chosen: for differences.
@@ -213,7 +288,9 @@ class Spectrum:
             return [(0.0, 1.0)]
         wide_nm = max(bandwidth_nm if like_nm is None else like_nm, LEAST_NM)
         turn = 2 * math.pi * self.path_um * wide_nm * 1e-3 / self.wavelength_um**2
-        place, weight = _colours(math.ceil(turn / _TURN_STEP) * _TURN_STEP, self.tolerance)
+        place, weight = _colours(
+            math.ceil(turn / _TURN_STEP) * _TURN_STEP, self.tolerance
+        )
         return list(zip((bandwidth_nm * place).tolist(), weight.tolist(), strict=True))
 
 
@@ -222,9 +299,15 @@ def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
     """(n,) places in standard deviations and weights of sum 1."""
     s = np.linspace(0, turn, 129)
     for count in range(2, _MOST_COLOURS + 1):
-        for place, weight in (np.polynomial.hermite_e.hermegauss(count), _even(count, turn)):
+        for place, weight in (
+            np.polynomial.hermite_e.hermegauss(count),
+            _even(count, turn),
+        ):
             weight = weight / weight.sum()
-            if np.abs(weight @ np.cos(place[:, None] * s) - np.exp(-(s**2) / 2)).max() <= tolerance:
+            if (
+                np.abs(weight @ np.cos(place[:, None] * s) - np.exp(-(s**2) / 2)).max()
+                <= tolerance
+            ):
                 return place, weight
     raise FitError(
         f"a spectrum so wide that light turns by {turn:.0f} rad against itself in one standard deviation needs more "
@@ -233,7 +316,8 @@ def _colours(turn: float, tolerance: float) -> tuple[Array, Array]:
 
 
 def _even(count: int, turn: float) -> tuple[Array, Array]:
-    """What is cut off at the ends, exp(-r²/2), and what the steps h leave of the fastest turn, which is of size
+    """What is cut off at the ends, exp(-r²/2), and what the steps h leave of the
+    fastest turn, which is of size
     exp(-(2 pi / h - t)² / 2), are alike where the reach r is 2 pi / h - t."""
     step = (math.hypot(turn, math.sqrt(4 * math.pi * (count - 1))) - turn) / (count - 1)
     place = step * (np.arange(count) - (count - 1) / 2)

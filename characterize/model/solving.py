@@ -1,4 +1,6 @@
-"""t of a lens's pillars by the modal solver: at every diameter that a bias can lead to, under large changes."""
+"""t of a lens's pillars by the modal solver: at every diameter that a bias can lead to,
+under large changes.
+"""
 
 import functools
 import math
@@ -15,23 +17,36 @@ from metalens.lens import Lens
 from metalens.made import Answers, Cause, Solved, coarser, designed, larger, of_kind
 from metalens.pillars import curve, engines
 
-REACH_UM = 0.031  # of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter waves
+# of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter
+# waves
+REACH_UM = 0.031
 TOLERANCE = 3e-3  # of t
-_SAME, _JUDGED = 0.05, 7  # relative deviation from the proxy up to which it is of this cell, at so many diameters
+_SAME, _JUDGED = (
+    0.05,
+    7,
+)  # relative deviation from the proxy up to which it is of this cell, at so many diameters
 _FINE_UM = 5e-4  # between the diameters at which the curves are sampled, likewise
 _FIT_SHARE = 0.4  # of the tolerance, for the rational functions
 _ROOM = 1.07  # of the amounts over the bounds of a fit
-_AMOUNTS = {"height_um": (-1.0, -0.5, 0.0, 0.5, 1.0), "n": (-1.0, -0.67, -0.33, 0.0, 0.33, 0.67, 1.0)}
+_AMOUNTS = {
+    "height_um": (-1.0, -0.5, 0.0, 0.5, 1.0),
+    "n": (-1.0, -0.67, -0.33, 0.0, 0.33, 0.67, 1.0),
+}
 
 
 def solved(lens: Lens) -> Solved | None:
-    """t by the modal solver; None where the lens's proxy is not of its cell (a measured one, say).
+    """t by the modal solver; None where the lens's proxy is not of its cell (a measured
+    one, say).
 
-    Polynomials through five heights over +-30 nm (more of longer waves, ``made.coarser``), and through seven indices.
+    Polynomials through five heights over +-30 nm (more of longer waves,
+    ``made.coarser``), and through seven indices.
 
-    Accuracy: 3e-3 of t by the solver's bar, half of it on average, at these amounts. Between them polynomials miss
-    resonances that move: of random pillars and amounts (two cells of silicon, all that the bounds allow) t was off by
-    0.025 at most in the height and 6e-3 in the index, and beside the resonance of the default cell at 0.23 um by up to
+    Accuracy: 3e-3 of t by the solver's bar, half of it on average, at these amounts.
+    Between them polynomials miss
+    resonances that move: of random pillars and amounts (two cells of silicon, all that
+    the bounds allow) t was off by
+    0.025 at most in the height and 6e-3 in the index, and beside the resonance of the
+    default cell at 0.23 um by up to
     0.03 in the index (through three indices by 0.29).
 
     Raises:
@@ -40,7 +55,10 @@ def solved(lens: Lens) -> Solved | None:
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     least, most, pitch = float(d.min()), float(d.max()), lens.cell.pitch_um
     some = np.clip(np.linspace(least, most, _JUDGED), *lens.proxy.domain_um)
-    exact = [modal.solve(lens.cell, one, lens.wavelength_um, tolerance=TOLERANCE).t for one in some.tolist()]
+    exact = [
+        modal.solve(lens.cell, one, lens.wavelength_um, tolerance=TOLERANCE).t
+        for one in some.tolist()
+    ]
     ratio = np.array(exact) / designed(lens.proxy, some, lens.wavelength_um)
     if np.abs(ratio * np.exp(-1j * np.angle(ratio.mean())) - 1).max() > _SAME:
         return None
@@ -51,7 +69,9 @@ def solved(lens: Lens) -> Solved | None:
 
 @functools.lru_cache(maxsize=8)
 def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> Solved:
-    """One rational curve over the diameter for every amount of every cause, sampled finely."""
+    """One rational curve over the diameter for every amount of every cause, sampled
+    finely.
+    """
     fine = _FINE_UM * coarser(wavelength_um)
     diameters = np.linspace(low_um, high_um, math.ceil((high_um - low_um) / fine) + 1)
     changes = _changes(wavelength_um)
@@ -71,15 +91,25 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
 
     with threads.one_blas_thread():
         threads.split(len(apart), some)
-    return Solved(wavelength_um, diameters, _powers(np.array([found[one] for one in cells]).T, changes))
+    return Solved(
+        wavelength_um,
+        diameters,
+        _powers(np.array([found[one] for one in cells]).T, changes),
+    )
 
 
 def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
-    """(diameters,) t of a cell: a few dozen solves on one mesh, and the rational function through them."""
+    """(diameters,) t of a cell: a few dozen solves on one mesh, and the rational
+    function through them.
+    """
     span = float(diameters[0]), float(diameters[-1])
-    solve = engines.smooth(cell, Light(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal")
+    solve = engines.smooth(
+        cell, Light(wavelength_um), span, tolerance=TOLERANCE / 2, engine="modal"
+    )
     nodes = curve.explore(solve, *span, tolerance=_FIT_SHARE * TOLERANCE)
-    return np.asarray(curve.curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(diameters)[:, 0])
+    return np.asarray(
+        curve.curve(nodes, tolerance=_FIT_SHARE * TOLERANCE).best(diameters)[:, 0]
+    )
 
 
 def _changes(wavelength_um: float) -> list[tuple[int, Cause, tuple[float, ...]]]:
@@ -88,18 +118,24 @@ def _changes(wavelength_um: float) -> list[tuple[int, Cause, tuple[float, ...]]]
     for n, (_, row) in enumerate(of_kind(Answers)):
         if isinstance(row.acts, Answers) and row.acts.exact:
             most = _ROOM * row.high * row.unit * larger(row.name, wavelength_um)
-            out.append((n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact])))
+            out.append(
+                (n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact]))
+            )
     return out
 
 
-def _powers(columns: Array, changes: Sequence[tuple[int, Cause, tuple[float, ...]]]) -> Array:
+def _powers(
+    columns: Array, changes: Sequence[tuple[int, Cause, tuple[float, ...]]]
+) -> Array:
     """(causes, orders, diameters) power series through the amounts of each cause."""
     orders = max(len(amounts) for *_, amounts in changes)
     out = np.zeros((len(list(of_kind(Answers))), orders, len(columns)), complex)
     first = 0
     for n, _, amounts in changes:
         values = columns[:, first : first + len(amounts)].T
-        out[n, : len(amounts)] = np.linalg.solve(polynomial.polyvander(amounts, len(amounts) - 1), values)
+        out[n, : len(amounts)] = np.linalg.solve(
+            polynomial.polyvander(amounts, len(amounts) - 1), values
+        )
         first += len(amounts)
     out[:, 0] = out[changes[0][0], 0]
     return out

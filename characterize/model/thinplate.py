@@ -1,6 +1,8 @@
-"""Smooth phases over the aperture without a formula: thin-plate modes of what the parameters cannot do.
+"""Smooth phases over the aperture without a formula: thin-plate modes of what the
+parameters cannot do.
 
-A bicubic spline less piston, tilt, defocus and the low Zernikes; its modes (Wahba 1990) are equal in rms and ordered by
+A bicubic spline less piston, tilt, defocus and the low Zernikes; its modes (Wahba 1990)
+are equal in rms and ordered by
 bending energy: the more a mode bends, the less likely it is.
 """
 
@@ -18,46 +20,66 @@ _GRID = 61
 
 
 def phase_rad(modes: Array, u: Array, v: Array) -> Array:
-    """(len(v), len(u)) phase of ``modes`` (m,) on a grid of lens places over the radius; 1e-5 of its size."""
+    """(len(v), len(u)) phase of ``modes`` (m,) on a grid of lens places over the
+    radius; 1e-5 of its size.
+    """
     t = np.linspace(-1, 1, 129)
     coarse = np.tensordot(modes, basis(*np.meshgrid(t, t), len(modes)), 1)
-    return np.asarray(RectBivariateSpline(t, t, coarse)(np.clip(v, -1, 1), np.clip(u, -1, 1)))
+    return np.asarray(
+        RectBivariateSpline(t, t, coarse)(np.clip(v, -1, 1), np.clip(u, -1, 1))
+    )
 
 
 def basis(u: Array, v: Array, count: int = MODES) -> Array:
     """(count, *shape) modes at lens places over the radius, of unit rms on the disc."""
     weights, taken, _ = _modes()
     splines, known = _splines(u, v), _known(u, v)
-    return np.asarray(np.tensordot(weights[:count], splines, 1) - np.tensordot(taken[:count], known, 1))
+    return np.asarray(
+        np.tensordot(weights[:count], splines, 1)
+        - np.tensordot(taken[:count], known, 1)
+    )
 
 
 def prior_rad() -> Array:
-    """(modes,) expected size of every mode: EXPECTED_RAD for the smoothest, then as its bending energy to the -1/2."""
+    """(modes,) expected size of every mode: EXPECTED_RAD for the smoothest, then as its
+    bending energy to the -1/2.
+    """
     energy = _modes()[2]
     return np.asarray(EXPECTED_RAD * np.sqrt(energy[0] / energy))
 
 
 def _splines(u: Array, v: Array) -> Array:
-    """(KNOTS², *shape) bicubic B-splines on -1 to 1 along both axes, held at the rim outside."""
+    """(KNOTS², *shape) bicubic B-splines on -1 to 1 along both axes, held at the rim
+    outside.
+    """
     knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, KNOTS - 2), [1.0] * 3])
 
     def along(t: Array) -> Array:
         inside = np.clip(t.ravel(), -1, 1)
-        return np.asarray(BSpline.design_matrix(inside, knots, 3).toarray().T.reshape(KNOTS, *t.shape))
+        return np.asarray(
+            BSpline.design_matrix(inside, knots, 3).toarray().T.reshape(KNOTS, *t.shape)
+        )
 
-    return np.asarray(np.einsum("i...,j...->ij...", along(v), along(u)).reshape(KNOTS**2, *u.shape))
+    return np.asarray(
+        np.einsum("i...,j...->ij...", along(v), along(u)).reshape(KNOTS**2, *u.shape)
+    )
 
 
 def _known(u: Array, v: Array) -> Array:
-    """(4 + wave-front causes, *shape) what parameters already do: piston, tilt, defocus, aberrations."""
-    return np.concatenate([np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(Bends, u, v)])
+    """(4 + wave-front causes, *shape) what parameters already do: piston, tilt,
+    defocus, aberrations.
+    """
+    return np.concatenate(
+        [np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(Bends, u, v)]
+    )
 
 
 @functools.lru_cache
 def _modes() -> tuple[Array, Array, Array]:
     """Least bending energy at unit rms, in the span of splines less the known shapes.
 
-    ((MODES, splines), (MODES, known), (MODES,) energy): a mode is the first @ splines - the second @ known.
+    ((MODES, splines), (MODES, known), (MODES,) energy): a mode is the first @ splines -
+    the second @ known.
     """
     t = np.linspace(-1, 1, _GRID)
     u, v = np.meshgrid(t, t)

@@ -1,8 +1,12 @@
-"""From nodes to a sensor window: products with two factors and few terms, on samples as coarse as the band allows.
+"""From nodes to a sensor window: products with two factors and few terms, on samples as
+coarse as the band allows.
 
-Along each axis the field less its carrier, the turns of the middle direction, holds no frequency above k times half the
-span of direction cosines. It is computed on an even grid ``ROOM`` times as fine as that asks, and interpolated to the
-window's samples by the weights of least error over the band: as in any prolate problem, that falls geometrically with
+Along each axis the field less its carrier, the turns of the middle direction, holds no
+frequency above k times half the
+span of direction cosines. It is computed on an even grid ``ROOM`` times as fine as that
+asks, and interpolated to the
+window's samples by the weights of least error over the band: as in any prolate problem,
+that falls geometrically with
 their number (Slepian and Pollak 1961; Knab 1979).
 """
 
@@ -19,20 +23,24 @@ from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 MIXED = 0.1  # of the tolerance, for functions of p in the terms
-_MIXED_FEW = 0.5  # the same where terms are left out: beside these it adds an eighth to what is missed
+# the same where terms are left out: beside these it adds an eighth to what is missed
+_MIXED_FEW = 0.5
 ROOM = 1.3  # samples over those of the sampling theorem
 _SHARE = 0.1  # of the tolerance, for the interpolation
 _COARSEST = 0.2  # tolerance of a small part of a derivative
 _TAPS = range(6, 42, 2)
 _TURNED = 24  # samples that a derivative of the field is taken from
-STEP = 1e-3  # of distance and wavelength, for derivatives: paths bend over as much as they are long
+# of distance and wavelength, for derivatives: paths bend over as much as they are long
+STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ways:
-    """Along one axis: nodes to coarse samples, ``to`` (coarse, nodes); coarse to fine samples, ``fine`` (fine, coarse).
+    """Along one axis: nodes to coarse samples, ``to`` (coarse, nodes); coarse to fine
+    samples, ``fine`` (fine, coarse).
 
-    Fields on coarse samples are less their carrier, so that ``fine`` is real; ``carrier`` (fine,) puts it back.
+    Fields on coarse samples are less their carrier, so that ``fine`` is real;
+    ``carrier`` (fine,) puts it back.
     moved: derivative of ``to`` by ``wave`` or ``distance``, per um, the carrier held.
     """
 
@@ -44,15 +52,22 @@ class Ways:
     def of_kind(self, kind: Any) -> "Ways":
         """In complex numbers of a kind."""
         moved = functools.cache(lambda name: self.moved(name).astype(kind))
-        return Ways(self.to.astype(kind), self.fine.astype(real_of(kind)), self.carrier.astype(kind), moved)
+        return Ways(
+            self.to.astype(kind),
+            self.fine.astype(real_of(kind)),
+            self.carrier.astype(kind),
+            moved,
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Terms:
-    """What is no product of both axes, as few terms: functions of p (b, p), their amounts in every term (q, r, b), and
+    """What is no product of both axes, as few terms: functions of p (b, p), their
+    amounts in every term (q, r, b), and
     every term on coarse samples (Y, r, X).
 
-    remainder, mixed: (r,), (b,) relative size of what is left out before each term, each function of p.
+    remainder, mixed: (r,), (b,) relative size of what is left out before each term,
+    each function of p.
     size: root mean square of the whole where the lens is seen.
     """
 
@@ -72,7 +87,8 @@ class Terms:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Turned:
-    """Coarse samples to derivatives of the field: :func:`turned` along (y, x) up to a degree, real.
+    """Coarse samples to derivatives of the field: :func:`turned` along (y, x) up to a
+    degree, real.
 
     bands: (y, x) rad/um that directions are counted in; kernel: of which field.
     """
@@ -86,8 +102,10 @@ class Turned:
 class Operators:
     """From nodes to window for one wavelength and distance: both axes, and the rest.
 
-    moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its own.
-    turned: the field's derivatives; None where the window's own samples are the coarse ones.
+    moved: derivative of the rest by ``wave`` or ``distance``, per um, as terms of its
+    own.
+    turned: the field's derivatives; None where the window's own samples are the coarse
+    ones.
     """
 
     y: Ways
@@ -97,7 +115,9 @@ class Operators:
     turned: Turned | None = None
 
     def field(self, light: Array, tolerance: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or with some left out."""
+        """(..., q, p) -> (..., Y, X) in the precision of the operators, by all terms or
+        with some left out.
+        """
         return self.finer(self.coarse(light, tolerance))
 
     def coarse(self, light: Array, tolerance: float = 0.0) -> Array:
@@ -106,10 +126,14 @@ class Operators:
 
     def finer(self, coarse: Array) -> Array:
         """(..., Y, X) on the window's samples of a field on the coarse ones."""
-        return np.asarray(self.envelope(coarse) * (self.y.carrier[:, None] * self.x.carrier))
+        return np.asarray(
+            self.envelope(coarse) * (self.y.carrier[:, None] * self.x.carrier)
+        )
 
     def envelope(self, coarse: Array) -> Array:
-        """As :meth:`finer`, less the turns of the middle direction, which no intensity sees."""
+        """As :meth:`finer`, less the turns of the middle direction, which no intensity
+        sees.
+        """
         flat = coarse.reshape(-1, *coarse.shape[-2:])
         out = np.empty((len(flat), len(self.y.fine), len(self.x.fine)), coarse.dtype)
 
@@ -121,39 +145,75 @@ class Operators:
             threads.split(len(flat), some)
         return out.reshape(*coarse.shape[:-2], *out.shape[-2:])
 
-    def rates(self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0) -> Array:
-        """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or ``distance`` per um, as an envelope.
+    def rates(
+        self, light: Array, name: str, tolerance: float = 0.0, *, beside: float = 0.0
+    ) -> Array:
+        """(..., q, p) -> (..., Y, X) derivative of :meth:`field` by ``wave`` or
+        ``distance`` per um, as an envelope.
 
-        Less what turns places of the window by themselves, which no intensity sees. ``tolerance`` is shared among the
-        parts by their size, and by that of what is added to them: ``beside`` times the field.
+        Less what turns places of the window by themselves, which no intensity sees.
+        ``tolerance`` is shared among the
+        parts by their size, and by that of what is added to them: ``beside`` times the
+        field.
         """
         y, x = (way.moved(name) for way in (self.y, self.x))
         moved = self.moved(name)
         pairs = (y, self.y.to), (x, self.x.to)
-        sizes = [*(float(np.linalg.norm(by) / np.linalg.norm(to)) for by, to in pairs), moved.size / self.rest.size]
+        sizes = [
+            *(float(np.linalg.norm(by) / np.linalg.norm(to)) for by, to in pairs),
+            moved.size / self.rest.size,
+        ]
         whole = tolerance * math.hypot(*sizes, beside) / math.sqrt(len(sizes))
         some = [min(whole / max(size, 1e-300), _COARSEST) for size in sizes]
-        ways = (y, self.x.to, self.rest), (self.y.to, x, self.rest), (self.y.to, self.x.to, moved)
-        return self.envelope(self._sum(light, tuple((*way, one) for way, one in zip(ways, some, strict=True))))
+        ways = (
+            (y, self.x.to, self.rest),
+            (self.y.to, x, self.rest),
+            (self.y.to, self.x.to, moved),
+        )
+        return self.envelope(
+            self._sum(
+                light, tuple((*way, one) for way, one in zip(ways, some, strict=True))
+            )
+        )
 
-    def _sum(self, light: Array, ways: tuple[tuple[Array, Array, Terms, float], ...]) -> Array:
-        """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X), for several (Fy, Fx, terms)."""
+    def _sum(
+        self, light: Array, ways: tuple[tuple[Array, Array, Terms, float], ...]
+    ) -> Array:
+        """Sum over r, q, b, p of W_r(Y, X) Fy(Y, q) a_rb(q) L(q, p) g_b(p) Fx(p, X),
+        for several (Fy, Fx, terms).
+        """
         ny, nx, kind = len(self.y.to), len(self.x.to), self.y.to.dtype
         products = []
         for y, x, terms, tolerance in ways:
             across, amounts, window = terms.some(tolerance)
-            products.append((y, (across[:, None] * x).reshape(len(across) * nx, -1).T, amounts, window))
+            products.append(
+                (
+                    y,
+                    (across[:, None] * x).reshape(len(across) * nx, -1).T,
+                    amounts,
+                    window,
+                )
+            )
         light = light.astype(kind, copy=False)
         out = np.zeros((*light.shape[:-2], ny, nx), kind)
-        flat, result = light.reshape(-1, *light.shape[-2:]), out.reshape(-1, *out.shape[-2:])
+        flat, result = (
+            light.reshape(-1, *light.shape[-2:]),
+            out.reshape(-1, *out.shape[-2:]),
+        )
 
         def some(first: int, last: int) -> None:
             frames = flat[first:last].reshape(-1, flat.shape[-1])
             for y, x, amounts, window in products:
-                mixed = amounts @ (frames @ x).reshape(last - first, len(amounts), -1, nx)
-                for i, one in enumerate(mixed.reshape(last - first, len(amounts), -1), first):
+                mixed = amounts @ (frames @ x).reshape(
+                    last - first, len(amounts), -1, nx
+                )
+                for i, one in enumerate(
+                    mixed.reshape(last - first, len(amounts), -1), first
+                ):
                     seen = (y @ one).reshape(ny, -1, nx)
-                    result[i] += np.multiply(seen, window, out=seen).sum(1)  # five times as quick as einsum
+                    result[i] += np.multiply(seen, window, out=seen).sum(
+                        1
+                    )  # five times as quick as einsum
 
         with threads.one_blas_thread():
             threads.split(len(flat), some)
@@ -161,8 +221,12 @@ class Operators:
 
 
 def weighted(weights: Array, values: Array) -> Array:
-    """(m, k) product of real (m, n) and complex (n, k) numbers: half the work of one of complex numbers."""
-    return np.asarray((weights @ np.ascontiguousarray(values).view(weights.dtype)).view(values.dtype))
+    """(m, k) product of real (m, n) and complex (n, k) numbers: half the work of one of
+    complex numbers.
+    """
+    return np.asarray(
+        (weights @ np.ascontiguousarray(values).view(weights.dtype)).view(values.dtype)
+    )
 
 
 def ways(
@@ -176,20 +240,27 @@ def ways(
     step_um: float,
     rim_um: float = 0.0,
 ) -> tuple[Array, Ways]:
-    """(coarse samples, the way there from nodes and from there to the window's samples) along one axis.
+    """(coarse samples, the way there from nodes and from there to the window's samples)
+    along one axis.
 
     Args:
         by: path to a place of the window, :meth:`Kernel.by_x` or :meth:`Kernel.by_y`.
-        nodes: (n,) direction cosines. at_um: (m,) even samples of the window. band: of the field, rad/um.
-        step_um: of the distance, for derivatives. rim_um: at either end, where a tenfold error is allowed.
+        nodes: (n,) direction cosines. at_um: (m,) even samples of the window. band: of
+            the field, rad/um.
+        step_um: of the distance, for derivatives. rim_um: at either end, where a
+            tenfold error is allowed.
     """
-    coarse, weights = _resampled(float(at_um[0]), float(at_um[-1]), len(at_um), band, tolerance, rim_um)
+    coarse, weights = _resampled(
+        float(at_um[0]), float(at_um[-1]), len(at_um), band, tolerance, rim_um
+    )
     middle = (nodes[0] + nodes[-1]) / 2
     turn, carrier = k * by(nodes, coarse[:, None]), k * by(middle, coarse[:, None])
     value = np.exp(1j * (turn - carrier))
 
     def moved(name: str) -> Array:
-        if name == "wave":  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
+        if (
+            name == "wave"
+        ):  # k dF/dk is k F, and dk is -k² / 2 pi of the wavelength's change
             return np.asarray(-1j * turn * k / (2 * np.pi) * value)
         ends = [by(nodes, coarse[:, None], off) for off in (step_um, -step_um)]
         return np.asarray(1j * k * (ends[0] - ends[1]) / (2 * step_um) * value)
@@ -198,17 +269,35 @@ def ways(
 
 
 def turned(at_um: Array, coarse_um: Array, band: float, degree: int) -> Array:
-    """(degree + 1, fine, coarse) from coarse samples to the field of light times powers of its own direction.
+    """(degree + 1, fine, coarse) from coarse samples to the field of light times powers
+    of its own direction.
 
-    Of the direction from the middle one, over ``band``: between -1 and 1, fields less their carrier. Light from there
-    turns as exp(i band t X) on the window, so that a factor t^a is a derivative of the field: by the weights of least
-    error over the band, as plain interpolation is (``a`` = 0). For odd ``a`` they are imaginary: here less their i.
+    Of the direction from the middle one, over ``band``: between -1 and 1, fields less
+    their carrier. Light from there
+    turns as exp(i band t X) on the window, so that a factor t^a is a derivative of the
+    field: by the weights of least
+    error over the band, as plain interpolation is (``a`` = 0). For odd ``a`` they are
+    imaginary: here less their i.
     """
-    return _turned(float(at_um[0]), float(at_um[-1]), len(at_um), tuple(coarse_um.tolist()), band, degree)
+    return _turned(
+        float(at_um[0]),
+        float(at_um[-1]),
+        len(at_um),
+        tuple(coarse_um.tolist()),
+        band,
+        degree,
+    )
 
 
 @functools.lru_cache(maxsize=16)
-def _turned(first: float, last: float, count: int, places: tuple[float, ...], band: float, degree: int) -> Array:
+def _turned(
+    first: float,
+    last: float,
+    count: int,
+    places: tuple[float, ...],
+    band: float,
+    degree: int,
+) -> Array:
     at_um, coarse_um = np.linspace(first, last, count), np.array(places)
     taps = min(_TURNED, len(coarse_um))
     index, apart = _nearby(at_um, coarse_um, band, taps)
@@ -223,22 +312,38 @@ def _turned(first: float, last: float, count: int, places: tuple[float, ...], ba
     return out
 
 
-def _nearby(at_um: Array, coarse_um: Array, band: float, taps: int) -> tuple[Array, Array]:
-    """(fine, taps) nearest coarse samples of every place, and what each of them tells of another: (taps, taps)."""
+def _nearby(
+    at_um: Array, coarse_um: Array, band: float, taps: int
+) -> tuple[Array, Array]:
+    """(fine, taps) nearest coarse samples of every place, and what each of them tells
+    of another: (taps, taps).
+    """
     step = coarse_um[1] - coarse_um[0]
-    first = np.clip(np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1, 0, len(coarse_um) - taps)
+    first = np.clip(
+        np.floor((at_um - coarse_um[0]) / step).astype(int) - taps // 2 + 1,
+        0,
+        len(coarse_um) - taps,
+    )
     apart = np.sinc(band * step / np.pi * (np.arange(taps)[:, None] - np.arange(taps)))
     return first[:, None] + np.arange(taps), apart
 
 
 @functools.lru_cache(maxsize=32)
 def _resampled(
-    first: float, last: float, count: int, band: float, tolerance: float, rim_um: float = 0.0
+    first: float,
+    last: float,
+    count: int,
+    band: float,
+    tolerance: float,
+    rim_um: float = 0.0,
 ) -> tuple[Array, Array]:
-    """(coarse even samples, (fine, coarse) weights) for functions of up to ``band`` rad/um; treat as read-only.
+    """(coarse even samples, (fine, coarse) weights) for functions of up to ``band``
+    rad/um; treat as read-only.
 
-    The window's own samples where they are no finer than that needs. With the fewest taps that are close enough, found
-    by halves: their error falls with their number. Taps reach beyond the window only where its rim is narrower.
+    The window's own samples where they are no finer than that needs. With the fewest
+    taps that are close enough, found
+    by halves: their error falls with their number. Taps reach beyond the window only
+    where its rim is narrower.
     """
     at_um, step = np.linspace(first, last, count), np.pi / band / ROOM
     width, fine = last - first, (last - first) / (count - 1)
@@ -246,8 +351,12 @@ def _resampled(
 
     def of(taps: int) -> tuple[Array, Array, float]:
         least = int(np.ceil(width / step)) + 1
-        coarse_count = max(least, taps, int(np.ceil((width - 2 * rim_um) / step)) + taps)
-        coarse = (first + last) / 2 + (np.arange(coarse_count) - (coarse_count - 1) / 2) * step
+        coarse_count = max(
+            least, taps, int(np.ceil((width - 2 * rim_um) / step)) + taps
+        )
+        coarse = (first + last) / 2 + (
+            np.arange(coarse_count) - (coarse_count - 1) / 2
+        ) * step
         weights, missed = _weights(at_um, coarse, band, taps)
         return coarse, weights, float(np.where(inner, missed, missed / 10).max())
 
@@ -264,13 +373,18 @@ def _resampled(
     return found[0], found[1]
 
 
-def _weights(at_um: Array, coarse_um: Array, band: float, taps: int) -> tuple[Array, Array]:
-    """(fine, coarse) weights of the nearest ``taps`` samples, least squares over an evenly filled band; (fine,) errors,
+def _weights(
+    at_um: Array, coarse_um: Array, band: float, taps: int
+) -> tuple[Array, Array]:
+    """(fine, coarse) weights of the nearest ``taps`` samples, least squares over an
+    evenly filled band; (fine,) errors,
     rms over it."""
     index, apart = _nearby(at_um, coarse_um, band, taps)
     seen = np.sinc(band / np.pi * (at_um[:, None] - coarse_um[index]))
     found = np.linalg.solve(apart, seen.T).T
-    missed = 1 - 2 * (found * seen).sum(1) + np.einsum("ni,ij,nj->n", found, apart, found)
+    missed = (
+        1 - 2 * (found * seen).sum(1) + np.einsum("ni,ij,nj->n", found, apart, found)
+    )
     out = np.zeros((len(at_um), len(coarse_um)))
     np.put_along_axis(out, index, found, 1)
     return out, np.sqrt(np.maximum(missed, 0.0))

@@ -1,4 +1,6 @@
-"""Checks of a fitted pupil, each with the cause it points to: order of the planes, convergence, planes left out."""
+"""Checks of a fitted pupil, each with the cause it points to: order of the planes,
+convergence, planes left out.
+"""
 
 import math
 
@@ -7,7 +9,9 @@ import numpy as np
 from characterize.inference import Data
 
 LEAST_NCC = 0.8
-MISSED = 0.35  # of the light that planes left out may miss beyond their noise; right optics miss about a tenth
+# of the light that planes left out may miss beyond their noise; right optics miss about
+# a tenth
+MISSED = 0.35
 DOUBTFUL = 0.18  # the same, from where on the optics are doubted aloud
 CAUSES = (
     "numerical_aperture, wavelength_um, pixel_um, index, bead_um or step_um may be wrong, a second bead may be in the "
@@ -16,9 +20,11 @@ CAUSES = (
 
 
 def order_score(data: Data) -> float:
-    """How much likelier planes resemble their neighbours than any others: 1 in order, 0 shuffled.
+    """How much likelier planes resemble their neighbours than any others: 1 in order, 0
+    shuffled.
 
-    Mean correlation of planes that follow each other, against that of the most alike ones; both above the mean of all.
+    Mean correlation of planes that follow each other, against that of the most alike
+    ones; both above the mean of all.
     nan where all planes look alike, or fewer than six.
     """
     n = len(data.electrons)
@@ -35,8 +41,12 @@ def order_score(data: Data) -> float:
 
 
 def missed(nrmse: float, data: Data, background: float) -> float:
-    """Share of the light that a prediction misses beyond the noise of single pixels, which is seen at dark places."""
-    steps = np.diff(data.electrons, axis=0)[data.usable[1:] & data.usable[:-1]] / math.sqrt(2)
+    """Share of the light that a prediction misses beyond the noise of single pixels,
+    which is seen at dark places.
+    """
+    steps = np.diff(data.electrons, axis=0)[
+        data.usable[1:] & data.usable[:-1]
+    ] / math.sqrt(2)
     noise = 1.4826 * float(np.median(np.abs(steps - np.median(steps))))
     light = (data.electrons - background)[data.usable]
     by_noise = noise * math.sqrt(light.size) / max(float(np.linalg.norm(light)), 1e-300)
@@ -47,7 +57,8 @@ def problems(data: Data, ncc: float, share: float, stopped: str) -> list[str]:
     """What makes a pupil no result, in words.
 
     Args:
-        ncc: correlation with the planes left out, else with all. share: of the light that is :func:`missed` there.
+        ncc: correlation with the planes left out, else with all. share: of the light
+            that is :func:`missed` there.
         stopped: why the fit stopped before it converged; empty where it did.
     """
     if order_score(data) < 0.4:
@@ -65,16 +76,24 @@ def problems(data: Data, ncc: float, share: float, stopped: str) -> list[str]:
         )
     if share > MISSED:
         words.append(
-            f"the pupil misses {share:.0%} of the light beyond noise (at most {MISSED:.0%} allowed): " + CAUSES
+            f"the pupil misses {share:.0%} of the light beyond noise (at most {MISSED:.0%} allowed): "
+            + CAUSES
         )
     return words
 
 
 def doubts(share: float, stopped: str) -> list[str]:
-    """What a pupil that is not refused still leaves to explain, in words; ``share`` of the light is missed."""
-    words = [f"not converged ({stopped}), though it predicts the images well"] if stopped and share <= DOUBTFUL else []
+    """What a pupil that is not refused still leaves to explain, in words; ``share`` of
+    the light is missed.
+    """
+    words = (
+        [f"not converged ({stopped}), though it predicts the images well"]
+        if stopped and share <= DOUBTFUL
+        else []
+    )
     if DOUBTFUL < share <= MISSED:
         words.append(
-            f"the pupil misses {share:.0%} of the light beyond noise, where right optics miss about a tenth: " + CAUSES
+            f"the pupil misses {share:.0%} of the light beyond noise, where right optics miss about a tenth: "
+            + CAUSES
         )
     return words

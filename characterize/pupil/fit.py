@@ -1,4 +1,6 @@
-"""Fit of a generic pupil to a through-focus stack, judged on planes that the fit never saw."""
+"""Fit of a generic pupil to a through-focus stack, judged on planes that the fit never
+saw.
+"""
 
 import dataclasses
 import functools
@@ -25,13 +27,18 @@ from metalens.ground.errors import FitError, FitRefused
 class PupilFit:
     """The pupil that explains a stack.
 
-    names, value, sigma: parameters with 1 sigma intervals (widened where chi2_per_dof is above 1).
-    measured, predicted: (n, y, x) windows in electrons; every plane of ``predicted`` by the fit of all planes.
+    names, value, sigma: parameters with 1 sigma intervals (widened where chi2_per_dof
+    is above 1).
+    measured, predicted: (n, y, x) windows in electrons; every plane of ``predicted`` by
+    the fit of all planes.
     phase_rad, amplitude: (nodes, nodes) pupil maps, nan and 0 outside the aperture.
-    held_out: agreement on planes left out, predicted from a fit of the others, or None where not judged.
-    between: the same of a cubic spline along the stack through the planes that were fitted, pixel by pixel.
+    held_out: agreement on planes left out, predicted from a fit of the others, or None
+    where not judged.
+    between: the same of a cubic spline along the stack through the planes that were
+    fitted, pixel by pixel.
     optics: (name, value, standard error) of what was freed.
-    cautions: degeneracies and corrections in words. problems: checks that failed, with their cause.
+    cautions: degeneracies and corrections in words. problems: checks that failed, with
+    their cause.
     """
 
     spec: PupilSpec
@@ -56,24 +63,34 @@ class PupilFit:
 
 
 def fit_pupil(
-    capture: captures.Capture, spec: PupilSpec, *, judge: bool = True, sparse: int = 2, insist: bool = False
+    capture: captures.Capture,
+    spec: PupilSpec,
+    *,
+    judge: bool = True,
+    sparse: int = 2,
+    insist: bool = False,
 ) -> PupilFit:
-    """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also of some planes, tested on others.
+    """Fit phase, amplitude, drift, blur, gains and backgrounds; with ``judge`` also of
+    some planes, tested on others.
 
     Args:
         sparse: of which planes alone: every second, third ...
-        insist: return a pupil that fails its checks (problems filled) instead of refusing it.
+        insist: return a pupil that fails its checks (problems filled) instead of
+            refusing it.
 
     Raises:
         CaptureError: wavelength, pixel or stage positions unknown.
-        FitError: too few planes, no bead, or refused: no convergence, planes out of order, predictions too poor.
+        FitError: too few planes, no bead, or refused: no convergence, planes out of
+            order, predictions too poor.
     """
     spec, frames = _complete(spec, capture), clean(capture)
     position = _positions(capture, spec)
     stated = dataclasses.replace(spec, stage_sigma_um=stage_sigma_um(spec, position))
     data, background, notes = _crop(frames, stated)
     spec, position, optics = _freed(stated, position, data, sparse if judge else 1)
-    held_out, between, start = _judge(spec, position, data, background, sparse if judge else len(position))
+    held_out, between, start = _judge(
+        spec, position, data, background, sparse if judge else len(position)
+    )
     model, solution = _fit(spec, position, data, start)
     phase, amplitude = _maps(model, solution.value)
     agreement = agree(solution.image, data, background)
@@ -102,12 +119,19 @@ def fit_pupil(
         chi2_per_dof=solution.chi2_per_dof,
         converged=solution.converged,
         reason=solution.reason,
-        cautions=(*frames.corrections, *notes, *told(stated, optics), *_cautions(spec, solution)),
+        cautions=(
+            *frames.corrections,
+            *notes,
+            *told(stated, optics),
+            *_cautions(spec, solution),
+        ),
         problems=tuple(problems),
     )
 
 
-def save(path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None) -> None:
+def save(
+    path: str | Path, fit: PupilFit, provenance: store.Provenance | None = None
+) -> None:
     """Write a pupil file (kind ``pupil``)."""
     arrays = {
         key: getattr(fit, key)
@@ -134,18 +158,32 @@ def save(path: str | Path, fit: PupilFit, provenance: store.Provenance | None = 
         "reason": fit.reason,
     }
     about |= {f"fitted_{name}": value for name, value, _ in fit.optics}
-    for label, score in (("agreement", fit.agreement), ("held_out", fit.held_out), ("between", fit.between)):
+    for label, score in (
+        ("agreement", fit.agreement),
+        ("held_out", fit.held_out),
+        ("between", fit.between),
+    ):
         if score is not None:
-            about |= {f"{label}_{key}": value for key, value in dataclasses.asdict(score).items()}
+            about |= {
+                f"{label}_{key}": value
+                for key, value in dataclasses.asdict(score).items()
+            }
     store.save(path, "pupil", arrays, attributes=about, provenance=provenance)
 
 
 def _spec_text(spec: PupilSpec) -> str:
-    return "\n".join(line for line in config.dumps(spec).splitlines() if not line.endswith("nan")) + "\n"
+    return (
+        "\n".join(
+            line for line in config.dumps(spec).splitlines() if not line.endswith("nan")
+        )
+        + "\n"
+    )
 
 
 def _complete(spec: PupilSpec, capture: captures.Capture) -> PupilSpec:
-    wave = capture.wavelength_um if math.isnan(spec.wavelength_um) else spec.wavelength_um
+    wave = (
+        capture.wavelength_um if math.isnan(spec.wavelength_um) else spec.wavelength_um
+    )
     pixel = capture.pixel_um if math.isnan(spec.pixel_um) else spec.pixel_um
     window = min(spec.window, *capture.frames.shape[1:])
     return dataclasses.replace(spec, wavelength_um=wave, pixel_um=pixel, window=window)
@@ -154,7 +192,9 @@ def _complete(spec: PupilSpec, capture: captures.Capture) -> PupilSpec:
 def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
     """Stage positions about the sharpest plane, from the capture or from step_um."""
     if len(capture.frames) < 3:
-        raise FitError(f"{len(capture.frames)} planes: a pupil needs three or more through focus")
+        raise FitError(
+            f"{len(capture.frames)} planes: a pupil needs three or more through focus"
+        )
     stated = capture.position_um
     if not math.isnan(spec.step_um) or not np.isfinite(stated).all():
         stated = np.arange(len(capture.frames)) * spec.step_um
@@ -165,31 +205,51 @@ def _positions(capture: captures.Capture, spec: PupilSpec) -> Array:
 
 
 def _crop(frames: Frames, spec: PupilSpec) -> tuple[Data, float, list[str]]:
-    """The window about the bead, moved inwards where it would reach over the edge; the background level; notes."""
+    """The window about the bead, moved inwards where it would reach over the edge; the
+    background level; notes.
+    """
     total = np.where(frames.usable, frames.electrons, np.nan)
     background = float(np.nanmedian(total))
     row, column = spec.center or _find(total - _plane(total) - background)
     sides = zip((row, column), total.shape[1:], strict=True)
-    first = [int(np.clip(place - spec.window // 2, 0, side - spec.window)) for place, side in sides]
+    first = [
+        int(np.clip(place - spec.window // 2, 0, side - spec.window))
+        for place, side in sides
+    ]
     notes = []
     if first != [row - spec.window // 2, column - spec.window // 2]:
-        notes.append(f"the bead at row {row}, column {column} is near the edge: the window is not centred on it")
+        notes.append(
+            f"the bead at row {row}, column {column} is near the edge: the window is not centred on it"
+        )
     cut = (slice(None), *(slice(f, f + spec.window) for f in first))
-    floor, scale = (np.broadcast_to(a, total.shape)[cut] for a in (frames.variance_e2, frames.scale))
+    floor, scale = (
+        np.broadcast_to(a, total.shape)[cut] for a in (frames.variance_e2, frames.scale)
+    )
     plane = _plane(total[cut])
     seen = total[cut] - background
     if np.ptp(plane) > 0.02 * np.nanmax(seen):
         background = float(np.nanpercentile(total[cut] - plane, 20))
-        notes.append(f"a background plane of {np.ptp(plane):.3g} e across the window was taken off")
+        notes.append(
+            f"a background plane of {np.ptp(plane):.3g} e across the window was taken off"
+        )
     else:
         plane = np.zeros_like(plane)
     electrons = frames.electrons[cut] - plane
-    data = Data(electrons, frames.usable[cut], frames.saturated[cut], floor, scale, spec.model_error)
+    data = Data(
+        electrons,
+        frames.usable[cut],
+        frames.saturated[cut],
+        floor,
+        scale,
+        spec.model_error,
+    )
     return data, background, notes
 
 
 def _plane(frames: Array) -> Array:
-    """(y, x) tilt of the background, of mean 0: least squares on the rim of the median plane, without its outliers."""
+    """(y, x) tilt of the background, of mean 0: least squares on the rim of the median
+    plane, without its outliers.
+    """
     bad = np.isnan(frames).all(0)
     level = np.where(bad, np.nan, np.nanmedian(np.where(bad, 0, frames), axis=0))
     ny, nx = level.shape
@@ -206,29 +266,38 @@ def _plane(frames: Array) -> Array:
 
 
 def _find(light: Array) -> tuple[int, int]:
-    """Row and column of the light's centre in the brightest planes; ``light`` (n, y, x) is nan where masked."""
+    """Row and column of the light's centre in the brightest planes; ``light`` (n, y, x)
+    is nan where masked.
+    """
     light = np.nan_to_num(light)
     peak = np.sort(ndimage.gaussian_filter(light, (0, 1, 1)), axis=0)[-3:].mean(0)
     row, column = (int(i) for i in np.unravel_index(int(peak.argmax()), peak.shape))
     return row, column
 
 
-def _freed(spec: PupilSpec, position: Array, data: Data, sparse: int) -> tuple[PupilSpec, Array, Optics]:
+def _freed(
+    spec: PupilSpec, position: Array, data: Data, sparse: int
+) -> tuple[PupilSpec, Array, Optics]:
     """What is free, from every ``sparse``-th plane, so that the others judge it too."""
     seen = np.arange(0, len(position), sparse if len(position) >= 2 * sparse + 1 else 1)
     part, planes = position[seen], data.planes(seen)
     coarse = functools.partial(_coarse, spec, part, planes)
-    made, optics, longer = freed(spec, part, planes, coarse, step_um=float(np.abs(np.diff(position)).mean()))
+    made, optics, longer = freed(
+        spec, part, planes, coarse, step_um=float(np.abs(np.diff(position)).mean())
+    )
     return made, longer * position, optics
 
 
 def _judge(
     spec: PupilSpec, position: Array, data: Data, background: float, sparse: int
 ) -> tuple[Agreement | None, Agreement | None, Array | None]:
-    """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a spline through the same planes.
+    """Every ``sparse``-th plane fitted, the others predicted, by the pupil and by a
+    spline through the same planes.
 
-    Gains and backgrounds between neighbours, drift from its polynomial; all planes where they are stated, as it is not
-    seen how far those left out stand off. Also the parameters of all planes so found, where a fit of all of them
+    Gains and backgrounds between neighbours, drift from its polynomial; all planes
+    where they are stated, as it is not
+    seen how far those left out stand off. Also the parameters of all planes so found,
+    where a fit of all of them
     starts. Nothing of too few planes.
     """
     if len(position) < 2 * sparse + 1:
@@ -237,35 +306,66 @@ def _judge(
     hidden = np.setdiff1d(np.arange(seen[-1]), seen)
     exact = dataclasses.replace(spec, stage_sigma_um=0.0)
     fitted, solution = _fit(exact, position[seen], data.planes(seen))
-    model = PupilModel(exact, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+    model = PupilModel(
+        exact,
+        position,
+        phase_order=spec.phase_order,
+        amplitude_order=spec.amplitude_order,
+    )
     model.span_um = fitted.span_um
     shared = fitted.layout().size - 2 * len(seen)
     order = np.argsort(position[seen])
     gain, level = (
-        np.interp(position, position[seen][order], solution.value[shared + k * len(seen) :][: len(seen)][order])
+        np.interp(
+            position,
+            position[seen][order],
+            solution.value[shared + k * len(seen) :][: len(seen)][order],
+        )
         for k in (0, 1)
     )
     x = np.concatenate([solution.value[:shared], gain, level])
     predicted, rest = model.images(x, False)[0][hidden], data.planes(hidden)
-    start = np.insert(x, fitted.layout().off.start, np.zeros(len(position) if spec.stage_sigma_um > 0 else 0))
+    start = np.insert(
+        x,
+        fitted.layout().off.start,
+        np.zeros(len(position) if spec.stage_sigma_um > 0 else 0),
+    )
     between = spline(position, data, seen, hidden)
     return agree(predicted, rest, background), agree(between, rest, background), start
 
 
-def _fit(spec: PupilSpec, position: Array, data: Data, start: Array | None = None) -> tuple[PupilModel, Solution]:
-    """Low orders from several starts, the best one on to all orders; all orders at once from a known ``start``."""
-    model = PupilModel(spec, position, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+def _fit(
+    spec: PupilSpec, position: Array, data: Data, start: Array | None = None
+) -> tuple[PupilModel, Solution]:
+    """Low orders from several starts, the best one on to all orders; all orders at once
+    from a known ``start``.
+    """
+    model = PupilModel(
+        spec,
+        position,
+        phase_order=spec.phase_order,
+        amplitude_order=spec.amplitude_order,
+    )
     if start is None:
         start = _coarse(spec, position, data, model)
     settings = Settings(iterations=60, step_tolerance=1.0, near=2.0, secant=True)
-    return model, leastsquares.fit(model.images, data, start, prior=_prior(model, start), settings=settings)
+    return model, leastsquares.fit(
+        model.images, data, start, prior=_prior(model, start), settings=settings
+    )
 
 
 def _coarse(spec: PupilSpec, position: Array, data: Data, model: PupilModel) -> Array:
     coarse = PupilModel(spec, position, phase_order=4, amplitude_order=0)
     starts = [_start(coarse, data, spherical) for spherical in (0.0, 0.8, -0.8)]
-    settings = Settings(iterations=12, step_tolerance=1.0, near=1.0, secant=True, finish=False)
-    tries = [leastsquares.fit(coarse.images, data, s, prior=_prior(coarse, s), settings=settings) for s in starts]
+    settings = Settings(
+        iterations=12, step_tolerance=1.0, near=1.0, secant=True, finish=False
+    )
+    tries = [
+        leastsquares.fit(
+            coarse.images, data, s, prior=_prior(coarse, s), settings=settings
+        )
+        for s in starts
+    ]
     return _grow(min(tries, key=lambda t: t.merit).value, coarse, model)
 
 
@@ -281,17 +381,24 @@ def _start(model: PupilModel, data: Data, spherical: float) -> Array:
     level = np.percentile(edge, 20, axis=1)
     light = (data.electrons - level[:, None, None]).sum((1, 2)).max()
     if light <= 0:
-        raise FitError("no light above the background in the window; check center and window")
+        raise FitError(
+            "no light above the background in the window; check center and window"
+        )
     x[-2 * layout.frames : -layout.frames] = math.log(light)
     x[-layout.frames :] = level
     return x
 
 
 def _offset(data: Data) -> Array:
-    """(y, x) pixels from the window's centre to the bead, where it is more than a quarter of the window; else 0."""
+    """(y, x) pixels from the window's centre to the bead, where it is more than a
+    quarter of the window; else 0.
+    """
     light = np.where(data.usable, data.electrons, np.nanmedian(data.electrons))
     peak = ndimage.gaussian_filter(light, (0, 1, 1)).max(0)
-    place = np.array(np.unravel_index(int(peak.argmax()), peak.shape)) - np.array(peak.shape) // 2
+    place = (
+        np.array(np.unravel_index(int(peak.argmax()), peak.shape))
+        - np.array(peak.shape) // 2
+    )
     return np.asarray(place * (np.abs(place).max() > peak.shape[0] / 8), float)
 
 
@@ -300,15 +407,21 @@ def _grow(value: Array, small: PupilModel, large: PupilModel) -> Array:
     a, b = small.layout(), large.layout()
     phase, amplitude, *_ = a.split(value)
     add = np.zeros(b.phase - len(phase)), np.zeros(b.amplitude - len(amplitude))
-    return np.concatenate([phase, add[0], amplitude, add[1], value[a.phase + a.amplitude :]])
+    return np.concatenate(
+        [phase, add[0], amplitude, add[1], value[a.phase + a.amplitude :]]
+    )
 
 
 def _prior(model: PupilModel, start: Array) -> Prior:
-    """Smoothness: coefficients of higher orders are smaller; gains of frames scatter by 30 % about their start."""
+    """Smoothness: coefficients of higher orders are smaller; gains of frames scatter by
+    30 % about their start.
+    """
     layout = model.layout()
     sigma = np.full(layout.size, np.inf)
     sigma[: layout.phase] = [3.0 * min(1.0, 4 / n) ** 3 for n, _ in model.phase_indices]
-    sigma[layout.phase :][: layout.amplitude] = [0.5 / n for n, _ in model.amplitude_indices]
+    sigma[layout.phase :][: layout.amplitude] = [
+        0.5 / n for n, _ in model.amplitude_indices
+    ]
     blur = layout.size - 2 * layout.frames - 1
     drift = slice(layout.phase + layout.amplitude, layout.off.start)
     sigma[drift], sigma[layout.off] = 10 * model.spec.pixel_um, model.stage_sigma_um

@@ -1,4 +1,6 @@
-"""Optics that are known roughly only: aperture, index, pixel and step fitted with the low orders of the pupil."""
+"""Optics that are known roughly only: aperture, index, pixel and step fitted with the
+low orders of the pupil.
+"""
 
 import dataclasses
 import math
@@ -18,12 +20,20 @@ Optics = tuple[tuple[str, float, float], ...]
 
 
 def freed(
-    spec: PupilSpec, position_um: Array, data: Data, coarse: Callable[[PupilModel], Array], *, step_um: float
+    spec: PupilSpec,
+    position_um: Array,
+    data: Data,
+    coarse: Callable[[PupilModel], Array],
+    *,
+    step_um: float,
 ) -> tuple[PupilSpec, Optics, float]:
-    """What ``spec.free`` names, fitted: the specification with it, (name, value, sigma), true step over stated.
+    """What ``spec.free`` names, fitted: the specification with it, (name, value,
+    sigma), true step over stated.
 
-    Each is a factor to the stated value, known to the relative error of ``record.FREE`` beforehand: where the images
-    fix products only (aperture times pixel, say), that decides. Derivatives by the factors are differences of images.
+    Each is a factor to the stated value, known to the relative error of ``record.FREE``
+    beforehand: where the images
+    fix products only (aperture times pixel, say), that decides. Derivatives by the
+    factors are differences of images.
 
     Args:
         coarse: parameters of a model of few orders from which to start.
@@ -49,22 +59,35 @@ def freed(
     made, position = images.optics(found.value[p:])
     spread = np.sqrt(np.diag(found.covariance)[p:] * max(1.0, found.chi2_per_dof))
     longer = float(np.ptp(position) / np.ptp(position_um))
-    value = [longer * step_um if name == "step_um" else float(getattr(made, name)) for name in spec.free]
-    optics = tuple((n, v, float(v * s)) for n, v, s in zip(spec.free, value, spread, strict=True))
+    value = [
+        longer * step_um if name == "step_um" else float(getattr(made, name))
+        for name in spec.free
+    ]
+    optics = tuple(
+        (n, v, float(v * s)) for n, v, s in zip(spec.free, value, spread, strict=True)
+    )
     return made, optics, longer
 
 
 class _Images:
-    """Images by the parameters of a pupil and the logarithms of the factors; the pupil is sampled alike for all.
+    """Images by the parameters of a pupil and the logarithms of the factors; the pupil
+    is sampled alike for all.
 
-    So is the kind of the model: one that turned vectorial at some aperture on the way would jump there.
+    So is the kind of the model: one that turned vectorial at some aperture on the way
+    would jump there.
     """
 
     def __init__(self, spec: PupilSpec, position_um: Array) -> None:
-        widest = dataclasses.replace(spec, numerical_aperture=min(1.2 * spec.numerical_aperture, 0.97 * spec.index))
+        widest = dataclasses.replace(
+            spec,
+            numerical_aperture=min(1.2 * spec.numerical_aperture, 0.97 * spec.index),
+        )
         kind: Literal["vector", "scalar"] = "vector" if widest.vectorial else "scalar"
         self.spec, self.position_um = dataclasses.replace(spec, model=kind), position_um
-        self.orders = {"phase_order": min(spec.phase_order, 6), "amplitude_order": min(spec.amplitude_order, 2)}
+        self.orders = {
+            "phase_order": min(spec.phase_order, 6),
+            "amplitude_order": min(spec.amplitude_order, 2),
+        }
         self.nodes = PupilModel(widest, 1.1 * position_um, **self.orders).nodes
         self.model = self._at(np.zeros(len(spec.free)))
 
@@ -72,10 +95,17 @@ class _Images:
         """Specification and positions for logarithms of the factors."""
         factor = dict(zip(self.spec.free, np.exp(logs).tolist(), strict=True))
         position = self.position_um * factor.pop("step_um", 1.0)
-        values = {name: getattr(self.spec, name) * size for name, size in factor.items()}
+        values = {
+            name: getattr(self.spec, name) * size for name, size in factor.items()
+        }
         index = max(values.get("index", self.spec.index), 1.0)
-        aperture = min(values.get("numerical_aperture", self.spec.numerical_aperture), _MOST_SINE * index)
-        return dataclasses.replace(self.spec, **(values | {"index": index, "numerical_aperture": aperture})), position
+        aperture = min(
+            values.get("numerical_aperture", self.spec.numerical_aperture),
+            _MOST_SINE * index,
+        )
+        return dataclasses.replace(
+            self.spec, **(values | {"index": index, "numerical_aperture": aperture})
+        ), position
 
     def _at(self, logs: Array) -> PupilModel:
         spec, position = self.optics(logs)
@@ -89,7 +119,10 @@ class _Images:
             return image, None
         more = []
         for step in _STEP * np.eye(k):
-            up, down = (self._at(x[-k:] + sign * step).images(x[:-k], False)[0] for sign in (1, -1))
+            up, down = (
+                self._at(x[-k:] + sign * step).images(x[:-k], False)[0]
+                for sign in (1, -1)
+            )
             more.append((up - down) / (2 * _STEP))
         return image, np.concatenate([slopes, np.array(more)])
 

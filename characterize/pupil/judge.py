@@ -1,4 +1,6 @@
-"""How predicted images of a stack compare with measured ones, and what a spline through its planes predicts."""
+"""How predicted images of a stack compare with measured ones, and what a spline through
+its planes predicts.
+"""
 
 from dataclasses import dataclass
 
@@ -13,7 +15,8 @@ from metalens.ground.arrays import Array
 class Agreement:
     """How predicted images compare with measured ones, all planes together.
 
-    ncc: Pearson correlation over all pixels. plane_ncc: mean over planes of the correlation inside the plane.
+    ncc: Pearson correlation over all pixels. plane_ncc: mean over planes of the
+    correlation inside the plane.
     nrmse: |predicted - measured| / |measured - background|.
     """
 
@@ -26,15 +29,22 @@ def agree(predicted: Array, data: Data, background: float) -> Agreement:
     """Agreement over usable, unsaturated pixels."""
     keep = data.usable & ~data.saturated
     a, b = predicted[keep], data.electrons[keep]
-    planes = [_ncc(p[k], d[k]) for p, d, k in zip(predicted, data.electrons, keep, strict=True)]
+    planes = [
+        _ncc(p[k], d[k])
+        for p, d, k in zip(predicted, data.electrons, keep, strict=True)
+    ]
     error = float(np.linalg.norm(a - b) / np.linalg.norm(b - background))
     return Agreement(_ncc(a, b), float(np.mean(planes)), error)
 
 
 def spline(position: Array, data: Data, seen: Array, hidden: Array) -> Array:
-    """(hidden, y, x) light of planes left out by cubic splines through the others: what no physics predicts."""
+    """(hidden, y, x) light of planes left out by cubic splines through the others: what
+    no physics predicts.
+    """
     order = seen[np.argsort(position[seen])]
-    light = np.where(data.usable, data.electrons, np.nanmedian(data.electrons[data.usable]))
+    light = np.where(
+        data.usable, data.electrons, np.nanmedian(data.electrons[data.usable])
+    )
     return np.asarray(CubicSpline(position[order], light[order])(position[hidden]))
 
 

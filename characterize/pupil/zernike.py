@@ -1,4 +1,6 @@
-"""Zernike polynomials on the unit disc, normalised to unit variance (Noll 1976), by radial order."""
+"""Zernike polynomials on the unit disc, normalised to unit variance (Noll 1976), by
+radial order.
+"""
 
 import math
 
@@ -20,7 +22,9 @@ _NAMES = {
 
 
 def indices(lowest: int, highest: int) -> list[Index]:
-    """(n, m) of all polynomials of radial order ``lowest`` to ``highest``, m from -n to n in steps of 2."""
+    """(n, m) of all polynomials of radial order ``lowest`` to ``highest``, m from -n to
+    n in steps of 2.
+    """
     return [(n, m) for n in range(lowest, highest + 1) for m in range(-n, n + 1, 2)]
 
 
@@ -30,13 +34,17 @@ def name(index: Index) -> str:
 
 
 def polynomial(index: Index, rho: Array, theta: Array) -> Array:
-    """Z_n^m at polar coordinates of the unit disc: sqrt(n + 1) (sqrt 2 if m) R(rho) cos(m theta), or sin for m < 0."""
+    """Z_n^m at polar coordinates of the unit disc: sqrt(n + 1) (sqrt 2 if m) R(rho)
+    cos(m theta), or sin for m < 0.
+    """
     n, m = index
     k = abs(m)
     radial = np.zeros_like(rho)
     for s in range((n - k) // 2 + 1):
         term = math.factorial(n - s) / (
-            math.factorial(s) * math.factorial((n + k) // 2 - s) * math.factorial((n - k) // 2 - s)
+            math.factorial(s)
+            * math.factorial((n + k) // 2 - s)
+            * math.factorial((n - k) // 2 - s)
         )
         radial = radial + (-1) ** s * term * rho ** (n - 2 * s)
     angular = np.cos(k * theta) if m >= 0 else np.sin(k * theta)
@@ -46,4 +54,8 @@ def polynomial(index: Index, rho: Array, theta: Array) -> Array:
 def basis(which: list[Index], x: Array, y: Array) -> Array:
     """(len(which), *shape) polynomials at Cartesian coordinates of the unit disc."""
     rho, theta = np.hypot(x, y), np.arctan2(y, x)
-    return np.stack([polynomial(index, rho, theta) for index in which]) if which else np.empty((0, *x.shape))
+    return (
+        np.stack([polynomial(index, rho, theta) for index in which])
+        if which
+        else np.empty((0, *x.shape))
+    )

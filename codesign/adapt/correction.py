@@ -1,8 +1,12 @@
-"""What the next lithography run should draw: a bias table from the as-built lens, a corrected map, and their gain.
+"""What the next lithography run should draw: a bias table from the as-built lens, a
+corrected map, and their gain.
 
-The table undoes what depends on the diameter alone: the mean bias, and through the diameters the phase that height,
-index and sidewall took. What varies over the lens (gradient, bow, saddle) is no table: a corrected diameter map undoes
-it. Both follow from the fit; the gain is simulated on the true lens, or on others of the posterior.
+The table undoes what depends on the diameter alone: the mean bias, and through the
+diameters the phase that height,
+index and sidewall took. What varies over the lens (gradient, bow, saddle) is no table:
+a corrected diameter map undoes
+it. Both follow from the fit; the gain is simulated on the true lens, or on others of
+the posterior.
 """
 
 import dataclasses
@@ -27,10 +31,13 @@ _RAYS = 8  # of the places where the corrected map is judged
 class Correction:
     """Proposal for the next mask.
 
-    drawn_nm, bias_nm: (knots,) the new bias table: made less drawn diameter, as ``layout`` takes it.
+    drawn_nm, bias_nm: (knots,) the new bias table: made less drawn diameter, as
+    ``layout`` takes it.
     old_nm: (knots,) bias of the present table at the same drawn diameters.
-    wanted_um: (knots,) made diameter that gives the designed phase in the process as it is, for ``designed_um``.
-    lens: the design with the unevenness of the bias taken off every pillar; to be drawn with the new table.
+    wanted_um: (knots,) made diameter that gives the designed phase in the process as it
+    is, for ``designed_um``.
+    lens: the design with the unevenness of the bias taken off every pillar; to be drawn
+    with the new table.
     """
 
     drawn_nm: Array
@@ -43,7 +50,9 @@ class Correction:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
-    """One state of the next lens: its PSFs, Strehl ratio against the designed wave front, and light."""
+    """One state of the next lens: its PSFs, Strehl ratio against the designed wave
+    front, and light.
+    """
 
     name: str
     stack: Stack
@@ -72,20 +81,34 @@ def propose(design: Lens, x: Array, *, response: Sensitivity, old: Bias) -> Corr
     """
     made = table(design, x, response=response, old=old, range_um=printed_um(design))
     return Correction(
-        made.drawn_nm, made.bias_nm, old.at(made.drawn_nm), made.designed_um, made.wanted_um, _evened(design, x)
+        made.drawn_nm,
+        made.bias_nm,
+        old.at(made.drawn_nm),
+        made.designed_um,
+        made.wanted_um,
+        _evened(design, x),
     )
 
 
 def printed_um(design: Lens) -> tuple[float, float]:
     """(least, largest) diameter of the design's pillars."""
     diameter = design.diameters.diameter_um
-    return float(diameter.min(where=diameter > 0, initial=np.inf)), float(diameter.max())
+    return float(diameter.min(where=diameter > 0, initial=np.inf)), float(
+        diameter.max()
+    )
 
 
 def table(
-    design: Lens, x: Array, *, response: Sensitivity, old: Bias, range_um: tuple[float, float], knots: int = 13
+    design: Lens,
+    x: Array,
+    *,
+    response: Sensitivity,
+    old: Bias,
+    range_um: tuple[float, float],
+    knots: int = 13,
 ) -> Table:
-    """The bias table alone, without a look at the pillars: what many draws of a posterior are asked for.
+    """The bias table alone, without a look at the pillars: what many draws of a
+    posterior are asked for.
 
     Raises:
         ConfigError: the table would be steeper than the layout can invert.
@@ -103,11 +126,15 @@ def table(
     return Table(drawn, bias, designed, wanted)
 
 
-def next_lenses(made: MadeLens, plan: Correction, x_fit: Array, x_true: Array) -> list[Proposal]:
-    """The lens as made, with the new table, with the corrected map too, and at the corrected distance besides.
+def next_lenses(
+    made: MadeLens, plan: Correction, x_fit: Array, x_true: Array
+) -> list[Proposal]:
+    """The lens as made, with the new table, with the corrected map too, and at the
+    corrected distance besides.
 
     Args:
-        x_fit: what the correction was made from. x_true: what the process really does; both all parameters.
+        x_fit: what the correction was made from. x_true: what the process really does;
+            both all parameters.
     """
     tabled = _drawn_with(made.design, plan, x_fit)
     full = made.redrawn(_drawn_with(plan.lens, plan, x_fit))
@@ -124,19 +151,28 @@ def next_lenses(made: MadeLens, plan: Correction, x_fit: Array, x_true: Array) -
     for name, lens, x in cases:
         wave = lens.wave(x)
         out.append(
-            Proposal(name, lens.stack(x), overlap(wave, goal), float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum()))
+            Proposal(
+                name,
+                lens.stack(x),
+                overlap(wave, goal),
+                float((abs(wave) ** 2).sum() / (abs(goal) ** 2).sum()),
+            )
         )
     return out
 
 
 def overlap(one: Array, other: Array) -> float:
-    """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a> <b, b>), best piston."""
+    """Strehl ratio of one wave against another on the same nodes: |<a, b>|² / (<a, a>
+    <b, b>), best piston.
+    """
     cross = abs(np.vdot(one, other)) ** 2
     return float(cross / ((abs(one) ** 2).sum() * (abs(other) ** 2).sum()))
 
 
 def uneven_nm(x: Array) -> Array:
-    """(places,) nm that the corrected map takes off at the axis, half-way and along the rim, of all parameters."""
+    """(places,) nm that the corrected map takes off at the axis, half-way and along the
+    rim, of all parameters.
+    """
     turn = 2 * np.pi * np.arange(_RAYS) / _RAYS
     rho = np.repeat([0.5, 1.0], _RAYS)
     u, v = (np.append(0.0, rho * np.tile(way(turn), 2)) for way in (np.cos, np.sin))
@@ -144,12 +180,18 @@ def uneven_nm(x: Array) -> Array:
 
 
 def write(folder: Path, plan: Correction, *, evened: bool = True) -> None:
-    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5 where it is ``evened``."""
+    """bias.csv and bias.toml (the [bias] table of PROCESS.toml), and lens_corrected.h5
+    where it is ``evened``.
+    """
     from metalens import lens as lenses
 
-    rows = [f"{d:.3f},{b:.3f}" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)]
+    rows = [
+        f"{d:.3f},{b:.3f}" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)
+    ]
     store.write_text(folder / "bias.csv", "\n".join(["drawn_nm,bias_nm", *rows]) + "\n")
-    pairs = ", ".join(f"[{d:.3f}, {b:.3f}]" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True))
+    pairs = ", ".join(
+        f"[{d:.3f}, {b:.3f}]" for d, b in zip(plan.drawn_nm, plan.bias_nm, strict=True)
+    )
     store.write_text(folder / "bias.toml", f"[bias]\ntable_nm = [{pairs}]\n")
     if evened:
         lenses.save(folder / "lens_corrected.h5", plan.lens)
@@ -165,15 +207,19 @@ def present_bias(path: Path | None) -> Bias:
 
 
 def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -> Array:
-    """Made diameters whose phase in the process as it is equals the designed one, up to a piston.
+    """Made diameters whose phase in the process as it is equals the designed one, up to
+    a piston.
 
-    Of pillars that lose their form as their edges move: by the phase of the designed ones with all edges moved so far.
+    Of pillars that lose their form as their edges move: by the phase of the designed
+    ones with all edges moved so far.
     """
     low, high = design.proxy.domain_um
     fine = np.linspace(low, min(high, 0.999 * design.diameters.pitch_um), 4001)
     wave = design.wavelength_um
     now, meant = (
-        np.unwrap(np.angle(transmission(design.proxy, response, fine, wave, made.answers())))
+        np.unwrap(
+            np.angle(transmission(design.proxy, response, fine, wave, made.answers()))
+        )
         for made in (state(x), State.of())
     )
     inside = (fine >= designed[0]) & (fine <= designed[-1])
@@ -182,9 +228,16 @@ def _wanted_um(design: Lens, designed: Array, x: Array, response: Sensitivity) -
 
     def made(size: float) -> Array:
         rate = response.by_edges((fine + size) / 2)
-        return np.maximum.accumulate(now if rate is None else now + (fine - size) * rate.imag)
+        return np.maximum.accumulate(
+            now if rate is None else now + (fine - size) * rate.imag
+        )
 
-    return np.array([np.interp(g, made(size), fine) for size, g in zip(designed.tolist(), goal.tolist(), strict=True)])
+    return np.array(
+        [
+            np.interp(g, made(size), fine)
+            for size, g in zip(designed.tolist(), goal.tolist(), strict=True)
+        ]
+    )
 
 
 def _evened(design: Lens, x: Array) -> Lens:
@@ -199,23 +252,42 @@ def _evened(design: Lens, x: Array) -> Lens:
 
 
 def _drawn_with(design: Lens, plan: Correction, x_fit: Array) -> Lens:
-    """The lens whose diameters, made by a process of that bias, are those that the new table aims at."""
+    """The lens whose diameters, made by a process of that bias, are those that the new
+    table aims at.
+    """
     d = design.diameters.diameter_um
-    aim = np.interp(d, plan.designed_um, plan.wanted_um - plan.designed_um) - state(x_fit)["bias_nm"] * 1e-3
+    aim = (
+        np.interp(d, plan.designed_um, plan.wanted_um - plan.designed_um)
+        - state(x_fit)["bias_nm"] * 1e-3
+    )
     return _with_diameters(design, d + aim, d > 0, keep=False)
 
 
-def _with_diameters(design: Lens, diameter_um: Array, there: Array, *, keep: bool = True) -> Lens:
-    """The lens with other diameters, kept within the proxy's domain unless a bias will bring them back into it."""
+def _with_diameters(
+    design: Lens, diameter_um: Array, there: Array, *, keep: bool = True
+) -> Lens:
+    """The lens with other diameters, kept within the proxy's domain unless a bias will
+    bring them back into it.
+    """
     low, high = design.proxy.domain_um if keep else (1e-3, np.inf)
     top = min(high, 0.999 * design.diameters.pitch_um)
     inside = np.where(there, np.clip(diameter_um, low, top), 0).astype(np.float32)
     return dataclasses.replace(
-        design, diameters=DiameterMap(inside, design.diameters.pitch_um), profile=f"{design.profile}, corrected"
+        design,
+        diameters=DiameterMap(inside, design.diameters.pitch_um),
+        profile=f"{design.profile}, corrected",
     )
 
 
 def table_rows(plan: Correction) -> list[tuple[Any, ...]]:
-    """Rows of the table for people: drawn diameter, present bias, new bias, designed and aimed diameter, nm."""
-    columns = plan.drawn_nm, plan.old_nm, plan.bias_nm, plan.designed_um * 1e3, plan.wanted_um * 1e3
+    """Rows of the table for people: drawn diameter, present bias, new bias, designed
+    and aimed diameter, nm.
+    """
+    columns = (
+        plan.drawn_nm,
+        plan.old_nm,
+        plan.bias_nm,
+        plan.designed_um * 1e3,
+        plan.wanted_um * 1e3,
+    )
     return [tuple(float(v) for v in row) for row in zip(*columns, strict=True)]

@@ -11,11 +11,13 @@ from metalens.ground.arrays import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Accuracy:
-    """Errors of one network on one lens: (n,) absolute errors of the slippage, mean over axes and along each, in mm.
+    """Errors of one network on one lens: (n,) absolute errors of the slippage, mean
+    over axes and along each, in mm.
 
     The error that the studies speak of is ``slip_mm``, the mean over the three axes.
 
-    above: why the error of the images that were read is above what their run asks for; empty where it is not.
+    above: why the error of the images that were read is above what their run asks for;
+    empty where it is not.
     """
 
     error_mm: Tensor
@@ -39,7 +41,9 @@ class Accuracy:
 
     def interval_mm(self, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
         """95 % interval of ``slip_mm`` by a bootstrap over frames."""
-        low, high = bootstrap(self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed)
+        low, high = bootstrap(
+            self.error_mm.mean(1).double().numpy(), draws=draws, seed=seed
+        )
         return low, high
 
     def values(self) -> dict[str, float]:
@@ -60,7 +64,9 @@ def accuracy(answers: Answers, seen: Seen) -> Accuracy:
     return Accuracy((answers.slip_mm - seen.slip_mm).abs(), answers.iou, seen.above)
 
 
-def bootstrap(values: Array, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
+def bootstrap(
+    values: Array, *, draws: int = 1000, seed: int = 0
+) -> tuple[float, float]:
     """95 % interval of the mean of (n,) values."""
     rows = np.random.default_rng(seed).integers(0, len(values), (draws, len(values)))
     low, high = np.quantile(np.asarray(values)[rows].mean(1), [0.025, 0.975])

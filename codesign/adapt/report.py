@@ -1,4 +1,6 @@
-"""The page of a retraining: what the made lens cost, what training on bought back, what the next mask should draw."""
+"""The page of a retraining: what the made lens cost, what training on bought back, what
+the next mask should draw.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,8 +27,10 @@ CASES = {
 class Story:
     """Everything that the page shows.
 
-    apart: PSF errors against the nominal lens of the fitted lens and of the lens that judges. curves: {job: (step,
-    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions: in words. refused: why the
+    apart: PSF errors against the nominal lens of the fitted lens and of the lens that
+    judges. curves: {job: (step,
+    loss)}. proposals: states of the next lens with their slippage errors, mm. cautions:
+    in words. refused: why the
     correction is not written; uneven: why the table alone is; empty where they are.
     """
 
@@ -48,14 +52,24 @@ def write(path: Path, story: Story) -> None:
         KeyFigure("slippage error, nominal lens", f"{o.nominal.slip_mm:.3f} mm"),
         KeyFigure("made lens, before", f"{o.before.slip_mm:.3f} mm"),
         KeyFigure("made lens, after", f"{o.after.slip_mm:.3f} mm"),
-        KeyFigure("share of the gap won back", _share(o), None if o.recovered is None else o.recovered >= 0.9),
+        KeyFigure(
+            "share of the gap won back",
+            _share(o),
+            None if o.recovered is None else o.recovered >= 0.9,
+        ),
     ]
-    judge = "the true lens of the virtual bench" if story.lenses.known else "lenses of the posterior not seen before"
+    judge = (
+        "the true lens of the virtual bench"
+        if story.lenses.known
+        else "lenses of the posterior not seen before"
+    )
     lead = f"A network trained on for the lens that was really made; judged on {judge}, on eyes it never saw."
     sections = [_accuracy(story), _light(story), _mask(story)]
     if story.cautions:
         sections.append(Section("Read with care", "\n\n".join(story.cautions)))
-    report.write(path, "Retrained on the lens as built", sections, lead=lead, key_figures=keys)
+    report.write(
+        path, "Retrained on the lens as built", sections, lead=lead, key_figures=keys
+    )
 
 
 def _share(o: Outcome) -> str:
@@ -63,11 +77,27 @@ def _share(o: Outcome) -> str:
 
 
 def _accuracy(story: Story) -> Section:
-    head = ("case", "slippage error / mm", "95 % interval", "axial / mm", "lateral / mm", "pupil IoU")
+    head = (
+        "case",
+        "slippage error / mm",
+        "95 % interval",
+        "axial / mm",
+        "lateral / mm",
+        "pupil IoU",
+    )
     rows: list[tuple[Any, ...]] = []
     for name, v in story.outcome.rows().items():
         interval = f"{v['slip_low_mm']:.3f} to {v['slip_high_mm']:.3f}"
-        rows.append((CASES[name], v["slip_mm"], interval, v["axial_mm"], v["lateral_mm"], v["iou"]))
+        rows.append(
+            (
+                CASES[name],
+                v["slip_mm"],
+                interval,
+                v["axial_mm"],
+                v["lateral_mm"],
+                v["iou"],
+            )
+        )
     text = (
         "Mean absolute error of the slippage over its three axes. Intervals are over frames. The nominal network was "
         "trained on for as many steps as the others, so that no case is credited with more training."
@@ -94,7 +124,14 @@ def bars(outcome: Outcome) -> bytes:
         [v["slip_high_mm"] - v["slip_mm"] for v in rows.values()],
     ]
     colours = {"before": "#d1495b", "after": "#2a9d8f"}
-    axes.barh(place, values, xerr=reach, color=[colours.get(n, "#9db4d8") for n in rows], height=0.62, ecolor="#444")
+    axes.barh(
+        place,
+        values,
+        xerr=reach,
+        color=[colours.get(n, "#9db4d8") for n in rows],
+        height=0.62,
+        ecolor="#444",
+    )
     axes.set_yticks(place, [CASES[n] for n in rows])
     axes.set(xlabel="slippage error / mm")
     axes.grid(axis="y", visible=False)
@@ -109,7 +146,11 @@ def _curves(story: Story) -> bytes:
         axes.plot(
             step[width - 1 :],
             smooth,
-            label={"nominal": "nominal lens", "retrained": "as built", "known": "truth known"}[name],
+            label={
+                "nominal": "nominal lens",
+                "retrained": "as built",
+                "known": "truth known",
+            }[name],
         )
     axes.set(xlabel="step", ylabel="task loss")
     axes.legend()
@@ -133,28 +174,57 @@ def _psfs(story: Story) -> bytes:
         ("as built", lenses.best),
         ("true" if lenses.known else "a draw", lenses.judges[0]),
     )
-    chosen = np.unique(np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int))
-    figure, axes = report.canvas(len(rows), len(chosen), size=(1.15 * len(chosen), 3.6), squeeze=False)
+    chosen = np.unique(
+        np.linspace(0, len(lenses.nominal.depths_um) - 1, 7).round().astype(int)
+    )
+    figure, axes = report.canvas(
+        len(rows), len(chosen), size=(1.15 * len(chosen), 3.6), squeeze=False
+    )
     for column, depth in enumerate(chosen):
         top = max(float(s.intensity[depth].max()) for _, s in rows)
         for row, (label, made) in enumerate(rows):
-            axes[row, column].imshow(made.intensity[depth].clamp_min(0).sqrt().numpy(), vmin=0, vmax=top**0.5)
+            axes[row, column].imshow(
+                made.intensity[depth].clamp_min(0).sqrt().numpy(), vmin=0, vmax=top**0.5
+            )
             axes[row, column].set(xticks=[], yticks=[])
             axes[row, column].grid(visible=False)
             axes[row, 0].set_ylabel(label)
-        axes[0, column].set_title(f"{float(lenses.nominal.depths_um[depth]) * 1e-3:.1f} mm")
+        axes[0, column].set_title(
+            f"{float(lenses.nominal.depths_um[depth]) * 1e-3:.1f} mm"
+        )
     return report.png(figure)
 
 
 def _mask(story: Story) -> Section:
-    head = ("next lens", "PSF error", "Strehl ratio", "light", "slippage error / mm, network not retrained")
-    rows = [(p.name, error, p.strehl, p.light, slip) for p, error, slip in story.proposals]
-    gain = Table(
-        head, rows, "Simulated with the lens that judges as the truth; Strehl and light against the design.", digits=3
+    head = (
+        "next lens",
+        "PSF error",
+        "Strehl ratio",
+        "light",
+        "slippage error / mm, network not retrained",
     )
-    columns = ("drawn / nm", "present bias / nm", "new bias / nm", "designed / nm", "aimed at / nm")
+    rows = [
+        (p.name, error, p.strehl, p.light, slip) for p, error, slip in story.proposals
+    ]
+    gain = Table(
+        head,
+        rows,
+        "Simulated with the lens that judges as the truth; Strehl and light against the design.",
+        digits=3,
+    )
+    columns = (
+        "drawn / nm",
+        "present bias / nm",
+        "new bias / nm",
+        "designed / nm",
+        "aimed at / nm",
+    )
     held = "bias.toml holds the new table for PROCESS.toml."
-    table = Table(columns, table_rows(story.plan), "Written to no file: see above." if story.refused else held)
+    table = Table(
+        columns,
+        table_rows(story.plan),
+        "Written to no file: see above." if story.refused else held,
+    )
     text = (
         "The new bias table takes off the mean bias of the fit, and gives every pillar the diameter at which the "
         "process as it is (height, index, sidewall) makes the designed phase. lens_corrected.h5 also takes off what "
@@ -166,7 +236,13 @@ def _mask(story: Story) -> Section:
     if story.refused:
         text = f"{story.refused[0].upper()}{story.refused[1:]}.\n\nWhat it would be, by the best fit alone: {text}"
     return Section(
-        "The next mask", text, [gain, Figure(_table_plot(story.plan), "Bias: made less drawn diameter."), table]
+        "The next mask",
+        text,
+        [
+            gain,
+            Figure(_table_plot(story.plan), "Bias: made less drawn diameter."),
+            table,
+        ],
     )
 
 

@@ -1,4 +1,6 @@
-"""A retraining taken up again: its network, with the lens it was trained on for, as experiments show them."""
+"""A retraining taken up again: its network, with the lens it was trained on for, as
+experiments show them.
+"""
 
 import json
 import os
@@ -34,19 +36,32 @@ class Recipe:
     truth: str = ""
 
 
-def given(folder: Path, run: Path, built: Path, truth: Path | None) -> dict[str, str | None]:
-    """Where a retraining's run, fit and truth lie, as seen from its folder, for its result."""
+def given(
+    folder: Path, run: Path, built: Path, truth: Path | None
+) -> dict[str, str | None]:
+    """Where a retraining's run, fit and truth lie, as seen from its folder, for its
+    result.
+    """
     paths = {"run": run, "asbuilt": built, "truth": truth}
-    return {name: None if path is None else _from(folder, path) for name, path in paths.items()}
+    return {
+        name: None if path is None else _from(folder, path)
+        for name, path in paths.items()
+    }
 
 
 def run_of(path: Path) -> Path:
-    """The folder of the run: of a retraining the one that it went on from, else the path itself."""
-    return _places(_folder(path))["run"] or path if is_retraining(_folder(path)) else path
+    """The folder of the run: of a retraining the one that it went on from, else the
+    path itself.
+    """
+    return (
+        _places(_folder(path))["run"] or path if is_retraining(_folder(path)) else path
+    )
 
 
 def lens_of(path: Path) -> str:
-    """Which lens forms the images: "as designed", or of a retraining "as fitted", or "as made" where that is known."""
+    """Which lens forms the images: "as designed", or of a retraining "as fitted", or
+    "as made" where that is known.
+    """
     folder = _folder(path)
     if not is_retraining(folder):
         return "as designed"
@@ -54,16 +69,21 @@ def lens_of(path: Path) -> str:
 
 
 def load(path: Path) -> Source:
-    """A finished run as :func:`codesign.adapt.source.load` has it; of a retraining its network and the made lens.
+    """A finished run as :func:`codesign.adapt.source.load` has it; of a retraining its
+    network and the made lens.
 
     Args:
-        path: of a run, of a retraining, or a checkpoint in that: ``nominal.safetensors`` is the network that nobody
-            warned of the made lens, ``known.safetensors`` the one that was trained with the truth known.
+        path: of a run, of a retraining, or a checkpoint in that:
+            ``nominal.safetensors`` is the network that nobody
+            warned of the made lens, ``known.safetensors`` the one that was trained with
+            the truth known.
 
-    The lens is the true one where the bench was virtual, else the one of the fitted values.
+    The lens is the true one where the bench was virtual, else the one of the fitted
+    values.
 
     Raises:
-        TrainingError: no finished run or retraining, or one whose run, fit or truth is no longer what it was.
+        TrainingError: no finished run or retraining, or one whose run, fit or truth is
+            no longer what it was.
     """
     folder = _folder(path)
     if not is_retraining(folder):
@@ -72,19 +92,32 @@ def load(path: Path) -> Source:
     with reading.steady(folder):
         manifest.check(folder)
         recipe, places = config.load(folder / RECIPE, Recipe), _places(folder)
-        for name, sha in (("run", recipe.weights), ("asbuilt", recipe.asbuilt), ("truth", recipe.truth)):
+        for name, sha in (
+            ("run", recipe.weights),
+            ("asbuilt", recipe.asbuilt),
+            ("truth", recipe.truth),
+        ):
             _unchanged(folder, name, places[name], sha)
-        source = retraining.load(_known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs)
+        source = retraining.load(
+            _known(places["run"]), budget_mmacs=recipe.settings.budget_mmacs
+        )
         built = asbuilt.load(_known(places["asbuilt"]))
         truth = None if places["truth"] is None else config.load(places["truth"], Truth)
         design = lenses.load_plain(_known(places["run"]) / "lens.h5")
         made = MadeLens(design, source.settings.optics, response=built.response)
         found = retraining.lenses(made, built, recipe.settings, truth)
-        if job not in retraining.jobs(found) or not (folder / f"{job}.safetensors").is_file():
+        if (
+            job not in retraining.jobs(found)
+            or not (folder / f"{job}.safetensors").is_file()
+        ):
             have = ", ".join(f"{name}.safetensors" for name in retraining.jobs(found))
-            raise TrainingError(f"{path}: no network of this retraining; it holds {have}")
+            raise TrainingError(
+                f"{path}: no network of this retraining; it holds {have}"
+            )
         going = retraining.job(source, recipe.settings, found, job)
-        going.restore(checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"])
+        going.restore(
+            checkpoint.load(folder / f"{job}.safetensors", settings=recipe)["trainer"]
+        )
     shown = found.judges[0] if found.known else found.best
     return replace(source, run=replace(source.run, trainer=going), made=shown)
 
@@ -95,7 +128,9 @@ def _folder(path: Path) -> Path:
 
 def _known(path: Path | None) -> Path:
     if path is None:
-        raise TrainingError("a retraining without a run or a fit: made by another version; retrain again")
+        raise TrainingError(
+            "a retraining without a run or a fit: made by another version; retrain again"
+        )
     return path
 
 
@@ -119,15 +154,24 @@ def _places(folder: Path) -> dict[str, Path | None]:
             f"{folder} holds a retraining that is not finished, or of a version that did not note its run and fit: go "
             f"on with `metalens retrain RUN_DIR --asbuilt FILE -o {folder} --resume`"
         ) from None
-    return {name: folder / told[name] if told.get(name) else None for name in ("run", "asbuilt", "truth")}
+    return {
+        name: folder / told[name] if told.get(name) else None
+        for name in ("run", "asbuilt", "truth")
+    }
 
 
 def _unchanged(folder: Path, name: str, path: Path | None, sha: str) -> None:
     """Refuse what has moved away or become another."""
-    file = path / "checkpoint.safetensors" if path is not None and name == "run" else path
+    file = (
+        path / "checkpoint.safetensors" if path is not None and name == "run" else path
+    )
     if file is None and not sha:
         return
     if file is None or not file.is_file():
-        raise TrainingError(f"{folder}: its {name} is no longer at {path}; put it back, or retrain from where it is")
+        raise TrainingError(
+            f"{folder}: its {name} is no longer at {path}; put it back, or retrain from where it is"
+        )
     if reading.sha256(file) != sha:
-        raise TrainingError(f"{folder}: {file} is not what it was retrained from; give it back, or retrain")
+        raise TrainingError(
+            f"{folder}: {file} is not what it was retrained from; give it back, or retrain"
+        )

@@ -1,4 +1,6 @@
-"""A finished run as retraining and the experiments take it up, and what is refused: half runs, other lenses."""
+"""A finished run as retraining and the experiments take it up, and what is refused:
+half runs, other lenses.
+"""
 
 import json
 from dataclasses import dataclass
@@ -19,9 +21,11 @@ from metalens.lens import Lens
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Source:
-    """A finished run that is trained on: its network, the architecture that was chosen, its row of result.json.
+    """A finished run that is trained on: its network, the architecture that was chosen,
+    its row of result.json.
 
-    made: of a retraining, the lens as made; None where images are those of the run's own lens.
+    made: of a retraining, the lens as made; None where images are those of the run's
+    own lens.
     """
 
     run: Run
@@ -39,7 +43,8 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
     """A finished run and its network of this budget.
 
     Raises:
-        TrainingError: no run folder, half written, unfinished, of another version, or without such a budget.
+        TrainingError: no run folder, half written, unfinished, of another version, or
+            without such a budget.
     """
     _no_retraining(folder)
     names = ("run.toml", "checkpoint.safetensors", "lens.h5", "result.json")
@@ -59,11 +64,22 @@ def load(folder: Path, *, budget_mmacs: float = 0.0) -> Source:
         settings = runs.load(folder / "run.toml")
         made = runs.resume(folder / "checkpoint.safetensors", settings)
         rows = rows_of(folder)
-    found = [r for r in rows if r["budget_mmacs"] == budget_mmacs] if budget_mmacs else rows[-1:]
+    found = (
+        [r for r in rows if r["budget_mmacs"] == budget_mmacs]
+        if budget_mmacs
+        else rows[-1:]
+    )
     if not found:
-        have = ", ".join("none" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:g}" for r in rows)
-        raise TrainingError(f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}")
-    return Source(made, architecture_of(found[0]["architecture"], made, folder), found[0])
+        have = ", ".join(
+            "none" if r["budget_mmacs"] is None else f"{r['budget_mmacs']:g}"
+            for r in rows
+        )
+        raise TrainingError(
+            f"{folder} holds no network of {budget_mmacs:g} MMACs; its budgets are {have}"
+        )
+    return Source(
+        made, architecture_of(found[0]["architecture"], made, folder), found[0]
+    )
 
 
 def is_retraining(folder: Path) -> bool:
@@ -72,7 +88,9 @@ def is_retraining(folder: Path) -> bool:
 
 
 def _no_retraining(folder: Path) -> None:
-    """Refuse a folder of `metalens retrain`, which holds a network and not the run that it belongs to."""
+    """Refuse a folder of `metalens retrain`, which holds a network and not the run that
+    it belongs to.
+    """
     if is_retraining(folder):
         raise TrainingError(
             f"{folder} holds a retraining, no run: its network was trained on for one made lens; give the folder that "
@@ -96,14 +114,19 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
             json.loads(path.read_text("utf-8"))["rows"], key=lambda r: r["budget_mmacs"]
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise TrainingError(f"{path}: cut short or of another version ({error!r}); resume the run") from None
+        raise TrainingError(
+            f"{path}: cut short or of another version ({error!r}); resume the run"
+        ) from None
     if not rows:
         raise TrainingError(f"{path}: holds no network; resume the run")
     return rows
 
 
-def architecture_of(entry: dict[str, Any] | None, run: Run, folder: Path) -> Architecture:
-    """The architecture in a row of result.json; the only one of a baseline network, whose row names none.
+def architecture_of(
+    entry: dict[str, Any] | None, run: Run, folder: Path
+) -> Architecture:
+    """The architecture in a row of result.json; the only one of a baseline network,
+    whose row names none.
 
     Raises:
         TrainingError: of another version, or outside the run's space.
@@ -112,21 +135,31 @@ def architecture_of(entry: dict[str, Any] | None, run: Run, folder: Path) -> Arc
     if isinstance(net, Baseline):
         return smallest(net.space)
     named = (entry or {}).items()
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in named if k not in ("error", "macs")}
+    values: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v
+        for k, v in named
+        if k not in ("error", "macs")
+    }
     try:
         return check(run.settings.space, Architecture(**values))
     except TypeError as error:
-        raise TrainingError(f"{folder}/result.json: its network is of another version ({error})") from None
+        raise TrainingError(
+            f"{folder}/result.json: its network is of another version ({error})"
+        ) from None
 
 
 def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
-    """Refuse an as-built record of another lens, or of a fit that failed its own checks.
+    """Refuse an as-built record of another lens, or of a fit that failed its own
+    checks.
 
     Raises:
         FitError: either of the two, with what to do.
     """
     mine, other = design.diameters, result.design.diameters
-    if mine.diameter_um.shape != other.diameter_um.shape or mine.pitch_um != other.pitch_um:
+    if (
+        mine.diameter_um.shape != other.diameter_um.shape
+        or mine.pitch_um != other.pitch_um
+    ):
         raise FitError(
             f"the as-built record is of another lens: {other.diameter_um.shape} pillars of pitch {other.pitch_um} um, "
             f"the run's lens has {mine.diameter_um.shape} of {mine.pitch_um} um; fit captures of the run's own lens.h5"
@@ -140,6 +173,8 @@ def check_lens(design: Lens, result: AsBuilt, *, insist: bool = False) -> None:
         )
     if not result.trusted and not insist:
         raise FitError(
-            "the fit was refused by its own checks: " + "; ".join(result.problems) + ". Mend the captures and fit "
+            "the fit was refused by its own checks: "
+            + "; ".join(result.problems)
+            + ". Mend the captures and fit "
             "again; --insist trains on it in spite of that"
         )

@@ -1,7 +1,10 @@
-"""The network trained on for the lens that was made: the inner loop on its PSFs, with the optics fixed.
+"""The network trained on for the lens that was made: the inner loop on its PSFs, with
+the optics fixed.
 
-Training draws a lens from the posterior of the fit at every step, so the network trusts no parameter more than the
-captures do. What retraining bought is measured against three others: the nominal lens, the made lens before, and, on
+Training draws a lens from the posterior of the fit at every step, so the network trusts
+no parameter more than the
+captures do. What retraining bought is measured against three others: the nominal lens,
+the made lens before, and, on
 a virtual bench, a network that was trained with the truth known.
 """
 
@@ -36,14 +39,19 @@ from codesign.train import (
 from metalens.ground.errors import TrainingError
 
 APART = 7919  # between the seeds of retrainings: no step of one is a step of another
-JOBS = ("nominal", "retrained", "known")  # networks that are trained on: for the design, the fit, and the truth
+JOBS = (
+    "nominal",
+    "retrained",
+    "known",
+)  # networks that are trained on: for the design, the fit, and the truth
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Lenses:
     """PSFs of the lens in question.
 
-    nominal: as designed. best: of the fitted values. drawn: from the posterior, for training. judges: those that
+    nominal: as designed. best: of the fitted values. drawn: from the posterior, for
+    training. judges: those that
     judge: the truth where it is known, else further draws. known: whether it is.
     """
 
@@ -55,7 +63,9 @@ class Lenses:
 
 
 def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
-    """Standard error of the difference of two mean slippage errors over the frames, which both cases share."""
+    """Standard error of the difference of two mean slippage errors over the frames,
+    which both cases share.
+    """
     apart = (worse.error_mm - better.error_mm).mean(1)
     return float(apart.std()) / math.sqrt(len(apart))
 
@@ -64,8 +74,10 @@ def gap_sigma_mm(worse: Accuracy, better: Accuracy) -> float:
 class Outcome:
     """Accuracy in the order of the story.
 
-    designed: the run's network on the nominal lens, as it was. nominal: trained on for the nominal lens just as long,
-    so that the others are not credited with more training. before: that network on the made lens. after: retrained on
+    designed: the run's network on the nominal lens, as it was. nominal: trained on for
+    the nominal lens just as long,
+    so that the others are not credited with more training. before: that network on the
+    made lens. after: retrained on
     the fit. known: trained on with the truth known; None on a real bench.
     """
 
@@ -87,34 +99,50 @@ class Outcome:
 
     @property
     def recovered(self) -> float | None:
-        """Share of the gap that retraining wins back; None where the gap is within two of its standard errors."""
+        """Share of the gap that retraining wins back; None where the gap is within two
+        of its standard errors.
+        """
         if self.gap_mm <= 2 * self.gap_sigma_mm:
             return None
         return (self.before.slip_mm - self.after.slip_mm) / self.gap_mm
 
     @property
     def above(self) -> str:
-        """Why the error of some case's images is above what the run asks for, of the made lens first; empty where none
+        """Why the error of some case's images is above what the run asks for, of the
+        made lens first; empty where none
         is."""
         return self.after.above or self.designed.above
 
     def rows(self) -> dict[str, dict[str, float]]:
         """Numbers by name of the case."""
-        cases = {n: getattr(self, n) for n in ("designed", "nominal", "before", "after", "known")}
+        cases = {
+            n: getattr(self, n)
+            for n in ("designed", "nominal", "before", "after", "known")
+        }
         return {name: case.values() for name, case in cases.items() if case is not None}
 
 
-def lenses(made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None) -> Lenses:
+def lenses(
+    made: MadeLens, result: AsBuilt, config: RetrainConfig, truth: Truth | None = None
+) -> Lenses:
     """PSFs of the nominal, fitted, drawn and (where known) true lens."""
     rows = list(built.posterior(result, config.draws + config.judge, seed=config.seed))
     drawn = tuple(made.stack(x) for x in rows[: config.draws])
     judging = rows[config.draws :] if truth is None else [truth.vector()]
     best = made.stack(result.parameters())
-    return Lenses(made.stack(), best, drawn, tuple(made.stack(x) for x in judging), truth is not None)
+    return Lenses(
+        made.stack(),
+        best,
+        drawn,
+        tuple(made.stack(x) for x in judging),
+        truth is not None,
+    )
 
 
 def trainer(source: Source, config: RetrainConfig, stacks: Sequence[Stack]) -> Trainer:
-    """The inner loop of the run, from its trained weights and where it is placed, on given PSFs; only weights move."""
+    """The inner loop of the run, from its trained weights and where it is placed, on
+    given PSFs; only weights move.
+    """
     settings, origin = source.settings, source.run.trainer
     fresh = model(
         settings.optics, pitch_um=settings.run.pitch_um, seed=settings.inner.seed, space=settings.space,
@@ -143,7 +171,13 @@ def fine_tuning(inner: InnerConfig, config: RetrainConfig) -> InnerConfig:
 
 def job(source: Source, config: RetrainConfig, found: Lenses, name: str) -> Trainer:
     """The training of one of :data:`JOBS`."""
-    return trainer(source, config, {"nominal": (found.nominal,), "retrained": found.drawn, "known": found.judges}[name])
+    return trainer(
+        source,
+        config,
+        {"nominal": (found.nominal,), "retrained": found.drawn, "known": found.judges}[
+            name
+        ],
+    )
 
 
 def network(going: Trainer) -> Supernet:
@@ -154,7 +188,9 @@ def network(going: Trainer) -> Supernet:
     """
     net = going.model.net
     if not isinstance(net, Supernet):
-        raise TrainingError(f"the run trained a {type(net).__name__}; only elastic networks are retrained")
+        raise TrainingError(
+            f"the run trained a {type(net).__name__}; only elastic networks are retrained"
+        )
     return net
 
 
@@ -163,8 +199,12 @@ def jobs(found: Lenses) -> tuple[str, ...]:
     return JOBS if found.known else JOBS[:2]
 
 
-def train(going: Trainer, path: Path, settings: object, *, every: int = 50) -> Iterator[Record]:
-    """Run one job to its end, from where it stands, with checkpoints in ``path``; a record a step."""
+def train(
+    going: Trainer, path: Path, settings: object, *, every: int = 50
+) -> Iterator[Record]:
+    """Run one job to its end, from where it stands, with checkpoints in ``path``; a
+    record a step.
+    """
     for record in going.run():
         yield record
         if record.step % every == 0 or record.step == going.inner.steps:
@@ -172,9 +212,11 @@ def train(going: Trainer, path: Path, settings: object, *, every: int = 50) -> I
 
 
 def settle(going: Trainer, source: Source, *, batches: int = 8) -> None:
-    """Measure the batch statistics on training frames through the lenses that the network was trained for.
+    """Measure the batch statistics on training frames through the lenses that the
+    network was trained for.
 
-    Never on frames that judge: a network that nobody warned of the made lens knows none of its images.
+    Never on frames that judge: a network that nobody warned of the made lens knows none
+    of its images.
     """
     frames = []
     for number in range(batches):
@@ -218,13 +260,23 @@ def held(source: Source, config: RetrainConfig) -> Held:
     """The test frames of a run, that no training sees."""
     scenes = source.run.scenes(TEST)
     size = source.settings.inner.batch
-    return Held(tuple(scenes.batch(n, size) for n in range(config.test_batches)), scenes.margin, scenes.stream)
+    return Held(
+        tuple(scenes.batch(n, size) for n in range(config.test_batches)),
+        scenes.margin,
+        scenes.stream,
+    )
 
 
 def judge(
-    going: Trainer, source: Source, config: RetrainConfig, stacks: Sequence[Stack], *, frames: Held | None = None
+    going: Trainer,
+    source: Source,
+    config: RetrainConfig,
+    stacks: Sequence[Stack],
+    *,
+    frames: Held | None = None,
 ) -> Accuracy:
-    """Errors on test frames, each the mean over these lenses: the frames are what all cases share.
+    """Errors on test frames, each the mean over these lenses: the frames are what all
+    cases share.
 
     frames: of :func:`held`, where several cases are judged.
     """
@@ -233,13 +285,20 @@ def judge(
     parts = []
     for made in stacks[: config.judge]:
         seen = assess.frames(going, frames, config.test_batches, stack=made)
-        answers = assess.predict(going.model.net, source.architecture, seen, going.inner)
+        answers = assess.predict(
+            going.model.net, source.architecture, seen, going.inner
+        )
         parts.append(reading.accuracy(answers, seen))
-    error, iou = (torch.stack([getattr(p, name) for p in parts]).mean(0) for name in ("error_mm", "iou"))
+    error, iou = (
+        torch.stack([getattr(p, name) for p in parts]).mean(0)
+        for name in ("error_mm", "iou")
+    )
     return Accuracy(error, iou, next((p.above for p in parts if p.above), ""))
 
 
-def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]) -> Outcome:
+def outcome(
+    source: Source, config: RetrainConfig, found: Lenses, trained: dict[str, Trainer]
+) -> Outcome:
     """Accuracy of all cases, on the same test frames."""
     nominal, frames = (found.nominal,), held(source, config)
     untouched = trainer(source, config, nominal)
@@ -257,12 +316,18 @@ def outcome(source: Source, config: RetrainConfig, found: Lenses, trained: dict[
 
 
 def retrain(
-    folder: Path, result: AsBuilt, *, config: RetrainConfig | None = None, truth: Truth | None = None
+    folder: Path,
+    result: AsBuilt,
+    *,
+    config: RetrainConfig | None = None,
+    truth: Truth | None = None,
 ) -> Outcome:
-    """A finished run's network trained on for the lens that was made, in one call; ``metalens retrain`` keeps files.
+    """A finished run's network trained on for the lens that was made, in one call;
+    ``metalens retrain`` keeps files.
 
     Args:
-        folder: of ``metalens codesign``. result: of ``metalens fit`` for that run's lens.h5.
+        folder: of ``metalens codesign``. result: of ``metalens fit`` for that run's
+            lens.h5.
         truth: of the virtual bench, where there is one.
 
     Raises:
@@ -275,7 +340,12 @@ def retrain(
     source = load(folder, budget_mmacs=config.budget_mmacs)
     design = lens_files.load(folder / "lens.h5")
     check_lens(design, result)
-    found = lenses(MadeLens(design, source.settings.optics, response=result.response), result, config, truth)
+    found = lenses(
+        MadeLens(design, source.settings.optics, response=result.response),
+        result,
+        config,
+        truth,
+    )
     trained = {name: job(source, config, found, name) for name in jobs(found)}
     for going in trained.values():
         for _ in going.run():

@@ -14,9 +14,12 @@ from metalens.image import Frames
 class Pose:
     """How the eye stands before the camera.
 
-    shift_mm: (batch, 3) displacement of the head as the camera sees it (:class:`codesign.eye.Labels`): what a network
-        can learn of the slippage. axis: (batch, 3) optic axis, a unit vector in the camera's frame.
-    points: (batch, points, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's middle: x, y as a fraction of
+    shift_mm: (batch, 3) displacement of the head as the camera sees it
+    (:class:`codesign.eye.Labels`): what a network
+        can learn of the slippage. axis: (batch, 3) optic axis, a unit vector in the
+        camera's frame.
+    points: (batch, points, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's
+    middle: x, y as a fraction of
         the image from its middle, beyond 0.5 outside of it.
     """
 
@@ -44,7 +47,9 @@ class Batch:
     pose: Pose | None = None
 
     def to(self, device: torch.device) -> "Batch":
-        """What is true of the frames on a device; the frames themselves go there as they are imaged."""
+        """What is true of the frames on a device; the frames themselves go there as
+        they are imaged.
+        """
         pose = None if self.pose is None else self.pose.to(device)
         return Batch(self.frames, self.mask.to(device), self.slip_mm.to(device), pose)
 

@@ -1,6 +1,8 @@
-"""Training and search under ``torchrun``: every process takes its part of each batch, and all move alike.
+"""Training and search under ``torchrun``: every process takes its part of each batch,
+and all move alike.
 
-Gradients are averaged and batch statistics taken over the whole batch, so two processes do what one does, to rounding.
+Gradients are averaged and batch statistics taken over the whole batch, so two processes
+do what one does, to rounding.
 Candidates of a search are judged by one process each.
 Outside ``torchrun`` there is one process and nothing here costs anything.
 """
@@ -21,7 +23,9 @@ from metalens.image import Frames
 
 
 def join(device: torch.device | None = None) -> None:
-    """Join the other processes of ``torchrun``, if it started this one; ``device``: where this one computes."""
+    """Join the other processes of ``torchrun``, if it started this one; ``device``:
+    where this one computes.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
         if device is not None and device.type == "cuda":
             torch.cuda.set_device(device)
@@ -63,16 +67,26 @@ def part_of(batch: Batch) -> Batch:
         return batch
     size, odd = divmod(len(batch.slip_mm), ranks())
     if odd:
-        raise TrainingError(f"a batch of {len(batch.slip_mm)} frames on {ranks()} processes: need a multiple of them")
+        raise TrainingError(
+            f"a batch of {len(batch.slip_mm)} frames on {ranks()} processes: need a multiple of them"
+        )
     mine = slice(rank() * size, (rank() + 1) * size)
     frames: Frames | Flat = _rows(batch.frames, mine)
     pose = None if batch.pose is None else _rows(batch.pose, mine)
-    return replace(batch, frames=frames, mask=batch.mask[mine], slip_mm=batch.slip_mm[mine], pose=pose)
+    return replace(
+        batch,
+        frames=frames,
+        mask=batch.mask[mine],
+        slip_mm=batch.slip_mm[mine],
+        pose=pose,
+    )
 
 
 def _rows(record: Any, rows: slice) -> Any:
     """Some of the frames of a record of tensors."""
-    return type(record)(*(getattr(record, name)[rows] for name in type(record).__slots__))
+    return type(record)(
+        *(getattr(record, name)[rows] for name in type(record).__slots__)
+    )
 
 
 def average(parameters: Iterable[nn.Parameter]) -> None:
@@ -80,7 +94,9 @@ def average(parameters: Iterable[nn.Parameter]) -> None:
     if ranks() == 1:
         return
     grads = [p.grad for p in parameters if p.grad is not None]
-    for kind in sorted({(g.dtype, g.device) for g in grads}, key=str):  # in the same order everywhere
+    for kind in sorted(
+        {(g.dtype, g.device) for g in grads}, key=str
+    ):  # in the same order everywhere
         mine = [g for g in grads if (g.dtype, g.device) == kind]
         joined = _reduced(torch.cat([g.flatten() for g in mine])) / ranks()
         start = 0
@@ -93,7 +109,9 @@ def mean_of(values: list[float]) -> list[float]:
     """Mean of numbers over the processes."""
     if ranks() == 1:
         return values
-    return [float(v) for v in _reduced(torch.tensor(values, dtype=torch.float64)) / ranks()]
+    return [
+        float(v) for v in _reduced(torch.tensor(values, dtype=torch.float64)) / ranks()
+    ]
 
 
 def each(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
@@ -104,7 +122,9 @@ def each(work: Callable[[Any], float], items: Sequence[Any]) -> list[float]:
     return [float(v) for v in (_reduced(found) if ranks() > 1 else found)]
 
 
-def batch_norm(x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5) -> Tensor:
+def batch_norm(
+    x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5
+) -> Tensor:
     """Batch normalisation with the statistics of all processes' frames; differentiable."""
     count = x.numel() // x.shape[1] * ranks()
     mean = _summed(x.sum((0, 2, 3))) / count
@@ -115,7 +135,9 @@ def batch_norm(x: Tensor, weight: Tensor, bias: Tensor, *, epsilon: float = 1e-5
 
 
 class _Sum(torch.autograd.Function):
-    """Sum over processes; every process's loss depends on every process's part, so gradients are summed too."""
+    """Sum over processes; every process's loss depends on every process's part, so
+    gradients are summed too.
+    """
 
     @staticmethod
     def forward(context: Any, value: Tensor) -> Tensor:

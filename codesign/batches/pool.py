@@ -1,4 +1,6 @@
-"""A pool of rendered eyes that training draws from again and again, each time at another scale."""
+"""A pool of rendered eyes that training draws from again and again, each time at
+another scale.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +26,12 @@ CHUNK = 64  # frames rendered at a time
 class Pool:
     """Frames at unit scale, with their labels; what :class:`PoolScenes` draws from.
 
-    light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil coverage without the margin.
-    place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3) the same as the camera sees it.
-    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.Pose`. here_um: (3,) nominal place.
+    light: (n, y, x) uint8. depth_um: (n, y, x) uint16. mask: (n, y, x) uint8, pupil
+    coverage without the margin.
+    place_um: (n, 3) nominal place and slippage together, at unit scale. seen_um: (n, 3)
+    the same as the camera sees it.
+    axis: (n, 3). points: (n, points, 2); see :class:`codesign.batches.Pose`. here_um:
+    (3,) nominal place.
     depths_um: (2,) range of the depth.
     """
 
@@ -50,8 +55,12 @@ def fill(scenes: EyeScenes, count: int) -> Pool:
     for number, start in enumerate(range(0, count, CHUNK)):
         parts.append(_part(scenes, number, min(CHUNK, count - start)))
     here = np.array([*scenes.rig.aim_um, scenes.rig.distance_um])
-    light, depth, mask, place, seen, axis, points = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    return Pool(light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um))
+    light, depth, mask, place, seen, axis, points = (
+        np.concatenate(rows) for rows in zip(*parts, strict=True)
+    )
+    return Pool(
+        light, depth, mask, place, seen, axis, points, here, np.array(scenes.depths_um)
+    )
 
 
 def save(path: Path, pool: Pool) -> None:
@@ -79,22 +88,36 @@ def _part(scenes: EyeScenes, number: int, count: int) -> tuple[Array, ...]:
     if mask.shape[-1] % MASK == 0:
         mask = F.avg_pool2d(mask, mask.shape[-1] // MASK)
     coverage = (mask[:, 0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    here = torch.tensor([*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64)
+    here = torch.tensor(
+        [*scenes.rig.aim_um, scenes.rig.distance_um], dtype=torch.float64
+    )
     place, seen = (
-        ((here + moved) / states.scale[:, None]).numpy() for moved in (made.labels.slip_um, made.labels.shift_um)
+        ((here + moved) / states.scale[:, None]).numpy()
+        for moved in (made.labels.slip_um, made.labels.shift_um)
     )
     pose = pose_of(made, scenes.margin)
-    return flat.light, flat.depth_um, coverage, place, seen, pose.axis.numpy(), pose.points.numpy()
+    return (
+        flat.light,
+        flat.depth_um,
+        coverage,
+        place,
+        seen,
+        pose.axis.numpy(),
+        pose.points.numpy(),
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoolScenes:
     """Batches from a pool; see :class:`codesign.train.inner.Scenes`.
 
-    Every pass over the pool has an order of its own, and every frame a new scale each time it is drawn.
+    Every pass over the pool has an order of its own, and every frame a new scale each
+    time it is drawn.
 
-    seed: of orders and scales. margin: samples around the frames. spread: of the scale, see :func:`decoupled`.
-    pool: or what gives it whenever a batch is asked for, so that many runs need not hold theirs at once.
+    seed: of orders and scales. margin: samples around the frames. spread: of the scale,
+    see :func:`decoupled`.
+    pool: or what gives it whenever a batch is asked for, so that many runs need not
+    hold theirs at once.
     """
 
     pool: Pool | Callable[[], Pool]
@@ -116,18 +139,39 @@ class PoolScenes:
         count = len(self.held)
         a_pass = count // size
         if a_pass == 0:
-            raise TrainingError(f"a pool of {count} frames is smaller than a batch of {size}: raise the pool")
+            raise TrainingError(
+                f"a pool of {count} frames is smaller than a batch of {size}: raise the pool"
+            )
         order = np.random.default_rng([self.seed, step // a_pass, 5]).permutation(count)
         first = step % a_pass * size
-        return self.rows(np.sort(order[first : first + size]), np.random.default_rng([self.seed, step, 6]))
+        return self.rows(
+            np.sort(order[first : first + size]),
+            np.random.default_rng([self.seed, step, 6]),
+        )
 
     def rows(self, rows: Array, generator: np.random.Generator) -> Batch:
         """The frames of these numbers, at scales drawn from ``generator``."""
         pool = self.held
-        here, place = torch.from_numpy(pool.here_um), torch.from_numpy(pool.place_um[rows])
+        here, place = (
+            torch.from_numpy(pool.here_um),
+            torch.from_numpy(pool.place_um[rows]),
+        )
         low, high = pool.depths_um
-        scale = decoupled(place[:, 2], (float(low), float(high)), self.spread, generator)
-        slip, shift = ((scale[:, None] * p - here) * 1e-3 for p in (place, torch.from_numpy(pool.seen_um[rows])))
-        pose = Pose(shift.float(), torch.from_numpy(pool.axis[rows]), torch.from_numpy(pool.points[rows]))
-        flat = Flat(pool.light[rows], pool.depth_um[rows], scale.numpy().astype(np.float32))
-        return Batch(flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float(), pose)
+        scale = decoupled(
+            place[:, 2], (float(low), float(high)), self.spread, generator
+        )
+        slip, shift = (
+            (scale[:, None] * p - here) * 1e-3
+            for p in (place, torch.from_numpy(pool.seen_um[rows]))
+        )
+        pose = Pose(
+            shift.float(),
+            torch.from_numpy(pool.axis[rows]),
+            torch.from_numpy(pool.points[rows]),
+        )
+        flat = Flat(
+            pool.light[rows], pool.depth_um[rows], scale.numpy().astype(np.float32)
+        )
+        return Batch(
+            flat, torch.from_numpy(pool.mask[rows]).float() / 255, slip.float(), pose
+        )

@@ -1,4 +1,6 @@
-"""Eyes as training and test frames: drawn from a seed and a number, with a margin, depth not readable from size."""
+"""Eyes as training and test frames: drawn from a seed and a number, with a margin,
+depth not readable from size.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -33,7 +35,10 @@ LOOKS = (
     *ALBEDOS, "iris_contrast", "veins", "pores", "lashes", "brow", "glint", "ambient", "fissure_upper_um",
     "fissure_lower_um", "pupil_radius_um",
 )  # fmt: skip
-LEAST = {"iris": 0.05, "pupil_radius_um": 700.0}  # 0 elsewhere: nobody could see the pupil of a black iris
+LEAST = {
+    "iris": 0.05,
+    "pupil_radius_um": 700.0,
+}  # 0 elsewhere: nobody could see the pupil of a black iris
 MOST = {name: 0.95 for name in ALBEDOS} | {"pupil_radius_um": 4300.0}
 
 
@@ -41,16 +46,25 @@ MOST = {name: 0.95 for name in ALBEDOS} | {"pupil_radius_um": 4300.0}
 class SceneConfig:
     """What the camera sees.
 
-    pixels: of the image grid along a side, ``sample_um`` of the optics apart. margin: samples rendered beyond it.
-    scale: spread of the scale ambiguity: depths and labels are multiplied by a factor of 1 +- scale at an unchanged
+    pixels: of the image grid along a side, ``sample_um`` of the optics apart. margin:
+    samples rendered beyond it.
+    scale: spread of the scale ambiguity: depths and labels are multiplied by a factor
+    of 1 +- scale at an unchanged
         pinhole image, so that size does not tell depth; see :func:`decoupled`.
-    slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up or down.
-    depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image tells it from slippage.
-    variety: factor on how far looks spread about the population's mean: albedos and texture of iris, sclera and skin,
-        lashes, brow, pupil and its size, glints, ambient light, exposure, opening of the lids. 1 is the population as
-        published, bare; from there to 2 and more come spectacles with reflections, make-up, uneven light, shadows,
-        movement and other views (:mod:`codesign.eye.worn`): for faces, lamps and cameras that nobody modelled.
-    pool: frames that training draws from again and again, at another scale each time; 0 renders every frame anew.
+    slip_mm: largest slippage along x, y, z. gaze_deg: largest gaze to the side and up
+    or down.
+    depth_sd_mm: spread of the pupil's depth between people at zero slippage; no image
+    tells it from slippage.
+    variety: factor on how far looks spread about the population's mean: albedos and
+    texture of iris, sclera and skin,
+        lashes, brow, pupil and its size, glints, ambient light, exposure, opening of
+        the lids. 1 is the population as
+        published, bare; from there to 2 and more come spectacles with reflections,
+        make-up, uneven light, shadows,
+        movement and other views (:mod:`codesign.eye.worn`): for faces, lamps and
+        cameras that nobody modelled.
+    pool: frames that training draws from again and again, at another scale each time; 0
+    renders every frame anew.
     """
 
     pixels: int = 128
@@ -63,13 +77,21 @@ class SceneConfig:
     pool: int = 0
 
     def __post_init__(self) -> None:
-        if self.pixels < 32 or not 0 <= self.margin < self.pixels or not 0 <= self.scale < 0.5:
+        if (
+            self.pixels < 32
+            or not 0 <= self.margin < self.pixels
+            or not 0 <= self.scale < 0.5
+        ):
             raise ConfigError(
                 f"pixels = {self.pixels}, margin = {self.margin}, scale = {self.scale}: need 32 or more pixels, a "
                 "margin below them, and a scale below 0.5"
             )
         nearest = 1e-3 * Rig().distance_um
-        if min(self.slip_mm) < 0 or self.slip_mm[2] >= nearest or not all(0 <= turn < 60 for turn in self.gaze_deg):
+        if (
+            min(self.slip_mm) < 0
+            or self.slip_mm[2] >= nearest
+            or not all(0 <= turn < 60 for turn in self.gaze_deg)
+        ):
             raise ConfigError(
                 f"slip_mm = {self.slip_mm}, gaze_deg = {self.gaze_deg}: need largest slippages of 0 or more, along z "
                 f"below the {nearest:g} mm that the eye stands before the lens, and angles of 0 to 60, as eyes turn"
@@ -82,7 +104,9 @@ class SceneConfig:
 
     @property
     def pupil_depths_um(self) -> tuple[float, float]:
-        """Least and largest depth of the pupils before the lens, whoever they are of (two standard deviations)."""
+        """Least and largest depth of the pupils before the lens, whoever they are of
+        (two standard deviations).
+        """
         reach = self.slip_mm[2] * 1e3 + 2e3 * self.depth_sd_mm
         return Rig().distance_um - reach, Rig().distance_um + reach
 
@@ -96,7 +120,11 @@ class SceneConfig:
             population={**wide.population, "depth_um": depth},
             gaze_x_rad=math.radians(self.gaze_deg[0]),
             gaze_y_rad=math.radians(self.gaze_deg[1]),
-            slip_um=(self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3),
+            slip_um=(
+                self.slip_mm[0] * 1e3,
+                self.slip_mm[1] * 1e3,
+                self.slip_mm[2] * 1e3,
+            ),
         )
 
 
@@ -136,63 +164,99 @@ class EyeScenes:
 
     def states(self, step: int, size: int) -> States:
         """Subjects and states of a step."""
-        plain = eye.draw(size, (self.seed, self.stream, step), motion=self.settings.motion)
+        plain = eye.draw(
+            size, (self.seed, self.stream, step), motion=self.settings.motion
+        )
         depth = self.rig.distance_um + plain.slip_um[:, 2]
         generator = np.random.default_rng((self.seed, self.stream, step, 1))
-        return replace(plain, scale=decoupled(depth, self.depths_um, self.settings.scale, generator))
+        return replace(
+            plain,
+            scale=decoupled(depth, self.depths_um, self.settings.scale, generator),
+        )
 
     def rendered(self, step: int, size: int) -> Rendered:
-        """Frames of a step with all labels, and with what the scenes' variety lets them wear."""
+        """Frames of a step with all labels, and with what the scenes' variety lets them
+        wear.
+        """
         seed = (self.seed, self.stream, step, 3)
-        return worn(self.states(step, size), self.rig, self.camera, self.settings.variety, seed)
+        return worn(
+            self.states(step, size), self.rig, self.camera, self.settings.variety, seed
+        )
 
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step, as training takes them."""
         return as_batch(self.rendered(step, size), self.margin)
 
 
-def worn(states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[int, ...]) -> Rendered:
+def worn(
+    states: States, rig: Rig, camera: Camera, variety: float, seed: tuple[int, ...]
+) -> Rendered:
     """Frames with what :mod:`codesign.eye.worn` draws for them; bare up to variety 1."""
     if variety <= 1:
         return render(states, rig=rig, camera=camera)
     found = drawn(len(states), variety, np.random.default_rng(seed))
-    return dressed(render(pigmented(states, found), rig=rig, camera=camera, view=viewed(found)), found)
+    return dressed(
+        render(pigmented(states, found), rig=rig, camera=camera, view=viewed(found)),
+        found,
+    )
 
 
 def varied(variety: float) -> Motion:
-    """The usual ranges with looks and opening of the lids spread by a factor about the mean."""
+    """The usual ranges with looks and opening of the lids spread by a factor about the
+    mean.
+    """
     usual = Motion()
     widest = max(1 - (1 - usual.aperture[0]) * variety, 0.1), usual.aperture[1]
     return replace(usual, population={**POPULATION, **looks(variety)}, aperture=widest)
 
 
 def looks(variety: float) -> dict[str, Trait]:
-    """Traits of :data:`LOOKS`, spread and limits widened about the mean, between :data:`LEAST` and :data:`MOST`."""
+    """Traits of :data:`LOOKS`, spread and limits widened about the mean, between
+    :data:`LEAST` and :data:`MOST`.
+    """
     found = {}
     for name in LOOKS:
         t = POPULATION[name]
         top = min(t.mean + (t.high - t.mean) * variety, MOST.get(name, math.inf))
         found[name] = replace(
-            t, sd=t.sd * variety, low=max(t.mean - (t.mean - t.low) * variety, LEAST.get(name, 0.0)), high=top
+            t,
+            sd=t.sd * variety,
+            low=max(t.mean - (t.mean - t.low) * variety, LEAST.get(name, 0.0)),
+            high=top,
         )
     return found
 
 
-def decoupled(depth_um: Tensor, range_um: tuple[float, float], spread: float, generator: np.random.Generator) -> Tensor:
-    """(n,) factors that bring depths to others, drawn evenly from ``range_um`` whatever the depth was.
+def decoupled(
+    depth_um: Tensor,
+    range_um: tuple[float, float],
+    spread: float,
+    generator: np.random.Generator,
+) -> Tensor:
+    """(n,) factors that bring depths to others, drawn evenly from ``range_um`` whatever
+    the depth was.
 
-    So the scaled depth has nothing to do with the size of what is seen: the geometric cue is removed, as far as a
-    factor of 1 +- ``spread`` reaches. A factor drawn on its own would leave most of the cue.
+    So the scaled depth has nothing to do with the size of what is seen: the geometric
+    cue is removed, as far as a
+    factor of 1 +- ``spread`` reaches. A factor drawn on its own would leave most of the
+    cue.
     """
     wanted = torch.from_numpy(generator.uniform(*range_um, len(depth_um)))
     return (wanted / depth_um).clamp(1 - spread, 1 + spread)
 
 
 def as_batch(made: Rendered, margin: int) -> Batch:
-    """Rendered frames as a training batch: the mask without its margin, the slippage in mm."""
+    """Rendered frames as a training batch: the mask without its margin, the slippage in
+    mm.
+    """
     inside = slice(margin, made.pupil.shape[-1] - margin)
     frames = Frames(made.frames.radiance, made.frames.coverage, made.frames.depth_um)
-    return Batch(frames, made.pupil[:, inside, inside], (made.labels.slip_um * 1e-3).float(), pose_of(made, margin))
+    return Batch(
+        frames,
+        made.pupil[:, inside, inside],
+        (made.labels.slip_um * 1e-3).float(),
+        pose_of(made, margin),
+    )
 
 
 def pose_of(made: Rendered, margin: int) -> Pose:
@@ -200,4 +264,6 @@ def pose_of(made: Rendered, margin: int) -> Pose:
     size, labels = made.pupil.shape[-1], made.labels
     places = torch.cat([labels.landmarks_px, labels.pupil_px[:, None]], 1)
     points = (places - (size - 1) / 2) / (size - 2 * margin)
-    return Pose((labels.shift_um * 1e-3).float(), labels.optic_axis.float(), points.float())
+    return Pose(
+        (labels.shift_um * 1e-3).float(), labels.optic_axis.float(), points.float()
+    )

@@ -1,6 +1,8 @@
-"""The run that is planned: its lens, its eyes, and its optics at any setting of any knob.
+"""The run that is planned: its lens, its eyes, and its optics at any setting of any
+knob.
 
-The true image has one knob, its tolerance: field points, depths, wavelengths and patches follow from it. The image of
+The true image has one knob, its tolerance: field points, depths, wavelengths and
+patches follow from it. The image of
 one PSF a depth has four. Pillars and mask are judged in either.
 """
 
@@ -15,7 +17,15 @@ import torch
 from codesign.budget import task
 from codesign.budget.response import between
 from codesign.budget.task import TaskSetting, Views
-from codesign.optics import Aperture, Device, Numerics, Window, device, gathered, kernels
+from codesign.optics import (
+    Aperture,
+    Device,
+    Numerics,
+    Window,
+    device,
+    gathered,
+    kernels,
+)
 from metalens import design, library
 from metalens.cell import Cell
 from metalens.design import Focus
@@ -28,7 +38,9 @@ from metalens.psf import Source, spectrum
 
 PILLARS: dict[str, tuple[float, ...]] = {"library_tolerance": (3e-2, 1e-2, 1e-3, 1e-4)}
 MASK: dict[str, tuple[float, ...]] = {"diameter_step_nm": (20, 10, 5, 2, 1)}
-LEVELS: dict[str, tuple[float, ...]] = {  # of one PSF a depth; coarsest first, the last of each is the finest
+LEVELS: dict[
+    str, tuple[float, ...]
+] = {  # of one PSF a depth; coarsest first, the last of each is the finest
     **PILLARS,
     "depth_count": (4, 6, 8, 12, 16, 24, 32, 48),
     "wavelength_count": (1, 2, 3, 4, 6, 8),
@@ -36,7 +48,11 @@ LEVELS: dict[str, tuple[float, ...]] = {  # of one PSF a depth; coarsest first, 
     "kernel_tolerance": (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 1e-4),
     **MASK,
 }
-TRUE_LEVELS: dict[str, tuple[float, ...]] = {**PILLARS, "image_tolerance": (0.2, 0.1, 0.05, 0.03, 0.02), **MASK}
+TRUE_LEVELS: dict[str, tuple[float, ...]] = {
+    **PILLARS,
+    "image_tolerance": (0.2, 0.1, 0.05, 0.03, 0.02),
+    **MASK,
+}
 PILOT = Numerics(12, 1, 1e-4, 1e-4)  # of the other knobs while one is looked at
 TRUE_PILOT = 0.1  # the same: tolerance of the true image
 SETTLE_STEPS = 2  # of the estimator, which starts at the true state
@@ -49,21 +65,30 @@ LAYERS = "the lens of a plan has neither glass nor stop; metalens budget LENS re
 
 Kind = Literal["true", "uniform"]
 Optics = PsfBasis | Imager
-Imaging = Numerics | float  # how the optics are computed: numerics of one PSF a depth, or the true image's tolerance
+Imaging = (
+    Numerics | float
+)  # how the optics are computed: numerics of one PSF a depth, or the true image's tolerance
 
 
 @dataclass(frozen=True, slots=True)
 class PlanConfig:
     """PLAN.toml: the lens and the run that is planned.
 
-    image: "true", through the field, the spectrum and the films of the device; or "uniform", one PSF a depth.
+    image: "true", through the field, the spectrum and the films of the device; or
+    "uniform", one PSF a depth.
     stacks: sets of PSFs that the run computes. frames: images that it forms.
-    aperture_mm: diameter of the lens. wavelength_nm: of the design. sensor_distance_mm: from lens to sensor.
-    source_distance_mm: at which the lens is focused. led_fwhm_nm: width of the source's spectrum; 0 for one wavelength.
+    aperture_mm: diameter of the lens. wavelength_nm: of the design. sensor_distance_mm:
+    from lens to sensor.
+    source_distance_mm: at which the lens is focused. led_fwhm_nm: width of the source's
+    spectrum; 0 for one wavelength.
     cell: of the pillars. task: what is looked at.
     """
 
-    ELSEWHERE: ClassVar[dict[str, str]] = {"spectrum": LIGHT, "wavelengths_nm": LIGHT, "layers": LAYERS}
+    ELSEWHERE: ClassVar[dict[str, str]] = {
+        "spectrum": LIGHT,
+        "wavelengths_nm": LIGHT,
+        "layers": LAYERS,
+    }
 
     aperture_mm: float = 1.0
     wavelength_nm: float = field(default=850.0, metadata={"above": 0})
@@ -77,7 +102,12 @@ class PlanConfig:
     task: TaskSetting = field(default_factory=TaskSetting)
 
     def __post_init__(self) -> None:
-        if not (0.02 <= self.aperture_mm <= 4 and self.stacks >= 1 and self.frames >= 1 and self.led_fwhm_nm >= 0):
+        if not (
+            0.02 <= self.aperture_mm <= 4
+            and self.stacks >= 1
+            and self.frames >= 1
+            and self.led_fwhm_nm >= 0
+        ):
             raise ConfigError(
                 f"aperture_mm = {self.aperture_mm}, stacks = {self.stacks}, frames = {self.frames}, led_fwhm_nm = "
                 f"{self.led_fwhm_nm}: need 0.02 to 4 mm, 1 or more of both, and a width of 0 or more"
@@ -89,22 +119,32 @@ class PlanConfig:
                 "needs pillars on a square lattice that answer x and y alike (metalens psf, layout and view take any)"
             )
         if self.source is not None:
-            spectrum.points(self.source)  # refused now, not after the floor was measured
+            spectrum.points(
+                self.source
+            )  # refused now, not after the floor was measured
 
     @property
     def source(self) -> Source | None:
         """The diode; None for one wavelength."""
-        return Source(self.wavelength_nm, self.led_fwhm_nm) if self.led_fwhm_nm else None
+        return (
+            Source(self.wavelength_nm, self.led_fwhm_nm) if self.led_fwhm_nm else None
+        )
 
     @property
     def geometry(self) -> tuple[float, float, float]:
-        """Sensor distance in mm, wavelength in nm and aperture in mm: what a reader is trained before."""
+        """Sensor distance in mm, wavelength in nm and aperture in mm: what a reader is
+        trained before.
+        """
         return self.sensor_distance_mm, self.wavelength_nm, self.aperture_mm
 
     @property
     def focus(self) -> Focus:
         """What the lens images onto what."""
-        return Focus(self.wavelength_nm * 1e-3, self.sensor_distance_mm * 1e3, self.source_distance_mm * 1e3)
+        return Focus(
+            self.wavelength_nm * 1e-3,
+            self.sensor_distance_mm * 1e3,
+            self.source_distance_mm * 1e3,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +161,12 @@ class Choice:
     @property
     def imaging(self) -> Imaging:
         """Of the optics."""
-        return Numerics(self.depth_count, self.wavelength_count, self.psf_tolerance, self.kernel_tolerance)
+        return Numerics(
+            self.depth_count,
+            self.wavelength_count,
+            self.psf_tolerance,
+            self.kernel_tolerance,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +184,22 @@ class TrueChoice:
 
 
 class Chain:
-    """The run to plan: its lens, eyes, and pillars at every library tolerance, computed when first asked for.
+    """The run to plan: its lens, eyes, and pillars at every library tolerance, computed
+    when first asked for.
 
-    levels: of every knob. around: setting of the optics while another knob is looked at.
+    levels: of every knob. around: setting of the optics while another knob is looked
+    at.
     """
 
-    def __init__(self, config: PlanConfig, say: Callable[[str], None] = lambda text: None) -> None:
-        config = replace(config, task=replace(config.task, sensor_distance_um=config.focus.sensor_distance_um))
+    def __init__(
+        self, config: PlanConfig, say: Callable[[str], None] = lambda text: None
+    ) -> None:
+        config = replace(
+            config,
+            task=replace(
+                config.task, sensor_distance_um=config.focus.sensor_distance_um
+            ),
+        )
         self.config, self.say = config, say
         self.levels = levels_of(config)
         self.around: Imaging = TRUE_PILOT if self.true else PILOT
@@ -184,21 +238,33 @@ class Chain:
     def table(self, tolerance: float) -> Array:
         """t of the aperture's diameters in the library of this tolerance."""
         made, _ = self.library(tolerance)
-        return between(made.t[:, 0, 0].mean(0), made.diameter_um, self.aperture.diameter_um)
+        return between(
+            made.t[:, 0, 0].mean(0), made.diameter_um, self.aperture.diameter_um
+        )
 
     def optics(self, table: Array, imaging: Imaging) -> Optics:
-        """The lens with these pillars: the true image at a tolerance, or kernels of one PSF a depth."""
+        """The lens with these pillars: the true image at a tolerance, or kernels of one
+        PSF a depth.
+        """
         maps = self.aperture.maps(table)
         if isinstance(imaging, Numerics):
-            return kernels(self.lens, maps, imaging, self.window, fwhm_nm=self.config.led_fwhm_nm)
+            return kernels(
+                self.lens, maps, imaging, self.window, fwhm_nm=self.config.led_fwhm_nm
+            )
         seen = self.device(imaging)
         return seen.image(wave=gathered(self.lens, *maps, window_um=seen.window_um))
 
     def _device(self, tolerance: float) -> Device:
-        """The designed lens as a true image, whose field points, depths, wavelengths and patches all pillars share."""
+        """The designed lens as a true image, whose field points, depths, wavelengths
+        and patches all pillars share.
+        """
         setting, lens = self.config.task, self.lens
         grid = Grid(
-            (setting.pixels,) * 2, setting.pitch_um, self.eyes.depths_um, setting.margin, 2 * setting.margin + 1
+            (setting.pixels,) * 2,
+            setting.pitch_um,
+            self.eyes.depths_um,
+            setting.margin,
+            2 * setting.margin + 1,
         )
         maps = self.aperture.maps(self.aperture.designed())
         return device(
@@ -212,20 +278,36 @@ class Chain:
         return task.electrons(self.eyes.anchor, optics, self.config.task)
 
     def read(self, images: torch.Tensor, believed: Optics) -> torch.Tensor:
-        """(scenes, unknowns) where the estimate of the eyes' states comes to rest, less the true ones."""
-        return task.settle(images, believed, self.states, self.config.task, seen=self.eyes, steps=SETTLE_STEPS)
+        """(scenes, unknowns) where the estimate of the eyes' states comes to rest, less
+        the true ones.
+        """
+        return task.settle(
+            images,
+            believed,
+            self.states,
+            self.config.task,
+            seen=self.eyes,
+            steps=SETTLE_STEPS,
+        )
 
     def _design(self) -> Lens:
         made, _ = self.library(self.levels["library_tolerance"][0])
         focus, aperture_um = self.config.focus, self.config.aperture_mm * 1e3
         wanted = design.phase_of(None, focus, radius_um=aperture_um / 2)
         return design.make(
-            wanted, focus, aperture_um=aperture_um, cell=made.cell, proxy=library.proxy_of(made), profile="hyperbolic"
+            wanted,
+            focus,
+            aperture_um=aperture_um,
+            cell=made.cell,
+            proxy=library.proxy_of(made),
+            profile="hyperbolic",
         )[0]
 
 
 def levels_of(config: PlanConfig) -> dict[str, tuple[float, ...]]:
-    """Settings of every knob of a run's optics; light of one wavelength has one number of them."""
+    """Settings of every knob of a run's optics; light of one wavelength has one number
+    of them.
+    """
     if config.image == "true":
         return dict(TRUE_LEVELS)
     return dict(LEVELS) if config.led_fwhm_nm else LEVELS | {"wavelength_count": (1.0,)}
@@ -233,5 +315,8 @@ def levels_of(config: PlanConfig) -> dict[str, tuple[float, ...]]:
 
 def choice_of(names: list[str], values: list[float]) -> Choice | TrueChoice:
     """The record of settings by name; counts are whole numbers."""
-    given = {n: int(v) if n.endswith("count") else v for n, v in zip(names, values, strict=True)}
+    given = {
+        n: int(v) if n.endswith("count") else v
+        for n, v in zip(names, values, strict=True)
+    }
     return TrueChoice(**given) if "image_tolerance" in given else Choice(**given)  # type: ignore[arg-type]

@@ -9,9 +9,11 @@ TOTAL, MEASURED = "all links", "measured, all at once"
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One link: rms phase error over the pillars (rad), relative L2 error of the PSFs, gaze error (rad, mean angle).
+    """One link: rms phase error over the pillars (rad), relative L2 error of the PSFs,
+    gaze error (rad, mean angle).
 
-    nan where the link has none. method: how it was found. counted: whether the sum holds it; a cause that the reader
+    nan where the link has none. method: how it was found. counted: whether the sum
+    holds it; a cause that the reader
     was trained with is no error of its answer.
     """
 
@@ -36,5 +38,9 @@ def total(found: list[Entry]) -> Entry:
         return math.sqrt(sum(v**2 for v in values if math.isfinite(v)))
 
     missing = [e.link for e in found if e.counted and math.isnan(e.gaze_rad)]
-    said = "root of the sum of squares" + (f"; without {', '.join(missing)}" if missing else "")
-    return Entry(TOTAL, together("phase_rad"), together("psf"), together("gaze_rad"), said)
+    said = "root of the sum of squares" + (
+        f"; without {', '.join(missing)}" if missing else ""
+    )
+    return Entry(
+        TOTAL, together("phase_rad"), together("psf"), together("gaze_rad"), said
+    )

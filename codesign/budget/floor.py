@@ -1,4 +1,6 @@
-"""What no setting of the numerics changes: the least gaze error that a plan can promise."""
+"""What no setting of the numerics changes: the least gaze error that a plan can
+promise.
+"""
 
 import math
 
@@ -11,18 +13,26 @@ from codesign.eye import Rig
 from metalens.ground.errors import ConfigError
 
 
-def floor(rig: Rig, run: Source | None, frames: ExperimentConfig, *, fwhm_nm: float = 0.0) -> tuple[Entry, ...]:
-    """Links of the error budget that no setting changes; with a run those of its reader, measured on its frames."""
+def floor(
+    rig: Rig, run: Source | None, frames: ExperimentConfig, *, fwhm_nm: float = 0.0
+) -> tuple[Entry, ...]:
+    """Links of the error budget that no setting changes; with a run those of its
+    reader, measured on its frames.
+    """
     if run is None:
         return tuple(person(frames, rig))
-    return tuple(entry for entry in Reading(run, frames, fwhm_nm=fwhm_nm).path() if entry.counted)
+    return tuple(
+        entry for entry in Reading(run, frames, fwhm_nm=fwhm_nm).path() if entry.counted
+    )
 
 
 def allowance_rad(goal_rad: float, links: tuple[Entry, ...]) -> float:
-    """What settings may add to a floor so that the root of the sum of squares meets the goal.
+    """What settings may add to a floor so that the root of the sum of squares meets the
+    goal.
 
     Raises:
-        ConfigError: the goal is not above the floor; it names the floor and its largest link.
+        ConfigError: the goal is not above the floor; it names the floor and its largest
+            link.
     """
     least = total(list(links)).gaze_rad
     if goal_rad <= least:

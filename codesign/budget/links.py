@@ -1,8 +1,12 @@
-"""The error budget of a lens: every link of the chain as phase, PSF and gaze error, each with how it was found.
+"""The error budget of a lens: every link of the chain as phase, PSF and gaze error,
+each with how it was found.
 
-From the true pupil to the answer: :mod:`codesign.budget.reading`. From the pillars on, a link is a change of the device
-in the true image, carried through pillars, PSFs and images of rendered eyes, and read by a run's network or, without
-a run, by the linear estimator of :mod:`codesign.budget.task`. Nothing is added that was not computed here or measured
+From the true pupil to the answer: :mod:`codesign.budget.reading`. From the pillars on,
+a link is a change of the device
+in the true image, carried through pillars, PSFs and images of rendered eyes, and read
+by a run's network or, without
+a run, by the linear estimator of :mod:`codesign.budget.task`. Nothing is added that was
+not computed here or measured
 in a file that is given.
 """
 
@@ -35,7 +39,8 @@ FINER = 30.0  # how much more precisely
 
 
 def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
-    """The budget, link by link from the answered gaze back to the pillars, ending with the sum.
+    """The budget, link by link from the answered gaze back to the pillars, ending with
+    the sum.
 
     Args:
         journal: of the links that an interrupted run has done.
@@ -44,13 +49,27 @@ def entries(about: Bench, journal: Journal | None = None) -> Iterator[Entry]:
         LensError: the as-built file is of another lens.
     """
     journal, found = journal or Journal(), list[Entry]()
-    if about.reading is not None:  # later links are judged with the persons that these calibrate
+    if (
+        about.reading is not None
+    ):  # later links are judged with the persons that these calibrate
         for entry in about.reading.path():
             found.append(entry)
             yield entry
     first = (answer,) if about.reading is None else ()
-    for part in (*first, device, pillars, neighbours, mask, process, calibration, numerics):
-        done = journal.part(part.__name__, lambda part=part: [astuple(entry) for entry in part(about)])  # type: ignore[misc]
+    for part in (
+        *first,
+        device,
+        pillars,
+        neighbours,
+        mask,
+        process,
+        calibration,
+        numerics,
+    ):
+        done = journal.part(
+            part.__name__,
+            lambda part=part: [astuple(entry) for entry in part(about)],  # type: ignore[misc]
+        )
         links = [Entry(*values) for values in done]
         found += links
         yield from links
@@ -62,14 +81,25 @@ def answer(about: Bench) -> Iterator[Entry]:
     """From the true pupil to the answer where no run was given: what no reader changes."""
     yield from person(about.given.frames, about.setting.rig)
     yield Entry("reader", NONE, NONE, NONE, "not known: no run was given (--run)")
-    noise = about.reader.noise_rad * math.sqrt(math.pi) / 2  # rms to mean of a Gaussian in the plane
-    yield Entry("sensor noise", NONE, NONE, noise, "one frame: Cramér-Rao bound of the linear estimator")
+    noise = (
+        about.reader.noise_rad * math.sqrt(math.pi) / 2
+    )  # rms to mean of a Gaussian in the plane
+    yield Entry(
+        "sensor noise",
+        NONE,
+        NONE,
+        noise,
+        "one frame: Cramér-Rao bound of the linear estimator",
+    )
     said = "known to the estimator, switched off; not in the sum"
     here = about.device
     for link, optics in (("field", here.one_psf()), ("radiometry", here.evenly_lit())):
         yield replace(about.entry(link, optics, said), counted=False)
     if about.given.fwhm_nm:
-        one, design_nm = here.one_wavelength(about.lens.wavelength_um), 1e3 * about.lens.wavelength_um
+        one, design_nm = (
+            here.one_wavelength(about.lens.wavelength_um),
+            1e3 * about.lens.wavelength_um,
+        )
         said += f"; pillars answer as at {design_nm:g} nm, whatever their library holds"
         yield replace(about.entry("spectrum", one, said), counted=False)
     else:
@@ -79,13 +109,23 @@ def answer(about: Bench) -> Iterator[Entry]:
 def device(about: Bench) -> Iterator[Entry]:
     """Pillars in place of the smooth phase, films, both polarisations."""
     if about.reading is not None:
-        said = "pillars of the lens file in place of the run's smooth phase without films"
-        smooth = about.device.image(wave=about.reading.true.wave, layers=about.reading.true.layers)
-        yield about.reading.changed("pillars on a lattice", about.device.whole, smooth, said)
+        said = (
+            "pillars of the lens file in place of the run's smooth phase without films"
+        )
+        smooth = about.device.image(
+            wave=about.reading.true.wave, layers=about.reading.true.layers
+        )
+        yield about.reading.changed(
+            "pillars on a lattice", about.device.whole, smooth, said
+        )
     films = about.lens.layers.films
     if films:
-        bare = about.device.image(layers=replace(about.lens.layers, front=(), behind=()))
-        yield about.entry("glass", bare, f"{len(films)} films of the lens file taken away")
+        bare = about.device.image(
+            layers=replace(about.lens.layers, front=(), behind=())
+        )
+        yield about.entry(
+            "glass", bare, f"{len(films)} films of the lens file taken away"
+        )
     else:
         yield Entry("glass", NONE, 0.0, 0.0, "the lens file holds no film")
     said = "flux of both polarisations through the sensor in place of one scalar"
@@ -105,7 +145,9 @@ def _changed(about: Bench, link: str, table: Array, method: str) -> Entry:
     """The entry of other pillars: a table t(D) against the designed one."""
     turn = np.angle(table / about.aperture.designed())
     optics = about.device.image(wave=about.gathered(*about.aperture.maps(table)))
-    return about.entry(link, optics, method, phase_rad=scatter_rad(turn, about.aperture.share))
+    return about.entry(
+        link, optics, method, phase_rad=scatter_rad(turn, about.aperture.share)
+    )
 
 
 def pillars(about: Bench) -> Iterator[Entry]:
@@ -115,9 +157,13 @@ def pillars(about: Bench) -> Iterator[Entry]:
     at = np.linspace(low, high, SOLVED)
     tolerance = given.library.sweep.bar if given.library else given.tolerance
     engine = engines.choose(lens.cell)
-    solve = engines.precise(lens.cell, Light(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine)
+    solve = engines.precise(
+        lens.cell, Light(lens.wavelength_um), tolerance=tolerance / FINER, engine=engine
+    )
     exact = np.array([solve(float(d)).t for d in at])
-    proxy = lens.proxy.transmission(at, lens.wavelength_um) * np.exp(1j * lens.proxy.phase_rad(at, lens.wavelength_um))
+    proxy = lens.proxy.transmission(at, lens.wavelength_um) * np.exp(
+        1j * lens.proxy.phase_rad(at, lens.wavelength_um)
+    )
     said = f"{engine} solver at {tolerance / FINER:.0e}, {SOLVED} diameters"
     designed, d = about.aperture.designed(), about.aperture.diameter_um
     if given.library is None:
@@ -125,24 +171,37 @@ def pillars(about: Bench) -> Iterator[Entry]:
         yield _changed(about, "pillar solver and proxy", table, f"against the {said}")
         return
     stored = _stored(given.library, at, lens.wavelength_um)
-    solved, read = (put_right(designed, d, at, ratio) for ratio in (exact / stored, stored / proxy))
+    solved, read = (
+        put_right(designed, d, at, ratio) for ratio in (exact / stored, stored / proxy)
+    )
     yield _changed(about, "pillar solver", solved, f"library against the {said}")
     yield _changed(about, "proxy", read, f"against the library, {SOLVED} diameters")
 
 
 def _stored(library: PillarLibrary, at_um: Array, wavelength_um: float) -> Array:
-    """t of the library at the nearest of its wavelengths, both polarisations averaged, between its diameters."""
+    """t of the library at the nearest of its wavelengths, both polarisations averaged,
+    between its diameters.
+    """
     near = int(np.argmin(np.abs(library.wavelength_um - wavelength_um)))
     return between(library.t[:, 0, near].mean(0), library.diameter_um, at_um)
 
 
 def neighbours(about: Bench) -> Iterator[Entry]:
-    """Local periodic approximation: rows of unlike pillars solved as one; what is open of them where the lens holds
+    """Local periodic approximation: rows of unlike pillars solved as one; what is open
+    of them where the lens holds
     them."""
     held = about.lens.neighbours
     if held is not None:
-        found = [among(about, other, "") for other in held.doubted(about.aperture.turn_sine())]
-        rms = [math.hypot(*column) for column in zip(*((e.phase_rad, e.psf, e.gaze_rad) for e in found), strict=True)]
+        found = [
+            among(about, other, "")
+            for other in held.doubted(about.aperture.turn_sine())
+        ]
+        rms = [
+            math.hypot(*column)
+            for column in zip(
+                *((e.phase_rad, e.psf, e.gaze_rad) for e in found), strict=True
+            )
+        ]
         said = "rows of the lens file, in the image: another truncation, a row left out, zones that get shorter"
         yield Entry("neighbours", rms[0], rms[1], rms[2], said)
         return
@@ -156,7 +215,9 @@ def neighbours(about: Bench) -> Iterator[Entry]:
 
 
 def lengths(rows: Neighbours, pitch_um: float) -> list[int]:
-    """Pillars of every row along the lattice: it turns light by one wave over its length."""
+    """Pillars of every row along the lattice: it turns light by one wave over its
+    length.
+    """
     return [round(n) for n in rows.wavelength_um / rows.sine[~rows.diagonal] / pitch_um]
 
 
@@ -167,7 +228,9 @@ def among(about: Bench, rows: Neighbours, said: str) -> Entry:
     if about.lens.neighbours is not None:
         turn = turn - np.angle(about.lens.neighbours.mean(sine[built]))
     maps = about.aperture.maps(about.aperture.designed())
-    optics = about.device.image(wave=about.gathered(*maps, lens=replace(about.lens, neighbours=rows)))
+    optics = about.device.image(
+        wave=about.gathered(*maps, lens=replace(about.lens, neighbours=rows))
+    )
     return about.entry("neighbours", optics, said, phase_rad=float(turn.std()))
 
 
@@ -185,13 +248,23 @@ def process(about: Bench) -> Iterator[Entry]:
     if about.given.mask is None:
         return
     about.given.mask.spread.check(about.lens.cell)
-    made = [Made(draw.state()) for draw in draws(about.given.mask.spread, about.given.draws, seed=5)]
-    yield drawn(about, "process spread", made, f"{len(made)} draws of the process, lens not measured")
+    made = [
+        Made(draw.state())
+        for draw in draws(about.given.mask.spread, about.given.draws, seed=5)
+    ]
+    yield drawn(
+        about,
+        "process spread",
+        made,
+        f"{len(made)} draws of the process, lens not measured",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A made lens on its sensor: its causes, and how far the distance is off. (A decentre moves the image alike.)"""
+    """A made lens on its sensor: its causes, and how far the distance is off. (A
+    decentre moves the image alike.)
+    """
 
     state: State
     shift_um: float = 0.0
@@ -207,25 +280,51 @@ def drawn(about: Bench, link: str, lenses: list[Made], method: str) -> Entry:
     rows = []
     for made in lenses:
         answers = made.state.answers()
-        table = transmission(about.lens.proxy, response, aperture.diameter_um, about.lens.wavelength_um, answers)
+        table = transmission(
+            about.lens.proxy,
+            response,
+            aperture.diameter_um,
+            about.lens.wavelength_um,
+            answers,
+        )
         bias = made.state.bias_um(u, v)
         phase, level = aperture.maps(table, bias_um=bias)
-        moved = biased(response, np.where(built, d.diameter_um, aperture.diameter_um[0]) + bias, bias)
+        moved = biased(
+            response,
+            np.where(built, d.diameter_um, aperture.diameter_um[0]) + bias,
+            bias,
+        )
         if not isinstance(moved, float):
-            phase = phase + torch.from_numpy((np.angle(moved) * built).astype(np.float32))
+            phase = phase + torch.from_numpy(
+                (np.angle(moved) * built).astype(np.float32)
+            )
             level = level * torch.from_numpy(abs(moved).astype(np.float32))
         if made.state.bends():
-            phase = phase + torch.from_numpy(made.state.phase_rad(u, v).astype(np.float32) * built)
+            phase = phase + torch.from_numpy(
+                made.state.phase_rad(u, v).astype(np.float32) * built
+            )
         turn = phase[torch.from_numpy(built)].numpy() - base
-        optics = about.device.image(wave=about.gathered(phase, level), shift_um=made.shift_um)
-        found = about.entry(link, optics, method, phase_rad=scatter_rad(turn, np.full(turn.size, 1 / turn.size)))
+        optics = about.device.image(
+            wave=about.gathered(phase, level), shift_um=made.shift_um
+        )
+        found = about.entry(
+            link,
+            optics,
+            method,
+            phase_rad=scatter_rad(turn, np.full(turn.size, 1 / turn.size)),
+        )
         rows.append((found.phase_rad, found.psf, found.gaze_rad))
-    rms = [math.sqrt(sum(v * v for v in column) / len(rows)) for column in zip(*rows, strict=True)]
+    rms = [
+        math.sqrt(sum(v * v for v in column) / len(rows))
+        for column in zip(*rows, strict=True)
+    ]
     return Entry(link, rms[0], rms[1], rms[2], method)
 
 
 def calibration(about: Bench) -> Iterator[Entry]:
-    """What the fit of the built lens leaves open: draws of its posterior against its best estimate."""
+    """What the fit of the built lens leaves open: draws of its posterior against its
+    best estimate.
+    """
     fitted = about.given.asbuilt
     if fitted is None:
         return
@@ -233,32 +332,62 @@ def calibration(about: Bench) -> Iterator[Entry]:
     if fitted.design.diameters.diameter_um.shape != mine.shape or not np.allclose(
         fitted.design.diameters.diameter_um, mine, atol=1e-6
     ):
-        raise LensError("the as-built file is of another lens than the one given; give the lens that was captured")
+        raise LensError(
+            "the as-built file is of another lens than the one given; give the lens that was captured"
+        )
     best = fitted.parameters()
     made = []
     for row in fitted.lens_samples(about.given.draws, seed=3):
         off = fitted.parameters(row) - best
         made.append(Made(state(off), float(off[PLACE["distance_um"]])))
-    said = f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"
+    said = (
+        f"{len(made)} draws of the fit's posterior against its best estimate (pillars)"
+    )
     yield drawn(about, "calibration of the lens", made, said)
 
 
 def numerics(about: Bench) -> Iterator[Entry]:
-    """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its setting, the rest at its finest.
+    """Propagation, depths, wavelengths and kernels of the one-PSF engine, each at its
+    setting, the rest at its finest.
 
-    Read by the linear estimator, run or not: they are the settings of ``metalens psf`` and of the planner.
+    Read by the linear estimator, run or not: they are the settings of ``metalens psf``
+    and of the planner.
     """
     n = about.given.numerics
     cases = [
-        ("propagation", {"psf_tolerance": n.psf_tolerance}, f"tolerance {n.psf_tolerance:g}"),
+        (
+            "propagation",
+            {"psf_tolerance": n.psf_tolerance},
+            f"tolerance {n.psf_tolerance:g}",
+        ),
         ("depth sampling", {"depth_count": n.depth_count}, f"{n.depth_count} depths"),
-        ("image kernels", {"basis_tolerance": n.basis_tolerance}, f"tolerance {n.basis_tolerance:g}"),
+        (
+            "image kernels",
+            {"basis_tolerance": n.basis_tolerance},
+            f"tolerance {n.basis_tolerance:g}",
+        ),
     ]
     if about.given.fwhm_nm:
         count = n.wavelength_count
-        cases.insert(2, ("wavelength sampling", {"wavelength_count": count}, f"{count} wavelengths"))
+        cases.insert(
+            2,
+            (
+                "wavelength sampling",
+                {"wavelength_count": count},
+                f"{count} wavelengths",
+            ),
+        )
     finest = about.basis(about.finest)
     for link, change, said in cases:
         optics = about.basis(replace(about.finest, **change))  # type: ignore[arg-type]
-        psf, gaze = psf_difference(optics, finest, about.window), task.gaze_mean(about.shift(optics, finest))
-        yield Entry(link, NONE, psf, gaze, f"{said} against the finest setting; linear estimator")
+        psf, gaze = (
+            psf_difference(optics, finest, about.window),
+            task.gaze_mean(about.shift(optics, finest)),
+        )
+        yield Entry(
+            link,
+            NONE,
+            psf,
+            gaze,
+            f"{said} against the finest setting; linear estimator",
+        )

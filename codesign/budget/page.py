@@ -10,15 +10,22 @@ from metalens.ground import report
 def write(path: Path, rows: list[Entry]) -> None:
     """One page: chart, table, how each number was found."""
     keys = [
-        report.KeyFigure("gaze error of all links", f"{math.degrees(rows[-1].gaze_rad):.2g}°"),
-        report.KeyFigure("largest", max(counted(rows[:-1]), key=lambda r: r.gaze_rad).link),
+        report.KeyFigure(
+            "gaze error of all links", f"{math.degrees(rows[-1].gaze_rad):.2g}°"
+        ),
+        report.KeyFigure(
+            "largest", max(counted(rows[:-1]), key=lambda r: r.gaze_rad).link
+        ),
     ]
     for row in rows:
         if row.link == MEASURED:
-            keys.insert(1, report.KeyFigure("measured on the same frames", f"{math.degrees(row.gaze_rad):.2g}°"))
-    lead = (
-        "What each link of the chain costs, carried through pillars, PSFs and images of eyes to the gaze that is read."
-    )
+            keys.insert(
+                1,
+                report.KeyFigure(
+                    "measured on the same frames", f"{math.degrees(row.gaze_rad):.2g}°"
+                ),
+            )
+    lead = "What each link of the chain costs, carried through pillars, PSFs and images of eyes to the gaze that is read."
     report.write(path, "Error budget", [section(rows)], lead=lead, key_figures=keys)
 
 
@@ -32,7 +39,10 @@ def section(rows: list[Entry]) -> report.Section:
     cells = [
         (
             r.link,
-            *("–" if math.isnan(v) else f"{v:.2g}" for v in (r.phase_rad, r.psf, math.degrees(r.gaze_rad))),
+            *(
+                "–" if math.isnan(v) else f"{v:.2g}"
+                for v in (r.phase_rad, r.psf, math.degrees(r.gaze_rad))
+            ),
             r.method,
         )
         for r in rows
@@ -44,20 +54,36 @@ def section(rows: list[Entry]) -> report.Section:
         "least variance that knows the lens and the population but not the subject. What a reader was trained with is "
         "shown switched off and is not in the sum."
     )
-    picture = report.Figure(chart(rows), "Gaze error of each link, log scale.", wide=True)
+    picture = report.Figure(
+        chart(rows), "Gaze error of each link, log scale.", wide=True
+    )
     return report.Section(
         "Error budget",
         words,
-        (picture, report.Table(head, cells, "Mean angles over eyes; the sum is the root of their squares.")),
+        (
+            picture,
+            report.Table(
+                head,
+                cells,
+                "Mean angles over eyes; the sum is the root of their squares.",
+            ),
+        ),
     )
 
 
 def chart(rows: list[Entry]) -> bytes:
     """Bars of the gaze error, the largest on top."""
-    shown = sorted((r for r in rows if r.gaze_rad > 0 and (r.counted or r.link == MEASURED)), key=lambda r: r.gaze_rad)
+    shown = sorted(
+        (r for r in rows if r.gaze_rad > 0 and (r.counted or r.link == MEASURED)),
+        key=lambda r: r.gaze_rad,
+    )
     figure, axes = report.canvas(size=(7.5, 0.5 + 0.32 * len(shown)))
     colours = ["#444" if r.link in (MEASURED, TOTAL) else "#1f6feb" for r in shown]
-    axes.barh([r.link for r in shown], [math.degrees(r.gaze_rad) for r in shown], color=colours)
+    axes.barh(
+        [r.link for r in shown],
+        [math.degrees(r.gaze_rad) for r in shown],
+        color=colours,
+    )
     axes.set(xscale="log", xlabel="gaze error / deg")
     axes.grid(axis="y", visible=False)
     return report.png(figure)

@@ -1,4 +1,6 @@
-"""What no reader changes: the person who is calibrated, and where a person looks who is told to look somewhere."""
+"""What no reader changes: the person who is calibrated, and where a person looks who is
+told to look somewhere.
+"""
 
 import math
 from collections.abc import Iterator
@@ -30,17 +32,41 @@ def told(config: ExperimentConfig, scenes: EyeScenes) -> Readings:
 
 
 def person(config: ExperimentConfig, rig: Rig) -> Iterator[Entry]:
-    """Subject with calibration, and fixation: the error of answers that are given the true pupil and slippage."""
-    scenes = EyeScenes(SceneConfig(), WIDTH_UM / SceneConfig().pixels, rig.sensor_distance_um, 0, EXPERIMENT)
-    trial = gaze_experiment.joined([gaze_experiment.states_of(config, s, scenes)[1] for s in range(config.subjects)])
+    """Subject with calibration, and fixation: the error of answers that are given the
+    true pupil and slippage.
+    """
+    scenes = EyeScenes(
+        SceneConfig(),
+        WIDTH_UM / SceneConfig().pixels,
+        rig.sensor_distance_um,
+        0,
+        EXPERIMENT,
+    )
+    trial = gaze_experiment.joined(
+        [
+            gaze_experiment.states_of(config, s, scenes)[1]
+            for s in range(config.subjects)
+        ]
+    )
     answers = []
     for one in (replace(config, fixation_deg=0.0), config):
         how = Sphere(scenes.rig, one.hidden, one.seed)
         answer, judged = gaze_experiment.calibrated(told(one, scenes), trial, one, how)
         answers.append(answer)
     kept = judged & trial.group(AXIAL)
-    alone, whole = (math.radians(float(np.mean(angle_deg(a, trial.stimulus_deg)[kept]))) for a in answers)
-    people = f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
-    yield Entry("subject and calibration", NONE, NONE, alone, f"true pupil and slippage; {people}")
+    alone, whole = (
+        math.radians(float(np.mean(angle_deg(a, trial.stimulus_deg)[kept])))
+        for a in answers
+    )
+    people = (
+        f"{config.subjects} subjects, {config.share:.0%} of their stimuli calibrate"
+    )
+    yield Entry(
+        "subject and calibration",
+        NONE,
+        NONE,
+        alone,
+        f"true pupil and slippage; {people}",
+    )
     said = f"scatter of {config.fixation_deg:g} deg about the stimulus"
     yield Entry("fixation", NONE, NONE, more(whole, alone), said)

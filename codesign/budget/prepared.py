@@ -1,4 +1,6 @@
-"""What the links of a budget are judged with: the lens as a device, its eyes, and the reader of its images."""
+"""What the links of a budget are judged with: the lens as a device, its eyes, and the
+reader of its images.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -35,8 +37,10 @@ from metalens.psf import Source
 class Given:
     """What is known beside the lens: each adds its entries.
 
-    numerics: of the chain. fwhm_nm: of the light source. mask: of the PROCESS.toml. library: that the proxy was fitted
-    to. asbuilt: of a fit. run: of a finished co-design run, whose reader answers. frames: that it is shown. draws: of
+    numerics: of the chain. fwhm_nm: of the light source. mask: of the PROCESS.toml.
+    library: that the proxy was fitted
+    to. asbuilt: of a fit. run: of a finished co-design run, whose reader answers.
+    frames: that it is shown. draws: of
     process and fit.
     """
 
@@ -46,16 +50,20 @@ class Given:
     library: PillarLibrary | None = None
     asbuilt: AsBuilt | None = None
     run: Run | None = None
-    frames: ExperimentConfig = field(default_factory=lambda: ExperimentConfig(subjects=5))
+    frames: ExperimentConfig = field(
+        default_factory=lambda: ExperimentConfig(subjects=5)
+    )
     draws: int = 4
     tolerance: float = 1e-3
 
 
 @dataclass(eq=False, slots=True)
 class Bench:
-    """The lens as a device, who reads its images, and the finest one-PSF optics that numerics are compared with.
+    """The lens as a device, who reads its images, and the finest one-PSF optics that
+    numerics are compared with.
 
-    device: the true image of the designed pillars. reader: the linear estimator that knows it. reading: of a run's
+    device: the true image of the designed pillars. reader: the linear estimator that
+    knows it. reading: of a run's
     network instead, where one is given.
     """
 
@@ -72,25 +80,44 @@ class Bench:
 
     @property
     def above(self) -> list[str]:
-        """Why the errors of the images are above their tolerance: of the pillars, and of the run's smooth phase."""
-        return [self.device.above, *([] if self.reading is None else [self.reading.true.above])]
+        """Why the errors of the images are above their tolerance: of the pillars, and
+        of the run's smooth phase.
+        """
+        return [
+            self.device.above,
+            *([] if self.reading is None else [self.reading.true.above]),
+        ]
 
-    def gathered(self, phase: torch.Tensor, level: torch.Tensor, *, lens: Lens | None = None) -> PillarCells:
+    def gathered(
+        self, phase: torch.Tensor, level: torch.Tensor, *, lens: Lens | None = None
+    ) -> PillarCells:
         """The lens plane of other pillars, over cells as the device's."""
-        return gathered(lens or self.lens, phase, level, window_um=self.device.window_um)
+        return gathered(
+            lens or self.lens, phase, level, window_um=self.device.window_um
+        )
 
     def basis(self, numerics: Numerics) -> PsfBasis:
         """One-PSF kernels of the designed lens."""
         maps = self.aperture.maps(self.aperture.designed())
-        return kernels(self.lens, maps, numerics, self.window, fwhm_nm=self.given.fwhm_nm)
+        return kernels(
+            self.lens, maps, numerics, self.window, fwhm_nm=self.given.fwhm_nm
+        )
 
     def shift(self, optics: PsfBasis | Imager, base: PsfBasis | Imager) -> torch.Tensor:
-        """(scenes, unknowns) change of the linear estimator's answer between images through two optics."""
-        one, other = (task.electrons(self.eyes.anchor, o, self.setting) for o in (optics, base))
+        """(scenes, unknowns) change of the linear estimator's answer between images
+        through two optics.
+        """
+        one, other = (
+            task.electrons(self.eyes.anchor, o, self.setting) for o in (optics, base)
+        )
         return self.reader.shift(one) - self.reader.shift(other)
 
-    def entry(self, link: str, optics: Imager, method: str, *, phase_rad: float = NONE) -> Entry:
-        """The entry of a change of the device, before the network or the linear estimator."""
+    def entry(
+        self, link: str, optics: Imager, method: str, *, phase_rad: float = NONE
+    ) -> Entry:
+        """The entry of a change of the device, before the network or the linear
+        estimator.
+        """
         base = self.device.whole
         if self.reading is not None:
             return self.reading.changed(link, optics, base, method, phase_rad=phase_rad)
@@ -99,12 +126,16 @@ class Bench:
 
 
 def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench:
-    """Render the eyes, prepare the device and its reader; the finest optics have twice the depths (64 at most).
+    """Render the eyes, prepare the device and its reader; the finest optics have twice
+    the depths (64 at most).
 
     Raises:
-        LensError: the run's lens is another than the one given; turned pillars, or another lattice than a square one.
+        LensError: the run's lens is another than the one given; turned pillars, or
+            another lattice than a square one.
     """
-    setting = replace(setting or TaskSetting(), sensor_distance_um=lens.reduced_um)  # as the true image maps directions
+    setting = replace(
+        setting or TaskSetting(), sensor_distance_um=lens.reduced_um
+    )  # as the true image maps directions
     aperture, eyes = Aperture(lens), task.views(setting)
     finest = finest_of(given.numerics, fwhm_nm=given.fwhm_nm)
     window = Window(*eyes.depths_um, setting.pitch_um)
@@ -117,16 +148,33 @@ def bench(lens: Lens, given: Given, setting: TaskSetting | None = None) -> Bench
         seen = reading.stands(wave, lens.layers, lens.sensor_distance_um)
         known = kernels(lens, maps, finest, window, fwhm_nm=given.fwhm_nm)
     else:
-        grid = Grid((setting.pixels,) * 2, setting.pitch_um, eyes.depths_um, setting.margin, 2 * setting.margin + 1)
+        grid = Grid(
+            (setting.pixels,) * 2,
+            setting.pitch_um,
+            eyes.depths_um,
+            setting.margin,
+            2 * setting.margin + 1,
+        )
         wave = gathered(lens, *maps, window_um=grid.window * grid.step_um)
-        line = Source(lens.wavelength_um * 1e3, given.fwhm_nm) if given.fwhm_nm else None
-        seen = device(wave, grid, layers=lens.layers, distance_um=lens.sensor_distance_um, spectrum=line)
+        line = (
+            Source(lens.wavelength_um * 1e3, given.fwhm_nm) if given.fwhm_nm else None
+        )
+        seen = device(
+            wave,
+            grid,
+            layers=lens.layers,
+            distance_um=lens.sensor_distance_um,
+            spectrum=line,
+        )
     reader = task.linear(eyes, known or seen.whole, setting)
-    return Bench(lens, given, setting, aperture, finest, window, eyes, seen, reader, reading)
+    return Bench(
+        lens, given, setting, aperture, finest, window, eyes, seen, reader, reading
+    )
 
 
 def finest_of(numerics: Numerics, *, fwhm_nm: float) -> Numerics:
-    """What settings are compared with: twice the depths (64 at most), six more wavelengths, a tenth of the tolerances
+    """What settings are compared with: twice the depths (64 at most), six more
+    wavelengths, a tenth of the tolerances
     or 1e-5 and 1e-4."""
     return Numerics(
         min(2 * numerics.depth_count, 64),
@@ -142,15 +190,23 @@ def same_lens(lens: Lens, optics: OpticsConfig) -> None:
     Raises:
         LensError: sensor distance, wavelength or aperture differ.
     """
-    mine = lens.sensor_distance_um * 1e-3, lens.wavelength_um * 1e3, 2e-3 * lens.diameters.radius_um
+    mine = (
+        lens.sensor_distance_um * 1e-3,
+        lens.wavelength_um * 1e3,
+        2e-3 * lens.diameters.radius_um,
+    )
     same_geometry(mine, optics, "the lens file; give the lens.h5 of the run")
 
 
-def same_geometry(mine: tuple[float, float, float], optics: OpticsConfig, where: str) -> None:
-    """Refuse a reader that was trained before another lens: one that differs by more than 2 %.
+def same_geometry(
+    mine: tuple[float, float, float], optics: OpticsConfig, where: str
+) -> None:
+    """Refuse a reader that was trained before another lens: one that differs by more
+    than 2 %.
 
     Args:
-        mine: sensor distance in mm, wavelength in nm and aperture in mm. where: they stand, and what to do.
+        mine: sensor distance in mm, wavelength in nm and aperture in mm. where: they
+            stand, and what to do.
 
     Raises:
         LensError: sensor distance, wavelength or aperture differ.

@@ -1,4 +1,5 @@
-"""A trained reader before the frames of the virtual experiment: what every cause adds on the way to the answered gaze.
+"""A trained reader before the frames of the virtual experiment: what every cause adds
+on the way to the answered gaze.
 
     true pupil and slippage -> the person's calibration          subject and calibration
     where the person really looks                                fixation
@@ -6,11 +7,16 @@
     noise of the sensor                                          sensor noise
     what training left out of its image                          field, radiometry, spectrum
 
-Each state has the causes of the one before and one more; persons are calibrated in every state anew, as they would be
-on such a device. A cause adds what the mean error has more than in the state before, in quadrature. The last state is
-the virtual experiment itself. Changes of the optics behind it (:meth:`Reading.changed`) add the mean angle by which
-they turn the answers: independent of the rest, that adds in quadrature too. What a reader was trained with is no error
-of its answer: the cause is then switched off to see what the reader makes of it, and does not count.
+Each state has the causes of the one before and one more; persons are calibrated in
+every state anew, as they would be
+on such a device. A cause adds what the mean error has more than in the state before, in
+quadrature. The last state is
+the virtual experiment itself. Changes of the optics behind it (:meth:`Reading.changed`)
+add the mean angle by which
+they turn the answers: independent of the rest, that adds in quadrature too. What a
+reader was trained with is no error
+of its answer: the cause is then switched off to see what the reader makes of it, and
+does not count.
 """
 
 from collections.abc import Iterator
@@ -37,7 +43,9 @@ THINNED = 320  # frames that small changes of the optics are judged on
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stand:
-    """Persons calibrated on the device as it is, and the frames on which a change of the optics is judged."""
+    """Persons calibrated on the device as it is, and the frames on which a change of
+    the optics is judged.
+    """
 
     people: dict[int, Person]
     frames: tuple[Rendered, ...]
@@ -45,9 +53,13 @@ class Stand:
 
 
 class Reading:
-    """A run's network with its frames; ``measured_deg`` is there once :meth:`path` is through."""
+    """A run's network with its frames; ``measured_deg`` is there once :meth:`path` is
+    through.
+    """
 
-    def __init__(self, source: Source, config: ExperimentConfig, *, fwhm_nm: float) -> None:
+    def __init__(
+        self, source: Source, config: ExperimentConfig, *, fwhm_nm: float
+    ) -> None:
         self.source, self.config = source, config
         self.scenes = source.run.scenes(EXPERIMENT)
         believed = source.run.trainer.optics
@@ -59,7 +71,9 @@ class Reading:
         trials = []
         for subject in range(config.subjects):
             states, trial = gaze_experiment.states_of(config, subject, self.scenes)
-            self.subjects.append(render(states, rig=self.scenes.rig, camera=self.scenes.camera))
+            self.subjects.append(
+                render(states, rig=self.scenes.rig, camera=self.scenes.camera)
+            )
             trials.append(trial)
         self.trial = gaze_experiment.joined(trials)
         self.true = self._device(self.optics)
@@ -70,7 +84,9 @@ class Reading:
     @property
     def frame(self) -> int:
         """Samples of a frame along a side, margin included."""
-        return self.source.settings.scenes.pixels + 2 * self.source.settings.scenes.margin
+        return (
+            self.source.settings.scenes.pixels + 2 * self.source.settings.scenes.margin
+        )
 
     def _device(self, settings: OpticsConfig) -> Device:
         margin = self.source.settings.scenes.margin
@@ -79,7 +95,9 @@ class Reading:
         if not isinstance(whole, Imager):
             raise TypeError("a device is imaged truly")
         plane = formed.optics_of(settings, coefficients)
-        return Device(plane.wave, plane.layers, plane.distance_um, whole, settings.image_tolerance)
+        return Device(
+            plane.wave, plane.layers, plane.distance_um, whole, settings.image_tolerance
+        )
 
     def stands(self, wave: object, layers: Layers, distance_um: float) -> Device:
         """The device of another lens plane behind films, on the frames of this run."""
@@ -95,18 +113,26 @@ class Reading:
         )
 
     def path(self) -> Iterator[Entry]:
-        """Entries from the true pupil to the answered gaze, and what was measured at its end."""
+        """Entries from the true pupil to the answered gaze, and what was measured at
+        its end.
+        """
         still = replace(self.config, fixation_deg=0.0)
         people = f"{self.config.subjects} subjects, {self.config.share:.0%} of their stimuli calibrate"
         said = f"true pupil and slippage; {people}"
         sphere = gaze_experiment.sphere(self.source, self.config)
-        yield self._grown("subject and calibration", self._error(told(still, self.scenes), sphere), said)
+        yield self._grown(
+            "subject and calibration",
+            self._error(told(still, self.scenes), sphere),
+            said,
+        )
         true = told(self.config, self.scenes)
         said = f"scatter of {self.config.fixation_deg:g} deg about the stimulus"
         yield self._grown("fixation", self._error(true, sphere), said)
         yield from self._reader(true, sphere)
         read, how = self._read(self.believed)
-        yield self._grown("sensor noise", self._error(read, how), "frames with the sensor's noise")
+        yield self._grown(
+            "sensor noise", self._error(read, how), "frames with the sensor's noise"
+        )
         for link, optics, psf, said in self._unknown():
             read, how = self._read(optics)
             yield replace(self._grown(link, self._error(read, how), said), psf=psf)
@@ -116,7 +142,8 @@ class Reading:
     def _reader(self, true: Readings, sphere: Calibrator) -> Iterator[Entry]:
         """The pupil as read with the true slippage, then all that is read.
 
-        Who reads an axis needs the pupil less than the sphere does: alone it costs at most what all together costs.
+        Who reads an axis needs the pupil less than the sphere does: alone it costs at
+        most what all together costs.
         """
         said = f"network of {self.source.row['mmacs']:.3g} MMACs, noiseless frames of the image that it was trained on"
         read, how = self._read(self.believed, quiet=True)
@@ -126,7 +153,9 @@ class Reading:
         yield self._grown("reader, slippage", together, said)
 
     def _grown(self, link: str, error_rad: float, method: str) -> Entry:
-        """The entry of one more cause: what the error has more than before, in quadrature; 0 where it has less."""
+        """The entry of one more cause: what the error has more than before, in
+        quadrature; 0 where it has less.
+        """
         before, self._error_rad = self._error_rad, error_rad
         return Entry(link, NONE, NONE, more(error_rad, before), method)
 
@@ -141,14 +170,28 @@ class Reading:
             return
         one = self._device(replace(self.optics, fwhm_nm=0.0, filter_nm=0.0))
         said = "the whole field before a reader trained on the PSFs of one chief ray"
-        yield "field", one.evenly_lit(), image_difference(one.one_psf(), one.whole), said
-        yield "radiometry", one.whole, 0.0, "cos⁴ and vignetting before a reader trained on even light"
+        yield (
+            "field",
+            one.evenly_lit(),
+            image_difference(one.one_psf(), one.whole),
+            said,
+        )
+        yield (
+            "radiometry",
+            one.whole,
+            0.0,
+            "cos⁴ and vignetting before a reader trained on even light",
+        )
         if self.optics.fwhm_nm:
-            said = f"{self.optics.fwhm_nm:g} nm before a reader trained on one wavelength"
+            said = (
+                f"{self.optics.fwhm_nm:g} nm before a reader trained on one wavelength"
+            )
             yield "spectrum", self.true.whole, self._broadened(), said
 
     def _broadened(self) -> float:
-        """Relative L2 change of the PSFs from one wavelength to the light of the device."""
+        """Relative L2 change of the PSFs from one wavelength to the light of the
+        device.
+        """
         narrow = self.true.one_wavelength(self.optics.wavelength_nm * 1e-3)
         return image_difference(narrow, self.true.whole)
 
@@ -157,83 +200,139 @@ class Reading:
         believed, here = self.source.run.trainer.optics, self.true
         said = "known to the reader, switched off: what it answers then; not in the sum"
         if believed.image == "true":
-            yield replace(self.changed("field", here.one_psf(), here.whole, said), counted=False)
-            yield replace(self.changed("radiometry", here.evenly_lit(), here.whole, said), counted=False)
+            yield replace(
+                self.changed("field", here.one_psf(), here.whole, said), counted=False
+            )
+            yield replace(
+                self.changed("radiometry", here.evenly_lit(), here.whole, said),
+                counted=False,
+            )
         if not self.optics.fwhm_nm:
             yield Entry("spectrum", NONE, 0.0, 0.0, "the light has one wavelength")
         elif believed.image == "true" and believed.fwhm_nm == self.optics.fwhm_nm:
             narrow = here.one_wavelength(self.optics.wavelength_nm * 1e-3)
-            yield replace(self.changed("spectrum", narrow, here.whole, said), counted=False)
+            yield replace(
+                self.changed("spectrum", narrow, here.whole, said), counted=False
+            )
 
-    def changed(self, link: str, optics: Imager, base: Imager, method: str, *, phase_rad: float = NONE) -> Entry:
-        """The entry of a change of the optics after the persons were calibrated: the turn of their answers."""
+    def changed(
+        self,
+        link: str,
+        optics: Imager,
+        base: Imager,
+        method: str,
+        *,
+        phase_rad: float = NONE,
+    ) -> Entry:
+        """The entry of a change of the optics after the persons were calibrated: the
+        turn of their answers.
+        """
         gaze = self.turned(optics, base)
         return Entry(link, phase_rad, image_difference(optics, base), gaze, method)
 
     def turned(self, optics: Imager, base: Imager) -> float:
-        """Mean angle, rad, between the answers to frames through two optics; the persons stay calibrated.
+        """Mean angle, rad, between the answers to frames through two optics; the
+        persons stay calibrated.
 
-        Without noise: Poisson counts of frames that hardly differ are other draws, and would turn the answers more.
+        Without noise: Poisson counts of frames that hardly differ are other draws, and
+            would turn the answers more.
         """
         stand = self._stand
         if stand is None:
             raise RuntimeError("changes are judged once the path is through")
         one, other = (
-            gaze_experiment.answered(stand.people, self._frames(stand.frames, o, quiet=True), stand.trial)
+            gaze_experiment.answered(
+                stand.people, self._frames(stand.frames, o, quiet=True), stand.trial
+            )
             for o in (optics, base)
         )
         return float(np.radians(angle_deg(one, other).mean()))
 
     def _settle(self, read: Readings, how: Calibrator) -> None:
-        """Keep the persons of the last state, what it measured, and a thin sample of the judged frames."""
+        """Keep the persons of the last state, what it measured, and a thin sample of
+        the judged frames.
+        """
         people = self._taught(read, how)
-        error = angle_deg(gaze_experiment.answered(people, read, self.trial), self.trial.stimulus_deg)
+        error = angle_deg(
+            gaze_experiment.answered(people, read, self.trial), self.trial.stimulus_deg
+        )
         judged = self._judged()
         for kind in self.measured_deg:
-            self.measured_deg[kind] = float(error[judged & self.trial.group(kind)].mean())
+            self.measured_deg[kind] = float(
+                error[judged & self.trial.group(kind)].mean()
+            )
         rows = np.flatnonzero(judged & self.trial.group(AXIAL))
         rows = rows[:: max(1, len(rows) // THINNED)]
         frames = tuple(
             _part(made, torch.from_numpy(rows[self.trial.subject[rows] == s] - first))
-            for s, (made, first) in enumerate(zip(self.subjects, self._starts(), strict=True))
+            for s, (made, first) in enumerate(
+                zip(self.subjects, self._starts(), strict=True)
+            )
         )
         fields = (getattr(self.trial, f)[rows] for f in gaze_experiment.Trial.__slots__)
         self._stand = Stand(people, frames, gaze_experiment.Trial(*fields))
 
     def _starts(self) -> Array:
-        return np.cumsum([0, *(len(made.labels.slip_um) for made in self.subjects[:-1])])
+        return np.cumsum(
+            [0, *(len(made.labels.slip_um) for made in self.subjects[:-1])]
+        )
 
     def _off(self, angles_deg: Array) -> float:
         """Mean over the judged frames under axial slippage, rad."""
-        return float(np.radians(angles_deg[self._judged() & self.trial.group(AXIAL)].mean()))
+        return float(
+            np.radians(angles_deg[self._judged() & self.trial.group(AXIAL)].mean())
+        )
 
     def _judged(self) -> Array:
-        return ~np.isin(np.arange(len(self.trial.subject)), gaze_experiment.calibrating(self.trial, self.config))
+        return ~np.isin(
+            np.arange(len(self.trial.subject)),
+            gaze_experiment.calibrating(self.trial, self.config),
+        )
 
     def _error(self, read: Readings, how: Calibrator) -> float:
-        """Mean error of the answers under axial slippage, rad, every person calibrated on what was read."""
+        """Mean error of the answers under axial slippage, rad, every person calibrated
+        on what was read.
+        """
         answers = gaze_experiment.answered(self._taught(read, how), read, self.trial)
         return self._off(angle_deg(answers, self.trial.stimulus_deg))
 
     def _taught(self, read: Readings, how: Calibrator) -> dict[int, Person]:
         return gaze_experiment.taught(read, self.trial, self.config, how)
 
-    def _read(self, optics: Imager | UniformImager, *, quiet: bool = False) -> tuple[Readings, Calibrator]:
-        """What is read of all frames, and how people are calibrated whose frames come through these optics (noisy)."""
+    def _read(
+        self, optics: Imager | UniformImager, *, quiet: bool = False
+    ) -> tuple[Readings, Calibrator]:
+        """What is read of all frames, and how people are calibrated whose frames come
+        through these optics (noisy).
+        """
         if self._before is None or self._before[0] is not optics:
-            self._before = optics, gaze_experiment.calibrator(self.source, optics, self.config)
+            self._before = (
+                optics,
+                gaze_experiment.calibrator(self.source, optics, self.config),
+            )
         return self._frames(self.subjects, optics, quiet=quiet), self._before[1]
 
     @torch.no_grad()
     def _frames(
-        self, subjects: list[Rendered] | tuple[Rendered, ...], optics: Imager | UniformImager, *, quiet: bool = False
+        self,
+        subjects: list[Rendered] | tuple[Rendered, ...],
+        optics: Imager | UniformImager,
+        *,
+        quiet: bool = False,
     ) -> Readings:
-        """What the network reads of frames through these optics; noise of the experiment's seeds."""
+        """What the network reads of frames through these optics; noise of the
+        experiment's seeds.
+        """
         found = []
         net, inner = self.source.run.trainer.model.net, self.source.settings.inner
         for subject, made in enumerate(subjects):
             seen = gaze_experiment.through(
-                self.source, made, optics, seed=gaze_experiment.NOISE + subject, snr_db=self.config.snr_db, quiet=quiet
+                self.source,
+                made,
+                optics,
+                seed=gaze_experiment.NOISE + subject,
+                snr_db=self.config.snr_db,
+                quiet=quiet,
             )
             found.append(assess.predict(net, self.source.architecture, seen, inner))
         return gaze_experiment.read_from(found, self.source)
@@ -241,6 +340,10 @@ class Reading:
 
 def _part(made: Rendered, rows: torch.Tensor) -> Rendered:
     """Some of the frames with their labels."""
-    frames = type(made.frames)(*(getattr(made.frames, f)[rows] for f in type(made.frames).__slots__))
-    labels = type(made.labels)(*(getattr(made.labels, f)[rows] for f in type(made.labels).__slots__))
+    frames = type(made.frames)(
+        *(getattr(made.frames, f)[rows] for f in type(made.frames).__slots__)
+    )
+    labels = type(made.labels)(
+        *(getattr(made.labels, f)[rows] for f in type(made.labels).__slots__)
+    )
     return replace(made, frames=frames, labels=labels, pupil=made.pupil[rows])

@@ -1,10 +1,16 @@
-"""What an error of the optics costs in gaze: the linearised estimator of gaze, slip and size that sees whole images.
+"""What an error of the optics costs in gaze: the linearised estimator of gaze, slip and
+size that sees whole images.
 
-An image I of an eye in state theta, formed by optics that differ a little from those the estimator knows, is read as
-the state theta + (D'WD + P)^-1 D'W dI: D the derivative of the known image, W the inverse noise variance, P the prior.
-Unknown are also the size (all depths and labels scaled at an unchanged pinhole image, paper Sec. 3.6), the brightness,
-and every trait of the subject within its population, so that depth is read from blur and not from a known anatomy. What
-the model of a subject cannot describe counts as noise in proportion to the light (``mismatch``).
+An image I of an eye in state theta, formed by optics that differ a little from those
+the estimator knows, is read as
+the state theta + (D'WD + P)^-1 D'W dI: D the derivative of the known image, W the
+inverse noise variance, P the prior.
+Unknown are also the size (all depths and labels scaled at an unchanged pinhole image,
+paper Sec. 3.6), the brightness,
+and every trait of the subject within its population, so that depth is read from blur
+and not from a known anatomy. What
+the model of a subject cannot describe counts as noise in proportion to the light
+(``mismatch``).
 """
 
 import math
@@ -19,11 +25,28 @@ from codesign.eye import population as eye
 from metalens.image import Frames, Imager, PsfBasis, Sensor, scene, sensor
 
 MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z", "scale")
-STEPS = (math.radians(0.02), math.radians(0.02), 5.0, 5.0, 5.0, 1e-3)  # rad, um, 1: half the central difference
-PRIOR = (0.18, 0.13, 1200.0, 900.0, 2000.0, 0.12)  # standard deviations before the image is seen
-TRAITS = tuple(n for n, trait in POPULATION.items() if trait.sd > 0 and n != "depth_um")  # a depth is a slip along z
+STEPS = (
+    math.radians(0.02),
+    math.radians(0.02),
+    5.0,
+    5.0,
+    5.0,
+    1e-3,
+)  # rad, um, 1: half the central difference
+PRIOR = (
+    0.18,
+    0.13,
+    1200.0,
+    900.0,
+    2000.0,
+    0.12,
+)  # standard deviations before the image is seen
+TRAITS = tuple(
+    n for n, trait in POPULATION.items() if trait.sd > 0 and n != "depth_um"
+)  # a depth is a slip along z
 TRAIT_STEP = 0.005  # of a trait's standard deviation
-FINE = 3  # rays along a side of a pixel: edges of the eye move smoothly, as they do on a sensor
+# rays along a side of a pixel: edges of the eye move smoothly, as they do on a sensor
+FINE = 3
 NAMES = (*MOTIONS, *TRAITS, "brightness")
 BRIGHTNESS = 0.3  # standard deviation before the image is seen
 SCENES = 77  # stream of the random generator
@@ -33,9 +56,11 @@ SCENES = 77  # stream of the random generator
 class TaskSetting:
     """What the estimator looks at.
 
-    scenes: eyes, from ``seed``. pixels: along a side, of ``pitch_um``; margin: rendered beyond them.
+    scenes: eyes, from ``seed``. pixels: along a side, of ``pitch_um``; margin: rendered
+    beyond them.
     sensor: noise and exposure; its own pitch is replaced by ``pitch_um``.
-    mismatch: share of the light of a pixel by which no subject of the population looks like the one that is seen.
+    mismatch: share of the light of a pixel by which no subject of the population looks
+    like the one that is seen.
     sensor_distance_um: of the lens, behind films the reduced one.
     pitch_um: of the sensor's pixels. seed: of the eyes.
     """
@@ -67,7 +92,9 @@ class TaskSetting:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Views:
-    """Renderings of every eye: as it is, and moved to both sides along every unknown but the brightness."""
+    """Renderings of every eye: as it is, and moved to both sides along every unknown
+    but the brightness.
+    """
 
     anchor: Frames
     moved: tuple[tuple[Frames, Frames], ...]
@@ -79,11 +106,14 @@ class Views:
         return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
-def views(setting: TaskSetting, states: States | None = None, *, exposed: States | None = None) -> Views:
+def views(
+    setting: TaskSetting, states: States | None = None, *, exposed: States | None = None
+) -> Views:
     """Render everything that the linear estimator needs; two frames an unknown and eye.
 
     Args:
-        states: instead of those of the setting. exposed: that the exposure was set at, by default these.
+        states: instead of those of the setting. exposed: that the exposure was set at,
+            by default these.
     """
     still = setting.states if states is None else states
     lit = still if exposed is None else exposed
@@ -98,15 +128,29 @@ def views(setting: TaskSetting, states: States | None = None, *, exposed: States
 def _frames(states: States, exposed: States, setting: TaskSetting) -> Frames:
     """Renderings averaged over each pixel."""
     camera = Camera(FINE * setting.size, setting.pitch_um / FINE)
-    return pixels_of(render(states, rig=setting.rig, camera=camera, exposed=exposed).frames)
+    return pixels_of(
+        render(states, rig=setting.rig, camera=camera, exposed=exposed).frames
+    )
 
 
 def pixels_of(fine: Frames) -> Frames:
-    """Means over FINE x FINE rays; a depth is that of what covers the pixel, or of nothing where nothing does."""
+    """Means over FINE x FINE rays; a depth is that of what covers the pixel, or of
+    nothing where nothing does.
+    """
     radiance, coverage, deep, plain = (
-        avg_pool2d(v, FINE) for v in (fine.radiance, fine.coverage, fine.coverage * fine.depth_um, fine.depth_um)
+        avg_pool2d(v, FINE)
+        for v in (
+            fine.radiance,
+            fine.coverage,
+            fine.coverage * fine.depth_um,
+            fine.depth_um,
+        )
     )
-    return Frames(radiance, coverage, torch.where(coverage > 0, deep / coverage.clamp_min(1e-9), plain))
+    return Frames(
+        radiance,
+        coverage,
+        torch.where(coverage > 0, deep / coverage.clamp_min(1e-9), plain),
+    )
 
 
 def steps() -> tuple[float, ...]:
@@ -141,23 +185,33 @@ def shifted(states: States, unknown: int, amount: float | Tensor) -> States:
     return replace(states, traits=traits)
 
 
-def electrons(frames: Frames, optics: PsfBasis | Imager, setting: TaskSetting) -> Tensor:
-    """(scenes, pixels) expected electrons through these optics, float64: one PSF a depth, or the true image."""
+def electrons(
+    frames: Frames, optics: PsfBasis | Imager, setting: TaskSetting
+) -> Tensor:
+    """(scenes, pixels) expected electrons through these optics, float64: one PSF a
+    depth, or the true image.
+    """
     if isinstance(optics, PsfBasis):
-        prepared = scene.uniform_imager(optics, (setting.size, setting.size), margin=setting.margin)
+        prepared = scene.uniform_imager(
+            optics, (setting.size, setting.size), margin=setting.margin
+        )
         light = scene.image(frames, prepared, margin=setting.margin)
     else:
         light = optics(frames)
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
-    return sensor.mean_electrons(light, setting.pitch_um, sensor=chip).flatten(1).double()
+    return (
+        sensor.mean_electrons(light, setting.pitch_um, sensor=chip).flatten(1).double()
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Linear:
     """The estimator about each eye.
 
-    image: (scenes, pixels) electrons that it expects. pull: (scenes, unknowns, pixels) change of its answer by a
-    change of the image, unknowns in the order of NAMES. covariance: (scenes, unknowns, unknowns) of its answer under
+    image: (scenes, pixels) electrons that it expects. pull: (scenes, unknowns, pixels)
+    change of its answer by a
+    change of the image, unknowns in the order of NAMES. covariance: (scenes, unknowns,
+    unknowns) of its answer under
     the noise of one frame.
     """
 
@@ -166,40 +220,55 @@ class Linear:
     covariance: Tensor
 
     def shift(self, image: Tensor) -> Tensor:
-        """(scenes, unknowns) error of the answer to images (scenes, pixels) of the same eyes by other optics."""
+        """(scenes, unknowns) error of the answer to images (scenes, pixels) of the same
+        eyes by other optics.
+        """
         return torch.einsum("skp,sp->sk", self.pull, image - self.image)
 
     @property
     def noise_rad(self) -> float:
         """Gaze error (rms over eyes, both angles) that the noise of one frame leaves."""
-        return float(self.covariance[:, :2, :2].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
+        return float(
+            self.covariance[:, :2, :2].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
+        )
 
 
 def linear(seen: Views, optics: PsfBasis | Imager, setting: TaskSetting) -> Linear:
     """The estimator that knows these optics."""
     image = electrons(seen.anchor, optics, setting)
     slopes = [
-        (electrons(more, optics, setting) - electrons(less, optics, setting)) / (2 * step)
+        (electrons(more, optics, setting) - electrons(less, optics, setting))
+        / (2 * step)
         for (more, less), step in zip(seen.moved, steps(), strict=True)
     ]
     return estimator(image, torch.stack(slopes, 1), setting)
 
 
 def estimator(image: Tensor, slopes: Tensor, setting: TaskSetting) -> Linear:
-    """The estimator of eyes whose images (scenes, pixels) move by slopes (scenes, unknowns but brightness, pixels)."""
+    """The estimator of eyes whose images (scenes, pixels) move by slopes (scenes,
+    unknowns but brightness, pixels).
+    """
     derivative = torch.cat([slopes, image[:, None]], 1)
     chip = replace(setting.sensor, pitch_um=setting.pitch_um)
     noise = sensor.variance(image, sensor=chip) + (setting.mismatch * image) ** 2
     weighted = derivative / noise[:, None]
     prior = precision()
     normal = weighted @ derivative.mT + prior
-    unit = normal.diagonal(dim1=1, dim2=2).rsqrt()  # the unknowns differ by powers of ten in size
-    inverse = torch.linalg.inv(normal * unit[:, :, None] * unit[:, None, :]) * unit[:, :, None] * unit[:, None, :]
+    unit = normal.diagonal(
+        dim1=1, dim2=2
+    ).rsqrt()  # the unknowns differ by powers of ten in size
+    inverse = (
+        torch.linalg.inv(normal * unit[:, :, None] * unit[:, None, :])
+        * unit[:, :, None]
+        * unit[:, None, :]
+    )
     return Linear(image, inverse @ weighted, inverse)
 
 
 def gaze_rms(shift: Tensor) -> float:
-    """Root mean square over eyes (and draws) of the gaze error, rad, from shifts (..., unknowns)."""
+    """Root mean square over eyes (and draws) of the gaze error, rad, from shifts (...,
+    unknowns).
+    """
     return float(shift[..., :2].pow(2).sum(-1).mean().sqrt())
 
 
@@ -209,11 +278,19 @@ def gaze_mean(shift: Tensor) -> float:
 
 
 def settle(
-    image: Tensor, optics: PsfBasis | Imager, states: States, setting: TaskSetting, *, seen: Views, steps: int
+    image: Tensor,
+    optics: PsfBasis | Imager,
+    states: States,
+    setting: TaskSetting,
+    *,
+    seen: Views,
+    steps: int,
 ) -> Tensor:
-    """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels), starting from the true states.
+    """(scenes, unknowns) where the estimate comes to rest on images (scenes, pixels),
+    starting from the true states.
 
-    Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen`` are those of the true states.
+    Gauss-Newton: every step renders the eyes and their slopes at the estimate; ``seen``
+    are those of the true states.
     """
     prior = precision()
     found = torch.zeros(len(image), len(NAMES), dtype=torch.float64)
@@ -224,6 +301,9 @@ def settle(
                 moved = shifted(moved, k, found[:, k])
             seen = views(setting, moved, exposed=states)
         reader = linear(seen, optics, setting)
-        pulled = reader.shift(image / (1 + found[:, -1:])) - (reader.covariance @ (found @ prior)[..., None])[..., 0]
+        pulled = (
+            reader.shift(image / (1 + found[:, -1:]))
+            - (reader.covariance @ (found @ prior)[..., None])[..., 0]
+        )
         found = found + pulled
     return found

@@ -1,6 +1,8 @@
-"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each with how it was found.
+"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each
+with how it was found.
 
-Links that are done are kept beside the output (NAME.resume): after an interruption the same command goes on.
+Links that are done are kept beside the output (NAME.resume): after an interruption the
+same command goes on.
 """
 
 import dataclasses
@@ -26,13 +28,17 @@ from metalens.psf import Source, spectrum
 
 
 def run(options: Options) -> int:
-    """Compute, write, report; exit 1 where the error of the device's image is above its tolerance."""
+    """Compute, write, report; exit 1 where the error of the device's image is above its
+    tolerance.
+    """
     target = options.output
     if target.suffix != ".h5":
         raise ConfigError(f"{target}: need a name that ends in .h5")
     made, given = lens.load_plain(options.lens), _given(options)
     if given.fwhm_nm:
-        spectrum.points(Source(made.wavelength_um * 1e3, given.fwhm_nm))  # refused now, not after the work
+        spectrum.points(
+            Source(made.wavelength_um * 1e3, given.fwhm_nm)
+        )  # refused now, not after the work
     with options.claim(target, beside=(".html", ".png")) as draft:
         origin = _provenance(options, given)
         title = f"{__version__}\n{origin.config}{origin.inputs}{given.frames}"
@@ -51,25 +57,37 @@ def run(options: Options) -> int:
 
 
 def of_light(made: lens.Lens) -> str:
-    """Of which light a budget is, where pillars of one size answer x and y apart; empty for others."""
+    """Of which light a budget is, where pillars of one size answer x and y apart; empty
+    for others.
+    """
     if not made.one_light:
         return ""
     return f"of {made.one_light}: these pillars ({made.cell.described}) answer x and y apart"
 
 
 def summary(rows: list[Entry]) -> dict[str, float]:
-    """The sum, what was measured on the same frames and the ratio of the two, where a run was given."""
+    """The sum, what was measured on the same frames and the ratio of the two, where a
+    run was given.
+    """
     found = {"gaze_error_deg": math.degrees(rows[-1].gaze_rad)}
     for row in rows:
         if row.link == MEASURED:
-            found |= {"measured_deg": math.degrees(row.gaze_rad), "closure": rows[-1].gaze_rad / row.gaze_rad}
+            found |= {
+                "measured_deg": math.degrees(row.gaze_rad),
+                "closure": rows[-1].gaze_rad / row.gaze_rad,
+            }
     return found
 
 
 def save(path: Path, rows: list[Entry], provenance: store.Provenance) -> None:
     """Write a budget file (kind ``budget``)."""
-    numbers = {name: np.array([getattr(r, name) for r in rows]) for name in ("phase_rad", "psf", "gaze_rad")}
-    words = {name: np.array([getattr(r, name) for r in rows]) for name in ("link", "method")}
+    numbers = {
+        name: np.array([getattr(r, name) for r in rows])
+        for name in ("phase_rad", "psf", "gaze_rad")
+    }
+    words = {
+        name: np.array([getattr(r, name) for r in rows]) for name in ("link", "method")
+    }
     counted = {"counted": np.array([r.counted for r in rows], np.uint8)}
     store.save(path, "budget", numbers | words | counted, provenance=provenance)
 
@@ -82,9 +100,17 @@ def load(path: Path) -> list[Entry]:
         StoreError: not a budget file.
     """
     arrays = store.load(path, "budget").arrays
-    words = {n: [w.decode() if isinstance(w, bytes) else str(w) for w in arrays[n]] for n in ("link", "method")}
+    words = {
+        n: [w.decode() if isinstance(w, bytes) else str(w) for w in arrays[n]]
+        for n in ("link", "method")
+    }
     counted = [bool(c) for c in arrays.get("counted", np.ones(len(words["link"])))]
-    columns = (words["link"], *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")), words["method"], counted)
+    columns = (
+        words["link"],
+        *(arrays[n].tolist() for n in ("phase_rad", "psf", "gaze_rad")),
+        words["method"],
+        counted,
+    )
     return [Entry(*row) for row in zip(*columns, strict=True)]
 
 
@@ -92,8 +118,13 @@ def text(rows: list[Entry]) -> str:
     """The table for a terminal."""
     lines = [f"{'link':<30} {'phase/rad':>10} {'PSF':>9} {'gaze/deg':>10}  how"]
     for r in rows:
-        numbers = [("-" if math.isnan(v) else f"{v:.2g}") for v in (r.phase_rad, r.psf, math.degrees(r.gaze_rad))]
-        lines.append(f"{r.link:<30} {numbers[0]:>10} {numbers[1]:>9} {numbers[2]:>10}  {r.method}")
+        numbers = [
+            ("-" if math.isnan(v) else f"{v:.2g}")
+            for v in (r.phase_rad, r.psf, math.degrees(r.gaze_rad))
+        ]
+        lines.append(
+            f"{r.link:<30} {numbers[0]:>10} {numbers[1]:>9} {numbers[2]:>10}  {r.method}"
+        )
     return "\n".join(lines)
 
 
@@ -101,7 +132,12 @@ def _given(options: Options) -> Given:
     if options.led_fwhm_nm < 0:
         raise ConfigError(f"--led-fwhm-nm {options.led_fwhm_nm:g}: need 0 or more")
     wide = options.led_fwhm_nm > 0
-    numerics = Numerics(options.depths, options.wavelengths if wide else 1, options.tolerance, options.kernels)
+    numerics = Numerics(
+        options.depths,
+        options.wavelengths if wide else 1,
+        options.tolerance,
+        options.kernels,
+    )
     return Given(
         numerics=numerics,
         fwhm_nm=options.led_fwhm_nm,

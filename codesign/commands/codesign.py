@@ -1,4 +1,6 @@
-"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
+"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched
+under compute budgets.
+"""
 
 import json
 from collections.abc import Iterator
@@ -41,28 +43,41 @@ SHOWN = 8  # test frames that are kept with the answers
 
 
 def run(options: Options) -> int:
-    """Train, search, finish; exit 1 where the error of the true image is above what the run asks for."""
+    """Train, search, finish; exit 1 where the error of the true image is above what the
+    run asks for.
+    """
     settings = _frozen(runs.load(options.config), options.freeze)
     if options.export and settings.network != "supernet":
-        raise ConfigError(f"--export writes elastic networks; network = {settings.network!r} has no such export")
+        raise ConfigError(
+            f"--export writes elastic networks; network = {settings.network!r} has no such export"
+        )
     device = device_of(options.device)
     parallel.join(device)
     if parallel.rank():
         return _assist(transaction.unfinished(options.output), settings, device)
-    with options.claim_work(options.output, keep=(CHECKPOINT,), resume=options.resume) as draft:
+    with options.claim_work(
+        options.output, keep=(CHECKPOINT,), resume=options.resume
+    ) as draft:
         rows, said = _work(options, settings, device, draft.path)
     count = torch.get_num_threads()
-    values = {"rows": rows, "folder": str(options.output), "image": said, "threads": count}
-    words = (
-        f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
+    values = {
+        "rows": rows,
+        "folder": str(options.output),
+        "image": said,
+        "threads": count,
+    }
+    words = f"trained on {count} thread{'s' * (count > 1)}; another number changes the last digits, and with them the run"
+    return options.console.judged(
+        values, f"{_table(rows)}\n{formed.words(said)}\n{words}", [said["above"]]
     )
-    return options.console.judged(values, f"{_table(rows)}\n{formed.words(said)}\n{words}", [said["above"]])
 
 
 def _work(
     options: Options, settings: RunConfig, device: torch.device, folder: Path
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Train, search and write into the folder; a row a network, and what images they were trained on."""
+    """Train, search and write into the folder; a row a network, and what images they
+    were trained on.
+    """
     console = options.console
     going = _resume(folder, settings) if options.resume else _start(folder, settings)
     if settings.run.pitch_um < settings.optics.sample_um:
@@ -85,8 +100,12 @@ def _work(
             )
     for budget, born in runs.search(going, folder / CHECKPOINT):
         one = {"budget_mmacs": budget, "error": born.error, "mmacs": born.macs / 1e6}
-        _log(folder, {"kind": "birth", **one, "architecture": asdict(born.architecture)})
-        console.say(f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs")
+        _log(
+            folder, {"kind": "birth", **one, "architecture": asdict(born.architecture)}
+        )
+        console.say(
+            f"budget {budget:g} MMACs: slip error {born.error:.3f} mm at {born.macs / 1e6:.2f} MMACs"
+        )
     parallel.leave()
     ends = finished(going)
     said = _image(going)
@@ -123,7 +142,9 @@ def _image(going: Run) -> dict[str, Any]:
     settings = going.settings
     side = settings.scenes.pixels + 2 * settings.scenes.margin
     coefficients = going.trainer.model.coefficients_rad.detach()
-    return formed.described(settings.optics, coefficients, side, margin=settings.scenes.margin)
+    return formed.described(
+        settings.optics, coefficients, side, margin=settings.scenes.margin
+    )
 
 
 def _export(folder: Path, going: Run, ends: list[End]) -> None:
@@ -131,11 +152,15 @@ def _export(folder: Path, going: Run, ends: list[End]) -> None:
     for end, state in zip(ends, going.searches, strict=False):
         if not isinstance(end.model.net, Baseline):
             path = folder / f"subnet_{end.row['budget_mmacs']:g}.onnx"
-            onnx_file.write(path, going, end.model.net, best(state.history).architecture)
+            onnx_file.write(
+                path, going, end.model.net, best(state.history).architecture
+            )
 
 
 def _assist(folder: Path, settings: RunConfig, device: torch.device) -> int:
-    """Another process of ``torchrun``: trains and searches along from the same checkpoint, writes nothing."""
+    """Another process of ``torchrun``: trains and searches along from the same
+    checkpoint, writes nothing.
+    """
     parallel.wait()
     going = runs.resume(folder / CHECKPOINT, settings)
     place(going.trainer, device)
@@ -172,7 +197,11 @@ def _resume(folder: Path, settings: RunConfig) -> Run:
     made = runs.resume(folder / CHECKPOINT, settings)
     births = sum(len(s.history) for s in made.searches)
     kept: list[str] = []
-    for line in (folder / LOG).read_text(encoding="utf-8").splitlines() if (folder / LOG).is_file() else []:
+    for line in (
+        (folder / LOG).read_text(encoding="utf-8").splitlines()
+        if (folder / LOG).is_file()
+        else []
+    ):
         entry = _entry(line)
         if entry.get("kind") == "step" and entry["step"] <= made.trainer.step:
             kept.append(line)
@@ -186,12 +215,16 @@ def _resume(folder: Path, settings: RunConfig) -> Run:
 def _entry(line: str) -> dict[str, Any]:
     try:
         entry: dict[str, Any] = json.loads(line)
-    except json.JSONDecodeError:  # the line that was being written when the run was killed
+    except (
+        json.JSONDecodeError
+    ):  # the line that was being written when the run was killed
         return {}
     return entry
 
 
-def _progress(console: Console, records: Iterator[Record], going: Run) -> Iterator[Record]:
+def _progress(
+    console: Console, records: Iterator[Record], going: Run
+) -> Iterator[Record]:
     left = going.settings.inner.steps - going.trainer.step
     return console.track(records, total=left, label="training")
 
@@ -208,14 +241,27 @@ def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> No
     _weights(folder, going, ends)
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
-    found = {"pitch_um": pitch, "seed": settings.inner.seed, "steps": settings.inner.steps, "rows": rows}
+    found = {
+        "pitch_um": pitch,
+        "seed": settings.inner.seed,
+        "steps": settings.inner.steps,
+        "rows": rows,
+    }
     found |= {"bound": pictures.bound(going)}
-    found |= {"network": settings.network, "frozen": list(settings.run.frozen), "image": said}
+    found |= {
+        "network": settings.network,
+        "frozen": list(settings.run.frozen),
+        "image": said,
+    }
     found |= {"pitch_held_um": going.trainer.pitch_held_um}
     found |= {"threads": torch.get_num_threads(), "bytes_depend_on_threads": True}
     store.write_text(folder / RESULT, json.dumps(found, indent=1) + "\n")
-    said_by = {f"network_{i}": _named(row["budget_mmacs"]) for i, row in enumerate(rows)}
-    store.save(folder / ANSWERS, "answers", pictures.answered(ends, SHOWN), attributes=said_by)
+    said_by = {
+        f"network_{i}": _named(row["budget_mmacs"]) for i, row in enumerate(rows)
+    }
+    store.save(
+        folder / ANSWERS, "answers", pictures.answered(ends, SHOWN), attributes=said_by
+    )
     if going.searches:
         store.write_bytes(folder / "pareto.png", _plot(going))
 
@@ -224,18 +270,26 @@ def _weights(folder: Path, going: Run, ends: list[End]) -> None:
     """Every network, cut to its own architecture."""
     for end, state in zip(ends, [*going.searches, None], strict=False):
         net, budget = end.model.net, end.row["budget_mmacs"]
-        kept = net if isinstance(net, Baseline) or state is None else Subnet(net, best(state.history).architecture)
+        kept = (
+            net
+            if isinstance(net, Baseline) or state is None
+            else Subnet(net, best(state.history).architecture)
+        )
         name = going.settings.network if budget is None else f"subnet_{budget:g}"
         checkpoint.save_network(folder / f"{name}.safetensors", kept)
 
 
 def _named(budget_mmacs: float | None) -> str:
-    return "network" if budget_mmacs is None else f"budget {budget_mmacs:g} million MACs"
+    return (
+        "network" if budget_mmacs is None else f"budget {budget_mmacs:g} million MACs"
+    )
 
 
 def _lens(path: Path, going: Run) -> None:
     settings = going.settings.optics
-    made = library.sweep(library.DEFAULT_CELL, wavelengths_um=(settings.focus.wavelength_um,))
+    made = library.sweep(
+        library.DEFAULT_CELL, wavelengths_um=(settings.focus.wavelength_um,)
+    )
     phase = trained.phase_of(settings, runs.coefficients(going).numpy())
     result, _ = design.make(
         phase,
@@ -244,19 +298,38 @@ def _lens(path: Path, going: Run) -> None:
         cell=made.cell,
         proxy=library.proxy_of(made),
         profile="codesign",
-        provenance=store.Provenance(config=config.dumps(going.settings), seed=going.settings.inner.seed),
+        provenance=store.Provenance(
+            config=config.dumps(going.settings), seed=going.settings.inner.seed
+        ),
     )
     lens.save(path, result)
 
 
 def _plot(going: Run) -> bytes:
     figure, axes = report.canvas(size=(6.0, 4.0))
-    for budget, state in zip(going.settings.run.budgets_mmacs, going.searches, strict=True):
+    for budget, state in zip(
+        going.settings.run.budgets_mmacs, going.searches, strict=True
+    ):
         macs = [c.macs / 1e6 for c in state.history]
-        axes.plot(macs, [c.error for c in state.history], "o", label=f"budget {budget:g} MMACs")
+        axes.plot(
+            macs,
+            [c.error for c in state.history],
+            "o",
+            label=f"budget {budget:g} MMACs",
+        )
     front = pareto([c for s in going.searches for c in s.history])
-    axes.step([c.macs / 1e6 for c in front], [c.error for c in front], where="post", color="k", label="Pareto set")
-    axes.set(xlabel="MMACs", ylabel="slippage error on validation / mm", title="Accuracy against compute")
+    axes.step(
+        [c.macs / 1e6 for c in front],
+        [c.error for c in front],
+        where="post",
+        color="k",
+        label="Pareto set",
+    )
+    axes.set(
+        xlabel="MMACs",
+        ylabel="slippage error on validation / mm",
+        title="Accuracy against compute",
+    )
     axes.legend()
     return report.png(figure)
 
@@ -272,5 +345,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
             told = f"+-{r['axial_interval_mm']:5.2f} mm ({100 * r['axial_coverage_90']:7.0f} %)"
         errors = f"{r['axial_slip_mm']:10.3f}  {told}  {r['lateral_slip_mm']:12.3f}"
         costs = f"{r['mmacs']:5.2f}  {r['effective_pitch_um']:16.1f}"
-        lines.append(f"{budget}  {costs}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}")
+        lines.append(
+            f"{budget}  {costs}  {errors}  {iou}  {r['depth_response_mm_per_mm']:6.2f}"
+        )
     return "\n".join([head, *lines])

@@ -1,6 +1,8 @@
-"""What a lens, a run or the paper's claims are worth: ``metalens evaluate optics | ...``, a module each.
+"""What a lens, a run or the paper's claims are worth: ``metalens evaluate optics |
+...``, a module each.
 
-``metalens evaluate lens.h5...`` is ``optics``, and ``metalens evaluate RUN_DIR...`` is ``paper``.
+``metalens evaluate lens.h5...`` is ``optics``, and ``metalens evaluate RUN_DIR...`` is
+``paper``.
 """
 
 from pathlib import Path
@@ -15,12 +17,17 @@ PARTS: dict[str, tuple[str, str]] = {
         "codesign.commands.options.experiment",
         "RUN_DIR... -> gaze and slippage of synthetic subjects on a bench (Sec. 5, Figs. 9 to 11)",
     ),
-    "paper": ("codesign.commands.options.paper", "RUN_DIR... -> every table and figure of the paper beside ours"),
+    "paper": (
+        "codesign.commands.options.paper",
+        "RUN_DIR... -> every table and figure of the paper beside ours",
+    ),
 }
 
 
 def part_of(word: str) -> str | None:
-    """The sub-verb that a first word is meant for: optics for a file, paper for a folder, None for anything else."""
+    """The sub-verb that a first word is meant for: optics for a file, paper for a
+    folder, None for anything else.
+    """
     path = Path(word)
     if path.is_dir():
         return "paper"

@@ -1,4 +1,6 @@
-"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about
+depth, and about whole scenes.
+"""
 
 import dataclasses
 import json
@@ -9,7 +11,15 @@ from typing import Any
 import torch
 
 from codesign.commands.options.optics import Options
-from codesign.evaluate import FieldSetting, ReaderConfig, Scenes, Setting, field_page, judged, reader
+from codesign.evaluate import (
+    FieldSetting,
+    ReaderConfig,
+    Scenes,
+    Setting,
+    field_page,
+    judged,
+    reader,
+)
 from codesign.evaluate import optics as evaluate_optics
 from codesign.evaluate import plots as evaluate_plots
 from codesign.evaluate import tables as evaluate_tables
@@ -31,7 +41,8 @@ SPREAD = "brings no light together in one bright spot of the sensor: its beams a
 class Settings:
     """The content of OPTICS.toml; every key may be left out.
 
-    axial: how the axial information is measured. over_field: what the designer's page shows. scenes: what the scene
+    axial: how the axial information is measured. over_field: what the designer's page
+    shows. scenes: what the scene
     table is made of. reader: what the reference reader sees, with ``--reader``.
     """
 
@@ -42,12 +53,20 @@ class Settings:
 
 
 def run(options: Options) -> int:
-    """Measure, print, draw, write; exit 1 where an error of PSFs or images is above what is aimed at."""
+    """Measure, print, draw, write; exit 1 where an error of PSFs or images is above
+    what is aimed at.
+    """
     if not options.lenses:
         raise ConfigError("no lens to evaluate; give at least one lens file")
-    settings = Settings() if options.config is None else config.load(options.config, Settings, empty=False)
+    settings = (
+        Settings()
+        if options.config is None
+        else config.load(options.config, Settings, empty=False)
+    )
     if options.scenes is not None:
-        settings = dataclasses.replace(settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes))
+        settings = dataclasses.replace(
+            settings, scenes=dataclasses.replace(settings.scenes, count=options.scenes)
+        )
     made = [lenses.load_plain(path) for path in options.lenses]
     names = distinct([reading.shown(path.stem) for path in options.lenses])
     folder = options.output
@@ -58,7 +77,11 @@ def run(options: Options) -> int:
 
 
 def _measure(
-    options: Options, settings: Settings, made: list[Lens], names: list[str], folder: Path
+    options: Options,
+    settings: Settings,
+    made: list[Lens],
+    names: list[str],
+    folder: Path,
 ) -> tuple[dict[str, Any], str]:
     """Measure, draw, write; the numbers and the tables."""
     if options.baselines:
@@ -67,23 +90,46 @@ def _measure(
             made.append(lens)
     measured = settings.axial.about(made[0])
     states = states_at(torch.arange(settings.scenes.count), settings.scenes.seed)
-    pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="PSFs")
+    pairs = options.console.track(
+        zip(names, made, strict=True), total=len(made), label="PSFs"
+    )
     axial = {name: evaluate_optics.axial(lens, measured) for name, lens in pairs}
-    pairs = options.console.track(zip(names, made, strict=True), total=len(made), label="field")
-    seen = {name: settings.over_field.of(lens, made[0], measured.angles_deg) for name, lens in pairs}
-    spread = [name for name, lens in zip(names, made, strict=True) if not design.focused(lens)]
+    pairs = options.console.track(
+        zip(names, made, strict=True), total=len(made), label="field"
+    )
+    seen = {
+        name: settings.over_field.of(lens, made[0], measured.angles_deg)
+        for name, lens in pairs
+    }
+    spread = [
+        name for name, lens in zip(names, made, strict=True) if not design.focused(lens)
+    ]
     told = [f"{name} {SPREAD}" for name in spread]
     try:
-        scenes = dict(zip(names, evaluate_optics.scene_energies(made, states, settings.scenes), strict=True))
+        scenes = dict(
+            zip(
+                names,
+                evaluate_optics.scene_energies(made, states, settings.scenes),
+                strict=True,
+            )
+        )
     except PropagationError as error:
         raise ConfigError("; ".join([str(error), *told])) from error
-    tables = [*evaluate_tables.tables(axial, scenes, measured, spread=told), *field_page.tables(seen)]
+    tables = [
+        *evaluate_tables.tables(axial, scenes, measured, spread=told),
+        *field_page.tables(seen),
+    ]
     values = evaluate_tables.values(axial, scenes, measured)
     values["failures"] = evaluate_tables.failures(axial, scenes, measured)
     for name, one in seen.items():
-        values["lenses"][name] |= {"focuses": name not in spread, "field": field_page.values(one)}
+        values["lenses"][name] |= {
+            "focuses": name not in spread,
+            "field": field_page.values(one),
+        }
     if options.reader:
-        table, values["reader"] = _read(options, settings.reader, dict(zip(names, made, strict=True)))
+        table, values["reader"] = _read(
+            options, settings.reader, dict(zip(names, made, strict=True))
+        )
         tables.append(table)
     text = "\n\n".join(table.text for table in tables)
     store.write_text(folder / "tables.txt", text + "\n")
@@ -99,11 +145,18 @@ def _measure(
     return values, text
 
 
-def _read(options: Options, setting: ReaderConfig, made: dict[str, Lens]) -> tuple[Table, dict[str, Any]]:
+def _read(
+    options: Options, setting: ReaderConfig, made: dict[str, Lens]
+) -> tuple[Table, dict[str, Any]]:
     """What the reference reader makes of every lens."""
-    found = dict(options.console.track(judged(made, setting), total=len(made), label="reader"))
+    found = dict(
+        options.console.track(judged(made, setting), total=len(made), label="reader")
+    )
     told = {name: one.values() for name, one in found.items()}
-    return reader.table(found, setting), {"settings": dataclasses.asdict(setting), "lenses": told}
+    return reader.table(found, setting), {
+        "settings": dataclasses.asdict(setting),
+        "lenses": told,
+    }
 
 
 def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> None:
@@ -111,15 +164,27 @@ def _write(folder: Path, pictures: dict[str, bytes], tables: list[Table]) -> Non
     captions = evaluate_plots.CAPTIONS | field_page.CAPTIONS
     for name, image in pictures.items():
         store.write_bytes(folder / f"{name}.png", image)
-    items = [Figure(image, captions[name], wide=True) for name, image in pictures.items()]
+    items = [
+        Figure(image, captions[name], wide=True) for name, image in pictures.items()
+    ]
     sections = [Section("Pictures", items=items), Section("Tables", items=tables)]
     write(folder / "report.html", "What the lenses tell", sections)
 
 
 def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
-    """The tuned hyperbolic lens and double helix, of the pillars and aperture of a lens, with their names."""
-    radius, measured = lens.diameters.radius_um + lens.diameters.pitch_um / 2, setting.about(lens)
-    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    """The tuned hyperbolic lens and double helix, of the pillars and aperture of a
+    lens, with their names.
+    """
+    radius, measured = (
+        lens.diameters.radius_um + lens.diameters.pitch_um / 2,
+        setting.about(lens),
+    )
+    focus = Focus(
+        lens.wavelength_um,
+        lens.sensor_distance_um,
+        lens.source_distance_um,
+        lens.layers,
+    )
     wanted = Fisher(
         depths_mm=measured.depths_mm,
         pixel_um=measured.pixel_um * min(setting.binnings),
@@ -139,4 +204,7 @@ def tuned_like(lens: Lens, setting: Setting) -> list[tuple[str, Lens]]:
 
 def distinct(names: list[str]) -> list[str]:
     """Names of lenses, numbered where two files have the same stem."""
-    return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({i + 1})"
+        for i, name in enumerate(names)
+    ]

@@ -1,4 +1,6 @@
-"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each run's lens and network (Sec. 5)."""
+"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each
+run's lens and network (Sec. 5).
+"""
 
 import json
 from collections.abc import Sequence
@@ -9,7 +11,14 @@ import numpy as np
 
 from codesign.adapt import Source, bootstrap, retrained
 from codesign.commands.options.experiment import Options
-from codesign.evaluate import AXIAL, LATERAL, ExperimentConfig, Result, experiment, experiment_plots
+from codesign.evaluate import (
+    AXIAL,
+    LATERAL,
+    ExperimentConfig,
+    Result,
+    experiment,
+    experiment_plots,
+)
 from codesign.gaze import People, people_file
 from codesign.optics import formed
 from metalens.ground import config as settings
@@ -22,75 +31,126 @@ GOALS = {"gaze_axial_deg": "<= 0.58 of mid-range", "slip_mm": "<= 0.55 of mid-ra
 
 
 def run(options: Options) -> int:
-    """Show, read, calibrate, draw; exit 1 where the error of a run's images is above what the run asks for."""
+    """Show, read, calibrate, draw; exit 1 where the error of a run's images is above
+    what the run asks for.
+    """
     if not options.runs:
         raise ConfigError("no run to evaluate; give one run folder or more")
     names = options.names or distinct(options.runs)
     if len(names) != len(options.runs):
-        raise ConfigError(f"{len(names)} names for {len(options.runs)} runs; give one a run")
+        raise ConfigError(
+            f"{len(names)} names for {len(options.runs)} runs; give one a run"
+        )
     if len(set(names)) < len(names):
-        raise ConfigError(f"names {', '.join(names)}: two are alike; give every run one of its own")
+        raise ConfigError(
+            f"names {', '.join(names)}: two are alike; give every run one of its own"
+        )
     folder, config = options.output, options.settings
     sources = [retrained.load(path) for path in options.runs]
     with options.claim_folder(folder) as draft:
         results: list[Result] = []
         steps = experiment(sources, config, names=names)
-        for _, found in options.console.track(steps, total=config.subjects, label="subjects"):
+        for _, found in options.console.track(
+            steps, total=config.subjects, label="subjects"
+        ):
             results = found
-        shown = {name: retrained.lens_of(path) for name, path in zip(names, options.runs, strict=True)}
-        values = summary(results, config) | {"images": images(options.runs, names), "lenses": shown}
-        values["failures"] = [f"{one.name}: {one.above}" for one in results if one.above]
+        shown = {
+            name: retrained.lens_of(path)
+            for name, path in zip(names, options.runs, strict=True)
+        }
+        values = summary(results, config) | {
+            "images": images(options.runs, names),
+            "lenses": shown,
+        }
+        values["failures"] = [
+            f"{one.name}: {one.above}" for one in results if one.above
+        ]
         pictures = {
             "samples.png": experiment_plots.samples(sources[0], config),
             "ambiguity.png": experiment_plots.ambiguity(results[0]),
             "errors.png": experiment_plots.errors(results),
         }
         _write(draft.path, values, pictures)
-        for number, (result, source) in enumerate(zip(results, sources, strict=True), 1):
+        for number, (result, source) in enumerate(
+            zip(results, sources, strict=True), 1
+        ):
             if isinstance(result.how, People):
-                people_file.save(draft.path / f"people_{number}.h5", result.how, provenance=_made(source, config))
-    return options.console.judged(values, f"{table(values)}\nopen {folder / PAGE}", values["failures"])
+                people_file.save(
+                    draft.path / f"people_{number}.h5",
+                    result.how,
+                    provenance=_made(source, config),
+                )
+    return options.console.judged(
+        values, f"{table(values)}\nopen {folder / PAGE}", values["failures"]
+    )
 
 
 def _made(source: Source, config: ExperimentConfig) -> store.Provenance:
     """By which run, shown what."""
     seed = source.settings.inner.seed
-    return store.Provenance(config=f"{settings.dumps(source.settings)}\n{settings.dumps(config)}", seed=seed)
+    return store.Provenance(
+        config=f"{settings.dumps(source.settings)}\n{settings.dumps(config)}", seed=seed
+    )
 
 
 def images(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """How every run's images were formed and how wrong they are, as the run itself found; None of older runs.
+    """How every run's images were formed and how wrong they are, as the run itself
+    found; None of older runs.
 
     Of a retraining, those of the run that it went on from.
     """
     return {
-        name: json.loads((retrained.run_of(folder) / "result.json").read_text("utf-8")).get("image")
+        name: json.loads(
+            (retrained.run_of(folder) / "result.json").read_text("utf-8")
+        ).get("image")
         for name, folder in zip(names, folders, strict=True)
     }
 
 
 def distinct(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the folders, of a network in a folder with its own, numbered where they repeat."""
+    """Names of the folders, of a network in a folder with its own, numbered where they
+    repeat.
+    """
     places = (path.resolve() for path in paths)
-    stems = [reading.shown(p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}") for p in places]
-    return tuple(s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems))
+    stems = [
+        reading.shown(
+            p.name if p.suffix != ".safetensors" else f"{p.parent.name} {p.stem}"
+        )
+        for p in places
+    ]
+    return tuple(
+        s if stems.count(s) == 1 else f"{s} {i + 1}" for i, s in enumerate(stems)
+    )
 
 
 def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, Any]:
-    """Numbers of every run with intervals over subjects, and ratios of the first to the others."""
+    """Numbers of every run with intervals over subjects, and ratios of the first to the
+    others.
+    """
     per = [_per_subject(r) for r in results]
     rows = []
     for result, means in zip(results, per, strict=True):
-        row: dict[str, Any] = {"name": result.name, "mmacs": result.mmacs, **_beyond(result)}
+        row: dict[str, Any] = {
+            "name": result.name,
+            "mmacs": result.mmacs,
+            **_beyond(result),
+        }
         for quantity, values in means.items():
-            known = bool(np.isfinite(values).all())  # a network without a mask has no overlap
+            known = bool(
+                np.isfinite(values).all()
+            )  # a network without a mask has no overlap
             row[quantity] = float(values.mean()) if known else None
             if known and len(values) > 1:
                 row[f"{quantity}_interval"] = list(bootstrap(values))
         rows.append(row)
     ratios = []
     for other, means in zip(results[1:], per[1:], strict=True):
-        for quantity in ("gaze_axial_deg", "gaze_lateral_deg", "slip_mm", "slip_axial_mm"):
+        for quantity in (
+            "gaze_axial_deg",
+            "gaze_lateral_deg",
+            "slip_mm",
+            "slip_axial_mm",
+        ):
             value, low, high = ratio(per[0][quantity], means[quantity])
             ratios.append({
                 "quantity": quantity, "against": other.name, "ratio": value, "interval": [low, high],
@@ -102,11 +162,16 @@ def summary(results: Sequence[Result], config: ExperimentConfig) -> dict[str, An
 
 
 def _beyond(result: Result) -> dict[str, Any]:
-    """Slippages that training never saw, how far it saw, and the axial error where it did."""
+    """Slippages that training never saw, how far it saw, and the axial error where it
+    did.
+    """
     within = result.within
     if within.all():
         return {}
-    axial, slips = result.slip_error_mm[:, 2], np.unique(result.trial.slip_mm[~within], axis=0)
+    axial, slips = (
+        result.slip_error_mm[:, 2],
+        np.unique(result.trial.slip_mm[~within], axis=0),
+    )
     return {
         "trained_to_mm": list(result.reach_mm), "beyond_training_mm": slips.tolist(),
         "slip_axial_within_mm": float(axial[within].mean()), "slip_axial_beyond_mm": float(axial[~within].mean()),
@@ -115,7 +180,10 @@ def _beyond(result: Result) -> dict[str, Any]:
 
 def _of_reach(row: dict[str, Any]) -> str:
     """A sentence of :func:`_beyond`."""
-    far = ", ".join("(" + ", ".join(f"{v:g}" for v in slip) + ")" for slip in row["beyond_training_mm"])
+    far = ", ".join(
+        "(" + ", ".join(f"{v:g}" for v in slip) + ")"
+        for slip in row["beyond_training_mm"]
+    )
     seen = ", ".join(f"{v:g}" for v in row["trained_to_mm"])
     return (
         f"{row['name']}: trained on slippage up to ({seen}) mm; {far} mm lie outside of what it saw: axial error "
@@ -125,7 +193,11 @@ def _of_reach(row: dict[str, Any]) -> str:
 
 def _of_lenses(values: dict[str, Any]) -> list[str]:
     """Sentences on the runs that are shown through another lens than the design's."""
-    made = {name: lens for name, lens in values.get("lenses", {}).items() if lens != "as designed"}
+    made = {
+        name: lens
+        for name, lens in values.get("lenses", {}).items()
+        if lens != "as designed"
+    }
     return [f"{name}: through the lens {lens}" for name, lens in made.items()]
 
 
@@ -133,7 +205,9 @@ def _per_subject(result: Result) -> dict[str, Any]:
     error, axial = result.slip_error_mm, result.trial.group(AXIAL)
     return {
         "gaze_axial_deg": result.per_subject(result.gaze_deg, axial),
-        "gaze_lateral_deg": result.per_subject(result.gaze_deg, result.trial.group(LATERAL)),
+        "gaze_lateral_deg": result.per_subject(
+            result.gaze_deg, result.trial.group(LATERAL)
+        ),
         "gaze_told_slip_deg": result.per_subject(result.told_deg, axial),
         "slip_mm": result.per_subject(error.mean(1)),
         "slip_axial_mm": result.per_subject(error[:, 2]),
@@ -144,7 +218,9 @@ def _per_subject(result: Result) -> dict[str, Any]:
     }
 
 
-def ratio(one: Any, other: Any, *, draws: int = 2000, seed: int = 0) -> tuple[float, float, float]:
+def ratio(
+    one: Any, other: Any, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float, float]:
     """Ratio of means over subjects with its 95 % interval, by a paired bootstrap."""
     rows = np.random.default_rng(seed).integers(0, len(one), (draws, len(one)))
     low, high = np.quantile(one[rows].mean(1) / other[rows].mean(1), [0.025, 0.975])
@@ -163,10 +239,16 @@ def table(values: dict[str, Any]) -> str:
         )
     for r in values["ratios"]:
         low, high = r["interval"]
-        lines.append(f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]")
-    lines += _of_lenses(values) + [_of_reach(r) for r in values["runs"] if "beyond_training_mm" in r]
+        lines.append(
+            f"{r['quantity']:<18}{values['first']} / {r['against']}: {r['ratio']:.2f} [{low:.2f}, {high:.2f}]"
+        )
+    lines += _of_lenses(values) + [
+        _of_reach(r) for r in values["runs"] if "beyond_training_mm" in r
+    ]
     for name, found in values.get("images", {}).items():
-        lines.append(f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}")
+        lines.append(
+            f"{name}: {formed.words(found) if found else 'image: uniform, of unknown error; run it again'}"
+        )
     return "\n".join(lines)
 
 
@@ -177,7 +259,8 @@ def _write(folder: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> 
     store.write_text(folder / JSON, json.dumps(values, indent=1) + "\n")
 
 
-COLUMNS = {  # of the page's table: what the numbers are called in the result, and on paper
+# of the page's table: what the numbers are called in the result, and on paper
+COLUMNS = {
     "name": "run",
     "mmacs": "million MACs a frame",
     "gaze_axial_deg": "gaze error under axial slip / deg",
@@ -212,14 +295,28 @@ def _page(path: Path, values: dict[str, Any], pictures: dict[str, bytes]) -> Non
     if ratios:
         head = ("error", "against", f"ratio of {values['first']}", "95 % interval")
         tables.append(report.Table(head, ratios, digits=3))
-    figures = [report.Figure(pictures[name], caption, wide=True) for name, caption in CAPTIONS.items()]
+    figures = [
+        report.Figure(pictures[name], caption, wide=True)
+        for name, caption in CAPTIONS.items()
+    ]
     keys = [
-        report.KeyFigure(f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°")
+        report.KeyFigure(
+            f"{r['name']}: gaze error under axial slip", f"{r['gaze_axial_deg']:.2f}°"
+        )
         for r in values["runs"]
     ]
     reach = [f"{_of_reach(r)}." for r in values["runs"] if "beyond_training_mm" in r]
-    words = " ".join([_told(values["settings"]), *(f"{line}." for line in _of_lenses(values)), *reach])
-    sections = [report.Section("Numbers", words, tables), report.Section("Figures", "", figures)]
+    words = " ".join(
+        [
+            _told(values["settings"]),
+            *(f"{line}." for line in _of_lenses(values)),
+            *reach,
+        ]
+    )
+    sections = [
+        report.Section("Numbers", words, tables),
+        report.Section("Figures", "", figures),
+    ]
     report.write(path, "Virtual experiment", sections, key_figures=keys)
 
 

@@ -1,4 +1,6 @@
-"""A run's network as ONNX, with the scale of the run: lengths on its sensor, slippage in mm, angles of the face."""
+"""A run's network as ONNX, with the scale of the run: lengths on its sensor, slippage
+in mm, angles of the face.
+"""
 
 from pathlib import Path
 
@@ -28,10 +30,17 @@ def pixels_of(run: Run) -> int:
 
 
 def write(path: Path, run: Run, net: Supernet, architecture: Architecture) -> None:
-    """Write a network of a run, cut to its architecture, for frames of the run's sensor.
+    """Write a network of a run, cut to its architecture, for frames of the run's
+    sensor.
 
     Raises:
         OSError: the target cannot be written.
     """
     pitch = float(run.trainer.model.pitch_um.detach())
-    exported.write(path, Subnet(net, architecture), scale_of(run), size=pixels_of(run), pitch_um=pitch)
+    exported.write(
+        path,
+        Subnet(net, architecture),
+        scale_of(run),
+        size=pixels_of(run),
+        pitch_um=pitch,
+    )

@@ -1,4 +1,6 @@
-"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
+"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours,
+ratio, conditions.
+"""
 
 import json
 from collections.abc import Sequence
@@ -20,13 +22,19 @@ DIM_DB = 15.0
 
 
 def run(options: Options) -> int:
-    """Measure what is missing, compare, write; exit 1 where a measurement's own check failed."""
+    """Measure what is missing, compare, write; exit 1 where a measurement's own check
+    failed.
+    """
     if len(options.runs) > len(ROLES):
-        raise ConfigError(f"{len(options.runs)} runs; give at most {len(ROLES)}: {', '.join(ROLES)}")
+        raise ConfigError(
+            f"{len(options.runs)} runs; give at most {len(ROLES)}: {', '.join(ROLES)}"
+        )
     folder = options.output
     runs = dict(zip(ROLES, options.runs, strict=False))
     if (folder / JSON).is_file() and not options.force:
-        raise ConfigError(f"{folder / JSON} exists; give --force to write it again from the measurements beside it")
+        raise ConfigError(
+            f"{folder / JSON} exists; give --force to write it again from the measurements beside it"
+        )
     for path in options.runs:
         retraining.rows_of(path)  # refused now, not after an hour of measuring
     with options.claim_work(folder, keep=("[!m]*",), grow=True) as draft:
@@ -34,29 +42,63 @@ def run(options: Options) -> int:
             _measure(options, draft.path)
         told = paper.lines(collect(draft.path, runs, options.others), draft.path)
         _write(draft.path, told)
-        values = [{**asdict(t.claim), "ours": asdict(t.ours) if t.ours else None, "picture": t.picture} for t in told]
-        store.write_text(draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n")
+        values = [
+            {
+                **asdict(t.claim),
+                "ours": asdict(t.ours) if t.ours else None,
+                "picture": t.picture,
+            }
+            for t in told
+        ]
+        store.write_text(
+            draft.path / JSON, json.dumps(values, indent=1, default=float) + "\n"
+        )
     text = f"{table(told)}\nopen {folder / PAGE}"
-    return options.console.judged({"lines": values, "folder": str(folder)}, text, failures(folder))
+    return options.console.judged(
+        {"lines": values, "folder": str(folder)}, text, failures(folder)
+    )
 
 
 def failures(folder: Path) -> list[str]:
     """The checks that the measurements in ``folder`` failed, each with which it is of."""
-    files = [folder / name for name in ("experiment/experiment.json", "dim/experiment.json", "optics/optics.json")]
-    read = {file.parent.name: json.loads(file.read_text("utf-8")) for file in files if file.is_file()}
-    return [f"{name}: {words}" for name, values in read.items() for words in values.get("failures", [])]
+    files = [
+        folder / name
+        for name in (
+            "experiment/experiment.json",
+            "dim/experiment.json",
+            "optics/optics.json",
+        )
+    ]
+    read = {
+        file.parent.name: json.loads(file.read_text("utf-8"))
+        for file in files
+        if file.is_file()
+    }
+    return [
+        f"{name}: {words}"
+        for name, values in read.items()
+        for words in values.get("failures", [])
+    ]
 
 
-def collect(folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()) -> dict[str, Measured]:
-    """Everything that was measured into ``folder``, and the rows of the runs and of those with a part frozen.
+def collect(
+    folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()
+) -> dict[str, Measured]:
+    """Everything that was measured into ``folder``, and the rows of the runs and of
+    those with a part frozen.
 
     Raises:
-        StoreError, TrainingError: a measurement or a run is damaged or of another version.
+        StoreError, TrainingError: a measurement or a run is damaged or of another
+            version.
     """
     found: dict[str, Measured] = {}
     experiment, dim, optics = (
         folder / name / f"{file}.json"
-        for name, file in (("experiment", "experiment"), ("dim", "experiment"), ("optics", "optics"))
+        for name, file in (
+            ("experiment", "experiment"),
+            ("dim", "experiment"),
+            ("optics", "optics"),
+        )
     )
     if experiment.is_file():
         found |= paper.of_experiment(experiment)
@@ -68,36 +110,58 @@ def collect(folder: Path, runs: dict[str, Path], others: Sequence[Path] = ()) ->
         found |= paper_runs.of_gaze(json.loads((folder / GAZE).read_text("utf-8")))
     rows = {role: retraining.rows_of(path) for role, path in runs.items()}
     found |= paper.of_runs(rows)
-    return found | paper_runs.of_ablations(rows.get("proposed", []), dict(paper_runs.frozen_rows(others)))
+    return found | paper_runs.of_ablations(
+        rows.get("proposed", []), dict(paper_runs.frozen_rows(others))
+    )
 
 
 def _measure(options: Options, folder: Path) -> None:
     names = ROLES[: len(options.runs)]
     config = ExperimentConfig(subjects=options.subjects)
-    for name, settings in (("experiment", config), ("dim", replace(config, snr_db=DIM_DB))):
+    for name, settings in (
+        ("experiment", config),
+        ("dim", replace(config, snr_db=DIM_DB)),
+    ):
         if not (folder / name / "experiment.json").is_file():
             options.console.say(f"measuring: {name}")
-            asked = experiment_options.Options(options.runs, folder / name, names, settings, quiet=True, force=True)
+            asked = experiment_options.Options(
+                options.runs, folder / name, names, settings, quiet=True, force=True
+            )
             command_experiment.run(asked)
     _measure_gaze(options, folder / GAZE)
     if not (folder / "optics" / "optics.json").is_file():
         options.console.say("measuring: optics")
-        order = sorted(zip(names, options.runs, strict=True), key=lambda pair: pair[0] != "hyperbolic")
+        order = sorted(
+            zip(names, options.runs, strict=True),
+            key=lambda pair: pair[0] != "hyperbolic",
+        )
         lenses = tuple(_named(folder, name, path) for name, path in order)
         asked_of = folder / "optics.toml"
-        store.write_text(asked_of, f"[scenes]\nimage_tolerance = {paper_runs.image_tolerance(options.runs)}\n")
+        store.write_text(
+            asked_of,
+            f"[scenes]\nimage_tolerance = {paper_runs.image_tolerance(options.runs)}\n",
+        )
         optics = optics_options.Options(
-            lenses=lenses, output=folder / "optics", config=asked_of, scenes=options.scenes, quiet=True, force=True
+            lenses=lenses,
+            output=folder / "optics",
+            config=asked_of,
+            scenes=options.scenes,
+            quiet=True,
+            force=True,
         )
         command_evaluate_optics.run(optics)
 
 
 def _measure_gaze(options: Options, path: Path) -> None:
-    """Gaze of the proposed run and of the other networks; runs that are in the file are not measured again."""
+    """Gaze of the proposed run and of the other networks; runs that are in the file are
+    not measured again.
+    """
     told = json.loads(path.read_text("utf-8")) if path.is_file() else {}
     for folder in (options.runs[0], *options.others):
         kind = paper_runs.kind_of(folder)
-        if str(folder) in told or (folder != options.runs[0] and kind.network == "supernet"):
+        if str(folder) in told or (
+            folder != options.runs[0] and kind.network == "supernet"
+        ):
             continue
         options.console.say(f"measuring: gaze of {folder}")
         told[str(folder)] = {"network": kind.network, "rows": paper_runs.gaze(folder)}
@@ -129,9 +193,18 @@ def _write(folder: Path, told: list[Line]) -> None:
             if any(not t.picture for t in mine)
             else []
         )
-        items += [report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True) for t in mine if t.picture]
+        items += [
+            report.Figure((folder / t.picture).read_bytes(), t.claim.what, wide=True)
+            for t in mine
+            if t.picture
+        ]
         sections.append(report.Section(place, items=items))
     done = sum(t.ours is not None or bool(t.picture) for t in told)
-    keys = [report.KeyFigure("claims of the paper", str(len(told))), report.KeyFigure("measured here", str(done))]
+    keys = [
+        report.KeyFigure("claims of the paper", str(len(told))),
+        report.KeyFigure("measured here", str(done)),
+    ]
     lead = "Every table and figure of the paper beside ours. What was not measured says which command would."
-    report.write(folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys)
+    report.write(
+        folder / PAGE, "The paper, and ours", sections, lead=lead, key_figures=keys
+    )

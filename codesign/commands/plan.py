@@ -1,6 +1,8 @@
-"""Which tolerances, depths and wavelengths suffice for a gaze error, at the least cost: settings files ready to run.
+"""Which tolerances, depths and wavelengths suffice for a gaze error, at the least cost:
+settings files ready to run.
 
-What is measured is kept beside the output (NAME.resume): after an interruption the same command goes on.
+What is measured is kept beside the output (NAME.resume): after an interruption the same
+command goes on.
 """
 
 import json
@@ -10,7 +12,17 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from codesign.adapt import train as retraining
-from codesign.budget import Chain, Journal, Pilot, Plan, PlanConfig, floor, plan, same_geometry, total
+from codesign.budget import (
+    Chain,
+    Journal,
+    Pilot,
+    Plan,
+    PlanConfig,
+    floor,
+    plan,
+    same_geometry,
+    total,
+)
 from codesign.commands.options.plan import Options
 from metalens import __version__
 from metalens.ground import config, reading, report, store
@@ -41,34 +53,55 @@ def angle_rad(text: str) -> float:
 
 
 def run(options: Options) -> int:
-    """Measure, choose, write; exit 1 where even the finest settings miss the goal, or the image its tolerance.
+    """Measure, choose, write; exit 1 where even the finest settings miss the goal, or
+    the image its tolerance.
 
     Raises:
-        ConfigError: the goal is below what no setting changes. LensError: the run is of another lens.
+        ConfigError: the goal is below what no setting changes. LensError: the run is of
+            another lens.
     """
     goal = angle_rad(options.gaze_error)
-    wanted = PlanConfig() if options.config is None else config.load(options.config, PlanConfig, empty=False)
+    wanted = (
+        PlanConfig()
+        if options.config is None
+        else config.load(options.config, PlanConfig, empty=False)
+    )
     target = options.output
     with options.claim_folder(target) as draft:
-        rig = replace(wanted.task.rig, sensor_distance_um=wanted.focus.sensor_distance_um)
+        rig = replace(
+            wanted.task.rig, sensor_distance_um=wanted.focus.sensor_distance_um
+        )
         run = retraining.load(options.run) if options.run else None
         if run is not None:
-            same_geometry(wanted.geometry, run.settings.optics, "the plan; give PLAN.toml those of the run")
+            same_geometry(
+                wanted.geometry,
+                run.settings.optics,
+                "the plan; give PLAN.toml those of the run",
+            )
         least = floor.floor(rig, run, options.frames, fwhm_nm=wanted.led_fwhm_nm)
         floor.allowance_rad(goal, least)
         chain = Chain(wanted, options.console.say)
-        read = {str(file): reading.sha256(file) for file in workers.material_files(wanted.cell)}
+        read = {
+            str(file): reading.sha256(file)
+            for file in workers.material_files(wanted.cell)
+        }
         title = f"{__version__}\n{config.dumps(wanted)}{read}"
-        journal = Journal(target.with_name(target.name + ".resume"), title, inputs=map(Path, read))
+        journal = Journal(
+            target.with_name(target.name + ".resume"), title, inputs=map(Path, read)
+        )
         measured = plan.pilot(chain, journal, floor=least)
         best = plan.choose(measured, goal, wanted)
         write(draft.path, best, measured, chain)
     journal.finish()
-    return options.console.judged(values(best, measured), text(best, measured, target), failures(best, chain))
+    return options.console.judged(
+        values(best, measured), text(best, measured, target), failures(best, chain)
+    )
 
 
 def failures(best: Plan, chain: Chain) -> list[str]:
-    """Why a plan does not do: the goal is missed, or the image of the chosen tolerance is not within it."""
+    """Why a plan does not do: the goal is missed, or the image of the chosen tolerance
+    is not within it.
+    """
     missed = [] if best.met else ["the goal is not met by the finest settings on offer"]
     if isinstance(best.choice, plan.TrueChoice):
         missed.append(chain.device(best.choice.image_tolerance).above)
@@ -88,7 +121,9 @@ def values(best: Plan, measured: Pilot) -> dict[str, object]:
         "finest_seconds": best.finest_seconds,
         "pilot_seconds": measured.spent_seconds,
         "noise_deg": math.degrees(measured.noise_rad),
-        "floor_deg": {entry.link: math.degrees(entry.gaze_rad) for entry in measured.floor},
+        "floor_deg": {
+            entry.link: math.degrees(entry.gaze_rad) for entry in measured.floor
+        },
     }
 
 
@@ -100,28 +135,42 @@ def write(folder: Path, best: Plan, measured: Pilot, chain: Chain) -> None:
     store.write_text(folder / "cell.toml", f"[cell]\n{cell}\n[sweep]\n{sweep}")
     store.write_text(folder / "psf.toml", psf_text(best, measured, chain))
     store.write_text(folder / "run.toml", run_text(best, chain))
-    store.write_text(folder / "process.toml", f"[rules]\ndiameter_step_nm = {int(choice.diameter_step_nm)}\n")
-    store.write_text(folder / "plan.json", json.dumps(values(best, measured), indent=1) + "\n")
+    store.write_text(
+        folder / "process.toml",
+        f"[rules]\ndiameter_step_nm = {int(choice.diameter_step_nm)}\n",
+    )
+    store.write_text(
+        folder / "plan.json", json.dumps(values(best, measured), indent=1) + "\n"
+    )
     _page(folder / "report.html", best, measured)
 
 
 def chosen_nodes(best: Plan, measured: Pilot) -> dict[str, int]:
-    """What the chosen tolerance of the true image needs: nodes of the field, depths, wavelengths; none of one PSF."""
+    """What the chosen tolerance of the true image needs: nodes of the field, depths,
+    wavelengths; none of one PSF.
+    """
     if not isinstance(best.choice, plan.TrueChoice):
         return {}
-    found = measured.nodes[measured.levels["image_tolerance"].index(best.choice.image_tolerance)]
+    found = measured.nodes[
+        measured.levels["image_tolerance"].index(best.choice.image_tolerance)
+    ]
     return dict(zip(("rows", "columns", "depths", "wavelengths"), found, strict=True))
 
 
 def psf_text(best: Plan, measured: Pilot, chain: Chain) -> str:
-    """PSF.toml: the depths, and for the true image the angles from the axis to the edge of the field."""
+    """PSF.toml: the depths, and for the true image the angles from the axis to the edge
+    of the field.
+    """
     choice, near, far = best.choice, *(1e-3 * d for d in chain.eyes.depths_um)
     if isinstance(choice, plan.TrueChoice):
         nodes = chosen_nodes(best, measured)
         half = chain.config.task.size / 2 * chain.config.task.pitch_um
         edge = math.degrees(math.atan(half / chain.lens.sensor_distance_um))
         count = nodes["columns"] // 2 + 1
-        depths, tolerance = nodes["depths"], round(choice.image_tolerance / 3, 4)  # adds a twentieth in quadrature
+        depths, tolerance = (
+            nodes["depths"],
+            round(choice.image_tolerance / 3, 4),
+        )  # adds a twentieth in quadrature
         angles = [round(edge * k / (count - 1), 3) for k in range(count)]
     else:
         depths, tolerance, angles = choice.depth_count, choice.psf_tolerance, [0.0]
@@ -133,7 +182,9 @@ def psf_text(best: Plan, measured: Pilot, chain: Chain) -> str:
 
 
 def _one_wavelength(wanted: PlanConfig) -> str:
-    """What a diode's PSFs need beyond the library of the design's wavelength, which is all that the plan looked at."""
+    """What a diode's PSFs need beyond the library of the design's wavelength, which is
+    all that the plan looked at.
+    """
     if wanted.source is None:
         return ""
     swept = spectrum.sweep(spectrum.points(wanted.source)[0] * 1e3)
@@ -162,14 +213,18 @@ def run_text(best: Plan, chain: Chain) -> str:
 def _page(path: Path, best: Plan, measured: Pilot) -> None:
     keys = [
         report.KeyFigure("goal", f"{math.degrees(best.goal_rad):.2g}°"),
-        report.KeyFigure("predicted", f"{math.degrees(best.predicted_rad):.2g}°", best.met),
+        report.KeyFigure(
+            "predicted", f"{math.degrees(best.predicted_rad):.2g}°", best.met
+        ),
         report.KeyFigure("the run", f"{best.seconds:.0f} s"),
         report.KeyFigure("everything at its finest", f"{best.finest_seconds:.0f} s"),
     ]
     rows = []
     for knob, levels in measured.levels.items():
         chosen = getattr(best.choice, knob)
-        for level, error, seconds in zip(levels, measured.errors[knob], measured.seconds[knob], strict=True):
+        for level, error, seconds in zip(
+            levels, measured.errors[knob], measured.seconds[knob], strict=True
+        ):
             gaze = math.degrees(float((error**2).sum(-1).mean() ** 0.5))
             rows.append(
                 (
@@ -189,14 +244,26 @@ def _page(path: Path, best: Plan, measured: Pilot) -> None:
         "Every setting was measured alone in a pilot; errors add as vectors over the eyes. What no setting changes is "
         f"the floor: {floor_words(measured)}. The process comes on top (metalens budget)."
     )
-    report.write(path, "Plan of a run", [report.Section("Settings", words, (table,))], key_figures=keys)
+    report.write(
+        path,
+        "Plan of a run",
+        [report.Section("Settings", words, (table,))],
+        key_figures=keys,
+    )
 
 
 def text(best: Plan, measured: Pilot, folder: Path) -> str:
     """The plan for a terminal."""
-    rows = [f"  {name.replace('_', ' '):<20} {value:g}" for name, value in asdict(best.choice).items()]
+    rows = [
+        f"  {name.replace('_', ' '):<20} {value:g}"
+        for name, value in asdict(best.choice).items()
+    ]
     nodes = chosen_nodes(best, measured)
-    field_of = f"  {'of the true image':<20} {', '.join(f'{v} {k}' for k, v in nodes.items())}\n" if nodes else ""
+    field_of = (
+        f"  {'of the true image':<20} {', '.join(f'{v} {k}' for k, v in nodes.items())}\n"
+        if nodes
+        else ""
+    )
     return (
         f"{folder}: gaze error {math.degrees(best.predicted_rad):.2g} deg predicted, "
         f"{math.degrees(best.goal_rad):.2g} allowed\n"
@@ -209,5 +276,8 @@ def text(best: Plan, measured: Pilot, folder: Path) -> str:
 
 def floor_words(measured: Pilot) -> str:
     """The floor and its links."""
-    links = ", ".join(f"{entry.link} {math.degrees(entry.gaze_rad):.2g} deg" for entry in measured.floor)
+    links = ", ".join(
+        f"{entry.link} {math.degrees(entry.gaze_rad):.2g} deg"
+        for entry in measured.floor
+    )
     return f"{math.degrees(total(list(measured.floor)).gaze_rad):.2g} deg ({links or 'no links'})"

@@ -1,4 +1,6 @@
-"""RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and the next mask's correction."""
+"""RUN_DIR and asbuilt.h5 to DIR: the network trained on for the lens that was made, and
+the next mask's correction.
+"""
 
 import json
 from dataclasses import asdict
@@ -30,10 +32,15 @@ Given = tuple[Source, asbuilt.AsBuilt, lens.Lens, Truth | None, Bias]
 
 
 def run(options: Options) -> int:
-    """Train on, judge, correct, report; exit 1 where the error of the images that judge is above what the run asks
+    """Train on, judge, correct, report; exit 1 where the error of the images that judge
+    is above what the run asks
     for."""
-    source = retraining.load(options.run_dir, budget_mmacs=options.settings.budget_mmacs)
-    retraining.network(source.run.trainer)  # refused now, not after the lenses were imaged
+    source = retraining.load(
+        options.run_dir, budget_mmacs=options.settings.budget_mmacs
+    )
+    retraining.network(
+        source.run.trainer
+    )  # refused now, not after the lenses were imaged
     place(source.run.trainer, device_of(options.device))
     result = asbuilt.load(options.asbuilt)
     design = lens.load_plain(options.run_dir / "lens.h5")
@@ -41,46 +48,85 @@ def run(options: Options) -> int:
     truth = config.load(options.truth, Truth) if options.truth else None
     old = correction.present_bias(options.process)
     recipe = _recipe(options, source)
-    with options.claim_work(options.output, keep=("*.safetensors",), resume=options.resume) as draft:
+    with options.claim_work(
+        options.output, keep=("*.safetensors",), resume=options.resume
+    ) as draft:
         _agree(draft, recipe, resume=options.resume)
-        story = _story(options, draft.path, recipe, (source, result, design, truth, old))
-    return options.console.judged(_values(story, options), _text(story, options.output), [story.outcome.above])
+        story = _story(
+            options, draft.path, recipe, (source, result, design, truth, old)
+        )
+    return options.console.judged(
+        _values(story, options), _text(story, options.output), [story.outcome.above]
+    )
 
 
-def _story(options: Options, folder: Path, recipe: Recipe, given: Given) -> retrain_report.Story:
+def _story(
+    options: Options, folder: Path, recipe: Recipe, given: Given
+) -> retrain_report.Story:
     """Train on, judge, correct and write into the folder."""
     source, result, design, truth, old = given
     made = MadeLens(design, source.settings.optics, response=result.response)
     console = options.console
-    console.say(f"lenses: the design, the fit and {options.settings.draws} draws of its posterior")
+    console.say(
+        f"lenses: the design, the fit and {options.settings.draws} draws of its posterior"
+    )
     found = retraining.lenses(made, result, options.settings, truth)
-    trained = {name: _train(options, folder, (recipe, source, found), name) for name in retraining.jobs(found)}
+    trained = {
+        name: _train(options, folder, (recipe, source, found), name)
+        for name in retraining.jobs(found)
+    }
     console.say(f"judging: {len(retraining.jobs(found)) + 2} cases on the same frames")
     outcome = retraining.outcome(source, options.settings, found, trained)
-    plan = correction.propose(design, result.parameters(), response=made.response, old=old)
+    plan = correction.propose(
+        design, result.parameters(), response=made.response, old=old
+    )
     true = (
-        truth.vector() if truth else list(posterior(result, options.settings.draws + 1, seed=options.settings.seed))[-1]
+        truth.vector()
+        if truth
+        else list(
+            posterior(result, options.settings.draws + 1, seed=options.settings.seed)
+        )[-1]
     )
     proposals, frames = [], retraining.held(source, options.settings)
     states = correction.next_lenses(made, plan, result.parameters(), true)
     for state in console.track(states, total=len(states), label="next lens"):
-        error = retraining.judge(trained["nominal"], source, options.settings, (state.stack,), frames=frames)
+        error = retraining.judge(
+            trained["nominal"], source, options.settings, (state.stack,), frames=frames
+        )
         proposals.append((state, psf_error(state.stack, found.nominal), error.slip_mm))
     printed = correction.printed_um(design)
     sure = judge(
-        result, lambda x: correction.table(design, x, response=made.response, old=old, range_um=printed).bias_nm
+        result,
+        lambda x: (
+            correction.table(
+                design, x, response=made.response, old=old, range_um=printed
+            ).bias_nm
+        ),
     )
     even = judge(result, correction.uneven_nm, part=MAP)
-    apart = psf_error(found.best, found.nominal), psf_error(found.judges[0], found.nominal)
+    apart = (
+        psf_error(found.best, found.nominal),
+        psf_error(found.judges[0], found.nominal),
+    )
     story = retrain_report.Story(
-        outcome, found, apart, _curves(folder, found), plan, proposals, _cautions(result, found), sure.words, even.words
+        outcome,
+        found,
+        apart,
+        _curves(folder, found),
+        plan,
+        proposals,
+        _cautions(result, found),
+        sure.words,
+        even.words,
     )
     if sure.usable:
         correction.write(folder, plan, evened=even.usable)
     _keep(folder, options, (source, trained["retrained"]), story)
     if options.export:
         net = retraining.network(trained["retrained"])
-        onnx_file.write(folder / "subnet_retrained.onnx", source.run, net, source.architecture)
+        onnx_file.write(
+            folder / "subnet_retrained.onnx", source.run, net, source.architecture
+        )
     return story
 
 
@@ -99,16 +145,24 @@ def _agree(draft: Draft, recipe: Recipe, *, resume: bool) -> None:
     folder = draft.path
     if resume:
         if not (folder / RECIPE).is_file():
-            raise TrainingError(f"{draft.target}: no retraining to resume ({RECIPE} missing); start without --resume")
+            raise TrainingError(
+                f"{draft.target}: no retraining to resume ({RECIPE} missing); start without --resume"
+            )
         changed = checkpoint.difference((folder / RECIPE).read_text("utf-8"), recipe)
         if changed:
-            raise TrainingError(f"{folder} belongs to other settings; start anew or undo the change:\n{changed}")
+            raise TrainingError(
+                f"{folder} belongs to other settings; start anew or undo the change:\n{changed}"
+            )
         return
     store.write_text(folder / RECIPE, config.dumps(recipe))
 
 
-def _train(options: Options, folder: Path, given: tuple[Recipe, Source, Lenses], name: str) -> Trainer:
-    """One job to its end, logged and kept; a resume drops log lines beyond its checkpoint."""
+def _train(
+    options: Options, folder: Path, given: tuple[Recipe, Source, Lenses], name: str
+) -> Trainer:
+    """One job to its end, logged and kept; a resume drops log lines beyond its
+    checkpoint.
+    """
     (recipe, source, found), console = given, options.console
     going = retraining.job(source, options.settings, found, name)
     path = folder / f"{name}.safetensors"
@@ -116,7 +170,9 @@ def _train(options: Options, folder: Path, given: tuple[Recipe, Source, Lenses],
         going.restore(checkpoint.load(path, settings=recipe)["trainer"])
     _trim(folder, name, going.step)
     records = retraining.train(going, path, recipe)
-    for record in console.track(records, total=going.inner.steps - going.step, label=f"training: {name}"):
+    for record in console.track(
+        records, total=going.inner.steps - going.step, label=f"training: {name}"
+    ):
         _log(folder, name, record)
     return going
 
@@ -132,12 +188,18 @@ def _trim(folder: Path, name: str, step: int) -> None:
 
 
 def _entries(folder: Path) -> list[dict[str, Any]]:
-    lines = (folder / LOG).read_text("utf-8").splitlines() if (folder / LOG).is_file() else []
+    lines = (
+        (folder / LOG).read_text("utf-8").splitlines()
+        if (folder / LOG).is_file()
+        else []
+    )
     entries = []
     for line in lines:
         try:
             entries.append(json.loads(line))
-        except json.JSONDecodeError:  # the line that was being written when the run was killed
+        except (
+            json.JSONDecodeError
+        ):  # the line that was being written when the run was killed
             continue
     return entries
 
@@ -145,7 +207,10 @@ def _entries(folder: Path) -> list[dict[str, Any]]:
 def _curves(folder: Path, found: Lenses) -> dict[str, tuple[list[int], list[float]]]:
     entries = _entries(folder)
     return {
-        name: ([e["step"] for e in entries if e["job"] == name], [e["task"] for e in entries if e["job"] == name])
+        name: (
+            [e["step"] for e in entries if e["job"] == name],
+            [e["task"] for e in entries if e["job"] == name],
+        )
         for name in retraining.jobs(found)
     }
 
@@ -154,32 +219,52 @@ def _cautions(result: asbuilt.AsBuilt, found: Lenses) -> list[str]:
     words = list(result.problems) + list(result.degeneracies)
     release = result.provenance.versions.get("metalens-toolchain", "an unknown release")
     if release != __version__:
-        words.append(f"the as-built record was made by release {release}, this is {__version__}")
+        words.append(
+            f"the as-built record was made by release {release}, this is {__version__}"
+        )
     if not found.known:
-        words.append("the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance")
+        words.append(
+            "the truth is not known: lenses drawn from the posterior judge, as good as the fit's covariance"
+        )
     return words
 
 
-def _keep(folder: Path, options: Options, trained: tuple[Source, Trainer], story: retrain_report.Story) -> None:
+def _keep(
+    folder: Path,
+    options: Options,
+    trained: tuple[Source, Trainer],
+    story: retrain_report.Story,
+) -> None:
     source, going = trained
     retraining.settle(going, source)
     cut = Subnet(retraining.network(going), source.architecture)
     checkpoint.save_network(folder / "subnet_retrained.safetensors", cut)
     retrain_report.write(folder / "report.html", story)
     store.write_bytes(folder / "cases.png", retrain_report.bars(story.outcome))
-    store.write_text(folder / RESULT, json.dumps(_values(story, options), indent=1) + "\n")
+    store.write_text(
+        folder / RESULT, json.dumps(_values(story, options), indent=1) + "\n"
+    )
 
 
 def _values(story: retrain_report.Story, options: Options) -> dict[str, Any]:
     o, folder = story.outcome, options.output
     states = [
-        {"name": p.name, "psf_error": error, "strehl": p.strehl, "light": p.light, "slip_mm": slip}
+        {
+            "name": p.name,
+            "psf_error": error,
+            "strehl": p.strehl,
+            "light": p.light,
+            "slip_mm": slip,
+        }
         for p, error, slip in story.proposals
     ]
     return {
         "folder": str(folder),
         "given": given(folder, options.run_dir, options.asbuilt, options.truth),
-        "rows": [{"case": retrain_report.CASES[name], **row} for name, row in o.rows().items()],
+        "rows": [
+            {"case": retrain_report.CASES[name], **row}
+            for name, row in o.rows().items()
+        ],
         "slip_mm": o.rows()["after"]["slip_mm"],
         "cases": o.rows(),
         "gap_mm": o.gap_mm,
@@ -201,7 +286,11 @@ def _text(story: retrain_report.Story, folder: Path) -> str:
         lines.append(
             f"{retrain_report.CASES[name]:<38}{v['slip_mm']:.3f} {span:<18} {v['axial_mm']:.3f}   {v['iou']:.3f}"
         )
-    won = "nothing to win back beyond chance" if o.recovered is None else f"{o.recovered:.0%} won back"
+    won = (
+        "nothing to win back beyond chance"
+        if o.recovered is None
+        else f"{o.recovered:.0%} won back"
+    )
     lines.append(f"gap {o.gap_mm:.3f} +- {o.gap_sigma_mm:.3f} mm, {won}")
     for p, error, slip in story.proposals:
         lines.append(

@@ -26,10 +26,14 @@ class Scene:
 
     frames, seed: how many states, drawn from which seed.
     pixels, pitch_um: of the image grid.
-    elevation_deg, distance_mm: of the camera below the eye's forward direction, and its distance from the pupil.
-    gaze_deg: largest gaze to the side, and up or down. slip_mm: largest slippage along the camera's x, y, z.
-    scale: spread of the scale ambiguity (depth and labels times 1 +- scale at an unchanged image).
-    variety: of the looks, as of training's frames: 1 the population as published, bare; 2 with spectacles, make-up,
+    elevation_deg, distance_mm: of the camera below the eye's forward direction, and its
+    distance from the pupil.
+    gaze_deg: largest gaze to the side, and up or down. slip_mm: largest slippage along
+    the camera's x, y, z.
+    scale: spread of the scale ambiguity (depth and labels times 1 +- scale at an
+    unchanged image).
+    variety: of the looks, as of training's frames: 1 the population as published, bare;
+    2 with spectacles, make-up,
         uneven light, shadows, movement and other views as well.
     layer_mm: thickness of the depth layers that are written; at most 0.5.
     """
@@ -50,13 +54,23 @@ class Scene:
         if not 1 <= self.frames <= 100_000:
             raise ConfigError(f"frames = {self.frames}: need 1 to 100000")
         if not 0 < self.layer_mm <= 0.5:
-            raise ConfigError(f"layer_mm = {self.layer_mm}: need a thickness above 0 and at most 0.5 mm")
-        if not (8 <= self.pixels <= 8192 and 0 < self.pitch_um < 1e4 and 0 < self.distance_mm < 1e4):
+            raise ConfigError(
+                f"layer_mm = {self.layer_mm}: need a thickness above 0 and at most 0.5 mm"
+            )
+        if not (
+            8 <= self.pixels <= 8192
+            and 0 < self.pitch_um < 1e4
+            and 0 < self.distance_mm < 1e4
+        ):
             raise ConfigError(
                 f"pixels = {self.pixels}, pitch_um = {self.pitch_um}, distance_mm = {self.distance_mm}: need 8 to 8192 "
                 "pixels, and a pitch and a distance above 0"
             )
-        if abs(self.elevation_deg) >= 90 or not all(0 <= v < 90 for v in self.gaze_deg) or min(self.slip_mm) < 0:
+        if (
+            abs(self.elevation_deg) >= 90
+            or not all(0 <= v < 90 for v in self.gaze_deg)
+            or min(self.slip_mm) < 0
+        ):
             raise ConfigError(
                 f"elevation_deg = {self.elevation_deg}, gaze_deg = {self.gaze_deg}, slip_mm = {self.slip_mm}: need "
                 "angles below 90, ranges of 0 or more"
@@ -69,32 +83,58 @@ class Scene:
     @property
     def rig(self) -> Rig:
         """Camera and lamps in um and rad."""
-        return replace(Rig(), elevation_rad=math.radians(self.elevation_deg), distance_um=self.distance_mm * 1e3)
+        return replace(
+            Rig(),
+            elevation_rad=math.radians(self.elevation_deg),
+            distance_um=self.distance_mm * 1e3,
+        )
 
     @property
     def motion(self) -> Motion:
         """Ranges in um and rad."""
         x, y = (math.radians(angle) for angle in self.gaze_deg)
         slip = (self.slip_mm[0] * 1e3, self.slip_mm[1] * 1e3, self.slip_mm[2] * 1e3)
-        return replace(varied(self.variety), gaze_x_rad=x, gaze_y_rad=y, slip_um=slip, scale=self.scale)
+        return replace(
+            varied(self.variety),
+            gaze_x_rad=x,
+            gaze_y_rad=y,
+            slip_um=slip,
+            scale=self.scale,
+        )
 
 
 def run(options: Options) -> int:
     """Render, write and show; exit 1 where the image's error is above what it aims at."""
     settings = Scene() if options.config is None else config.load(options.config, Scene)
     if options.fwhm_nm < 0 or (options.fwhm_nm and options.lens is None):
-        raise ConfigError(f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is")
+        raise ConfigError(
+            f"--fwhm-nm {options.fwhm_nm:g}: need 0 or more, and --lens, whose light it is"
+        )
     if options.referee:
         pathtraced.start()
     lens = None if options.lens is None else lenses.load(options.lens)
     folder, failures = options.output, list[str]()
-    with options.claim_folder(folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2) as draft:
+    with options.claim_folder(
+        folder, room=transaction.ROOM + 4 * settings.frames * settings.pixels**2
+    ) as draft:
         count = _make(settings, draft.path, referee=options.referee)
-        values: dict[str, object] = {"frames": settings.frames, "layers": count, "folder": str(folder)}
-        words = f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png"
+        values: dict[str, object] = {
+            "frames": settings.frames,
+            "layers": count,
+            "folder": str(folder),
+        }
+        words = (
+            f"{settings.frames} frames, {count} layers in the first: {folder}/sheet.png"
+        )
         if lens is not None and options.lens is not None:
-            options.console.say("the lens over its field; half a minute for one of 1 mm")
-            about = Provenance(config.dumps(settings), {options.lens.name: reading.sha256(options.lens)}, settings.seed)
+            options.console.say(
+                "the lens over its field; half a minute for one of 1 mm"
+            )
+            about = Provenance(
+                config.dumps(settings),
+                {options.lens.name: reading.sha256(options.lens)},
+                settings.seed,
+            )
             found = _imaged(settings, lens, options.fwhm_nm)
             imaged.write(draft.path, found, about)
             values |= {"image_error": found.error, "light": found.light}
@@ -106,7 +146,9 @@ def run(options: Options) -> int:
 def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
     """Render and write; the number of layers of the first frame."""
     camera = Camera(settings.pixels, settings.pitch_um)
-    states = dataset.states_at(torch.arange(settings.frames), settings.seed, motion=settings.motion)
+    states = dataset.states_at(
+        torch.arange(settings.frames), settings.seed, motion=settings.motion
+    )
     made = worn(states, settings.rig, camera, settings.variety, (settings.seed, 3))
     about = Provenance(config=config.dumps(settings), seed=settings.seed)
     dataset.write_shard(folder / "scene.h5", made, seed=settings.seed, provenance=about)
@@ -123,7 +165,9 @@ def _make(settings: Scene, folder: Path, *, referee: bool) -> int:
 
 def _imaged(settings: Scene, lens: Lens, fwhm_nm: float) -> imaged.Imaged:
     count = min(settings.frames, imaged.FRAMES)
-    states = dataset.states_at(torch.arange(count), settings.seed, motion=settings.motion)
+    states = dataset.states_at(
+        torch.arange(count), settings.seed, motion=settings.motion
+    )
 
     def rendered(camera: Camera, rig: Rig) -> Rendered:
         return worn(states, rig, camera, settings.variety, (settings.seed, 3))
@@ -134,7 +178,9 @@ def _imaged(settings: Scene, lens: Lens, fwhm_nm: float) -> imaged.Imaged:
 
 def _write_layers(path: Path, made: Rendered, step_um: float, about: Provenance) -> int:
     """The occupied layers of the first frame, as image formation takes them."""
-    frame = scene.Frames(made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1])
+    frame = scene.Frames(
+        made.frames.radiance[:1], made.frames.coverage[:1], made.frames.depth_um[:1]
+    )
     seen = frame.depth_um[frame.coverage > 0]
     low, high = float(seen.min()), float(seen.max())
     depths = torch.arange(max(low - step_um, step_um), high + 2 * step_um, step_um)
@@ -153,15 +199,46 @@ def _table(made: Rendered) -> str:
     """Labels as comma-separated values, a frame a line."""
     labels = made.labels
     marks = [f"{name} {axis} px" for name in landmarks.NAMES for axis in "xy"]
-    head = ["slip x um", "slip y um", "slip z um", "optic x", "optic y", "optic z", "visual x", "visual y", "visual z"]
-    head += ["pupil x um", "pupil y um", "pupil z um", "pupil x px", "pupil y px", "visible", *marks]
-    columns = [labels.slip_um, labels.optic_axis, labels.visual_axis, labels.pupil_um, labels.pupil_px]
+    head = [
+        "slip x um",
+        "slip y um",
+        "slip z um",
+        "optic x",
+        "optic y",
+        "optic z",
+        "visual x",
+        "visual y",
+        "visual z",
+    ]
+    head += [
+        "pupil x um",
+        "pupil y um",
+        "pupil z um",
+        "pupil x px",
+        "pupil y px",
+        "visible",
+        *marks,
+    ]
+    columns = [
+        labels.slip_um,
+        labels.optic_axis,
+        labels.visual_axis,
+        labels.pupil_um,
+        labels.pupil_px,
+    ]
     columns += [labels.visible[:, None], labels.landmarks_px.flatten(1)]
     rows = torch.cat(columns, 1).tolist()
-    return "\n".join([",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]) + "\n"
+    return (
+        "\n".join(
+            [",".join(head), *(",".join(f"{v:.6g}" for v in row) for row in rows)]
+        )
+        + "\n"
+    )
 
 
-def contact_sheet(made: Rendered, path: Path, *, columns: int = 6, most: int = 24) -> None:
+def contact_sheet(
+    made: Rendered, path: Path, *, columns: int = 6, most: int = 24
+) -> None:
     """A picture of frames, with depth and pupil masks of the first row below."""
     import cv2
 
@@ -171,10 +248,17 @@ def contact_sheet(made: Rendered, path: Path, *, columns: int = 6, most: int = 2
     low, high = float(depth.min()), float(depth.max())
     near = 255 * (high - depth) / max(high - low, 1e-9)
     frames += list(near.numpy().astype(np.uint8)) if len(frames) % columns == 0 else []
-    frames += list((made.pupil[:columns] * 255).numpy().astype(np.uint8)) if len(frames) % columns == 0 else []
+    frames += (
+        list((made.pupil[:columns] * 255).numpy().astype(np.uint8))
+        if len(frames) % columns == 0
+        else []
+    )
     blank = np.zeros_like(frames[0])
     frames += [blank] * (-len(frames) % columns)
-    rows = [np.concatenate(frames[k : k + columns], 1) for k in range(0, len(frames), columns)]
+    rows = [
+        np.concatenate(frames[k : k + columns], 1)
+        for k in range(0, len(frames), columns)
+    ]
     done, coded = cv2.imencode(".png", np.concatenate(rows, 0))
     if not done:
         raise OSError(f"{path}: the picture could not be encoded")

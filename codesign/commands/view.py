@@ -1,4 +1,6 @@
-"""Panels of a co-design run (training, searches, networks, answers, bound, lens), of rendered eyes, of a budget."""
+"""Panels of a co-design run (training, searches, networks, answers, bound, lens), of
+rendered eyes, of a budget.
+"""
 
 import json
 import math
@@ -13,7 +15,16 @@ from codesign.train import Candidate, pareto
 from metalens.ground import report, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import StoreError
-from metalens.view import Axis, Curves, Images, Numbers, Panel, Points, at_brightest, lens_panels
+from metalens.view import (
+    Axis,
+    Curves,
+    Images,
+    Numbers,
+    Panel,
+    Points,
+    at_brightest,
+    lens_panels,
+)
 
 LOG, RESULT, LENS, ANSWERS = "log.jsonl", "result.json", "lens.h5", "answers.h5"
 
@@ -25,7 +36,11 @@ def panels(path: Path) -> list[Panel]:
         StoreError: a log or a result that is no JSON.
     """
     entries = _lines(path / LOG)
-    result = _json((path / RESULT).read_text(encoding="utf-8"), path / RESULT) if (path / RESULT).is_file() else {}
+    result = (
+        _json((path / RESULT).read_text(encoding="utf-8"), path / RESULT)
+        if (path / RESULT).is_file()
+        else {}
+    )
     shown = [*_training(entries), *_searched(entries), *_networks(result)]
     if (path / ANSWERS).is_file():
         shown += answers(path / ANSWERS)
@@ -48,7 +63,9 @@ def _json(text: str, path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise StoreError(f"{path}: not JSON ({error})") from None
     if not isinstance(found, dict):
-        raise StoreError(f"{path}: need a table of names and values, found {type(found).__name__}")
+        raise StoreError(
+            f"{path}: need a table of names and values, found {type(found).__name__}"
+        )
     return found
 
 
@@ -57,35 +74,67 @@ def _training(entries: list[dict[str, Any]]) -> list[Panel]:
     if len(steps) < 2:
         return []
     x = np.array([entry["step"] for entry in steps], float)
-    names = [k for k, v in steps[0].items() if k not in ("kind", "step") and isinstance(v, (int, float))]
-    lines = {name: np.array([entry.get(name, np.nan) for entry in steps], float) for name in names}
+    names = [
+        k
+        for k, v in steps[0].items()
+        if k not in ("kind", "step") and isinstance(v, (int, float))
+    ]
+    lines = {
+        name: np.array([entry.get(name, np.nan) for entry in steps], float)
+        for name in names
+    }
     said = {name: report.in_words(name) for name in names}
     moving = [name for name in names if np.ptp(lines[name]) > 0]
-    budgets = list(dict.fromkeys(entry["budget_mmacs"] for entry in entries if "budget_mmacs" in entry))
+    budgets = list(
+        dict.fromkeys(
+            entry["budget_mmacs"] for entry in entries if "budget_mmacs" in entry
+        )
+    )
     shown = {name: {said[name]: lines[name]} for name in moving}
     if "mmacs" in shown and len(budgets) > 1:
         shown["mmacs"] = _in_turn(x, lines["mmacs"], budgets)
-    return [Curves(f"Training: {said[name]}", x, "step", curves, "") for name, curves in shown.items()]
+    return [
+        Curves(f"Training: {said[name]}", x, "step", curves, "")
+        for name, curves in shown.items()
+    ]
 
 
 def _in_turn(step: Array, values: Array, budgets: list[float]) -> dict[str, Array]:
-    """A curve for each budget, of what is of a step for each in turn; between its steps the last value stands."""
+    """A curve for each budget, of what is of a step for each in turn; between its steps
+    the last value stands.
+    """
     curves = {}
     for i, budget in enumerate(budgets):
-        last = np.maximum.accumulate(np.where((step - 1) % len(budgets) == i, np.arange(len(step)), -1))
+        last = np.maximum.accumulate(
+            np.where((step - 1) % len(budgets) == i, np.arange(len(step)), -1)
+        )
         curves[f"budget {budget:g}"] = np.where(last >= 0, values[last], np.nan)
     return curves
 
 
 def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
-    """Every network that the searches tried, and those that no other beats in both error and cost."""
-    births = [e for e in entries if e.get("kind") == "birth" and {"error", "mmacs", "budget_mmacs"} <= set(e)]
+    """Every network that the searches tried, and those that no other beats in both
+    error and cost.
+    """
+    births = [
+        e
+        for e in entries
+        if e.get("kind") == "birth" and {"error", "mmacs", "budget_mmacs"} <= set(e)
+    ]
     births = [e for e in births if math.isfinite(e["error"])]
     if not births:
         return []
-    tried = [Candidate(_architecture(e.get("architecture", {})), e["error"], e["mmacs"]) for e in births]
-    front = [next(i for i, one in enumerate(tried) if one is best) for best in pareto(tried)]
-    notes = [dict(_layers(e["architecture"])) if e.get("architecture") else {} for e in births]
+    tried = [
+        Candidate(_architecture(e.get("architecture", {})), e["error"], e["mmacs"])
+        for e in births
+    ]
+    front = [
+        next(i for i, one in enumerate(tried) if one is best) for best in pareto(tried)
+    ]
+    notes = [
+        dict(_layers(e["architecture"])) if e.get("architecture") else {}
+        for e in births
+    ]
     return [
         Points(
             "Networks of the searches",
@@ -102,18 +151,30 @@ def _searched(entries: list[dict[str, Any]]) -> list[Panel]:
 
 
 def _architecture(held: dict[str, Any]) -> Architecture:
-    sizes = {name: tuple(held.get(name, ())) for name in ("depths", "kernels", "expansions")}
-    return Architecture(**sizes, width=held.get("width", 1.0), resolution=held.get("resolution", 1.0))
+    sizes = {
+        name: tuple(held.get(name, ())) for name in ("depths", "kernels", "expansions")
+    }
+    return Architecture(
+        **sizes, width=held.get("width", 1.0), resolution=held.get("resolution", 1.0)
+    )
 
 
 def _layers(held: dict[str, Any]) -> list[tuple[str, str]]:
-    """(what, how many) of a network: its input, its channels, and the blocks of each stage."""
+    """(what, how many) of a network: its input, its channels, and the blocks of each
+    stage.
+    """
     depths = held["depths"]
     slots = len(held["kernels"]) // len(depths)
-    rows = [("input scale", f"{held['resolution']:.3g}"), ("channels, of the full ones", f"{held['width']:.3g}")]
+    rows = [
+        ("input scale", f"{held['resolution']:.3g}"),
+        ("channels, of the full ones", f"{held['width']:.3g}"),
+    ]
     for stage, depth in enumerate(depths):
         used = range(stage * slots, stage * slots + depth)
-        blocks = ", ".join(f"{held['kernels'][i]}×{held['kernels'][i]} × {held['expansions'][i]:g}" for i in used)
+        blocks = ", ".join(
+            f"{held['kernels'][i]}×{held['kernels'][i]} × {held['expansions'][i]:g}"
+            for i in used
+        )
         rows.append((f"stage {stage + 1}", blocks))
     return rows
 
@@ -128,7 +189,15 @@ def _bound(result: dict[str, Any]) -> list[Panel]:
         "noise a thousandth of its power. Readers of real frames collect less."
     )
     return [
-        Curves("Bound on the depth of a window", x, "depth / mm", {"bound": least}, "mm", caption=words, scale="log")
+        Curves(
+            "Bound on the depth of a window",
+            x,
+            "depth / mm",
+            {"bound": least},
+            "mm",
+            caption=words,
+            scale="log",
+        )
     ]
 
 
@@ -136,60 +205,157 @@ def answers(path: Path) -> list[Panel]:
     """Test frames and what the networks said of them, beside the truth."""
     stored = store.load(path, "answers")
     held, count = stored.arrays, len(stored.arrays["frames"])
-    names = [str(stored.attributes[f"network_{i}"]) for i in range(len(held["told_slip_um"]))]
-    axes = [Axis("network", names), Axis("frame", list(range(count))), Axis("shown", ["truth", "answer"], blink=True)]
+    names = [
+        str(stored.attributes[f"network_{i}"]) for i in range(len(held["told_slip_um"]))
+    ]
+    axes = [
+        Axis("network", names),
+        Axis("frame", list(range(count))),
+        Axis("shown", ["truth", "answer"], blink=True),
+    ]
     shown: list[Panel] = [
-        Images("Frames of the test", held["frames"], axes[1:2], 1.0, "of its spread", across="pixels", from_least=True)
+        Images(
+            "Frames of the test",
+            held["frames"],
+            axes[1:2],
+            1.0,
+            "of its spread",
+            across="pixels",
+            from_least=True,
+        )
     ]
     for title, true, told, unit in _PAIRS:
         if told in held:
-            both = np.stack([np.broadcast_to(held[true], held[told].shape), held[told]], axis=2)
+            both = np.stack(
+                [np.broadcast_to(held[true], held[told].shape), held[told]], axis=2
+            )
             scaled = both * (1e-3 if unit == "mm" else 1.0)
-            shown.append(Images(title, scaled, axes, 1.0, unit, across="cells", from_least=unit == "mm"))
+            shown.append(
+                Images(
+                    title,
+                    scaled,
+                    axes,
+                    1.0,
+                    unit,
+                    across="cells",
+                    from_least=unit == "mm",
+                )
+            )
     rows = []
     for i, name in enumerate(names):
-        slips = np.stack([held["slip_um"], held["told_slip_um"][i]], axis=2).reshape(count, 6)
+        slips = np.stack([held["slip_um"], held["told_slip_um"][i]], axis=2).reshape(
+            count, 6
+        )
         wide = [1e-3 * v if v == v else "–" for v in held["interval_um"][i].tolist()]
         rows += [(name, k, *(1e-3 * slips[k]).tolist(), wide[k]) for k in range(count)]
     head = [f"{word} {axis} / mm" for axis in "xyz" for word in ("true", "read")]
     words = "Slippage of the eye; z is along the axis of the camera."
-    return [*shown, Numbers("Answers", ("network", "frame", *head, "90 % interval of z / mm"), rows, words)]
+    return [
+        *shown,
+        Numbers(
+            "Answers",
+            ("network", "frame", *head, "90 % interval of z / mm"),
+            rows,
+            words,
+        ),
+    ]
 
 
 def _networks(result: dict[str, Any]) -> list[Panel]:
     if not result:
         return []
     rows = [row for row in result.get("rows", []) if isinstance(row, dict)]
-    names = sorted({name for row in rows for name, value in row.items() if isinstance(value, (int, float, str))})
+    names = sorted(
+        {
+            name
+            for row in rows
+            for name, value in row.items()
+            if isinstance(value, (int, float, str))
+        }
+    )
     table = [[row.get(name, "") for name in names] for row in rows]
-    shown: list[Panel] = [Numbers("Networks of the run", [report.in_words(name) for name in names], table)]
-    drawn = [(f"budget {row['budget_mmacs']:g}", _layers(held)) for row in rows if (held := row.get("architecture"))]
+    shown: list[Panel] = [
+        Numbers("Networks of the run", [report.in_words(name) for name in names], table)
+    ]
+    drawn = [
+        (f"budget {row['budget_mmacs']:g}", _layers(held))
+        for row in rows
+        if (held := row.get("architecture"))
+    ]
     if drawn:
         head = ["", *(name for name, _ in drawn)]
-        lines = [[what, *(layers[i][1] for _, layers in drawn)] for i, (what, _) in enumerate(drawn[0][1])]
+        lines = [
+            [what, *(layers[i][1] for _, layers in drawn)]
+            for i, (what, _) in enumerate(drawn[0][1])
+        ]
         words = "Blocks of each stage: side of the kernel × expansion of the channels."
         shown.append(Numbers("Layers of the networks", head, lines, words))
     return shown
 
 
 def scene(path: Path) -> list[Panel]:
-    """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of every frame."""
+    """Rendered eyes: what the camera would see, depth, pupil mask, and the labels of
+    every frame.
+    """
     held = store.load(path, "scene").arrays
     count = len(held["radiance"])
-    frames, full = [Axis("frame", list(range(count)))], float(np.iinfo(held["radiance"].dtype).max)
-    far = held["coverage"] > full / 2  # the far sheet shows where it covers most of the pixel
+    frames, full = (
+        [Axis("frame", list(range(count)))],
+        float(np.iinfo(held["radiance"].dtype).max),
+    )
+    far = (
+        held["coverage"] > full / 2
+    )  # the far sheet shows where it covers most of the pixel
     depth_mm = 1e-3 * np.where(far, held["depth_um"][:, 1], held["depth_um"][:, 0])
-    labels = {k.removeprefix("labels/"): v for k, v in held.items() if k.startswith("labels/")}
-    told = {name: value for name in ("slip_um", "pupil_um", "visible") if (value := labels.get(name)) is not None}
-    head = [f"{report.in_words(name)}{axis}" for name, v in told.items() for axis in ([""] if v.ndim == 1 else _XYZ)]
-    rows = [[i, *np.concatenate([np.atleast_1d(v[i]) for v in told.values()]).tolist()] for i in range(count)]
+    labels = {
+        k.removeprefix("labels/"): v for k, v in held.items() if k.startswith("labels/")
+    }
+    told = {
+        name: value
+        for name in ("slip_um", "pupil_um", "visible")
+        if (value := labels.get(name)) is not None
+    }
+    head = [
+        f"{report.in_words(name)}{axis}"
+        for name, v in told.items()
+        for axis in ([""] if v.ndim == 1 else _XYZ)
+    ]
+    rows = [
+        [i, *np.concatenate([np.atleast_1d(v[i]) for v in told.values()]).tolist()]
+        for i in range(count)
+    ]
     return [
         Images(
-            "Rendered eyes", held["radiance"].sum(1, dtype=float) / full, frames, 1.0, "of full light", across="pixels"
+            "Rendered eyes",
+            held["radiance"].sum(1, dtype=float) / full,
+            frames,
+            1.0,
+            "of full light",
+            across="pixels",
         ),
-        Images("Depth", depth_mm, frames, 1.0, "mm from the lens", across="pixels", from_least=True),
-        Images("Pupil", held["pupil"] / full, frames, 1.0, "share of the pixel", across="pixels"),
-        Numbers("Labels", ("frame", *head), rows, "Positions in the camera's axes; labels.csv holds all of them."),
+        Images(
+            "Depth",
+            depth_mm,
+            frames,
+            1.0,
+            "mm from the lens",
+            across="pixels",
+            from_least=True,
+        ),
+        Images(
+            "Pupil",
+            held["pupil"] / full,
+            frames,
+            1.0,
+            "share of the pixel",
+            across="pixels",
+        ),
+        Numbers(
+            "Labels",
+            ("frame", *head),
+            rows,
+            "Positions in the camera's axes; labels.csv holds all of them.",
+        ),
     ]
 
 
@@ -198,28 +364,65 @@ def layers(path: Path) -> list[Panel]:
     held = store.load(path, "layers").arrays
     axis = [Axis("layer at", (1e-3 * held["depth_um"]).tolist(), "mm")]
     return [
-        Images("Light of a layer", held["radiance"], axis, 1.0, "of full light", across="pixels"),
-        Images("What a layer covers", held["coverage"], axis, 1.0, "share of the pixel", across="pixels"),
+        Images(
+            "Light of a layer",
+            held["radiance"],
+            axis,
+            1.0,
+            "of full light",
+            across="pixels",
+        ),
+        Images(
+            "What a layer covers",
+            held["coverage"],
+            axis,
+            1.0,
+            "share of the pixel",
+            across="pixels",
+        ),
     ]
 
 
 def image(path: Path) -> list[Panel]:
-    """Scenes and what a lens makes of them, and the PSFs over field and depth that did it."""
+    """Scenes and what a lens makes of them, and the PSFs over field and depth that did
+    it.
+    """
     stored = store.load(path, "image")
     held, about = stored.arrays, stored.attributes
     frames = Axis("frame", list(range(len(held["scene"]))))
     both = np.stack([held["scene"], held["image"]], axis=1)
     shown = Axis("shown", ["scene", "image"], blink=True)
     names = [Axis("depth", (1e-3 * held["depth_um"]).tolist(), "mm")]
-    names += [Axis("field, down", held["y_deg"].tolist(), "deg"), Axis("field, across", held["x_deg"].tolist(), "deg")]
+    names += [
+        Axis("field, down", held["y_deg"].tolist(), "deg"),
+        Axis("field, across", held["x_deg"].tolist(), "deg"),
+    ]
     psf, step = held["psf"] / held["psf"].max(), float(about["pitch_um"])
-    parts = [(report.in_words(k.removeprefix("error_")), v) for k, v in sorted(about.items()) if k.startswith("error_")]
+    parts = [
+        (report.in_words(k.removeprefix("error_")), v)
+        for k, v in sorted(about.items())
+        if k.startswith("error_")
+    ]
     words = f"Relative L2 error of a texture, {float(about['error']):.2g} together; outside: light beyond the windows."
     unit = "light, as of the scene"
     return [
         Images("Scene and image", both, [frames, shown], step, unit),
-        Images("Image less scene", held["image"] - held["scene"], [frames], step, unit, signed=True),
-        Images("Points of the field", psf, at_brightest(names, psf), step, "of the highest peak", optics=True),
+        Images(
+            "Image less scene",
+            held["image"] - held["scene"],
+            [frames],
+            step,
+            unit,
+            signed=True,
+        ),
+        Images(
+            "Points of the field",
+            psf,
+            at_brightest(names, psf),
+            step,
+            "of the highest peak",
+            optics=True,
+        ),
         Numbers("Error of the image", ("cause", "error"), parts, words),
     ]
 
@@ -227,12 +430,31 @@ def image(path: Path) -> list[Panel]:
 def budget(path: Path) -> list[Panel]:
     """Every link from pillar to answer with its error."""
     rows = [
-        (row.link, row.phase_rad, row.psf, math.degrees(row.gaze_rad), "yes" if row.counted else "no", row.method)
+        (
+            row.link,
+            row.phase_rad,
+            row.psf,
+            math.degrees(row.gaze_rad),
+            "yes" if row.counted else "no",
+            row.method,
+        )
         for row in budgets.load(path)
     ]
-    shown = [tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row) for row in rows]
-    head = ("link", "phase / rad", "PSF, relative L2", "gaze / deg", "in the sum", "how")
-    words = "The last row is the root of the sum of squares of those that are in the sum."
+    shown = [
+        tuple("–" if isinstance(v, float) and math.isnan(v) else v for v in row)
+        for row in rows
+    ]
+    head = (
+        "link",
+        "phase / rad",
+        "PSF, relative L2",
+        "gaze / deg",
+        "in the sum",
+        "how",
+    )
+    words = (
+        "The last row is the root of the sum of squares of those that are in the sum."
+    )
     return [Numbers("Error of every link", head, shown, words)]
 
 

@@ -1,4 +1,6 @@
-"""Figs. 9 to 11 of the paper for runs of one's own: masks, pupil centres under slippage, gaze errors by stimulus."""
+"""Figs. 9 to 11 of the paper for runs of one's own: masks, pupil centres under
+slippage, gaze errors by stimulus.
+"""
 
 from collections.abc import Sequence
 
@@ -7,7 +9,14 @@ import torch
 
 from codesign.adapt import Source
 from codesign.batches import EXPERIMENT
-from codesign.evaluate.gaze_experiment import AXIAL, LATERAL, Result, ready, states_of, through
+from codesign.evaluate.gaze_experiment import (
+    AXIAL,
+    LATERAL,
+    Result,
+    ready,
+    states_of,
+    through,
+)
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import render
 from metalens.ground import report
@@ -17,12 +26,16 @@ COLOURS = ("#e9812b", "#1f6feb", "#2a9d8f", "#6d597a")
 
 @torch.no_grad()
 def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> bytes:
-    """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is (green) and as it is read (red)."""
+    """Fig. 9 b: eyes of a few subjects in every slippage state; the pupil as it is
+    (green) and as it is read (red).
+    """
     scenes, net = source.run.scenes(EXPERIMENT), source.run.trainer.model.net
     prepared, slips = ready(source), config.slips_mm
     points = len(config.stimuli_deg)
     count = min(subjects, config.subjects)
-    figure, axes = report.canvas(count, len(slips), size=(1.25 * len(slips), 1.3 * count), squeeze=False)
+    figure, axes = report.canvas(
+        count, len(slips), size=(1.25 * len(slips), 1.3 * count), squeeze=False
+    )
     net.eval()
     for subject in range(count):
         rows = torch.arange(len(slips)) * points + (points // 2 + 5 * subject) % points
@@ -33,11 +46,18 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
         for column, slip in enumerate(slips):
             ax = axes[subject, column]
             ax.imshow(seen.frames[column, 0].numpy(), cmap="gray", extent=(0, 1, 1, 0))
-            for mask, level, colour in ((seen.mask[column], 0.5, "#39d353"), (logits[column], 0.0, "#ff4d4d")):
-                if mask.numel() and float(mask.min()) < level < float(mask.max()):  # some networks give no mask
+            for mask, level, colour in (
+                (seen.mask[column], 0.5, "#39d353"),
+                (logits[column], 0.0, "#ff4d4d"),
+            ):
+                if mask.numel() and float(mask.min()) < level < float(
+                    mask.max()
+                ):  # some networks give no mask
                     n = mask.shape[-1]
                     place = (np.arange(n) + 0.5) / n
-                    ax.contour(place, place, mask.numpy(), [level], colors=colour, linewidths=1)
+                    ax.contour(
+                        place, place, mask.numpy(), [level], colors=colour, linewidths=1
+                    )
             ax.set(xticks=[], yticks=[])
             ax.grid(visible=False)
             if subject == 0:
@@ -46,29 +66,49 @@ def samples(source: Source, config: ExperimentConfig, *, subjects: int = 4) -> b
 
 
 def ambiguity(result: Result) -> bytes:
-    """Fig. 10: pupil centres of all stimuli under axial and lateral slippage, and their means with ranges."""
+    """Fig. 10: pupil centres of all stimuli under axial and lateral slippage, and their
+    means with ranges.
+    """
     trial, percent = result.trial, result.centre * 100
     figure, axes = report.canvas(1, 3, size=(10.5, 3.2))
     for ax, kind, along in ((axes[0], AXIAL, 2), (axes[1], LATERAL, 0)):
         keep = trial.group(kind)
-        dots = ax.scatter(*percent[keep].T, c=trial.slip_mm[keep, along], s=2, cmap="viridis")
+        dots = ax.scatter(
+            *percent[keep].T, c=trial.slip_mm[keep, along], s=2, cmap="viridis"
+        )
         figure.colorbar(dots, ax=ax, label=f"d{'xyz'[along]} / mm")
-        ax.set(title=f"{kind} slippage", xlabel="pupil x / % of the frame", ylabel="pupil y / %")
+        ax.set(
+            title=f"{kind} slippage",
+            xlabel="pupil x / % of the frame",
+            ylabel="pupil y / %",
+        )
         ax.invert_yaxis()
     for state in np.unique(trial.state):
         mine = trial.state == state
         middle, slip = percent[mine].mean(0), trial.slip_mm[mine][0]
         low, high = np.percentile(percent[mine], [2.5, 97.5], axis=0)
         reach = np.abs(np.stack([low - middle, high - middle]))
-        axes[2].errorbar(*middle, xerr=reach[:, :1], yerr=reach[:, 1:], fmt="o", label=f"({slip[0]:g}, {slip[2]:g})")
-    axes[2].set(title="mean and 95 % range by (dx, dz)", xlabel="pupil x / %", ylabel="pupil y / %")
+        axes[2].errorbar(
+            *middle,
+            xerr=reach[:, :1],
+            yerr=reach[:, 1:],
+            fmt="o",
+            label=f"({slip[0]:g}, {slip[2]:g})",
+        )
+    axes[2].set(
+        title="mean and 95 % range by (dx, dz)",
+        xlabel="pupil x / %",
+        ylabel="pupil y / %",
+    )
     axes[2].invert_yaxis()
     axes[2].legend(fontsize=6)
     return report.png(figure)
 
 
 def errors(results: Sequence[Result]) -> bytes:
-    """Fig. 11: mean gaze error at every stimulus, as the size of its marker, under axial and lateral slippage."""
+    """Fig. 11: mean gaze error at every stimulus, as the size of its marker, under
+    axial and lateral slippage.
+    """
     figure, axes = report.canvas(1, 2, size=(10.5, 3.8))
     for ax, kind in zip(axes, (AXIAL, LATERAL), strict=True):
         for i, (result, colour) in enumerate(zip(results, COLOURS, strict=False)):
@@ -77,9 +117,28 @@ def errors(results: Sequence[Result]) -> bytes:
             for point in np.unique(trial.stimulus[keep]):
                 mine = keep & (trial.stimulus == point)
                 x, y = trial.stimulus_deg[mine][0]
-                ax.scatter(x + shift, y, s=24 * result.gaze_deg[mine].mean() ** 2 + 2, color=colour, alpha=0.75, lw=0)
-            ax.scatter([], [], color=colour, label=f"{result.name}: {result.gaze(kind):.2f}°")
-        ax.set(title=f"{kind} slippage", xlabel="stimulus across / deg", ylabel="stimulus down / deg", aspect="equal")
+                ax.scatter(
+                    x + shift,
+                    y,
+                    s=24 * result.gaze_deg[mine].mean() ** 2 + 2,
+                    color=colour,
+                    alpha=0.75,
+                    lw=0,
+                )
+            ax.scatter(
+                [], [], color=colour, label=f"{result.name}: {result.gaze(kind):.2f}°"
+            )
+        ax.set(
+            title=f"{kind} slippage",
+            xlabel="stimulus across / deg",
+            ylabel="stimulus down / deg",
+            aspect="equal",
+        )
         ax.invert_yaxis()
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=len(results), fontsize=7)
+        ax.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.18),
+            ncols=len(results),
+            fontsize=7,
+        )
     return report.png(figure)

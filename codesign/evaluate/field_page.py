@@ -1,4 +1,6 @@
-"""Lenses as an optical designer looks at them: distortion, field curvature, light and MTF over the field angle."""
+"""Lenses as an optical designer looks at them: distortion, field curvature, light and
+MTF over the field angle.
+"""
 
 import math
 from collections.abc import Mapping
@@ -27,25 +29,37 @@ class FieldSetting:
     """How lenses are looked at over the field.
 
     angles_deg: field angles along x, of either sign; left out, those of [axial].
-    frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of 2 NA / wavelength of the first lens.
-    depth_mm: of the sources, inf for collimated light; left out, the focus that each lens was made for.
+    frequencies_per_mm: of the MTF; left out, an eighth, a quarter and a half of 2 NA /
+    wavelength of the first lens.
+    depth_mm: of the sources, inf for collimated light; left out, the focus that each
+    lens was made for.
     """
 
-    angles_deg: tuple[float, ...] | None = field(default=None, metadata={"signed": True})
+    angles_deg: tuple[float, ...] | None = field(
+        default=None, metadata={"signed": True}
+    )
     frequencies_per_mm: tuple[float, ...] | None = None
     depth_mm: float | None = None
 
     def __post_init__(self) -> None:
         angles, frequencies = self.angles_deg, self.frequencies_per_mm
         if angles is not None and not (angles and max(map(abs, angles)) < 85):
-            raise ConfigError(f"angles_deg = {angles}: need one field angle or more, between -85 and 85")
+            raise ConfigError(
+                f"angles_deg = {angles}: need one field angle or more, between -85 and 85"
+            )
         if frequencies is not None and not (frequencies and min(frequencies) > 0):
-            raise ConfigError(f"frequencies_per_mm = {frequencies}: need one or more, all above 0")
+            raise ConfigError(
+                f"frequencies_per_mm = {frequencies}: need one or more, all above 0"
+            )
         if self.depth_mm is not None and not self.depth_mm > 0:
-            raise ConfigError(f"depth_mm = {self.depth_mm}: need a depth above 0, or inf")
+            raise ConfigError(
+                f"depth_mm = {self.depth_mm}: need a depth above 0, or inf"
+            )
 
     def of(self, lens: Lens, first: Lens, angles_deg: tuple[float, ...]) -> OverField:
-        """A lens over the field, with what was left out from the first one and from other angles."""
+        """A lens over the field, with what was left out from the first one and from
+        other angles.
+        """
         return over_field(
             lens,
             self.angles_deg or angles_deg,
@@ -56,7 +70,11 @@ class FieldSetting:
 
 def values(found: OverField) -> dict[str, Any]:
     """Every number of one lens, ready for JSON: None where there is none."""
-    arrays = {name: _plain(np.asarray(getattr(found, name))) for name in found.__slots__ if name != "left_out"}
+    arrays = {
+        name: _plain(np.asarray(getattr(found, name)))
+        for name in found.__slots__
+        if name != "left_out"
+    }
     return arrays | {"left_out": list(found.left_out)}
 
 
@@ -77,7 +95,9 @@ def tables(seen: Mapping[str, OverField]) -> list[Table]:
         for k, angle in enumerate(one.angles_deg):
             label = name if k == 0 else ""
             focus = [_told(v, 1) for v in (*one.close_um[k], *one.sharpest_um[k])]
-            bent, lost = (_told(100 * v[k], 2) for v in (one.distortion, one.vignetting))
+            bent, lost = (
+                _told(100 * v[k], 2) for v in (one.distortion, one.vignetting)
+            )
             chief, light = _told(one.chief_um[k, 0], 2), _told(one.illumination[k], 3)
             rows.append((label, f"{angle:g}", chief, bent, *focus, lost, light))
             mtf = [_told(v, 3) for pair in one.mtf[k].T for v in pair]
@@ -92,8 +112,13 @@ def tables(seen: Mapping[str, OverField]) -> list[Table]:
 
 
 def _caption(seen: Mapping[str, OverField]) -> str:
-    depths = {f"{1e-3 * one.depth_um:.4g} mm" if math.isfinite(one.depth_um) else "infinity" for one in seen.values()}
-    why = "".join(f"\n{name}: {line}." for name, one in seen.items() for line in one.left_out)
+    depths = {
+        f"{1e-3 * one.depth_um:.4g} mm" if math.isfinite(one.depth_um) else "infinity"
+        for one in seen.values()
+    }
+    why = "".join(
+        f"\n{name}: {line}." for name, one in seen.items() for line in one.left_out
+    )
     return (
         f"Over the field along x, sources at {', '.join(sorted(depths))}, design wavelength. Foci behind (+) or before "
         f"the sensor, T tangential and S sagittal; illumination relative to 0°.{why}"
@@ -113,15 +138,28 @@ def picture(seen: Mapping[str, OverField]) -> bytes:
     for name, one in seen.items():
         order = np.argsort(one.angles_deg)
         angle = one.angles_deg[order]
-        colour = panels[0].plot(angle, 100 * one.distortion[order], ".-", label=name)[0].get_color()
+        colour = (
+            panels[0]
+            .plot(angle, 100 * one.distortion[order], ".-", label=name)[0]
+            .get_color()
+        )
         for axis, style, mark in ((0, "-", "o"), (1, "--", "s")):
             panels[1].plot(angle, one.close_um[order, axis], style, color=colour)
-            panels[1].plot(angle, one.sharpest_um[order, axis], mark, color=colour, markersize=3, fillstyle="none")
+            panels[1].plot(
+                angle,
+                one.sharpest_um[order, axis],
+                mark,
+                color=colour,
+                markersize=3,
+                fillstyle="none",
+            )
         panels[2].plot(angle, one.illumination[order], ".-", color=colour)
         panels[2].plot(angle, one.vignetting[order], ":", color=colour)
     panels[0].set(title="distortion", ylabel="distortion / %")
     panels[1].set(title="field curvature", ylabel="focus from the sensor / µm")
-    panels[2].set(title="illumination and vignetting", ylabel="share", ylim=(-0.03, None))
+    panels[2].set(
+        title="illumination and vignetting", ylabel="share", ylim=(-0.03, None)
+    )
     panels[0].legend(fontsize=7)
     for panel in panels:
         panel.set_xlabel("field angle / °")
@@ -131,15 +169,25 @@ def picture(seen: Mapping[str, OverField]) -> bytes:
 def mtf_picture(seen: Mapping[str, OverField]) -> bytes:
     """MTF over the field angle, a panel for each frequency."""
     frequencies = next(iter(seen.values())).frequencies_per_mm
-    figure, panels = canvas(1, len(frequencies), size=(1 + 3.2 * len(frequencies), 3.2), squeeze=False, sharey=True)
+    figure, panels = canvas(
+        1,
+        len(frequencies),
+        size=(1 + 3.2 * len(frequencies), 3.2),
+        squeeze=False,
+        sharey=True,
+    )
     for name, one in seen.items():
         order = np.argsort(one.angles_deg)
         for k, panel in enumerate(panels[0]):
-            line = panel.plot(one.angles_deg[order], one.mtf[order, 0, k], ".-", label=name)
+            line = panel.plot(
+                one.angles_deg[order], one.mtf[order, 0, k], ".-", label=name
+            )
             colour = line[0].get_color()
             panel.plot(one.angles_deg[order], one.mtf[order, 1, k], ".--", color=colour)
     for panel, frequency in zip(panels[0], frequencies, strict=True):
-        panel.set(title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1))
+        panel.set(
+            title=f"{frequency:g} periods per mm", xlabel="field angle / °", ylim=(0, 1)
+        )
     panels[0, 0].set_ylabel("modulation")
     panels[0, 0].legend(fontsize=7)
     return png(figure)

@@ -1,8 +1,12 @@
-"""The experiment of the paper's Sec. 5 with synthetic subjects: a grid of stimuli under known slippage of the camera.
+"""The experiment of the paper's Sec. 5 with synthetic subjects: a grid of stimuli under
+known slippage of the camera.
 
-The paper's bench holds the head, shows 7 x 7 stimuli over 25 x 35 degrees, and moves the camera to seven places that
-share an origin: two to the side and four along the axis, in steps of 2.5 mm. Here the subjects are drawn from the
-population of :mod:`codesign.eye.population`, none of whom training saw; every run sees the same frames through its
+The paper's bench holds the head, shows 7 x 7 stimuli over 25 x 35 degrees, and moves
+the camera to seven places that
+share an origin: two to the side and four along the axis, in steps of 2.5 mm. Here the
+subjects are drawn from the
+population of :mod:`codesign.eye.population`, none of whom training saw; every run sees
+the same frames through its
 own lens.
 """
 
@@ -24,7 +28,15 @@ from codesign.evaluate.shown import Result as Result
 from codesign.evaluate.shown import Trial as Trial
 from codesign.eye import POPULATION, Rendered, Rig, States, render
 from codesign.eye import population as eye
-from codesign.gaze import Calibrator, Person, Readings, Sphere, angle_deg, face_angles, shared
+from codesign.gaze import (
+    Calibrator,
+    Person,
+    Readings,
+    Sphere,
+    angle_deg,
+    face_angles,
+    shared,
+)
 from codesign.network import losses, recalibrate
 from codesign.optics import formed
 from codesign.train import Answers, Seen, assess, frame_wide, read_out
@@ -33,11 +45,18 @@ from metalens.ground.errors import ConfigError
 from metalens.image import Imager, UniformImager, low_snr
 
 LOOKS, POINTS, PEOPLE, NOISE = 20, 21, 555, 1_000_003  # streams of the random generator
-TURNS = 4  # corrections of where an eye looks, each twenty times as fine as the one before
-BEFORE, EACH = 100_000, 120  # first number of the people who calibrated before, and their frames
+TURNS = (
+    4  # corrections of where an eye looks, each twenty times as fine as the one before
+)
+BEFORE, EACH = (
+    100_000,
+    120,
+)  # first number of the people who calibrated before, and their frames
 
 
-def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tuple[States, Trial]:
+def states_of(
+    config: ExperimentConfig, subject: int, scenes: EyeScenes
+) -> tuple[States, Trial]:
     """All frames of one subject: slippage states outermost, stimuli within.
 
     Raises:
@@ -52,35 +71,58 @@ def states_of(config: ExperimentConfig, subject: int, scenes: EyeScenes) -> tupl
         )
     n = len(stimuli) * len(slips)
     rng = np.random.default_rng([config.seed, subject, LOOKS])
-    person = eye.draw(1, (config.seed, PEOPLE, subject), motion=replace(scenes.settings.motion, scale=0.0))
+    person = eye.draw(
+        1,
+        (config.seed, PEOPLE, subject),
+        motion=replace(scenes.settings.motion, scale=0.0),
+    )
     base = person[torch.zeros(n, dtype=torch.int64)]
-    state, stimulus = (g.ravel() for g in np.meshgrid(np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"))
+    state, stimulus = (
+        g.ravel()
+        for g in np.meshgrid(
+            np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"
+        )
+    )
     looks = stimuli[stimulus] + config.fixation_deg * rng.standard_normal((n, 2))
     traits = base.traits.clone()
     radius = list(POPULATION).index("pupil_radius_um")
-    traits[:, radius] *= torch.from_numpy(np.clip(1 + config.pupil_sd * rng.standard_normal(n), 0.7, 1.3))
+    traits[:, radius] *= torch.from_numpy(
+        np.clip(1 + config.pupil_sd * rng.standard_normal(n), 0.7, 1.3)
+    )
     states = replace(
         base,
         traits=traits,
         torsion_rad=torch.zeros(n, dtype=torch.float64),
         slip_um=torch.from_numpy(slips[state] * 1e3),
-        aperture=torch.from_numpy(np.clip(1 + 0.05 * rng.standard_normal(n), 0.8, 1.15)),
+        aperture=torch.from_numpy(
+            np.clip(1 + 0.05 * rng.standard_normal(n), 0.8, 1.15)
+        ),
     )
     trial = Trial(np.full(n, subject), stimulus, state, stimuli[stimulus], slips[state])
     return turned_to(states, looks, scenes.rig), trial
 
 
 def turned_to(states: States, looks_deg: Array, rig: Rig) -> States:
-    """States whose visual axes point along angles (n, 2) across and down, in the frame of the face: to 1e-5 degrees.
+    """States whose visual axes point along angles (n, 2) across and down, in the frame
+    of the face: to 1e-5 degrees.
 
-    The visual axis lies nasal of and above the optic axis, by which eyes are turned; what that leaves is corrected.
+    The visual axis lies nasal of and above the optic axis, by which eyes are turned;
+    what that leaves is corrected.
     """
     kappa = torch.stack([states.trait("kappa_x_rad"), states.trait("kappa_y_rad")], 1)
     straight = torch.zeros_like(states.mount_rad)
-    found = replace(states, gaze_rad=torch.from_numpy(np.radians(looks_deg)) + kappa, mount_rad=straight)
+    found = replace(
+        states,
+        gaze_rad=torch.from_numpy(np.radians(looks_deg)) + kappa,
+        mount_rad=straight,
+    )
     for _ in range(TURNS):
-        miss = looks_deg - face_angles(eye.directions(found, rig)[1].numpy(), rig.elevation_rad)
-        found = replace(found, gaze_rad=found.gaze_rad + torch.from_numpy(np.radians(miss)))
+        miss = looks_deg - face_angles(
+            eye.directions(found, rig)[1].numpy(), rig.elevation_rad
+        )
+        found = replace(
+            found, gaze_rad=found.gaze_rad + torch.from_numpy(np.radians(miss))
+        )
     return replace(found, mount_rad=states.mount_rad)
 
 
@@ -93,7 +135,9 @@ def through(
     snr_db: float | None = None,
     quiet: bool = False,
 ) -> Seen:
-    """Rendered frames through a run's lens and sensor, with noise of a seed or ``quiet``; dimmed with ``snr_db``."""
+    """Rendered frames through a run's lens and sensor, with noise of a seed or
+    ``quiet``; dimmed with ``snr_db``.
+    """
     trainer = source.run.trainer
     margin = source.settings.scenes.margin
     batch = as_batch(made, margin)
@@ -102,23 +146,38 @@ def through(
     sensor, pitch = trainer.sensor, trainer.model.pitch_um
     if snr_db is not None:
         at = replace(sensor, pitch_um=float(pitch))
-        sensor = replace(low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um)
-    pixels = read_out(light, trainer.optics.sample_um, pitch, sensor, generator=noise, quiet=quiet)
+        sensor = replace(
+            low_snr(at, float(light.mean()), snr_db=snr_db), pitch_um=sensor.pitch_um
+        )
+    pixels = read_out(
+        light, trainer.optics.sample_um, pitch, sensor, generator=noise, quiet=quiet
+    )
     wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
-    return Seen(pixels, losses.framed(batch.mask, wide), batch.slip_mm, trainer.inner.batch, wide=wide)
+    return Seen(
+        pixels,
+        losses.framed(batch.mask, wide),
+        batch.slip_mm,
+        trainer.inner.batch,
+        wide=wide,
+    )
 
 
 @torch.no_grad()
 def experiment(
-    sources: Sequence[Source], config: ExperimentConfig, *, names: Sequence[str] | None = None
+    sources: Sequence[Source],
+    config: ExperimentConfig,
+    *,
+    names: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, list[Result]]]:
     """Run the experiment, subject by subject.
 
     Yields:
-        (subjects done, one :class:`Result` a run); results are there with the last subject only.
+        (subjects done, one :class:`Result` a run); results are there with the last
+        subject only.
 
     Raises:
-        ConfigError: runs whose frames differ in size, samples or lens distance: they cannot share subjects' frames; or
+        ConfigError: runs whose frames differ in size, samples or lens distance: they
+            cannot share subjects' frames; or
             eyes that slip to where a run's images hold no depth.
     """
     _check(sources, config)
@@ -127,36 +186,54 @@ def experiment(
     visible: list[Array] = []
     answers: list[list[Answers]] = [[] for _ in sources]
     prepared = [ready(source, image=config.image) for source in sources]
-    how = [calibrator(source, imager, config) for source, imager in zip(sources, prepared, strict=True)]
+    how = [
+        calibrator(source, imager, config)
+        for source, imager in zip(sources, prepared, strict=True)
+    ]
     for subject in range(config.subjects):
         states, trial = states_of(config, subject, scenes)
         made = render(states, rig=scenes.rig, camera=scenes.camera)
         trials.append(trial)
         visible.append((made.labels.shift_um * 1e-3).numpy())
         for kept, source, imager in zip(answers, sources, prepared, strict=True):
-            seen = through(source, made, imager, seed=NOISE + subject, snr_db=config.snr_db)
+            seen = through(
+                source, made, imager, seed=NOISE + subject, snr_db=config.snr_db
+            )
             kept.append(_answers(source, seen))
         if subject + 1 < config.subjects:
             yield subject + 1, []
     whole = joined(trials)
     labels = names or [f"run {i + 1}" for i in range(len(sources))]
-    above = [formed.above(source.run.trainer.optics, one) for source, one in zip(sources, prepared, strict=True)]
+    above = [
+        formed.above(source.run.trainer.optics, one)
+        for source, one in zip(sources, prepared, strict=True)
+    ]
     yield (
         config.subjects,
         [
-            replace(_result(label, source, kept, whole, config, one), visible_mm=np.concatenate(visible), above=told)
-            for label, source, kept, one, told in zip(labels, sources, answers, how, above, strict=True)
+            replace(
+                _result(label, source, kept, whole, config, one),
+                visible_mm=np.concatenate(visible),
+                above=told,
+            )
+            for label, source, kept, one, told in zip(
+                labels, sources, answers, how, above, strict=True
+            )
         ],
     )
 
 
 def _answers(source: Source, seen: Seen) -> Answers:
-    return assess.predict(source.run.trainer.model.net, source.architecture, seen, source.settings.inner)
+    return assess.predict(
+        source.run.trainer.model.net, source.architecture, seen, source.settings.inner
+    )
 
 
 def joined(trials: Sequence[Trial]) -> Trial:
     """Frames of several subjects, one after the other."""
-    return Trial(*(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__))
+    return Trial(
+        *(np.concatenate([getattr(t, f) for t in trials]) for f in Trial.__slots__)
+    )
 
 
 def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
@@ -171,7 +248,10 @@ def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
         )
     slips = config.slips_mm[:, 2]
     for source in sources:
-        eye_mm, held = 1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um, source.settings.optics.depths_mm
+        eye_mm, held = (
+            1e-3 * source.run.scenes(EXPERIMENT).rig.distance_um,
+            source.settings.optics.depths_mm,
+        )
         if not held[0] <= eye_mm + slips.min() <= eye_mm + slips.max() <= held[1]:
             raise ConfigError(
                 f"axial_mm {config.axial_mm}: eyes {eye_mm + slips.min():g} to {eye_mm + slips.max():g} mm before the "
@@ -179,23 +259,35 @@ def _check(sources: Sequence[Source], config: ExperimentConfig) -> None:
             )
 
 
-def ready(source: Source, *, image: Literal["true", "trained"] = "true") -> UniformImager | Imager:
-    """The imager of a run's lens, of a retraining the made one; its network set to statistics of training frames, as
+def ready(
+    source: Source, *, image: Literal["true", "trained"] = "true"
+) -> UniformImager | Imager:
+    """The imager of a run's lens, of a retraining the made one; its network set to
+    statistics of training frames, as
     they were formed.
 
     Raises:
-        SceneError: the true image of this lens cannot be formed at the run's ``optics.image_tolerance``.
+        SceneError: the true image of this lens cannot be formed at the run's
+            ``optics.image_tolerance``.
     """
     trainer = source.run.trainer
     if source.made is None:
-        measured = assess.frames(trainer, trainer.scenes, min(8, source.settings.test_batches))
+        measured = assess.frames(
+            trainer, trainer.scenes, min(8, source.settings.test_batches)
+        )
         recalibrate(trainer.model.net, source.architecture, assess.parts(measured))
     else:
         retraining.settle(trainer, source)
     settings, scenes = trainer.optics, source.settings.scenes
     seen = replace(settings, image="true") if image == "true" else settings
     size = scenes.pixels + 2 * scenes.margin
-    return formed.imager(seen, trainer.model.coefficients_rad, size, margin=scenes.margin, made=source.made)
+    return formed.imager(
+        seen,
+        trainer.model.coefficients_rad,
+        size,
+        margin=scenes.margin,
+        made=source.made,
+    )
 
 
 def sphere(source: Source, config: ExperimentConfig) -> Sphere:
@@ -204,11 +296,16 @@ def sphere(source: Source, config: ExperimentConfig) -> Sphere:
 
 
 @torch.no_grad()
-def calibrator(source: Source, imager: UniformImager | Imager, config: ExperimentConfig) -> Calibrator:
-    """How people are calibrated whom a run's network reads: by what people have in common, if it tells the axis.
+def calibrator(
+    source: Source, imager: UniformImager | Imager, config: ExperimentConfig
+) -> Calibrator:
+    """How people are calibrated whom a run's network reads: by what people have in
+    common, if it tells the axis.
 
-    That is learned from ``config.people`` whom neither training nor the experiment shows, before the same stimuli, on
-    the same stage at places of their own between its ends: EACH of their frames, drawn at random, through the run's
+    That is learned from ``config.people`` whom neither training nor the experiment
+    shows, before the same stimuli, on
+    the same stage at places of their own between its ends: EACH of their frames, drawn
+    at random, through the run's
     lens, light and noise.
     """
     scenes = source.run.scenes(EXPERIMENT)
@@ -222,8 +319,12 @@ def calibrator(source: Source, imager: UniformImager | Imager, config: Experimen
         theirs = replace(config, axial_mm=tuple(axial), lateral_mm=tuple(lateral))
         states, trial = states_of(theirs, BEFORE + person, scenes)
         rows = np.sort(rng.permutation(len(trial.subject))[:EACH])
-        made = render(states[torch.from_numpy(rows)], rig=scenes.rig, camera=scenes.camera)
-        seen = through(source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db)
+        made = render(
+            states[torch.from_numpy(rows)], rig=scenes.rig, camera=scenes.camera
+        )
+        seen = through(
+            source, made, imager, seed=2 * NOISE + person, snr_db=config.snr_db
+        )
         found.append(_answers(source, seen))
         looked.append(trial.stimulus_deg[rows])
         if found[0].axis is None:
@@ -233,8 +334,13 @@ def calibrator(source: Source, imager: UniformImager | Imager, config: Experimen
 
 
 def read_from(kept: Sequence[Answers], source: Source) -> Readings:
-    """A run's answers to frames one after the other, in the units that gaze is calibrated in."""
-    centre, slip = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "slip_mm"))
+    """A run's answers to frames one after the other, in the units that gaze is
+    calibrated in.
+    """
+    centre, slip = (
+        torch.cat([getattr(a, f) for a in kept]).double().numpy()
+        for f in ("centre", "slip_mm")
+    )
     axes = [a.axis for a in kept if a.axis is not None]
     tilt = source.run.scenes(EXPERIMENT).rig.elevation_rad
     angles = face_angles(torch.cat(axes).double().numpy(), tilt) if axes else None
@@ -242,28 +348,61 @@ def read_from(kept: Sequence[Answers], source: Source) -> Readings:
 
 
 def _result(
-    name: str, source: Source, kept: list[Answers], trial: Trial, config: ExperimentConfig, how: Calibrator
+    name: str,
+    source: Source,
+    kept: list[Answers],
+    trial: Trial,
+    config: ExperimentConfig,
+    how: Calibrator,
 ) -> Result:
     read = read_from(kept, source)
     predicted, judged = calibrated(read, trial, config, how)
-    told, _ = calibrated(replace(read, slip_mm=trial.slip_mm), trial, config, sphere(source, config))
-    error, told_error = (np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan) for p in (predicted, told))
+    told, _ = calibrated(
+        replace(read, slip_mm=trial.slip_mm), trial, config, sphere(source, config)
+    )
+    error, told_error = (
+        np.where(judged, angle_deg(p, trial.stimulus_deg), math.nan)
+        for p in (predicted, told)
+    )
     mmacs, reach = float(source.row["mmacs"]), source.settings.scenes.slip_mm
-    centre, iou = (torch.cat([getattr(a, f) for a in kept]).double().numpy() for f in ("centre", "iou"))
-    return Result(name, mmacs, trial, read.slip_mm, centre, iou, error, predicted, told_error, reach, how)
+    centre, iou = (
+        torch.cat([getattr(a, f) for a in kept]).double().numpy()
+        for f in ("centre", "iou")
+    )
+    return Result(
+        name,
+        mmacs,
+        trial,
+        read.slip_mm,
+        centre,
+        iou,
+        error,
+        predicted,
+        told_error,
+        reach,
+        how,
+    )
 
 
-def calibrated(read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator) -> tuple[Array, Array]:
-    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that it never saw."""
+def calibrated(
+    read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator
+) -> tuple[Array, Array]:
+    """(n, 2) gaze of every frame by its subject's own calibration, and (n,) frames that
+    it never saw.
+    """
     judged = ~np.isin(np.arange(len(read)), calibrating(trial, config))
     return answered(taught(read, trial, config, how), read, trial), judged
 
 
-def taught(read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator) -> dict[int, Person]:
+def taught(
+    read: Readings, trial: Trial, config: ExperimentConfig, how: Calibrator
+) -> dict[int, Person]:
     """Every subject's calibration by number, on the stimuli of :func:`calibrating`."""
     known = calibrating(trial, config)
     mine = {int(s): known[trial.subject[known] == s] for s in np.unique(trial.subject)}
-    return {s: how.person(read[rows], trial.stimulus_deg[rows]) for s, rows in mine.items()}
+    return {
+        s: how.person(read[rows], trial.stimulus_deg[rows]) for s, rows in mine.items()
+    }
 
 
 def answered(people: Mapping[int, Person], read: Readings, trial: Trial) -> Array:
@@ -276,7 +415,9 @@ def answered(people: Mapping[int, Person], read: Readings, trial: Trial) -> Arra
 
 
 def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
-    """Numbers of the frames that subjects are calibrated on: a share of their stimuli, in every slippage state."""
+    """Numbers of the frames that subjects are calibrated on: a share of their stimuli,
+    in every slippage state.
+    """
     known = []
     for subject in np.unique(trial.subject):
         rows = np.flatnonzero(trial.subject == subject)
@@ -284,7 +425,9 @@ def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
         rng = np.random.default_rng([config.seed, int(subject), POINTS])
         count = round(config.share * len(points))
         if config.points == "spread":
-            chosen = spread(config.stimuli_deg[points], count, first=int(rng.integers(len(points))))
+            chosen = spread(
+                config.stimuli_deg[points], count, first=int(rng.integers(len(points)))
+            )
         else:
             chosen = rng.choice(len(points), count, replace=False)
         known.append(rows[np.isin(trial.stimulus[rows], points[chosen])])
@@ -292,7 +435,9 @@ def calibrating(trial: Trial, config: ExperimentConfig) -> Array:
 
 
 def spread(places: Array, count: int, *, first: int) -> Array:
-    """(count,) numbers of places (n, 2) that cover them: each next one is the farthest from all before it."""
+    """(count,) numbers of places (n, 2) that cover them: each next one is the farthest
+    from all before it.
+    """
     chosen = [first]
     while len(chosen) < count:
         gaps = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(1)

@@ -1,4 +1,6 @@
-"""Rendered frames through a lens onto its sensor: scene, image, and the PSFs over field and depth that made it."""
+"""Rendered frames through a lens onto its sensor: scene, image, and the PSFs over field
+and depth that made it.
+"""
 
 import math
 from collections.abc import Callable
@@ -18,7 +20,8 @@ from metalens.lens import Lens
 from metalens.psf import Source, spectrum
 
 FRAMES = 6  # that are imaged
-BLUR_UM = 144.0  # of the scene around a frame that is blurred into it: half a window of the PSFs
+# of the scene around a frame that is blurred into it: half a window of the PSFs
+BLUR_UM = 144.0
 TOLERANCE = 0.03  # of the image, relative L2 of a texture
 NODES = 3  # PSFs that are kept along x, y and depth: first, middle, last
 
@@ -27,10 +30,14 @@ NODES = 3  # PSFs that are kept along x, y and depth: first, middle, last
 class Imaged:
     """Frames and their images.
 
-    scene, image: (frames, y, x), the image scaled to the light of the scenes. psf: (depth, row, column, y, x) of sum
-    1, at depth_um, and at the field angles y_deg and x_deg of the rows and columns; the outermost are those of the
-    samples around the frame that are blurred into it. parts: of the error by cause. light: words for what of it the
-    pillars are not known for; problem: why the error is above :data:`TOLERANCE`. Empty where there are none.
+    scene, image: (frames, y, x), the image scaled to the light of the scenes. psf:
+    (depth, row, column, y, x) of sum
+    1, at depth_um, and at the field angles y_deg and x_deg of the rows and columns; the
+    outermost are those of the
+    samples around the frame that are blurred into it. parts: of the error by cause.
+    light: words for what of it the
+    pillars are not known for; problem: why the error is above :data:`TOLERANCE`. Empty
+    where there are none.
     """
 
     scene: Array
@@ -52,16 +59,28 @@ def margin_of(pitch_um: float) -> int:
 
 
 def lens_imager(
-    lens: Lens, camera: Camera, depths_um: tuple[float, float], *, fwhm_nm: float = 0.0, tolerance: float = TOLERANCE
+    lens: Lens,
+    camera: Camera,
+    depths_um: tuple[float, float],
+    *,
+    fwhm_nm: float = 0.0,
+    tolerance: float = TOLERANCE,
 ) -> Imager:
-    """The true image of a lens file on the samples of a camera, for frames with a margin (:func:`margin_of`) that hold
+    """The true image of a lens file on the samples of a camera, for frames with a
+    margin (:func:`margin_of`) that hold
     these depths.
 
     Raises:
         SceneError: see :func:`metalens.image.imager`.
     """
     margin = margin_of(camera.pitch_um)
-    grid = Grid((camera.pixels, camera.pixels), camera.pitch_um, depths_um, margin, 2 * margin + 1)
+    grid = Grid(
+        (camera.pixels, camera.pixels),
+        camera.pitch_um,
+        depths_um,
+        margin,
+        2 * margin + 1,
+    )
     return imager(lens, grid, spectrum=source_of(lens, fwhm_nm), tolerance=tolerance)
 
 
@@ -72,17 +91,25 @@ def source_of(lens: Lens, fwhm_nm: float) -> Source | None:
 
 @torch.no_grad()
 def imaged(
-    lens: Lens, camera: Camera, rig: Rig, rendered: Callable[[Camera, Rig], Rendered], *, fwhm_nm: float = 0.0
+    lens: Lens,
+    camera: Camera,
+    rig: Rig,
+    rendered: Callable[[Camera, Rig], Rendered],
+    *,
+    fwhm_nm: float = 0.0,
 ) -> Imaged:
     """Image the first frames.
 
     Args:
-        camera: samples of the sensor. rendered: gives the frames of a camera and a rig, whose pinhole is as far from
-            its sensor as this lens through its films (:attr:`metalens.lens.Lens.reduced_um`). fwhm_nm: width of the
+        camera: samples of the sensor. rendered: gives the frames of a camera and a rig,
+            whose pinhole is as far from
+            its sensor as this lens through its films
+            (:attr:`metalens.lens.Lens.reduced_um`). fwhm_nm: width of the
             light; 0 for one wavelength.
 
     Raises:
-        SceneError: a frame that reaches so far aside that part of the face lies behind the lens; a lens that cannot be
+        SceneError: a frame that reaches so far aside that part of the face lies behind
+            the lens; a lens that cannot be
             imaged over this field to 3 %, see :func:`metalens.image.imager`.
     """
     margin = margin_of(camera.pitch_um)
@@ -103,7 +130,9 @@ def imaged(
     plain, light = made.pinhole()[:, inside, inside], optics(made.frames)
     if not float(light.sum()) > 0:
         raise SceneError("no light of these frames reaches the sensor")
-    rows, columns, depths = (np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3])
+    rows, columns, depths = (
+        np.linspace(0, n - 1, NODES).round().astype(int) for n in optics.stack.shape[:3]
+    )
     psf = optics.stack[np.ix_(rows, columns, depths)].permute(2, 0, 1, 3, 4)
     y_um, x_um = optics.plan.y_um.numpy()[rows], optics.plan.x_um.numpy()[columns]
     return Imaged(
@@ -125,7 +154,9 @@ def write(folder: Path, found: Imaged, about: Provenance) -> None:
     """image.h5 (kind ``image``) and image.png."""
     names = ("scene", "image", "psf", "depth_um", "y_deg", "x_deg")
     arrays = {name: np.asarray(getattr(found, name)) for name in names}
-    said = {"pitch_um": found.pitch_um, "error": found.error} | {f"error_{k}": v for k, v in found.parts.items()}
+    said = {"pitch_um": found.pitch_um, "error": found.error} | {
+        f"error_{k}": v for k, v in found.parts.items()
+    }
     store.save(folder / "image.h5", "image", arrays, attributes=said, provenance=about)
     store.write_bytes(folder / "image.png", picture(found))
 

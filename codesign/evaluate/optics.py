@@ -1,5 +1,7 @@
-"""Lenses compared as the paper compares them: axial information on and off axis (Table 3, Fig. 7), and the sensitivity
-of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals over scenes."""
+"""Lenses compared as the paper compares them: axial information on and off axis (Table
+3, Fig. 7), and the sensitivity
+of whole scenes to gaze and slip (Table 1, Fig. 5), with confidence intervals over
+scenes."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +15,15 @@ from torch import Tensor
 from codesign.eye import Camera, Rendered, Rig, States, Triplets, triplets
 from codesign.optics import formed
 from metalens.ground.errors import ConfigError, SceneError
-from metalens.image import Grid, Imager, Normalisation, axial_information, imager, integrate, scene
+from metalens.image import (
+    Grid,
+    Imager,
+    Normalisation,
+    axial_information,
+    imager,
+    integrate,
+    scene,
+)
 from metalens.lens import Lens, reach
 from metalens.psf import View, from_lens, passed_um2
 
@@ -24,13 +34,17 @@ WINDOW = 56.4  # width of the PSFs, in wavelength / NA
 class Setting:
     """How lenses are measured.
 
-    depths_mm, count: of I(z); left out, the depths over which the first lens goes from 1.75 waves out of focus at the
+    depths_mm, count: of I(z); left out, the depths over which the first lens goes from
+    1.75 waves out of focus at the
         rim to as many on the other side.
-    angles_deg: field angles. pixel_um, binnings: pixels; left out, pixels of 0.88 wavelength / NA of the first lens.
+    angles_deg: field angles. pixel_um, binnings: pixels; left out, pixels of 0.88
+    wavelength / NA of the first lens.
     normalisation: of Eq. 11.
-    window_um, sample_um: of the PSFs; light outside the window counts as lost. Left out, 56.4 wavelength / NA of the
+    window_um, sample_um: of the PSFs; light outside the window counts as lost. Left
+    out, 56.4 wavelength / NA of the
         first lens or 8 radii of its blur, and what shows its finest detail.
-    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. tolerance: of the PSF engine.
+    radius_um: of the encircled energy; left out, 5.3 wavelength / NA. tolerance: of the
+    PSF engine.
     """
 
     depths_mm: tuple[float, float] | None = None
@@ -46,14 +60,23 @@ class Setting:
 
     def __post_init__(self) -> None:
         low, high = self.depths_mm or (1.0, 1.0)
-        if not (0 < low <= high and self.count >= 1 and self.angles_deg and self.binnings and min(self.binnings) >= 1):
+        if not (
+            0 < low <= high
+            and self.count >= 1
+            and self.angles_deg
+            and self.binnings
+            and min(self.binnings) >= 1
+        ):
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, count = {self.count}, angles_deg = {self.angles_deg}, binnings = "
                 f"{self.binnings}: need 0 < nearest <= farthest, and at least one depth, angle and binning"
             )
         sample = 1e-6 if self.sample_um is None else self.sample_um
         wide = self.window_um is None or self.window_um >= 4 * sample
-        lengths = [1.0 if length is None else length for length in (self.pixel_um, self.radius_um)]
+        lengths = [
+            1.0 if length is None else length
+            for length in (self.pixel_um, self.radius_um)
+        ]
         if not (wide and sample > 0 and min(lengths) > 0):
             raise ConfigError(
                 f"window_um = {self.window_um}, sample_um = {self.sample_um}, pixel_um = {self.pixel_um}, radius_um = "
@@ -62,7 +85,11 @@ class Setting:
 
     def about(self, lens: Lens) -> "Filled":
         """These with what was left to the lens."""
-        near, far = (1e3 * z for z in self.depths_mm) if self.depths_mm else reach.depth_range_um(lens)
+        near, far = (
+            (1e3 * z for z in self.depths_mm)
+            if self.depths_mm
+            else reach.depth_range_um(lens)
+        )
         pixel = self.pixel_um or reach.pixel_um(lens)
         sample = self.sample_um or reach.sample_um(lens, pixel * min(self.binnings))
         window = self.window_um or reach.window_um(lens, (near, far), airy=WINDOW)
@@ -72,13 +99,18 @@ class Setting:
             "depths_mm": (near * 1e-3, far * 1e-3),
             "radius_um": self.radius_um or reach.disc_um(lens),
         }
-        own |= {"sample_um": sample, "window_um": max(4, round(window / sample)) * sample}
+        own |= {
+            "sample_um": sample,
+            "window_um": max(4, round(window / sample)) * sample,
+        }
         return Filled(**own, step_um=reach.depth_step_um(lens, near))
 
 
 @dataclass(frozen=True, slots=True)
 class Filled(Setting):
-    """A :class:`Setting` with nothing left to the lens. step_um: of the difference in Eq. 11."""
+    """A :class:`Setting` with nothing left to the lens. step_um: of the difference in
+    Eq. 11.
+    """
 
     depths_mm: tuple[float, float] = field(kw_only=True)
     pixel_um: float = field(kw_only=True)
@@ -92,10 +124,14 @@ class Filled(Setting):
 class Scenes:
     """What the sensitivity of whole scenes is measured on.
 
-    count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the paper's kind of step).
-    pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the light within it.
-    image: "true", every part of the image through the PSFs of its own field angle; or "uniform", the PSF on axis for
-        the whole image, an approximation whose error is printed. image_tolerance: of the true image, relative L2 of a
+    count, seed: of the scenes. gaze_step_deg, slip_step_mm: from the anchor (the
+    paper's kind of step).
+    pitch_um, pixels: of the sensor. window_um: of the PSFs, which are normalised to the
+    light within it.
+    image: "true", every part of the image through the PSFs of its own field angle; or
+    "uniform", the PSF on axis for
+        the whole image, an approximation whose error is printed. image_tolerance: of
+        the true image, relative L2 of a
         texture.
     """
 
@@ -128,9 +164,12 @@ class Scenes:
 class Axial:
     """Honest axial information of one lens.
 
-    information: (angles, binnings, depths) per mm², over sub-pixel positions. encircled: (angles, depths) share of the
-    light through the lens that a circle of the radius holds, placed where it holds most. psf_error: of the engine.
-    slices: (depths, x) the light on axis summed over y, on samples: what a line across the PSF's image shows.
+    information: (angles, binnings, depths) per mm², over sub-pixel positions.
+    encircled: (angles, depths) share of the
+    light through the lens that a circle of the radius holds, placed where it holds
+    most. psf_error: of the engine.
+    slices: (depths, x) the light on axis summed over y, on samples: what a line across
+    the PSF's image shows.
     """
 
     information: Tensor
@@ -140,18 +179,24 @@ class Axial:
 
 
 def axial(lens: Lens, setting: Setting | None = None) -> Axial:
-    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the PSF engine.
+    """I(z) of Eq. 11 of the full pillar lens, at every angle and binning, through the
+    PSF engine.
 
-    What the setting leaves out is that of this lens: to compare lenses, take :meth:`Setting.about` of one.
+    What the setting leaves out is that of this lens: to compare lenses, take
+    :meth:`Setting.about` of one.
     """
     s = setting if isinstance(setting, Filled) else (setting or Setting()).about(lens)
     depths = np.linspace(1e3 * s.depths_mm[0], 1e3 * s.depths_mm[1], s.count)
     both = np.sort(np.concatenate([depths, depths + s.step_um]))
     samples = round(s.window_um / s.sample_um)
     angles = tuple((math.radians(a), 0.0) for a in s.angles_deg)
-    stack = from_lens(lens, View(tuple(both), angles, s.window_um, samples), tolerance=s.tolerance)
+    stack = from_lens(
+        lens, View(tuple(both), angles, s.window_um, samples), tolerance=s.tolerance
+    )
     where = [int(np.argmin(np.abs(both - d))) for d in (*depths, *(depths + s.step_um))]
-    intensity = torch.as_tensor(stack.intensity)[..., where, :, :].reshape(len(angles), 2, s.count, samples, samples)
+    intensity = torch.as_tensor(stack.intensity)[..., where, :, :].reshape(
+        len(angles), 2, s.count, samples, samples
+    )
     values = []
     for b in s.binnings:
         values.append(
@@ -164,37 +209,61 @@ def axial(lens: Lens, setting: Setting | None = None) -> Axial:
                 normalisation=s.normalisation,
             )
         )
-    light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(len(angles), s.count)
-    share = light / torch.as_tensor(np.array([passed_um2(lens, angle, tuple(depths)) for angle in angles]))
+    light = torch.as_tensor(stack.energy_um2)[..., where[: s.count]].reshape(
+        len(angles), s.count
+    )
+    share = light / torch.as_tensor(
+        np.array([passed_um2(lens, angle, tuple(depths)) for angle in angles])
+    )
     inside = most_encircled(intensity[:, 0], s.sample_um, radius_um=s.radius_um)
     slices = intensity[0, 0].sum(1)
-    return Axial(torch.stack(values, 1), inside * share.clamp(max=1.0), float(stack.error), slices)
+    return Axial(
+        torch.stack(values, 1),
+        inside * share.clamp(max=1.0),
+        float(stack.error),
+        slices,
+    )
 
 
 def most_encircled(intensity: Tensor, sample_um: float, *, radius_um: float) -> Tensor:
-    """Largest share of the light (..., y, x) that a circle of this radius holds, wherever in the window it lies.
+    """Largest share of the light (..., y, x) that a circle of this radius holds,
+    wherever in the window it lies.
 
-    Off axis the core of a PSF is neither at the chief ray nor at the centroid, which haze pulls away.
+    Off axis the core of a PSF is neither at the chief ray nor at the centroid, which
+    haze pulls away.
     """
     n = intensity.shape[-1]
-    grid = (torch.arange(n, dtype=torch.float64) + n // 2) % n - n // 2  # 0 first, as the transform counts
-    inside = (radius_um / sample_um + 0.5 - torch.hypot(grid[:, None], grid)).clamp(0, 1).to(intensity)
-    summed: Tensor = torch.fft.irfft2(torch.fft.rfft2(intensity) * torch.fft.rfft2(inside), s=(n, n))
+    grid = (
+        torch.arange(n, dtype=torch.float64) + n // 2
+    ) % n - n // 2  # 0 first, as the transform counts
+    inside = (
+        (radius_um / sample_um + 0.5 - torch.hypot(grid[:, None], grid))
+        .clamp(0, 1)
+        .to(intensity)
+    )
+    summed: Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(intensity) * torch.fft.rfft2(inside), s=(n, n)
+    )
     most: Tensor = summed.amax((-2, -1))
     return most
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneEnergy:
-    """Table 1 of one lens: (scenes,) squared differences of energy-matched images, summed over pixels.
+    """Table 1 of one lens: (scenes,) squared differences of energy-matched images,
+    summed over pixels.
 
     gaze: |I_gaze - I_anchor|². slip: |I_slip - I_anchor|². separability: |I_gaze - I_slip|².
-    light: least share of the light through the lens that the PSFs' window holds, over the depths of the scenes; of the
+    light: least share of the light through the lens that the PSFs' window holds, over
+    the depths of the scenes; of the
     true image, of its mean over the field.
-    image_error: of the images, relative L2 of a texture: the true image's own estimate, or how far the uniform image is
+    image_error: of the images, relative L2 of a texture: the true image's own estimate,
+    or how far the uniform image is
     from it; nan where it is not known.
-    maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared difference of gaze and slip (Fig. 5).
-    above: why the error of the true image is above what it aims at; empty where it is not.
+    maps: (3, y, x) of the first scene: anchor, squared change with gaze, squared
+    difference of gaze and slip (Fig. 5).
+    above: why the error of the true image is above what it aims at; empty where it is
+    not.
     """
 
     gaze: Tensor
@@ -208,14 +277,20 @@ class SceneEnergy:
     @property
     def angle_rad(self) -> Tensor:
         """(scenes,) span angle of Eq. 5 between the changes with gaze and with slip."""
-        along = (self.gaze + self.slip - self.separability) / (2 * torch.sqrt(self.gaze * self.slip).clamp_min(1e-300))
+        along = (self.gaze + self.slip - self.separability) / (
+            2 * torch.sqrt(self.gaze * self.slip).clamp_min(1e-300)
+        )
         return torch.arccos(along.clamp(-1, 1))
 
 
-def scene_energies(lenses: Sequence[Lens], states: States, settings: Scenes | None = None) -> list[SceneEnergy]:
-    """Table 1: how much the images of the same scenes change with gaze and with axial slip.
+def scene_energies(
+    lenses: Sequence[Lens], states: States, settings: Scenes | None = None
+) -> list[SceneEnergy]:
+    """Table 1: how much the images of the same scenes change with gaze and with axial
+    slip.
 
-    Images of all lenses are scaled to the same mean (the paper normalises the PSFs' sums). The steps are the paper's
+    Images of all lenses are scaled to the same mean (the paper normalises the PSFs'
+    sums). The steps are the paper's
     kind of perturbation, not infinitesimal ones.
 
     Raises:
@@ -241,14 +316,22 @@ def scene_energies(lenses: Sequence[Lens], states: States, settings: Scenes | No
             found = energies_of(true, views, light=light, image_error=true.error)
             out.append(replace(found, above=true.above(settings.image_tolerance)))
             continue
-        basis, light = lens_basis(lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um)
+        basis, light = lens_basis(
+            lens, rendered, pitch_um=settings.pitch_um, window_um=settings.window_um
+        )
         one = scene.uniform_imager(basis, (settings.pixels, settings.pixels))
-        out.append(energies_of(one, views, light=light, image_error=formed.difference(one, true)))
+        out.append(
+            energies_of(
+                one, views, light=light, image_error=formed.difference(one, true)
+            )
+        )
     return out
 
 
 def lens_imager(lens: Lens, views: Sequence[Rendered], settings: Scenes) -> Imager:
-    """The true image of a lens at one wavelength, on the pixels of the scenes and over the depths that they hold."""
+    """The true image of a lens at one wavelength, on the pixels of the scenes and over
+    the depths that they hold.
+    """
     window = 2 * math.ceil(settings.window_um / (2 * settings.pitch_um)) + 1
     grid = Grid((settings.pixels,) * 2, settings.pitch_um, depths_of(views), 0, window)
     return imager(lens, grid, layers=lens.layers, tolerance=settings.image_tolerance)
@@ -260,7 +343,9 @@ def depths_of(views: Sequence[Rendered]) -> tuple[float, float]:
     return max(float(seen.min()), 5e3), max(float(seen.max()), 6e3)
 
 
-def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0) -> Triplets:
+def scene_views(
+    states: States, settings: Scenes, *, sensor_distance_um: float = 2000.0
+) -> Triplets:
     """Anchor, gaze and slip views of the states."""
     return triplets(
         states,
@@ -272,32 +357,64 @@ def scene_views(states: States, settings: Scenes, *, sensor_distance_um: float =
 
 
 def energies_of(
-    optics: scene.UniformImager | Imager, views: Triplets, *, light: float = 1.0, image_error: float = math.nan
+    optics: scene.UniformImager | Imager,
+    views: Triplets,
+    *,
+    light: float = 1.0,
+    image_error: float = math.nan,
 ) -> SceneEnergy:
     """Table 1 of any PSFs, see :func:`scene_energies`."""
     seen = [v.frames for v in (views.anchor, views.gaze, views.slip)]
-    images = [optics(f) if isinstance(optics, Imager) else scene.image(f, optics) for f in seen]
+    images = [
+        optics(f) if isinstance(optics, Imager) else scene.image(f, optics)
+        for f in seen
+    ]
     anchor, gaze, slip = (i / images[0].mean((1, 2), keepdim=True) for i in images)
     maps = [(a - b) ** 2 for a, b in ((gaze, anchor), (slip, anchor), (gaze, slip))]
     sums = [m.sum((1, 2)) for m in maps]
-    return SceneEnergy(sums[0], sums[1], sums[2], light, image_error, torch.stack([anchor[0], maps[0][0], maps[2][0]]))
+    return SceneEnergy(
+        sums[0],
+        sums[1],
+        sums[2],
+        light,
+        image_error,
+        torch.stack([anchor[0], maps[0][0], maps[2][0]]),
+    )
 
 
 def lens_basis(
-    lens: Lens, views: Sequence[Rendered], *, pitch_um: float, window_um: float = 288.0, tolerance: float = 1e-3
+    lens: Lens,
+    views: Sequence[Rendered],
+    *,
+    pitch_um: float,
+    window_um: float = 288.0,
+    tolerance: float = 1e-3,
 ) -> tuple[scene.PsfBasis, float]:
-    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few kernels of sum 1.
+    """PSFs of a lens on the pixel grid, at the depths that these frames hold, as a few
+    kernels of sum 1.
 
-    Also the least share of the light through the lens that the window holds: what lies outside is left out of the
+    Also the least share of the light through the lens that the window holds: what lies
+    outside is left out of the
     images, where a real sensor would show it as haze.
     """
     low, high = depths_of(views)
-    count = max(2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1)  # 0.5 mm at the pupil, more beyond
+    count = max(
+        2, math.ceil((1 / low - 1 / high) / (500.0 / 21e3**2)) + 1
+    )  # 0.5 mm at the pupil, more beyond
     depths = 1 / torch.linspace(1 / high, 1 / low, count, dtype=torch.float64).flip(0)
-    fine, window = max(1, math.ceil(pitch_um / 0.85)), 2 * math.ceil(window_um / (2 * pitch_um))
+    fine, window = (
+        max(1, math.ceil(pitch_um / 0.85)),
+        2 * math.ceil(window_um / (2 * pitch_um)),
+    )
     view = View(tuple(depths.tolist()), ((0.0, 0.0),), window * pitch_um, window * fine)
     stack = from_lens(lens, view, tolerance=1e-3)
     intensity = torch.as_tensor(stack.intensity).reshape(count, window * fine, -1)
-    pixels = integrate(intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1))  # odd: centred
-    light = float((stack.energy_um2[0] / passed_um2(lens, (0.0, 0.0), depths.tolist())).min())
-    return scene.basis(pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance), min(light, 1.0)
+    pixels = integrate(
+        intensity, pitch_um / fine, pitch_um=pitch_um, shape=(window + 1, window + 1)
+    )  # odd: centred
+    light = float(
+        (stack.energy_um2[0] / passed_um2(lens, (0.0, 0.0), depths.tolist())).min()
+    )
+    return scene.basis(
+        pixels / pixels.sum((1, 2), keepdim=True), depths, tolerance=tolerance
+    ), min(light, 1.0)

@@ -1,6 +1,8 @@
-"""The paper's tables and figures as claims, and what was measured here beside each: paper, ours, ratio, conditions.
+"""The paper's tables and figures as claims, and what was measured here beside each:
+paper, ours, ratio, conditions.
 
-What was not measured says so, with the command that would measure it: no number is filled in.
+What was not measured says so, with the command that would measure it: no number is
+filled in.
 """
 
 import json
@@ -14,14 +16,20 @@ from typing import Any
 from metalens.ground import config
 from metalens.ground.errors import StoreError
 
-ROLES = ("proposed", "hyperbolic", "best_focus", "double_helix")  # of the runs, in the order they are given
+ROLES = (
+    "proposed",
+    "hyperbolic",
+    "best_focus",
+    "double_helix",
+)  # of the runs, in the order they are given
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
     """A number or picture of the paper.
 
-    place: table, figure or section. value: nan where the paper prints a picture only. key: of our measurement.
+    place: table, figure or section. value: nan where the paper prints a picture only.
+    key: of our measurement.
     how: the command that measures it. note: conditions of the paper.
     """
 
@@ -48,7 +56,9 @@ class Claims:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A number of ours with its 95 % interval (nan: none) and the conditions that it holds for."""
+    """A number of ours with its 95 % interval (nan: none) and the conditions that it
+    holds for.
+    """
 
     value: float
     low: float = math.nan
@@ -70,25 +80,43 @@ class Line:
     @property
     def ratio(self) -> float:
         """Ours over the paper's; nan without either."""
-        return self.ours.value / self.claim.value if self.ours and not self.claim.picture else math.nan
+        return (
+            self.ours.value / self.claim.value
+            if self.ours and not self.claim.picture
+            else math.nan
+        )
 
     def words(self) -> tuple[str, str, str, str, str, str]:
         """Cells of a table: place, what, paper, ours, ratio, conditions."""
         c = self.claim
-        paper = "picture" if c.picture else f"{c.value:g} {c.unit if c.unit != 'ratio' else ''}".strip()
+        paper = (
+            "picture"
+            if c.picture
+            else f"{c.value:g} {c.unit if c.unit != 'ratio' else ''}".strip()
+        )
         if self.picture:
             return c.place, c.what, paper, self.picture, "", c.note
         if self.ours is None:
             return c.place, c.what, paper, "not measured", "", f"measure with: {c.how}"
-        span = f" [{self.ours.low:.3g}, {self.ours.high:.3g}]" if not math.isnan(self.ours.low) else ""
+        span = (
+            f" [{self.ours.low:.3g}, {self.ours.high:.3g}]"
+            if not math.isnan(self.ours.low)
+            else ""
+        )
         ratio = "" if c.picture else f"{self.ratio:.2f}"
-        conditions = "; ".join(w for w in (self.ours.conditions, f"paper: {c.note}" if c.note else "") if w)
+        conditions = "; ".join(
+            w for w in (self.ours.conditions, f"paper: {c.note}" if c.note else "") if w
+        )
         return c.place, c.what, paper, f"{self.ours.value:.3g}{span}", ratio, conditions
 
 
 def claims() -> tuple[Claim, ...]:
     """Every claim, in the order of the paper."""
-    text = resources.files("codesign").joinpath("data", "claims.toml").read_text(encoding="utf-8")
+    text = (
+        resources.files("codesign")
+        .joinpath("data", "claims.toml")
+        .read_text(encoding="utf-8")
+    )
     return config.loads(text, Claims, where="claims.toml").claim
 
 
@@ -125,10 +153,16 @@ def of_experiment(path: Path) -> dict[str, Measured]:
     for entry in told["ratios"]:
         if entry["against"] != "hyperbolic":
             continue
-        for key, name in (("slip", "slip_mm"), ("gaze_axial", "gaze_axial_deg"), ("gaze_lateral", "gaze_lateral_deg")):
+        for key, name in (
+            ("slip", "slip_mm"),
+            ("gaze_axial", "gaze_axial_deg"),
+            ("gaze_lateral", "gaze_lateral_deg"),
+        ):
             if entry["quantity"] == name:
                 low, high = entry["interval"]
-                found[f"{key}/ratio"] = Measured(entry["ratio"], low, high, "mid-range hyperbolic, paired subjects")
+                found[f"{key}/ratio"] = Measured(
+                    entry["ratio"], low, high, "mid-range hyperbolic, paired subjects"
+                )
     return found
 
 
@@ -138,19 +172,27 @@ def of_dim(bright: Path, dim: Path) -> dict[str, Measured]:
     Raises:
         StoreError: no such file, or of another version.
     """
-    good, poor = ({r["name"]: r["gaze_axial_deg"] for r in _json(p, "runs")["runs"]} for p in (bright, dim))
+    good, poor = (
+        {r["name"]: r["gaze_axial_deg"] for r in _json(p, "runs")["runs"]}
+        for p in (bright, dim)
+    )
     words = "gaze under axial slip, networks trained in good light"
     found = {}
     if "proposed" in poor:
-        found["dim/proposed"] = Measured(poor["proposed"] / good["proposed"], conditions=words)
+        found["dim/proposed"] = Measured(
+            poor["proposed"] / good["proposed"], conditions=words
+        )
         for name in ("hyperbolic", "double_helix"):
             if name in poor:
-                found[f"dim/{name}"] = Measured(poor[name] / poor["proposed"], conditions=words)
+                found[f"dim/{name}"] = Measured(
+                    poor[name] / poor["proposed"], conditions=words
+                )
     return found
 
 
 def of_optics(path: Path) -> dict[str, Measured]:
-    """Measurements in an optics.json whose lenses are named by :data:`ROLES`, hyperbolic first.
+    """Measurements in an optics.json whose lenses are named by :data:`ROLES`,
+    hyperbolic first.
 
     Raises:
         StoreError: no such file, or of another version.
@@ -160,34 +202,49 @@ def of_optics(path: Path) -> dict[str, Measured]:
     base = told["lenses"].get("hyperbolic")
     for name, values in told["lenses"].items():
         for kind, (value, low, high) in values["scene_ratios"].items():
-            found[f"scenes/{kind}/{name}"] = Measured(value, low, high, "same states, images of equal light")
+            found[f"scenes/{kind}/{name}"] = Measured(
+                value, low, high, "same states, images of equal light"
+            )
         if base is None:
             continue
         for i, angle in enumerate(told["angles_deg"]):
             one, other = (sum(v["information_per_mm2"][i][0]) for v in (values, base))
-            words = f"honest I(z), {told['normalisation']} normalisation, pixels not binned"
-            found[f"information/{angle:g}/{name}"] = Measured(one / other, conditions=words)
+            words = (
+                f"honest I(z), {told['normalisation']} normalisation, pixels not binned"
+            )
+            found[f"information/{angle:g}/{name}"] = Measured(
+                one / other, conditions=words
+            )
     return found
 
 
 def of_runs(rows: Mapping[str, list[dict[str, Any]]]) -> dict[str, Measured]:
-    """Fig. 8 a from the rows of result.json of the proposed and the hyperbolic run: errors at equal budgets."""
+    """Fig. 8 a from the rows of result.json of the proposed and the hyperbolic run:
+    errors at equal budgets.
+    """
     if not {"proposed", "hyperbolic"} <= rows.keys():
         return {}
     ours, theirs = (
-        {r["budget_mmacs"]: r for r in rows[name] if "axial_slip_mm" in r} for name in ("proposed", "hyperbolic")
+        {r["budget_mmacs"]: r for r in rows[name] if "axial_slip_mm" in r}
+        for name in ("proposed", "hyperbolic")
     )
     shared = sorted(ours.keys() & theirs.keys())
     if not shared:
         return {}
     least = shared[0]
     error = ours[least]["axial_slip_mm"] / theirs[least]["axial_slip_mm"]
-    found = {"fig8a/error": Measured(error, conditions=f"axial slippage at {ours[least]['mmacs']:.1f} MMACs")}
+    found = {
+        "fig8a/error": Measured(
+            error, conditions=f"axial slippage at {ours[least]['mmacs']:.1f} MMACs"
+        )
+    }
     goal = min(r["axial_slip_mm"] for r in theirs.values())
     best = min(r["mmacs"] for r in theirs.values() if r["axial_slip_mm"] == goal)
     enough = [r["mmacs"] for r in ours.values() if r["axial_slip_mm"] <= goal]
     if enough:
-        found["fig8a/compute"] = Measured(min(enough) / best, conditions=f"axial slippage of {goal:.2f} mm or less")
+        found["fig8a/compute"] = Measured(
+            min(enough) / best, conditions=f"axial slippage of {goal:.2f} mm or less"
+        )
     return found
 
 
@@ -197,8 +254,12 @@ def _json(path: Path, *needed: str) -> dict[str, Any]:
     except FileNotFoundError:
         raise StoreError(f"{path}: no such file; measure it first") from None
     except json.JSONDecodeError as error:
-        raise StoreError(f"{path}: not a JSON file ({error}); measure it again") from None
+        raise StoreError(
+            f"{path}: not a JSON file ({error}); measure it again"
+        ) from None
     missing = [name for name in needed if name not in told]
     if missing:
-        raise StoreError(f"{path}: {', '.join(missing)} missing: made by another version; measure it again")
+        raise StoreError(
+            f"{path}: {', '.join(missing)} missing: made by another version; measure it again"
+        )
     return told

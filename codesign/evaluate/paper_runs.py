@@ -1,4 +1,6 @@
-"""What finished runs say to Table 2 and Fig. 8b of the paper: gaze of other networks, cost of what is frozen."""
+"""What finished runs say to Table 2 and Fig. 8b of the paper: gaze of other networks,
+cost of what is frozen.
+"""
 
 import functools
 import json
@@ -20,9 +22,14 @@ from codesign.train import Run, Seen, assess
 from codesign.train import run as runs
 from metalens.ground.errors import TrainingError
 
-TABLE_2 = {"nvgaze": "nvgaze", "popovic": "popovic_et_al", "de2gaze": "de2gaze"}  # our network: the claim's key
+TABLE_2 = {
+    "nvgaze": "nvgaze",
+    "popovic": "popovic_et_al",
+    "de2gaze": "de2gaze",
+}  # our network: the claim's key
 PEOPLE, EACH = 16, 40  # frames of a person; a fifth of them calibrates
-BEFORE = 32  # other people of as many frames, whose gaze tells what an axis that is read means
+# other people of as many frames, whose gaze tells what an axis that is read means
+BEFORE = 32
 WORDS = "visual axis after a personal calibration on a fifth of the frames"
 
 
@@ -46,13 +53,20 @@ def kind_of(folder: Path) -> Kind:
 
 
 def image_tolerance(folders: Sequence[Path]) -> float:
-    """Of the true image that lenses of these runs are compared by: the largest that one of them is imaged at."""
-    return max(runs.load(folder / "run.toml").optics.image_tolerance for folder in folders)
+    """Of the true image that lenses of these runs are compared by: the largest that one
+    of them is imaged at.
+    """
+    return max(
+        runs.load(folder / "run.toml").optics.image_tolerance for folder in folders
+    )
 
 
 @torch.no_grad()
-def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5) -> list[dict[str, Any]]:
-    """Gaze errors of every network of a finished run on people whom training never saw; least compute first.
+def gaze(
+    folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5
+) -> list[dict[str, Any]]:
+    """Gaze errors of every network of a finished run on people whom training never saw;
+    least compute first.
 
     Raises:
         TrainingError: no finished run, half written, or of another version.
@@ -61,7 +75,11 @@ def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5)
     going = runs.resume(folder / "checkpoint.safetensors", settings)
     shown = _shown(going, TEST, people, each, seed)
     before = functools.cache(lambda: _shown(going, VALIDATION, BEFORE, each, seed + 1))
-    known = assess.parts(assess.frames(going.trainer, going.trainer.scenes, min(8, settings.test_batches)))
+    known = assess.parts(
+        assess.frames(
+            going.trainer, going.trainer.scenes, min(8, settings.test_batches)
+        )
+    )
     out = []
     for row in sorted(retraining.rows_of(folder), key=lambda r: float(r["mmacs"])):
         architecture = retraining.architecture_of(row["architecture"], going, folder)
@@ -70,25 +88,43 @@ def gaze(folder: Path, *, people: int = PEOPLE, each: int = EACH, seed: int = 5)
         if read.axis_deg is not None:
             how = gaze_test.learnt(before()[0], _read(going, architecture, before()))
         found = gaze_test.gaze_errors(shown[0], read, how=how)
-        out.append({"mmacs": row["mmacs"], "people": people, "frames_each": each, "seed": seed, **asdict(found)})
+        out.append(
+            {
+                "mmacs": row["mmacs"],
+                "people": people,
+                "frames_each": each,
+                "seed": seed,
+                **asdict(found),
+            }
+        )
     return out
 
 
-def _shown(going: Run, stream: int, people: int, each: int, seed: int) -> tuple[gaze_test.People, Seen]:
+def _shown(
+    going: Run, stream: int, people: int, each: int, seed: int
+) -> tuple[gaze_test.People, Seen]:
     """People and their frames through a run's lens."""
     test = gaze_test.people(going.scenes(stream), people, each, seed=seed)
-    return test, assess.frames(going.trainer, test, math.ceil(people * each / going.settings.inner.batch))
+    return test, assess.frames(
+        going.trainer, test, math.ceil(people * each / going.settings.inner.batch)
+    )
 
 
-def _read(going: Run, architecture: Architecture, shown: tuple[gaze_test.People, Seen]) -> Readings:
+def _read(
+    going: Run, architecture: Architecture, shown: tuple[gaze_test.People, Seen]
+) -> Readings:
     """What a network of a run reads of their frames."""
     test, seen = shown
-    answers = assess.predict(going.trainer.model.net, architecture, seen, going.settings.inner)
+    answers = assess.predict(
+        going.trainer.model.net, architecture, seen, going.settings.inner
+    )
     return gaze_test.read_of(test, answers.centre, answers.slip_mm, answers.axis)
 
 
 def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
-    """Table 2 from gaze.json: {folder: {network, rows of :func:`gaze`}}; the first supernet is the proposed one."""
+    """Table 2 from gaze.json: {folder: {network, rows of :func:`gaze`}}; the first
+    supernet is the proposed one.
+    """
     found: dict[str, Measured] = {}
     for entry in told.values():
         rows = entry["rows"]
@@ -96,7 +132,9 @@ def of_gaze(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Measured]:
             found[f"table2/{TABLE_2[entry['network']]}"] = _measured(rows[0])
         elif "table2/proposed_efficient" not in found:
             found["table2/proposed_efficient"] = _measured(rows[0])
-            found["table2/proposed_accurate"] = _measured(min(rows, key=lambda r: float(r["personal_deg"])))
+            found["table2/proposed_accurate"] = _measured(
+                min(rows, key=lambda r: float(r["personal_deg"]))
+            )
     return found
 
 
@@ -108,22 +146,31 @@ def _measured(row: Mapping[str, Any]) -> Measured:
 def of_ablations(
     ours: Sequence[Mapping[str, Any]], others: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> dict[str, Measured]:
-    """Fig. 8b: compute of a run with one part frozen over ours, at the best axial slippage that the frozen one reaches.
+    """Fig. 8b: compute of a run with one part frozen over ours, at the best axial
+    slippage that the frozen one reaches.
 
-    ours: rows of the joint run. others: {frozen part: rows}. A part whose best error ours never reaches is left out.
+    ours: rows of the joint run. others: {frozen part: rows}. A part whose best error
+    ours never reaches is left out.
     """
     found = {}
     for part, rows in others.items():
         best = min(rows, key=lambda r: float(r["axial_slip_mm"]))
-        enough = [float(r["mmacs"]) for r in ours if r["axial_slip_mm"] <= best["axial_slip_mm"]]
+        enough = [
+            float(r["mmacs"])
+            for r in ours
+            if r["axial_slip_mm"] <= best["axial_slip_mm"]
+        ]
         if enough:
             words = f"axial slippage of {best['axial_slip_mm']:.2f} mm or less, at {min(enough):.1f} MMACs"
-            found[f"fig8b/{part}"] = Measured(float(best["mmacs"]) / min(enough), conditions=words)
+            found[f"fig8b/{part}"] = Measured(
+                float(best["mmacs"]) / min(enough), conditions=words
+            )
     return found
 
 
 def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """(part, rows) of every run of the elastic network in which exactly one part was frozen.
+    """(part, rows) of every run of the elastic network in which exactly one part was
+    frozen.
 
     Raises:
         TrainingError: two runs with the same part frozen.
@@ -135,6 +182,8 @@ def frozen_rows(folders: Sequence[Path]) -> Iterator[tuple[str, list[dict[str, A
             continue
         part = kind.frozen[0]
         if part in seen:
-            raise TrainingError(f"{seen[part]} and {folder} both have {part} frozen; give one of them")
+            raise TrainingError(
+                f"{seen[part]} and {folder} both have {part} frozen; give one of them"
+            )
         seen[part] = folder
         yield part, retraining.rows_of(folder)

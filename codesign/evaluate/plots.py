@@ -1,4 +1,6 @@
-"""Pictures of lenses side by side: I(z) per binning, slices along depth (Fig. 7), and what scenes show (Fig. 5)."""
+"""Pictures of lenses side by side: I(z) per binning, slices along depth (Fig. 7), and
+what scenes show (Fig. 5).
+"""
 
 from collections.abc import Mapping
 
@@ -29,7 +31,10 @@ def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
             mean = float(found.information[0, k].mean())
             shown = found.information[0, k].clamp_min(max(1e-6 * mean, 1e-30)).numpy()
             panel.semilogy(depths, shown, ".-", label=f"{name}: {mean:.3g}")
-        panel.set(title=f"{binning} × {binning} of {setting.pixel_um:g} µm", xlabel="source depth / mm")
+        panel.set(
+            title=f"{binning} × {binning} of {setting.pixel_um:g} µm",
+            xlabel="source depth / mm",
+        )
         panel.legend(fontsize=7, title="mean", title_fontsize=7)
     panels[0, 0].set_ylabel(f"I(z) / mm⁻² ({setting.normalisation})")
     return png(figure)
@@ -38,17 +43,32 @@ def information(axial: Mapping[str, Axial], setting: Filled) -> bytes:
 def slices(axial: Mapping[str, Axial], setting: Filled) -> bytes:
     """Light along x over depth, lenses down, binnings across."""
     shape = (len(axial), len(setting.binnings))
-    figure, panels = canvas(*shape, size=(1 + 2.6 * shape[1], 0.6 + 2.0 * shape[0]), squeeze=False, sharex=True)
+    figure, panels = canvas(
+        *shape,
+        size=(1 + 2.6 * shape[1], 0.6 + 2.0 * shape[0]),
+        squeeze=False,
+        sharex=True,
+    )
     (low, high), half = setting.depths_mm, HALF * setting.window_um
-    for place, (row, (name, found)) in enumerate(zip(panels, axial.items(), strict=True)):
+    for place, (row, (name, found)) in enumerate(
+        zip(panels, axial.items(), strict=True)
+    ):
         for panel, binning in zip(row, setting.binnings, strict=True):
             pixel = setting.pixel_um * binning
             pixels = int(2 * half / pixel) // 2 * 2 + 1
-            weights = pixel_weights(found.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels)
+            weights = pixel_weights(
+                found.slices.shape[1], setting.sample_um, pitch_um=pixel, count=pixels
+            )
             light = found.slices @ weights.to(found.slices).mT
             shown = (light / light.amax(1, keepdim=True).clamp_min(1e-30)).numpy()
             edge = pixels * pixel / 2
-            panel.imshow(shown, extent=(-edge, edge, high, low), aspect="auto", vmin=0, interpolation="nearest")
+            panel.imshow(
+                shown,
+                extent=(-edge, edge, high, low),
+                aspect="auto",
+                vmin=0,
+                interpolation="nearest",
+            )
             panel.grid(False)
             panel.set_xlim(-half, half)
             if place == 0:
@@ -60,14 +80,32 @@ def slices(axial: Mapping[str, Axial], setting: Filled) -> bytes:
 
 
 def scenes(energies: Mapping[str, SceneEnergy]) -> bytes:
-    """The first scene through every lens: image, change with gaze, difference of gaze and slip."""
+    """The first scene through every lens: image, change with gaze, difference of gaze
+    and slip.
+    """
     titles = ("image", "(gaze − anchor)²", "(gaze − slip)²")
-    figure, panels = canvas(len(energies), 3, size=(8.4, 0.5 + 2.6 * len(energies)), squeeze=False)
-    tops = [float(torch.quantile(torch.stack([e.maps[k] for e in energies.values()]), 0.998)) for k in range(3)]
-    for place, (row, (name, energy)) in enumerate(zip(panels, energies.items(), strict=True)):
-        for panel, picture, top, title in zip(row, energy.maps, tops, titles, strict=True):
+    figure, panels = canvas(
+        len(energies), 3, size=(8.4, 0.5 + 2.6 * len(energies)), squeeze=False
+    )
+    tops = [
+        float(
+            torch.quantile(torch.stack([e.maps[k] for e in energies.values()]), 0.998)
+        )
+        for k in range(3)
+    ]
+    for place, (row, (name, energy)) in enumerate(
+        zip(panels, energies.items(), strict=True)
+    ):
+        for panel, picture, top, title in zip(
+            row, energy.maps, tops, titles, strict=True
+        ):
             grey = title == "image"
-            panel.imshow(picture.numpy(), cmap="gray" if grey else "magma", vmin=0, vmax=max(top, 1e-12))
+            panel.imshow(
+                picture.numpy(),
+                cmap="gray" if grey else "magma",
+                vmin=0,
+                vmax=max(top, 1e-12),
+            )
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
             if place == 0:

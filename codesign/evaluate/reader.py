@@ -1,9 +1,13 @@
-"""A fixed, cheap reader that judges any lens by what a small reader really collects of the depth in its images.
+"""A fixed, cheap reader that judges any lens by what a small reader really collects of
+the depth in its images.
 
-    frames → log power of windows → depth of each window (labels of the renderer) → slippage, with its uncertainty
+    frames → log power of windows → depth of each window (labels of the renderer) →
+    slippage, with its uncertainty
 
-The same for every lens: frames, noise, layers, schedule and order of the frames come from the seed alone, so a lens has
-one number. The lens images through its true image: whole field, depth, spectrum. An information bound of stationary
+The same for every lens: frames, noise, layers, schedule and order of the frames come
+from the seed alone, so a lens has
+one number. The lens images through its true image: whole field, depth, spectrum. An
+information bound of stationary
 texture ranks lenses that readers cannot tell apart; what is read of them does not.
 """
 
@@ -45,10 +49,13 @@ SHARE = 0.9  # of the intervals
 class ReaderConfig:
     """What the reference reader sees.
 
-    frames: that it learns from, drawn from rendered ones at new scales; a multiple of 32. pool: that are rendered.
+    frames: that it learns from, drawn from rendered ones at new scales; a multiple of
+    32. pool: that are rendered.
     test: that judge it; as many again calibrate its intervals. seed: of everything.
-    pixels, pitch_um: of the sensor, square. electrons: that a white object gives in a pixel of 9 um.
-    fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs cover.
+    pixels, pitch_um: of the sensor, square. electrons: that a white object gives in a
+    pixel of 9 um.
+    fwhm_nm: spectral width of the light, 0 for one wavelength. depths_mm: that the PSFs
+    cover.
     tolerance: of the true image.
     """
 
@@ -64,19 +71,30 @@ class ReaderConfig:
     tolerance: float = field(default=0.03, metadata={"above": 0})
 
     def __post_init__(self) -> None:
-        if min(self.frames, self.pool, self.test) < BATCH or self.frames % BATCH or self.test % BATCH:
+        if (
+            min(self.frames, self.pool, self.test) < BATCH
+            or self.frames % BATCH
+            or self.test % BATCH
+        ):
             raise ConfigError(
                 f"reader: frames = {self.frames}, pool = {self.pool}, test = {self.test}: need {BATCH} or more, frames "
                 f"and test a multiple of {BATCH}"
             )
-        if not (32 <= self.pixels <= 512 and self.pitch_um > 0 and self.electrons > 0 and self.fwhm_nm >= 0):
+        if not (
+            32 <= self.pixels <= 512
+            and self.pitch_um > 0
+            and self.electrons > 0
+            and self.fwhm_nm >= 0
+        ):
             raise ConfigError(
                 f"reader: pixels = {self.pixels}, pitch_um = {self.pitch_um}, electrons = {self.electrons}, fwhm_nm = "
                 f"{self.fwhm_nm}: need 32 to 512 pixels, pitch and electrons above 0, a width of 0 or more"
             )
         near, far = self.depths_mm
         if not 0 < near < far < math.inf:
-            raise ConfigError(f"reader: depths_mm = {self.depths_mm}: need 0 < least < largest")
+            raise ConfigError(
+                f"reader: depths_mm = {self.depths_mm}: need 0 < least < largest"
+            )
 
     @property
     def margin(self) -> int:
@@ -90,8 +108,12 @@ class ReaderConfig:
 
     @property
     def sensor(self) -> Sensor:
-        """Pixels of this pitch: 5 electrons of read noise, full well at twice the white object's light, 10 bits."""
-        return Sensor(self.pitch_um, 9.0, self.electrons, 0.0, 2 * self.electrons, 5.0, 10)
+        """Pixels of this pitch: 5 electrons of read noise, full well at twice the white
+        object's light, 10 bits.
+        """
+        return Sensor(
+            self.pitch_um, 9.0, self.electrons, 0.0, 2 * self.electrons, 5.0, 10
+        )
 
 
 BATCH = 32
@@ -102,9 +124,12 @@ SLIP_SCALE_MM = torch.tensor([1.4, 1.2, 2.3])
 class Read:
     """What was read of the test frames through one lens; errors absolute, (frames,).
 
-    axial_mm, lateral_mm: of the slippage. window_mm: of the windows' depths, mean of each frame; guess_mm: of the best
-    constant; trusted_mm: of the half of all windows whose depths it says it is surest of. covered: share of frames
-    within the calibrated 90 % interval of the axial slippage, whose mean half width is interval_mm. image_error: of the
+    axial_mm, lateral_mm: of the slippage. window_mm: of the windows' depths, mean of
+    each frame; guess_mm: of the best
+    constant; trusted_mm: of the half of all windows whose depths it says it is surest
+    of. covered: share of frames
+    within the calibrated 90 % interval of the axial slippage, whose mean half width is
+    interval_mm. image_error: of the
     image, relative L2.
     """
 
@@ -118,8 +143,12 @@ class Read:
     trusted_mm: float
 
     def values(self) -> dict[str, float]:
-        """The numbers by name, axial with its 95 % interval by a bootstrap over the frames."""
-        rows = np.random.default_rng(0).integers(0, len(self.axial_mm), (1000, len(self.axial_mm)))
+        """The numbers by name, axial with its 95 % interval by a bootstrap over the
+        frames.
+        """
+        rows = np.random.default_rng(0).integers(
+            0, len(self.axial_mm), (1000, len(self.axial_mm))
+        )
         low, high = np.quantile(self.axial_mm.numpy()[rows].mean(1), [0.025, 0.975])
         return {
             "axial_mm": float(self.axial_mm.mean()), "axial_low_mm": float(low), "axial_high_mm": float(high),
@@ -130,7 +159,9 @@ class Read:
 
 
 class ReferenceReader(nn.Module):
-    """The blur branch and a small network from its depths to the slippage with the logarithm of its spread."""
+    """The blur branch and a small network from its depths to the slippage with the
+    logarithm of its spread.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -149,7 +180,9 @@ class ReferenceReader(nn.Module):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frames:
-    """Frames of one lens with their truth: pixels (n, 1, y, x), vergence (n, windows, windows), slip_mm (n, 3)."""
+    """Frames of one lens with their truth: pixels (n, 1, y, x), vergence (n, windows,
+    windows), slip_mm (n, 3).
+    """
 
     pixels: Tensor
     vergence: Tensor
@@ -158,7 +191,9 @@ class Frames:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scenery:
-    """Scenes that are the same for every lens: to learn from, to calibrate and to judge."""
+    """Scenes that are the same for every lens: to learn from, to calibrate and to
+    judge.
+    """
 
     learn: Scenes
     calibrate: Scenes
@@ -166,7 +201,8 @@ class Scenery:
 
 
 def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
-    """Render what all lenses of this sensor distance are judged on; size tells no depth.
+    """Render what all lenses of this sensor distance are judged on; size tells no
+    depth.
 
     Raises:
         ConfigError: eyes out of the depths of the PSFs.
@@ -178,16 +214,26 @@ def scenery(config: ReaderConfig, *, sensor_distance_um: float) -> Scenery:
             f"reader: depths_mm = {config.depths_mm} do not hold the eyes, {near:g} to {far:g} mm before the lens"
         )
     of = {
-        stream: EyeScenes(scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream)
+        stream: EyeScenes(
+            scenes, config.pitch_um, sensor_distance_um, config.seed + 101, stream
+        )
         for stream in (EXPERIMENT, VALIDATION, TEST)
     }
-    pools = {stream: fill(one, config.test if stream != EXPERIMENT else config.pool) for stream, one in of.items()}
-    kept = {s: PoolScenes(p, config.margin, scenes.scale, config.seed + s) for s, p in pools.items()}
+    pools = {
+        stream: fill(one, config.test if stream != EXPERIMENT else config.pool)
+        for stream, one in of.items()
+    }
+    kept = {
+        s: PoolScenes(p, config.margin, scenes.scale, config.seed + s)
+        for s, p in pools.items()
+    }
     return Scenery(kept[EXPERIMENT], kept[VALIDATION], kept[TEST])
 
 
 def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) -> Read:
-    """Train the reader on images through ``optics`` and judge it; the same seed gives the same numbers."""
+    """Train the reader on images through ``optics`` and judge it; the same seed gives
+    the same numbers.
+    """
     threads.keep_memory()
     state = torch.get_rng_state()
     torch.manual_seed(config.seed)
@@ -205,27 +251,48 @@ def read(optics: Imager | UniformImager, seen: Scenery, config: ReaderConfig) ->
 
 
 @torch.no_grad()
-def frames(optics: Imager | UniformImager, scenes: Scenes, config: ReaderConfig, count: int) -> Frames:
-    """``count`` frames of a stream through a lens onto the sensor, with noise of the batch's number."""
+def frames(
+    optics: Imager | UniformImager, scenes: Scenes, config: ReaderConfig, count: int
+) -> Frames:
+    """``count`` frames of a stream through a lens onto the sensor, with noise of the
+    batch's number.
+    """
     pixels, vergence, slip = [], [], []
     pitch = torch.tensor(config.pitch_um, dtype=torch.float64)
     for number in range(count // BATCH):
         batch = scenes.batch(number, BATCH)
         light = irradiance(batch.frames, optics, margin=config.margin)
         noise = torch.Generator().manual_seed(7_000_003 * (config.seed + 1) + number)
-        pixels.append(read_out(light, config.pitch_um, pitch, config.sensor, generator=noise, exact=False))
-        vergence.append(blur.window_vergence(depth_um(batch.frames, margin=config.margin)))
+        pixels.append(
+            read_out(
+                light,
+                config.pitch_um,
+                pitch,
+                config.sensor,
+                generator=noise,
+                exact=False,
+            )
+        )
+        vergence.append(
+            blur.window_vergence(depth_um(batch.frames, margin=config.margin))
+        )
         slip.append(batch.slip_mm)
     return Frames(torch.cat(pixels), torch.cat(vergence), torch.cat(slip))
 
 
-def _learn_depth(made: ReferenceReader, learn: Frames, *, passes: int = 4, batch: int = 64) -> None:
-    for rows in _steps(made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01):
+def _learn_depth(
+    made: ReferenceReader, learn: Frames, *, passes: int = 4, batch: int = 64
+) -> None:
+    for rows in _steps(
+        made.branch, len(learn.pixels), passes, batch, rate=3e-3, decay=0.01
+    ):
         told, _ = made.branch(learn.pixels[rows])
         losses.depth(told, learn.vergence[rows]).backward()  # type: ignore[no-untyped-call]
 
 
-def _learn_slip(made: ReferenceReader, learn: Frames, *, passes: int = 12, batch: int = 128) -> None:
+def _learn_slip(
+    made: ReferenceReader, learn: Frames, *, passes: int = 12, batch: int = 128
+) -> None:
     features = _features(made, learn)
     truth = learn.slip_mm / SLIP_SCALE_MM
     for rows in _steps(made.slip, len(features), passes, batch, rate=2e-3, decay=0.03):
@@ -236,7 +303,9 @@ def _learn_slip(made: ReferenceReader, learn: Frames, *, passes: int = 12, batch
         loss.backward()
 
 
-def _steps(part: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float) -> Iterator[Tensor]:
+def _steps(
+    part: nn.Module, count: int, passes: int, batch: int, *, rate: float, decay: float
+) -> Iterator[Tensor]:
     """Rows of every batch; a step of AdamW on one rising and falling rate after each."""
     part.train()
     optimiser = torch.optim.AdamW(part.parameters(), lr=rate, weight_decay=decay)
@@ -254,30 +323,53 @@ def _steps(part: nn.Module, count: int, passes: int, batch: int, *, rate: float,
 
 @torch.no_grad()
 def _features(made: ReferenceReader, seen: Frames) -> Tensor:
-    parts = [made.branch(seen.pixels[i : i + 256])[1] for i in range(0, len(seen.pixels), 256)]
+    parts = [
+        made.branch(seen.pixels[i : i + 256])[1]
+        for i in range(0, len(seen.pixels), 256)
+    ]
     return torch.cat(parts)
 
 
 @torch.no_grad()
-def _judge(made: ReferenceReader, spare: Frames, judged: Frames, image_error: float) -> Read:
+def _judge(
+    made: ReferenceReader, spare: Frames, judged: Frames, image_error: float
+) -> Read:
     def slip(seen: Frames) -> tuple[Tensor, Tensor]:
         found = made.slip(_features(made, seen))
-        return (found[:, :3] * SLIP_SCALE_MM - seen.slip_mm).abs(), found[:, 5].clamp(-4, 2).exp() * SLIP_SCALE_MM[2]
+        return (found[:, :3] * SLIP_SCALE_MM - seen.slip_mm).abs(), found[:, 5].clamp(
+            -4, 2
+        ).exp() * SLIP_SCALE_MM[2]
 
     error, spread = slip(spare)
     ratio = (error[:, 2] / spread).sort().values
     reach = float(ratio[min(math.ceil(SHARE * (len(ratio) + 1)), len(ratio)) - 1])
     error, spread = slip(judged)
-    told = torch.cat([made.branch(judged.pixels[i : i + 256])[0] for i in range(0, len(judged.pixels), 256)])
+    told = torch.cat(
+        [
+            made.branch(judged.pixels[i : i + 256])[0]
+            for i in range(0, len(judged.pixels), 256)
+        ]
+    )
     truth = blur.depth_mm(judged.vergence)
     depth = blur.depth_mm(told[:, 0])
     window = (depth - truth).abs()
-    trusted = window.flatten()[(depth**2 * told[:, 1].exp()).flatten().argsort()[: window.numel() // 2]]
+    trusted = window.flatten()[
+        (depth**2 * told[:, 1].exp()).flatten().argsort()[: window.numel() // 2]
+    ]
     guess = float((truth - truth.median()).abs().mean())
     inside = float((error[:, 2] <= reach * spread).float().mean())
     wide = float((reach * spread).mean())
     lateral, windows = error[:, :2].mean(1), window.mean((1, 2))
-    return Read(error[:, 2], lateral, windows, guess, inside, wide, image_error, float(trusted.mean()))
+    return Read(
+        error[:, 2],
+        lateral,
+        windows,
+        guess,
+        inside,
+        wide,
+        image_error,
+        float(trusted.mean()),
+    )
 
 
 def table(found: dict[str, Read], config: ReaderConfig) -> Table:
@@ -287,14 +379,34 @@ def table(found: dict[str, Read], config: ReaderConfig) -> Table:
         f"Read by the reference reader: {config.frames} frames of {config.pixels} pixels of {config.pitch_um:g} µm, "
         f"{config.electrons:g} e, {light}, whole field; 95 % interval over {config.test} test frames."
     )
-    head = ("lens", "axial / mm", "90 % interval", "covers", "lateral / mm", "windows / mm (guess)", "image error")
+    head = (
+        "lens",
+        "axial / mm",
+        "90 % interval",
+        "covers",
+        "lateral / mm",
+        "windows / mm (guess)",
+        "image error",
+    )
     rows = []
     for name, one in found.items():
         v = one.values()
-        axial = f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
+        axial = (
+            f"{v['axial_mm']:.2f} [{v['axial_low_mm']:.2f}, {v['axial_high_mm']:.2f}]"
+        )
         wide, covered = f"±{v['interval_mm']:.2f} mm", f"{100 * v['covered']:.0f} %"
         windows = f"{v['window_mm']:.2f} ({v['guess_mm']:.2f})"
-        rows.append((name, axial, wide, covered, f"{v['lateral_mm']:.2f}", windows, f"{v['image_error']:.3f}"))
+        rows.append(
+            (
+                name,
+                axial,
+                wide,
+                covered,
+                f"{v['lateral_mm']:.2f}",
+                windows,
+                f"{v['image_error']:.3f}",
+            )
+        )
     return Table(head, rows, caption)
 
 
@@ -302,16 +414,34 @@ def judged(lenses: dict[str, Lens], config: ReaderConfig) -> Iterator[tuple[str,
     """Every lens by name, on the same scenes.
 
     Raises:
-        ConfigError: lenses of different sensor distances (through films: reduced), whose frames differ in size.
+        ConfigError: lenses of different sensor distances (through films: reduced),
+            whose frames differ in size.
     """
     distances = {name: lens.reduced_um for name, lens in lenses.items()}
     if max(distances.values()) > min(distances.values()) * 1.001:
-        raise ConfigError(f"lenses of different sensor distances {distances} um: compare lenses of one distance")
+        raise ConfigError(
+            f"lenses of different sensor distances {distances} um: compare lenses of one distance"
+        )
     seen = scenery(config, sensor_distance_um=next(iter(distances.values())))
     near, far = config.depths_mm
     about = {"fwhm_nm": config.fwhm_nm, "tolerance": config.tolerance}
     for name, lens in lenses.items():
-        yield name, read(lens_imager(lens, config.camera, (near * 1e3, far * 1e3), **about), seen, config)
+        yield (
+            name,
+            read(
+                lens_imager(lens, config.camera, (near * 1e3, far * 1e3), **about),
+                seen,
+                config,
+            ),
+        )
 
 
-__all__ = ["Read", "ReaderConfig", "ReferenceReader", "judged", "read", "scenery", "table"]
+__all__ = [
+    "Read",
+    "ReaderConfig",
+    "ReferenceReader",
+    "judged",
+    "read",
+    "scenery",
+    "table",
+]

@@ -1,7 +1,10 @@
-"""A free-form lens from Eq. 6 itself: triplets of rendered eyes through the PSFs of the phase, and their Fisher matrix.
+"""A free-form lens from Eq. 6 itself: triplets of rendered eyes through the PSFs of the
+phase, and their Fisher matrix.
 
-For :func:`metalens.design.free_form.search.optimise`. The images are energy-matched as in Table 1, and every entry of
-the Fisher matrix is relative to that of images without any blur, so that 0 is a lens that loses nothing to a pinhole.
+For :func:`metalens.design.free_form.search.optimise`. The images are energy-matched as
+in Table 1, and every entry of
+the Fisher matrix is relative to that of images without any blur, so that 0 is a lens
+that loses nothing to a pinhole.
 """
 
 import torch
@@ -10,7 +13,14 @@ from torch import Tensor
 from codesign.evaluate.optics import Scenes, scene_views
 from codesign.eye import states_at
 from metalens.design.free_form import Asked, Score
-from metalens.image import OpticsLoss, Pupil, encircled_energy, integrate, optics_loss, scene
+from metalens.image import (
+    OpticsLoss,
+    Pupil,
+    encircled_energy,
+    integrate,
+    optics_loss,
+    scene,
+)
 from metalens.image import pupil as pupils
 
 DEPTHS = 14  # of the PSF stack, at equal steps of 1/z over what the scenes hold
@@ -19,34 +29,61 @@ DEPTHS = 14  # of the PSF stack, at equal steps of 1/z over what the scenes hold
 class SceneObjective:
     """Eq. 6 of a phase on the pupil, over a fixed set of scenes."""
 
-    def __init__(self, pupil: Pupil, settings: Asked, scenes: Scenes | None = None) -> None:
+    def __init__(
+        self, pupil: Pupil, settings: Asked, scenes: Scenes | None = None
+    ) -> None:
         """Render the triplets once.
 
         Args:
-            scenes: pixels, pitch and steps; by default 128 pixels of 9 um and ``settings.scenes`` scenes.
+            scenes: pixels, pitch and steps; by default 128 pixels of 9 um and
+                ``settings.scenes`` scenes.
         """
         self.pupil, self.settings = pupil, settings
-        self.scenes = scenes or Scenes(count=settings.scenes, pitch_um=9.0, pixels=128, window_um=153.0)
+        self.scenes = scenes or Scenes(
+            count=settings.scenes, pitch_um=9.0, pixels=128, window_um=153.0
+        )
         states = states_at(torch.arange(self.scenes.count), 100 + settings.seed)
-        self.views = scene_views(states, self.scenes, sensor_distance_um=pupil.sensor_distance_um)
-        self.frames = [view.frames for view in (self.views.anchor, self.views.gaze, self.views.slip)]
+        self.views = scene_views(
+            states, self.scenes, sensor_distance_um=pupil.sensor_distance_um
+        )
+        self.frames = [
+            view.frames
+            for view in (self.views.anchor, self.views.gaze, self.views.slip)
+        ]
         seen = torch.cat([f.depth_um[f.coverage > 0] for f in self.frames])
         low, high = float(seen.min()), float(seen.max())
-        self.depths_um = 1 / torch.linspace(1 / low, 1 / high, DEPTHS, dtype=torch.float64)
-        self.size = int(min(self.scenes.window_um, pupil.period_um) / self.scenes.pitch_um) // 2 * 2 - 1
+        self.depths_um = 1 / torch.linspace(
+            1 / low, 1 / high, DEPTHS, dtype=torch.float64
+        )
+        self.size = (
+            int(min(self.scenes.window_um, pupil.period_um) / self.scenes.pitch_um)
+            // 2
+            * 2
+            - 1
+        )
         self.sources = [self._cut(f) for f in self.frames]
         sharp = [f.radiance.sum(1) for f in self.frames]
         self.reference = self._fisher(sharp).diagonal().detach()
 
     def _cut(self, frames: scene.Frames) -> Tensor:
-        """Spectra (depths, frames, light and coverage, sheets, Y, X) of the frames cut at the depths."""
+        """Spectra (depths, frames, light and coverage, sheets, Y, X) of the frames cut
+        at the depths.
+        """
         nodes = torch.zeros(DEPTHS, self.size, self.size)
-        whole = scene.PsfBasis(nodes, torch.eye(DEPTHS)[None, None], self.depths_um, 0.0, 0.0)
-        self.optics = scene.uniform_imager(whole, (self.scenes.pixels, self.scenes.pixels))
+        whole = scene.PsfBasis(
+            nodes, torch.eye(DEPTHS)[None, None], self.depths_um, 0.0, 0.0
+        )
+        self.optics = scene.uniform_imager(
+            whole, (self.scenes.pixels, self.scenes.pixels)
+        )
         return scene.spectra(frames, self.optics)
 
-    def loss(self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Eq. 6 without its last term, and the encircled energy at every depth (which the design holds instead)."""
+    def loss(
+        self, phase_rad: Tensor, focus_um: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Eq. 6 without its last term, and the encircled energy at every depth (which
+        the design holds instead).
+        """
         found, energy = self.evaluate(phase_rad, focus_um)
         return found.value, energy
 
@@ -59,18 +96,32 @@ class SceneObjective:
     def evaluate(self, phase_rad: Tensor, focus_um: float) -> tuple[OpticsLoss, Tensor]:
         """The loss with its parts, and the encircled energy at every depth."""
         sample = self.settings.sample_um
-        samples = min(int((self.size + 2) * self.scenes.pitch_um / sample), int(self.pupil.period_um / sample))
+        samples = min(
+            int((self.size + 2) * self.scenes.pitch_um / sample),
+            int(self.pupil.period_um / sample),
+        )
         fine = pupils.psf(
-            phase_rad, self.pupil, depths_um=self.depths_um, focus_um=focus_um, sample_um=sample, samples=samples
+            phase_rad,
+            self.pupil,
+            depths_um=self.depths_um,
+            focus_um=focus_um,
+            sample_um=sample,
+            samples=samples,
         )
         energy = encircled_energy(fine, sample, radius_um=self.settings.radius_um)
-        stack = integrate(fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size))
-        optics = scene.with_kernels(self.optics, stack / stack.sum((1, 2), keepdim=True))
+        stack = integrate(
+            fine, sample, pitch_um=self.scenes.pitch_um, shape=(self.size, self.size)
+        )
+        optics = scene.with_kernels(
+            self.optics, stack / stack.sum((1, 2), keepdim=True)
+        )
         size = (self.scenes.pixels, self.scenes.pixels)
         images = [scene.image_spectra(source, optics, size) for source in self.sources]
         scale = torch.sqrt(self.reference)
         fisher = self._fisher(images) / torch.outer(scale, scale)
-        found = optics_loss(fisher, energy, orthogonality=self.settings.orthogonality, compactness=0.0)
+        found = optics_loss(
+            fisher, energy, orthogonality=self.settings.orthogonality, compactness=0.0
+        )
         return found, energy
 
     def _fisher(self, images: list[Tensor]) -> Tensor:

@@ -40,16 +40,22 @@ class Trial:
 class ExperimentConfig:
     """What is shown to whom, and how gaze is calibrated.
 
-    subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that they span.
+    subjects: their number. grid: stimuli (across, down). field_deg: (across, down) that
+    they span.
     axial_mm, lateral_mm: slippage states beside the origin, along z and x.
-    share: of the stimuli that a subject is calibrated on; the rest is judged. points: whether these stimuli are drawn
+    share: of the stimuli that a subject is calibrated on; the rest is judged. points:
+    whether these stimuli are drawn
         at random or spread over the field, as a calibration screen would show them.
-    people: who calibrated before, and tell what readings mean for all of them: the prior of every subject.
+    people: who calibrated before, and tell what readings mean for all of them: the
+    prior of every subject.
     hidden: neurons of the regressor, of networks that tell no axis.
     fixation_deg: standard deviation of where a subject really looks.
-    image: "true", what the device shows, whatever the run was trained on; "trained", the image that the run knows.
-    pupil_sd: relative change of the pupil's radius from frame to frame. seed: of subjects, fixation and calibration.
-    snr_db: dim light under a strong ambient one, so that a pixel has this signal-to-noise ratio; None for good light.
+    image: "true", what the device shows, whatever the run was trained on; "trained",
+    the image that the run knows.
+    pupil_sd: relative change of the pupil's radius from frame to frame. seed: of
+    subjects, fixation and calibration.
+    snr_db: dim light under a strong ambient one, so that a pixel has this
+    signal-to-noise ratio; None for good light.
     """
 
     subjects: int = 20
@@ -69,32 +75,45 @@ class ExperimentConfig:
 
     def __post_init__(self) -> None:
         points = self.grid[0] * self.grid[1]
-        if self.subjects < 1 or min(self.grid) < 2 or not 3 <= round(self.share * points) < points:
+        if (
+            self.subjects < 1
+            or min(self.grid) < 2
+            or not 3 <= round(self.share * points) < points
+        ):
             raise ConfigError(
                 f"subjects {self.subjects}, grid {self.grid}, share {self.share}: need a subject, a grid of 2 x 2 or "
                 "more, and a share that leaves 3 or more stimuli to calibrate on and some to judge"
             )
         if self.people < 2:
-            raise ConfigError(f"people {self.people}: need two or more, to tell how people differ")
+            raise ConfigError(
+                f"people {self.people}: need two or more, to tell how people differ"
+            )
         if min(self.hidden, self.seed, self.fixation_deg, self.pupil_sd) < 0:
             raise ConfigError(
                 f"hidden {self.hidden}, seed {self.seed}, fixation_deg {self.fixation_deg:g}, pupil_sd "
                 f"{self.pupil_sd:g}: need 0 or more"
             )
         if not all(0 < field < 120 for field in self.field_deg):
-            raise ConfigError(f"field_deg {self.field_deg}: need two angles above 0 and below 120, as eyes turn")
+            raise ConfigError(
+                f"field_deg {self.field_deg}: need two angles above 0 and below 120, as eyes turn"
+            )
 
     @property
     def stimuli_deg(self) -> Array:
         """(points, 2) direction of every stimulus, x and y (down)."""
-        x, y = (np.linspace(-f / 2, f / 2, n) for f, n in zip(self.field_deg, self.grid, strict=True))
+        x, y = (
+            np.linspace(-f / 2, f / 2, n)
+            for f, n in zip(self.field_deg, self.grid, strict=True)
+        )
         return np.stack([g.ravel() for g in np.meshgrid(x, y)], 1)
 
     @property
     def slips_mm(self) -> Array:
         """(states, 3): the origin, the lateral and the axial ones."""
         lateral = [(x, 0.0, 0.0) for x in self.lateral_mm]
-        return np.array([(0.0, 0.0, 0.0), *lateral, *((0.0, 0.0, z) for z in self.axial_mm)])
+        return np.array(
+            [(0.0, 0.0, 0.0), *lateral, *((0.0, 0.0, z) for z in self.axial_mm)]
+        )
 
     @property
     def frames(self) -> int:
@@ -106,11 +125,16 @@ class ExperimentConfig:
 class Result:
     """One run in the experiment.
 
-    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,). gaze_deg: (n,) error of the
-    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg: (n,) the same error where sphere
-    and regressor are given the pupil as read and the true slippage: what the pupil alone leaves. reach_mm: largest
-    slippage along x, y, z that the run's training saw. how: subjects were calibrated. visible_mm: (n, 3) displacement
-    of the head as the camera sees it, its own turn on the mount included: all that can be read. above: why the error
+    slip_mm: (n, 3) as read. centre: (n, 2) pupil, fraction of the image. iou: (n,).
+    gaze_deg: (n,) error of the
+    calibrated gaze, nan for frames that calibrated. predicted_deg: (n, 2). told_deg:
+    (n,) the same error where sphere
+    and regressor are given the pupil as read and the true slippage: what the pupil
+    alone leaves. reach_mm: largest
+    slippage along x, y, z that the run's training saw. how: subjects were calibrated.
+    visible_mm: (n, 3) displacement
+    of the head as the camera sees it, its own turn on the mount included: all that can
+    be read. above: why the error
     of the images is above what the run asks for; empty where it is not.
     """
 
@@ -144,26 +168,41 @@ class Result:
 
     @property
     def slip_visible_mm(self) -> Array:
-        """(n, 3) absolute errors of one who reads the visible displacement exactly; nan where it is not known."""
+        """(n, 3) absolute errors of one who reads the visible displacement exactly; nan
+        where it is not known.
+        """
         blank = np.full_like(self.trial.slip_mm, math.nan)
-        return blank if self.visible_mm is None else np.asarray(np.abs(self.visible_mm - self.trial.slip_mm))
+        return (
+            blank
+            if self.visible_mm is None
+            else np.asarray(np.abs(self.visible_mm - self.trial.slip_mm))
+        )
 
     @property
     def slip_rest_mm(self) -> Array:
-        """(n, 3) absolute errors beside the mean error of the subject's calibration, nan for frames that calibrated.
+        """(n, 3) absolute errors beside the mean error of the subject's calibration,
+        nan for frames that calibrated.
 
-        What is constant of a person (size of the face, and the camera's turn on it) is no slippage: a device is zeroed
+        What is constant of a person (size of the face, and the camera's turn on it) is
+        no slippage: a device is zeroed
         where its wearer calibrates.
         """
         error, judged = self.slip_mm - self.trial.slip_mm, np.isfinite(self.gaze_deg)
         out = np.full_like(error, math.nan)
         for subject in np.unique(self.trial.subject):
             mine = self.trial.subject == subject
-            out[mine & judged] = np.abs(error[mine & judged] - error[mine & ~judged].mean(0))
+            out[mine & judged] = np.abs(
+                error[mine & judged] - error[mine & ~judged].mean(0)
+            )
         return out
 
     def per_subject(self, values: Array, chosen: Array | None = None) -> Array:
-        """(subjects,) means of (n,) values, of which nan are left out; nan where none is left."""
+        """(subjects,) means of (n,) values, of which nan are left out; nan where none
+        is left.
+        """
         keep = np.isfinite(values) if chosen is None else np.isfinite(values) & chosen
-        mine = (values[keep & (self.trial.subject == s)] for s in np.unique(self.trial.subject))
+        mine = (
+            values[keep & (self.trial.subject == s)]
+            for s in np.unique(self.trial.subject)
+        )
         return np.array([one.mean() if len(one) else math.nan for one in mine])

@@ -1,4 +1,6 @@
-"""Tables 1 and 3 of the paper for any lenses, as tables and as numbers, with intervals over scenes."""
+"""Tables 1 and 3 of the paper for any lenses, as tables and as numbers, with intervals
+over scenes.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +14,11 @@ from codesign.evaluate.optics import Axial, Filled, SceneEnergy
 from metalens.ground.report import Table
 
 KINDS = ("gaze", "slip", "separability")
-PAPER_SCENES = {"gaze": 1.85, "slip": 1.60, "separability": 1.57}  # proposed lens against hyperbolic, Table 1
+PAPER_SCENES = {
+    "gaze": 1.85,
+    "slip": 1.60,
+    "separability": 1.57,
+}  # proposed lens against hyperbolic, Table 1
 PAPER_ANGLES = (5.0, 10.0, 15.0, 20.0)
 PAPER_AXIAL = {  # Table 3, averaged over 16-26 mm
     "hyperbolic": (0.24, 0.24, 0.31, 0.33),
@@ -21,8 +27,12 @@ PAPER_AXIAL = {  # Table 3, averaged over 16-26 mm
 }
 
 
-def ratio(values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0) -> tuple[float, float, float]:
-    """Ratio of means over scenes and its 95 % interval, by a paired bootstrap over the scenes."""
+def ratio(
+    values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float, float]:
+    """Ratio of means over scenes and its 95 % interval, by a paired bootstrap over the
+    scenes.
+    """
     rng = np.random.default_rng(seed)
     a, b = values.double().numpy(), reference.double().numpy()
     rows = rng.integers(0, len(a), (draws, len(a)))
@@ -30,16 +40,22 @@ def ratio(values: Tensor, reference: Tensor, *, draws: int = 2000, seed: int = 0
     return float(a.mean() / b.mean()), float(low), float(high)
 
 
-def ratios(scenes: Mapping[str, SceneEnergy]) -> dict[str, dict[str, tuple[float, float, float]]]:
+def ratios(
+    scenes: Mapping[str, SceneEnergy],
+) -> dict[str, dict[str, tuple[float, float, float]]]:
     """{lens: {kind: (ratio to the first lens, low, high)}} of Table 1."""
     first = next(iter(scenes.values()))
     return {
-        name: {kind: ratio(getattr(energy, kind), getattr(first, kind)) for kind in KINDS}
+        name: {
+            kind: ratio(getattr(energy, kind), getattr(first, kind)) for kind in KINDS
+        }
         for name, energy in scenes.items()
     }
 
 
-def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> dict[str, Any]:
+def values(
+    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled
+) -> dict[str, Any]:
     """Every number of the tables, ready for JSON."""
     out: dict[str, Any] = {
         "depths_mm": np.linspace(*setting.depths_mm, setting.count).tolist(),
@@ -55,15 +71,21 @@ def values(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], settin
             "information_per_mm2": found.information.tolist(),
             "encircled_energy": found.encircled.tolist(),
             "psf_error": found.psf_error,
-            "scene_ratios": {kind: list(interval) for kind, interval in compared[name].items()},
+            "scene_ratios": {
+                kind: list(interval) for kind, interval in compared[name].items()
+            },
             "span_angle_deg": float(torch.rad2deg(energy.angle_rad).mean()),
             "light_in_window": energy.light,
-            "image_error": None if math.isnan(energy.image_error) else energy.image_error,
+            "image_error": None
+            if math.isnan(energy.image_error)
+            else energy.image_error,
         }
     return out
 
 
-def failures(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled) -> list[str]:
+def failures(
+    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled
+) -> list[str]:
     """What of the numbers misses its tolerance, in words."""
     asked = setting.tolerance
     above = [
@@ -75,9 +97,14 @@ def failures(axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], sett
 
 
 def tables(
-    axial: Mapping[str, Axial], scenes: Mapping[str, SceneEnergy], setting: Filled, *, spread: Sequence[str] = ()
+    axial: Mapping[str, Axial],
+    scenes: Mapping[str, SceneEnergy],
+    setting: Filled,
+    *,
+    spread: Sequence[str] = (),
 ) -> list[Table]:
-    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the paper's numbers below each;
+    """Table 3 (with the field's centre, binnings and encircled energy) and Table 1, the
+    paper's numbers below each;
     spread: what is said of lenses that do not focus, a line each."""
     return [_axial(axial, setting, spread), _scenes(scenes)]
 
@@ -87,15 +114,31 @@ def _axial(axial: Mapping[str, Axial], setting: Filled, spread: Sequence[str]) -
     caption = (
         f"Axial information I(z) of Eq. 11 per mm², mean over {low:g}–{high:g} mm, {setting.normalisation} "
         f"normalisation, averaged over sub-pixel positions; pixels of {setting.pixel_um:g} µm. Light: the least share "
-        f"within {setting.radius_um:g} µm over the depths." + "".join(f"\n{line}." for line in spread)
+        f"within {setting.radius_um:g} µm over the depths."
+        + "".join(f"\n{line}." for line in spread)
     )
-    head = ("lens", "binning", *(f"{angle:g}°" for angle in setting.angles_deg), "light on axis", "light at all angles")
+    head = (
+        "lens",
+        "binning",
+        *(f"{angle:g}°" for angle in setting.angles_deg),
+        "light on axis",
+        "light at all angles",
+    )
     rows: list[tuple[str, ...]] = []
     for name, found in axial.items():
         for k, b in enumerate(setting.binnings):
             told = [f"{float(v):.3g}" for v in found.information[:, k].mean(-1)]
-            least = [f"{float(found.encircled[0].min()):.2f}", f"{float(found.encircled.min()):.2f}"] if k == 0 else []
-            rows.append((name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""])))
+            least = (
+                [
+                    f"{float(found.encircled[0].min()):.2f}",
+                    f"{float(found.encircled.min()):.2f}",
+                ]
+                if k == 0
+                else []
+            )
+            rows.append(
+                (name if k == 0 else "", f"{b} × {b}", *told, *(least or ["", ""]))
+            )
     for name, numbers in PAPER_AXIAL.items():
         known = dict(zip(PAPER_ANGLES, numbers, strict=True))
         told = [f"{known[a]:.2f}" if a in known else "–" for a in setting.angles_deg]
@@ -105,14 +148,33 @@ def _axial(axial: Mapping[str, Axial], setting: Filled, spread: Sequence[str]) -
 
 def _scenes(scenes: Mapping[str, SceneEnergy]) -> Table:
     first = next(iter(scenes))
-    caption = (
-        f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
-    )
+    caption = f"Energy-matched images of {len(scenes[first].gaze)} scenes: ratio to {first}, 95 % interval over the scenes."
     rows: list[tuple[str, ...]] = []
     for name, found in ratios(scenes).items():
         one = scenes[name]
-        parts = [f"{value:.2f} [{low:.2f}, {high:.2f}]" for value, low, high in found.values()]
+        parts = [
+            f"{value:.2f} [{low:.2f}, {high:.2f}]"
+            for value, low, high in found.values()
+        ]
         angle = float(torch.rad2deg(one.angle_rad).mean())
-        rows.append((name, *parts, f"{angle:.1f}°", f"{one.light:.2f}", f"{one.image_error:.3f}"))
-    rows.append(("paper: proposed", *(f"{PAPER_SCENES[kind]:.2f}" for kind in KINDS), "–", "–", "–"))
-    return Table(("lens", *KINDS, "span angle", "light in window", "image error"), rows, caption)
+        rows.append(
+            (
+                name,
+                *parts,
+                f"{angle:.1f}°",
+                f"{one.light:.2f}",
+                f"{one.image_error:.3f}",
+            )
+        )
+    rows.append(
+        (
+            "paper: proposed",
+            *(f"{PAPER_SCENES[kind]:.2f}" for kind in KINDS),
+            "–",
+            "–",
+            "–",
+        )
+    )
+    return Table(
+        ("lens", *KINDS, "span angle", "light in window", "image error"), rows, caption
+    )

@@ -1,4 +1,6 @@
-"""Sets of states: triplets for the Fisher matrix, pairs that share a pupil position, and shards of frames on disk."""
+"""Sets of states: triplets for the Fisher matrix, pairs that share a pupil position,
+and shards of frames on disk.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,16 +21,25 @@ from metalens.image import Frames
 
 
 def states_at(indices: Tensor, seed: int, *, motion: Motion | None = None) -> States:
-    """State number i of the endless set of a seed: the same whoever asks for it, alone or among others."""
+    """State number i of the endless set of a seed: the same whoever asks for it, alone
+    or among others.
+    """
     parts = [eye.draw(1, (seed, int(i)), motion=motion) for i in indices]
-    return States(*(torch.cat([getattr(part, name) for part in parts]) for name in States.__slots__))
+    return States(
+        *(
+            torch.cat([getattr(part, name) for part in parts])
+            for name in States.__slots__
+        )
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Triplets:
-    """Anchor, gaze+ and slip+ renderings of the same subjects (paper Sec. 3.6), and the steps between them.
+    """Anchor, gaze+ and slip+ renderings of the same subjects (paper Sec. 3.6), and the
+    steps between them.
 
-    gaze_step_rad, slip_step_um: the steps taken, along the motions that ``directions`` names.
+    gaze_step_rad, slip_step_um: the steps taken, along the motions that ``directions``
+    names.
     """
 
     anchor: Rendered
@@ -51,26 +62,53 @@ def triplets(
     """Finite-difference triplets in the linear regime, at one exposure.
 
     Accuracy:
-        Divided by the default steps, the differences agree with the exact derivatives to 2 % (gaze) and 8 % (slip),
-        with an error in proportion to the step: lashes and lid edges are a few tens of um wide. At half a degree,
+        Divided by the default steps, the differences agree with the exact derivatives
+        to 2 % (gaze) and 8 % (slip),
+        with an error in proportion to the step: lashes and lid edges are a few tens of
+        um wide. At half a degree,
         where edges move by pixels, they are wrong by 40 % and more.
     """
-    kinds = {"gaze_x": (0, 0), "gaze_y": (0, 1), "slip_x": (1, 0), "slip_y": (1, 1), "slip_z": (1, 2)}
-    if directions[0] not in ("gaze_x", "gaze_y") or directions[1] not in ("slip_x", "slip_y", "slip_z"):
-        raise SceneError(f"directions {directions}: need a gaze and a slip, of {', '.join(kinds)}")
-    turn, move = torch.zeros(2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    kinds = {
+        "gaze_x": (0, 0),
+        "gaze_y": (0, 1),
+        "slip_x": (1, 0),
+        "slip_y": (1, 1),
+        "slip_z": (1, 2),
+    }
+    if directions[0] not in ("gaze_x", "gaze_y") or directions[1] not in (
+        "slip_x",
+        "slip_y",
+        "slip_z",
+    ):
+        raise SceneError(
+            f"directions {directions}: need a gaze and a slip, of {', '.join(kinds)}"
+        )
+    turn, move = (
+        torch.zeros(2, dtype=torch.float64),
+        torch.zeros(3, dtype=torch.float64),
+    )
     turn[kinds[directions[0]][1]] = gaze_step_rad
     move[kinds[directions[1]][1]] = slip_step_um
-    turned, moved = replace(states, gaze_rad=states.gaze_rad + turn), replace(states, slip_um=states.slip_um + move)
-    views = [render(s, rig=rig, camera=camera, exposed=states) for s in (states, turned, moved)]
-    return Triplets(views[0], views[1], views[2], gaze_step_rad, slip_step_um, directions)
+    turned, moved = (
+        replace(states, gaze_rad=states.gaze_rad + turn),
+        replace(states, slip_um=states.slip_um + move),
+    )
+    views = [
+        render(s, rig=rig, camera=camera, exposed=states)
+        for s in (states, turned, moved)
+    ]
+    return Triplets(
+        views[0], views[1], views[2], gaze_step_rad, slip_step_um, directions
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ambiguity:
-    """Pairs of states of one subject whose pupil centroids coincide on the sensor (paper Sec. 3.6).
+    """Pairs of states of one subject whose pupil centroids coincide on the sensor
+    (paper Sec. 3.6).
 
-    first, second: the states. distance_px: (n,) between the centroids of their rendered pupil masks.
+    first, second: the states. distance_px: (n,) between the centroids of their rendered
+    pupil masks.
     tried: pairs that were looked at to find these.
     """
 
@@ -90,10 +128,13 @@ def ambiguity_pairs(
     tolerance_px: float = 0.1,
     least_slip_um: float = 800.0,
 ) -> Ambiguity:
-    """Pairs of distinct slip and gaze whose visible pupil has the same centroid within ``tolerance_px``.
+    """Pairs of distinct slip and gaze whose visible pupil has the same centroid within
+    ``tolerance_px``.
 
-    The second state takes a new slip; its gaze is then solved, on the rendered masks, so that the centroid returns.
-    Pairs that need a gaze outside the range, or whose pupil is cut by lid or frame, are left out.
+    The second state takes a new slip; its gaze is then solved, on the rendered masks,
+    so that the centroid returns.
+    Pairs that need a gaze outside the range, or whose pupil is cut by lid or frame, are
+    left out.
 
     Raises:
         SceneError: fewer than one pair in fifty is possible in these ranges.
@@ -103,26 +144,37 @@ def ambiguity_pairs(
     found = tried = 0
     while found < count:
         if tried > 50 * max(found, 64):
-            raise SceneError(f"{found} pairs in {tried} tries: widen the gaze range or narrow the slip range")
+            raise SceneError(
+                f"{found} pairs in {tried} tries: widen the gaze range or narrow the slip range"
+            )
         batch = max(32, count - found)
-        first, second = (eye.draw(batch, (seed, tried, part), motion=motion) for part in (0, 1))
+        first, second = (
+            eye.draw(batch, (seed, tried, part), motion=motion) for part in (0, 1)
+        )
         tried += batch
         second = replace(first, slip_um=second.slip_um)
-        second, distance, good = _returned(first, second, rig=rig, camera=camera, tolerance_px=tolerance_px)
+        second, distance, good = _returned(
+            first, second, rig=rig, camera=camera, tolerance_px=tolerance_px
+        )
         limits = torch.tensor([motion.gaze_x_rad, motion.gaze_y_rad])
         good &= (second.gaze_rad.abs() <= limits).all(1)
         good &= (second.slip_um - first.slip_um).norm(dim=1) >= least_slip_um
         rows = torch.nonzero(good)[: count - found, 0]
         kept.append((first[rows], second[rows], distance[rows]))
         found += len(rows)
-    joined = [States(*(torch.cat([getattr(k[i], n) for k in kept]) for n in States.__slots__)) for i in (0, 1)]
+    joined = [
+        States(*(torch.cat([getattr(k[i], n) for k in kept]) for n in States.__slots__))
+        for i in (0, 1)
+    ]
     return Ambiguity(joined[0], joined[1], torch.cat([k[2] for k in kept]), tried)
 
 
 def _returned(
     first: States, second: States, *, rig: Rig, camera: Camera, tolerance_px: float
 ) -> tuple[States, Tensor, Tensor]:
-    """``second`` with the gaze that brings its centroid to that of ``first``: Newton steps on rendered masks."""
+    """``second`` with the gaze that brings its centroid to that of ``first``: Newton
+    steps on rendered masks.
+    """
     goal = render(first, rig=rig, camera=camera).labels
     gaze, step = second.gaze_rad, 2e-3
     slopes = torch.stack(
@@ -137,26 +189,39 @@ def _returned(
         2,
     )
     det = slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]
-    slopes = slopes + torch.where(det.abs() < 1.0, 1e3, 0.0)[:, None, None] * torch.eye(2, dtype=torch.float64)
+    slopes = slopes + torch.where(det.abs() < 1.0, 1e3, 0.0)[:, None, None] * torch.eye(
+        2, dtype=torch.float64
+    )
     for _ in range(6):
         here, visible = _centroids(second, gaze, rig, camera)
         miss = goal.centroid_px - here
         if bool((miss.norm(dim=1) < 0.3 * tolerance_px).all()):
             break
-        gaze = gaze + torch.linalg.solve(slopes, miss[..., None])[..., 0].clamp(-0.25, 0.25)
+        gaze = gaze + torch.linalg.solve(slopes, miss[..., None])[..., 0].clamp(
+            -0.25, 0.25
+        )
     here, visible = _centroids(second, gaze, rig, camera)
     distance = (goal.centroid_px - here).norm(dim=1)
     good = (distance <= tolerance_px) & (visible > 0.97) & (goal.visible > 0.97)
     return replace(second, gaze_rad=gaze), distance, good
 
 
-def _centroids(states: States, gaze_rad: Tensor, rig: Rig, camera: Camera) -> tuple[Tensor, Tensor]:
+def _centroids(
+    states: States, gaze_rad: Tensor, rig: Rig, camera: Camera
+) -> tuple[Tensor, Tensor]:
     labels = render(replace(states, gaze_rad=gaze_rad), rig=rig, camera=camera).labels
     return labels.centroid_px, labels.visible
 
 
-def write_shard(path: str | Path, rendered: Rendered, *, seed: int, provenance: Provenance | None = None) -> None:
-    """One HDF5 file (kind ``scene``) of frames, masks and labels: light and coverage in 8 bits, depth in um.
+def write_shard(
+    path: str | Path,
+    rendered: Rendered,
+    *,
+    seed: int,
+    provenance: Provenance | None = None,
+) -> None:
+    """One HDF5 file (kind ``scene``) of frames, masks and labels: light and coverage in
+    8 bits, depth in um.
 
     Accuracy: light to 1/510, coverage to 1/510, depth to 1 um (16 bits up to 65 mm).
     """
@@ -167,8 +232,13 @@ def write_shard(path: str | Path, rendered: Rendered, *, seed: int, provenance: 
         "depth_um": f.depth_um.clamp(0, 65535).round().numpy().astype(np.uint16),
         "pupil": _bytes(rendered.pupil),
     }
-    arrays |= {f"labels/{name}": getattr(labels, name).numpy() for name in type(labels).__slots__}
-    store.save(path, "scene", arrays, provenance=replace(provenance or Provenance(), seed=seed))
+    arrays |= {
+        f"labels/{name}": getattr(labels, name).numpy()
+        for name in type(labels).__slots__
+    }
+    store.save(
+        path, "scene", arrays, provenance=replace(provenance or Provenance(), seed=seed)
+    )
 
 
 @reader
@@ -182,7 +252,11 @@ def read_shard(path: str | Path) -> tuple[Frames, Tensor, dict[str, Tensor]]:
     eye_share = torch.from_numpy(arrays["coverage"]).float() / 255
     radiance = torch.from_numpy(arrays["radiance"]).float() / 255
     depth = torch.from_numpy(arrays["depth_um"].astype(np.float32))
-    labels = {name[7:]: torch.from_numpy(a) for name, a in arrays.items() if name.startswith("labels/")}
+    labels = {
+        name[7:]: torch.from_numpy(a)
+        for name, a in arrays.items()
+        if name.startswith("labels/")
+    }
     frames = Frames(radiance, torch.stack([1 - eye_share, eye_share], 1), depth)
     return frames, torch.from_numpy(arrays["pupil"]).float() / 255, labels
 

@@ -1,11 +1,17 @@
-"""The scene model compiled: float32 for frames, dual numbers of two tangents for exact derivatives.
+"""The scene model compiled: float32 for frames, dual numbers of two tangents for exact
+derivatives.
 
-The source of :mod:`codesign.eye.model` is compiled twice by numba, with two sets of elementary functions. Pixels are
-shaded in tiles, in passes over all lanes of a tile; a pass that no pixel of the tile needs is left out.
+The source of :mod:`codesign.eye.model` is compiled twice by numba, with two sets of
+elementary functions. Pixels are
+shaded in tiles, in passes over all lanes of a tile; a pass that no pixel of the tile
+needs is left out.
 
-All passes are put into the one function that loops over tiles. A function that is called is optimised by itself, and
-once more inside the library of its caller; a process that has just compiled them runs the first, one that takes them
-from the cache the second, and with sums in any order (``fastmath``) these round otherwise.
+All passes are put into the one function that loops over tiles. A function that is
+called is optimised by itself, and
+once more inside the library of its caller; a process that has just compiled them runs
+the first, one that takes them
+from the cache the second, and with sums in any order (``fastmath``) these round
+otherwise.
 """
 
 import inspect
@@ -25,7 +31,10 @@ from metalens.ground import threads
 from metalens.ground.arrays import Array
 
 COLUMNS = 16  # of a tile: a vector register of float32, or two
-ROWS, DUAL_ROWS = 4, 2  # of a tile: independent work for a processor's pipelines, within its nearest cache
+ROWS, DUAL_ROWS = (
+    4,
+    2,
+)  # of a tile: independent work for a processor's pipelines, within its nearest cache
 SAMPLES = 4  # texture samples in a pass, at most
 
 # what a tile holds, in this order, and the assignments between these names
@@ -34,7 +43,10 @@ NAMES = (
     "tc", "cx", "cy", "cz", "inside", "seen", "bare", "front", "near", "disc", "pupil", "brown", "virtual", "r",
     "white", "far", "back", "hole", *(f"{axis} of sample {k}" for k in range(SAMPLES) for axis in "uv"),
 )  # fmt: skip
-FIRST_SHADED, LAST_SHADED = "near", "u of sample 0"  # from the first to before the last: 0 where nothing shades
+FIRST_SHADED, LAST_SHADED = (
+    "near",
+    "u of sample 0",
+)  # from the first to before the last: 0 where nothing shades
 FACE = """
 dx, dy, dz = ray(u, w)
 s, seen, gx, gy, upper, lower, nx, ny, nz = lids(p, dx, dy, dz)
@@ -57,8 +69,10 @@ back, hole = (ts + disc * (tc + virtual - ts)) * dz, pupil * seen
 class _Tile:
     """The shading of a tile, compiled on some operations.
 
-    lanes: pixels in a tile. at: first lane of every name. size: lanes of all names. words: integers of the samples.
-    shade: function of parameters, textures, tile and words; finds all that follows from the rays in the tile.
+    lanes: pixels in a tile. at: first lane of every name. size: lanes of all names.
+    words: integers of the samples.
+    shade: function of parameters, textures, tile and words; finds all that follows from
+    the rays in the tile.
     """
 
     lanes: int
@@ -68,7 +82,9 @@ class _Tile:
     shade: Any
 
 
-def _tile(operations: Callable[[int], render_lanes.Operations], rows: int, *, dual: bool) -> _Tile:
+def _tile(
+    operations: Callable[[int], render_lanes.Operations], rows: int, *, dual: bool
+) -> _Tile:
     lanes = rows * COLUMNS
     width = (3 if dual else 1) * lanes
     at = {name: k * width for k, name in enumerate(NAMES)}
@@ -80,13 +96,17 @@ def _tile(operations: Callable[[int], render_lanes.Operations], rows: int, *, du
         text = render_inline.loops(source, at, lanes=lanes, dual=dual)
         exec(compile(text, "<pass of the scene model>", "exec"), scope)
         passes.append(inside(scope["run"]))
-    return _Tile(lanes, at, len(NAMES) * width, 2 * SAMPLES * lanes, _shading(passes, at, lanes))
+    return _Tile(
+        lanes, at, len(NAMES) * width, 2 * SAMPLES * lanes, _shading(passes, at, lanes)
+    )
 
 
 def _shading(passes: list[Any], at: dict[str, int], lanes: int) -> Any:
     """All passes over a tile, each where a pixel needs it; what is left out is 0."""
     face, skin, globe, iris, white, light = passes
-    seen, met, disc, first, last = (at[name] for name in ("seen", "inside", "disc", FIRST_SHADED, LAST_SHADED))
+    seen, met, disc, first, last = (
+        at[name] for name in ("seen", "inside", "disc", FIRST_SHADED, LAST_SHADED)
+    )
 
     @inside  # type: ignore[untyped-decorator]
     def shade(p: Any, t: Any, x: Any, words: Any) -> None:
@@ -124,7 +144,9 @@ def _most(x: Any, at: Any, lanes: Any) -> Any:
 
 @inside  # type: ignore[untyped-decorator]
 def _aim(u: Any, w: Any, row: Any, column: Any, x: Any, width: Any, rows: Any) -> None:
-    """Tangents of the rays of a tile; lanes beyond the frame repeat its last row and column."""
+    """Tangents of the rays of a tile; lanes beyond the frame repeat its last row and
+    column.
+    """
     for j in range(rows):
         y = w[min(row + j, len(w) - 1)]
         for i in range(COLUMNS):
@@ -133,8 +155,12 @@ def _aim(u: Any, w: Any, row: Any, column: Any, x: Any, width: Any, rows: Any) -
 
 
 @inside  # type: ignore[untyped-decorator]
-def _put(x: Any, at: Any, rows: Any, out: Any, n: Any, k: Any, row: Any, column: Any) -> None:
-    """Copy the part of a tile's lanes that lies in the frame to plane (n, k) of ``out``."""
+def _put(
+    x: Any, at: Any, rows: Any, out: Any, n: Any, k: Any, row: Any, column: Any
+) -> None:
+    """Copy the part of a tile's lanes that lies in the frame to plane (n, k) of
+    ``out``.
+    """
     for j in range(min(rows, out.shape[2] - row)):
         if column + COLUMNS <= out.shape[3]:
             for i in range(COLUMNS):
@@ -146,16 +172,20 @@ def _put(x: Any, at: Any, rows: Any, out: Any, n: Any, k: Any, row: Any, column:
 
 _PLAIN = _tile(render_lanes.plain, ROWS, dual=False)
 _DUAL = _tile(render_lanes.dual, DUAL_ROWS, dual=True)
-# globals: a compiled function that a loop closes over enters the key of numba's cache by a name that is never the same
+# globals: a compiled function that a loop closes over enters the key of numba's cache
+# by a name that is never the same
 _shade, _shade_dual = _PLAIN.shade, _DUAL.shade
 
 
 def _frames(stamp: int) -> Any:
-    """The loop over tiles; ``stamp`` of the sources enters the key of numba's cache on disk."""
+    """The loop over tiles; ``stamp`` of the sources enters the key of numba's cache on
+    disk.
+    """
     tile = _PLAIN
     size, count, lanes = tile.size, tile.words, tile.lanes
     seen, bare, front, near, far, back, hole = (
-        tile.at[name] for name in ("seen", "bare", "front", "near", "far", "back", "hole")
+        tile.at[name]
+        for name in ("seen", "bare", "front", "near", "far", "back", "hole")
     )
 
     @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
@@ -163,7 +193,9 @@ def _frames(stamp: int) -> Any:
         first: int, end: int, parameters: Array, scale: Array, bank: Array, u: Array, w: Array,
         light: Array, cover: Array, depth: Array, pupil: Array,
     ) -> None:  # fmt: skip
-        """Strips of frames from the first to before the end; see :func:`render`. What is hidden is not shaded."""
+        """Strips of frames from the first to before the end; see :func:`render`. What
+        is hidden is not shaded.
+        """
         if stamp == 0:
             return
         strips = (len(w) + ROWS - 1) // ROWS
@@ -190,10 +222,20 @@ def _frames(stamp: int) -> Any:
 def _tangents(stamp: int) -> Any:
     tile = _DUAL
     size, count, lanes = tile.size, tile.words, tile.lanes
-    near, far, seen, front, back = (tile.at[name] for name in ("near", "far", "seen", "front", "back"))
+    near, far, seen, front, back = (
+        tile.at[name] for name in ("near", "far", "seen", "front", "back")
+    )
 
     @numba.njit(nogil=True, cache=True, **SETTINGS)  # type: ignore[untyped-decorator]
-    def tangents(first: int, end: int, parameters: Array, bank: Array, u: Array, w: Array, out: Array) -> None:
+    def tangents(
+        first: int,
+        end: int,
+        parameters: Array,
+        bank: Array,
+        u: Array,
+        w: Array,
+        out: Array,
+    ) -> None:
         """Strips of frames from the first to before the end; see :func:`differentiate`."""
         if stamp == 0:
             return
@@ -208,13 +250,17 @@ def _tangents(stamp: int) -> Any:
                     _put(x, near + k * lanes, DUAL_ROWS, out, n, 5 * k, row, column)
                     _put(x, far + k * lanes, DUAL_ROWS, out, n, 5 * k + 1, row, column)
                     _put(x, seen + k * lanes, DUAL_ROWS, out, n, 5 * k + 2, row, column)
-                    _put(x, front + k * lanes, DUAL_ROWS, out, n, 5 * k + 3, row, column)
+                    _put(
+                        x, front + k * lanes, DUAL_ROWS, out, n, 5 * k + 3, row, column
+                    )
                     _put(x, back + k * lanes, DUAL_ROWS, out, n, 5 * k + 4, row, column)
 
     return tangents
 
 
-_stamp = 1 + zlib.crc32("".join(map(inspect.getsource, (model, render_inline, render_lanes))).encode())
+_stamp = 1 + zlib.crc32(
+    "".join(map(inspect.getsource, (model, render_inline, render_lanes))).encode()
+)
 frames, tangents = _frames(_stamp), _tangents(_stamp)
 
 
@@ -222,19 +268,31 @@ def render(
     parameters: Array, scale: Array, bank: Array, u: Array, w: Array, light: Array, cover: Array, depth: Array,
     pupil: Array,
 ) -> None:  # fmt: skip
-    """Render frames: parameters (n, COUNT), scale (n,) of the depths, tangents u (x,), w (y,).
+    """Render frames: parameters (n, COUNT), scale (n,) of the depths, tangents u (x,),
+    w (y,).
 
-    Fills light, cover, depth (n, 2, y, x) and pupil (n, 1, y, x). Sheet 0 is skin, sheet 1 the eye; light is
+    Fills light, cover, depth (n, 2, y, x) and pupil (n, 1, y, x). Sheet 0 is skin,
+    sheet 1 the eye; light is
     multiplied by the coverage.
     """
     rest = (parameters, scale, bank, u, w, light, cover, depth, pupil)
-    threads.split(len(parameters) * -(-len(w) // ROWS), lambda first, end: frames(first, end, *rest))
+    threads.split(
+        len(parameters) * -(-len(w) // ROWS),
+        lambda first, end: frames(first, end, *rest),
+    )
 
 
-def differentiate(parameters: Array, bank: Array, u: Array, w: Array, out: Array) -> None:
-    """Frames and two directional derivatives: parameters (n, 3, COUNT) hold values and two tangents.
+def differentiate(
+    parameters: Array, bank: Array, u: Array, w: Array, out: Array
+) -> None:
+    """Frames and two directional derivatives: parameters (n, 3, COUNT) hold values and
+    two tangents.
 
-    Fills out (n, 3 * 5, y, x): light of skin and eye, coverage of the eye, depth of skin and eye; their tangents.
+    Fills out (n, 3 * 5, y, x): light of skin and eye, coverage of the eye, depth of
+    skin and eye; their tangents.
     """
     rest = (parameters, bank, u, w, out)
-    threads.split(len(parameters) * -(-len(w) // DUAL_ROWS), lambda first, end: tangents(first, end, *rest))
+    threads.split(
+        len(parameters) * -(-len(w) // DUAL_ROWS),
+        lambda first, end: tangents(first, end, *rest),
+    )

@@ -1,4 +1,6 @@
-"""Where points of the eye and face land in the image: canthi, lid margins, limbus, and the pupil through the cornea."""
+"""Where points of the eye and face land in the image: canthi, lid margins, limbus, and
+the pupil through the cornea.
+"""
 
 import torch
 from torch import Tensor
@@ -10,7 +12,8 @@ NAMES = (
     "limbus right", "limbus down", "limbus left", "limbus up", "corneal apex",
 )  # fmt: skip
 SETTLED_UM = 1e-6  # from the wanted point on the iris: 1e-9 of a tangent
-NEAREST_UM = 500.0  # points closer than this, or behind the camera, are projected as if they were this far
+# points closer than this, or behind the camera, are projected as if they were this far
+NEAREST_UM = 500.0
 
 
 def project(points_um: Tensor) -> Tensor:
@@ -19,7 +22,9 @@ def project(points_um: Tensor) -> Tensor:
 
 
 def landmark_points(p: Tensor) -> Tensor:
-    """(n, len(NAMES), 2) tangents of the landmarks of frames with parameters ``p`` (n, COUNT)."""
+    """(n, len(NAMES), 2) tangents of the landmarks of frames with parameters ``p`` (n,
+    COUNT).
+    """
     centre, axis, across, below, right, down, out = (
         p[:, k : k + 3]
         for k in (
@@ -43,27 +48,39 @@ def landmark_points(p: Tensor) -> Tensor:
     ring, radius = v[:, model.LIMBUS_D], v[:, model.LIMBUS_R]
     points = [on_lid(middle - half, zero), on_lid(middle + half, zero)]
     points += [on_lid(middle, -v[:, model.UPPER]), on_lid(middle, v[:, model.LOWER])]
-    points += [centre + ring * axis + radius * way for way in (across, below, -across, -below)]
+    points += [
+        centre + ring * axis + radius * way for way in (across, below, -across, -below)
+    ]
     points.append(centre + (v[:, model.CORNEA_D] + v[:, model.CORNEA_R]) * axis)
     return project(torch.stack(points, 1))
 
 
 def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
-    """Tangents of the rays that reach points of the iris plane after refraction, by a damped Newton iteration.
+    """Tangents of the rays that reach points of the iris plane after refraction, by a
+    damped Newton iteration.
 
     Args:
         p: (n, COUNT) parameters.
         iris_um: (n, m, 2) points in the plane of the iris.
 
     Returns:
-        (n, m, 2) tangents; 1e-9 accurate where the cornea shows the point. For an eye that is turned away from the
-        camera, the straight projection where the iteration does not converge: always finite.
+        (n, m, 2) tangents; 1e-9 accurate where the cornea shows the point. For an eye
+        that is turned away from the
+        camera, the straight projection where the iteration does not converge: always
+        finite.
     """
     centre, axis, across, below = (
-        p[:, None, k : k + 3] for k in (model.CENTRE, model.AXIS, model.IRIS_X, model.IRIS_Y)
+        p[:, None, k : k + 3]
+        for k in (model.CENTRE, model.AXIS, model.IRIS_X, model.IRIS_Y)
     )
-    lift = p[:, None, model.PUPIL_D, None] + 550.0  # entrance pupil: the pupil seems nearer by 0.55 mm, 13 % larger
-    straight = project(centre + lift * axis + 1.13 * (iris_um[..., :1] * across + iris_um[..., 1:] * below))
+    lift = (
+        p[:, None, model.PUPIL_D, None] + 550.0
+    )  # entrance pupil: the pupil seems nearer by 0.55 mm, 13 % larger
+    straight = project(
+        centre
+        + lift * axis
+        + 1.13 * (iris_um[..., :1] * across + iris_um[..., 1:] * below)
+    )
     q = p.mT[:, :, None]
 
     def land(t: Tensor) -> Tensor:
@@ -73,7 +90,9 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         return torch.stack([x, y], -1)
 
     t, h = straight, 1e-6
-    around = h * torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=t.dtype)
+    around = h * torch.tensor(
+        [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=t.dtype
+    )
     for _ in range(steps):
         here, right, left, down, up = land(t + around[:, None, None])
         miss = here - iris_um
@@ -85,5 +104,7 @@ def iris_to_camera(p: Tensor, iris_um: Tensor, *, steps: int = 12) -> Tensor:
         dx = (along_y[..., 1] * miss[..., 0] - along_y[..., 0] * miss[..., 1]) / det
         dy = (along_x[..., 0] * miss[..., 1] - along_x[..., 1] * miss[..., 0]) / det
         t = t - torch.stack([dx, dy], -1).clamp(-0.05, 0.05)
-    good = ((land(t) - iris_um).norm(dim=-1, keepdim=True) < 1.0) & ((t - straight).norm(dim=-1, keepdim=True) < 0.3)
+    good = ((land(t) - iris_um).norm(dim=-1, keepdim=True) < 1.0) & (
+        (t - straight).norm(dim=-1, keepdim=True) < 0.3
+    )
     return torch.where(good, t, straight)

@@ -1,6 +1,8 @@
-"""The arithmetic of the scene model in compiled kernels: on float32, and on dual numbers (value, tangent, tangent).
+"""The arithmetic of the scene model in compiled kernels: on float32, and on dual
+numbers (value, tangent, tangent).
 
-A tile ``x`` is a flat array of float32 lanes; ``words`` are the integers of its texture samples. Dual numbers take
+A tile ``x`` is a flat array of float32 lanes; ``words`` are the integers of its texture
+samples. Dual numbers take
 three runs of lanes: their values, then both tangents.
 """
 
@@ -21,9 +23,11 @@ Operations = dict[str, Callable[..., Any]]
 
 @inside  # type: ignore[untyped-decorator]
 def locate(index: Any, u: Any, v: Any, words: Any, to: Any, lanes: Any) -> Any:
-    """Leave the places of the pairs of texture pixels above and below (u, v), and return the parts of a pixel.
+    """Leave the places of the pairs of texture pixels above and below (u, v), and
+    return the parts of a pixel.
 
-    Textures repeat; their size is a power of two. The casts keep numba from widening to 64 bits.
+    Textures repeat; their size is a power of two. The casts keep numba from widening to
+    64 bits.
     """
     first, last = i32(index) * i32(SIZE * SIZE), i32(SIZE - 1)
     fu, fv = np.floor(u), np.floor(v)
@@ -50,7 +54,11 @@ def blend(s: Any, t: Any, top: Any, bottom: Any) -> Any:
     ds, dt = f32(6) * s * (f32(1) - s) * k, f32(6) * t * (f32(1) - t) * k
     s, t = s * s * (f32(3) - f32(2) * s), t * t * (f32(3) - f32(2) * t)
     above, below = a + (b - a) * s, c + (d - c) * s
-    return (above + (below - above) * t) * k, ds * ((b - a) + ((d - c) - (b - a)) * t), dt * (below - above)
+    return (
+        (above + (below - above) * t) * k,
+        ds * ((b - a) + ((d - c) - (b - a)) * t),
+        dt * (below - above),
+    )
 
 
 @inside  # type: ignore[untyped-decorator]
@@ -66,7 +74,9 @@ def plain(lanes: int) -> Operations:
     def store(value: Any, x: Any, at: Any) -> None:
         x[at] = value
 
-    def placed(index: Any, u: Any, v: Any, x: Any, at: Any, words: Any, to: Any) -> None:
+    def placed(
+        index: Any, u: Any, v: Any, x: Any, at: Any, words: Any, to: Any
+    ) -> None:
         x[at], x[at + lanes] = locate(index, u, v, words, to, lanes)
 
     def sampled(x: Any, at: Any, words: Any, to: Any) -> Any:
@@ -116,20 +126,29 @@ def dual(lanes: int) -> Operations:
     def store(value: Any, x: Any, at: Any) -> None:
         x[at], x[at + lanes], x[at + two] = value
 
-    def placed(index: Any, u: Any, v: Any, x: Any, at: Any, words: Any, to: Any) -> None:
+    def placed(
+        index: Any, u: Any, v: Any, x: Any, at: Any, words: Any, to: Any
+    ) -> None:
         x[at], x[at + three] = locate(index[0], u[0], v[0], words, to, lanes)
         x[at + lanes], x[at + two] = u[1], u[2]
         x[at + four], x[at + five] = v[1], v[2]
 
     def sampled(x: Any, at: Any, words: Any, to: Any) -> Any:
         value, du, dv = blend(x[at], x[at + three], words[to], words[to + lanes])
-        first, second = du * x[at + lanes] + dv * x[at + four], du * x[at + two] + dv * x[at + five]
+        first, second = (
+            du * x[at + lanes] + dv * x[at + four],
+            du * x[at + two] + dv * x[at + five],
+        )
         return (value, first, second)
 
     return {
         "add": lambda a, b: (a[0] + b[0], a[1] + b[1], a[2] + b[2]),
         "sub": lambda a, b: (a[0] - b[0], a[1] - b[1], a[2] - b[2]),
-        "mul": lambda a, b: (a[0] * b[0], a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0]),
+        "mul": lambda a, b: (
+            a[0] * b[0],
+            a[0] * b[1] + a[1] * b[0],
+            a[0] * b[2] + a[2] * b[0],
+        ),
         "div": div,
         "neg": lambda a: (-a[0], -a[1], -a[2]),
         "number": lambda value: (f32(value), f32(0), f32(0)),

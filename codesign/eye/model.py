@@ -1,8 +1,12 @@
-"""What a pixel sees: lids, skin and eye in front of a pinhole, as plain arithmetic on single rays.
+"""What a pixel sees: lids, skin and eye in front of a pinhole, as plain arithmetic on
+single rays.
 
-Written once, for torch tensors (the float64 twin: exact derivatives) and, through :mod:`codesign.eye.kernel`, for
-compiled scalars and dual numbers. So: assignments and returns only, no branches, operators + - * / and the functions
-of :mod:`codesign.eye.ops`. Lengths um; camera at the origin looking along +z, x right, y down; ``p`` holds the
+Written once, for torch tensors (the float64 twin: exact derivatives) and, through
+:mod:`codesign.eye.kernel`, for
+compiled scalars and dual numbers. So: assignments and returns only, no branches,
+operators + - * / and the functions
+of :mod:`codesign.eye.ops`. Lengths um; camera at the origin looking along +z, x right,
+y down; ``p`` holds the
 parameters of a frame at the indices below, ``t`` the bank of textures.
 """
 
@@ -13,12 +17,47 @@ from codesign.eye.ops import above, sqrt, step, tex, unit
 # where each parameter of a frame sits in ``p``; three entries a vector
 CENTRE, FACE_X, FACE_Y, FACE_Z, AXIS, IRIS_X, IRIS_Y, PLANE = 0, 3, 6, 9, 12, 15, 18, 21
 LED, LED_COUNT = 24, 3
-SCLERA_R, CORNEA_R, CORNEA_D, LIMBUS_R, LIMBUS_D, PUPIL_R, PUPIL_D, INDEX, LID_R, BLEND, EDGE = range(33, 44)
+(
+    SCLERA_R,
+    CORNEA_R,
+    CORNEA_D,
+    LIMBUS_R,
+    LIMBUS_D,
+    PUPIL_R,
+    PUPIL_D,
+    INDEX,
+    LID_R,
+    BLEND,
+    EDGE,
+) = range(33, 44)
 UPPER, LOWER, SKEW, MIDDLE, HALF, CREASE = range(44, 50)
-IRIS, IRIS_CONTRAST, SCLERA, VEINS, SKIN, PORES, LASHES, PUPIL, GLINT, AMBIENT, GAIN, BROW = range(50, 62)
-T_IRIS, T_VEIN, T_SKIN, T_FINE, T_LASH, OFFSET_X, OFFSET_Y, TURN_X, TURN_Y, CARUNCLE = range(62, 72)
+(
+    IRIS,
+    IRIS_CONTRAST,
+    SCLERA,
+    VEINS,
+    SKIN,
+    PORES,
+    LASHES,
+    PUPIL,
+    GLINT,
+    AMBIENT,
+    GAIN,
+    BROW,
+) = range(50, 62)
+T_IRIS, T_VEIN, T_SKIN, T_FINE, T_LASH, OFFSET_X, OFFSET_Y, TURN_X, TURN_Y, CARUNCLE = (
+    range(62, 72)
+)
 COUNT = 72
-MOVING = {"CENTRE", "AXIS", "IRIS_X", "IRIS_Y", "PLANE", "UPPER", "LOWER"}  # change with gaze and slip
+MOVING = {
+    "CENTRE",
+    "AXIS",
+    "IRIS_X",
+    "IRIS_Y",
+    "PLANE",
+    "UPPER",
+    "LOWER",
+}  # change with gaze and slip
 
 Real = Any  # a torch tensor, or a compiled scalar or dual number
 
@@ -29,12 +68,16 @@ def ray(u: Real, w: Real) -> tuple[Real, Real, Real]:
     return u * k, w * k, k
 
 
-def lids(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
+def lids(
+    p: Real, dx: Real, dy: Real, dz: Real
+) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
     """Front of the face along a ray: lid shell and face plane in a smooth union.
 
     Returns:
-        distance, openness of the lids (1 where the eye is seen), face coordinates x and y from the eye's centre,
-        gap to the upper and lower lid margin (above 0 inside the opening), and the normal.
+        distance, openness of the lids (1 where the eye is seen), face coordinates x and
+        y from the eye's centre,
+        gap to the upper and lower lid margin (above 0 inside the opening), and the
+        normal.
     """
     b = p[CENTRE] * dx + p[CENTRE + 1] * dy + p[CENTRE + 2] * dz
     ex = p[CENTRE] - b * dx
@@ -42,7 +85,11 @@ def lids(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real,
     ez = p[CENTRE + 2] - b * dz
     shell = b - sqrt(above(p[LID_R] * p[LID_R] - ex * ex - ey * ey - ez * ez, 1e6))
     facing = above(-(dx * p[FACE_Z] + dy * p[FACE_Z + 1] + dz * p[FACE_Z + 2]), 0.05)
-    height = -(p[PLANE] * p[FACE_Z] + p[PLANE + 1] * p[FACE_Z + 1] + p[PLANE + 2] * p[FACE_Z + 2])
+    height = -(
+        p[PLANE] * p[FACE_Z]
+        + p[PLANE + 1] * p[FACE_Z + 1]
+        + p[PLANE + 2] * p[FACE_Z + 2]
+    )
     plane = height / facing
     h = unit(0.5 + 0.5 * (plane - shell) / p[BLEND])
     s = plane + (shell - plane) * h - 0.5 * p[BLEND] * h * (1.0 - h)
@@ -59,7 +106,11 @@ def lids(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real,
     arch = 1.0 - along * along
     upper = gy + arch * (p[UPPER] + p[SKEW] * along)
     lower = arch * (p[LOWER] - p[SKEW] * along) - gy
-    openness = step(upper / p[EDGE]) * step(lower / p[EDGE]) * step((upper + lower) / p[EDGE] - 1.0)
+    openness = (
+        step(upper / p[EDGE])
+        * step(lower / p[EDGE])
+        * step((upper + lower) / p[EDGE] - 1.0)
+    )
     return s, openness, gx, gy, upper, lower, nx * n, ny * n, nz * n
 
 
@@ -75,13 +126,25 @@ def skin(
     rim_up = (upper + 250.0) / 260.0
     rim_low = (lower + 330.0) / 330.0
     albedo = p[SKIN] * (1.0 + p[PORES] * (coarse + 0.7 * fine))
-    albedo = albedo * (1.0 - 0.42 / (1.0 + fold * fold)) * (1.0 - 0.20 / (1.0 + pouch * pouch))
-    albedo = albedo * (1.0 - 0.25 / (1.0 + rim_up * rim_up)) + 0.10 / (1.0 + rim_low * rim_low * rim_low * rim_low)
+    albedo = (
+        albedo
+        * (1.0 - 0.42 / (1.0 + fold * fold))
+        * (1.0 - 0.20 / (1.0 + pouch * pouch))
+    )
+    albedo = albedo * (1.0 - 0.25 / (1.0 + rim_up * rim_up)) + 0.10 / (
+        1.0 + rim_low * rim_low * rim_low * rim_low
+    )
     above_lid = unit(-upper / 3800.0)
     below_lid = unit(-lower / 2600.0)
     hair = tex(t, p[T_LASH], gx * 0.016 + p[OFFSET_X], 255.0 * above_lid)
     short = tex(t, p[T_LASH], gx * 0.011 + p[OFFSET_Y], 255.0 * below_lid)
-    lash = unit(p[LASHES] * (hair * step(above_lid * 20.0 - 1.0) + 0.5 * short * step(below_lid * 8.0 - 1.0)))
+    lash = unit(
+        p[LASHES]
+        * (
+            hair * step(above_lid * 20.0 - 1.0)
+            + 0.5 * short * step(below_lid * 8.0 - 1.0)
+        )
+    )
     band = (gy + 17000.0 + gx * gx / 60000.0) / 2600.0
     brow = unit(p[BROW] * (0.8 + 1.6 * fine) / (1.0 + band * band * band * band))
     albedo = albedo * (1.0 - 0.85 * lash) * (1.0 - 0.75 * brow)
@@ -105,7 +168,8 @@ def globe(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real
 def iris(
     p: Real, t: Real, tc: Real, cx: Real, cy: Real, cz: Real, inside: Real, dx: Real, dy: Real, dz: Real
 ) -> tuple[Real, Real, Real, Real, Real]:  # fmt: skip
-    """Share of iris and of pupil, distance from the axis, albedo, and distance behind the cornea of the virtual image.
+    """Share of iris and of pupil, distance from the axis, albedo, and distance behind
+    the cornea of the virtual image.
 
     Without cornea on the ray (``inside`` 0) both shares are 0.
     """
@@ -119,27 +183,46 @@ def iris(
 
 
 def pigment(p: Real, t: Real, x: Real, y: Real, r: Real) -> Real:
-    """Albedo of the iris at (x, y) in its plane, ``r`` from the axis; the picture stretches with the pupil."""
+    """Albedo of the iris at (x, y) in its plane, ``r`` from the axis; the picture
+    stretches with the pupil.
+    """
     span = unit((r - p[PUPIL_R]) / above(p[LIMBUS_R] - p[PUPIL_R], 300.0))
     place = (40.0 + 84.0 * span) / r
     tu = x * place
     tv = y * place
-    figure = tex(t, p[T_IRIS], 128.0 + p[TURN_X] * tu - p[TURN_Y] * tv, 128.0 + p[TURN_Y] * tu + p[TURN_X] * tv)
+    figure = tex(
+        t,
+        p[T_IRIS],
+        128.0 + p[TURN_X] * tu - p[TURN_Y] * tv,
+        128.0 + p[TURN_Y] * tu + p[TURN_X] * tv,
+    )
     brown = p[IRIS] * (1.0 + p[IRIS_CONTRAST] * figure)
-    return brown * (1.0 - 0.45 * step((span - 0.94) * 9.0)) * (1.0 - 0.35 * step((0.03 - span) * 25.0))
+    return (
+        brown
+        * (1.0 - 0.45 * step((span - 0.94) * 9.0))
+        * (1.0 - 0.35 * step((0.03 - span) * 25.0))
+    )
 
 
 def sclera(
     p: Real, t: Real, gx: Real, gy: Real, lower: Real, mx: Real, my: Real, mz: Real, r: Real, inside: Real
 ) -> Real:  # fmt: skip
-    """Albedo of sclera, vessels, limbal ring, caruncle and tear film; ``r`` is from the axis in the iris plane."""
+    """Albedo of sclera, vessels, limbal ring, caruncle and tear film; ``r`` is from the
+    axis in the iris plane.
+    """
     su = mx * p[IRIS_X] + my * p[IRIS_X + 1] + mz * p[IRIS_X + 2]
     sv = mx * p[IRIS_Y] + my * p[IRIS_Y + 1] + mz * p[IRIS_Y + 2]
     vein = tex(t, p[T_VEIN], su * 190.0 + p[OFFSET_X], sv * 190.0 + p[OFFSET_Y])
     rim = (r - p[LIMBUS_R]) / 1300.0
-    white = p[SCLERA] * (1.0 - p[VEINS] * vein) * (1.0 - 0.25 * inside / (1.0 + rim * rim))
-    flesh = ((gx - p[CARUNCLE]) * (gx - p[CARUNCLE]) + (gy - 500.0) * (gy - 500.0)) / 3.2e6
-    white = white + (0.8 * p[SKIN] * (1.0 + 0.3 * vein) - white) / (1.0 + flesh * flesh * flesh)
+    white = (
+        p[SCLERA] * (1.0 - p[VEINS] * vein) * (1.0 - 0.25 * inside / (1.0 + rim * rim))
+    )
+    flesh = (
+        (gx - p[CARUNCLE]) * (gx - p[CARUNCLE]) + (gy - 500.0) * (gy - 500.0)
+    ) / 3.2e6
+    white = white + (0.8 * p[SKIN] * (1.0 + 0.3 * vein) - white) / (
+        1.0 + flesh * flesh * flesh
+    )
     tear = (lower - 120.0) / 150.0
     return white + 0.12 / (1.0 + tear * tear * tear * tear)
 
@@ -148,24 +231,44 @@ def shade(
     p: Real, white: Real, brown: Real, disc: Real, pupil: Real, inside: Real, upper: Real, lower: Real,
     ts: Real, mx: Real, my: Real, mz: Real, tc: Real, cx: Real, cy: Real, cz: Real, dx: Real, dy: Real, dz: Real,
 ) -> Real:  # fmt: skip
-    """Radiance of the eye from its albedos and shares, under the lamps and below the lids."""
+    """Radiance of the eye from its albedos and shares, under the lamps and below the
+    lids.
+    """
     near = ts + inside * (tc - ts)
     nx = mx + inside * (cx - mx)
     ny = my + inside * (cy - my)
     nz = mz + inside * (cz - mz)
     sharp = 250.0 + 1750.0 * inside
-    outer, inner, shine = wet_lamps(p, near * dx, near * dy, near * dz, nx, ny, nz, dx, dy, dz, sharp)
+    outer, inner, shine = wet_lamps(
+        p, near * dx, near * dy, near * dz, nx, ny, nz, dx, dy, dz, sharp
+    )
     lid = above(upper, 0.0) / 900.0
-    dim = 1.0 - 0.50 / ((1.0 + lid) * (1.0 + lid)) - 0.15 / (1.0 + above(lower, 0.0) / 500.0)
-    lit = white * outer * (1.0 - disc) + disc * (brown * inner * (1.0 - pupil / above(disc, 1e-3)))
+    dim = (
+        1.0
+        - 0.50 / ((1.0 + lid) * (1.0 + lid))
+        - 0.15 / (1.0 + above(lower, 0.0) / 500.0)
+    )
+    lit = white * outer * (1.0 - disc) + disc * (
+        brown * inner * (1.0 - pupil / above(disc, 1e-3))
+    )
     lit = (lit + p[PUPIL] * pupil) * dim
     return (lit + p[GLINT] * shine) * p[GAIN]
 
 
 def eye(
-    p: Real, t: Real, gx: Real, gy: Real, upper: Real, lower: Real, dx: Real, dy: Real, dz: Real
+    p: Real,
+    t: Real,
+    gx: Real,
+    gy: Real,
+    upper: Real,
+    lower: Real,
+    dx: Real,
+    dy: Real,
+    dz: Real,
 ) -> tuple[Real, Real, Real]:
-    """Radiance of the eye along a ray, distance of what is seen (the iris at its virtual image), share of pupil."""
+    """Radiance of the eye along a ray, distance of what is seen (the iris at its
+    virtual image), share of pupil.
+    """
     ts, mx, my, mz = globe(p, dx, dy, dz)
     tc, cx, cy, cz, inside = cornea(p, dx, dy, dz)
     disc, pupil, r, brown, virtual = iris(p, t, tc, cx, cy, cz, inside, dx, dy, dz)
@@ -176,8 +279,12 @@ def eye(
     return light, ts + disc * (tc + virtual - ts), pupil
 
 
-def cornea(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Real, Real]:
-    """Distance and normal where the ray meets the cornea's sphere, and 1 where that is in front of the limbus."""
+def cornea(
+    p: Real, dx: Real, dy: Real, dz: Real
+) -> tuple[Real, Real, Real, Real, Real]:
+    """Distance and normal where the ray meets the cornea's sphere, and 1 where that is
+    in front of the limbus.
+    """
     ox = p[CENTRE] + p[CORNEA_D] * p[AXIS]
     oy = p[CENTRE + 1] + p[CORNEA_D] * p[AXIS + 1]
     oz = p[CENTRE + 2] + p[CORNEA_D] * p[AXIS + 2]
@@ -190,15 +297,23 @@ def cornea(p: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real, Rea
     cx = (tc * dx - ox) / p[CORNEA_R]
     cy = (tc * dy - oy) / p[CORNEA_R]
     cz = (tc * dz - oz) / p[CORNEA_R]
-    forward = (cx * p[AXIS] + cy * p[AXIS + 1] + cz * p[AXIS + 2]) * p[CORNEA_R] + p[CORNEA_D] - p[LIMBUS_D]
+    forward = (
+        (cx * p[AXIS] + cy * p[AXIS + 1] + cz * p[AXIS + 2]) * p[CORNEA_R]
+        + p[CORNEA_D]
+        - p[LIMBUS_D]
+    )
     inside = step(forward / (2.0 * p[EDGE])) * unit(free / 2e5)
     return tc, cx, cy, cz, inside
 
 
-def refract(p: Real, tc: Real, cx: Real, cy: Real, cz: Real, dx: Real, dy: Real, dz: Real) -> tuple[Real, Real, Real]:
-    """Where the refracted ray meets the iris plane, in iris coordinates, and its path inside the eye.
+def refract(
+    p: Real, tc: Real, cx: Real, cy: Real, cz: Real, dx: Real, dy: Real, dz: Real
+) -> tuple[Real, Real, Real]:
+    """Where the refracted ray meets the iris plane, in iris coordinates, and its path
+    inside the eye.
 
-    Rays that meet the plane at a glancing angle are held at a slope of 0.05: they land far outside the iris.
+    Rays that meet the plane at a glancing angle are held at a slope of 0.05: they land
+    far outside the iris.
     """
     eta = 1.0 / p[INDEX]
     c = -(cx * dx + cy * dy + cz * dz)
@@ -219,8 +334,12 @@ def refract(p: Real, tc: Real, cx: Real, cy: Real, cz: Real, dx: Real, dy: Real,
     return x, y, path
 
 
-def lamps(p: Real, px: Real, py: Real, pz: Real, nx: Real, ny: Real, nz: Real, wrap: Real) -> Real:
-    """Irradiance of the three flood LEDs and of ambient light from above; 1 is a LED at 20 mm, normal incidence."""
+def lamps(
+    p: Real, px: Real, py: Real, pz: Real, nx: Real, ny: Real, nz: Real, wrap: Real
+) -> Real:
+    """Irradiance of the three flood LEDs and of ambient light from above; 1 is a LED at
+    20 mm, normal incidence.
+    """
     first = lamp(p[LED] - px, p[LED + 1] - py, p[LED + 2] - pz, nx, ny, nz, wrap)
     second = lamp(p[LED + 3] - px, p[LED + 4] - py, p[LED + 5] - pz, nx, ny, nz, wrap)
     third = lamp(p[LED + 6] - px, p[LED + 7] - py, p[LED + 8] - pz, nx, ny, nz, wrap)
@@ -233,8 +352,12 @@ def ambient(p: Real, nx: Real, ny: Real, nz: Real) -> Real:
     return p[AMBIENT] * (0.6 - 0.4 * up)
 
 
-def lamp(vx: Real, vy: Real, vz: Real, nx: Real, ny: Real, nz: Real, wrap: Real) -> Real:
-    """Irradiance of a small lamp at v from the point; ``wrap`` lets skin glow past the terminator."""
+def lamp(
+    vx: Real, vy: Real, vz: Real, nx: Real, ny: Real, nz: Real, wrap: Real
+) -> Real:
+    """Irradiance of a small lamp at v from the point; ``wrap`` lets skin glow past the
+    terminator.
+    """
     k = 1.0 / sqrt(vx * vx + vy * vy + vz * vz + 1e6)
     return above((vx * nx + vy * ny + vz * nz) * k + wrap, 0.0) * (k * k * 4e8)
 
@@ -242,10 +365,38 @@ def lamp(vx: Real, vy: Real, vz: Real, nx: Real, ny: Real, nz: Real, wrap: Real)
 def wet_lamps(
     p: Real, px: Real, py: Real, pz: Real, nx: Real, ny: Real, nz: Real, dx: Real, dy: Real, dz: Real, sharp: Real
 ) -> tuple[Real, Real, Real]:  # fmt: skip
-    """Irradiance of the outer surface (normal n), of the iris behind it, and mirror reflections of two lamps."""
-    a, b, c = wet_lamp(p, p[LED] - px, p[LED + 1] - py, p[LED + 2] - pz, nx, ny, nz, dx, dy, dz, sharp)
-    d, e, f = wet_lamp(p, p[LED + 3] - px, p[LED + 4] - py, p[LED + 5] - pz, nx, ny, nz, dx, dy, dz, sharp)
-    g, h, _ = wet_lamp(p, p[LED + 6] - px, p[LED + 7] - py, p[LED + 8] - pz, nx, ny, nz, dx, dy, dz, sharp)
+    """Irradiance of the outer surface (normal n), of the iris behind it, and mirror
+    reflections of two lamps.
+    """
+    a, b, c = wet_lamp(
+        p, p[LED] - px, p[LED + 1] - py, p[LED + 2] - pz, nx, ny, nz, dx, dy, dz, sharp
+    )
+    d, e, f = wet_lamp(
+        p,
+        p[LED + 3] - px,
+        p[LED + 4] - py,
+        p[LED + 5] - pz,
+        nx,
+        ny,
+        nz,
+        dx,
+        dy,
+        dz,
+        sharp,
+    )
+    g, h, _ = wet_lamp(
+        p,
+        p[LED + 6] - px,
+        p[LED + 7] - py,
+        p[LED + 8] - pz,
+        nx,
+        ny,
+        nz,
+        dx,
+        dy,
+        dz,
+        sharp,
+    )
     outer = (a + d + g) / 1.3 + ambient(p, nx, ny, nz)
     inner = (b + e + h) / 1.15 + ambient(p, p[AXIS], p[AXIS + 1], p[AXIS + 2])
     return outer, inner, c + f
@@ -254,14 +405,21 @@ def wet_lamps(
 def wet_lamp(
     p: Real, vx: Real, vy: Real, vz: Real, nx: Real, ny: Real, nz: Real, dx: Real, dy: Real, dz: Real, sharp: Real
 ) -> tuple[Real, Real, Real]:  # fmt: skip
-    """One lamp at v from the point: light on the surface, on the iris, and its lobe about the mirror direction."""
+    """One lamp at v from the point: light on the surface, on the iris, and its lobe
+    about the mirror direction.
+    """
     k = 1.0 / sqrt(vx * vx + vy * vy + vz * vz + 1e6)
     fall = k * k * 4e8
     outer = above((vx * nx + vy * ny + vz * nz) * k + 0.3, 0.0) * fall
-    inner = above((vx * p[AXIS] + vy * p[AXIS + 1] + vz * p[AXIS + 2]) * k + 0.15, 0.0) * fall
+    inner = (
+        above((vx * p[AXIS] + vy * p[AXIS + 1] + vz * p[AXIS + 2]) * k + 0.15, 0.0)
+        * fall
+    )
     hx = vx * k - dx
     hy = vy * k - dy
     hz = vz * k - dz
     along = above(hx * nx + hy * ny + hz * nz, 0.0)
-    off = 1.0 + sharp * 0.5 * (1.0 - along * along / (hx * hx + hy * hy + hz * hz + 1e-3))
+    off = 1.0 + sharp * 0.5 * (
+        1.0 - along * along / (hx * hx + hy * hy + hz * hz + 1e-3)
+    )
     return outer, inner, 1.0 / (off * off)

@@ -1,4 +1,6 @@
-"""The arithmetic of the scene model for torch tensors; the compiled kernels have their own of the same names."""
+"""The arithmetic of the scene model for torch tensors; the compiled kernels have their
+own of the same names.
+"""
 
 import torch
 from torch import Tensor
@@ -26,9 +28,11 @@ def step(x: Tensor) -> Tensor:
 
 
 def tex(bank: Tensor, index: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Sample of picture ``index`` of ``bank`` (pictures, size, size), periodic; u, v in pixels.
+    """Sample of picture ``index`` of ``bank`` (pictures, size, size), periodic; u, v in
+    pixels.
 
-    Blended by smooth steps between the pixels: bilinear blending would have derivatives that jump.
+    Blended by smooth steps between the pixels: bilinear blending would have derivatives
+    that jump.
     """
     size = bank.shape[-1]
     fu, fv = torch.floor(u.detach()), torch.floor(v.detach())

@@ -1,9 +1,14 @@
-"""The eye and face as numbers: a documented population, subjects drawn from it, and their states of gaze and slip.
+"""The eye and face as numbers: a documented population, subjects drawn from it, and
+their states of gaze and slip.
 
-The model eye has one spherical cornea, one refracting surface, a plane iris and one centre of rotation (Guestrin and
-Eizenman 2006). Real eyes have none: the centre of vertical turns lies about 1 mm before that of horizontal ones (Fry
-and Hill 1962, 1963). At 20 degrees 1 mm moves the pupil by 0.34 mm, which reads as 1.5 degrees; a personal
-calibration takes up most of it because it is nearly linear in the gaze. Corneal asphericity (Q about -0.25) moves the
+The model eye has one spherical cornea, one refracting surface, a plane iris and one
+centre of rotation (Guestrin and
+Eizenman 2006). Real eyes have none: the centre of vertical turns lies about 1 mm before
+that of horizontal ones (Fry
+and Hill 1962, 1963). At 20 degrees 1 mm moves the pupil by 0.34 mm, which reads as 1.5
+degrees; a personal
+calibration takes up most of it because it is nearly linear in the gaze. Corneal
+asphericity (Q about -0.25) moves the
 refracted limbus side of the iris by up to 0.1 mm and the pupil by less than 0.02 mm.
 """
 
@@ -34,37 +39,115 @@ class Trait:
 
 POPULATION: Mapping[str, Trait] = {
     "size": Trait(
-        1.0, 0.03, 0.9, 1.1, "common factor of all radii: axial length 24.2 +- 0.85 mm (Le Grand; Olsen 2007)"
+        1.0,
+        0.03,
+        0.9,
+        1.1,
+        "common factor of all radii: axial length 24.2 +- 0.85 mm (Le Grand; Olsen 2007)",
     ),
-    "sclera_radius_um": Trait(12000, 200, 11300, 12700, "Le Grand full theoretical eye: 12.3 mm; 24 mm globe"),
-    "cornea_radius_um": Trait(7800, 200, 7000, 8600, "Gullstrand 7.7, Le Grand 7.8; +- 0.25 mm in adults"),
-    "limbus_radius_um": Trait(5900, 150, 5400, 6400, "visible iris 11.8 +- 0.4 mm (Caroline and Andre 2002)"),
-    "pupil_radius_um": Trait(1900, 500, 900, 3600, "2-7 mm pupils; Watson and Yellott 2012"),
+    "sclera_radius_um": Trait(
+        12000, 200, 11300, 12700, "Le Grand full theoretical eye: 12.3 mm; 24 mm globe"
+    ),
+    "cornea_radius_um": Trait(
+        7800, 200, 7000, 8600, "Gullstrand 7.7, Le Grand 7.8; +- 0.25 mm in adults"
+    ),
+    "limbus_radius_um": Trait(
+        5900, 150, 5400, 6400, "visible iris 11.8 +- 0.4 mm (Caroline and Andre 2002)"
+    ),
+    "pupil_radius_um": Trait(
+        1900, 500, 900, 3600, "2-7 mm pupils; Watson and Yellott 2012"
+    ),
     "pupil_behind_um": Trait(
-        3600, 150, 3100, 4200, "pupil behind the corneal apex (Gullstrand 3.6 mm; G&E K = 4.2 mm)"
+        3600,
+        150,
+        3100,
+        4200,
+        "pupil behind the corneal apex (Gullstrand 3.6 mm; G&E K = 4.2 mm)",
     ),
-    "index": Trait(1.3375, 0.0, 1.3375, 1.3375, "cornea and aqueous as one (Guestrin and Eizenman 2006)"),
-    "kappa_x_rad": Trait(math.radians(5.0), math.radians(1.5), 0.0, 0.17, "visual axis nasal of the optic axis (G&E)"),
-    "kappa_y_rad": Trait(math.radians(1.5), math.radians(1.0), -0.05, 0.1, "visual axis above the optic axis (G&E)"),
-    "depth_um": Trait(0, 1000, -3000, 3000, "pupil depth beside the rig's; the paper's 16-26 mm is 3 sigma with slip"),
+    "index": Trait(
+        1.3375,
+        0.0,
+        1.3375,
+        1.3375,
+        "cornea and aqueous as one (Guestrin and Eizenman 2006)",
+    ),
+    "kappa_x_rad": Trait(
+        math.radians(5.0),
+        math.radians(1.5),
+        0.0,
+        0.17,
+        "visual axis nasal of the optic axis (G&E)",
+    ),
+    "kappa_y_rad": Trait(
+        math.radians(1.5),
+        math.radians(1.0),
+        -0.05,
+        0.1,
+        "visual axis above the optic axis (G&E)",
+    ),
+    "depth_um": Trait(
+        0,
+        1000,
+        -3000,
+        3000,
+        "pupil depth beside the rig's; the paper's 16-26 mm is 3 sigma with slip",
+    ),
     "lid_thickness_um": Trait(950, 150, 600, 1400, "lid shell outside the globe"),
-    "fissure_upper_um": Trait(5000, 700, 3300, 6800, "fissure height 10 mm (Farkas 1994), above the pupil's centre"),
-    "fissure_lower_um": Trait(5900, 500, 4700, 7000, "lower margin at or just below the limbus"),
-    "fissure_half_um": Trait(11600, 350, 10700, 12400, "half chord between the canthi: 30 mm along the curve (Farkas)"),
-    "fissure_skew_um": Trait(850, 400, -500, 2000, "peak of the upper margin nasal, of the lower temporal"),
-    "fissure_middle_um": Trait(400, 350, -600, 1400, "the temporal canthus is farther from the pupil"),
+    "fissure_upper_um": Trait(
+        5000,
+        700,
+        3300,
+        6800,
+        "fissure height 10 mm (Farkas 1994), above the pupil's centre",
+    ),
+    "fissure_lower_um": Trait(
+        5900, 500, 4700, 7000, "lower margin at or just below the limbus"
+    ),
+    "fissure_half_um": Trait(
+        11600,
+        350,
+        10700,
+        12400,
+        "half chord between the canthi: 30 mm along the curve (Farkas)",
+    ),
+    "fissure_skew_um": Trait(
+        850, 400, -500, 2000, "peak of the upper margin nasal, of the lower temporal"
+    ),
+    "fissure_middle_um": Trait(
+        400, 350, -600, 1400, "the temporal canthus is farther from the pupil"
+    ),
     "crease_um": Trait(2600, 700, 900, 4500, "upper lid fold above the margin"),
     "plane_um": Trait(7000, 800, 5000, 9500, "face plane behind the corneal apex"),
-    "iris": Trait(0.34, 0.09, 0.14, 0.6, "albedo at 850 nm: dark irises are bright in the near infrared"),
+    "iris": Trait(
+        0.34,
+        0.09,
+        0.14,
+        0.6,
+        "albedo at 850 nm: dark irises are bright in the near infrared",
+    ),
     "iris_contrast": Trait(0.34, 0.10, 0.1, 0.7, "texture, relative"),
     "sclera": Trait(0.62, 0.06, 0.45, 0.8, "albedo at 850 nm"),
     "veins": Trait(0.16, 0.06, 0.02, 0.4, "vessels are faint beyond 800 nm"),
-    "skin": Trait(0.52, 0.08, 0.3, 0.72, "albedo at 850 nm, 0.4-0.65: melanin hardly absorbs (Angelopoulou 2001)"),
+    "skin": Trait(
+        0.52,
+        0.08,
+        0.3,
+        0.72,
+        "albedo at 850 nm, 0.4-0.65: melanin hardly absorbs (Angelopoulou 2001)",
+    ),
     "pores": Trait(0.10, 0.03, 0.03, 0.22, "texture, relative"),
     "lashes": Trait(0.9, 0.25, 0.1, 1.5, "opacity of the lash picture"),
     "brow": Trait(0.8, 0.3, 0.0, 1.5, "opacity of the brow"),
-    "pupil": Trait(0.018, 0.008, 0.004, 0.06, "off-axis lamps: hardly any red-eye light"),
-    "glint": Trait(0.5, 0.2, 0.0, 1.2, "tear-film reflection of the flood LEDs; not used by the tracker"),
+    "pupil": Trait(
+        0.018, 0.008, 0.004, 0.06, "off-axis lamps: hardly any red-eye light"
+    ),
+    "glint": Trait(
+        0.5,
+        0.2,
+        0.0,
+        1.2,
+        "tear-film reflection of the flood LEDs; not used by the tracker",
+    ),
     "ambient": Trait(0.12, 0.08, 0.0, 0.5, "diffuse light in units of a LED at 20 mm"),
     "exposure": Trait(0.5, 0.08, 0.3, 0.75, "level set by the automatic exposure"),
 }
@@ -75,9 +158,12 @@ TEXTURES = ("iris", "vein", "skin", "fine", "lash", "offset_x", "offset_y", "tur
 class Rig:
     """Camera and lamps on the glasses.
 
-    distance_um: lens to pupil when nothing slipped. The paper's bench sits 2 cm below the eye at 45 degrees, whose
-        axis meets the pupil at 28 mm, outside the 16-26 mm of its own simulation; we keep angle and depth range.
-    elevation_rad: of the face's normal above the direction to the camera; the camera looks up.
+    distance_um: lens to pupil when nothing slipped. The paper's bench sits 2 cm below
+    the eye at 45 degrees, whose
+        axis meets the pupil at 28 mm, outside the 16-26 mm of its own simulation; we
+        keep angle and depth range.
+    elevation_rad: of the face's normal above the direction to the camera; the camera
+    looks up.
     aim_um: (x, y) of the nominal pupil beside the camera's axis.
     sensor_distance_um: lens to sensor.
     lamps_um: positions of the flood LEDs in the camera's frame.
@@ -87,10 +173,18 @@ class Rig:
     elevation_rad: float = math.radians(45.0)
     aim_um: tuple[float, float] = (2400.0, -300.0)
     sensor_distance_um: float = 2000.0
-    lamps_um: tuple[tuple[float, float, float], ...] = ((9e3, -5e3, 0.0), (-9e3, -5e3, 0.0), (0.0, -12e3, 3e3))
+    lamps_um: tuple[tuple[float, float, float], ...] = (
+        (9e3, -5e3, 0.0),
+        (-9e3, -5e3, 0.0),
+        (0.0, -12e3, 3e3),
+    )
 
     def __post_init__(self) -> None:
-        if not (self.distance_um > 0 and math.isfinite(self.distance_um) and abs(self.elevation_rad) < 1.4):
+        if not (
+            self.distance_um > 0
+            and math.isfinite(self.distance_um)
+            and abs(self.elevation_rad) < 1.4
+        ):
             raise SceneError(
                 f"rig at {self.distance_um} um, {self.elevation_rad} rad: need a distance above 0 and |angle| < 1.4"
             )
@@ -100,15 +194,19 @@ class Rig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class States:
-    """Subjects and what their eyes and glasses do: gaze (phi, theta), torsion omega, slip t (paper Sec. 3.6).
+    """Subjects and what their eyes and glasses do: gaze (phi, theta), torsion omega,
+    slip t (paper Sec. 3.6).
 
     traits: (n, len(POPULATION)) in its order. textures: (n, len(TEXTURES)).
-    gaze_rad: (n, 2) turn of the optic axis from straight ahead, to +x and to +y (down); its length is the angle.
+    gaze_rad: (n, 2) turn of the optic axis from straight ahead, to +x and to +y (down);
+    its length is the angle.
     torsion_rad: (n,) beyond Listing's law, which gives 0.
-    slip_um: (n, 3) displacement of the head in the camera's frame, +z away from the lens.
+    slip_um: (n, 3) displacement of the head in the camera's frame, +z away from the
+    lens.
     mount_rad: (n, 2) small turns of the camera about its x and y axes.
     aperture: (n,) opening of the lids, 1 relaxed, 0 closed.
-    scale: (n,) factor of every depth and label at an unchanged pinhole image (scale ambiguity).
+    scale: (n,) factor of every depth and label at an unchanged pinhole image (scale
+    ambiguity).
     """
 
     traits: Tensor
@@ -128,7 +226,12 @@ class States:
             "gaze_rad": (n, 2),
             "torsion_rad": (n,),
         }
-        shapes |= {"slip_um": (n, 3), "mount_rad": (n, 2), "aperture": (n,), "scale": (n,)}
+        shapes |= {
+            "slip_um": (n, 3),
+            "mount_rad": (n, 2),
+            "aperture": (n,),
+            "scale": (n,),
+        }
         for name, shape in shapes.items():
             value = getattr(self, name)
             if tuple(value.shape) != shape:
@@ -157,7 +260,9 @@ class Motion:
 
     gaze_x_rad: float = math.radians(18.0)
     gaze_y_rad: float = math.radians(13.0)
-    torsion_rad: float = math.radians(1.0)  # thickness of Listing's plane: Straumann et al. 1996
+    torsion_rad: float = math.radians(
+        1.0
+    )  # thickness of Listing's plane: Straumann et al. 1996
     slip_um: tuple[float, float, float] = (2000.0, 1500.0, 3500.0)
     mount_rad: float = math.radians(1.0)
     aperture: tuple[float, float] = (0.75, 1.1)
@@ -165,7 +270,9 @@ class Motion:
     population: Mapping[str, Trait] = field(default_factory=lambda: POPULATION)
 
 
-def draw(count: int, seed: int | tuple[int, ...], *, motion: Motion | None = None) -> States:
+def draw(
+    count: int, seed: int | tuple[int, ...], *, motion: Motion | None = None
+) -> States:
     """Random subjects in random states; the same seed gives the same states.
 
     ``motion.scale`` s > 0 draws the scale factor of each state uniformly in 1 +- s.
@@ -175,8 +282,14 @@ def draw(count: int, seed: int | tuple[int, ...], *, motion: Motion | None = Non
     for trait in motion.population.values():
         value = trait.mean + trait.sd * rng.standard_normal(count)
         columns.append(np.clip(value, trait.low, trait.high))
-    pictures = [kind * VARIANTS + rng.integers(0, VARIANTS, count) for kind in range(len(KINDS))]
-    places = [rng.uniform(0, 256, count), rng.uniform(0, 256, count), rng.uniform(-math.pi, math.pi, count)]
+    pictures = [
+        kind * VARIANTS + rng.integers(0, VARIANTS, count) for kind in range(len(KINDS))
+    ]
+    places = [
+        rng.uniform(0, 256, count),
+        rng.uniform(0, 256, count),
+        rng.uniform(-math.pi, math.pi, count),
+    ]
     gaze = rng.uniform(-1, 1, (count, 2)) * [motion.gaze_x_rad, motion.gaze_y_rad]
     values = (
         np.stack(columns, 1),
@@ -192,33 +305,58 @@ def draw(count: int, seed: int | tuple[int, ...], *, motion: Motion | None = Non
 
 
 def parameters(
-    states: States, rig: Rig, *, pixel_rad: float, exposed: States | None = None, view: View | None = None
+    states: States,
+    rig: Rig,
+    *,
+    pixel_rad: float,
+    exposed: States | None = None,
+    view: View | None = None,
 ) -> Tensor:
-    """(n, COUNT) parameters of :mod:`codesign.eye.model` in float64, differentiable in gaze, torsion, slip, mount.
+    """(n, COUNT) parameters of :mod:`codesign.eye.model` in float64, differentiable in
+    gaze, torsion, slip, mount.
 
     Args:
         pixel_rad: angle of a pixel, which sets the softness of edges.
-        exposed: states that the automatic exposure was set at; by default these, without following their derivatives.
+        exposed: states that the automatic exposure was set at; by default these,
+            without following their derivatives.
         view: other cameras than the rig's.
     """
     t = dict(zip(POPULATION, states.traits.unbind(1), strict=True))
     size = t["size"]
-    cornea, limbus, sclera = (t[k] * size for k in ("cornea_radius_um", "limbus_radius_um", "sclera_radius_um"))
+    cornea, limbus, sclera = (
+        t[k] * size
+        for k in ("cornea_radius_um", "limbus_radius_um", "sclera_radius_um")
+    )
     ring, offset = _spheres(sclera, cornea, limbus)
     behind = offset + cornea - t["pupil_behind_um"] * size
     face = _face(rig, states, view)
     axis, across, down = _turned(face, states)
-    centre = _turn(_nominal_centre(rig, t["depth_um"], behind, view), states.mount_rad) + states.slip_um
+    centre = (
+        _turn(_nominal_centre(rig, t["depth_um"], behind, view), states.mount_rad)
+        + states.slip_um
+    )
     plane = centre + face[2] * (offset + cornea - t["plane_um"])[:, None]
-    lamps = torch.tensor(rig.lamps_um, dtype=torch.float64).flatten().expand(len(states), -1)
+    lamps = (
+        torch.tensor(rig.lamps_um, dtype=torch.float64)
+        .flatten()
+        .expand(len(states), -1)
+    )
     follow = 0.5 * sclera * torch.sin(states.gaze_rad[:, 1].clamp(-1.2, 1.2))
     lower = t["fissure_lower_um"] * size + 0.9 * follow
-    upper = states.aperture * (t["fissure_upper_um"] * size - follow) - (1 - states.aperture) * lower
+    upper = (
+        states.aperture * (t["fissure_upper_um"] * size - follow)
+        - (1 - states.aperture) * lower
+    )
     half = t["fissure_half_um"] * size
     held = states if exposed is None else exposed
     depth = _exposure_depth(rig, t["depth_um"], behind, held, view)
     gain = t["exposure"] * (depth.clamp_min(3000.0) / 20e3) ** 2 / 1.6
-    edge = 0.6 * (pixel_rad if view is None else pixel_rad * view.wide) * depth.clamp_min(2000.0) + 25.0
+    edge = (
+        0.6
+        * (pixel_rad if view is None else pixel_rad * view.wide)
+        * depth.clamp_min(2000.0)
+        + 25.0
+    )
     places = {
         model.CENTRE: centre, model.FACE_X: face[0], model.FACE_Y: face[1], model.FACE_Z: face[2], model.AXIS: axis,
         model.IRIS_X: across, model.IRIS_Y: down, model.PLANE: plane, model.LED: lamps,
@@ -253,12 +391,16 @@ def _as_they_are(traits: Mapping[str, Tensor]) -> dict[int, Tensor]:
 
 def _textures(textures: Tensor) -> dict[int, Tensor]:
     named = dict(zip(TEXTURES, textures.unbind(1), strict=True))
-    turn = {model.TURN_X: torch.cos(named["turn"]), model.TURN_Y: torch.sin(named["turn"])}
+    turn = {
+        model.TURN_X: torch.cos(named["turn"]),
+        model.TURN_Y: torch.sin(named["turn"]),
+    }
     return turn | {place: named[name] for place, name in PICTURES.items()}
 
 
 def _row(places: Mapping[int, Tensor]) -> Tensor:
-    """(n, COUNT) parameters of frames from what stands at each index, (n,) or (n, several).
+    """(n, COUNT) parameters of frames from what stands at each index, (n,) or (n,
+    several).
 
     Raises:
         SceneError: an index is left out, or filled twice.
@@ -266,63 +408,107 @@ def _row(places: Mapping[int, Tensor]) -> Tensor:
     columns, filled = [], 0
     for place in sorted(places):
         if place != filled:
-            raise SceneError(f"parameter {filled} of a frame is {'left out' if place > filled else 'filled twice'}")
-        columns.append(places[place] if places[place].ndim == 2 else places[place][:, None])
+            raise SceneError(
+                f"parameter {filled} of a frame is {'left out' if place > filled else 'filled twice'}"
+            )
+        columns.append(
+            places[place] if places[place].ndim == 2 else places[place][:, None]
+        )
         filled += columns[-1].shape[1]
     if filled != model.COUNT:
-        raise SceneError(f"a frame has {filled} parameters, the picture reads {model.COUNT}")
+        raise SceneError(
+            f"a frame has {filled} parameters, the picture reads {model.COUNT}"
+        )
     return torch.cat(columns, 1)
 
 
 def mean_eye_um(rig: Rig) -> tuple[tuple[float, float, float], float]:
-    """Rotation centre of the population's mean eye before this camera, and how far its pupil lies from that centre."""
-    mean = {name: torch.tensor([trait.mean], dtype=torch.float64) for name, trait in POPULATION.items()}
-    _, offset = _spheres(*(mean[f"{name}_radius_um"] for name in ("sclera", "cornea", "limbus")))
+    """Rotation centre of the population's mean eye before this camera, and how far its
+    pupil lies from that centre.
+    """
+    mean = {
+        name: torch.tensor([trait.mean], dtype=torch.float64)
+        for name, trait in POPULATION.items()
+    }
+    _, offset = _spheres(
+        *(mean[f"{name}_radius_um"] for name in ("sclera", "cornea", "limbus"))
+    )
     radius = offset + mean["cornea_radius_um"] - mean["pupil_behind_um"]
     x, y, z = _nominal_centre(rig, mean["depth_um"], radius)[0].tolist()
     return (x, y, z), float(radius)
 
 
 def _spheres(sclera: Tensor, cornea: Tensor, limbus: Tensor) -> tuple[Tensor, Tensor]:
-    """(n,) plane of the limbus, which lies on both spheres, and centre of the cornea, from the sclera's centre."""
+    """(n,) plane of the limbus, which lies on both spheres, and centre of the cornea,
+    from the sclera's centre.
+    """
     ring = torch.sqrt((sclera**2 - limbus**2).clamp_min(1e6))
     return ring, ring - torch.sqrt((cornea**2 - limbus**2).clamp_min(1e6))
 
 
-def directions(states: States, rig: Rig, view: View | None = None) -> tuple[Tensor, Tensor]:
+def directions(
+    states: States, rig: Rig, view: View | None = None
+) -> tuple[Tensor, Tensor]:
     """(n, 3) optic axis and (n, 3) visual axis in the camera's frame, unit vectors."""
     axis, across, down = _turned(_face(rig, states, view), states)
-    side, rise = torch.tan(states.trait("kappa_x_rad")), torch.tan(states.trait("kappa_y_rad"))
-    visual = axis - side[:, None] * across - rise[:, None] * down  # nose to -x, up to -y
+    side, rise = (
+        torch.tan(states.trait("kappa_x_rad")),
+        torch.tan(states.trait("kappa_y_rad")),
+    )
+    visual = (
+        axis - side[:, None] * across - rise[:, None] * down
+    )  # nose to -x, up to -y
     return axis, visual / visual.norm(dim=1, keepdim=True)
 
 
 def _axes(rig: Rig, view: View | None) -> Tensor:
-    """(3, 1 or n, 3) axes of the face before the camera, or before each of the cameras of a view."""
-    return face_axes(rig.elevation_rad)[:, None] if view is None else seen_axes(rig.elevation_rad, view).transpose(0, 1)
+    """(3, 1 or n, 3) axes of the face before the camera, or before each of the cameras
+    of a view.
+    """
+    return (
+        face_axes(rig.elevation_rad)[:, None]
+        if view is None
+        else seen_axes(rig.elevation_rad, view).transpose(0, 1)
+    )
 
 
-def _face(rig: Rig, states: States, view: View | None = None) -> tuple[Tensor, Tensor, Tensor]:
+def _face(
+    rig: Rig, states: States, view: View | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Axes of the face in the camera's frame: right, down, and out towards the viewer."""
-    right, down, out = (_turn(row.expand(len(states), 3), states.mount_rad) for row in _axes(rig, view))
+    right, down, out = (
+        _turn(row.expand(len(states), 3), states.mount_rad) for row in _axes(rig, view)
+    )
     return right, down, out
 
 
-def _nominal_centre(rig: Rig, depth_um: Tensor, behind_um: Tensor, view: View | None = None) -> Tensor:
+def _nominal_centre(
+    rig: Rig, depth_um: Tensor, behind_um: Tensor, view: View | None = None
+) -> Tensor:
     out = _axes(rig, view)[2]
     aim = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
     along = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     return aim + depth_um[:, None] * along - behind_um[:, None] * out
 
 
-def _exposure_depth(rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States, view: View | None) -> Tensor:
-    """(n,) distance of the face for which exposure and edges are set, without derivatives."""
-    centre = _turn(_nominal_centre(rig, depth_um, behind_um, view), states.mount_rad) + states.slip_um
+def _exposure_depth(
+    rig: Rig, depth_um: Tensor, behind_um: Tensor, states: States, view: View | None
+) -> Tensor:
+    """(n,) distance of the face for which exposure and edges are set, without
+    derivatives.
+    """
+    centre = (
+        _turn(_nominal_centre(rig, depth_um, behind_um, view), states.mount_rad)
+        + states.slip_um
+    )
     return (centre[:, 2] - 0.7 * behind_um).detach().clamp_min(1000.0)
 
 
-def _turned(face: tuple[Tensor, Tensor, Tensor], states: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Optic axis and iris axes after the least rotation that points the eye (Listing's law), then torsion about it.
+def _turned(
+    face: tuple[Tensor, Tensor, Tensor], states: States
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Optic axis and iris axes after the least rotation that points the eye (Listing's
+    law), then torsion about it.
 
     Smooth everywhere up to a turn of pi: no gimbal.
     """
@@ -334,7 +520,10 @@ def _turned(face: tuple[Tensor, Tensor, Tensor], states: States) -> tuple[Tensor
     axis = torch.cos(angle) * out + sine * toward
     across = right - gx * (fall * toward + sine * out)
     below = down - gy * (fall * toward + sine * out)
-    c, s = torch.cos(states.torsion_rad)[:, None], torch.sin(states.torsion_rad)[:, None]
+    c, s = (
+        torch.cos(states.torsion_rad)[:, None],
+        torch.sin(states.torsion_rad)[:, None],
+    )
     return axis, c * across + s * below, c * below - s * across
 
 

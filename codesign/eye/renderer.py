@@ -1,4 +1,6 @@
-"""Frames of eyes: radiance and coverage of two sheets, depth, pupil masks, labels, and exact derivatives."""
+"""Frames of eyes: radiance and coverage of two sheets, depth, pupil masks, labels, and
+exact derivatives.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -19,7 +21,8 @@ MOTIONS = ("gaze_x", "gaze_y", "slip_x", "slip_y", "slip_z")  # rad, rad, um, um
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """The pinhole grid that frames are rendered on: the image side of the lens, turned upright.
+    """The pinhole grid that frames are rendered on: the image side of the lens, turned
+    upright.
 
     pixels: along both sides. pitch_um: of the grid.
     """
@@ -29,28 +32,37 @@ class Camera:
 
     def __post_init__(self) -> None:
         if not (1 <= self.pixels <= 8192 and 0 < self.pitch_um < 1e4):
-            raise SceneError(f"camera of {self.pixels} pixels of {self.pitch_um} um: need 1-8192 pixels, pitch above 0")
+            raise SceneError(
+                f"camera of {self.pixels} pixels of {self.pitch_um} um: need 1-8192 pixels, pitch above 0"
+            )
 
     def tangents(self, rig: Rig) -> Array:
         """(pixels,) tangents of the rays through the pixel centres along one side."""
-        return (np.arange(self.pixels) - (self.pixels - 1) / 2) * (self.pitch_um / rig.sensor_distance_um)
+        return (np.arange(self.pixels) - (self.pixels - 1) / 2) * (
+            self.pitch_um / rig.sensor_distance_um
+        )
 
     def position_px(self, tangent: Tensor, rig: Rig) -> Tensor:
         """Pixel coordinates (x, y) of tangents; the first pixel's centre is 0."""
-        return tangent * (rig.sensor_distance_um / self.pitch_um) + (self.pixels - 1) / 2
+        return (
+            tangent * (rig.sensor_distance_um / self.pitch_um) + (self.pixels - 1) / 2
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Labels:
-    """What is true of each frame, in the camera's frame; lengths with the scale of the state applied.
+    """What is true of each frame, in the camera's frame; lengths with the scale of the
+    state applied.
 
     slip_um: (n, 3) displacement of the head from the rig's nominal place.
-    shift_um: (n, 3) the same as the camera sees it: with what its own turn and the person's depth displace the head.
+    shift_um: (n, 3) the same as the camera sees it: with what its own turn and the
+    person's depth displace the head.
     optic_axis, visual_axis: (n, 3) unit vectors, pointing out of the eye.
     centre_um, pupil_um: (n, 3) centre of rotation and of the pupil.
     pupil_px: (n, 2) where the refracted centre of the pupil lands (x, y).
     centroid_px: (n, 2) centroid of the visible pupil; ``pupil_px`` where none is seen.
-    visible: (n,) seen share of the pupil's area, 0 where it is hidden or out of the frame.
+    visible: (n,) seen share of the pupil's area, 0 where it is hidden or out of the
+    frame.
     landmarks_px: (n, len(landmarks.NAMES), 2).
     """
 
@@ -68,7 +80,9 @@ class Labels:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rendered:
-    """frames: near and far sheet. pupil: (n, y, x) visible share of pupil in every pixel. labels: of every frame."""
+    """frames: near and far sheet. pupil: (n, y, x) visible share of pupil in every
+    pixel. labels: of every frame.
+    """
 
     frames: Frames
     pupil: Tensor
@@ -88,24 +102,38 @@ def render(
     exposed: States | None = None,
     view: View | None = None,
 ) -> Rendered:
-    """Render states with labels, masks and depth (float32); compiled, on all threads of numba.
+    """Render states with labels, masks and depth (float32); compiled, on all threads of
+    numba.
 
     Args:
-        exposed: states that the automatic exposure was set at, where it shall not follow; by default these.
-        view: other cameras than the rig's. A picture that is ``wide`` times as wide is that of an eye so much smaller
-            across at the same depth, as this rig's camera would see it: places of its labels shrink with it.
+        exposed: states that the automatic exposure was set at, where it shall not
+            follow; by default these.
+        view: other cameras than the rig's. A picture that is ``wide`` times as wide is
+            that of an eye so much smaller
+            across at the same depth, as this rig's camera would see it: places of its
+            labels shrink with it.
 
     Raises:
         SceneError: non-finite states (from :class:`States`) or an impossible camera.
     """
     rig, camera = rig or Rig(), camera or Camera()
-    p = parameters(states, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um, exposed=exposed, view=view)
+    p = parameters(
+        states,
+        rig,
+        pixel_rad=camera.pitch_um / rig.sensor_distance_um,
+        exposed=exposed,
+        view=view,
+    )
     wide = np.ones(len(states)) if view is None else view.wide.numpy()
     frames, mask = _compiled(p, states.scale, rig, camera, texture_seed, wide)
-    return Rendered(frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view))
+    return Rendered(
+        frames, mask, _labels(states, p, mask, rig=rig, camera=camera, view=view)
+    )
 
 
-def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int, wide: Array) -> tuple[Frames, Tensor]:
+def _compiled(
+    p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int, wide: Array
+) -> tuple[Frames, Tensor]:
     from codesign.eye import kernel as render_kernel
 
     n, size = len(p), camera.pixels
@@ -114,13 +142,26 @@ def _compiled(p: Tensor, scale: Tensor, rig: Rig, camera: Camera, seed: int, wid
     values, factor = (a.detach().numpy().astype(np.float32) for a in (p, scale))
     ends = [*np.flatnonzero(np.diff(wide)) + 1, n]  # of runs of frames that are as wide
     for first, end in zip([0, *ends], ends, strict=False):
-        t, run = (camera.tangents(rig) * wide[first]).astype(np.float32), slice(first, end)
+        t, run = (
+            (camera.tangents(rig) * wide[first]).astype(np.float32),
+            slice(first, end),
+        )
         out = (light[run], cover[run], depth[run], pupil[run])
         render_kernel.render(values[run], factor[run], textures.pairs(seed), t, t, *out)
-    return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(pupil[:, 0])
+    return Frames(*map(torch.from_numpy, (light, cover, depth))), torch.from_numpy(
+        pupil[:, 0]
+    )
 
 
-def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera, view: View | None) -> Labels:
+def _labels(
+    states: States,
+    p: Tensor,
+    mask: Tensor,
+    *,
+    rig: Rig,
+    camera: Camera,
+    view: View | None,
+) -> Labels:
     p, scale = p.detach(), states.scale[:, None]
     wide = torch.ones_like(states.scale) if view is None else view.wide
     across = torch.stack([1 / wide, 1 / wide, torch.ones_like(wide)], 1)
@@ -128,7 +169,9 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
     pupil = centre + p[:, model.PUPIL_D, None] * p[:, model.AXIS : model.AXIS + 3]
     optic, visual = directions(states, rig, view)
     here = torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64)
-    middle_and_rim = camera.position_px(iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig)
+    middle_and_rim = camera.position_px(
+        iris_to_camera(p, _pupil_points(p)) / wide[:, None, None], rig
+    )
     middle = middle_and_rim[:, 0]
     x, y = middle_and_rim[:, 1:].unbind(-1)
     area = 0.5 * (x * y.roll(-1, 1) - y * x.roll(-1, 1)).sum(1).abs()
@@ -152,15 +195,28 @@ def _labels(states: States, p: Tensor, mask: Tensor, *, rig: Rig, camera: Camera
 
 
 def _seen_place(states: States, rig: Rig) -> Tensor:
-    """(n, 3) where a pupil that looks straight ahead stands before a camera turned by its mounting; not slipped."""
-    depth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) * states.trait("depth_um")[:, None]
-    return _turn(torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64) + depth, states.mount_rad)
+    """(n, 3) where a pupil that looks straight ahead stands before a camera turned by
+    its mounting; not slipped.
+    """
+    depth = (
+        torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        * states.trait("depth_um")[:, None]
+    )
+    return _turn(
+        torch.tensor([*rig.aim_um, rig.distance_um], dtype=torch.float64) + depth,
+        states.mount_rad,
+    )
 
 
 def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
     """(n, 1 + rim, 2) centre and rim of the pupil in the plane of the iris."""
     turn = torch.arange(rim, dtype=torch.float64) * (2 * torch.pi / rim)
-    circle = torch.cat([torch.zeros(1, 2, dtype=torch.float64), torch.stack([torch.cos(turn), torch.sin(turn)], 1)])
+    circle = torch.cat(
+        [
+            torch.zeros(1, 2, dtype=torch.float64),
+            torch.stack([torch.cos(turn), torch.sin(turn)], 1),
+        ]
+    )
     return p[:, model.PUPIL_R, None, None] * circle
 
 
@@ -168,7 +224,8 @@ def _pupil_points(p: Tensor, rim: int = 24) -> Tensor:
 class Sensitivities:
     """Frames and their exact derivatives along two motions.
 
-    frames: as rendered. first, second: derivative of every field of ``frames`` (per rad, per um).
+    frames: as rendered. first, second: derivative of every field of ``frames`` (per
+    rad, per um).
     """
 
     frames: Frames
@@ -184,7 +241,8 @@ def sensitivities(
     camera: Camera | None = None,
     texture_seed: int = 0,
 ) -> Sensitivities:
-    """Derivatives of the rendered sheets by forward-mode dual numbers, compiled (float32).
+    """Derivatives of the rendered sheets by forward-mode dual numbers, compiled
+    (float32).
 
     The brightness is held: the automatic exposure does not follow the motion.
 
@@ -199,7 +257,11 @@ def sensitivities(
     t = camera.tangents(rig).astype(np.float32)
     out = np.empty((n, 3, 5, size, size), np.float32)
     render_kernel.differentiate(
-        packed.numpy().astype(np.float32), textures.pairs(texture_seed), t, t, out.reshape(n, 15, size, size)
+        packed.numpy().astype(np.float32),
+        textures.pairs(texture_seed),
+        t,
+        t,
+        out.reshape(n, 15, size, size),
     )
     scale = states.scale.to(torch.float32)[:, None, None, None]
     value, first, second = (torch.from_numpy(out[:, k]) for k in range(3))
@@ -221,8 +283,14 @@ def parameter_tangents(
             raise SceneError(f"motion {name!r}: need one of {', '.join(MOTIONS)}")
 
     def packed(change: Tensor) -> Tensor:
-        moved = replace(states, gaze_rad=states.gaze_rad + change[:, :2], slip_um=states.slip_um + change[:, 2:])
-        return parameters(moved, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um)
+        moved = replace(
+            states,
+            gaze_rad=states.gaze_rad + change[:, :2],
+            slip_um=states.slip_um + change[:, 2:],
+        )
+        return parameters(
+            moved, rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
+        )
 
     still = torch.zeros(len(states), len(MOTIONS), dtype=torch.float64)
     values, slopes = still, []
@@ -234,8 +302,11 @@ def parameter_tangents(
     return values, slopes[0], slopes[1]
 
 
-def twin(p: Tensor, rig: Rig, camera: Camera, *, texture_seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The compiled frames again, in torch and the dtype of ``p``: exact, differentiable, and slow.
+def twin(
+    p: Tensor, rig: Rig, camera: Camera, *, texture_seed: int = 0
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The compiled frames again, in torch and the dtype of ``p``: exact,
+    differentiable, and slow.
 
     Args:
         p: (n, COUNT) parameters.
@@ -251,7 +322,21 @@ def twin(p: Tensor, rig: Rig, camera: Camera, *, texture_seed: int = 0) -> tuple
     near = model.skin(q, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz)
     far, z, hole = model.eye(q, bank, gx, gy, upper, lower, dx, dy, dz)
     light = torch.stack([near * (1 - seen), far * seen], 1)
-    return light, torch.stack([1 - seen, seen], 1), torch.stack([s * dz, z * dz], 1), hole * seen
+    return (
+        light,
+        torch.stack([1 - seen, seen], 1),
+        torch.stack([s * dz, z * dz], 1),
+        hole * seen,
+    )
 
 
-__all__ = ["NAMES", "Camera", "Labels", "Rendered", "Sensitivities", "render", "sensitivities", "twin"]
+__all__ = [
+    "NAMES",
+    "Camera",
+    "Labels",
+    "Rendered",
+    "Sensitivities",
+    "render",
+    "sensitivities",
+    "twin",
+]

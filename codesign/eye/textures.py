@@ -1,4 +1,6 @@
-"""Pictures of iris, vessels, skin and lashes, made once from a seed and sampled by the renderer."""
+"""Pictures of iris, vessels, skin and lashes, made once from a seed and sampled by the
+renderer.
+"""
 
 import functools
 import math
@@ -16,7 +18,9 @@ KINDS = ("iris", "vein", "skin", "fine", "lash")
 
 @functools.lru_cache(maxsize=2)
 def bank(seed: int = 0) -> Array:
-    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants of a kind together; about 1 s."""
+    """(len(KINDS) * VARIANTS, SIZE, SIZE) float32 in steps of 1 / STEPS, the variants
+    of a kind together; about 1 s.
+    """
     makers = (_iris, _veins, _skin, _fine, _lashes)
     pictures = [
         maker(np.random.default_rng((seed, kind, variant)))
@@ -30,7 +34,9 @@ def bank(seed: int = 0) -> Array:
 
 @functools.lru_cache(maxsize=2)
 def pairs(seed: int = 0) -> Array:
-    """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its right neighbour, flat."""
+    """The bank as integers of 1 / STEPS, every pixel (low half of an int32) with its
+    right neighbour, flat.
+    """
     steps = np.round(bank(seed) * STEPS).astype(np.int32)
     out = ((steps & 0xFFFF) | (np.roll(steps, -1, axis=2) << 16)).ravel()
     out.flags.writeable = False
@@ -38,33 +44,67 @@ def pairs(seed: int = 0) -> Array:
 
 
 def noise(
-    rng: np.random.Generator, *, power: float, stretch: float = 1.0, shape: tuple[int, int] = (SIZE, SIZE)
+    rng: np.random.Generator,
+    *,
+    power: float,
+    stretch: float = 1.0,
+    shape: tuple[int, int] = (SIZE, SIZE),
 ) -> Array:
-    """Periodic Gaussian noise of unit deviation, amplitude 1 / f^power, ``stretch`` times longer along y."""
+    """Periodic Gaussian noise of unit deviation, amplitude 1 / f^power, ``stretch``
+    times longer along y.
+    """
     fy = np.fft.fftfreq(shape[0])[:, None] * shape[0] * stretch
     fx = np.fft.rfftfreq(shape[1])[None] * shape[1]
     frequency = np.hypot(fy, fx)
     frequency[0, 0] = np.inf
-    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * frequency**-power, s=shape)
+    field = np.fft.irfft2(
+        np.fft.rfft2(rng.standard_normal(shape)) * frequency**-power, s=shape
+    )
     return np.asarray(field / field.std())
 
 
 def _iris(rng: np.random.Generator) -> Array:
-    """Fibres, collarette, crypts and furrows in the plane of the iris: pupil margin at radius 40, limbus at 124."""
+    """Fibres, collarette, crypts and furrows in the plane of the iris: pupil margin at
+    radius 40, limbus at 124.
+    """
     rings, turns = 96, 1024
     rho = (np.arange(rings) / (rings - 1))[:, None]
-    fibres = np.tanh(0.9 * noise(rng, power=0.7, stretch=rng.uniform(5, 11), shape=(2 * rings, turns))[:rings])
+    fibres = np.tanh(
+        0.9
+        * noise(rng, power=0.7, stretch=rng.uniform(5, 11), shape=(2 * rings, turns))[
+            :rings
+        ]
+    )
     clouds = noise(rng, power=1.4, stretch=2.0, shape=(2 * rings, turns))[:rings]
     wave = 0.28 + 0.05 * np.tanh(noise(rng, power=1.2, shape=(4, turns))[:1])
     collarette = np.exp(-(((rho - wave) / 0.045) ** 2))
     furrows = sum(
-        np.exp(-(((rho - at - 0.02 * np.tanh(noise(rng, power=1.5, shape=(4, turns))[:1])) / 0.016) ** 2))
+        np.exp(
+            -(
+                (
+                    (
+                        rho
+                        - at
+                        - 0.02 * np.tanh(noise(rng, power=1.5, shape=(4, turns))[:1])
+                    )
+                    / 0.016
+                )
+                ** 2
+            )
+        )
         for at in rng.uniform(0.55, 0.9, rng.integers(1, 4))
     )
-    polar = 0.6 * fibres + 0.35 * clouds + rng.uniform(0.3, 0.9) * collarette - rng.uniform(0, 0.6) * furrows
+    polar = (
+        0.6 * fibres
+        + 0.35 * clouds
+        + rng.uniform(0.3, 0.9) * collarette
+        - rng.uniform(0, 0.6) * furrows
+    )
     for _ in range(int(rng.integers(3, 14))):
         polar -= _crypt(rng, rho, turns)
-    y, x = np.meshgrid(np.arange(SIZE) - SIZE / 2, np.arange(SIZE) - SIZE / 2, indexing="ij")
+    y, x = np.meshgrid(
+        np.arange(SIZE) - SIZE / 2, np.arange(SIZE) - SIZE / 2, indexing="ij"
+    )
     row = np.clip((np.hypot(y, x) - 40) / 84, 0, 1) * (rings - 1)
     column = (np.arctan2(y, x) / (2 * math.pi) % 1) * turns
     return _bilinear(np.tanh(polar), row, column)
@@ -74,7 +114,9 @@ def _crypt(rng: np.random.Generator, rho: Array, turns: int) -> Array:
     """A dark lozenge with a soft border beside the collarette."""
     at, where = rng.uniform(0.32, 0.6), rng.uniform(0, 1)
     turn = (np.arange(turns) / turns - where + 0.5) % 1 - 0.5
-    distance = np.abs((rho - at) / rng.uniform(0.05, 0.13)) + np.abs(turn / rng.uniform(0.006, 0.018))
+    distance = np.abs((rho - at) / rng.uniform(0.05, 0.13)) + np.abs(
+        turn / rng.uniform(0.006, 0.018)
+    )
     return np.asarray(rng.uniform(0.6, 1.3) / (1 + np.exp(6 * (distance - 1))))
 
 
@@ -84,7 +126,9 @@ def _bilinear(picture: Array, row: Array, column: Array) -> Array:
     s, t = column - c, row - r
     c = c % picture.shape[1]
     top = picture[r, c] * (1 - s) + picture[r, right] * s
-    return np.asarray(top * (1 - t) + (picture[below, c] * (1 - s) + picture[below, right] * s) * t)
+    return np.asarray(
+        top * (1 - t) + (picture[below, c] * (1 - s) + picture[below, right] * s) * t
+    )
 
 
 def _veins(rng: np.random.Generator) -> Array:
@@ -93,12 +137,27 @@ def _veins(rng: np.random.Generator) -> Array:
     for _ in range(int(rng.integers(5, 12))):
         start = np.array([rng.choice([0.0, SIZE]), rng.uniform(0, SIZE)])
         heading = (0.0 if start[0] == 0 else math.pi) + rng.normal(0, 0.5)
-        _vessel(canvas, rng, start, heading, width=rng.uniform(0.25, 0.8), length=int(rng.integers(40, 120)), depth=2)
+        _vessel(
+            canvas,
+            rng,
+            start,
+            heading,
+            width=rng.uniform(0.25, 0.8),
+            length=int(rng.integers(40, 120)),
+            depth=2,
+        )
     return np.asarray(ndimage.gaussian_filter(canvas / 255.0, 0.8, mode="wrap"))
 
 
 def _vessel(
-    canvas: Array, rng: np.random.Generator, at: Array, heading: float, *, width: float, length: int, depth: int
+    canvas: Array,
+    rng: np.random.Generator,
+    at: Array,
+    heading: float,
+    *,
+    width: float,
+    length: int,
+    depth: int,
 ) -> None:
     import cv2
 
@@ -108,14 +167,26 @@ def _vessel(
         path.append(path[-1] + 2.0 * np.array([math.cos(heading), math.sin(heading)]))
         if depth and rng.random() < 0.03:
             angle = heading + rng.choice([-0.6, 0.6])
-            _vessel(canvas, rng, path[-1], angle, width=0.7 * width, length=length // 2, depth=depth - 1)
+            _vessel(
+                canvas,
+                rng,
+                path[-1],
+                angle,
+                width=0.7 * width,
+                length=length // 2,
+                depth=depth - 1,
+            )
     line = np.round(np.array(path) * 16).astype(np.int32).reshape(-1, 1, 2)
-    cv2.polylines(canvas, [line], False, int(255 * min(1.0, 1.4 * width)), 1, cv2.LINE_AA, 4)
+    cv2.polylines(
+        canvas, [line], False, int(255 * min(1.0, 1.4 * width)), 1, cv2.LINE_AA, 4
+    )
 
 
 def _skin(rng: np.random.Generator) -> Array:
     """Blotches and shallow folds that run across."""
-    return np.asarray(np.tanh(0.6 * noise(rng, power=1.4) + 0.5 * noise(rng, power=1.1, stretch=4.0)))
+    return np.asarray(
+        np.tanh(0.6 * noise(rng, power=1.4) + 0.5 * noise(rng, power=1.1, stretch=4.0))
+    )
 
 
 def _fine(rng: np.random.Generator) -> Array:
@@ -126,19 +197,35 @@ def _fine(rng: np.random.Generator) -> Array:
 
 
 def _lashes(rng: np.random.Generator) -> Array:
-    """Hairs that grow from row 0 (the lid's margin), bend to one side and taper, in [0, 1]; the last rows are empty."""
+    """Hairs that grow from row 0 (the lid's margin), bend to one side and taper, in [0,
+    1]; the last rows are empty.
+    """
     import cv2
 
     canvas = np.zeros((SIZE, 3 * SIZE), np.uint8)
     lean = rng.uniform(-0.25, 0.25)
     for root in np.arange(0, SIZE, rng.uniform(4.5, 8.0)) + rng.uniform(0, 3):
-        root, length, bend = root + rng.normal(0, 2.5), rng.uniform(60, 235), lean + rng.normal(0, 0.3)
+        root, length, bend = (
+            root + rng.normal(0, 2.5),
+            rng.uniform(60, 235),
+            lean + rng.normal(0, 0.3),
+        )
         along = np.linspace(0, 1, 12)
         x, y = root + SIZE + length * bend * along**2, length * along
         points = np.round(np.stack([x, y], 1) * 16).astype(np.int32)
         for k in range(11):
             width = 2 if k < 4 else 1
-            cv2.line(canvas, points[k].tolist(), points[k + 1].tolist(), int(255 - 21 * k), width, cv2.LINE_AA, 4)
+            cv2.line(
+                canvas,
+                points[k].tolist(),
+                points[k + 1].tolist(),
+                int(255 - 21 * k),
+                width,
+                cv2.LINE_AA,
+                4,
+            )
     folded = np.maximum.reduce([canvas[:, k * SIZE : (k + 1) * SIZE] for k in range(3)])
     folded[-8:] = 0
-    return np.asarray(ndimage.gaussian_filter(folded / 255.0, 0.7, mode=("constant", "wrap")))
+    return np.asarray(
+        ndimage.gaussian_filter(folded / 255.0, 0.7, mode=("constant", "wrap"))
+    )

@@ -11,11 +11,14 @@ from metalens.ground.errors import SceneError
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """Another camera for each of n frames; its lamps go with it, and the nominal pupil lies where the rig's does.
+    """Another camera for each of n frames; its lamps go with it, and the nominal pupil
+    lies where the rig's does.
 
-    tilt_rad: (n,) seen from this much higher than the rig does, about the face's horizontal.
+    tilt_rad: (n,) seen from this much higher than the rig does, about the face's
+    horizontal.
     side_rad: (n,) and from this far to the face's +x, about its vertical.
-    roll_rad: (n,) turned about the camera's own axis; what is right of the axis comes below it.
+    roll_rad: (n,) turned about the camera's own axis; what is right of the axis comes
+    below it.
     wide: (n,) tangents of the picture's rays over those of the rig's camera, above 0.
     """
 
@@ -25,24 +28,35 @@ class View:
     wide: Tensor
 
     def __post_init__(self) -> None:
-        if not (all(self.tilt_rad.shape == getattr(self, n).shape for n in self.__slots__) and (self.wide > 0).all()):
+        if not (
+            all(self.tilt_rad.shape == getattr(self, n).shape for n in self.__slots__)
+            and (self.wide > 0).all()
+        ):
             raise SceneError(
                 f"views {[tuple(getattr(self, n).shape) for n in self.__slots__]}: need (n,), wide above 0"
             )
 
 
 def face_axes(elevation_rad: float) -> Tensor:
-    """(3, 3) rows right, down and out of the face in the frame of a camera that sees it from this far below."""
+    """(3, 3) rows right, down and out of the face in the frame of a camera that sees it
+    from this far below.
+    """
     s, c = math.sin(elevation_rad), math.cos(elevation_rad)
-    return torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64)
+    return torch.tensor(
+        [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]], dtype=torch.float64
+    )
 
 
 def seen_axes(elevation_rad: float, view: View) -> Tensor:
-    """(n, 3, 3) of :func:`face_axes` as these cameras see them: Rz(roll) [axes after Ry(side) at elevation - tilt]."""
+    """(n, 3, 3) of :func:`face_axes` as these cameras see them: Rz(roll) [axes after
+    Ry(side) at elevation - tilt].
+    """
     elevation = elevation_rad - view.tilt_rad
     (s, c), (a, b) = ((torch.sin(v), torch.cos(v)) for v in (elevation, view.side_rad))
     zero = torch.zeros_like(s)
-    right = torch.stack([b, -a * s, -a * c], 1)  # cos(side) right + sin(side) out of a camera straight below
+    right = torch.stack(
+        [b, -a * s, -a * c], 1
+    )  # cos(side) right + sin(side) out of a camera straight below
     down = torch.stack([zero, c, -s], 1)
     out = torch.stack([-a, -b * s, -b * c], 1)
     x, y, z = torch.stack([right, down, out], 1).unbind(2)

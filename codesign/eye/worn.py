@@ -1,7 +1,10 @@
-"""What real frames have and the model of the eye has not: spectacles, make-up, uneven light, movement, other cameras.
+"""What real frames have and the model of the eye has not: spectacles, make-up, uneven
+light, movement, other cameras.
 
-Every cause is a record of :data:`CAUSES` and changes rendered frames, their depth and their pupil masks, in the image.
-It is on in a share of the frames that grows with the ``variety`` of the scenes: none at 1, the record's share at 2.
+Every cause is a record of :data:`CAUSES` and changes rendered frames, their depth and
+their pupil masks, in the image.
+It is on in a share of the frames that grows with the ``variety`` of the scenes: none at
+1, the record's share at 2.
 """
 
 from collections.abc import Mapping
@@ -22,7 +25,8 @@ from metalens.image import Frames
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that a frame may have: in this share of them at variety 2, its size drawn evenly from a range.
+    """Something that a frame may have: in this share of them at variety 2, its size
+    drawn evenly from a range.
 
     low, high: range of its size in ``unit``.
     """
@@ -35,47 +39,152 @@ class Cause:
 
 
 CAUSES: Mapping[str, Cause] = {
-    "tilt": Cause(0.7, -30.0, 50.0, "deg", "the camera sees the face from below or above its usual place"),
-    "liner": Cause(0.25, 0.3, 0.9, "opacity", "dark line along the lids' margins: liner, mascara, dense lashes"),
-    "lid_shadow": Cause(0.25, 0.15, 0.6, "opacity", "darkened upper lid: eye shadow, a deep socket"),
-    "rim": Cause(0.2, 0.03, 0.10, "frame widths", "band of a spectacle frame before the face"),
-    "reflection": Cause(0.25, 0.15, 0.8, "radiance", "windows and lamps mirrored in spectacle glass"),
-    "glints": Cause(0.4, 0.4, 1.2, "radiance", "mirror images of lamps on the cornea and the tears"),
-    "gradient": Cause(0.6, 0.1, 0.7, "of the mean light", "light that falls off from one side to the other"),
-    "shade": Cause(0.25, 0.2, 0.7, "of the light", "shadow with a soft edge, of brow, nose or frame"),
-    "movement": Cause(0.3, 0.008, 0.04, "frame widths", "the eye or the camera moves during the exposure"),
-    "vignette": Cause(0.4, 0.1, 0.8, "of the light", "another camera's corners are darker than its middle"),
-    "saturation": Cause(0.25, 0.01, 0.15, "of the pixels", "the brightest part of the frame is at the camera's white"),
-    "tone": Cause(0.5, -0.6, 0.6, "logarithm of gamma", "another camera's curve: dark parts lifted or crushed"),
-    "side": Cause(0.6, -40.0, 40.0, "deg", "the camera sees the face from its left or right"),
-    "roll": Cause(0.5, -25.0, 25.0, "deg", "the camera is turned about its axis"),
-    "wide": Cause(0.7, 1.1, 2.2, "times the field", "a wider field: the whole opening of the lids, lashes and brow"),
-    "iris": Cause(0.35, 0.08, 0.5, "of the albedo", "irises little brighter than the pupil, as some are beyond 900 nm"),
-    "overhang": Cause(0.5, 0.5, 1.0, "opacity", "dark lashes from the lids' margins, across the eye and its lids"),
-    "socket": Cause(
-        0.3, 0.2, 0.75, "of the light", "the eye lies darker than the skin: deep sockets, lamps from the side"
+    "tilt": Cause(
+        0.7,
+        -30.0,
+        50.0,
+        "deg",
+        "the camera sees the face from below or above its usual place",
     ),
-    "patch": Cause(0.4, 0.4, 0.95, "opacity", "dark places of the skin: brow, hair, nostril, socket"),
-    "retina": Cause(0.2, 0.02, 0.25, "radiance", "light from the retina, of lamps near the camera's axis"),
-    "veil": Cause(0.4, 0.02, 0.2, "radiance", "stray light and black level: dark parts lifted by as much everywhere"),
+    "liner": Cause(
+        0.25,
+        0.3,
+        0.9,
+        "opacity",
+        "dark line along the lids' margins: liner, mascara, dense lashes",
+    ),
+    "lid_shadow": Cause(
+        0.25, 0.15, 0.6, "opacity", "darkened upper lid: eye shadow, a deep socket"
+    ),
+    "rim": Cause(
+        0.2, 0.03, 0.10, "frame widths", "band of a spectacle frame before the face"
+    ),
+    "reflection": Cause(
+        0.25, 0.15, 0.8, "radiance", "windows and lamps mirrored in spectacle glass"
+    ),
+    "glints": Cause(
+        0.4, 0.4, 1.2, "radiance", "mirror images of lamps on the cornea and the tears"
+    ),
+    "gradient": Cause(
+        0.6,
+        0.1,
+        0.7,
+        "of the mean light",
+        "light that falls off from one side to the other",
+    ),
+    "shade": Cause(
+        0.25,
+        0.2,
+        0.7,
+        "of the light",
+        "shadow with a soft edge, of brow, nose or frame",
+    ),
+    "movement": Cause(
+        0.3,
+        0.008,
+        0.04,
+        "frame widths",
+        "the eye or the camera moves during the exposure",
+    ),
+    "vignette": Cause(
+        0.4,
+        0.1,
+        0.8,
+        "of the light",
+        "another camera's corners are darker than its middle",
+    ),
+    "saturation": Cause(
+        0.25,
+        0.01,
+        0.15,
+        "of the pixels",
+        "the brightest part of the frame is at the camera's white",
+    ),
+    "tone": Cause(
+        0.5,
+        -0.6,
+        0.6,
+        "logarithm of gamma",
+        "another camera's curve: dark parts lifted or crushed",
+    ),
+    "side": Cause(
+        0.6, -40.0, 40.0, "deg", "the camera sees the face from its left or right"
+    ),
+    "roll": Cause(0.5, -25.0, 25.0, "deg", "the camera is turned about its axis"),
+    "wide": Cause(
+        0.7,
+        1.1,
+        2.2,
+        "times the field",
+        "a wider field: the whole opening of the lids, lashes and brow",
+    ),
+    "iris": Cause(
+        0.35,
+        0.08,
+        0.5,
+        "of the albedo",
+        "irises little brighter than the pupil, as some are beyond 900 nm",
+    ),
+    "overhang": Cause(
+        0.5,
+        0.5,
+        1.0,
+        "opacity",
+        "dark lashes from the lids' margins, across the eye and its lids",
+    ),
+    "socket": Cause(
+        0.3,
+        0.2,
+        0.75,
+        "of the light",
+        "the eye lies darker than the skin: deep sockets, lamps from the side",
+    ),
+    "patch": Cause(
+        0.4,
+        0.4,
+        0.95,
+        "opacity",
+        "dark places of the skin: brow, hair, nostril, socket",
+    ),
+    "retina": Cause(
+        0.2,
+        0.02,
+        0.25,
+        "radiance",
+        "light from the retina, of lamps near the camera's axis",
+    ),
+    "veil": Cause(
+        0.4,
+        0.02,
+        0.2,
+        "radiance",
+        "stray light and black level: dark parts lifted by as much everywhere",
+    ),
 }
 VIEWS = ("tilt", "side", "roll", "wide")  # of the view that frames are rendered from
 BEFORE = (*VIEWS, "iris")  # what frames are rendered with; all else is put on them
 RIM_DEPTH = 0.7  # of the pupil's depth: some 6 mm before the face
-WHITE, BLACK = 0.99, 1e-3  # of a tone curve: share of the pixels below its white, and the least level of it
+WHITE, BLACK = (
+    0.99,
+    1e-3,
+)  # of a tone curve: share of the pixels below its white, and the least level of it
 TAPS = 15  # of the kernel of a movement, at most its length
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Worn:
-    """What each of n frames has: ``size`` by cause, 0 where it is off; ``draws`` (n, 12) in [0, 1) place it."""
+    """What each of n frames has: ``size`` by cause, 0 where it is off; ``draws`` (n,
+    12) in [0, 1) place it.
+    """
 
     size: Mapping[str, Array]
     draws: Array
 
 
 def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
-    """Causes of ``count`` frames; off everywhere up to variety 1. The same generator draws the same at any variety."""
+    """Causes of ``count`` frames; off everywhere up to variety 1. The same generator
+    draws the same at any variety.
+    """
     size = {}
     for name, cause in CAUSES.items():
         on = generator.random(count) < min(cause.share * max(variety - 1.0, 0.0), 1.0)
@@ -86,7 +195,12 @@ def drawn(count: int, variety: float, generator: np.random.Generator) -> Worn:
 def viewed(worn: Worn) -> View:
     """The cameras that the frames are rendered from."""
     tilt, side, roll, wide = (torch.from_numpy(worn.size[name]) for name in VIEWS)
-    return View(torch.deg2rad(tilt), torch.deg2rad(side), torch.deg2rad(roll), torch.where(wide > 0, wide, 1.0))
+    return View(
+        torch.deg2rad(tilt),
+        torch.deg2rad(side),
+        torch.deg2rad(roll),
+        torch.where(wide > 0, wide, 1.0),
+    )
 
 
 def pigmented(states: States, worn: Worn) -> States:
@@ -97,19 +211,31 @@ def pigmented(states: States, worn: Worn) -> States:
 
 
 def dressed(made: Rendered, worn: Worn) -> Rendered:
-    """Rendered frames with what is worn but the causes of :func:`viewed` and :func:`pigmented`: those came before.
+    """Rendered frames with what is worn but the causes of :func:`viewed` and
+    :func:`pigmented`: those came before.
 
-    Light, coverage and depth of both sheets change, and the pupil's mask where something hides or moves it; of the
+    Light, coverage and depth of both sheets change, and the pupil's mask where
+    something hides or moves it; of the
     labels the centroid and the visible share of the pupil follow.
     """
     if not any(worn.size[name].any() for name in CAUSES if name not in BEFORE):
         return made
-    light, cover, depth = (getattr(made.frames, name).clone() for name in Frames.__slots__)
+    light, cover, depth = (
+        getattr(made.frames, name).clone() for name in Frames.__slots__
+    )
     pupil, grid = made.pupil.clone(), _grid(int(light.shape[-1]))
-    for steps in ((_made_up, _grown, _glints), (_lit,), (_spectacles,), (_moved,), (_recorded,)):
+    for steps in (
+        (_made_up, _grown, _glints),
+        (_lit,),
+        (_spectacles,),
+        (_moved,),
+        (_recorded,),
+    ):
         for step in steps:
             step(light, cover, depth, pupil, grid, worn, made.labels)
-    return Rendered(Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil))
+    return Rendered(
+        Frames(light, cover, depth), pupil, _labels(made.labels, made.pupil, pupil)
+    )
 
 
 def _grid(pixels: int) -> tuple[Tensor, Tensor]:
@@ -124,8 +250,18 @@ def _on(worn: Worn, name: str) -> list[tuple[int, float, Array]]:
     return [(int(i), float(size[i]), worn.draws[i]) for i in np.flatnonzero(size)]
 
 
-def _made_up(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
-    """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin above, up to 12 % of the frame."""
+def _made_up(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: object,
+    worn: Worn,
+    of: Labels,
+) -> None:
+    """Liner: skin within 1.5 to 4 % of the frame of the opening. Shadow: the skin
+    above, up to 12 % of the frame.
+    """
     pixels = int(light.shape[-1])
     for i, opacity, draws in _on(worn, "liner"):
         wide = max(1, round((0.015 + 0.025 * draws[0]) * pixels))
@@ -133,11 +269,23 @@ def _made_up(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: o
         light[i, 0] *= 1 - opacity * near
     for i, opacity, draws in _on(worn, "lid_shadow"):
         high = max(2, round((0.06 + 0.06 * draws[2]) * pixels))
-        light[i, 0] *= 1 - opacity * _soft(_spread(cover[i, 1], up=high, down=0), high / 2)
+        light[i, 0] *= 1 - opacity * _soft(
+            _spread(cover[i, 1], up=high, down=0), high / 2
+        )
 
 
-def _grown(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
-    """A darker eye, light of the retina, dark places of the skin, lashes over both sheets; masks stay outlines."""
+def _grown(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: object,
+    worn: Worn,
+    of: Labels,
+) -> None:
+    """A darker eye, light of the retina, dark places of the skin, lashes over both
+    sheets; masks stay outlines.
+    """
     for i, taken, _ in _on(worn, "socket"):
         light[i, 1] *= 1 - taken
     for i, radiance, _ in _on(worn, "retina"):
@@ -149,7 +297,9 @@ def _grown(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: obj
 
 
 def _spread(cover: Tensor, *, up: int, down: int) -> Tensor:
-    """(y, x) largest coverage within ``up`` rows below each pixel and ``down`` rows above it."""
+    """(y, x) largest coverage within ``up`` rows below each pixel and ``down`` rows
+    above it.
+    """
     padded = F.pad(cover[None, None], (0, 0, down, up))
     return F.max_pool2d(padded, (up + down + 1, 1), stride=1)[0, 0]
 
@@ -163,7 +313,9 @@ def _soft(picture: Tensor, width: float) -> Tensor:
 
 def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
             of: Labels) -> None:  # fmt: skip
-    """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is seen of the eye."""
+    """One to four spots about the pupil, 0.5 to 4 % of the frame across, on what is
+    seen of the eye.
+    """
     pixels, (x, y) = int(light.shape[-1]), grid
     for i, radiance, draws in _on(worn, "glints"):
         px, py = ((of.pupil_px[i] + 0.5) / pixels - 0.5).tolist()
@@ -172,7 +324,9 @@ def _glints(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tu
             at = turn + 1.7 * k
             size = 0.005 + 0.035 * ((draws[6] + 0.37 * k) % 1) ** 2
             dx, dy = x - px - apart * np.cos(at), y - py - apart * np.sin(at)
-            light[i, 1] += radiance * cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
+            light[i, 1] += (
+                radiance * cover[i, 1] / (1 + ((dx**2 + dy**2) / size**2) ** 2)
+            )
 
 
 def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
@@ -190,22 +344,42 @@ def _lit(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple
 
 def _spectacles(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
                 of: Labels) -> None:  # fmt: skip
-    """Mirrored windows on the glass, then the rim before all: an arc that hides what is behind it."""
+    """Mirrored windows on the glass, then the rim before all: an arc that hides what is
+    behind it.
+    """
     x, y = grid
     for i, radiance, draws in _on(worn, "reflection"):
         for k in range(1 + int(3 * draws[0])):
-            at_x, at_y = ((draws[1] + 0.61 * k) % 1 - 0.5, (draws[2] + 0.43 * k) % 1 - 0.5)
-            half_x, half_y = 0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1), 0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1)
+            at_x, at_y = (
+                (draws[1] + 0.61 * k) % 1 - 0.5,
+                (draws[2] + 0.43 * k) % 1 - 0.5,
+            )
+            half_x, half_y = (
+                0.02 + 0.1 * ((draws[3] + 0.29 * k) % 1),
+                0.02 + 0.08 * ((draws[4] + 0.53 * k) % 1),
+            )
             lean = 0.6 * (draws[5] - 0.5)
             u, v = (x - at_x) + lean * (y - at_y), (y - at_y) - lean * (x - at_x)
-            light[i] += radiance * cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+            light[i] += (
+                radiance * cover[i] / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
+            )
     for i, width, draws in _on(worn, "rim"):
-        radius, at, gap = 0.45 + 0.5 * draws[6], 6.283 * draws[7], 0.30 + 0.17 * draws[8]
+        radius, at, gap = (
+            0.45 + 0.5 * draws[6],
+            6.283 * draws[7],
+            0.30 + 0.17 * draws[8],
+        )
         middle_x, middle_y = (radius - gap) * np.cos(at), (radius - gap) * np.sin(at)
-        away = torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
-        band = torch.sigmoid((width / 2 - (away - width / 2).abs()) * light.shape[-1] * 2)
+        away = (
+            torch.hypot(x + middle_x, (y + middle_y) * (0.8 + 0.4 * draws[9])) - radius
+        )
+        band = torch.sigmoid(
+            (width / 2 - (away - width / 2).abs()) * light.shape[-1] * 2
+        )
         shine = 0.02 + 0.5 * draws[10] ** 2 * (1 + 0.6 * torch.cos(away / width * 6.0))
-        eye = depth[i, 1][depth[i, 1] > 0]  # 0 behind skin, which is most of many frames
+        eye = depth[i, 1][
+            depth[i, 1] > 0
+        ]  # 0 behind skin, which is most of many frames
         far = (eye if len(eye) else depth[i, 0]).median() * RIM_DEPTH
         _hidden(light, cover, depth, pupil, i, band, band * shine, far)
 
@@ -221,8 +395,18 @@ def _hidden(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, i: int, 
     depth[i, 0] = torch.where(band > 0.5, depth_um, depth[i, 0])
 
 
-def _moved(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: object, worn: Worn, of: Labels) -> None:
-    """Both sheets and the mask averaged along a line: what the pixels collect while the picture moves."""
+def _moved(
+    light: Tensor,
+    cover: Tensor,
+    depth: Tensor,
+    pupil: Tensor,
+    grid: object,
+    worn: Worn,
+    of: Labels,
+) -> None:
+    """Both sheets and the mask averaged along a line: what the pixels collect while the
+    picture moves.
+    """
     pixels = int(light.shape[-1])
     for i, length, draws in _on(worn, "movement"):
         kernel = line_kernel(length * pixels, 3.1416 * draws[11])
@@ -231,14 +415,21 @@ def _moved(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: obj
         reach = len(kernel) // 2
         padded = F.pad(stack[:, None], (reach,) * 4, mode="replicate")
         seen = F.conv2d(padded, kernel[None, None])[:, 0]
-        light[i], cover[i], depth[i], pupil[i] = seen[:2], seen[2:4], seen[4:6] / seen[6:8], seen[8]
+        light[i], cover[i], depth[i], pupil[i] = (
+            seen[:2],
+            seen[2:4],
+            seen[4:6] / seen[6:8],
+            seen[8],
+        )
 
 
 def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: tuple[Tensor, Tensor], worn: Worn,
               of: Labels) -> None:  # fmt: skip
-    """As another camera gives it: stray light, darker corners, white from some level on, a curve from black to white.
+    """As another camera gives it: stray light, darker corners, white from some level
+    on, a curve from black to white.
 
-    A factor on both sheets alike. Curves are of the light before the lens, where frames are dressed: blur and curve
+    A factor on both sheets alike. Curves are of the light before the lens, where frames
+    are dressed: blur and curve
     change places only at edges.
     """
     x, y = grid
@@ -248,7 +439,9 @@ def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: 
         light[i] *= 1 - dark * 2 * (x**2 + y**2)
     for i, share, _ in _on(worn, "saturation"):
         level = light[i].sum(0)
-        light[i] *= (torch.quantile(level, 1 - share) / level.clamp_min(1e-9)).clamp(max=1.0)
+        light[i] *= (torch.quantile(level, 1 - share) / level.clamp_min(1e-9)).clamp(
+            max=1.0
+        )
     for i, log_gamma, _ in _on(worn, "tone"):
         level = light[i].sum(0)
         white = torch.quantile(level, WHITE).clamp_min(1e-9)
@@ -256,14 +449,21 @@ def _recorded(light: Tensor, cover: Tensor, depth: Tensor, pupil: Tensor, grid: 
 
 
 def line_kernel(length_px: float, angle_rad: float) -> Tensor:
-    """(k, k) weights, of sum 1, of a picture that moves evenly along a line of this length through the middle."""
+    """(k, k) weights, of sum 1, of a picture that moves evenly along a line of this
+    length through the middle.
+    """
     reach = min(int(np.ceil(length_px / 2)), TAPS // 2)
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     for along in ((np.arange(32) + 0.5) / 32 - 0.5) * min(length_px, 2 * reach):
         x, y = along * np.cos(angle_rad) + reach, along * np.sin(angle_rad) + reach
         column, row = (min(int(v), 2 * reach - 1) if reach else 0 for v in (x, y))
         s, t = (x - column, y - row) if reach else (0.0, 0.0)
-        for dy, dx, weight in ((0, 0, (1 - s) * (1 - t)), (0, 1, s * (1 - t)), (1, 0, (1 - s) * t), (1, 1, s * t)):
+        for dy, dx, weight in (
+            (0, 0, (1 - s) * (1 - t)),
+            (0, 1, s * (1 - t)),
+            (1, 0, (1 - s) * t),
+            (1, 1, s * t),
+        ):
             if weight > 0:
                 kernel[row + dy, column + dx] += weight
     return torch.from_numpy(kernel / kernel.sum()).float()
@@ -275,5 +475,9 @@ def _labels(labels: Labels, before: Tensor, after: Tensor) -> Labels:
     share = torch.where(was > 1e-6, now / was.clamp_min(1e-9), torch.ones_like(was))
     place = torch.arange(after.shape[-1], dtype=torch.float64)
     sums = torch.stack([(after.sum(k).double() * place).sum(1) for k in (1, 2)], 1)
-    centroid = torch.where(now[:, None] > 1e-6, sums / now.clamp_min(1e-9)[:, None], labels.pupil_px)
-    return replace(labels, visible=(labels.visible * share).clamp(max=1.0), centroid_px=centroid)
+    centroid = torch.where(
+        now[:, None] > 1e-6, sums / now.clamp_min(1e-9)[:, None], labels.pupil_px
+    )
+    return replace(
+        labels, visible=(labels.visible * share).clamp(max=1.0), centroid_px=centroid
+    )

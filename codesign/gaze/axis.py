@@ -1,6 +1,8 @@
-"""From pupil centre and slippage to the optical axis of the eye: the spherical-eye solver.
+"""From pupil centre and slippage to the optical axis of the eye: the spherical-eye
+solver.
 
-Camera frame: origin at the lens, z towards the eye, x right and y down as on the (upright) sensor image.
+Camera frame: origin at the lens, z towards the eye, x right and y down as on the
+(upright) sensor image.
 """
 
 from dataclasses import dataclass
@@ -16,7 +18,8 @@ class EyeGeometry:
     """Where the eye of a population mean sits before the camera, and how it is built.
 
     centre_mm: rotation centre of the eye at zero slippage.
-    radius_mm: rotation centre to the pupil (13.1 mm from the corneal apex less 3.05 mm of anterior chamber,
+    radius_mm: rotation centre to the pupil (13.1 mm from the corneal apex less 3.05 mm
+    of anterior chamber,
         Le Grand's eye; apex to rotation centre after Guestrin and Eizenman 2006).
     sensor_distance_mm: lens to sensor: turns a place on the sensor into a ray.
     """
@@ -36,8 +39,10 @@ class EyeGeometry:
 class OpticalAxis:
     """Result of the solver.
 
-    direction: (batch, 3) unit vector from the rotation centre through the pupil, towards the camera side.
-    hit: (batch,) whether the ray meets the sphere; where it does not, ``direction`` points to the place on the
+    direction: (batch, 3) unit vector from the rotation centre through the pupil,
+    towards the camera side.
+    hit: (batch,) whether the ray meets the sphere; where it does not, ``direction``
+    points to the place on the
         sphere that is nearest to the ray.
     """
 
@@ -45,22 +50,32 @@ class OpticalAxis:
     hit: Tensor
 
 
-def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> OpticalAxis:
-    """Intersect the ray through the pupil's image with the sphere on which the pupil moves.
+def optical_axis(
+    pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry
+) -> OpticalAxis:
+    """Intersect the ray through the pupil's image with the sphere on which the pupil
+    moves.
 
-    The slippage moves the camera, so the eye sits at centre - slip. With the unit ray u and centre C the near
-    intersection is at t = u·C - sqrt((u·C)² - |C|² + R²); values and gradients stay finite when the ray misses.
+    The slippage moves the camera, so the eye sits at centre - slip. With the unit ray u
+    and centre C the near
+    intersection is at t = u·C - sqrt((u·C)² - |C|² + R²); values and gradients stay
+    finite when the ray misses.
 
     Args:
-        pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the lens axis.
+        pupil_mm: (batch, 2) pupil centre x, y on the sensor, upright image, from the
+            lens axis.
         slip_mm: (batch, 3) displacement of the camera.
     """
     x, y = pupil_mm[..., 0], pupil_mm[..., 1]
     ray = torch.stack([x, y, torch.full_like(x, geometry.sensor_distance_mm)], -1)
     ray = ray / ray.norm(dim=-1, keepdim=True)
-    centre = torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
+    centre = (
+        torch.tensor(geometry.centre_mm, dtype=ray.dtype, device=ray.device) - slip_mm
+    )
     along = (ray * centre).sum(-1)
-    beside = centre - along[..., None] * ray  # from the nearest point of the ray to the centre
+    beside = (
+        centre - along[..., None] * ray
+    )  # from the nearest point of the ray to the centre
     inside = geometry.radius_mm**2 - (beside**2).sum(-1)
     hit = inside > 0
     depth = torch.sqrt(torch.where(hit, inside, torch.ones_like(inside))) * hit
@@ -70,7 +85,10 @@ def optical_axis(pupil_mm: Tensor, slip_mm: Tensor, geometry: EyeGeometry) -> Op
 
 def angle_rad(one: Tensor, other: Tensor) -> Tensor:
     """(batch,) angle between directions, accurate and differentiable down to zero: 2 atan2(|a-b|, |a+b|)."""
-    a, b = one / one.norm(dim=-1, keepdim=True), other / other.norm(dim=-1, keepdim=True)
+    a, b = (
+        one / one.norm(dim=-1, keepdim=True),
+        other / other.norm(dim=-1, keepdim=True),
+    )
     gap = ((a - b) ** 2).sum(-1)
     near = torch.sqrt(torch.where(gap > 0, gap, torch.ones_like(gap))) * (gap > 0)
     return 2 * torch.atan2(near, (a + b).norm(dim=-1))

@@ -1,7 +1,10 @@
-"""Gaze from a network's answers, three ways apart: population eye, the person's own eye, and personal calibration.
+"""Gaze from a network's answers, three ways apart: population eye, the person's own
+eye, and personal calibration.
 
-With a population eye the error is that of anatomy, 3 degrees whatever the lens. So a test takes several frames of each
-of several people, calibrates on a fifth of them (the paper's 20 % of the points), and judges the rest. Where the optic
+With a population eye the error is that of anatomy, 3 degrees whatever the lens. So a
+test takes several frames of each
+of several people, calibrates on a fifth of them (the paper's 20 % of the points), and
+judges the rest. Where the optic
 axis is read too, :func:`learnt` makes a calibrator of what other people's frames tell.
 """
 
@@ -26,7 +29,9 @@ from metalens.ground.errors import TrainingError
 
 @dataclass(frozen=True, eq=False, slots=True)
 class People:
-    """Frames of ``people`` people, ``each`` one after the other; see :class:`codesign.train.inner.Scenes`."""
+    """Frames of ``people`` people, ``each`` one after the other; see
+    :class:`codesign.train.inner.Scenes`.
+    """
 
     scenes: EyeScenes
     states: States
@@ -51,26 +56,41 @@ class People:
     def batch(self, step: int, size: int) -> Batch:
         """Frames of a step."""
         part = self.states[slice(step * size, (step + 1) * size)]
-        return as_batch(render(part, rig=self.scenes.rig, camera=self.scenes.camera), self.margin)
+        return as_batch(
+            render(part, rig=self.scenes.rig, camera=self.scenes.camera), self.margin
+        )
 
 
 def people(scenes: EyeScenes, count: int, each: int, *, seed: int) -> People:
-    """``count`` people who look and slip in ``each`` ways; one mounting of the camera a person, no change of scale."""
+    """``count`` people who look and slip in ``each`` ways; one mounting of the camera a
+    person, no change of scale.
+    """
     subjects = eye.draw(count, (seed, 21), motion=scenes.settings.motion)
     moves = eye.draw(count * each, (seed, 22), motion=scenes.settings.motion)
     rows = torch.arange(count).repeat_interleave(each)
     mine = subjects[rows]
-    states = replace(moves, traits=mine.traits, textures=mine.textures, mount_rad=mine.mount_rad)
-    camera = replace(scenes.camera, pixels=32, pitch_um=scenes.camera.pitch_um * scenes.camera.pixels / 32)
-    return People(scenes, states, render(states, rig=scenes.rig, camera=camera).labels, count)
+    states = replace(
+        moves, traits=mine.traits, textures=mine.textures, mount_rad=mine.mount_rad
+    )
+    camera = replace(
+        scenes.camera,
+        pixels=32,
+        pitch_um=scenes.camera.pitch_um * scenes.camera.pixels / 32,
+    )
+    return People(
+        scenes, states, render(states, rig=scenes.rig, camera=camera).labels, count
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class GazeErrors:
-    """Mean angles in degrees between found and true gaze, over the frames that no calibration saw.
+    """Mean angles in degrees between found and true gaze, over the frames that no
+    calibration saw.
 
-    population: optical axis, mean eye. anatomy: optical axis, the person's own eye. personal: visual axis after a
-    calibration on the person's own frames. The floors: the same by the sphere (:mod:`codesign.gaze.personal`) with true
+    population: optical axis, mean eye. anatomy: optical axis, the person's own eye.
+    personal: visual axis after a
+    calibration on the person's own frames. The floors: the same by the sphere
+    (:mod:`codesign.gaze.personal`) with true
     slippage and pupil, what is left to the solver and not to the network.
     """
 
@@ -82,15 +102,23 @@ class GazeErrors:
     personal_floor_deg: float
 
 
-def read_of(test: People, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None) -> Readings:
+def read_of(
+    test: People, centre: Tensor, slip_mm: Tensor, axis: Tensor | None = None
+) -> Readings:
     """What a network found in the frames, in the units that gaze is calibrated in.
 
     Args:
-        centre: (n, 2) pupil centre, fraction of the frame from its middle. slip_mm: (n, 3) of the head.
-        axis: (n, 3) optic axis in the camera's frame; None of a network that tells none.
+        centre: (n, 2) pupil centre, fraction of the frame from its middle. slip_mm: (n,
+            3) of the head.
+        axis: (n, 3) optic axis in the camera's frame; None of a network that tells
+            none.
     """
     edge_mm = test.scenes.settings.pixels * test.scenes.sample_um * 1e-3
-    angles = None if axis is None else face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
+    angles = (
+        None
+        if axis is None
+        else face_angles(axis.double().numpy(), test.scenes.rig.elevation_rad)
+    )
     return Readings(centre.double().numpy() * edge_mm, slip_mm.double().numpy(), angles)
 
 
@@ -108,33 +136,49 @@ def learnt(before: People, read: Readings) -> shared.People:
     return shared.learn(read, looked_deg(before), np.arange(len(read)) // before.each)
 
 
-def gaze_errors(test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2) -> GazeErrors:
+def gaze_errors(
+    test: People, read: Readings, *, how: Calibrator | None = None, share: float = 0.2
+) -> GazeErrors:
     """Gaze from what a network found in the frames.
 
     Args:
-        how: people are calibrated; without it by pupil and slippage alone, as for the floor.
+        how: people are calibrated; without it by pupil and slippage alone, as for the
+            floor.
         share: part of each person's frames that calibrates.
 
     Raises:
-        TrainingError: a share that leaves less than 3 frames to calibrate or none to judge.
+        TrainingError: a share that leaves less than 3 frames to calibrate or none to
+            judge.
     """
     known = round(share * test.each)
     if not 3 <= known < test.each:
-        raise TrainingError(f"{known} of {test.each} frames a person calibrate: need 3 or more, and some to judge")
+        raise TrainingError(
+            f"{known} of {test.each} frames a person calibrate: need 3 or more, and some to judge"
+        )
     camera = test.scenes.camera.pitch_um * test.scenes.camera.pixels / 32
-    true = Readings(((test.labels.pupil_px - 15.5) * camera * 1e-3).numpy(), (test.labels.slip_um * 1e-3).numpy())
+    true = Readings(
+        ((test.labels.pupil_px - 15.5) * camera * 1e-3).numpy(),
+        (test.labels.slip_um * 1e-3).numpy(),
+    )
     sphere = Sphere(test.scenes.rig)
-    found, floor = _angles(test, read, how or sphere, known), _angles(test, true, sphere, known)
+    found, floor = (
+        _angles(test, read, how or sphere, known),
+        _angles(test, true, sphere, known),
+    )
     return GazeErrors(*(math.degrees(v) for v in (*found, *floor)))
 
 
-def _angles(test: People, read: Readings, how: Calibrator, known: int) -> tuple[float, float, float]:
+def _angles(
+    test: People, read: Readings, how: Calibrator, known: int
+) -> tuple[float, float, float]:
     labels = test.labels
     pupil_mm, slip_mm = torch.from_numpy(read.pupil_mm), torch.from_numpy(read.slip_mm)
     own = (labels.centre_um - labels.slip_um) * 1e-3
     radius = (labels.pupil_um - labels.centre_um).norm(dim=1).mean().item() * 1e-3
     early = (torch.arange(len(own)) % test.each) < known
-    mean = _fitted(test, own.mean(0), radius, torch.nonzero(early)[:, 0], pupil_mm, slip_mm)
+    mean = _fitted(
+        test, own.mean(0), radius, torch.nonzero(early)[:, 0], pupil_mm, slip_mm
+    )
     crowd = optical_axis(pupil_mm, -slip_mm, mean).direction
     looked = looked_deg(test)
     errors: list[list[Tensor]] = [[], [], []]
@@ -153,15 +197,29 @@ def _angles(test: People, read: Readings, how: Calibrator, known: int) -> tuple[
 
 
 def _fitted(
-    test: People, centre: Tensor, radius: float, rows: Tensor, pupil_mm: Tensor, slip_mm: Tensor
+    test: People,
+    centre: Tensor,
+    radius: float,
+    rows: Tensor,
+    pupil_mm: Tensor,
+    slip_mm: Tensor,
 ) -> EyeGeometry:
-    """An eye of this centre, and the radius that suits these frames best (the cornea magnifies)."""
+    """An eye of this centre, and the radius that suits these frames best (the cornea
+    magnifies).
+    """
     distance = test.scenes.sensor_distance_um * 1e-3
-    trials = [EyeGeometry(_place(centre), radius * f, distance) for f in np.linspace(0.9, 1.15, 26)]
+    trials = [
+        EyeGeometry(_place(centre), radius * f, distance)
+        for f in np.linspace(0.9, 1.15, 26)
+    ]
     truth = test.labels.optic_axis[rows]
     return min(
         trials,
-        key=lambda g: float(angle_rad(optical_axis(pupil_mm[rows], -slip_mm[rows], g).direction, truth).mean()),
+        key=lambda g: float(
+            angle_rad(
+                optical_axis(pupil_mm[rows], -slip_mm[rows], g).direction, truth
+            ).mean()
+        ),
     )
 
 

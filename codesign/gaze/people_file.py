@@ -1,4 +1,5 @@
-"""What people have in common, as a file: with an exported network, all by which a device calibrates its wearer.
+"""What people have in common, as a file: with an exported network, all by which a
+device calibrates its wearer.
 
 people = load("people_1.h5")
 wearer = people.person(Readings(pupil_mm, slip_mm, axis_deg), gaze_deg)   # some points that were looked at
@@ -15,18 +16,32 @@ from metalens.ground.errors import StoreError
 from metalens.ground.reading import reader
 
 KIND = "people"
-SHAPES = {"mean": (36, 2), "variance": (36, 2), "noise": (2,), "middle": (7,), "spread": (7,)}
+SHAPES = {
+    "mean": (36, 2),
+    "variance": (36, 2),
+    "noise": (2,),
+    "middle": (7,),
+    "spread": (7,),
+}
 
 
-def save(path: Path, people: People, *, provenance: store.Provenance | None = None) -> None:
-    """Write a file of kind ``people``: β, τ² and σ² in deg and deg², middle and spread of the readings in deg and mm.
+def save(
+    path: Path, people: People, *, provenance: store.Provenance | None = None
+) -> None:
+    """Write a file of kind ``people``: β, τ² and σ² in deg and deg², middle and spread
+    of the readings in deg and mm.
 
     Raises:
         OSError: the target cannot be written (the old file stays).
     """
     model = people.model
     arrays = {"mean": model.mean, "variance": model.variance, "noise": model.noise}
-    store.save(path, KIND, arrays | {"middle": people.middle, "spread": people.spread}, provenance=provenance)
+    store.save(
+        path,
+        KIND,
+        arrays | {"middle": people.middle, "spread": people.spread},
+        provenance=provenance,
+    )
 
 
 @reader
@@ -38,9 +53,19 @@ def load(path: Path) -> People:
     """
     arrays = store.load(path, KIND).arrays
     found = {name: np.asarray(arrays[name], dtype=float) for name in SHAPES}
-    odd = [n for n, shape in SHAPES.items() if found[n].shape != shape or not np.isfinite(found[n]).all()]
-    odd += [n for n in ("variance", "noise", "spread") if n not in odd and not (found[n] > 0).all()]
+    odd = [
+        n
+        for n, shape in SHAPES.items()
+        if found[n].shape != shape or not np.isfinite(found[n]).all()
+    ]
+    odd += [
+        n
+        for n in ("variance", "noise", "spread")
+        if n not in odd and not (found[n] > 0).all()
+    ]
     if odd:
-        raise StoreError(f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again")
+        raise StoreError(
+            f"{path}: {', '.join(odd)} of a shape or value that no people have; edited: make it again"
+        )
     model = Mixed(found["mean"], found["variance"], found["noise"])
     return People(model, found["middle"], found["spread"])

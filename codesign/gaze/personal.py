@@ -1,7 +1,10 @@
-"""Gaze of one person from pupil and slippage: the spherical eye fitted to a few points, then a small regressor.
+"""Gaze of one person from pupil and slippage: the spherical eye fitted to a few points,
+then a small regressor.
 
-The paper's Secs. 3.2 and 5: a slippage-corrected ray meets the sphere on which the pupil moves, and one hidden layer
-learns what is left for this person. A regressor without the sphere has to learn the geometry itself from ten points.
+The paper's Secs. 3.2 and 5: a slippage-corrected ray meets the sphere on which the
+pupil moves, and one hidden layer
+learns what is left for this person. A regressor without the sphere has to learn the
+geometry itself from ten points.
 """
 
 import math
@@ -20,11 +23,20 @@ from codesign.gaze.regressor import Regressor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
-# What people differ by, standard deviations: centre of the eye 1 mm each way (mounting and head), its radius 0.6 mm
-# (size, and the cornea that magnifies), angles between sphere and gaze 5 degrees (kappa and mounting), roll 0.05 rad.
+# What people differ by, standard deviations: centre of the eye 1 mm each way (mounting
+# and head), its radius 0.6 mm
+# (size, and the cornea that magnifies), angles between sphere and gaze 5 degrees (kappa
+# and mounting), roll 0.05 rad.
 SPREAD = np.array([1.0, 1.0, 1.0, 0.6, 5.0, 5.0, 0.05])
-READING_DEG = 1.0  # what a frame is trusted to at first, against SPREAD; then what the first fit leaves, 0.3 at least
-PENALTIES = (0.01, 0.1, 1.0, 10.0)  # of the regressor's weights: from ten clean points to eight noisy ones
+# what a frame is trusted to at first, against SPREAD; then what the first fit leaves,
+# 0.3 at least
+READING_DEG = 1.0
+PENALTIES = (
+    0.01,
+    0.1,
+    1.0,
+    10.0,
+)  # of the regressor's weights: from ten clean points to eight noisy ones
 FOLDS = 4  # that the penalty is chosen over
 TRIAL_STEPS = 40  # of a fit whose penalty is on trial
 
@@ -33,8 +45,10 @@ TRIAL_STEPS = 40  # of a fit whose penalty is on trial
 class PersonalGaze:
     """A calibrated person.
 
-    mean: the population's eye. own: (7,) centre and radius beside it in mm, two angles in deg, roll in rad.
-    elevation_rad: of the face before the camera. rest: of the sphere's angles and the slippage, to what it misses.
+    mean: the population's eye. own: (7,) centre and radius beside it in mm, two angles
+    in deg, roll in rad.
+    elevation_rad: of the face before the camera. rest: of the sphere's angles and the
+    slippage, to what it misses.
     """
 
     mean: EyeGeometry
@@ -45,8 +59,12 @@ class PersonalGaze:
     def sphere(self, pupil_mm: Array, slip_mm: Array) -> Array:
         """(n, 2) gaze of the fitted sphere alone, deg."""
         x, y, z = np.asarray(self.mean.centre_mm) + self.own[:3]
-        geometry = EyeGeometry((x, y, z), self.mean.radius_mm + self.own[3], self.mean.sensor_distance_mm)
-        ray = optical_axis(torch.from_numpy(pupil_mm), torch.from_numpy(-slip_mm), geometry)
+        geometry = EyeGeometry(
+            (x, y, z), self.mean.radius_mm + self.own[3], self.mean.sensor_distance_mm
+        )
+        ray = optical_axis(
+            torch.from_numpy(pupil_mm), torch.from_numpy(-slip_mm), geometry
+        )
         angles = face_angles(ray.direction.numpy(), self.elevation_rad) + self.own[4:6]
         c, s = math.cos(self.own[6]), math.sin(self.own[6])
         return np.asarray(angles @ np.array([[c, s], [-s, c]]))
@@ -76,7 +94,14 @@ class Sphere:
         Raises:
             TrainingError: fewer than 3 points.
         """
-        return fit(read.pupil_mm, read.slip_mm, gaze_deg, rig=self.rig, hidden=self.hidden, seed=self.seed)
+        return fit(
+            read.pupil_mm,
+            read.slip_mm,
+            gaze_deg,
+            rig=self.rig,
+            hidden=self.hidden,
+            seed=self.seed,
+        )
 
 
 def mean_geometry(rig: Rig) -> EyeGeometry:
@@ -86,18 +111,31 @@ def mean_geometry(rig: Rig) -> EyeGeometry:
     return EyeGeometry((x, y, z), 1e-3 * radius, 1e-3 * rig.sensor_distance_um)
 
 
-def fit(pupil_mm: Array, slip_mm: Array, gaze_deg: Array, *, rig: Rig, hidden: int = 10, seed: int = 0) -> PersonalGaze:
-    """Calibrate a person: the sphere by regularised least squares, then a regressor of what it leaves.
+def fit(
+    pupil_mm: Array,
+    slip_mm: Array,
+    gaze_deg: Array,
+    *,
+    rig: Rig,
+    hidden: int = 10,
+    seed: int = 0,
+) -> PersonalGaze:
+    """Calibrate a person: the sphere by regularised least squares, then a regressor of
+    what it leaves.
 
     Args:
-        pupil_mm: (n, 2) pupil on the sensor, from the lens axis. slip_mm: (n, 3) displacement of the head.
-        gaze_deg: (n, 2) where the person looked, across and down. hidden: neurons of the regressor; 0 for none.
+        pupil_mm: (n, 2) pupil on the sensor, from the lens axis. slip_mm: (n, 3)
+            displacement of the head.
+        gaze_deg: (n, 2) where the person looked, across and down. hidden: neurons of
+            the regressor; 0 for none.
 
     Raises:
         TrainingError: fewer than 3 points.
     """
     if len(pupil_mm) < 3:
-        raise TrainingError(f"a personal calibration from {len(pupil_mm)} points, need 3 or more")
+        raise TrainingError(
+            f"a personal calibration from {len(pupil_mm)} points, need 3 or more"
+        )
     mean = mean_geometry(rig)
     pupil, slip = (np.ascontiguousarray(a, dtype=float) for a in (pupil_mm, slip_mm))
 
@@ -110,18 +148,27 @@ def fit(pupil_mm: Array, slip_mm: Array, gaze_deg: Array, *, rig: Rig, hidden: i
 
     own = least_squares(residual, np.zeros(len(SPREAD)), args=(READING_DEG,)).x
     freedom = max(1, 2 * len(pupil) - len(own))
-    left = max(0.3, float(np.sqrt((residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum() / freedom)))
+    left = max(
+        0.3, float(np.sqrt((residual(own, 1.0)[: 2 * len(pupil)] ** 2).sum() / freedom))
+    )
     person = of(least_squares(residual, own, args=(left,)).x * SPREAD)
     if not hidden:
         return person
     first = person.sphere(pupil, slip)
     features, missed = np.concatenate([first, slip], 1), gaze_deg - first
     penalty = _penalty(features, missed, gaze_deg, hidden=hidden, seed=seed)
-    return replace(person, rest=regressor.fit(features, missed, hidden=hidden, penalty=penalty, seed=seed))
+    return replace(
+        person,
+        rest=regressor.fit(features, missed, hidden=hidden, penalty=penalty, seed=seed),
+    )
 
 
-def _penalty(features: Array, missed: Array, gaze_deg: Array, *, hidden: int, seed: int) -> float:
-    """The penalty under which points are best foretold by the others; frames of one stimulus stay together."""
+def _penalty(
+    features: Array, missed: Array, gaze_deg: Array, *, hidden: int, seed: int
+) -> float:
+    """The penalty under which points are best foretold by the others; frames of one
+    stimulus stay together.
+    """
     _, stimulus = np.unique(gaze_deg, axis=0, return_inverse=True)
     fold: Array = np.ravel(stimulus) % FOLDS
 
@@ -131,7 +178,12 @@ def _penalty(features: Array, missed: Array, gaze_deg: Array, *, hidden: int, se
             out = fold == number
             if out.any() and (~out).sum() >= 3:
                 made = regressor.fit(
-                    features[~out], missed[~out], hidden=hidden, penalty=penalty, seed=seed, steps=TRIAL_STEPS
+                    features[~out],
+                    missed[~out],
+                    hidden=hidden,
+                    penalty=penalty,
+                    seed=seed,
+                    steps=TRIAL_STEPS,
                 )
                 total += float(((made(features[out]) - missed[out]) ** 2).sum())
         return total
@@ -146,6 +198,8 @@ def angle_deg(one: Array, other: Array) -> Array:
 
 
 def direction(angles_rad: Array) -> Array:
-    """(n, 3) unit vectors right, down and out of the face, of angles (n, 2) across and down."""
+    """(n, 3) unit vectors right, down and out of the face, of angles (n, 2) across and
+    down.
+    """
     x, y = angles_rad.T
     return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], 1)

@@ -1,4 +1,6 @@
-"""What a network reads of frames, in the units that gaze is calibrated in, and what calibrates a person with it."""
+"""What a network reads of frames, in the units that gaze is calibrated in, and what
+calibrates a person with it.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,8 +15,10 @@ from metalens.ground.arrays import Array
 class Readings:
     """Of n frames.
 
-    pupil_mm: (n, 2) pupil on the sensor, upright image, from the lens axis. slip_mm: (n, 3) displacement of the head.
-    axis_deg: (n, 2) angles of the optic axis across and down in the frame of the face; None where no axis is read.
+    pupil_mm: (n, 2) pupil on the sensor, upright image, from the lens axis. slip_mm:
+    (n, 3) displacement of the head.
+    axis_deg: (n, 2) angles of the optic axis across and down in the frame of the face;
+    None where no axis is read.
     """
 
     pupil_mm: Array
@@ -25,7 +29,11 @@ class Readings:
         return len(self.pupil_mm)
 
     def __getitem__(self, rows: Array | slice) -> "Readings":
-        return Readings(self.pupil_mm[rows], self.slip_mm[rows], None if self.axis_deg is None else self.axis_deg[rows])
+        return Readings(
+            self.pupil_mm[rows],
+            self.slip_mm[rows],
+            None if self.axis_deg is None else self.axis_deg[rows],
+        )
 
 
 class Person(Protocol):
@@ -43,6 +51,12 @@ class Calibrator(Protocol):
 
 
 def face_angles(direction: Array, elevation_rad: float) -> Array:
-    """(n, 2) angles across and down, deg, in the frame of the face, of directions (n, 3) in the camera's."""
+    """(n, 2) angles across and down, deg, in the frame of the face, of directions (n,
+    3) in the camera's.
+    """
     right, down, out = face_axes(elevation_rad).numpy() @ np.asarray(direction).T
-    return np.asarray(np.degrees(np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)))
+    return np.asarray(
+        np.degrees(
+            np.stack([np.arctan2(right, out), np.arcsin(np.clip(down, -1, 1))], 1)
+        )
+    )

@@ -1,13 +1,18 @@
-"""Gaze of one person from few points, with what is common to people learned from others: a linear mixed model.
+"""Gaze of one person from few points, with what is common to people learned from
+others: a linear mixed model.
 
-A network reads the optic axis, the pupil and the slippage of every frame, each with errors of its own. Over people,
+A network reads the optic axis, the pupil and the slippage of every frame, each with
+errors of its own. Over people,
 gaze follows them as
 
     g = a + F (β + u_p) + e,    u_p ~ N(0, diag τ²),  e ~ N(0, σ²),    F = (1, x, x xᵀ),  x = (a, pupil, slippage)
 
-(Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all, u_p is of one person. β, τ²
-and σ² come from people whom nobody judges (:func:`learn`: expectation maximisation); a person's u_p is its mean under
-that prior, given a few frames. So terms by which people hardly differ, as how a network misreads large slippage, need
+(Laird and Ware 1982, Biometrics 38, 963), a the axis's angles: β is the same for all,
+u_p is of one person. β, τ²
+and σ² come from people whom nobody judges (:func:`learn`: expectation maximisation); a
+person's u_p is its mean under
+that prior, given a few frames. So terms by which people hardly differ, as how a network
+misreads large slippage, need
 no points of theirs, and kappa, by which they differ most, gets nearly all of them.
 """
 
@@ -19,8 +24,12 @@ from codesign.gaze.readings import Readings
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 
-ROUNDS = 40  # of expectation maximisation: answers stand by then, variances near 0 still fall
-KAPPA_DEG, OTHERS_DEG = 5.0, 1.0  # first guess of how people differ: by an offset, and by any other term a unit
+# of expectation maximisation: answers stand by then, variances near 0 still fall
+ROUNDS = 40
+KAPPA_DEG, OTHERS_DEG = (
+    5.0,
+    1.0,
+)  # first guess of how people differ: by an offset, and by any other term a unit
 LEAST = 1e-9  # deg²: a variance that people do not show stays above 0
 
 
@@ -28,7 +37,8 @@ LEAST = 1e-9  # deg²: a variance that people do not show stays above 0
 class Mixed:
     """What people have in common, and how far they differ.
 
-    mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of answers in degrees.
+    mean: (terms, 2) β. variance: (terms, 2) τ². noise: (2,) σ², all of answers in
+    degrees.
     """
 
     mean: Array
@@ -36,20 +46,29 @@ class Mixed:
     noise: Array
 
     def own(self, design: Array, answers: Array) -> Array:
-        """(terms, 2) coefficients β + u of one person, the mean under the prior given its frames.
+        """(terms, 2) coefficients β + u of one person, the mean under the prior given
+        its frames.
 
         Args:
             design: (n, terms). answers: (n, 2).
         """
-        return np.stack([self.mean[:, k] + self._of(design, answers, k)[0] for k in range(2)], 1)
+        return np.stack(
+            [self.mean[:, k] + self._of(design, answers, k)[0] for k in range(2)], 1
+        )
 
     def _of(self, design: Array, answers: Array, k: int) -> tuple[Array, Array]:
         """Mean (terms,) and covariance (terms, terms) of u in one answer."""
-        cov = np.linalg.inv(design.T @ design / self.noise[k] + np.diag(1 / self.variance[:, k]))
-        return cov @ (design.T @ (answers[:, k] - design @ self.mean[:, k])) / self.noise[k], cov
+        cov = np.linalg.inv(
+            design.T @ design / self.noise[k] + np.diag(1 / self.variance[:, k])
+        )
+        return cov @ (
+            design.T @ (answers[:, k] - design @ self.mean[:, k])
+        ) / self.noise[k], cov
 
 
-def mixed(design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS) -> Mixed:
+def mixed(
+    design: Array, answers: Array, person: Array, *, first: Array, rounds: int = ROUNDS
+) -> Mixed:
     """The model of greatest likelihood, from ``rounds`` of expectation maximisation.
 
     Args:
@@ -66,24 +85,37 @@ def mixed(design: Array, answers: Array, person: Array, *, first: Array, rounds:
             "two people or more, and more frames than terms"
         )
     mean = np.linalg.lstsq(design, answers, rcond=None)[0]
-    found = Mixed(mean, np.repeat(first[:, None], 2, 1), np.maximum((answers - design @ mean).var(0), LEAST))
+    found = Mixed(
+        mean,
+        np.repeat(first[:, None], 2, 1),
+        np.maximum((answers - design @ mean).var(0), LEAST),
+    )
     for _ in range(rounds):
         found = _again(found, design, answers, people)
     return found
 
 
 def _again(found: Mixed, design: Array, answers: Array, people: list[Array]) -> Mixed:
-    """One round: u of everybody given the model, then the model given them (both with their covariances)."""
-    mean, variance, noise = (np.empty_like(v) for v in (found.mean, found.variance, found.noise))
+    """One round: u of everybody given the model, then the model given them (both with
+    their covariances).
+    """
+    mean, variance, noise = (
+        np.empty_like(v) for v in (found.mean, found.variance, found.noise)
+    )
     for k in range(2):
         told = [found._of(design[rows], answers[rows], k) for rows in people]
         theirs = np.zeros(len(design))
         for rows, (u, _) in zip(people, told, strict=True):
             theirs[rows] = design[rows] @ u
         mean[:, k] = np.linalg.lstsq(design, answers[:, k] - theirs, rcond=None)[0]
-        variance[:, k] = np.mean([u**2 + np.diag(cov) for u, cov in told], axis=0) + LEAST
+        variance[:, k] = (
+            np.mean([u**2 + np.diag(cov) for u, cov in told], axis=0) + LEAST
+        )
         left = ((answers[:, k] - design @ mean[:, k] - theirs) ** 2).sum()
-        unsure = sum(np.sum((design[rows] @ cov) * design[rows]) for rows, (_, cov) in zip(people, told, strict=True))
+        unsure = sum(
+            np.sum((design[rows] @ cov) * design[rows])
+            for rows, (_, cov) in zip(people, told, strict=True)
+        )
         noise[k] = (left + unsure) / len(design) + LEAST
     return Mixed(mean, variance, noise)
 
@@ -92,7 +124,8 @@ def _again(found: Mixed, design: Array, answers: Array, people: list[Array]) -> 
 class People:
     """What a network's readings tell of gaze, over people.
 
-    model: of the terms. middle, spread: (7,) of the readings over people, the unit of every term.
+    model: of the terms. middle, spread: (7,) of the readings over people, the unit of
+    every term.
     """
 
     model: Mixed
@@ -110,13 +143,17 @@ class People:
             TrainingError: fewer than 3 points, or readings without an axis.
         """
         if len(read) < 3:
-            raise TrainingError(f"a personal calibration from {len(read)} points, need 3 or more")
+            raise TrainingError(
+                f"a personal calibration from {len(read)} points, need 3 or more"
+            )
         return Own(self, self.model.own(self.terms(read), gaze_deg - _axis(read)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Own:
-    """A calibrated person. people: the prior. coefficients: (36, 2) of this person's terms, deg."""
+    """A calibrated person. people: the prior. coefficients: (36, 2) of this person's
+    terms, deg.
+    """
 
     people: People
     coefficients: Array
@@ -130,7 +167,8 @@ def learn(read: Readings, gaze_deg: Array, person: Array) -> People:
     """What readings of many people tell of gaze.
 
     Args:
-        read: of n frames. gaze_deg: (n, 2) where was looked, across and down. person: (n,) whose frame it is.
+        read: of n frames. gaze_deg: (n, 2) where was looked, across and down. person:
+            (n,) whose frame it is.
 
     Raises:
         TrainingError: too few people or frames, or readings without an axis.
@@ -140,12 +178,16 @@ def learn(read: Readings, gaze_deg: Array, person: Array) -> People:
     design = _terms(together, middle, spread)
     first = np.full(design.shape[1], OTHERS_DEG**2)
     first[0] = KAPPA_DEG**2
-    return People(mixed(design, gaze_deg - _axis(read), person, first=first), middle, spread)
+    return People(
+        mixed(design, gaze_deg - _axis(read), person, first=first), middle, spread
+    )
 
 
 def _axis(read: Readings) -> Array:
     if read.axis_deg is None:
-        raise TrainingError("the readings hold no optic axis, which gaze is told from here; calibrate by the sphere")
+        raise TrainingError(
+            "the readings hold no optic axis, which gaze is told from here; calibrate by the sphere"
+        )
     return read.axis_deg
 
 

@@ -1,6 +1,8 @@
-"""The search space: elastic MobileNetV3 backbones as plain records (paper Sec. 3.3, after Howard et al. 2019).
+"""The search space: elastic MobileNetV3 backbones as plain records (paper Sec. 3.3,
+after Howard et al. 2019).
 
-An :class:`Architecture` names depth, kernel, expansion, width and resolution; :func:`blocks` turns it into the
+An :class:`Architecture` names depth, kernel, expansion, width and resolution;
+:func:`blocks` turns it into the
 inverted residuals that the network builds and the cost model counts.
 """
 
@@ -55,9 +57,12 @@ class Block:
 class Space:
     """Everything that can vary, and what stays.
 
-    resolution: (least, largest) scale of the input; the search moves in steps of 0.1, training in any.
-    stem_channels: of the first convolution. stages: runs of blocks. kernels: sizes of convolutions to choose from.
-    expansions: widening inside a block. depths: blocks of a stage. widths: factors of the channels.
+    resolution: (least, largest) scale of the input; the search moves in steps of 0.1,
+    training in any.
+    stem_channels: of the first convolution. stages: runs of blocks. kernels: sizes of
+    convolutions to choose from.
+    expansions: widening inside a block. depths: blocks of a stage. widths: factors of
+    the channels.
     """
 
     stem_channels: int = field(default=16, metadata={"above": 0})
@@ -87,7 +92,8 @@ class Architecture:
     """One member of the space.
 
     depths: blocks of each stage.
-    kernels, expansions: of every slot (stages x deepest); slots beyond a stage's depth are idle.
+    kernels, expansions: of every slot (stages x deepest); slots beyond a stage's depth
+    are idle.
     width: channel multiplier. resolution: input scale.
     """
 
@@ -99,7 +105,9 @@ class Architecture:
 
 
 def divisible(channels: float, divisor: int = 8) -> int:
-    """Channels rounded to a multiple of ``divisor``, never losing more than a tenth (MobileNet convention)."""
+    """Channels rounded to a multiple of ``divisor``, never losing more than a tenth
+    (MobileNet convention).
+    """
     rounded = max(divisor, int(channels + divisor / 2) // divisor * divisor)
     return rounded + divisor if rounded < 0.9 * channels else rounded
 
@@ -110,19 +118,29 @@ def check(space: Space, architecture: Architecture) -> Architecture:
     Raises:
         ConfigError: naming the entry that does not.
     """
-    wanted = {"depths": len(space.stages), "kernels": space.slots, "expansions": space.slots}
+    wanted = {
+        "depths": len(space.stages),
+        "kernels": space.slots,
+        "expansions": space.slots,
+    }
     for name, count in wanted.items():
         values = getattr(architecture, name)
         if len(values) != count:
             raise ConfigError(f"architecture has {len(values)} {name}, need {count}")
         for i, value in enumerate(values):
             if value not in getattr(space, name):
-                raise ConfigError(f"architecture: {name}[{i}] is {value}, need one of {getattr(space, name)}")
+                raise ConfigError(
+                    f"architecture: {name}[{i}] is {value}, need one of {getattr(space, name)}"
+                )
     if architecture.width not in space.widths:
-        raise ConfigError(f"architecture: width is {architecture.width}, need one of {space.widths}")
+        raise ConfigError(
+            f"architecture: width is {architecture.width}, need one of {space.widths}"
+        )
     low, high = space.resolution
     if not low <= architecture.resolution <= high:
-        raise ConfigError(f"architecture: resolution is {architecture.resolution}, need {low} to {high}")
+        raise ConfigError(
+            f"architecture: resolution is {architecture.resolution}, need {low} to {high}"
+        )
     return architecture
 
 
@@ -136,7 +154,9 @@ def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
     inputs = stem_channels(space, architecture)
     deepest = max(space.depths)
     result = []
-    for i, (stage, depth) in enumerate(zip(space.stages, architecture.depths, strict=True)):
+    for i, (stage, depth) in enumerate(
+        zip(space.stages, architecture.depths, strict=True)
+    ):
         row = []
         for j in range(depth):
             slot = i * deepest + j
@@ -144,7 +164,17 @@ def blocks(space: Space, architecture: Architecture) -> list[list[Block]]:
             outputs = divisible(stage.channels * architecture.width)
             squeeze = divisible(hidden / 4) if stage.squeeze else 0
             stride = stage.stride if j == 0 else 1
-            row.append(Block(architecture.kernels[slot], inputs, hidden, outputs, stride, squeeze, stage.activation))
+            row.append(
+                Block(
+                    architecture.kernels[slot],
+                    inputs,
+                    hidden,
+                    outputs,
+                    stride,
+                    squeeze,
+                    stage.activation,
+                )
+            )
             inputs = outputs
         result.append(row)
     return result
@@ -165,16 +195,24 @@ def sample(space: Space, generator: np.random.Generator) -> Architecture:
     return Architecture(
         depths=tuple(int(v) for v in generator.choice(space.depths, len(space.stages))),
         kernels=tuple(int(v) for v in generator.choice(space.kernels, space.slots)),
-        expansions=tuple(int(v) for v in generator.choice(space.expansions, space.slots)),
+        expansions=tuple(
+            int(v) for v in generator.choice(space.expansions, space.slots)
+        ),
         width=float(generator.choice(space.widths)),
         resolution=float(generator.choice(resolutions(space))),
     )
 
 
 def mutate(
-    space: Space, architecture: Architecture, generator: np.random.Generator, *, rate: float = 0.15
+    space: Space,
+    architecture: Architecture,
+    generator: np.random.Generator,
+    *,
+    rate: float = 0.15,
 ) -> Architecture:
-    """A neighbour: every entry is drawn anew with probability ``rate``, and at least one entry differs."""
+    """A neighbour: every entry is drawn anew with probability ``rate``, and at least
+    one entry differs.
+    """
     while True:
         other = sample(space, generator)
         child = replace(
@@ -183,7 +221,9 @@ def mutate(
             kernels=_mix(architecture.kernels, other.kernels, generator, rate),
             expansions=_mix(architecture.expansions, other.expansions, generator, rate),
             width=other.width if generator.random() < rate else architecture.width,
-            resolution=other.resolution if generator.random() < rate else architecture.resolution,
+            resolution=other.resolution
+            if generator.random() < rate
+            else architecture.resolution,
         )
         if active(space, child) != active(space, architecture):
             return child
@@ -196,12 +236,22 @@ def resolutions(space: Space) -> tuple[float, ...]:
 
 
 def active(space: Space, architecture: Architecture) -> Architecture:
-    """The same network with every idle slot set to the least choice: equal networks compare equal."""
-    used = [j < depth for depth in architecture.depths for j in range(max(space.depths))]
+    """The same network with every idle slot set to the least choice: equal networks
+    compare equal.
+    """
+    used = [
+        j < depth for depth in architecture.depths for j in range(max(space.depths))
+    ]
     return replace(
         architecture,
-        kernels=tuple(k if u else min(space.kernels) for k, u in zip(architecture.kernels, used, strict=True)),
-        expansions=tuple(e if u else min(space.expansions) for e, u in zip(architecture.expansions, used, strict=True)),
+        kernels=tuple(
+            k if u else min(space.kernels)
+            for k, u in zip(architecture.kernels, used, strict=True)
+        ),
+        expansions=tuple(
+            e if u else min(space.expansions)
+            for e, u in zip(architecture.expansions, used, strict=True)
+        ),
     )
 
 
@@ -216,6 +266,11 @@ def _uniform(space: Space, pick: Callable[[Any], Any]) -> Architecture:
 
 
 def _mix(
-    mine: tuple[int, ...], others: tuple[int, ...], generator: np.random.Generator, rate: float
+    mine: tuple[int, ...],
+    others: tuple[int, ...],
+    generator: np.random.Generator,
+    rate: float,
 ) -> tuple[int, ...]:
-    return tuple(b if generator.random() < rate else a for a, b in zip(mine, others, strict=True))
+    return tuple(
+        b if generator.random() < rate else a for a, b in zip(mine, others, strict=True)
+    )

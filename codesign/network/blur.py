@@ -1,4 +1,6 @@
-"""The depth of every window of the frame, from what blur leaves of its texture (:mod:`codesign.network.windows`)."""
+"""The depth of every window of the frame, from what blur leaves of its texture
+(:mod:`codesign.network.windows`).
+"""
 
 import functools
 import math
@@ -21,22 +23,42 @@ from codesign.network.windows import (
     window_content,
 )
 
-FEATURES = COLUMNS * ROWS + 1 + STEP_FEATURES  # powers, the mean of the window, steps of brightness
+FEATURES = (
+    COLUMNS * ROWS + 1 + STEP_FEATURES
+)  # powers, the mean of the window, steps of brightness
 PLACES = 5  # polynomials of the place in the frame
 HIDDEN = (48, 32)
-REACH = 5  # windows along a side that a block reads together: a face is smooth, and neighbours tell of a window
+# windows along a side that a block reads together: a face is smooth, and neighbours
+# tell of a window
+REACH = 5
 BLOCKS = 2  # one after the other
-BESIDE = 8  # numbers that a window tells the slippage beside its depth: where the eye is in it, how sure its texture is
-SLIP_FEATURES = (3 + BESIDE) * GRID**2 + 2  # vergence, its spread, the mean and these of every window; means
+# numbers that a window tells the slippage beside its depth: where the eye is in it, how
+# sure its texture is
+BESIDE = 8
+SLIP_FEATURES = (
+    3 + BESIDE
+) * GRID**2 + 2  # vergence, its spread, the mean and these of every window; means
 
-VERGENCE_PER_M, VERGENCE_UNIT_PER_M = 45.0, 8.0  # 1 / depth of a face before the camera: mean and spread
+VERGENCE_PER_M, VERGENCE_UNIT_PER_M = (
+    45.0,
+    8.0,
+)  # 1 / depth of a face before the camera: mean and spread
 
 
 def macs(size: int) -> int:
-    """Multiply-accumulates of the branch for a square frame of ``size`` pixels: waves, steps, layers."""
+    """Multiply-accumulates of the branch for a square frame of ``size`` pixels: waves,
+    steps, layers.
+    """
     around = HIDDEN[0] * REACH**2 + HIDDEN[0] ** 2
-    layers = (FEATURES + PLACES) * HIDDEN[0] + BLOCKS * around + HIDDEN[0] * HIDDEN[1] + HIDDEN[1] * (2 + BESIDE)
-    return spectra_macs(size) + STEP_MACS + GRID**2 * layers + BLOCKS * 3 * HIDDEN[0] ** 2
+    layers = (
+        (FEATURES + PLACES) * HIDDEN[0]
+        + BLOCKS * around
+        + HIDDEN[0] * HIDDEN[1]
+        + HIDDEN[1] * (2 + BESIDE)
+    )
+    return (
+        spectra_macs(size) + STEP_MACS + GRID**2 * layers + BLOCKS * 3 * HIDDEN[0] ** 2
+    )
 
 
 def content_macs(channels: int) -> int:
@@ -46,10 +68,17 @@ def content_macs(channels: int) -> int:
 
 @functools.lru_cache(maxsize=16)
 def window_weights(size: int) -> Tensor:
-    """(GRID, size) share of every pixel of a line in each window: the square of the weight, which power has; sum 1."""
+    """(GRID, size) share of every pixel of a line in each window: the square of the
+    weight, which power has; sum 1.
+    """
     step = step_of(size)
     first = (size - (GRID + 1) * step) // 2
-    weight = torch.sin(math.pi * (torch.arange(2 * step, dtype=torch.float64) + 0.5) / (2 * step)) ** 4
+    weight = (
+        torch.sin(
+            math.pi * (torch.arange(2 * step, dtype=torch.float64) + 0.5) / (2 * step)
+        )
+        ** 4
+    )
     out = torch.zeros(GRID, size, dtype=torch.float64)
     for i in range(GRID):
         out[i, first + i * step : first + (i + 2) * step] = weight / weight.sum()
@@ -57,7 +86,9 @@ def window_weights(size: int) -> Tensor:
 
 
 def window_vergence(depth_um: Tensor) -> Tensor:
-    """(batch, GRID, GRID) mean 1 / depth of every window, in the units of the branch, from (batch, y, x) depths."""
+    """(batch, GRID, GRID) mean 1 / depth of every window, in the units of the branch,
+    from (batch, y, x) depths.
+    """
     rows, columns = (window_weights(int(n)).to(depth_um) for n in depth_um.shape[-2:])
     vergence = (1e6 / depth_um - VERGENCE_PER_M) / VERGENCE_UNIT_PER_M
     return rows @ vergence @ columns.mT
@@ -69,11 +100,15 @@ def depth_mm(vergence: Tensor) -> Tensor:
 
 
 class Around(nn.Module):
-    """What its neighbours tell of a window, added to what it tells itself: x + mix(hardswish(depthwise(x)))."""
+    """What its neighbours tell of a window, added to what it tells itself: x +
+    mix(hardswish(depthwise(x))).
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.gather = nn.Conv2d(channels, channels, REACH, padding=REACH // 2, groups=channels)
+        self.gather = nn.Conv2d(
+            channels, channels, REACH, padding=REACH // 2, groups=channels
+        )
         self.mix = nn.Conv2d(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -82,7 +117,9 @@ class Around(nn.Module):
 
 
 class Overall(nn.Module):
-    """What all windows together tell, added to each: x + give(hardswish(take(mean and spread over the windows)))."""
+    """What all windows together tell, added to each: x + give(hardswish(take(mean and
+    spread over the windows))).
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -97,15 +134,22 @@ class Overall(nn.Module):
 
 
 class BlurBranch(nn.Module):
-    """Depth of every window from its blur, with its spread: ``forward(frames) -> (depth, features)``.
+    """Depth of every window from its blur, with its spread: ``forward(frames) ->
+    (depth, features)``.
 
-    depth: (batch, 2, GRID, GRID) vergence in units of :data:`VERGENCE_UNIT_PER_M` about :data:`VERGENCE_PER_M`, and
-    the logarithm of its standard deviation. features: (batch, SLIP_FEATURES) for the slippage.
+    depth: (batch, 2, GRID, GRID) vergence in units of :data:`VERGENCE_UNIT_PER_M` about
+    :data:`VERGENCE_PER_M`, and
+    the logarithm of its standard deviation. features: (batch, SLIP_FEATURES) for the
+    slippage.
 
-    A PSF differs from window to window of the field, so every window weighs the spectra that the first layer has
-    learned by gains and offsets of its own; they cost next to nothing. Its depth is then read together with its
-    neighbours', twice, each time with what all windows of the frame hold. Beside it every window tells the slippage a
-    few numbers that no label holds: depths alone, trained on their own, leave a fifth more error.
+    A PSF differs from window to window of the field, so every window weighs the spectra
+    that the first layer has
+    learned by gains and offsets of its own; they cost next to nothing. Its depth is
+    then read together with its
+    neighbours', twice, each time with what all windows of the frame hold. Beside it
+    every window tells the slippage a
+    few numbers that no label holds: depths alone, trained on their own, leave a fifth
+    more error.
     """
 
     place: Tensor
@@ -123,17 +167,25 @@ class BlurBranch(nn.Module):
         self.depth = nn.Conv2d(HIDDEN[1], 2 + BESIDE, 1)
         line = torch.linspace(-1, 1, GRID)
         x, y = line.expand(GRID, GRID), line[:, None].expand(GRID, GRID)
-        self.register_buffer("place", torch.stack([x, y, x**2, y**2, x * y])[None].clone(), persistent=False)
+        self.register_buffer(
+            "place",
+            torch.stack([x, y, x**2, y**2, x * y])[None].clone(),
+            persistent=False,
+        )
 
     def forward(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         weighed, mean = self._weighed(frames)
         return self._told(self.depth(self._read(weighed)), mean)
 
     def _weighed(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID, GRID), and its mean."""
+        """Spectra of every window under its own weights, (batch, HIDDEN[0], GRID,
+        GRID), and its mean.
+        """
         power, mean = spectra(frames)
         told = self.norm(torch.cat([torch.log(power + FLOOR), mean, steps(frames)], 1))
-        told = torch.cat([told, self.place + torch.zeros_like(mean)], 1)  # of as many frames, traced too
+        told = torch.cat(
+            [told, self.place + torch.zeros_like(mean)], 1
+        )  # of as many frames, traced too
         return self.first(told) * self.gain + self.offset, mean
 
     def _read(self, weighed: Tensor) -> Tensor:
@@ -146,17 +198,26 @@ class BlurBranch(nn.Module):
         depth = torch.stack([out[:, 0], spread], 1)
         trust = torch.exp(-2 * spread)
         total = trust.sum((1, 2))
-        means = torch.stack([(trust * depth[:, 0]).sum((1, 2)) / total, spread.mean((1, 2))], 1)
-        return depth, torch.cat([depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1)], 1)
+        means = torch.stack(
+            [(trust * depth[:, 0]).sum((1, 2)) / total, spread.mean((1, 2))], 1
+        )
+        return depth, torch.cat(
+            [depth.flatten(1), mean.flatten(1), means, out[:, 2:].flatten(1)], 1
+        )
 
 
 class InformedBranch(BlurBranch):
-    """The branch that is told what a window shows: ``forward(frames, content) -> (depth, features, axial)``.
+    """The branch that is told what a window shows: ``forward(frames, content) ->
+    (depth, features, axial)``.
 
-    content: (batch, channels, y, x) of the whole frame, as the pupil's mask is decoded from. A power spectrum is that
-    of texture times blur; whoever knows a pupil's edge from a lash knows the texture, and reads the blur from fewer
-    frames. axial: (batch,) axial slippage, in units of its scale: every window's own estimate, with the shares that
-    the windows claim (their softmax). What the calibration head makes of the depths is added to it.
+    content: (batch, channels, y, x) of the whole frame, as the pupil's mask is decoded
+    from. A power spectrum is that
+    of texture times blur; whoever knows a pupil's edge from a lash knows the texture,
+    and reads the blur from fewer
+    frames. axial: (batch,) axial slippage, in units of its scale: every window's own
+    estimate, with the shares that
+    the windows claim (their softmax). What the calibration head makes of the depths is
+    added to it.
     """
 
     def __init__(self, norm: nn.Module, channels: int) -> None:

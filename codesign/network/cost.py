@@ -1,8 +1,12 @@
-"""Multiply-accumulates of a network as a function of architecture and pixel pitch (paper Eq. 9).
+"""Multiply-accumulates of a network as a function of architecture and pixel pitch
+(paper Eq. 9).
 
-Every convolution costs (its multiply-accumulates per output pixel) x (output pixels), and the output of total
-stride s on an input of n pixels has ceil(n / s)² pixels. So a network is a short list of (stride, cost per
-output pixel) and a constant; at integer n the sum is exact, between integers it follows a C1 cubic.
+Every convolution costs (its multiply-accumulates per output pixel) x (output pixels),
+and the output of total
+stride s on an input of n pixels has ceil(n / s)² pixels. So a network is a short list
+of (stride, cost per
+output pixel) and a constant; at integer n the sum is exact, between integers it follows
+a C1 cubic.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,7 +17,13 @@ import torch
 from torch import Tensor
 
 from codesign.network import blur
-from codesign.network.architecture import Architecture, Block, Space, blocks, stem_channels
+from codesign.network.architecture import (
+    Architecture,
+    Block,
+    Space,
+    blocks,
+    stem_channels,
+)
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 
@@ -40,13 +50,17 @@ class Cost:
     def at(self, size: int | Array) -> Array:
         """Exact count for square inputs of ``size`` pixels (integers)."""
         size = np.asarray(size)
-        parts = [macs * (-(-size // stride)) ** 2 for stride, macs in self.per_pixel.items()]
+        parts = [
+            macs * (-(-size // stride)) ** 2 for stride, macs in self.per_pixel.items()
+        ]
         if self.blur:
             parts.append(np.vectorize(blur.macs, otypes=[np.int64])(size))
         return np.asarray(sum(parts) + self.constant)
 
 
-def backbone(stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: int = 3) -> Cost:
+def backbone(
+    stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: int = 3
+) -> Cost:
     """Cost of a stem of stride 2 and the blocks behind it."""
     per_pixel, constant, stride = {2: inputs * stem * stem_kernel**2}, 0, 2
     for block in rows:
@@ -62,13 +76,19 @@ def backbone(stem: int, rows: Iterable[Block], *, inputs: int = 1, stem_kernel: 
 def network(space: Space, architecture: Architecture) -> Cost:
     """Cost of backbone, blur branch, perception head and calibration head."""
     rows = blocks(space, architecture)
-    body = backbone(stem_channels(space, architecture), [b for row in rows for b in row])
+    body = backbone(
+        stem_channels(space, architecture), [b for row in rows for b in row]
+    )
     per_pixel = dict(body.per_pixel)
     laterals = lateral_strides(space)
     for stage, stride in laterals:
-        per_pixel[stride] = per_pixel.get(stride, 0) + rows[stage][-1].outputs * MASK_CHANNELS
+        per_pixel[stride] = (
+            per_pixel.get(stride, 0) + rows[stage][-1].outputs * MASK_CHANNELS
+        )
     finest = laterals[0][1]
-    per_pixel[finest] += MASK_CHANNELS * (9 + 1 + POINTS)  # depthwise 3x3, then the mask itself and the landmarks
+    per_pixel[finest] += MASK_CHANNELS * (
+        9 + 1 + POINTS
+    )  # depthwise 3x3, then the mask itself and the landmarks
     deepest = total_stride(space)
     per_pixel[deepest] += rows[-1][-1].outputs * SLIP_CHANNELS
     told = SLIP_CHANNELS * SLIP_GRID**2 + blur.SLIP_FEATURES + POINT_FEATURES
@@ -78,7 +98,9 @@ def network(space: Space, architecture: Architecture) -> Cost:
 
 
 def lateral_strides(space: Space) -> list[tuple[int, int]]:
-    """(stage, total stride) of the features that the mask is decoded from: the last stage of every stride."""
+    """(stage, total stride) of the features that the mask is decoded from: the last
+    stage of every stride.
+    """
     stride, last = 2, {}
     for i, stage in enumerate(space.stages):
         stride *= stage.stride
@@ -98,7 +120,9 @@ def input_size(window_um: float, pitch_um: float, resolution: float) -> float:
         ConfigError: less than 16 pixels remain.
     """
     if not (pitch_um > 0 and window_um > 0 and 0 < resolution <= 1):
-        raise ConfigError(f"window {window_um} um, pitch {pitch_um} um, resolution {resolution}: need all above 0")
+        raise ConfigError(
+            f"window {window_um} um, pitch {pitch_um} um, resolution {resolution}: need all above 0"
+        )
     size = window_um / pitch_um * resolution
     if size < LEAST_SIZE:
         raise ConfigError(
@@ -112,8 +136,11 @@ def coarsest_um(window_um: float, resolution: float) -> float:
     return window_um * resolution / LEAST_SIZE
 
 
-def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float) -> Tensor:
-    """Multiply-accumulates at a continuous input size, differentiable; exact where ``size`` is an integer.
+def macs_of_size(
+    space: Space, architecture: Architecture, size: Tensor | float
+) -> Tensor:
+    """Multiply-accumulates at a continuous input size, differentiable; exact where
+    ``size`` is an integer.
 
     Args:
         size: pixels along the edge of the input, 16 or more, scalar.
@@ -124,7 +151,8 @@ def macs_of_size(space: Space, architecture: Architecture, size: Tensor | float)
 def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
     """Counts at integer sizes continued to a continuous size, differentiable.
 
-    A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more pixels never cost less, and where
+    A monotone cubic (Fritsch and Carlson 1980) runs through the exact counts: more
+    pixels never cost less, and where
     two counts are equal the gradient between them is zero.
 
     Args:
@@ -134,7 +162,10 @@ def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
     low = int(torch.floor(size.detach()))
     counts = at(np.arange(low - 1, low + 3)).astype(float)
     before, here, after, beyond = (torch.tensor(c, dtype=torch.float64) for c in counts)
-    slope, next_slope = _slope(here - before, after - here), _slope(after - here, beyond - after)
+    slope, next_slope = (
+        _slope(here - before, after - here),
+        _slope(after - here, beyond - after),
+    )
     u = size - low
     return (
         here * (1 + 2 * u) * (1 - u) ** 2
@@ -146,19 +177,33 @@ def interpolated(at: Callable[[Array], Array], size: Tensor | float) -> Tensor:
 
 def _slope(left: Tensor, right: Tensor) -> Tensor:
     """Harmonic mean of two rises; zero where one of them is."""
-    return torch.where((left > 0) & (right > 0), 2 * left * right / (left + right).clamp_min(1), torch.zeros_like(left))
+    return torch.where(
+        (left > 0) & (right > 0),
+        2 * left * right / (left + right).clamp_min(1),
+        torch.zeros_like(left),
+    )
 
 
 def macs(
-    architecture: Architecture, pitch_um: Tensor | float, *, window_um: float, space: Space | None = None
+    architecture: Architecture,
+    pitch_um: Tensor | float,
+    *,
+    window_um: float,
+    space: Space | None = None,
 ) -> Tensor:
-    """Multiply-accumulates C_total of one inference as a function of the pixel pitch (paper Eq. 9), differentiable.
+    """Multiply-accumulates C_total of one inference as a function of the pixel pitch
+    (paper Eq. 9), differentiable.
 
     Args:
-        pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on the sensor.
+        pitch_um: effective pixel pitch, scalar. window_um: edge of the square image on
+            the sensor.
 
     Raises:
         ConfigError: a pitch that leaves less than 16 pixels.
     """
-    input_size(window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution)
-    return macs_of_size(space or Space(), architecture, window_um / pitch_um * architecture.resolution)
+    input_size(
+        window_um, float(torch.as_tensor(pitch_um).detach()), architecture.resolution
+    )
+    return macs_of_size(
+        space or Space(), architecture, window_um / pitch_um * architecture.resolution
+    )

@@ -1,4 +1,6 @@
-"""A network as one ONNX graph: frames of the sensor in, lengths and angles out, as gaze is calibrated from."""
+"""A network as one ONNX graph: frames of the sensor in, lengths and angles out, as gaze
+is calibrated from.
+"""
 
 import math
 import warnings
@@ -28,8 +30,10 @@ OUTPUTS = {  # name: what it is
 class Scale:
     """What turns a network's answers into lengths and angles.
 
-    frame_mm: edge of all pixels. slip_mm: unit of the slippage. elevation_rad: of the face's normal above the direction
-    to the camera. axis, points: whether training gave them weight; what it did not is left out.
+    frame_mm: edge of all pixels. slip_mm: unit of the slippage. elevation_rad: of the
+    face's normal above the direction
+    to the camera. axis, points: whether training gave them weight; what it did not is
+    left out.
     """
 
     frame_mm: float
@@ -46,7 +50,9 @@ class Scale:
 
 
 class Exported(nn.Module):
-    """``forward(frames) -> (outputs...)`` in the order of :attr:`Scale.outputs`; frames (batch, 1, size, size)."""
+    """``forward(frames) -> (outputs...)`` in the order of :attr:`Scale.outputs`; frames
+    (batch, 1, size, size).
+    """
 
     def __init__(self, net: Subnet, scale: Scale) -> None:
         super().__init__()
@@ -71,32 +77,53 @@ class Exported(nn.Module):
 
     def _angles(self, axis: Tensor) -> Tensor:
         """As :func:`codesign.gaze.face_angles`, of axes of any length."""
-        right, down, out = (axis @ face_axes(self.scale.elevation_rad).to(axis).mT).unbind(1)
+        right, down, out = (
+            axis @ face_axes(self.scale.elevation_rad).to(axis).mT
+        ).unbind(1)
         level = torch.sqrt(right**2 + out**2)
-        return torch.stack([torch.atan2(right, out), torch.atan2(down, level)], 1) * (180 / math.pi)
+        return torch.stack([torch.atan2(right, out), torch.atan2(down, level)], 1) * (
+            180 / math.pi
+        )
 
 
-def write(path: str | Path, net: Subnet, scale: Scale, *, size: int, pitch_um: float) -> None:
-    """Write an ONNX file (opset 17) for any number of square frames of ``size`` pixels, ``pitch_um`` apart.
+def write(
+    path: str | Path, net: Subnet, scale: Scale, *, size: int, pitch_um: float
+) -> None:
+    """Write an ONNX file (opset 17) for any number of square frames of ``size`` pixels,
+    ``pitch_um`` apart.
 
-    Every input and output says in the file what it is, in which unit; so do the file's properties of the camera.
+    Every input and output says in the file what it is, in which unit; so do the file's
+    properties of the camera.
 
     Accuracy:
-        onnxruntime against torch, float32 through some forty layers in another order: 1e-4 of a logit, mm or degree.
+        onnxruntime against torch, float32 through some forty layers in another order:
+        1e-4 of a logit, mm or degree.
 
     Raises:
         OSError: the target cannot be written.
     """
-    made, example, names = Exported(net, scale), torch.zeros(2, 1, size, size), scale.outputs
+    made, example, names = (
+        Exported(net, scale),
+        torch.zeros(2, 1, size, size),
+        scale.outputs,
+    )
     with replacing(path) as part:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # sizes are fixed on purpose; the exporter's own age is no news here
+            warnings.simplefilter(
+                "ignore"
+            )  # sizes are fixed on purpose; the exporter's own age is no news here
             torch.onnx.export(
                 made, (example,), str(part), dynamo=False, input_names=["frames"], output_names=list(names),
                 opset_version=OPSET, dynamic_axes={name: {0: "batch"} for name in ("frames", *names)},
             )  # fmt: skip
         with torch.no_grad():
-            shapes = dict(zip(names, (tuple(value.shape[1:]) for value in made(example)), strict=True))
+            shapes = dict(
+                zip(
+                    names,
+                    (tuple(value.shape[1:]) for value in made(example)),
+                    strict=True,
+                )
+            )
         camera = {
             "pixels": size,
             "pitch_um": pitch_um,
@@ -106,7 +133,9 @@ def write(path: str | Path, net: Subnet, scale: Scale, *, size: int, pitch_um: f
         _describe(part, shapes, {name: repr(value) for name, value in camera.items()})
 
 
-def _describe(path: Path, shapes: dict[str, tuple[int, ...]], about: dict[str, str]) -> None:
+def _describe(
+    path: Path, shapes: dict[str, tuple[int, ...]], about: dict[str, str]
+) -> None:
     """Say in the file what its inputs and outputs are, and of which camera."""
     import onnx
 
@@ -115,7 +144,9 @@ def _describe(path: Path, shapes: dict[str, tuple[int, ...]], about: dict[str, s
     for value in made.graph.output:
         shape: list[str | int | None] = ["batch", *shapes[value.name]]
         value.CopyFrom(
-            onnx.helper.make_tensor_value_info(value.name, onnx.TensorProto.FLOAT, shape, OUTPUTS[value.name])
+            onnx.helper.make_tensor_value_info(
+                value.name, onnx.TensorProto.FLOAT, shape, OUTPUTS[value.name]
+            )
         )
     onnx.helper.set_model_props(made, about)
     path.write_bytes(made.SerializeToString())

@@ -1,7 +1,9 @@
 """Normalisation by what was seen before: the batch itself moves nothing.
 
-The blur of a frame says how deep it lies, and so does the mean power of a batch of frames: batch normalisation takes it
-away, with an error of one over the root of the batch, and the network learns depths beside those of the batch. A mean
+The blur of a frame says how deep it lies, and so does the mean power of a batch of
+frames: batch normalisation takes it
+away, with an error of one over the root of the batch, and the network learns depths
+beside those of the batch. A mean
 over many steps takes away what frames have in common alone.
 """
 
@@ -11,14 +13,19 @@ from torch import Tensor, nn
 from codesign.batches import parallel
 
 REACH = 100  # batches that the means reach back over
-EPSILON = 1e-2  # of the variance: a wave that no frame holds is not blown up when one does
+EPSILON = (
+    1e-2  # of the variance: a wave that no frame holds is not blown up when one does
+)
 
 
 class RunningNorm(nn.Module):
-    """(x - m) / sqrt(v + EPSILON) a channel, m and v those of the last batches, this one included.
+    """(x - m) / sqrt(v + EPSILON) a channel, m and v those of the last batches, this
+    one included.
 
-    Of n batches the n-th has a share of 1 / n, from REACH batches on of 1 / REACH. Gradients do not go through m and v.
-    Evaluation moves nothing, nor does a batch that is not finite. In double precision: a power's mean is many times its
+    Of n batches the n-th has a share of 1 / n, from REACH batches on of 1 / REACH.
+    Gradients do not go through m and v.
+    Evaluation moves nothing, nor does a batch that is not finite. In double precision:
+    a power's mean is many times its
     spread, and the difference of squares would leave four digits.
     """
 
@@ -29,7 +36,9 @@ class RunningNorm(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(channels, dtype=torch.float64))
-        self.register_buffer("square", torch.ones(channels, dtype=torch.float64))  # mean of x^2
+        self.register_buffer(
+            "square", torch.ones(channels, dtype=torch.float64)
+        )  # mean of x^2
         self.register_buffer("batches", torch.zeros((), dtype=torch.int64))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -43,7 +52,11 @@ class RunningNorm(nn.Module):
         exact = x.double()
         found = torch.stack([exact.mean((0, 2, 3)), (exact**2).mean((0, 2, 3))])
         if parallel.ranks() > 1:
-            found = torch.tensor(parallel.mean_of(found.flatten().tolist())).to(found).view_as(found)
+            found = (
+                torch.tensor(parallel.mean_of(found.flatten().tolist()))
+                .to(found)
+                .view_as(found)
+            )
         if bool(torch.isfinite(found).all()):
             self.batches += 1
             share = 1 / min(int(self.batches), REACH)
@@ -52,8 +65,12 @@ class RunningNorm(nn.Module):
 
 
 def kept(net: nn.Module) -> list[tuple[Tensor, Tensor]]:
-    """Every running mean of a network with a copy of it as it is now, for :func:`put_back`."""
-    found = [b for m in net.modules() if isinstance(m, RunningNorm) for b in m.buffers()]
+    """Every running mean of a network with a copy of it as it is now, for
+    :func:`put_back`.
+    """
+    found = [
+        b for m in net.modules() if isinstance(m, RunningNorm) for b in m.buffers()
+    ]
     return [(b, b.clone()) for b in found]
 
 

@@ -1,13 +1,18 @@
-"""Adam along the directions in which a layer's gradients vary, for the layers that read blur.
+"""Adam along the directions in which a layer's gradients vary, for the layers that read
+blur.
 
-The log powers of a window rise and fall together: of 145 numbers one direction holds most of the variance, and what
-tells depth from texture lies across it. Adam scales every number alone, and such directions are learned one after the
-other. Scaled along the eigenvectors of the gradients' own second moments they are learned at once (SOAP: Vyas et al.
+The log powers of a window rise and fall together: of 145 numbers one direction holds
+most of the variance, and what
+tells depth from texture lies across it. Adam scales every number alone, and such
+directions are learned one after the
+other. Scaled along the eigenvectors of the gradients' own second moments they are
+learned at once (SOAP: Vyas et al.
 2024, arXiv:2409.11321):
 
     L = <G Gᵀ>,  R = <Gᵀ G>,  U = Q_Lᵀ G Q_R,  step = Q_L (<U> / √<U²>) Q_Rᵀ    for a gradient G (outputs, inputs)
 
-The first gradient turns at once: <U²> gathered along other axes would hold the common direction in each of them, and
+The first gradient turns at once: <U²> gathered along other axes would hold the common
+direction in each of them, and
 keep every step short for the hundred steps after.
 """
 
@@ -17,18 +22,33 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-SMALLEST, WIDEST = 8, 600  # sides: smaller layers are left to Adam; wider sides keep their axes: moments cost too much
-LEAST = 1e-3  # of a layer's root mean square: where gradients are rounding, rounding is not blown up
-TURN = 10  # steps from turn to turn, one step of orthogonal iteration each: fewer follow better, and cost a QR a side
+SMALLEST, WIDEST = (
+    8,
+    600,
+)  # sides: smaller layers are left to Adam; wider sides keep their axes: moments cost too much
+# of a layer's root mean square: where gradients are rounding, rounding is not blown up
+LEAST = 1e-3
+# steps from turn to turn, one step of orthogonal iteration each: fewer follow better,
+# and cost a QR a side
+TURN = 10
 
 
 def layers(net: nn.Module) -> list[nn.Parameter]:
-    """Weights of the dense layers that read blur and slippage: (outputs, inputs) or (outputs, inputs, 1, 1).
+    """Weights of the dense layers that read blur and slippage: (outputs, inputs) or
+    (outputs, inputs, 1, 1).
 
-    Those of an elastic network that every member uses whole, in the order of its parameters.
+    Those of an elastic network that every member uses whole, in the order of its
+    parameters.
     """
-    rooms = [getattr(net, name) for name in ("blur", "calibration") if hasattr(net, name)]
-    found = [m for room in rooms for m in room.modules() if isinstance(m, nn.Linear | nn.Conv2d) and _dense(m)]
+    rooms = [
+        getattr(net, name) for name in ("blur", "calibration") if hasattr(net, name)
+    ]
+    found = [
+        m
+        for room in rooms
+        for m in room.modules()
+        if isinstance(m, nn.Linear | nn.Conv2d) and _dense(m)
+    ]
     return [layer.get_parameter("weight") for layer in found]
 
 
@@ -40,7 +60,8 @@ def _dense(layer: nn.Linear | nn.Conv2d) -> bool:
 class Soap(torch.optim.Optimizer):
     """Adam along turned directions, with decoupled weight decay.
 
-    ``weights``: (outputs, inputs) or (outputs, inputs, 1, 1). A side above WIDEST keeps its own axes.
+    ``weights``: (outputs, inputs) or (outputs, inputs, 1, 1). A side above WIDEST keeps
+    its own axes.
     """
 
     def __init__(
@@ -52,8 +73,13 @@ class Soap(torch.optim.Optimizer):
         epsilon: float = 1e-8,
         weight_decay: float = 0.0,
     ) -> None:
-        """``betas``: of the mean gradient, and of all second moments, of the layer and along its directions."""
-        super().__init__(weights, dict(lr=lr, betas=betas, epsilon=epsilon, weight_decay=weight_decay))
+        """``betas``: of the mean gradient, and of all second moments, of the layer and
+        along its directions.
+        """
+        super().__init__(
+            weights,
+            dict(lr=lr, betas=betas, epsilon=epsilon, weight_decay=weight_decay),
+        )
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
@@ -91,28 +117,40 @@ def _fresh(gradient: Tensor) -> dict[str, Tensor]:
     state = {name: torch.zeros_like(gradient) for name in ("mean", "square")}
     for side, size in _sides(gradient):
         state[f"moment_{side}"] = gradient.new_zeros(size, size)
-        state[f"turn_{side}"] = torch.eye(size, dtype=gradient.dtype, device=gradient.device)
+        state[f"turn_{side}"] = torch.eye(
+            size, dtype=gradient.dtype, device=gradient.device
+        )
     return state | {"step": torch.zeros(())}
 
 
 def _sides(gradient: Tensor) -> Iterator[tuple[str, int]]:
     """Names and sizes of the sides that are turned."""
-    return ((name, size) for name, size in zip(("left", "right"), gradient.shape, strict=True) if size <= WIDEST)
+    return (
+        (name, size)
+        for name, size in zip(("left", "right"), gradient.shape, strict=True)
+        if size <= WIDEST
+    )
 
 
-def _follow(state: dict[str, Tensor], gradient: Tensor, count: int, slow: float) -> None:
+def _follow(
+    state: dict[str, Tensor], gradient: Tensor, count: int, slow: float
+) -> None:
     """Second moments of the layer, and from time to time its directions."""
     for side, _ in _sides(gradient):
         moment = state[f"moment_{side}"]
-        moment.lerp_(gradient @ gradient.T if side == "left" else gradient.T @ gradient, 1 - slow)
+        moment.lerp_(
+            gradient @ gradient.T if side == "left" else gradient.T @ gradient, 1 - slow
+        )
         if (count - 1) % TURN == 0:
             state[f"turn_{side}"] = _nearer(moment, state[f"turn_{side}"])
 
 
 def _nearer(moment: Tensor, turn: Tensor) -> Tensor:
-    """Orthogonal directions nearer to the eigenvectors of the moment: Q R = (M + m LEAST² I) Q of before.
+    """Orthogonal directions nearer to the eigenvectors of the moment: Q R = (M + m
+    LEAST² I) Q of before.
 
-    m: mean eigenvalue. What gradients never excite, most directions of the first steps, stays where it is.
+    m: mean eigenvalue. What gradients never excite, most directions of the first steps,
+    stays where it is.
     """
     own = LEAST**2 * moment.diagonal().mean()
     orthogonal: Tensor = torch.linalg.qr(moment @ turn + own * turn).Q

@@ -1,4 +1,6 @@
-"""One architecture cut out of a supernet, to be kept: it holds only the weights that it uses."""
+"""One architecture cut out of a supernet, to be kept: it holds only the weights that it
+uses.
+"""
 
 from typing import Any
 
@@ -10,9 +12,11 @@ from codesign.network.supernet import ElasticBlock, Supernet, modules_of
 
 
 class Subnet(nn.Module):
-    """One architecture cut out of a supernet: ``forward(frames) -> (mask_logits, centre, slip)``.
+    """One architecture cut out of a supernet: ``forward(frames) -> (mask_logits,
+    centre, slip)``.
 
-    It holds only the weights that it uses; outputs equal those of the recalibrated supernet.
+    It holds only the weights that it uses; outputs equal those of the recalibrated
+    supernet.
     """
 
     def __init__(self, net: Supernet, architecture: Architecture) -> None:
@@ -50,8 +54,16 @@ def _trim_block(module: ElasticBlock, block: Block) -> None:
     _trim_conv(module.project, block.hidden, block.outputs, 1)
     if module.squeeze is not None:
         down, up = module.squeeze.down, module.squeeze.up
-        _keep(down, weight=down.weight[: block.squeeze, : block.hidden], bias=down.bias[: block.squeeze])
-        _keep(up, weight=up.weight[: block.hidden, : block.squeeze], bias=up.bias[: block.hidden])
+        _keep(
+            down,
+            weight=down.weight[: block.squeeze, : block.hidden],
+            bias=down.bias[: block.squeeze],
+        )
+        _keep(
+            up,
+            weight=up.weight[: block.hidden, : block.squeeze],
+            bias=up.bias[: block.hidden],
+        )
 
 
 def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
@@ -60,7 +72,10 @@ def _trim_conv(conv: Any, inputs: int, outputs: int, kernel: int) -> None:
     _keep(conv, weight=conv.weight[:outputs, :inputs, inside, inside])
     norm = conv.norm
     _keep(norm, weight=norm.weight[:outputs], bias=norm.bias[:outputs])
-    norm.mean, norm.variance = norm.mean[:outputs].clone(), norm.variance[:outputs].clone()
+    norm.mean, norm.variance = (
+        norm.mean[:outputs].clone(),
+        norm.variance[:outputs].clone(),
+    )
 
 
 def _keep(module: nn.Module, **tensors: Tensor) -> None:

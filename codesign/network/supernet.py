@@ -2,8 +2,10 @@
 
 Every architecture of the space is a slice of one set of weights.
 
-A kernel is the centre of a larger one, channels are the first of more, blocks are the first of a stage (after
-Cai et al. 2019). Batch statistics belong to one architecture at a time: :func:`recalibrate` measures them.
+A kernel is the centre of a larger one, channels are the first of more, blocks are the
+first of a stage (after
+Cai et al. 2019). Batch statistics belong to one architecture at a time:
+:func:`recalibrate` measures them.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,7 +18,15 @@ from torch.nn import functional as F
 
 from codesign.batches import parallel
 from codesign.network import blur, normed
-from codesign.network.architecture import Activation, Architecture, Block, Space, blocks, largest, stem_channels
+from codesign.network.architecture import (
+    Activation,
+    Architecture,
+    Block,
+    Space,
+    blocks,
+    largest,
+    stem_channels,
+)
 from codesign.network.cost import (
     MASK_CHANNELS,
     POINT_FEATURES,
@@ -38,15 +48,23 @@ from metalens.ground.errors import TrainingError
 class Prediction:
     """What the network says of a frame.
 
-    mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a network that gives no mask.
-    centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle, -0.5 at the left and top edge.
-    slip: (batch, 3) camera displacement in units of the scale that the loss divides by (paper Eq. 7).
-    depth: (batch, 2, windows, windows) what blur tells of each window's depth (:mod:`codesign.network.blur`): vergence
-        and the logarithm of its standard deviation; None of a network without that branch.
-    slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``; None of a network that does not tell it.
-    points: (batch, POINTS, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's middle, as ``centre`` is told;
+    mask_logits: (batch, y, x) at a quarter of the input resolution; (batch, 0, 0) of a
+    network that gives no mask.
+    centre: (batch, 2) pupil centre x, y as a fraction of the image from its middle,
+    -0.5 at the left and top edge.
+    slip: (batch, 3) camera displacement in units of the scale that the loss divides by
+    (paper Eq. 7).
+    depth: (batch, 2, windows, windows) what blur tells of each window's depth
+    (:mod:`codesign.network.blur`): vergence
+        and the logarithm of its standard deviation; None of a network without that
+        branch.
+    slip_log_sd: (batch, 3) logarithm of the standard deviation of ``slip``; None of a
+    network that does not tell it.
+    points: (batch, POINTS, 2) landmarks (:data:`codesign.eye.NAMES`), then the pupil's
+    middle, as ``centre`` is told;
         None of a network that seeks none.
-    axis: (batch, 3) optic axis of the eye in the camera's frame, not normalised; likewise.
+    axis: (batch, 3) optic axis of the eye in the camera's frame, not normalised;
+    likewise.
     """
 
     mask_logits: Tensor
@@ -84,11 +102,15 @@ class SlicedNorm(nn.Module):
             return activated(parallel.batch_norm(x, weight, bias), act)
         if self.training or self.measuring:
             return normed.batch_norm(x, weight, bias, act)
-        return activated(F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias), act)
+        return activated(
+            F.batch_norm(x, self.mean[:count], self.variance[:count], weight, bias), act
+        )
 
     @torch.no_grad()
     def _measure(self, x: Tensor) -> None:
-        """Running mean over batches of equal weight, so the order of the batches does not matter."""
+        """Running mean over batches of equal weight, so the order of the batches does
+        not matter.
+        """
         count = x.shape[1]
         self.batches += 1
         variance, mean = torch.var_mean(x, dim=(0, 2, 3), unbiased=x.numel() > count)
@@ -97,9 +119,13 @@ class SlicedNorm(nn.Module):
 
 
 class SlicedConv(nn.Module):
-    """Convolution with norm, of which the leading channels and the centre of the kernel are used."""
+    """Convolution with norm, of which the leading channels and the centre of the kernel
+    are used.
+    """
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 1, *, depthwise: bool = False) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int = 1, *, depthwise: bool = False
+    ) -> None:
         super().__init__()
         fan_out = kernel**2 * (1 if depthwise else outputs)
         shape = (outputs, 1 if depthwise else inputs, kernel, kernel)
@@ -108,13 +134,23 @@ class SlicedConv(nn.Module):
         self.depthwise = depthwise
 
     def forward(
-        self, x: Tensor, outputs: int, *, kernel: int = 1, stride: int = 1, act: Activation | None = None
+        self,
+        x: Tensor,
+        outputs: int,
+        *,
+        kernel: int = 1,
+        stride: int = 1,
+        act: Activation | None = None,
     ) -> Tensor:
         trim = (self.weight.shape[-1] - kernel) // 2
         inside = slice(trim, trim + kernel)
-        weight = self.weight[:outputs, : 1 if self.depthwise else x.shape[1], inside, inside]
+        weight = self.weight[
+            :outputs, : 1 if self.depthwise else x.shape[1], inside, inside
+        ]
         groups = outputs if self.depthwise else 1
-        y: Tensor = self.norm(F.conv2d(x, weight, stride=stride, padding=kernel // 2, groups=groups), act)
+        y: Tensor = self.norm(
+            F.conv2d(x, weight, stride=stride, padding=kernel // 2, groups=groups), act
+        )
         return y
 
 
@@ -129,8 +165,14 @@ class SqueezeExcite(nn.Module):
     def forward(self, x: Tensor, squeeze: int) -> Tensor:
         count = x.shape[1]
         pooled = x.mean((2, 3))
-        inside = F.relu(F.linear(pooled, self.down.weight[:squeeze, :count], self.down.bias[:squeeze]))
-        gate = F.hardsigmoid(F.linear(inside, self.up.weight[:count, :squeeze], self.up.bias[:count]))
+        inside = F.relu(
+            F.linear(
+                pooled, self.down.weight[:squeeze, :count], self.down.bias[:squeeze]
+            )
+        )
+        gate = F.hardsigmoid(
+            F.linear(inside, self.up.weight[:count, :squeeze], self.up.bias[:count])
+        )
         gated: Tensor = x * gate[:, :, None, None]
         return gated
 
@@ -141,14 +183,20 @@ class ElasticBlock(nn.Module):
     def __init__(self, most: Block) -> None:
         super().__init__()
         self.expand = SlicedConv(most.inputs, most.hidden)
-        self.depthwise = SlicedConv(most.hidden, most.hidden, most.kernel, depthwise=True)
-        self.squeeze = SqueezeExcite(most.hidden, most.squeeze) if most.squeeze else None
+        self.depthwise = SlicedConv(
+            most.hidden, most.hidden, most.kernel, depthwise=True
+        )
+        self.squeeze = (
+            SqueezeExcite(most.hidden, most.squeeze) if most.squeeze else None
+        )
         self.project = SlicedConv(most.hidden, most.outputs)
 
     def forward(self, x: Tensor, block: Block) -> Tensor:
         act = block.activation
         y = self.expand(x, block.hidden, act=act) if block.hidden != block.inputs else x
-        y = self.depthwise(y, block.hidden, kernel=block.kernel, stride=block.stride, act=act)
+        y = self.depthwise(
+            y, block.hidden, kernel=block.kernel, stride=block.stride, act=act
+        )
         if self.squeeze is not None:
             y = self.squeeze(y, block.squeeze)
         projected: Tensor = self.project(y, block.outputs)
@@ -156,9 +204,11 @@ class ElasticBlock(nn.Module):
 
 
 class PerceptionHead(nn.Module):
-    """Pupil mask and maps of landmarks from the last features of every stride, added up from coarse to fine.
+    """Pupil mask and maps of landmarks from the last features of every stride, added up
+    from coarse to fine.
 
-    ``forward(features) -> (mask, maps, decoded)``: the last is what both are decoded from.
+    ``forward(features) -> (mask, maps, decoded)``: the last is what both are decoded
+    from.
     """
 
     def __init__(self, channels: list[int]) -> None:
@@ -170,7 +220,9 @@ class PerceptionHead(nn.Module):
 
     def forward(self, features: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         total = self.laterals[-1](features[-1], MASK_CHANNELS, act="hardswish")
-        for lateral, feature in zip(list(self.laterals)[-2::-1], features[-2::-1], strict=True):
+        for lateral, feature in zip(
+            list(self.laterals)[-2::-1], features[-2::-1], strict=True
+        ):
             total = F.interpolate(total, size=feature.shape[-2:], mode="nearest")
             total = total + lateral(feature, MASK_CHANNELS, act="hardswish")
         decoded = self.smooth(total, MASK_CHANNELS, kernel=3, act="hardswish")
@@ -178,10 +230,13 @@ class PerceptionHead(nn.Module):
 
 
 class CalibrationHead(nn.Module):
-    """Slip and optic axis from the flattened last feature map, so that place in the image is kept (paper Eq. 7), from
-    the depths and from the landmarks: ``forward(features, depths, points) -> (slip, spread, axis)``.
+    """Slip and optic axis from the flattened last feature map, so that place in the
+    image is kept (paper Eq. 7), from
+    the depths and from the landmarks: ``forward(features, depths, points) -> (slip,
+    spread, axis)``.
 
-    What no depth changes, the axis, is read without depths. The uncertainty is read from what the slip is read from,
+    What no depth changes, the axis, is read without depths. The uncertainty is read
+    from what the slip is read from,
     but does not shape it.
     """
 
@@ -197,11 +252,17 @@ class CalibrationHead(nn.Module):
         self.turned = nn.Linear(2 * SLIP_HIDDEN, SLIP_HIDDEN)
         self.axis = nn.Linear(SLIP_HIDDEN, 3)
 
-    def forward(self, features: Tensor, depths: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, features: Tensor, depths: Tensor, points: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         reduced = self.reduce(features, SLIP_CHANNELS, act="hardswish")
         grid = resampled(reduced, (SLIP_GRID, SLIP_GRID))
-        seen = F.hardswish(torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1))
-        joined = F.hardswish(self.joined(torch.cat([seen, F.hardswish(self.depths(depths))], 1)))
+        seen = F.hardswish(
+            torch.cat([self.hidden(grid.flatten(1)), self.points(points)], 1)
+        )
+        joined = F.hardswish(
+            self.joined(torch.cat([seen, F.hardswish(self.depths(depths))], 1))
+        )
         axis = self.axis(F.hardswish(self.turned(seen)))
         return self.slip(joined), self.spread(joined.detach()).clamp(-4, 2), axis
 
@@ -209,7 +270,8 @@ class CalibrationHead(nn.Module):
 class Supernet(nn.Module):
     """All architectures of ``space`` in one set of weights.
 
-    ``forward(frames, architecture)``: frames (batch, 1, y, x), standardised; returns a :class:`Prediction`.
+    ``forward(frames, architecture)``: frames (batch, 1, y, x), standardised; returns a
+    :class:`Prediction`.
     """
 
     def __init__(self, space: Space | None = None) -> None:
@@ -218,17 +280,25 @@ class Supernet(nn.Module):
         most = largest(self.space)
         rows = blocks(self.space, most)
         self.stem = SlicedConv(1, stem_channels(self.space, most), 3)
-        self.stages = nn.ModuleList(nn.ModuleList(ElasticBlock(b) for b in row) for row in rows)
-        self.perception = PerceptionHead([rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)])
+        self.stages = nn.ModuleList(
+            nn.ModuleList(ElasticBlock(b) for b in row) for row in rows
+        )
+        self.perception = PerceptionHead(
+            [rows[stage][-1].outputs for stage, _ in lateral_strides(self.space)]
+        )
         self.calibration = CalibrationHead(rows[-1][-1].outputs)
         self.blur = blur.InformedBranch(RunningNorm(blur.FEATURES), MASK_CHANNELS)
 
     def forward(self, frames: Tensor, architecture: Architecture) -> Prediction:
         seen = scaled(frames, architecture.resolution)
-        x = self.stem(seen, self._stem(architecture), kernel=3, stride=2, act="hardswish")
+        x = self.stem(
+            seen, self._stem(architecture), kernel=3, stride=2, act="hardswish"
+        )
         kept = {stage for stage, _ in lateral_strides(self.space)}
         features = []
-        for i, (stage, row) in enumerate(zip(self.stages, blocks(self.space, architecture), strict=True)):
+        for i, (stage, row) in enumerate(
+            zip(self.stages, blocks(self.space, architecture), strict=True)
+        ):
             for module, block in zip(modules_of(stage), row, strict=False):
                 x = module(x, block)
             if i in kept:
@@ -236,12 +306,18 @@ class Supernet(nn.Module):
         logits, maps, decoded = self.perception(features)
         depth, told, axial = self.blur(seen, decoded)
         points, spread_out = places(maps)
-        slip, spread, axis = self.calibration(x, told, torch.cat([points.flatten(1), spread_out], 1))
+        slip, spread, axis = self.calibration(
+            x, told, torch.cat([points.flatten(1), spread_out], 1)
+        )
         slip = slip + F.pad(axial[:, None], (2, 0))
-        return Prediction(logits, soft_argmax(logits), slip, depth, spread, points, axis)
+        return Prediction(
+            logits, soft_argmax(logits), slip, depth, spread, points, axis
+        )
 
     def counts(self, architecture: Architecture, sizes: Array) -> Array:
-        """Multiply-accumulates of a member for square frames of these sizes after scaling (integers), exact."""
+        """Multiply-accumulates of a member for square frames of these sizes after
+        scaling (integers), exact.
+        """
         return network(self.space, architecture).at(sizes)
 
     def _stem(self, architecture: Architecture) -> int:
@@ -255,9 +331,11 @@ def scaled(frames: Tensor, resolution: float) -> Tensor:
 
 
 def soft_argmax(logits: Tensor) -> Tensor:
-    """(batch, 2) centre of mass x, y of the mask probability, as a fraction of the image from its middle.
+    """(batch, 2) centre of mass x, y of the mask probability, as a fraction of the
+    image from its middle.
 
-    Probabilities below 0.05 are left out, so that the sea of background does not pull the centre; an empty mask
+    Probabilities below 0.05 are left out, so that the sea of background does not pull
+    the centre; an empty mask
     gives (0, 0) with a finite gradient.
     """
     probability = torch.sigmoid(logits)
@@ -266,12 +344,16 @@ def soft_argmax(logits: Tensor) -> Tensor:
     height, width = logits.shape[-2:]
     x = (torch.arange(width, device=logits.device) + 0.5) / width - 0.5
     y = (torch.arange(height, device=logits.device) + 0.5) / height - 0.5
-    return torch.stack([(weight.sum(1) * x).sum(1) / total, (weight.sum(2) * y).sum(1) / total], -1)
+    return torch.stack(
+        [(weight.sum(1) * x).sum(1) / total, (weight.sum(2) * y).sum(1) / total], -1
+    )
 
 
 def places(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """(batch, points, 2) centre of mass x, y of every map's softmax, fraction of the image from its middle, and
-    (batch, points) its root mean square width: wide where the point is not seen, or out of the image.
+    """(batch, points, 2) centre of mass x, y of every map's softmax, fraction of the
+    image from its middle, and
+    (batch, points) its root mean square width: wide where the point is not seen, or out
+    of the image.
 
     Args:
         maps: (batch, points, y, x).
@@ -280,17 +362,25 @@ def places(maps: Tensor) -> tuple[Tensor, Tensor]:
     share = torch.softmax(maps.flatten(2), 2).view(maps.shape)
     columns, rows = share.sum(2), share.sum(3)
     x = (torch.arange(width, dtype=maps.dtype, device=maps.device) + 0.5) / width - 0.5
-    y = (torch.arange(height, dtype=maps.dtype, device=maps.device) + 0.5) / height - 0.5
+    y = (
+        torch.arange(height, dtype=maps.dtype, device=maps.device) + 0.5
+    ) / height - 0.5
     middle = torch.stack([columns @ x, rows @ y], -1)
-    around = (columns * (x - middle[..., :1]) ** 2).sum(-1) + (rows * (y - middle[..., 1:]) ** 2).sum(-1)
+    around = (columns * (x - middle[..., :1]) ** 2).sum(-1) + (
+        rows * (y - middle[..., 1:]) ** 2
+    ).sum(-1)
     return middle, torch.sqrt(around + 1e-6)
 
 
 @torch.no_grad()
-def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]) -> None:
-    """Measure the batch statistics of one architecture from a reset, on fixed batches; leaves eval mode.
+def recalibrate(
+    net: nn.Module, architecture: Architecture, batches: Iterable[Tensor]
+) -> None:
+    """Measure the batch statistics of one architecture from a reset, on fixed batches;
+    leaves eval mode.
 
-    Running means (:class:`codesign.network.running.RunningNorm`) belong to all architectures and stay.
+    Running means (:class:`codesign.network.running.RunningNorm`) belong to all
+    architectures and stay.
 
     Raises:
         TrainingError: no batch was given.
@@ -311,7 +401,9 @@ def recalibrate(net: nn.Module, architecture: Architecture, batches: Iterable[Te
         for norm in norms:
             norm.measuring = False
     if count == 0:
-        raise TrainingError("recalibration needs at least one batch of frames, found none")
+        raise TrainingError(
+            "recalibration needs at least one batch of frames, found none"
+        )
 
 
 def modules_of(stage: nn.Module) -> Iterator[Any]:

@@ -1,13 +1,18 @@
-"""What a window of the frame holds that blur changes: log powers of waves, and how its steps of brightness are spread.
+"""What a window of the frame holds that blur changes: log powers of waves, and how its
+steps of brightness are spread.
 
-A window is a quarter of the frame wide; 7 x 7 of them overlap by half. The waves have 0 … 8 periods a window under a
+A window is a quarter of the frame wide; 7 x 7 of them overlap by half. The waves have 0
+… 8 periods a window under a
 Hann weight:
 
     P(i, f) = |Σ_x w(x - x_i) e^{2πi f·x} frame(x)|² / Σ w²         log P: texture and blur add up in it
 
-Places and frequencies are fractions of the frame, so frames of any number of pixels give the same features as far as
-their pixels reach; waves beyond Nyquist are left out. A power says how much a window varies at a scale, not whether
-along one lash or everywhere; how the steps between neighbouring samples are distributed says it, and blur takes the
+Places and frequencies are fractions of the frame, so frames of any number of pixels
+give the same features as far as
+their pixels reach; waves beyond Nyquist are left out. A power says how much a window
+varies at a scale, not whether
+along one lash or everywhere; how the steps between neighbouring samples are distributed
+says it, and blur takes the
 steepest steps first.
 """
 
@@ -27,9 +32,13 @@ WAVES = 8  # periods a window of the finest wave
 COLUMNS, ROWS = WAVES + 1, 2 * WAVES  # of frequencies: 0 … 8 along x, -7 … 8 along y
 FLOOR = 1e-2  # of the power, in units of the frame's variance a pixel
 
-SAMPLES = 8 * (GRID + 1)  # along a side, on which steps are taken: the finest wave is at their Nyquist frequency
+SAMPLES = (
+    8 * (GRID + 1)
+)  # along a side, on which steps are taken: the finest wave is at their Nyquist frequency
 STEP_FLOOR = FLOOR / 4  # of a squared step, in units of the frame's variance
-STEPS: tuple[tuple[tuple[int, int, int], ...], ...] = (  # of a sample from its neighbours: (x, y, weight)
+STEPS: tuple[
+    tuple[tuple[int, int, int], ...], ...
+] = (  # of a sample from its neighbours: (x, y, weight)
     ((0, 0, 1), (-1, 0, -1)),
     ((0, 0, 1), (0, -1, -1)),
     ((0, 0, 1), (-1, -1, -1)),
@@ -39,7 +48,9 @@ STEPS: tuple[tuple[tuple[int, int, int], ...], ...] = (  # of a sample from its 
     ((-1, 0, 1), (1, 0, 1), (0, -1, 1), (0, 1, 1), (0, 0, -4)),
 )
 REACHES = (1, 2)  # samples from neighbour to neighbour, of means over as many
-TOLD = 3  # of every kind of step: mean and spread of the logarithm of its square, and its steepest
+# of every kind of step: mean and spread of the logarithm of its square, and its
+# steepest
+TOLD = 3
 STEP_FEATURES = TOLD * len(STEPS) * len(REACHES)
 STEP_MACS = SAMPLES**2 * (len(REACHES) * sum(len(taps) for taps in STEPS) + 4)
 
@@ -58,7 +69,8 @@ def spectra_macs(size: int) -> int:
 
 @functools.lru_cache(maxsize=64)
 def filters(size: int) -> tuple[Tensor, Tensor]:
-    """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) under their Hann weight, on the second half of a window.
+    """Cosines (step, 0 … 8 periods) and sines (step, 1 … 8) under their Hann weight, on
+    the second half of a window.
 
     From its middle on: cosines are even about it, sines are odd.
     """
@@ -66,7 +78,9 @@ def filters(size: int) -> tuple[Tensor, Tensor]:
     place = torch.arange(step, dtype=torch.float64)[:, None] + 0.5
     weight = torch.cos(math.pi * place / (2 * step)) ** 2
     weight = weight / (math.sqrt(2) * weight.norm())
-    period = size / ((GRID + 1) / 2)  # pixels of one wave a window, whatever the window was rounded to
+    period = size / (
+        (GRID + 1) / 2
+    )  # pixels of one wave a window, whatever the window was rounded to
     frequency = torch.arange(WAVES + 1) / period
     seen = (frequency <= 0.5 + 1e-9) * weight
     turn = 2 * math.pi * frequency * place
@@ -74,13 +88,16 @@ def filters(size: int) -> tuple[Tensor, Tensor]:
 
 
 def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID, GRID) its mean under the weight.
+    """(batch, COLUMNS ROWS, GRID, GRID) power of every window, and (batch, 1, GRID,
+    GRID) its mean under the weight.
 
-    Separable, and folded about the middle of a window: one product serves a pixel and its mirror image, a frequency
+    Separable, and folded about the middle of a window: one product serves a pixel and
+    its mirror image, a frequency
     and its negative.
 
     Args:
-        frames: (batch, 1, size, size), standardised; the margin that no window covers is cut off evenly.
+        frames: (batch, 1, size, size), standardised; the margin that no window covers
+            is cut off evenly.
     """
     size = int(frames.shape[-1])
     step = step_of(size)
@@ -88,21 +105,35 @@ def spectra(frames: Tensor) -> tuple[Tensor, Tensor]:
     inside = slice(first, first + (GRID + 1) * step)
     cosine, sine = (f.to(frames) for f in filters(size))
     even, odd = _folded(frames[:, 0, inside, inside], 2)
-    real, imaginary = even @ cosine, F.pad(odd @ sine, (1, 0))  # (batch, rows, windows along x, COLUMNS)
-    (real_even, real_odd), (imaginary_even, imaginary_odd) = (_folded(part, 1) for part in (real, imaginary))
-    rc, ic = real_even @ cosine, imaginary_even @ cosine  # (batch, windows along y, along x, COLUMNS, frequencies)
+    real, imaginary = (
+        even @ cosine,
+        F.pad(odd @ sine, (1, 0)),
+    )  # (batch, rows, windows along x, COLUMNS)
+    (real_even, real_odd), (imaginary_even, imaginary_odd) = (
+        _folded(part, 1) for part in (real, imaginary)
+    )
+    rc, ic = (
+        real_even @ cosine,
+        imaginary_even @ cosine,
+    )  # (batch, windows along y, along x, COLUMNS, frequencies)
     rs, js = (F.pad(part @ sine, (1, 0)) for part in (real_odd, imaginary_odd))
     up = (rc - js) ** 2 + (ic + rs) ** 2
     down = (rc + js) ** 2 + (ic - rs) ** 2
     power = torch.cat([down[..., 1:WAVES].flip(-1), up], -1)
-    mean = rc[..., 0, 0] / (4 / 3 * step)  # frequency 0 along both axes; the weight's sum squared
-    return power.permute(0, 3, 4, 1, 2).reshape(-1, COLUMNS * ROWS, GRID, GRID), mean[:, None]
+    mean = rc[..., 0, 0] / (
+        4 / 3 * step
+    )  # frequency 0 along both axes; the weight's sum squared
+    return power.permute(0, 3, 4, 1, 2).reshape(-1, COLUMNS * ROWS, GRID, GRID), mean[
+        :, None
+    ]
 
 
 def steps(frames: Tensor) -> Tensor:
-    """(batch, STEP_FEATURES, GRID, GRID) how squared steps between neighbours are spread over every window.
+    """(batch, STEP_FEATURES, GRID, GRID) how squared steps between neighbours are
+    spread over every window.
 
-    By kind of step, in units of STEP_FLOOR: the mean of log(1 + square), its standard deviation, and the logarithm of
+    By kind of step, in units of STEP_FLOOR: the mean of log(1 + square), its standard
+    deviation, and the logarithm of
     1 + the fourth powers' mean, a fourth of it: the steepest rule it.
 
     Args:
@@ -116,21 +147,29 @@ def steps(frames: Tensor) -> Tensor:
 
 
 def window_content(maps: Tensor) -> Tensor:
-    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y, x) of the whole frame.
+    """(batch, channels, GRID, GRID) mean over every window of maps (batch, channels, y,
+    x) of the whole frame.
 
-    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is two of them wide.
+    The frame is averaged to as many steps of windows as it has, GRID + 1; a window is
+    two of them wide.
     """
     height, width = (int(n) for n in maps.shape[-2:])
     steps, sides = GRID + 1, (max(1, height // (GRID + 1)), max(1, width // (GRID + 1)))
     coarse = F.avg_pool2d(maps, sides)
     if tuple(coarse.shape[-2:]) != (steps, steps):
-        coarse = F.interpolate(coarse, size=(steps, steps), mode="bilinear", align_corners=False)
+        coarse = F.interpolate(
+            coarse, size=(steps, steps), mode="bilinear", align_corners=False
+        )
     return F.avg_pool2d(coarse, 2, 1)
 
 
 def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """(batch, channels, *size): averaged by whole factors, then interpolated where the size is no divisor."""
-    factor = [max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)]
+    """(batch, channels, *size): averaged by whole factors, then interpolated where the
+    size is no divisor.
+    """
+    factor = [
+        max(1, int(have) // want) for have, want in zip(x.shape[-2:], size, strict=True)
+    ]
     pooled = F.avg_pool2d(x, factor) if max(factor) > 1 else x
     if tuple(int(s) for s in pooled.shape[-2:]) == size:
         return pooled
@@ -138,25 +177,46 @@ def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _folded(x: Tensor, along: int) -> tuple[Tensor, Tensor]:
-    """Windows along an axis, appended as the last one from their middle on: sums and differences with their mirror."""
+    """Windows along an axis, appended as the last one from their middle on: sums and
+    differences with their mirror.
+    """
     sides = [int(n) for n in x.shape[1:]]
     sides[along - 1 : along] = [GRID + 1, sides[along - 1] // (GRID + 1)]
     halves = x.reshape(-1, *sides).movedim(along + 1, -1)
-    before, after = halves.narrow(along, 0, GRID).flip(-1), halves.narrow(along, 1, GRID)
+    before, after = (
+        halves.narrow(along, 0, GRID).flip(-1),
+        halves.narrow(along, 1, GRID),
+    )
     return after + before, after - before
 
 
 def _moments(samples: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """(batch, kinds, y, x) of which windows have the means: log(1 + square), its square, and the fourth power's.
+    """(batch, kinds, y, x) of which windows have the means: log(1 + square), its
+    square, and the fourth power's.
 
-    Compiled, as means over blocks already, where no derivative is asked, and nobody follows what is done.
+    Compiled, as means over blocks already, where no derivative is asked, and nobody
+    follows what is done.
     """
     first = samples[0]
-    if first.device.type == "cpu" and first.dtype == torch.float32 and not first.requires_grad and not followed():
+    if (
+        first.device.type == "cpu"
+        and first.dtype == torch.float32
+        and not first.requires_grad
+        and not followed()
+    ):
         return stepped.moments(samples, REACHES, _kernels(), GRID + 1, STEP_FLOOR)
-    square = torch.cat([_steps(of, reach) for of, reach in zip(samples, REACHES, strict=True)], 1) ** 2
+    square = (
+        torch.cat(
+            [_steps(of, reach) for of, reach in zip(samples, REACHES, strict=True)], 1
+        )
+        ** 2
+    )
     told = torch.log1p(square / STEP_FLOOR)
-    return told, told**2, (square**2) ** 2  # squares twice: a power of four is a function call a number
+    return (
+        told,
+        told**2,
+        (square**2) ** 2,
+    )  # squares twice: a power of four is a function call a number
 
 
 def followed() -> bool:
@@ -177,7 +237,9 @@ def _kernels() -> Array:
 
 
 def _steps(samples: Tensor, reach: int) -> Tensor:
-    """(batch, kinds, y, x) of (batch, 1, y, x), of variance 1 on white samples of it; beyond the edge it goes on."""
+    """(batch, kinds, y, x) of (batch, 1, y, x), of variance 1 on white samples of it;
+    beyond the edge it goes on.
+    """
     rows, columns = (int(n) for n in samples.shape[-2:])
     wide = F.pad(samples, (reach,) * 4, mode="replicate")
 
@@ -188,5 +250,10 @@ def _steps(samples: Tensor, reach: int) -> Tensor:
     kinds = []
     for taps in STEPS:
         norm = math.sqrt(sum(weight**2 for _, _, weight in taps))
-        kinds.append(sum((weight / norm * shifted(x, y) for x, y, weight in taps), torch.zeros_like(samples)))
+        kinds.append(
+            sum(
+                (weight / norm * shifted(x, y) for x, y, weight in taps),
+                torch.zeros_like(samples),
+            )
+        )
     return torch.cat(kinds, 1)

@@ -1,7 +1,10 @@
-"""The PSFs that a made lens gives to training: every pillar as built, gathered on the pupil, on the samples of a run.
+"""The PSFs that a made lens gives to training: every pillar as built, gathered on the
+pupil, on the samples of a run.
 
-A draw from the posterior of a fit takes a tenth of a second: the pillars' transmission comes from a table over the
-diameter, and the light that one of them sends to other diffraction orders averages out over a few micrometres.
+A draw from the posterior of a fit takes a tenth of a second: the pillars' transmission
+comes from a table over the
+diameter, and the light that one of them sends to other diffraction orders averages out
+over a few micrometres.
 """
 
 import math
@@ -32,7 +35,8 @@ SPARE = 4  # samples around the window, so that what wraps around does not reach
 
 
 def of_lens(x: Array) -> Array:
-    """The parameters that a lens keeps when it leaves the bench; those of bench and light source are set to rest.
+    """The parameters that a lens keeps when it leaves the bench; those of bench and
+    light source are set to rest.
 
     x: all parameters, in the order of ``characterize.model.parameters.NAMES``.
     """
@@ -40,41 +44,66 @@ def of_lens(x: Array) -> Array:
 
 
 def posterior(built: AsBuilt, count: int, *, seed: int) -> Iterator[Array]:
-    """All parameters of ``count`` lenses that the fit holds possible, as far as their light goes."""
+    """All parameters of ``count`` lenses that the fit holds possible, as far as their
+    light goes.
+    """
     for row in built.lens_samples(count, seed=seed):
         yield built.parameters(row)
 
 
 def psf_error(one: Stack, other: Stack) -> float:
     """Relative L2 difference of two stacks of PSFs, each PSF of sum 1."""
-    a, b = (s.intensity.double() / s.intensity.double().sum((-2, -1), keepdim=True) for s in (one, other))
+    a, b = (
+        s.intensity.double() / s.intensity.double().sum((-2, -1), keepdim=True)
+        for s in (one, other)
+    )
     return float((a - b).norm() / b.norm())
 
 
 class MadeLens:
     """A design, ready to give the PSFs of any lens that was made of it.
 
-    response: what height, index and sidewall do to the pillars; by effective index without it.
+    response: what height, index and sidewall do to the pillars; by effective index
+    without it.
 
-    Accuracy: PSFs on samples of a run differ from those of :func:`metalens.psf.psf_stack` over all pillars by 3e-3
+    Accuracy: PSFs on samples of a run differ from those of
+    :func:`metalens.psf.psf_stack` over all pillars by 3e-3
     (relative L2); a test holds it.
     """
 
-    def __init__(self, design: Lens, settings: OpticsConfig, *, response: Sensitivity | None = None) -> None:
+    def __init__(
+        self,
+        design: Lens,
+        settings: OpticsConfig,
+        *,
+        response: Sensitivity | None = None,
+    ) -> None:
         if settings.angle_deg:
-            raise TrainingError(f"the run sees its lens at {settings.angle_deg:g} deg: a made lens is known on axis")
-        self.design, self.settings, self.response = design, settings, response or sensitivity(design)
+            raise TrainingError(
+                f"the run sees its lens at {settings.angle_deg:g} deg: a made lens is known on axis"
+            )
+        self.design, self.settings, self.response = (
+            design,
+            settings,
+            response or sensitivity(design),
+        )
         d = design.diameters
-        self.focus = Focus(design.wavelength_um, design.sensor_distance_um, design.source_distance_um)
+        self.focus = Focus(
+            design.wavelength_um, design.sensor_distance_um, design.source_distance_um
+        )
         window = settings.window_samples * settings.sample_um
-        width = cell_um(design.layers, design.wavelength_um, window, design.sensor_distance_um)
+        width = cell_um(
+            design.layers, design.wavelength_um, window, design.sensor_distance_um
+        )
         self._block = max(1, round(width / d.pitch_um))
         self._rim_um = d.radius_um  # looks through all pillars
         self._diameter_um = np.ascontiguousarray(d.diameter_um, np.float32)
         self._carrier = np.empty(d.diameter_um.shape, np.complex64)
         for rows in range(0, len(d.y_um), 128):
             part = slice(rows, rows + 128)
-            self._carrier[part] = np.exp(-1j * profiles.hyperbolic(d.x_um, d.y_um[part, None], self.focus))
+            self._carrier[part] = np.exp(
+                -1j * profiles.hyperbolic(d.x_um, d.y_um[part, None], self.focus)
+            )
 
     def stack(self, x: Array | None = None) -> Stack:
         """PSFs on axis of the lens with these parameters; of the design without them.
@@ -88,14 +117,22 @@ class MadeLens:
         nodes_x, nodes_y = (c.numpy() for c in coordinates(pupil))
         cells = self._gathered(state(known))
         field = self._on_nodes(cells, nodes_x, nodes_y)
-        phase = profiles.hyperbolic(nodes_x, nodes_y, self.focus) + self._aberration(state(known), nodes_x, nodes_y)
+        phase = profiles.hyperbolic(nodes_x, nodes_y, self.focus) + self._aberration(
+            state(known), nodes_x, nodes_y
+        )
         light = self._psfs(torch.from_numpy(field), torch.from_numpy(phase), pupil)
-        return Stack(light, self.settings.depths_um, Optics(self._plane(known, cells), self.design.layers, distance))
+        return Stack(
+            light,
+            self.settings.depths_um,
+            Optics(self._plane(known, cells), self.design.layers, distance),
+        )
 
     def wave(self, x: Array | None = None) -> Array:
-        """(nodes, nodes) complex wave behind the lens, its focusing phase taken off, on nodes of the design's pupil.
+        """(nodes, nodes) complex wave behind the lens, its focusing phase taken off, on
+        nodes of the design's pupil.
 
-        A wrong lens-sensor distance counts as the defocus that it is. Zero beyond the rim.
+        A wrong lens-sensor distance counts as the defocus that it is. Zero beyond the
+        rim.
         """
         known = of_lens(vector() if x is None else x)
         pupil = self._pupil(self.design.sensor_distance_um)
@@ -103,8 +140,12 @@ class MadeLens:
         field = self._on_nodes(self._gathered(state(known)), nodes_x, nodes_y)
         r2 = nodes_x**2 + nodes_y**2
         actual = self.design.sensor_distance_um + float(known[PLACE["distance_um"]])
-        paths = path_difference(r2, actual) - path_difference(r2, self.design.sensor_distance_um)
-        phase = 2 * math.pi / self.design.wavelength_um * paths + self._aberration(state(known), nodes_x, nodes_y)
+        paths = path_difference(r2, actual) - path_difference(
+            r2, self.design.sensor_distance_um
+        )
+        phase = 2 * math.pi / self.design.wavelength_um * paths + self._aberration(
+            state(known), nodes_x, nodes_y
+        )
         return np.asarray(field * np.exp(1j * phase) * amplitude(pupil).numpy())
 
     def redrawn(self, lens: Lens) -> "MadeLens":
@@ -116,7 +157,10 @@ class MadeLens:
         d, filled, made = self.design.diameters, _filled(cells), state(known)
         step = self._block * d.pitch_um
         half = filled.shape[1] * step / 2, filled.shape[0] * step / 2
-        centre = tuple(float(first) - d.pitch_um / 2 + h for first, h in zip((d.x_um[0], d.y_um[0]), half, strict=True))
+        centre = tuple(
+            float(first) - d.pitch_um / 2 + h
+            for first, h in zip((d.x_um[0], d.y_um[0]), half, strict=True)
+        )
 
         def added(x_um: Tensor, y_um: Tensor) -> Tensor:
             return torch.from_numpy(self._aberration(made, x_um.numpy(), y_um.numpy()))
@@ -124,7 +168,9 @@ class MadeLens:
         parts = torch.from_numpy(np.stack([filled.real, filled.imag])).float()
         bent = added if made.bends() else None
         plane = self.focus, self._rim_um + d.pitch_um / 2, parts, half, d.pitch_um
-        return PillarCells(*plane, lambda: self._pillars(made), (centre[0], centre[1]), bent)
+        return PillarCells(
+            *plane, lambda: self._pillars(made), (centre[0], centre[1]), bent
+        )
 
     def _pillars(self, known: State) -> Tensor:
         """(y, x) complex t of every pillar, 0 where there is none."""
@@ -136,14 +182,20 @@ class MadeLens:
 
     def _pupil(self, distance_um: float) -> Pupil:
         d, s = self.design, self.settings
-        rough = Pupil(self._rim_um + d.diameters.pitch_um / 2, distance_um, d.wavelength_um)
+        rough = Pupil(
+            self._rim_um + d.diameters.pitch_um / 2, distance_um, d.wavelength_um
+        )
         width = (s.window_samples + SPARE) * s.sample_um
         return Pupil(
-            rough.radius_um, distance_um, d.wavelength_um, max(64, math.ceil(width * rough.edge / d.wavelength_um) * 2)
+            rough.radius_um,
+            distance_um,
+            d.wavelength_um,
+            max(64, math.ceil(width * rough.edge / d.wavelength_um) * 2),
         )
 
     def _gathered(self, known: State, block: int | None = None) -> Array:
-        """(cells, cells) mean of t exp(-i phase of the focus) over the pillars of each cell, 0 where there is none;
+        """(cells, cells) mean of t exp(-i phase of the focus) over the pillars of each
+        cell, 0 where there is none;
         block: pillars along a cell in place of the window's own."""
         d = self.design.diameters
         bias = known.bias_polynomial_um()
@@ -151,14 +203,37 @@ class MadeLens:
         low = float(self._diameter_um[self._diameter_um > 0].min()) - reach
         count = int((float(self._diameter_um.max()) + reach - low) / TABLE_STEP_UM) + 2
         grid = low + TABLE_STEP_UM * np.arange(count)
-        t = transmission(self.design.proxy, self.response, grid, self.design.wavelength_um, known.answers())
+        t = transmission(
+            self.design.proxy,
+            self.response,
+            grid,
+            self.design.wavelength_um,
+            known.answers(),
+        )
         edges = self.response.by_edges(grid)
         u, v = d.x_um / self._rim_um, d.y_um / self._rim_um
-        table = t.astype(np.complex64), np.empty(0, complex) if edges is None else edges, low, TABLE_STEP_UM
-        return np.asarray(_gather(self._diameter_um, self._carrier, *table, u, v, bias, block or self._block))
+        table = (
+            t.astype(np.complex64),
+            np.empty(0, complex) if edges is None else edges,
+            low,
+            TABLE_STEP_UM,
+        )
+        return np.asarray(
+            _gather(
+                self._diameter_um,
+                self._carrier,
+                *table,
+                u,
+                v,
+                bias,
+                block or self._block,
+            )
+        )
 
     def _on_nodes(self, cells: Array, nodes_x: Array, nodes_y: Array) -> Array:
-        """The field of the cells at the pupil's nodes; beyond the rim it goes on as at the rim."""
+        """The field of the cells at the pupil's nodes; beyond the rim it goes on as at
+        the rim.
+        """
         d, b = self.design.diameters, self._block
         filled = _filled(cells)
         place = [
@@ -166,12 +241,15 @@ class MadeLens:
             for nodes, first in ((nodes_y, d.y_um[0]), (nodes_x, d.x_um[0]))
         ]
         real, imaginary = (
-            ndimage.map_coordinates(a, place, order=1, mode="nearest") for a in (filled.real, filled.imag)
+            ndimage.map_coordinates(a, place, order=1, mode="nearest")
+            for a in (filled.real, filled.imag)
         )
         return np.asarray(real + 1j * imaginary)
 
     def _psfs(self, field: Tensor, phase: Tensor, pupil: Pupil) -> Tensor:
-        """(depths, samples, samples) share of the light through the aperture on each sample, low-passed to the grid."""
+        """(depths, samples, samples) share of the light through the aperture on each
+        sample, low-passed to the grid.
+        """
         k = 2 * math.pi / pupil.wavelength_um
         r2 = sum(c**2 for c in coordinates(pupil))
         inward = phase + k * path_difference(r2, pupil.sensor_distance_um)
@@ -183,9 +261,14 @@ class MadeLens:
         scale = (s.sample_um / pupil.period_um) ** 2 / (given * size**2)
         out = []
         for depth in self.settings.depths_um.tolist():
-            angle = torch.remainder(inward + k * path_difference(r2, depth), 2 * math.pi)
+            angle = torch.remainder(
+                inward + k * path_difference(r2, depth), 2 * math.pi
+            )
             light = torch.fft.fft2(
-                (weight * field * torch.polar(torch.ones_like(angle), angle)).to(torch.complex64), s=(size, size)
+                (weight * field * torch.polar(torch.ones_like(angle), angle)).to(
+                    torch.complex64
+                ),
+                s=(size, size),
             )
             transfer = torch.fft.fft2(light.real**2 + light.imag**2)
             keep = torch.arange(-harmonics + 1, harmonics) % size
@@ -193,34 +276,49 @@ class MadeLens:
         return torch.stack(out).to(torch.float32)
 
     def _samples(self, pupil: Pupil) -> tuple[int, Tensor]:
-        """Harmonics of the period up to what the samples show, and (samples, 2 harmonics - 1) from them to samples."""
+        """Harmonics of the period up to what the samples show, and (samples, 2
+        harmonics - 1) from them to samples.
+        """
         s = self.settings
         edge = pupil.period_um / (2 * s.sample_um)
         harmonics = math.floor(edge + 0.5) + 1
         m = torch.arange(-harmonics + 1, harmonics, dtype=torch.float64)
-        kept = (edge - m.abs() + 0.5).clamp(0, 1)  # the last in part, so that the width of the period does not matter
-        place = (torch.arange(s.window_samples, dtype=torch.float64) - (s.window_samples - 1) / 2) * s.sample_um
+        kept = (edge - m.abs() + 0.5).clamp(
+            0, 1
+        )  # the last in part, so that the width of the period does not matter
+        place = (
+            torch.arange(s.window_samples, dtype=torch.float64)
+            - (s.window_samples - 1) / 2
+        ) * s.sample_um
         f = m / pupil.period_um
-        wave = torch.exp(2j * math.pi * place[:, None] * f) * (kept * torch.sinc(f * s.sample_um))
+        wave = torch.exp(2j * math.pi * place[:, None] * f) * (
+            kept * torch.sinc(f * s.sample_um)
+        )
         return harmonics, wave.to(torch.complex64)
 
 
 def _filled(cells: Array) -> Array:
     """Empty cells with the value of the nearest filled one."""
-    rows, columns = ndimage.distance_transform_edt(cells == 0, return_distances=False, return_indices=True)
+    rows, columns = ndimage.distance_transform_edt(
+        cells == 0, return_distances=False, return_indices=True
+    )
     return np.asarray(cells[rows, columns])
 
 
 @numba.njit(cache=True, fastmath=True)
 def _gather(diameter, carrier, table, edges, low, step, u, v, bias, block):  # type: ignore[no-untyped-def]
-    """Mean of table[(D + b - low) / step] * carrier over blocks, b = sum_mn bias_mn u^m v^n; 0 for empty blocks.
+    """Mean of table[(D + b - low) / step] * carrier over blocks, b = sum_mn bias_mn u^m
+    v^n; 0 for empty blocks.
 
-    edges: on the same grid, of pillars that lose their form as they grow: times exp(b edges(D + b/2)); else empty.
+    edges: on the same grid, of pillars that lose their form as they grow: times exp(b
+    edges(D + b/2)); else empty.
     """
     rows, columns = diameter.shape
     terms = len(bias)
     along = np.zeros(terms)
-    total = np.zeros(((rows + block - 1) // block, (columns + block - 1) // block), np.complex128)
+    total = np.zeros(
+        ((rows + block - 1) // block, (columns + block - 1) // block), np.complex128
+    )
     count = np.zeros(total.shape, np.int64)
     for i in range(rows):
         for m in range(terms):
@@ -235,7 +333,9 @@ def _gather(diameter, carrier, table, edges, low, step, u, v, bias, block):  # t
                     b = b * u[j] + along[m]
                 value = table[int((d + b - low) / step + 0.5)] * carrier[i, j]
                 if edges.size > 0:
-                    value = value * np.exp(b * edges[int((d + b / 2 - low) / step + 0.5)])
+                    value = value * np.exp(
+                        b * edges[int((d + b / 2 - low) / step + 0.5)]
+                    )
                 total[i // block, j // block] += value
                 count[i // block, j // block] += 1
     return np.where(count > 0, total / np.maximum(count, 1), 0)

@@ -1,4 +1,5 @@
-"""Families of lenses that training starts from: what is added to one hyperbolic focus, and the terms that move.
+"""Families of lenses that training starts from: what is added to one hyperbolic focus,
+and the terms that move.
 
 vortices     rings of a double helix, (2 ring - 1) θ
 parts        sectors of the aperture, each tilted along its own direction: their images lie ``apart_um`` about a circle
@@ -22,7 +23,8 @@ Family = Literal["free", "radial"]
 class Start:
     """A fixed phase on top of a hyperbolic focus.
 
-    zones: rings of a double helix. parts: sectors; apart_um: diameter of the circle that their images lie on.
+    zones: rings of a double helix. parts: sectors; apart_um: diameter of the circle
+    that their images lie on.
     foci_um: source distance of each ring; none for one focus.
     """
 
@@ -34,7 +36,12 @@ class Start:
     foci_um: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.zones < 0 or self.parts < 1 or not self.apart_um >= 0 or any(not f > 0 for f in self.foci_um):
+        if (
+            self.zones < 0
+            or self.parts < 1
+            or not self.apart_um >= 0
+            or any(not f > 0 for f in self.foci_um)
+        ):
             raise ConfigError(
                 f"zones = {self.zones}, parts = {self.parts}, apart_um = {self.apart_um}, foci = {self.foci_um} um: "
                 "need zones of 0 or more, 1 part or more, a distance of 0 or more, and foci above 0"
@@ -57,8 +64,13 @@ class Start:
         return total
 
     def _split(self, x: Tensor, y: Tensor) -> Tensor:
-        """k (s/2) (cos θ_i x + sin θ_i y) / d in sector i, θ_i the sector's middle: light goes that way by s/2."""
-        sector = torch.floor(torch.remainder(torch.atan2(y, x) / (2 * math.pi) + 0.5 / self.parts, 1) * self.parts)
+        """k (s/2) (cos θ_i x + sin θ_i y) / d in sector i, θ_i the sector's middle:
+        light goes that way by s/2.
+        """
+        sector = torch.floor(
+            torch.remainder(torch.atan2(y, x) / (2 * math.pi) + 0.5 / self.parts, 1)
+            * self.parts
+        )
         way = sector * (2 * math.pi / self.parts)
         k = 2 * math.pi / self.focus.wavelength_um
         slope = k * self.apart_um / 2 / self.focus.sensor_distance_um
@@ -66,7 +78,11 @@ class Start:
 
     def _refocused(self, r2: Tensor, share: Tensor) -> Tensor:
         """Phase of each ring's own source distance less that of the common one."""
-        ring = torch.floor(share * len(self.foci_um)).clamp(0, len(self.foci_um) - 1).long()
+        ring = (
+            torch.floor(share * len(self.foci_um))
+            .clamp(0, len(self.foci_um) - 1)
+            .long()
+        )
         own = torch.tensor(self.foci_um, dtype=torch.float64, device=ring.device)[ring]
         k, s = 2 * math.pi / self.focus.wavelength_um, self.focus.source_distance_um
 
@@ -80,11 +96,17 @@ class Start:
 def terms(x: Tensor, y: Tensor, count: int, family: Family) -> list[Tensor]:
     """The first ``count`` terms over the unit disc, where x and y lie.
 
-    free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity of n. radial: rho^2, rho^4, …
+    free: rho^n cos(m theta), rho^n sin(m theta) for n = 2, 3, …, |m| <= n of the parity
+    of n. radial: rho^2, rho^4, …
     """
     square = x**2 + y**2
-    rings = [square]  # rho^2, rho^4, …; products of x and y cost a tenth of powers and cosines
-    cosine, sine = [torch.ones_like(square), x], [torch.zeros_like(square), y]  # rho^m cos(m theta), rho^m sin(m theta)
+    rings = [
+        square
+    ]  # rho^2, rho^4, …; products of x and y cost a tenth of powers and cosines
+    cosine, sine = (
+        [torch.ones_like(square), x],
+        [torch.zeros_like(square), y],
+    )  # rho^m cos(m theta), rho^m sin(m theta)
     if family == "radial":
         while len(rings) < count:
             rings.append(rings[-1] * square)

@@ -1,10 +1,13 @@
-"""The image that training sees: true over field, depth and spectrum, or by one PSF a depth, as the settings say.
+"""The image that training sees: true over field, depth and spectrum, or by one PSF a
+depth, as the settings say.
 
     true      every part of the image through the PSFs of its own field angle, summed over the light source's spectrum
     uniform   the PSF of one chief ray and one wavelength for the whole image: a named approximation, see :func:`apart`
 
-While the lens moves, its PSFs over the field are formed anew every few steps; between them the gradient of the light at
-the nodes of the field goes to the phase through a few field points and wavelengths that are drawn at random, which is
+While the lens moves, its PSFs over the field are formed anew every few steps; between
+them the gradient of the light at
+the nodes of the field goes to the phase through a few field points and wavelengths that
+are drawn at random, which is
 unbiased (:mod:`metalens.field.slopes`).
 """
 
@@ -19,19 +22,31 @@ from torch import Tensor
 from codesign.optics import stack as lens
 from codesign.optics.lens_errors import LensError, variance_rad2
 from codesign.optics.stack import OpticsConfig, Stack
-from metalens.field import Layers, Optics, SmoothWave, blurred, normalised, surrogate, trial, with_psfs
+from metalens.field import (
+    Layers,
+    Optics,
+    SmoothWave,
+    blurred,
+    normalised,
+    surrogate,
+    trial,
+    with_psfs,
+)
 from metalens.ground.errors import PropagationError, SceneError, TrainingError
 from metalens.image import Frames, Grid, Imager, UniformImager, scene
 from metalens.image import imager as field_imager
 from metalens.psf import Source
 
-There = tuple[int, int, torch.device]  # samples along a side of the frames, margin included; margin; where they are
+There = tuple[
+    int, int, torch.device
+]  # samples along a side of the frames, margin included; margin; where they are
 
 
 def source_of(settings: OpticsConfig) -> Source | None:
     """The light that reaches the sensor; None for one wavelength.
 
-    A Gaussian line of width a behind a Gaussian filter of width b has the width a b / √(a² + b²).
+    A Gaussian line of width a behind a Gaussian filter of width b has the width a b /
+    √(a² + b²).
     """
     width = settings.fwhm_nm
     if width and settings.filter_nm:
@@ -39,11 +54,17 @@ def source_of(settings: OpticsConfig) -> Source | None:
     return Source(settings.wavelength_nm, width) if width else None
 
 
-def wave_of(settings: OpticsConfig, coefficients_rad: Tensor, error: LensError | None = None) -> SmoothWave:
-    """The lens plane of these coefficients for :func:`metalens.image.imager`; differentiable in them."""
+def wave_of(
+    settings: OpticsConfig, coefficients_rad: Tensor, error: LensError | None = None
+) -> SmoothWave:
+    """The lens plane of these coefficients for :func:`metalens.image.imager`;
+    differentiable in them.
+    """
     split = settings.parts > 1 or settings.foci_mm
     if settings.polynomials or settings.zones or split or error is not None:
-        added = functools.partial(lens.phase_at, settings, coefficients_rad, error=error)
+        added = functools.partial(
+            lens.phase_at, settings, coefficients_rad, error=error
+        )
     else:
         added = None
     return SmoothWave(settings.focus, settings.aperture_mm * 500, added)
@@ -53,7 +74,9 @@ def grid_of(settings: OpticsConfig, frame: int, margin: int) -> Grid:
     """Square frames of ``frame`` samples, margin included."""
     side = frame - 2 * margin
     depths = settings.depths_mm[0] * 1e3, settings.depths_mm[1] * 1e3
-    return Grid((side, side), settings.sample_um, depths, margin, settings.window_samples)
+    return Grid(
+        (side, side), settings.sample_um, depths, margin, settings.window_samples
+    )
 
 
 def imager(
@@ -69,11 +92,13 @@ def imager(
     """What images frames of ``frame`` samples, margin included.
 
     Args:
-        error: one draw of the lenses that are made. made: a lens that is made in place of the coefficients.
+        error: one draw of the lenses that are made. made: a lens that is made in place
+            of the coefficients.
         device: where the frames are imaged, and the true image's PSFs are computed.
 
     Raises:
-        TrainingError: of the lens that is made only PSFs of one chief ray are known, and the true image is asked for.
+        TrainingError: of the lens that is made only PSFs of one chief ray are known,
+            and the true image is asked for.
     """
     if settings.image == "uniform":
         found = made or lens.stack(settings, coefficients_rad, error=error)
@@ -99,13 +124,18 @@ def _made(settings: OpticsConfig, made: Stack, there: There) -> Imager:
 
 
 @functools.lru_cache(maxsize=3)
-def _still(settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There) -> Imager:
+def _still(
+    settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There
+) -> Imager:
     return _formed(settings, coefficients_rad, there, None)
 
 
 @torch.no_grad()
 def _formed(
-    settings: OpticsConfig, coefficients_rad: tuple[float, ...], there: There, error: LensError | None
+    settings: OpticsConfig,
+    coefficients_rad: tuple[float, ...],
+    there: There,
+    error: LensError | None,
 ) -> Imager:
     wave = wave_of(settings, torch.tensor(coefficients_rad, dtype=torch.float64), error)
     return _through(settings, _in_place(settings, wave), there)
@@ -127,12 +157,16 @@ def _through(settings: OpticsConfig, plane: Optics, there: There) -> Imager:
     )
     if settings.passed == 1:
         return whole
-    dimmer = [replace(patch, energy=patch.energy * settings.passed) for patch in whole.patches]
+    dimmer = [
+        replace(patch, energy=patch.energy * settings.passed) for patch in whole.patches
+    ]
     return replace(whole, energy=whole.energy * settings.passed, patches=dimmer)
 
 
 def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
-    """See :func:`codesign.optics.stack.hazy`; the shadow's light falls on all samples alike."""
+    """See :func:`codesign.optics.stack.hazy`; the shadow's light falls on all samples
+    alike.
+    """
     light = lens.hazy(settings, whole.stack, variance_rad2(error.state()))
     total = light.sum((-2, -1))
     return with_psfs(whole, light / total[..., None, None], whole.energy * total)
@@ -142,8 +176,10 @@ def _hazy(settings: OpticsConfig, whole: Imager, error: LensError) -> Imager:
 class Live:
     """A true image whose lens moves: the imager with the light of its nodes as a leaf.
 
-    light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes that were asked for. ready:
-    the imager, differentiable in it. pairs: what was drawn of :func:`metalens.field.drawn`; None for all nodes.
+    light: (rows, columns, depths, h, w), gathers the gradient of the loss, of the nodes
+    that were asked for. ready:
+    the imager, differentiable in it. pairs: what was drawn of
+    :func:`metalens.field.drawn`; None for all nodes.
     """
 
     light: Tensor
@@ -151,13 +187,16 @@ class Live:
     pairs: tuple[Tensor, Tensor] | None = None
 
     def pass_on(self, settings: OpticsConfig, coefficients_rad: Tensor) -> None:
-        """Add to the gradient of the coefficients what the light gathered, from the points and wavelengths drawn.
+        """Add to the gradient of the coefficients what the light gathered, from the
+        points and wavelengths drawn.
 
         Raises:
             ValueError: none were drawn: the light's own gradient is that of all nodes.
         """
         if self.pairs is None:
-            raise ValueError("no field points were drawn: need live(..., pairs) to pass a gradient on")
+            raise ValueError(
+                "no field points were drawn: need live(..., pairs) to pass a gradient on"
+            )
         if self.light.grad is None:
             return
         optics = optics_of(settings, coefficients_rad)
@@ -165,11 +204,18 @@ class Live:
         value.backward()  # type: ignore[no-untyped-call]
 
 
-def live(settings: OpticsConfig, whole: Imager, pairs: tuple[Tensor, Tensor] | None = None) -> Live:
-    """An imager with its nodes' light as a leaf, of the nodes that were drawn or of all; the relative illumination is
+def live(
+    settings: OpticsConfig, whole: Imager, pairs: tuple[Tensor, Tensor] | None = None
+) -> Live:
+    """An imager with its nodes' light as a leaf, of the nodes that were drawn or of
+    all; the relative illumination is
     held, and the image is that of the kernels that there are."""
     with torch.no_grad():
-        unit = normalised(torch.ones_like(whole.stack[..., :1, :1]), optics_of(settings, torch.zeros(0)), whole.plan)[1]
+        unit = normalised(
+            torch.ones_like(whole.stack[..., :1, :1]),
+            optics_of(settings, torch.zeros(0)),
+            whole.plan,
+        )[1]
         light = whole.stack * (whole.energy / unit)[..., None, None]
     light.requires_grad_()
     psfs = light / light.sum((-2, -1), keepdim=True)
@@ -188,10 +234,21 @@ def _in_place(settings: OpticsConfig, wave: SmoothWave) -> Optics:
 
 
 @torch.no_grad()
-def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> float:
-    """Relative L2 difference of the uniform image of a texture in depth from its true image: the error of 'uniform'."""
-    true = imager(replace(settings, image="true"), coefficients_rad, frame, margin=margin)
-    one = imager(replace(settings, image="uniform", layers=None), coefficients_rad, frame, margin=margin)
+def apart(
+    settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
+) -> float:
+    """Relative L2 difference of the uniform image of a texture in depth from its true
+    image: the error of 'uniform'.
+    """
+    true = imager(
+        replace(settings, image="true"), coefficients_rad, frame, margin=margin
+    )
+    one = imager(
+        replace(settings, image="uniform", layers=None),
+        coefficients_rad,
+        frame,
+        margin=margin,
+    )
     if not isinstance(true, Imager) or not isinstance(one, UniformImager):
         raise TrainingError("no pair of images to compare")
     return difference(one, true)
@@ -199,7 +256,8 @@ def apart(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margi
 
 @torch.no_grad()
 def difference(one: UniformImager, true: Imager) -> float:
-    """Relative L2 difference of the image of a texture in depth through one PSF a depth from its true image.
+    """Relative L2 difference of the image of a texture in depth through one PSF a depth
+    from its true image.
 
     Of the texture's contrast; both images of frames of one size, with the same margin.
     """
@@ -208,22 +266,33 @@ def difference(one: UniformImager, true: Imager) -> float:
     inside = slice(edge, edge + grid.samples[0])
     want = blurred(seen, true)[..., inside, inside]
     part = slice(grid.spare, grid.spare + grid.samples[0] + 2 * grid.margin)
-    few = Frames(*(getattr(seen, name)[..., part, part].contiguous() for name in Frames.__slots__))
+    few = Frames(
+        *(
+            getattr(seen, name)[..., part, part].contiguous()
+            for name in Frames.__slots__
+        )
+    )
     got = scene.image(few, one, margin=grid.margin)
     return float((got - want).norm() / (want - want.mean()).norm())
 
 
 def above(settings: OpticsConfig, found: UniformImager | Imager) -> str:
-    """Why the error of the true image is above ``optics.image_tolerance``; empty where it is not, or the image is
+    """Why the error of the true image is above ``optics.image_tolerance``; empty where
+    it is not, or the image is
     uniform, whose distance from the true one is told instead."""
     return found.above(settings.image_tolerance) if isinstance(found, Imager) else ""
 
 
-def described(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int) -> dict[str, Any]:
-    """What the images are and how wrong, for a report: kind, error, and the source's width and filter.
+def described(
+    settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, margin: int
+) -> dict[str, Any]:
+    """What the images are and how wrong, for a report: kind, error, and the source's
+    width and filter.
 
-    error: of the uniform image, :func:`apart`; of the true image, its own estimate; None where the true image of this
-    lens cannot be formed, for the reason under ``problem``. above: why the true image's own estimate is above
+    error: of the uniform image, :func:`apart`; of the true image, its own estimate;
+    None where the true image of this
+    lens cannot be formed, for the reason under ``problem``. above: why the true image's
+    own estimate is above
     ``optics.image_tolerance``; empty where it is not.
     """
     found: dict[str, Any] = {
@@ -234,9 +303,14 @@ def described(settings: OpticsConfig, coefficients_rad: Tensor, frame: int, *, m
     }
     try:
         if settings.image == "uniform":
-            return found | {"error": apart(settings, coefficients_rad, frame, margin=margin)}
+            return found | {
+                "error": apart(settings, coefficients_rad, frame, margin=margin)
+            }
         made = imager(settings, coefficients_rad, frame, margin=margin)
-        return found | {"error": float(getattr(made, "error", math.nan)), "above": above(settings, made)}
+        return found | {
+            "error": float(getattr(made, "error", math.nan)),
+            "above": above(settings, made),
+        }
     except (SceneError, PropagationError) as problem:
         return found | {"error": None, "problem": str(problem)}
 

@@ -1,7 +1,10 @@
-"""Lenses as they will be made, drawn while training: what the assembly and every cause of the table do to the light.
+"""Lenses as they will be made, drawn while training: what the assembly and every cause
+of the table do to the light.
 
-Training knows the phase of its lens but not its pillars. Their answers are taken as those of the default cell, whose
-phases fill a turn evenly wherever one looks: what all of them answer alike is a phase of the wave front, what they
+Training knows the phase of its lens but not its pillars. Their answers are taken as
+those of the default cell, whose
+phases fill a turn evenly wherever one looks: what all of them answer alike is a phase
+of the wave front, what they
 answer differently takes light out of the image.
 """
 
@@ -22,10 +25,14 @@ from metalens.made import DRAWN, Answers, Draw, State, guide, of_kind
 from metalens.pillars import DEFAULT_CELL, Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
-_FIRST = ("bias_nm", "height_nm")  # of the process: the order that correlations are written in
+_FIRST = (
+    "bias_nm",
+    "height_nm",
+)  # of the process: the order that correlations are written in
 ENTRIES = (*ASSEMBLY, *_FIRST, *(name for name in DRAWN if name not in _FIRST))
 WAVELENGTH_UM = 0.85
-# phase of the default cell over its domain, as `metalens library` finds it (1e-3 rad); a test holds it to the solver
+# phase of the default cell over its domain, as `metalens library` finds it (1e-3 rad);
+# a test holds it to the solver
 TURN = Proxy(
     np.array(
         [[2.23327426, 3.46714529, 0.160908115, -0.19169534, -0.0139012285, 0.0567230276, 0.00584519421, -0.0124124034,
@@ -33,20 +40,29 @@ TURN = Proxy(
     ),
     np.array([[0.95]]), (0.06, 0.20321608040201006), (WAVELENGTH_UM, WAVELENGTH_UM), 1e-3, 0.05, power=3,
 )  # fmt: skip
-_Entries: Any = dataclasses.make_dataclass("_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True)
+_Entries: Any = dataclasses.make_dataclass(
+    "_Entries", [(name, float, 0.0) for name in ENTRIES], frozen=True
+)
 
 
 @dataclass(frozen=True)
 class LensErrors(_Entries):  # type: ignore[misc]
-    """Fabrication and assembly errors drawn during training, so that the lens stands them (standard deviations).
+    """Fabrication and assembly errors drawn during training, so that the lens stands
+    them (standard deviations).
 
-    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted lens, waves at the rim.
-    astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process spreads, in the names of
-    :class:`metalens.made.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k, k) between the first k of them,
+    focus_um: error of the lens-sensor distance. tilt_waves: coma-like phase of a tilted
+    lens, waves at the rim.
+    astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process
+    spreads, in the names of
+    :class:`metalens.made.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k,
+    k) between the first k of them,
     rows one after the other; empty for none.
-    bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of the bias from axis to rim,
-    along an axis and in all directions. index: of the pillars. sidewall_deg: lean of their walls.
-    width_nm, length_nm: of all pillars along x and y alone. turn_deg, pedestal_nm, cap_nm: refused, since plain round
+    bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of
+    the bias from axis to rim,
+    along an axis and in all directions. index: of the pillars. sidewall_deg: lean of
+    their walls.
+    width_nm, length_nm: of all pillars along x and y alone. turn_deg, pedestal_nm,
+    cap_nm: refused, since plain round
     pillars have none.
     """
 
@@ -54,10 +70,14 @@ class LensErrors(_Entries):  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         if min(self.deviations) < 0:
-            raise ConfigError(f"spread {self.deviations}: need standard deviations of 0 or more")
+            raise ConfigError(
+                f"spread {self.deviations}: need standard deviations of 0 or more"
+            )
         for name in ("turn_deg", "pedestal_nm", "cap_nm"):
             if getattr(self, name):
-                raise ConfigError(f"spread.{name}: pillars are drawn as plain round ones, which have none; need 0")
+                raise ConfigError(
+                    f"spread.{name}: pillars are drawn as plain round ones, which have none; need 0"
+                )
         if self.correlation:
             self._check()
 
@@ -79,12 +99,26 @@ class LensErrors(_Entries):  # type: ignore[misc]
         """The errors of one lens; None where nothing varies."""
         if not any(self.deviations):
             return None
-        held = [n for n, name in enumerate(ENTRIES) if name not in DRAWN or DRAWN[name].sigma or self.deviations[n]]
+        held = [
+            n
+            for n, name in enumerate(ENTRIES)
+            if name not in DRAWN or DRAWN[name].sigma or self.deviations[n]
+        ]
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(held, held)])
         root = vectors * np.sqrt(values.clip(0))
-        normal = torch.randn(len(held), generator=generator, dtype=torch.float64).numpy()
-        turn = 2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
-        return LensError({ENTRIES[n]: amount for n, amount in zip(held, (root @ normal).tolist(), strict=True)}, turn)
+        normal = torch.randn(
+            len(held), generator=generator, dtype=torch.float64
+        ).numpy()
+        turn = (
+            2 * math.pi * float(torch.rand(1, generator=generator, dtype=torch.float64))
+        )
+        return LensError(
+            {
+                ENTRIES[n]: amount
+                for n, amount in zip(held, (root @ normal).tolist(), strict=True)
+            },
+            turn,
+        )
 
     def _check(self) -> None:
         size = math.isqrt(len(self.correlation))
@@ -96,19 +130,25 @@ class LensErrors(_Entries):  # type: ignore[misc]
         if not np.allclose(np.diag(matrix), 1) or not np.allclose(matrix, matrix.T):
             raise ConfigError("correlation must be symmetric with ones on its diagonal")
         if np.linalg.eigvalsh(matrix)[0] < -1e-9:
-            raise ConfigError("correlation is not positive semi-definite: no errors can be correlated like that")
+            raise ConfigError(
+                "correlation is not positive semi-definite: no errors can be correlated like that"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class LensError:
-    """One lens: amounts by entry of :data:`ENTRIES` (left out: 0), and the direction of its gradients."""
+    """One lens: amounts by entry of :data:`ENTRIES` (left out: 0), and the direction of
+    its gradients.
+    """
 
     amounts: Mapping[str, float]
     turn_rad: float = 0.0
 
     def state(self) -> State:
         """What the process did to it."""
-        return Draw({n: a for n, a in self.amounts.items() if n in DRAWN}, self.turn_rad).state()
+        return Draw(
+            {n: a for n, a in self.amounts.items() if n in DRAWN}, self.turn_rad
+        ).state()
 
     def assembly(self) -> tuple[float, ...]:
         """Amounts of :data:`ASSEMBLY`."""
@@ -116,32 +156,54 @@ class LensError:
 
 
 def wave_front_rad(state: State, u: Tensor, v: Tensor) -> Tensor:
-    """Phase at lens places over the radius that all pillars share: their mean answer, and the causes that bend."""
+    """Phase at lens places over the radius that all pillars share: their mean answer,
+    and the causes that bend.
+    """
     x, y = u.cpu().numpy(), v.cpu().numpy()
-    shared = _answers()[0][0] * (state.bias_um(x, y) - state.bias_um(np.zeros(1), np.zeros(1)))
+    shared = _answers()[0][0] * (
+        state.bias_um(x, y) - state.bias_um(np.zeros(1), np.zeros(1))
+    )
     return torch.from_numpy(shared + state.phase_rad(x, y)).to(u.device)
 
 
 def variance_rad2(state: State, *, rings: int = 12) -> float:
-    """Variance of the pillars' phases about what they share, mean over the aperture (Gauss nodes: exact)."""
+    """Variance of the pillars' phases about what they share, mean over the aperture
+    (Gauss nodes: exact).
+    """
     node, weight = np.polynomial.legendre.leggauss(rings)
-    radius, turn = np.sqrt((node[:, None] + 1) / 2), np.arange(2 * rings) * (math.pi / rings)
-    bias, answers = state.bias_um(radius * np.cos(turn), radius * np.sin(turn)), state.answers()
+    radius, turn = (
+        np.sqrt((node[:, None] + 1) / 2),
+        np.arange(2 * rings) * (math.pi / rings),
+    )
+    bias, answers = (
+        state.bias_um(radius * np.cos(turn), radius * np.sin(turn)),
+        state.answers(),
+    )
     mean, square = (float(weight @ power.mean(1)) / 2 for power in (bias, bias**2))
     c = _answers()[1]
-    return float(c[0, 0] * square + 2 * mean * (c[0, 1:] @ answers) + answers @ c[1:, 1:] @ answers)
+    return float(
+        c[0, 0] * square
+        + 2 * mean * (c[0, 1:] @ answers)
+        + answers @ c[1:, 1:] @ answers
+    )
 
 
 @functools.cache
 def _answers() -> tuple[Array, Array]:
-    """Mean and covariance over a turn of d phase / d(diameter, answering causes), base units, of the default cell.
+    """Mean and covariance over a turn of d phase / d(diameter, answering causes), base
+    units, of the default cell.
 
-    Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 % of the covariance with height.
+    Accuracy: by the diameter as the proxy, 1 %; by the rest as an effective index, 5 %
+    of the covariance with height.
     """
     start = TURN.phase_rad(np.array([TURN.domain_um[0]]), WAVELENGTH_UM)[0]
     even = start + np.linspace(0, 2 * math.pi, 400, endpoint=False)
     diameter = np.asarray(TURN.diameter_um(even, WAVELENGTH_UM))
     seen = guide(DEFAULT_CELL, TURN, WAVELENGTH_UM, diameter)
-    quick = [row.acts.quick(seen).imag for _, row in of_kind(Answers) if isinstance(row.acts, Answers)]
+    quick = [
+        row.acts.quick(seen).imag
+        for _, row in of_kind(Answers)
+        if isinstance(row.acts, Answers)
+    ]
     rates = np.stack([TURN.dphase_ddiameter(diameter, WAVELENGTH_UM), *quick])
     return rates.mean(1), np.cov(rates)

@@ -1,8 +1,12 @@
-"""A frame once more, path traced by Mitsuba 3 in a scene of shapes: a referee of the renderer.
+"""A frame once more, path traced by Mitsuba 3 in a scene of shapes: a referee of the
+renderer.
 
-The globe, the refracting cornea, the plane iris with its hole, the lids and the skin, the three lamps and the ambient
-light stand where the model has them, with the model's albedos. What the renderer leaves out is here: shadows, light
-between surfaces, light refracted on its way in, mirror images of the surroundings. Those of the lamps are compared
+The globe, the refracting cornea, the plane iris with its hole, the lids and the skin,
+the three lamps and the ambient
+light stand where the model has them, with the model's albedos. What the renderer leaves
+out is here: shadows, light
+between surfaces, light refracted on its way in, mirror images of the surroundings.
+Those of the lamps are compared
 apart: the renderer draws them wider than they are.
 """
 
@@ -17,7 +21,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.eye import POPULATION, Camera, Rig, States, model, parameters, renderer, textures
+from codesign.eye import (
+    POPULATION,
+    Camera,
+    Rig,
+    States,
+    model,
+    parameters,
+    renderer,
+    textures,
+)
 from codesign.referee.traced_shapes import LAMP_RADIUS_MM, build
 from metalens.ground import store
 from metalens.ground.arrays import Array
@@ -31,9 +44,11 @@ LEAST_LLVM = 17  # older ones end the process over an instruction that they do n
 class Comparison:
     """A frame of the renderer beside the path tracer's.
 
-    ours: (y, x) radiance, without mirror images of the lamps. halves: (2, y, x) traced with independent paths.
+    ours: (y, x) radiance, without mirror images of the lamps. halves: (2, y, x) traced
+    with independent paths.
     regions: masks (y, x) of REGIONS, and "all", which is all but "mirrors".
-    seconds: of ours and of the tracing. samples: paths a pixel, of both halves. variant: of Mitsuba.
+    seconds: of ours and of the tracing. samples: paths a pixel, of both halves.
+    variant: of Mitsuba.
     """
 
     ours: Array
@@ -49,7 +64,9 @@ class Comparison:
         return np.asarray(self.halves.mean(0))
 
     def error(self, region: str = "all", image: Array | None = None) -> float:
-        """Relative L2 error of ``image`` (ours) against the traced radiance; the noise of tracing cancels."""
+        """Relative L2 error of ``image`` (ours) against the traced radiance; the noise
+        of tracing cancels.
+        """
         mask = self.regions[region]
         first, second = ((self.ours if image is None else image) - self.halves) * mask
         square = float((self.halves[0] * self.halves[1] * mask).sum())
@@ -69,17 +86,25 @@ class Comparison:
             for name in found
         ]
         ours, traced = self.seconds
-        return [head, *rows, f"ours {1e3 * ours:.1f} ms, {self.samples} paths a pixel {traced:.1f} s ({self.variant})"]
+        return [
+            head,
+            *rows,
+            f"ours {1e3 * ours:.1f} ms, {self.samples} paths a pixel {traced:.1f} s ({self.variant})",
+        ]
 
 
 def start() -> Any:
-    """Mitsuba with a variant set: compiled for vectors where a new enough LLVM is found, else scalar.
+    """Mitsuba with a variant set: compiled for vectors where a new enough LLVM is
+    found, else scalar.
 
     Raises:
         SceneError: Mitsuba is not installed.
     """
     try:
-        mitsuba, drjit = importlib.import_module("mitsuba"), importlib.import_module("drjit")
+        mitsuba, drjit = (
+            importlib.import_module("mitsuba"),
+            importlib.import_module("drjit"),
+        )
     except ImportError as error:
         raise SceneError(
             "the path-traced referee needs Mitsuba 3, which is not installed: pip install 'metalens-toolchain[referee]'"
@@ -90,8 +115,15 @@ def start() -> Any:
     return mitsuba
 
 
-def compare(states: States, *, rig: Rig | None = None, camera: Camera | None = None, samples: int = 512) -> Comparison:
-    """Render the first of the states both ways; by default 96 pixels of 15 um, about half a minute on one core.
+def compare(
+    states: States,
+    *,
+    rig: Rig | None = None,
+    camera: Camera | None = None,
+    samples: int = 512,
+) -> Comparison:
+    """Render the first of the states both ways; by default 96 pixels of 15 um, about
+    half a minute on one core.
 
     Args:
         samples: paths a pixel, in two halves of their own seeds.
@@ -108,13 +140,30 @@ def compare(states: States, *, rig: Rig | None = None, camera: Camera | None = N
     begin = time.perf_counter()
     ours = renderer.render(state, rig=rig, camera=camera).pinhole()[0].double().numpy()
     middle = time.perf_counter()
-    halves = np.stack([trace(state, rig=rig, camera=camera, samples=samples // 2, seed=seed) for seed in (0, 1)])
+    halves = np.stack(
+        [
+            trace(state, rig=rig, camera=camera, samples=samples // 2, seed=seed)
+            for seed in (0, 1)
+        ]
+    )
     seconds = middle - begin, time.perf_counter() - middle
-    return Comparison(ours, halves, _regions(state, rig, camera), seconds, 2 * (samples // 2), mitsuba.variant())
+    return Comparison(
+        ours,
+        halves,
+        _regions(state, rig, camera),
+        seconds,
+        2 * (samples // 2),
+        mitsuba.variant(),
+    )
 
 
 def trace(
-    states: States, *, rig: Rig | None = None, camera: Camera | None = None, samples: int = 64, seed: int = 0
+    states: States,
+    *,
+    rig: Rig | None = None,
+    camera: Camera | None = None,
+    samples: int = 64,
+    seed: int = 0,
 ) -> Array:
     """(y, x) radiance of the first of the states, in the renderer's unit.
 
@@ -133,7 +182,9 @@ def picture(made: Comparison, path: Path) -> None:
     """Ours, the traced frame and their difference side by side, as a PNG."""
     import cv2
 
-    shown = np.concatenate([made.ours, made.traced, np.abs(made.ours - made.traced)], 1).clip(0, 1) ** (1 / 1.8)
+    shown = np.concatenate(
+        [made.ours, made.traced, np.abs(made.ours - made.traced)], 1
+    ).clip(0, 1) ** (1 / 1.8)
     large = (255 * shown).astype(np.uint8).repeat(3, 0).repeat(3, 1)
     done, coded = cv2.imencode(".png", large)
     if not done:
@@ -142,7 +193,9 @@ def picture(made: Comparison, path: Path) -> None:
 
 
 def _parameters(states: States, rig: Rig, camera: Camera) -> Tensor:
-    return parameters(states[:1], rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um)[0]
+    return parameters(
+        states[:1], rig, pixel_rad=camera.pitch_um / rig.sensor_distance_um
+    )[0]
 
 
 def _bank() -> Tensor:
@@ -156,7 +209,9 @@ def _without_glints(states: States) -> States:
 
 
 def _regions(states: States, rig: Rig, camera: Camera) -> dict[str, Array]:
-    """Masks of REGIONS: pixels that show one of them alone, those that show a lamp in the cornea, and the others."""
+    """Masks of REGIONS: pixels that show one of them alone, those that show a lamp in
+    the cornea, and the others.
+    """
     p, t = _parameters(states, rig, camera), torch.from_numpy(camera.tangents(rig))
     dx, dy, dz = model.ray(t[None], t[:, None])
     seen = model.lids(p, dx, dy, dz)[1]
@@ -175,7 +230,9 @@ def _regions(states: States, rig: Rig, camera: Camera) -> dict[str, Array]:
 
 
 def _mirrors(p: Tensor, dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
-    """Where the cornea's sphere mirrors a lamp, or what is within a lamp's radius of it."""
+    """Where the cornea's sphere mirrors a lamp, or what is within a lamp's radius of
+    it.
+    """
     tc, cx, cy, cz, inside = model.cornea(p, dx, dy, dz)
     ray, normal = torch.stack([dx, dy, dz], -1), torch.stack([cx, cy, cz], -1)
     back = ray - 2 * (ray * normal).sum(-1, keepdim=True) * normal

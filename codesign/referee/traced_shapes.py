@@ -1,4 +1,6 @@
-"""A state of the eye as shapes for Mitsuba 3: what the renderer finds along rays, as surfaces in space (mm)."""
+"""A state of the eye as shapes for Mitsuba 3: what the renderer finds along rays, as
+surfaces in space (mm).
+"""
 
 import math
 from typing import Any
@@ -10,16 +12,23 @@ from torch import Tensor
 from codesign.eye import Camera, Rig, model
 from metalens.ground.arrays import Array
 
-LAMP_RADIUS_MM = 2.0  # of the emitting spheres, large enough to be met by chance through the cornea
+LAMP_RADIUS_MM = (
+    2.0  # of the emitting spheres, large enough to be met by chance through the cornea
+)
 
 
-def build(mitsuba: Any, p: Tensor, bank: Tensor, *, rig: Rig, camera: Camera) -> dict[str, Any]:
-    """The scene of parameters ``p`` (COUNT,) as Mitsuba's dictionary; the camera at the origin.
+def build(
+    mitsuba: Any, p: Tensor, bank: Tensor, *, rig: Rig, camera: Camera
+) -> dict[str, Any]:
+    """The scene of parameters ``p`` (COUNT,) as Mitsuba's dictionary; the camera at the
+    origin.
 
     ``bank``: textures in the dtype of ``p``.
     """
     transform = mitsuba.ScalarTransform4f
-    half = math.degrees(math.atan(camera.pixels * camera.pitch_um / 2 / rig.sensor_distance_um))
+    half = math.degrees(
+        math.atan(camera.pixels * camera.pitch_um / 2 / rig.sensor_distance_um)
+    )
     centre, axis = p[model.CENTRE : model.CENTRE + 3], p[model.AXIS : model.AXIS + 3]
     cornea = ((centre + p[model.CORNEA_D] * axis) * 1e-3).tolist()
     out: dict[str, Any] = {
@@ -47,13 +56,23 @@ def build(mitsuba: Any, p: Tensor, bank: Tensor, *, rig: Rig, camera: Camera) ->
         out["fold"] = _mesh(mitsuba, "fold", *fold)
     for k in range(model.LED_COUNT):
         place = (p[model.LED + 3 * k : model.LED + 3 * k + 3] * 1e-3).tolist()
-        emitter = {"type": "area", "radiance": 400 / LAMP_RADIUS_MM**2}  # irradiance pi at 20 mm: radiance 1 of white
-        out[f"lamp{k}"] = {"type": "sphere", "center": place, "radius": LAMP_RADIUS_MM, "emitter": emitter}
+        emitter = {
+            "type": "area",
+            "radiance": 400 / LAMP_RADIUS_MM**2,
+        }  # irradiance pi at 20 mm: radiance 1 of white
+        out[f"lamp{k}"] = {
+            "type": "sphere",
+            "center": place,
+            "radius": LAMP_RADIUS_MM,
+            "emitter": emitter,
+        }
     return out
 
 
 def _sky(p: Tensor, above: Array) -> Array:
-    """Radiance from directions at this cosine from straight above; over any hemisphere it adds to ``model.ambient``."""
+    """Radiance from directions at this cosine from straight above; over any hemisphere
+    it adds to ``model.ambient``.
+    """
     return np.asarray(0.6 * float(p[model.AMBIENT]) * (1 + above))
 
 
@@ -69,18 +88,28 @@ def _ambient(mitsuba: Any, p: Tensor) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _rays(rig: Rig, camera: Camera, p: Tensor) -> tuple[int, tuple[Tensor, Tensor, Tensor]]:
-    """A square grid of rays, twice as fine as the pixels and 1.6 times as wide: its side, and their directions."""
-    t = torch.linspace(-1, 1, int(3.2 * camera.pixels) + 1, dtype=p.dtype) * (1.6 * float(camera.tangents(rig)[-1]))
+def _rays(
+    rig: Rig, camera: Camera, p: Tensor
+) -> tuple[int, tuple[Tensor, Tensor, Tensor]]:
+    """A square grid of rays, twice as fine as the pixels and 1.6 times as wide: its
+    side, and their directions.
+    """
+    t = torch.linspace(-1, 1, int(3.2 * camera.pixels) + 1, dtype=p.dtype) * (
+        1.6 * float(camera.tangents(rig)[-1])
+    )
     return len(t), model.ray(t[None], t[:, None])
 
 
-def _face(p: Tensor, bank: Tensor, rig: Rig, camera: Camera) -> tuple[Array, Array, Array]:
+def _face(
+    p: Tensor, bank: Tensor, rig: Rig, camera: Camera
+) -> tuple[Array, Array, Array]:
     """Lids and skin: the near sheet without the opening."""
     side, (dx, dy, dz) = _rays(rig, camera, p)
     s, seen, gx, gy, upper, lower, nx, ny, nz = model.lids(p, dx, dy, dz)
     light = model.lamps(p, s * dx, s * dy, s * dz, nx, ny, nz, 0.35)
-    albedo = model.skin(p, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz) / (light * p[model.GAIN])
+    albedo = model.skin(p, bank, s, gx, gy, upper, lower, dx, dy, dz, nx, ny, nz) / (
+        light * p[model.GAIN]
+    )
     points = torch.stack([s * dx, s * dy, s * dz], -1)
     faces = _grid(side, side)
     open_ = seen.flatten().numpy()[faces].mean(1) > 0.5
@@ -88,7 +117,9 @@ def _face(p: Tensor, bank: Tensor, rig: Rig, camera: Camera) -> tuple[Array, Arr
 
 
 def _globe(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
-    """The sclera behind the limbus, with the albedo that the model gives the ray through each point."""
+    """The sclera behind the limbus, with the albedo that the model gives the ray
+    through each point.
+    """
     edge = math.asin(float(p[model.LIMBUS_R] / p[model.SCLERA_R]))
     angle = torch.linspace(edge, 2.2, 240, dtype=p.dtype)[:, None]
     unit = _about(p, torch.cos(angle), torch.sin(angle), 513)
@@ -98,11 +129,19 @@ def _globe(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
     zero = torch.zeros_like(gx)
     mx, my, mz = unit.unbind(-1)
     albedo = model.sclera(p, bank, gx, gy, lower, mx, my, mz, zero, zero)
-    return points.reshape(-1, 3).numpy() * 1e-3, _grid(240, 513), albedo.flatten().numpy()
+    return (
+        points.reshape(-1, 3).numpy() * 1e-3,
+        _grid(240, 513),
+        albedo.flatten().numpy(),
+    )
 
 
-def _fold(p: Tensor, bank: Tensor, rig: Rig, camera: Camera) -> tuple[Array, Array, Array]:
-    """The far sheet where rays through the opening pass beside the globe: conjunctiva, as the model continues it."""
+def _fold(
+    p: Tensor, bank: Tensor, rig: Rig, camera: Camera
+) -> tuple[Array, Array, Array]:
+    """The far sheet where rays through the opening pass beside the globe: conjunctiva,
+    as the model continues it.
+    """
     side, (dx, dy, dz) = _rays(rig, camera, p)
     ts, mx, my, mz = model.globe(p, dx, dy, dz)
     _, seen, gx, gy, _, lower, *_ = model.lids(p, dx, dy, dz)
@@ -119,30 +158,48 @@ def _fold(p: Tensor, bank: Tensor, rig: Rig, camera: Camera) -> tuple[Array, Arr
 
 
 def _iris(p: Tensor, bank: Tensor) -> tuple[Array, Array, Array]:
-    """A dark floor 0.2 mm behind the pupil, the iris from its margin outwards, and the wall up to the limbus.
+    """A dark floor 0.2 mm behind the pupil, the iris from its margin outwards, and the
+    wall up to the limbus.
 
-    The model's albedos are those that are seen from outside; tissue in water must be brighter by Saunderson's formula
+    The model's albedos are those that are seen from outside; tissue in water must be
+    brighter by Saunderson's formula
     (1942), which takes the light that the surface keeps inside.
     """
     hole, rim = float(p[model.PUPIL_R]), float(p[model.LIMBUS_R])
     rings = torch.linspace(hole, rim, 120, dtype=p.dtype)
-    radius = torch.cat([torch.tensor([0.0, hole, hole], dtype=p.dtype), rings, torch.tensor([rim], dtype=p.dtype)])
+    radius = torch.cat(
+        [
+            torch.tensor([0.0, hole, hole], dtype=p.dtype),
+            rings,
+            torch.tensor([rim], dtype=p.dtype),
+        ]
+    )
     plane = float(p[model.PUPIL_D])
     height = torch.full_like(radius, plane)
     height[:2], height[-1] = plane - 200, float(p[model.LIMBUS_D])
-    points = p[model.CENTRE : model.CENTRE + 3] + _about(p, height[:, None], radius[:, None], 513)
+    points = p[model.CENTRE : model.CENTRE + 3] + _about(
+        p, height[:, None], radius[:, None], 513
+    )
     turn = torch.linspace(0, 2 * math.pi, 513, dtype=p.dtype)
     x, y = radius[:, None] * torch.cos(turn), radius[:, None] * torch.sin(turn)
     albedo = model.pigment(p, bank, x, y, torch.sqrt(x * x + y * y + 1))
     albedo[:3] = p[model.PUPIL]
-    kept = 1 - 0.94 / p[model.INDEX] ** 2  # of diffuse light from inside; 6 % of that from outside
+    kept = (
+        1 - 0.94 / p[model.INDEX] ** 2
+    )  # of diffuse light from inside; 6 % of that from outside
     lost = ((p[model.INDEX] - 1) / (p[model.INDEX] + 1)) ** 2
     albedo = albedo / ((1 - lost) * (1 - kept) + kept * albedo)
-    return points.reshape(-1, 3).numpy() * 1e-3, _grid(len(radius), 513), albedo.flatten().numpy()
+    return (
+        points.reshape(-1, 3).numpy() * 1e-3,
+        _grid(len(radius), 513),
+        albedo.flatten().numpy(),
+    )
 
 
 def _about(p: Tensor, along: Tensor, across: Tensor, turns: int) -> Tensor:
-    """(rows, turns, 3) rings about the optic axis, ``along`` it and ``across`` it (rows, 1)."""
+    """(rows, turns, 3) rings about the optic axis, ``along`` it and ``across`` it
+    (rows, 1).
+    """
     turn = torch.linspace(0, 2 * math.pi, turns, dtype=p.dtype)
     axis, right, down = (p[k : k + 3] for k in (model.AXIS, model.IRIS_X, model.IRIS_Y))
     ring = torch.cos(turn)[:, None] * right + torch.sin(turn)[:, None] * down
@@ -152,7 +209,9 @@ def _about(p: Tensor, along: Tensor, across: Tensor, turns: int) -> Tensor:
 def _grid(rows: int, columns: int) -> Array:
     """(2 (rows - 1) (columns - 1), 3) triangles of a grid of points."""
     k = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
+    a, b, c, d = (
+        part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:])
+    )
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
 
 
@@ -160,11 +219,15 @@ def _mesh(mitsuba: Any, name: str, points: Array, faces: Array, albedo: Array) -
     """Triangles that scatter diffusely on both sides, with an albedo at every point."""
     colour = {"type": "mesh_attribute", "name": "vertex_albedo"}
     properties = mitsuba.Properties()
-    properties["bsdf"] = mitsuba.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}})
+    properties["bsdf"] = mitsuba.load_dict(
+        {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
+    )
     mesh = mitsuba.Mesh(name, len(points), len(faces), props=properties)
     values = mitsuba.traverse(mesh)
     values["vertex_positions"] = points.astype(np.float32).ravel()
     values["faces"] = faces.astype(np.uint32).ravel()
     values.update()
-    mesh.add_attribute("vertex_albedo", 3, np.repeat(albedo.clip(0, 0.98), 3).astype(np.float32))
+    mesh.add_attribute(
+        "vertex_albedo", 3, np.repeat(albedo.clip(0, 0.98), 3).astype(np.float32)
+    )
     return mesh

@@ -17,10 +17,13 @@ from metalens.image import Imager, UniformImager
 class Seen:
     """Frames as the sensor gave them, with their truth.
 
-    frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm: (n, 3). batch: frames at a time.
+    frames: (n, 1, y, x) standardised. mask: (n, y, x) over the whole frame. slip_mm:
+    (n, 3). batch: frames at a time.
     wide: the frame's width over the image's (:func:`frame_wide`).
-    vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`; None where it is not known.
-    above: why the error of their images is above ``optics.image_tolerance`` (:func:`codesign.optics.formed.above`);
+    vergence: (n, windows, windows) of :func:`codesign.network.blur.window_vergence`;
+    None where it is not known.
+    above: why the error of their images is above ``optics.image_tolerance``
+    (:func:`codesign.optics.formed.above`);
         empty where it is not.
     """
 
@@ -35,7 +38,9 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """Mean absolute errors of the slippage in mm, and mean intersection over union of the pupil."""
+    """Mean absolute errors of the slippage in mm, and mean intersection over union of
+    the pupil.
+    """
 
     axial_mm: float
     lateral_mm: float
@@ -48,24 +53,44 @@ class Assessment:
 
 
 @torch.no_grad()
-def frames(trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None) -> Seen:
-    """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now, with fixed noise."""
+def frames(
+    trainer: Trainer, scenes: Scenes, batches: int, *, stack: Stack | None = None
+) -> Seen:
+    """Frames through the lens (or the PSFs of ``stack``) and sensor as they are now,
+    with fixed noise.
+    """
     prepared: UniformImager | Imager | None = None
     pitch, wide, above = trainer.model.pitch_um, 1.0, ""
     pixels, masks, slips, depths = [], [], [], []
     for number in range(batches):
         batch = scenes.batch(number, trainer.inner.batch)
         if prepared is None:
-            given = trainer.optics, trainer.model.coefficients_rad, samples(batch.frames)
-            prepared = formed.imager(*given, margin=scenes.margin, made=stack, device=trainer.light.device)
+            given = (
+                trainer.optics,
+                trainer.model.coefficients_rad,
+                samples(batch.frames),
+            )
+            prepared = formed.imager(
+                *given, margin=scenes.margin, made=stack, device=trainer.light.device
+            )
             above = formed.above(trainer.optics, prepared)
         light = irradiance(batch.frames, prepared, margin=scenes.margin).cpu()
-        noise = torch.Generator().manual_seed(1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number)
-        wide = frame_wide(light.shape[-1], trainer.optics.sample_um, float(pitch.detach()))
-        pixels.append(read_out(light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise))
+        noise = torch.Generator().manual_seed(
+            1_000_003 * (int(getattr(scenes, "stream", 0)) + 1) + number
+        )
+        wide = frame_wide(
+            light.shape[-1], trainer.optics.sample_um, float(pitch.detach())
+        )
+        pixels.append(
+            read_out(
+                light, trainer.optics.sample_um, pitch, trainer.sensor, generator=noise
+            )
+        )
         masks.append(losses.framed(batch.mask, wide))
         slips.append(batch.slip_mm)
-        depths.append(blur.window_vergence(depth_um(batch.frames, margin=scenes.margin)))
+        depths.append(
+            blur.window_vergence(depth_um(batch.frames, margin=scenes.margin))
+        )
     shown = torch.cat(pixels), torch.cat(masks), torch.cat(slips)
     return Seen(*shown, trainer.inner.batch, torch.cat(depths), wide, above)
 
@@ -76,10 +101,13 @@ class Answers:
 
     slip_mm: (n, 3). centre: (n, 2) of the pupil, fraction of the image from its middle.
     iou: (n,) of the pupil's mask, at the sensor's pixels.
-    slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of one that gives none.
-    depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its spread; likewise.
+    slip_sd_mm: (n, 3) standard deviation that the network gives its slippage; None of
+    one that gives none.
+    depth: (n, 2, windows, windows) vergence of the windows and the logarithm of its
+    spread; likewise.
     mask: (n, y, x) logits of the pupil on the network's own grid; likewise.
-    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise, and where training gave it no weight.
+    axis: (n, 3) optic axis in the camera's frame, a unit vector; likewise, and where
+    training gave it no weight.
     """
 
     slip_mm: Tensor
@@ -92,11 +120,18 @@ class Answers:
 
 
 @torch.no_grad()
-def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Answers:
-    """Answers with the batch statistics that the network holds (see :func:`codesign.network.supernet.recalibrate`)."""
+def predict(
+    net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig
+) -> Answers:
+    """Answers with the batch statistics that the network holds (see
+    :func:`codesign.network.supernet.recalibrate`).
+    """
     training = net.training
     net.eval()
-    found = [net(seen.frames[i : i + seen.batch], architecture) for i in range(0, len(seen.frames), seen.batch)]
+    found = [
+        net(seen.frames[i : i + seen.batch], architecture)
+        for i in range(0, len(seen.frames), seen.batch)
+    ]
     net.train(training)
     slip = torch.cat([f.slip for f in found]) * torch.tensor(inner.slip_scale_mm)
     pixels = int(seen.frames.shape[-1])
@@ -118,15 +153,23 @@ def predict(net: Supernet | Baseline, architecture: Architecture, seen: Seen, in
 
 def parts(seen: Seen) -> list[Tensor]:
     """Frames a batch at a time."""
-    return [seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)]
+    return [
+        seen.frames[i : i + seen.batch] for i in range(0, len(seen.frames), seen.batch)
+    ]
 
 
 @torch.no_grad()
-def assess(net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig) -> Assessment:
-    """Errors of one architecture, with its own batch statistics measured on the first half of the frames."""
+def assess(
+    net: Supernet | Baseline, architecture: Architecture, seen: Seen, inner: InnerConfig
+) -> Assessment:
+    """Errors of one architecture, with its own batch statistics measured on the first
+    half of the frames.
+    """
     batches = parts(seen)
     recalibrate(net, architecture, batches[: max(1, len(batches) // 2)])
     answers = predict(net, architecture, seen, inner)
     error = (answers.slip_mm - seen.slip_mm).abs().mean(0)
     net.train()
-    return Assessment(float(error[2]), float(error[:2].mean()), float(answers.iou.mean()))
+    return Assessment(
+        float(error[2]), float(error[:2].mean()), float(answers.iou.mean())
+    )

@@ -1,4 +1,6 @@
-"""Training state on disk: every tensor bit for bit (safetensors), the rest as JSON, written whole or not at all."""
+"""Training state on disk: every tensor bit for bit (safetensors), the rest as JSON,
+written whole or not at all.
+"""
 
 import json
 from dataclasses import MISSING, fields, is_dataclass
@@ -22,16 +24,23 @@ def save(path: str | Path, state: dict[str, Any], *, settings: object) -> None:
     """Write a training state.
 
     Args:
-        state: nested dicts and lists of tensors, numbers, strings, booleans and None; keys are strings or integers.
+        state: nested dicts and lists of tensors, numbers, strings, booleans and None;
+            keys are strings or integers.
         settings: the run's config record; kept as TOML so that a resume can compare it.
 
     Raises:
-        OSError: the target cannot be written, the disk is full (the old checkpoint stays).
+        OSError: the target cannot be written, the disk is full (the old checkpoint
+            stays).
         TrainingError: the state holds something else.
     """
     tensors: dict[str, Tensor] = {}
     tree = _split(state, "", tensors)
-    about = {"kind": "checkpoint", "version": VERSION, "state": tree, "settings": config.dumps(settings)}
+    about = {
+        "kind": "checkpoint",
+        "version": VERSION,
+        "state": tree,
+        "settings": config.dumps(settings),
+    }
     _write(Path(path), tensors, ABOUT, json.dumps(about))
 
 
@@ -41,11 +50,18 @@ def save_network(path: str | Path, net: nn.Module) -> None:
     Raises:
         OSError: the target cannot be written, the disk is full (the old file stays).
     """
-    _write(Path(path), {name: weight.contiguous() for name, weight in net.state_dict().items()}, "kind", "subnet")
+    _write(
+        Path(path),
+        {name: weight.contiguous() for name, weight in net.state_dict().items()},
+        "kind",
+        "subnet",
+    )
 
 
 def _write(path: Path, tensors: dict[str, Tensor], key: str, value: str) -> None:
-    """Of what is said about the tensors there is one entry: the writer puts several into an order drawn by chance."""
+    """Of what is said about the tensors there is one entry: the writer puts several
+    into an order drawn by chance.
+    """
     with replacing(path) as part:
         try:
             save_file(tensors, str(part), metadata={key: value})
@@ -57,12 +73,15 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
     """Read a training state back.
 
     Raises:
-        TrainingError: missing, truncated or foreign file, another version, or a run of other settings (the
+        TrainingError: missing, truncated or foreign file, another version, or a run of
+            other settings (the
             difference is named).
     """
     path = Path(path)
     if not path.is_file():
-        raise TrainingError(f"{path}: no checkpoint to resume from; start without --resume")
+        raise TrainingError(
+            f"{path}: no checkpoint to resume from; start without --resume"
+        )
     try:
         with safe_open(str(path), framework="pt") as file:
             about = _about(file.metadata() or {})
@@ -71,22 +90,40 @@ def load(path: str | Path, *, settings: object) -> dict[str, Any]:
         merged: dict[str, Any] = _merge(about["state"], tensors)
     except TrainingError:
         raise
-    except (SafetensorError, OSError, LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise TrainingError(f"{path}: truncated or not a checkpoint ({error})") from error
+    except (
+        SafetensorError,
+        OSError,
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise TrainingError(
+            f"{path}: truncated or not a checkpoint ({error})"
+        ) from error
     return merged
 
 
 def difference(old: str, settings: object) -> str:
-    """What changed from settings in TOML to these, one ``key: old -> new`` a line; '' for none.
+    """What changed from settings in TOML to these, one ``key: old -> new`` a line; ''
+    for none.
 
-    A setting that the old ones do not know stands at its default there: one whose default is not what was done before
+    A setting that the old ones do not know stands at its default there: one whose
+    default is not what was done before
     needs another :data:`VERSION`.
     """
-    before, after, plain = _flat(old), _flat(config.dumps(settings)), _flat(config.dumps(_plain(settings)))
+    before, after, plain = (
+        _flat(old),
+        _flat(config.dumps(settings)),
+        _flat(config.dumps(_plain(settings))),
+    )
     before = {key: value for key, value in plain.items() if key in after} | before
     keys = sorted(before.keys() | after.keys())
     changed = [k for k in keys if before.get(k) != after.get(k)]
-    return "\n".join(f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed)
+    return "\n".join(
+        f"{k}: {before.get(k, 'absent')} -> {after.get(k, 'absent')}" for k in changed
+    )
 
 
 def _plain(settings: Any) -> Any:
@@ -118,7 +155,9 @@ def _check(path: Path, metadata: dict[str, Any], settings: object) -> None:
         )
     changed = difference(metadata["settings"], settings)
     if changed:
-        raise TrainingError(f"{path} belongs to other settings; start a new run or undo the change:\n{changed}")
+        raise TrainingError(
+            f"{path} belongs to other settings; start a new run or undo the change:\n{changed}"
+        )
 
 
 def _flat(text: str) -> dict[str, str]:
@@ -137,12 +176,16 @@ def _split(node: Any, name: str, tensors: dict[str, Tensor]) -> Any:
         tensors[name] = node.detach().contiguous().clone()
         return {_TENSOR: name}
     if isinstance(node, dict):
-        return {"items": [[k, _split(v, f"{name}/{k}", tensors)] for k, v in node.items()]}
+        return {
+            "items": [[k, _split(v, f"{name}/{k}", tensors)] for k, v in node.items()]
+        }
     if isinstance(node, list | tuple):
         return [_split(v, f"{name}/{i}", tensors) for i, v in enumerate(node)]
     if node is None or isinstance(node, bool | int | float | str):
         return node
-    raise TrainingError(f"checkpoint entry {name or '/'} is a {type(node).__name__}; need tensors, numbers, text")
+    raise TrainingError(
+        f"checkpoint entry {name or '/'} is a {type(node).__name__}; need tensors, numbers, text"
+    )
 
 
 def _merge(tree: Any, tensors: dict[str, Tensor]) -> Any:

@@ -1,4 +1,6 @@
-"""Does a network read the optics? Its answer to PSFs of another depth while the picture's geometry stays."""
+"""Does a network read the optics? Its answer to PSFs of another depth while the
+picture's geometry stays.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +16,9 @@ from metalens.image import Frames
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Displaced:
-    """Frames that are blurred as if everything stood ``shift_um`` farther away; places and sizes stay."""
+    """Frames that are blurred as if everything stood ``shift_um`` farther away; places
+    and sizes stay.
+    """
 
     scenes: Scenes
     shift_um: float
@@ -41,13 +45,16 @@ def displaced(frames: Frames | Flat, shift_um: float) -> Frames | Flat:
         return Frames(frames.radiance, frames.coverage, frames.depth_um + shift_um)
     far = frames.depth_um * frames.scale[:, None, None] + shift_um
     return Flat(
-        frames.light, (far / frames.scale[:, None, None]).clip(0, 65535).round().astype(np.uint16), frames.scale
+        frames.light,
+        (far / frames.scale[:, None, None]).clip(0, 65535).round().astype(np.uint16),
+        frames.scale,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class DepthResponse:
-    """mm of predicted axial slippage per mm of PSF depth: 1 for a network that measures by the blur alone.
+    """mm of predicted axial slippage per mm of PSF depth: 1 for a network that measures
+    by the blur alone.
 
     mean, standard_error: over frames. frames: how many.
     """
@@ -66,15 +73,20 @@ def depth_response(
     batches: int,
     shift_um: float = 1000.0,
 ) -> DepthResponse:
-    """Shift the depth of the PSFs alone and see how far the prediction follows; the noise is the same in both.
+    """Shift the depth of the PSFs alone and see how far the prediction follows; the
+    noise is the same in both.
 
-    A network that guesses depth from the size of what it sees answers 0, however well it scores on natural frames.
-    The batch statistics must be measured (:func:`codesign.network.supernet.recalibrate`).
+    A network that guesses depth from the size of what it sees answers 0, however well
+    it scores on natural frames.
+    The batch statistics must be measured
+    (:func:`codesign.network.supernet.recalibrate`).
     """
     here = _axial(trainer, scenes, net, architecture, batches)
     there = _axial(trainer, Displaced(scenes, shift_um), net, architecture, batches)
     change = (there - here) / (shift_um * 1e-3)
-    return DepthResponse(float(change.mean()), float(change.std() / len(change) ** 0.5), len(change))
+    return DepthResponse(
+        float(change.mean()), float(change.std() / len(change) ** 0.5), len(change)
+    )
 
 
 def _axial(

@@ -1,4 +1,6 @@
-"""Regularised evolution over architectures under a compute budget, with ageing (Real et al. 2019), and Pareto sets."""
+"""Regularised evolution over architectures under a compute budget, with ageing (Real et
+al. 2019), and Pareto sets.
+"""
 
 import dataclasses
 import json
@@ -9,7 +11,16 @@ from typing import Any
 import numpy as np
 
 from codesign.batches import parallel
-from codesign.network import Architecture, Space, active, check, largest, mutate, sample, smallest
+from codesign.network import (
+    Architecture,
+    Space,
+    active,
+    check,
+    largest,
+    mutate,
+    sample,
+    smallest,
+)
 from metalens.ground.errors import TrainingError, nearest
 
 
@@ -30,7 +41,8 @@ class Plan:
     tournament: members that compete to be the parent.
     rounds: evaluations in all, the first population included.
     mutation: chance that one entry changes.
-    together: candidates that are born before any of them is judged, so that the processes of ``torchrun`` can share
+    together: candidates that are born before any of them is judged, so that the
+    processes of ``torchrun`` can share
         them. The result depends on this number, not on how many processes there are.
     """
 
@@ -42,8 +54,13 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.together < 1:
-            raise TrainingError(f"together = {self.together}: need 1 or more candidates at once")
-        if not (self.population >= 1 and 1 <= self.tournament <= self.population <= self.rounds):
+            raise TrainingError(
+                f"together = {self.together}: need 1 or more candidates at once"
+            )
+        if not (
+            self.population >= 1
+            and 1 <= self.tournament <= self.population <= self.rounds
+        ):
             raise TrainingError(
                 f"population {self.population}, tournament {self.tournament}, rounds {self.rounds}: need "
                 "1 <= population, 1 <= tournament <= population <= rounds"
@@ -80,30 +97,39 @@ def evolve(
     seed: int,
     start: Search | None = None,
 ) -> Iterator[Search]:
-    """Search state after every round of births; give the last one as ``start`` to go on exactly where it stopped.
+    """Search state after every round of births; give the last one as ``start`` to go on
+    exactly where it stopped.
 
-    The first two candidates are those that :func:`sandwich` trains at every step (:func:`ends`).
+    The first two candidates are those that :func:`sandwich` trains at every step
+    (:func:`ends`).
 
     Args:
         evaluate: error of an architecture; each different network is evaluated once.
-        count: its multiply-accumulates; only candidates within ``budget`` are evaluated.
+        count: its multiply-accumulates; only candidates within ``budget`` are
+            evaluated.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
     """
     affordable(space, count, budget)
-    state = start or Search(generator=dict(np.random.default_rng(seed).bit_generator.state))
+    state = start or Search(
+        generator=dict(np.random.default_rng(seed).bit_generator.state)
+    )
     known = {active(space, c.architecture): c.error for c in state.history}
     while len(state.history) < plan.rounds:
         generator = np.random.default_rng()
         generator.bit_generator.state = state.generator
         here = len(state.history)
         births = min(plan.together, plan.rounds - here)
-        born = list(ends(space, count, budget)[here : here + births]) if here < 2 else []
+        born = (
+            list(ends(space, count, budget)[here : here + births]) if here < 2 else []
+        )
         while len(born) < births:
             born.append(_next(space, plan, state, count, budget, generator))
         fresh = {active(space, a): a for a in born if active(space, a) not in known}
-        known |= dict(zip(fresh, parallel.each(evaluate, list(fresh.values())), strict=True))
+        known |= dict(
+            zip(fresh, parallel.each(evaluate, list(fresh.values())), strict=True)
+        )
         judged = (Candidate(a, known[active(space, a)], float(count(a))) for a in born)
         state = Search((*state.history, *judged), dict(generator.bit_generator.state))
         yield state
@@ -124,9 +150,16 @@ def affordable(space: Space, count: Count, budget: float) -> None:
 
 
 def search(
-    space: Space, plan: Plan, evaluate: Evaluate, count: Count, *, budget: float, seed: int
+    space: Space,
+    plan: Plan,
+    evaluate: Evaluate,
+    count: Count,
+    *,
+    budget: float,
+    seed: int,
 ) -> tuple[Candidate, ...]:
-    """A whole search: every candidate in order of birth; :func:`best` and :func:`pareto` read it.
+    """A whole search: every candidate in order of birth; :func:`best` and
+    :func:`pareto` read it.
 
     Raises:
         TrainingError: the smallest network of the space is beyond the budget.
@@ -138,18 +171,36 @@ def search(
 
 
 def _next(
-    space: Space, plan: Plan, state: Search, count: Count, budget: float, generator: np.random.Generator
+    space: Space,
+    plan: Plan,
+    state: Search,
+    count: Count,
+    budget: float,
+    generator: np.random.Generator,
 ) -> Architecture:
-    """A random member while the first population grows, then a child of the best of a tournament."""
+    """A random member while the first population grows, then a child of the best of a
+    tournament.
+    """
     if len(state.history) < plan.population:
-        return _within(lambda: sample(space, generator), count, budget) or smallest(space)
+        return _within(lambda: sample(space, generator), count, budget) or smallest(
+            space
+        )
     alive = state.alive(plan)
     rivals = generator.choice(len(alive), plan.tournament, replace=False)
-    parent = min((alive[i] for i in rivals), key=lambda c: (_rank(c.error), c.macs)).architecture
-    return _within(lambda: mutate(space, parent, generator, rate=plan.mutation), count, budget) or parent
+    parent = min(
+        (alive[i] for i in rivals), key=lambda c: (_rank(c.error), c.macs)
+    ).architecture
+    return (
+        _within(
+            lambda: mutate(space, parent, generator, rate=plan.mutation), count, budget
+        )
+        or parent
+    )
 
 
-def _within(draw: Callable[[], Architecture], count: Count, budget: float, *, tries: int = 200) -> Architecture | None:
+def _within(
+    draw: Callable[[], Architecture], count: Count, budget: float, *, tries: int = 200
+) -> Architecture | None:
     for _ in range(tries):
         drawn = draw()
         if count(drawn) <= budget:
@@ -171,41 +222,67 @@ def pareto(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Candidates that no other beats in both error and cost, cheapest first."""
     front: list[Candidate] = []
     for candidate in sorted(candidates, key=lambda c: (c.macs, _rank(c.error))):
-        if np.isfinite(candidate.error) and (not front or candidate.error < front[-1].error):
+        if np.isfinite(candidate.error) and (
+            not front or candidate.error < front[-1].error
+        ):
             front.append(candidate)
     return tuple(front)
 
 
 def sandwich(
-    space: Space, count: Count, budget: float, generator: np.random.Generator, *, subnets: int
+    space: Space,
+    count: Count,
+    budget: float,
+    generator: np.random.Generator,
+    *,
+    subnets: int,
 ) -> list[Architecture]:
-    """Members of one training step: the largest, the smallest and ``subnets`` drawn ones.
+    """Members of one training step: the largest, the smallest and ``subnets`` drawn
+    ones.
 
-    With a budget above 0 each sees its input at the highest resolution that the budget allows (:func:`ends`): what is
+    With a budget above 0 each sees its input at the highest resolution that the budget
+    allows (:func:`ends`): what is
     never chosen is not trained. Where nothing fits, the smallest at least resolution.
     """
     if not budget:
-        return [largest(space), smallest(space), *(sample(space, generator) for _ in range(subnets))]
+        return [
+            largest(space),
+            smallest(space),
+            *(sample(space, generator) for _ in range(subnets)),
+        ]
     large, small = ends(space, count, budget)
     drawn = [
-        _within(lambda: fitted(space, sample(space, generator), count, budget), count, budget, tries=20)
+        _within(
+            lambda: fitted(space, sample(space, generator), count, budget),
+            count,
+            budget,
+            tries=20,
+        )
         for _ in range(subnets)
     ]
     return [large, small, *(one or small for one in drawn)]
 
 
-def ends(space: Space, count: Count, budget: float) -> tuple[Architecture, Architecture]:
-    """The largest uniform network that fits at any resolution, and the smallest: most weights, most pixels.
+def ends(
+    space: Space, count: Count, budget: float
+) -> tuple[Architecture, Architecture]:
+    """The largest uniform network that fits at any resolution, and the smallest: most
+    weights, most pixels.
 
-    Both at the highest resolution that the budget allows; the smallest at least resolution where nothing fits.
+    Both at the highest resolution that the budget allows; the smallest at least
+    resolution where nothing fits.
     """
     small = fitted(space, smallest(space), count, budget)
     made = (fitted(space, candidate, count, budget) for candidate in uniform(space))
     return next((a for a in made if count(a) <= budget), small), small
 
 
-def fitted(space: Space, architecture: Architecture, count: Count, budget: float) -> Architecture:
-    """The architecture at the highest resolution that the budget allows; at the least if none does."""
+def fitted(
+    space: Space, architecture: Architecture, count: Count, budget: float
+) -> Architecture:
+    """The architecture at the highest resolution that the budget allows; at the least
+    if none does.
+    """
     low, high = space.resolution
     whole = dataclasses.replace(architecture, resolution=high)
     if count(whole) <= budget:
@@ -218,16 +295,23 @@ def fitted(space: Space, architecture: Architecture, count: Count, budget: float
 
 
 def uniform(space: Space) -> Iterator[Architecture]:
-    """Networks alike in all stages, large to smallest: width, then depth, then kernel and expansion are reduced."""
+    """Networks alike in all stages, large to smallest: width, then depth, then kernel
+    and expansion are reduced.
+    """
     whole, least = largest(space), smallest(space)
     shallow = dataclasses.replace(whole, depths=least.depths)
     for width in sorted(space.widths, reverse=True):
-        yield from (dataclasses.replace(part, width=width) for part in (whole, shallow, least))
+        yield from (
+            dataclasses.replace(part, width=width) for part in (whole, shallow, least)
+        )
 
 
 def dumps(search: Search) -> str:
     """The state as JSON text."""
-    history = [{**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs} for c in search.history]
+    history = [
+        {**dataclasses.asdict(c.architecture), "error": c.error, "macs": c.macs}
+        for c in search.history
+    ]
     return json.dumps({"history": history, "generator": search.generator})
 
 
@@ -242,7 +326,9 @@ def loads(text: str, space: Space) -> Search:
         history = tuple(_candidate(entry, space) for entry in raw["history"])
         return Search(history, raw["generator"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise TrainingError(f"not the state of an architecture search: {error!r}") from error
+        raise TrainingError(
+            f"not the state of an architecture search: {error!r}"
+        ) from error
 
 
 def _candidate(entry: dict[str, Any], space: Space) -> Candidate:
@@ -251,7 +337,11 @@ def _candidate(entry: dict[str, Any], space: Space) -> Candidate:
     fields = {f.name for f in dataclasses.fields(Architecture)}
     for name in values:
         if name not in fields:
-            raise TrainingError(f"unknown entry {name!r} of an architecture{nearest(name, fields)}")
-    fixed: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+            raise TrainingError(
+                f"unknown entry {name!r} of an architecture{nearest(name, fields)}"
+            )
+    fixed: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
+    }
     made = Architecture(**fixed)
     return Candidate(check(space, made), float(error), float(macs))

@@ -1,9 +1,14 @@
-"""The inner loop: lens, pixel pitch and network weights move together against one loss (paper Eqs. 8 and 10).
+"""The inner loop: lens, pixel pitch and network weights move together against one loss
+(paper Eqs. 8 and 10).
 
-Every step draws its frames, architectures, noise and lens errors from the seed and the step's number alone, so a run
-that is stopped anywhere goes on bit for bit. Optics, pitch and weights have their own rates, clips and schedules: the
-gradients of phase coefficients are a hundred times smaller than those of weights, and one shared clip never acts.
-The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`), on the schedule of the weights.
+Every step draws its frames, architectures, noise and lens errors from the seed and the
+step's number alone, so a run
+that is stopped anywhere goes on bit for bit. Optics, pitch and weights have their own
+rates, clips and schedules: the
+gradients of phase coefficients are a hundred times smaller than those of weights, and
+one shared clip never acts.
+The layers that read blur have an optimiser of their own (:mod:`codesign.network.soap`),
+on the schedule of the weights.
 """
 
 import math
@@ -14,8 +19,27 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from codesign.batches import Batch, Flat, Pose, Scenes, depth_um, irradiance, parallel, samples
-from codesign.network import Architecture, Baseline, Prediction, blur, cost, losses, running, smallest, soap
+from codesign.batches import (
+    Batch,
+    Flat,
+    Pose,
+    Scenes,
+    depth_um,
+    irradiance,
+    parallel,
+    samples,
+)
+from codesign.network import (
+    Architecture,
+    Baseline,
+    Prediction,
+    blur,
+    cost,
+    losses,
+    running,
+    smallest,
+    soap,
+)
 from codesign.optics import LensError, OpticsConfig, Stack
 from codesign.optics import stack as lens
 from codesign.train import moving
@@ -33,18 +57,25 @@ from metalens.image import Frames, Imager, Sensor, UniformImager
 class InnerConfig:
     """Settings of the inner loop.
 
-    steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest (sandwich rule); with
+    steps, batch, seed: of the run. subnets: sampled beside the largest and the smallest
+    (sandwich rule); with
         ``architecture`` fixed, that one alone is trained.
-    weights, optics, pitch: schedules of the three groups. The pitch never gets finer than the samples of the image or
-        than the run's budgets allow, nor so coarse that least resolution leaves a network less than 16 pixels.
-    slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of windows.
-    axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read from; 0 where slippage alone
+    weights, optics, pitch: schedules of the three groups. The pitch never gets finer
+    than the samples of the image or
+        than the run's budgets allow, nor so coarse that least resolution leaves a
+        network less than 16 pixels.
+    slip_weight, optics_weight, budget_weight: of Eq. 10. depth_weight: of the depths of
+    windows.
+    axis_weight, point_weight: of the optic axis and the landmarks, which gaze is read
+    from; 0 where slippage alone
         counts: they cost a tenth of what is read along the axis.
     energy: encircled share that the optics loss keeps.
-    budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their resolution to keep it
+    budget_mmacs: C_budget; 0 for those of the run, in turn. Members lower their
+    resolution to keep it
         (:func:`sandwich`); the hinge acts on those that cannot.
     slip_scale_mm: spread of the slippage, the unit of the network's answer.
-    refresh: steps after which the true image is formed anew while the lens moves. draws: field points and wavelengths a
+    refresh: steps after which the true image is formed anew while the lens moves.
+    draws: field points and wavelengths a
         step through which its gradient goes; few are noisier and quicker.
     patience: steps without a finite gradient, one after the other, that end the run.
     """
@@ -70,7 +101,10 @@ class InnerConfig:
     patience: int = 20
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1 or min(self.slip_scale_mm) <= 0:
+        if (
+            min(self.steps, self.batch, self.patience, self.refresh, self.draws) < 1
+            or min(self.slip_scale_mm) <= 0
+        ):
             raise ConfigError(
                 f"steps {self.steps}, batch {self.batch}, patience {self.patience}, refresh {self.refresh}, draws "
                 f"{self.draws}: need 1 or more; slip_scale_mm {self.slip_scale_mm}: need all above 0"
@@ -81,8 +115,10 @@ class InnerConfig:
 class Given:
     """What a step trains on.
 
-    light: (batch, y, x) on the sensor. vergence: (batch, windows, windows) of :func:`blur.window_vergence`.
-    seen: (batch, 1, rows, columns) frames of the sensor; None where the pitch moves, and members see it differently.
+    light: (batch, y, x) on the sensor. vergence: (batch, windows, windows) of
+    :func:`blur.window_vergence`.
+    seen: (batch, 1, rows, columns) frames of the sensor; None where the pitch moves,
+    and members see it differently.
     """
 
     step: int
@@ -110,7 +146,9 @@ class Record:
 
 
 class Trainer:
-    """The loop with its optimisers; ``state`` and ``restore`` keep everything that a resume needs."""
+    """The loop with its optimisers; ``state`` and ``restore`` keep everything that a
+    resume needs.
+    """
 
     def __init__(
         self,
@@ -125,34 +163,56 @@ class Trainer:
         budgets_mmacs: Sequence[float] = (),
         largest_only: bool = False,
     ) -> None:
-        """``stacks``: PSFs of a lens that is already made; every step draws one of them, and no optics move.
+        """``stacks``: PSFs of a lens that is already made; every step draws one of
+        them, and no optics move.
 
-        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none. ``largest_only``: of a step's members.
+        ``budgets_mmacs``: one a step, in turn, where ``inner`` names none.
+        ``largest_only``: of a step's members.
         """
         self.largest_only = largest_only
-        self.budgets_mmacs = (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
-        self.inner, self.optics, self.sensor, self.scenes, self.model = inner, optics, sensor, scenes, made
+        self.budgets_mmacs = (
+            (inner.budget_mmacs,) if inner.budget_mmacs else tuple(budgets_mmacs)
+        )
+        self.inner, self.optics, self.sensor, self.scenes, self.model = (
+            inner,
+            optics,
+            sensor,
+            scenes,
+            made,
+        )
         self.architecture = architecture
         self.light = Light(
-            optics, stacks, refresh=inner.refresh, draws=inner.draws, seed=inner.seed, draw=self._lens_error
+            optics,
+            stacks,
+            refresh=inner.refresh,
+            draws=inner.draws,
+            seed=inner.seed,
+            draw=self._lens_error,
         )
         reading = soap.layers(made.net)
         others = [p for p in made.net.parameters() if all(p is not q for q in reading)]
         self.groups: dict[str, tuple[Schedule, list[nn.Parameter]]] = {
             "weights": (inner.weights, others),
             "reading": (inner.weights, reading),
-            "optics": (inner.optics, [made.coefficients_rad] if made.coefficients_rad.numel() else []),
+            "optics": (
+                inner.optics,
+                [made.coefficients_rad] if made.coefficients_rad.numel() else [],
+            ),
             "pitch": (inner.pitch, [made.log_pitch]),
         }
         self.optimisers: dict[str, torch.optim.Optimizer] = {
             name: soap.Soap(parameters, weight_decay=0.01)
             if name == "reading"
-            else torch.optim.AdamW(parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True)
+            else torch.optim.AdamW(
+                parameters, weight_decay=0.01 if name == "weights" else 0.0, fused=True
+            )
             for name, (_, parameters) in self.groups.items()
             if parameters
         }
         self.step, self.skipped, self.bad_run = 0, 0, 0
-        self.pitch_held_um: float | None = None  # where the last step was held back from a finer or coarser pitch
+        self.pitch_held_um: float | None = (
+            None  # where the last step was held back from a finer or coarser pitch
+        )
         self._begins_um = float(made.pitch_um.detach())
         self._coarsest_um = math.inf  # until the first frames say how wide they are
 
@@ -199,18 +259,28 @@ class Trainer:
 
     def _advance(self, batch: Batch) -> Record:
         progress = self.step / self.inner.steps
-        rates = {name: schedule.at(progress) for name, (schedule, _) in self.groups.items()}
+        rates = {
+            name: schedule.at(progress) for name, (schedule, _) in self.groups.items()
+        }
         for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
-        moves, live = rates["pitch"] > 0, rates["optics"] > 0 and "optics" in self.optimisers
-        return self._stepped(self._given(self.step, batch, live=live, seen=not moves), rates)
+        moves, live = (
+            rates["pitch"] > 0,
+            rates["optics"] > 0 and "optics" in self.optimisers,
+        )
+        return self._stepped(
+            self._given(self.step, batch, live=live, seen=not moves), rates
+        )
 
     def _stepped(self, given: Given, rates: dict[str, float]) -> Record:
         """A step of every optimiser on what is given."""
         means = running.kept(self.model.net)
         task, each = self._losses(given, pitch_moves=rates["pitch"] > 0)
         optics_loss = given.optics_loss
-        total, macs = task + self.inner.optics_weight * optics_loss.to(self.light.device), each.mean()
+        total, macs = (
+            task + self.inner.optics_weight * optics_loss.to(self.light.device),
+            each.mean(),
+        )
         if self._budget:
             over = losses.over_budget(each, self._budget).mean()
             total = total + self.inner.budget_weight * over.to(self.light.device)
@@ -218,33 +288,55 @@ class Trainer:
         self.light.pass_on(self.model.coefficients_rad)
         parallel.average(p for _, ps in self.groups.values() for p in ps)
         finite = math.isfinite(parallel.mean_of([float(total.detach())])[0])
-        finite = finite and moving.finite(p for _, ps in self.groups.values() for p in ps)
+        finite = finite and moving.finite(
+            p for _, ps in self.groups.values() for p in ps
+        )
         if not finite:
             running.put_back(means)
         self._apply(rates, finite=finite)
         self.step += 1
         values = (total, task, optics_loss, self.model.pitch_um, macs / 1e6)
-        loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of([float(v.detach()) for v in values])
-        return Record(self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped)
+        loss, task_loss, optics_value, pitch_um, mmacs = parallel.mean_of(
+            [float(v.detach()) for v in values]
+        )
+        return Record(
+            self.step, loss, task_loss, optics_value, pitch_um, mmacs, self.skipped
+        )
 
     def _batch(self, step: int) -> Batch:
         """The frames of a step, by its number alone."""
         return parallel.part_of(self.scenes.batch(step, self.inner.batch))
 
     def _given(self, step: int, batch: Batch, *, live: bool, seen: bool) -> Given:
-        """What a step trains on; ``seen``: as the pixels give it, which takes a pitch that does not move."""
+        """What a step trains on; ``seen``: as the pixels give it, which takes a pitch
+        that does not move.
+        """
         margin, pitch = self.scenes.margin, self.model.pitch_um.detach()
         with torch.set_grad_enabled(live):
             optics, optics_loss = self._light(step, batch.frames, live)
             light = irradiance(batch.frames, optics, margin=margin)
-        vergence = blur.window_vergence(depth_um(batch.frames, margin=margin, device=self.light.device))
+        vergence = blur.window_vergence(
+            depth_um(batch.frames, margin=margin, device=self.light.device)
+        )
         frames = self._read(step, light, pitch, False) if seen else None
-        return Given(step, batch.to(self.light.device), light, optics_loss, vergence, frames)
+        return Given(
+            step, batch.to(self.light.device), light, optics_loss, vergence, frames
+        )
 
     def _read(self, step: int, light: Tensor, pitch: Tensor, resized: bool) -> Tensor:
-        """Frames of the sensor. All readings of a step begin the same noise: networks differ by what they see."""
+        """Frames of the sensor. All readings of a step begin the same noise: networks
+        differ by what they see.
+        """
         noise = self._generator(1, step)
-        return read_out(light, self.optics.sample_um, pitch, self.sensor, generator=noise, exact=False, resized=resized)
+        return read_out(
+            light,
+            self.optics.sample_um,
+            pitch,
+            self.sensor,
+            generator=noise,
+            exact=False,
+            resized=resized,
+        )
 
     def _losses(self, given: Given, *, pitch_moves: bool) -> tuple[Tensor, Tensor]:
         """Mean task loss of the step's members, and the multiply-accumulates of each."""
@@ -252,31 +344,54 @@ class Trainer:
         scale = torch.tensor(self.inner.slip_scale_mm, device=self.light.device)
         size = given.light.shape[-1] * self.optics.sample_um
         self._coarsest_um = cost.coarsest_um(size, self.model.net.space.resolution[0])
-        members = self._members(lambda a: float(network_macs(self.model.net, a, size, pitch.detach())))
+        members = self._members(
+            lambda a: float(network_macs(self.model.net, a, size, pitch.detach()))
+        )
         finer = {a: pitch_moves and a.resolution < 1 for a in members}
         frames = {False: given.seen} if given.seen is not None else {
             resized: self._read(given.step, given.light, pitch, resized) for resized in set(finer.values())
         }  # fmt: skip
         batch, pose, parts = given.batch, given.batch.pose, []
-        wide = frame_wide(given.light.shape[-1], self.optics.sample_um, float(pitch.detach()))
+        wide = frame_wide(
+            given.light.shape[-1], self.optics.sample_um, float(pitch.detach())
+        )
         mask = losses.framed(batch.mask, wide)
         shift = batch.slip_mm if pose is None else pose.shift_mm
         for a in members:
             answer = self.model.net(frames[finer[a]], a)
-            loss = losses.task(answer, mask, shift, scale, slip_weight=self.inner.slip_weight)
-            loss = loss + losses.reading(answer, given.vergence, shift, scale, depth_weight=self.inner.depth_weight)
-            parts.append(loss if pose is None else loss + self._pose(answer, pose, wide))
-        macs = torch.stack([network_macs(self.model.net, a, size, pitch) for a in members])
+            loss = losses.task(
+                answer, mask, shift, scale, slip_weight=self.inner.slip_weight
+            )
+            loss = loss + losses.reading(
+                answer,
+                given.vergence,
+                shift,
+                scale,
+                depth_weight=self.inner.depth_weight,
+            )
+            parts.append(
+                loss if pose is None else loss + self._pose(answer, pose, wide)
+            )
+        macs = torch.stack(
+            [network_macs(self.model.net, a, size, pitch) for a in members]
+        )
         return torch.stack(parts).mean(), macs
 
     def _pose(self, answer: Prediction, pose: Pose, wide: float) -> Tensor:
-        weights = {"axis_weight": self.inner.axis_weight, "point_weight": self.inner.point_weight}
+        weights = {
+            "axis_weight": self.inner.axis_weight,
+            "point_weight": self.inner.point_weight,
+        }
         return losses.pose(answer, pose.axis, pose.points / wide, **weights)
 
-    def _light(self, step: int, frames: Frames | Flat, live: bool) -> tuple[UniformImager | Imager, Tensor]:
+    def _light(
+        self, step: int, frames: Frames | Flat, live: bool
+    ) -> tuple[UniformImager | Imager, Tensor]:
         """What images this step's frames, and the optics loss."""
         coefficients = self.model.coefficients_rad
-        optics = self.light.at(step, coefficients, samples(frames), self.scenes.margin, live=live)
+        optics = self.light.at(
+            step, coefficients, samples(frames), self.scenes.margin, live=live
+        )
         if self.light.stacks or not (live and self.inner.optics_weight):
             return optics, torch.zeros(())
         made = lens.stack(self.optics, coefficients, error=self._lens_error(step))
@@ -292,17 +407,29 @@ class Trainer:
         if isinstance(self.model.net, Baseline):
             return [smallest(space)]
         generator = np.random.default_rng([self.inner.seed, self.step, 3])
-        members = sandwich(space, count, self._budget, generator, subnets=self.inner.subnets)
-        return members[:1] if self.largest_only else list(dict.fromkeys(members))  # equal ones count once
+        members = sandwich(
+            space, count, self._budget, generator, subnets=self.inner.subnets
+        )
+        return (
+            members[:1] if self.largest_only else list(dict.fromkeys(members))
+        )  # equal ones count once
 
     @property
     def _budget(self) -> float:
         """Multiply-accumulates that this step's members may take; 0 for any."""
-        return self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6 if self.budgets_mmacs else 0.0
+        return (
+            self.budgets_mmacs[self.step % len(self.budgets_mmacs)] * 1e6
+            if self.budgets_mmacs
+            else 0.0
+        )
 
     def _generator(self, stream: int, step: int | None = None) -> torch.Generator:
         at = self.step if step is None else step
-        seed = int(np.random.SeedSequence([self.inner.seed, at, stream]).generate_state(1, np.uint64)[0])
+        seed = int(
+            np.random.SeedSequence([self.inner.seed, at, stream]).generate_state(
+                1, np.uint64
+            )[0]
+        )
         return torch.Generator().manual_seed(seed >> 1)
 
     def _apply(self, rates: dict[str, float], *, finite: bool) -> None:
@@ -323,12 +450,29 @@ class Trainer:
                     group["lr"] = rates[name]
                 optimiser.step()
         if rates["pitch"] > 0:  # pixels finer than the image's samples show nothing new
-            finest = min(max(self.optics.sample_um, self.model.finest_um), self._begins_um)
-            self.pitch_held_um = self.model.hold(finest, max(self._coarsest_um, self._begins_um))
+            finest = min(
+                max(self.optics.sample_um, self.model.finest_um), self._begins_um
+            )
+            self.pitch_held_um = self.model.hold(
+                finest, max(self._coarsest_um, self._begins_um)
+            )
 
     def _culprits(self) -> str:
-        bad = [name for name, (_, parameters) in self.groups.items() if not moving.finite(parameters)]
+        bad = [
+            name
+            for name, (_, parameters) in self.groups.items()
+            if not moving.finite(parameters)
+        ]
         return "not finite: " + (" and ".join(bad) if bad else "the loss itself")
 
 
-__all__ = ["Batch", "InnerConfig", "Model", "Record", "Scenes", "Schedule", "Trainer", "model"]
+__all__ = [
+    "Batch",
+    "InnerConfig",
+    "Model",
+    "Record",
+    "Scenes",
+    "Schedule",
+    "Trainer",
+    "model",
+]

@@ -1,6 +1,8 @@
-"""TensorBoard event files of a run, written without TensorBoard: scalars and pictures (PSFs, frames, masks).
+"""TensorBoard event files of a run, written without TensorBoard: scalars and pictures
+(PSFs, frames, masks).
 
-A file is a list of records (length, its checksum, content, its checksum; masked CRC-32C) whose contents are ``Event``
+A file is a list of records (length, its checksum, content, its checksum; masked
+CRC-32C) whose contents are ``Event``
 messages in protocol-buffer encoding. ``tensorboard --logdir RUN_DIR`` shows them.
 """
 
@@ -23,13 +25,25 @@ class Journal:
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Numbers of a step, by name."""
-        parts = [_bytes(1, _bytes(1, name.encode()) + _key(2, 5) + struct.pack("<f", v)) for name, v in values.items()]
+        parts = [
+            _bytes(1, _bytes(1, name.encode()) + _key(2, 5) + struct.pack("<f", v))
+            for name, v in values.items()
+        ]
         self._append(_key(2, 0) + _varint(step) + _bytes(5, b"".join(parts)))
 
     def picture(self, step: int, name: str, png: bytes) -> None:
         """A PNG picture of a step."""
-        width, height = struct.unpack(">II", png[16:24])  # of the header chunk that every PNG begins with
-        size = _key(1, 0) + _varint(height) + _key(2, 0) + _varint(width) + _key(3, 0) + _varint(4)
+        width, height = struct.unpack(
+            ">II", png[16:24]
+        )  # of the header chunk that every PNG begins with
+        size = (
+            _key(1, 0)
+            + _varint(height)
+            + _key(2, 0)
+            + _varint(width)
+            + _key(3, 0)
+            + _varint(4)
+        )
         value = _bytes(1, name.encode()) + _bytes(4, size + _bytes(4, png))
         self._append(_key(2, 0) + _varint(step) + _bytes(5, _bytes(1, value)))
 

@@ -1,4 +1,6 @@
-"""What training moves, and how: network weights, phase of the lens, pixel pitch, each on a schedule of its own."""
+"""What training moves, and how: network weights, phase of the lens, pixel pitch, each
+on a schedule of its own.
+"""
 
 import math
 from collections.abc import Iterable
@@ -14,7 +16,8 @@ from metalens.ground.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own clip.
+    """How one group of parameters moves: Adam with warm-up, cosine decay, and its own
+    clip.
 
     rate: largest learning rate; 0 keeps the group fixed.
     start, end: part of the run in which it moves.
@@ -28,21 +31,28 @@ class Schedule:
 
     def __post_init__(self) -> None:
         if not (self.rate >= 0 and 0 <= self.start < self.end <= 1 and self.clip > 0):
-            raise ConfigError(f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0")
+            raise ConfigError(
+                f"{self}: need rate >= 0, 0 <= start < end <= 1, clip > 0"
+            )
 
     def at(self, progress: float) -> float:
         """Learning rate at this part of the run."""
         if not self.start <= progress < self.end:
             return 0.0
         inside = (progress - self.start) / (self.end - self.start)
-        return self.rate * min(1.0, inside / 0.1 + 0.01) * (0.5 + 0.5 * math.cos(math.pi * inside))
+        return (
+            self.rate
+            * min(1.0, inside / 0.1 + 0.01)
+            * (0.5 + 0.5 * math.cos(math.pi * inside))
+        )
 
 
 @dataclass(eq=False)
 class Model:
     """What training moves.
 
-    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel pitch in um. finest_um: pitch below
+    coefficients_rad: (polynomials,) of the lens. log_pitch: logarithm of the pixel
+    pitch in um. finest_um: pitch below
     which no network of the run keeps its budget; 0 for none.
     """
 
@@ -57,15 +67,28 @@ class Model:
         return self.log_pitch.exp()
 
     def hold(self, finest_um: float, coarsest_um: float) -> float | None:
-        """Bring the pitch back between these; the one that it was held at, None where it was between them."""
+        """Bring the pitch back between these; the one that it was held at, None where
+        it was between them.
+        """
         wanted = float(self.pitch_um.detach())
         with torch.no_grad():
             self.log_pitch.clamp_(math.log(finest_um), math.log(coarsest_um))
-        return finest_um if wanted < finest_um else coarsest_um if wanted > coarsest_um else None
+        return (
+            finest_um
+            if wanted < finest_um
+            else coarsest_um
+            if wanted > coarsest_um
+            else None
+        )
 
 
 def model(
-    settings: OpticsConfig, *, pitch_um: float, seed: int, space: Space | None = None, network: Name = "supernet"
+    settings: OpticsConfig,
+    *,
+    pitch_um: float,
+    seed: int,
+    space: Space | None = None,
+    network: Name = "supernet",
 ) -> Model:
     """A fresh model: network weights from the seed, a lens without added phase."""
     torch.manual_seed(seed)
@@ -79,16 +102,25 @@ def model(
 
 
 def finite(parameters: Iterable[nn.Parameter]) -> bool:
-    """Whether all gradients that there are have finite numbers alone; a device is asked once."""
+    """Whether all gradients that there are have finite numbers alone; a device is asked
+    once.
+    """
     grads = [p.grad for p in parameters if p.grad is not None]
     places = {g.device for g in grads}
-    largest = (nn.utils.get_total_norm([g for g in grads if g.device == place], math.inf) for place in places)
+    largest = (
+        nn.utils.get_total_norm([g for g in grads if g.device == place], math.inf)
+        for place in places
+    )
     return all(bool(torch.isfinite(one)) for one in largest)
 
 
 def laid_out(optimiser: torch.optim.Optimizer) -> None:
-    """Moments laid out in memory as their parameters: a fused step walks through both in one order without asking."""
+    """Moments laid out in memory as their parameters: a fused step walks through both
+    in one order without asking.
+    """
     for parameter, kept in optimiser.state.items():
         for name, value in kept.items():
-            if name != "step" and value.shape == parameter.shape:  # the count of a scalar is no moment of it
+            if (
+                name != "step" and value.shape == parameter.shape
+            ):  # the count of a scalar is no moment of it
                 kept[name] = torch.empty_like(parameter).copy_(value)

@@ -1,8 +1,12 @@
-"""Where a run computes: on the processor, or on a GPU while the processor renders the frames of the next step.
+"""Where a run computes: on the processor, or on a GPU while the processor renders the
+frames of the next step.
 
-PSFs, images, pixels, network and losses lie on the GPU; of the frames three bytes a pixel travel there. The noise is
-drawn on the processor, so that a step has the same everywhere, and gradients come back to lens and pitch, which stay.
-A GPU sums in another order than the processor: two runs on one are equal to rounding, not to the bit.
+PSFs, images, pixels, network and losses lie on the GPU; of the frames three bytes a
+pixel travel there. The noise is
+drawn on the processor, so that a step has the same everywhere, and gradients come back
+to lens and pitch, which stay.
+A GPU sums in another order than the processor: two runs on one are equal to rounding,
+not to the bit.
 """
 
 import os
@@ -18,7 +22,8 @@ from metalens.ground.errors import ConfigError
 
 
 def device_of(wanted: Place) -> torch.device:
-    """The device of a choice: under ``torchrun`` each process takes the GPU of its local number.
+    """The device of a choice: under ``torchrun`` each process takes the GPU of its
+    local number.
 
     Raises:
         ConfigError: a GPU is asked for where PyTorch finds none.
@@ -30,11 +35,15 @@ def device_of(wanted: Place) -> torch.device:
         )
     if wanted == "cpu" or not found:
         return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    return torch.device(
+        "cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
+    )
 
 
 def place(trainer: Trainer, device: torch.device) -> None:
-    """Let a trainer image and train on a device: its network and what its optimiser remembers move there."""
+    """Let a trainer image and train on a device: its network and what its optimiser
+    remembers move there.
+    """
     if device.type == "cpu":
         return
     trainer.light.device = device
@@ -42,12 +51,16 @@ def place(trainer: Trainer, device: torch.device) -> None:
     net = trainer.model.net
     net.to(device)
     for optimiser in trainer.optimisers.values():
-        optimiser.load_state_dict(optimiser.state_dict())  # casts what it holds to its parameters' devices
+        optimiser.load_state_dict(
+            optimiser.state_dict()
+        )  # casts what it holds to its parameters' devices
     attend(net, device)
 
 
 def attend(net: nn.Module, device: torch.device) -> None:
-    """From now on frames on the processor are taken to ``device``, and what is predicted of those is brought back."""
+    """From now on frames on the processor are taken to ``device``, and what is
+    predicted of those is brought back.
+    """
     brought = False
 
     def enter(_: nn.Module, given: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -57,7 +70,9 @@ def attend(net: nn.Module, device: torch.device) -> None:
 
     def leave(_: nn.Module, __: tuple[Any, ...], answer: Prediction) -> Prediction:
         parts = (getattr(answer, name) for name in Prediction.__slots__)
-        return Prediction(*(part.cpu() if brought and part is not None else part for part in parts))
+        return Prediction(
+            *(part.cpu() if brought and part is not None else part for part in parts)
+        )
 
     net.register_forward_pre_hook(enter)
     net.register_forward_hook(leave)

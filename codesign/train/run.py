@@ -1,4 +1,6 @@
-"""A co-design run from its config: joint training, search over architectures under budgets, and what is kept of it."""
+"""A co-design run from its config: joint training, search over architectures under
+budgets, and what is kept of it.
+"""
 
 import functools
 import math
@@ -12,7 +14,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from codesign.batches import VALIDATION, EyeScenes, Pool, PoolScenes, SceneConfig, fill, parallel
+from codesign.batches import (
+    VALIDATION,
+    EyeScenes,
+    Pool,
+    PoolScenes,
+    SceneConfig,
+    fill,
+    parallel,
+)
 from codesign.network import Architecture, Name, Space, cost, smallest
 from codesign.optics import OpticsConfig
 from codesign.train import assess, checkpoint, evolution
@@ -33,10 +43,13 @@ class Budgets:
     """Where the run starts, and what it is searched under.
 
     pitch_um: pixel pitch at the start; it moves where ``inner.pitch`` has a rate.
-    budgets_mmacs: one search each; the results together are the Pareto set. Training keeps to them in turn.
-    frozen: parts that stay as they start (the paper's ablations); a frozen architecture is the largest
+    budgets_mmacs: one search each; the results together are the Pareto set. Training
+    keeps to them in turn.
+    frozen: parts that stay as they start (the paper's ablations); a frozen architecture
+    is the largest
         uniform one, at the resolution that each budget allows, trained alone.
-    finetune_steps: of further training of the weights of each budget's network, on its own.
+    finetune_steps: of further training of the weights of each budget's network, on its
+    own.
     """
 
     pitch_um: float = 9.0
@@ -45,9 +58,17 @@ class Budgets:
     finetune_steps: int = 0
 
     def __post_init__(self) -> None:
-        if not self.pitch_um > 0 or not self.budgets_mmacs or min(self.budgets_mmacs) <= 0:
-            raise ConfigError(f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0")
-        if len({f"{budget:g}" for budget in self.budgets_mmacs}) < len(self.budgets_mmacs):
+        if (
+            not self.pitch_um > 0
+            or not self.budgets_mmacs
+            or min(self.budgets_mmacs) <= 0
+        ):
+            raise ConfigError(
+                f"pitch_um = {self.pitch_um}, budgets_mmacs = {self.budgets_mmacs}: need all above 0"
+            )
+        if len({f"{budget:g}" for budget in self.budgets_mmacs}) < len(
+            self.budgets_mmacs
+        ):
             raise ConfigError(
                 f"budgets_mmacs = {self.budgets_mmacs}: two are alike, and so would be their files' names"
             )
@@ -59,12 +80,18 @@ class Budgets:
 class RunConfig:
     """The content of RUN.toml; a preset gives every value that the file leaves out.
 
-    checkpoint_every: steps. validation_batches: judge architectures. test_batches: judge the result.
-    network: the elastic network, or a baseline in its place (no search; one row without a budget).
-    ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that test out.
-    preset: of what is not given: smoke (2 minutes), laptop (half an hour), paper (GPUs).
-    scenes: what is looked at. optics: the lens and how its images are formed. sensor: noise and exposure.
-    space: networks trained together. inner: training of weights and lens. search: of architecture and pitch.
+    checkpoint_every: steps. validation_batches: judge architectures. test_batches:
+    judge the result.
+    network: the elastic network, or a baseline in its place (no search; one row without
+    a budget).
+    ambiguity_pairs: pairs of test frames on which only blur tells depth; 0 leaves that
+    test out.
+    preset: of what is not given: smoke (2 minutes), laptop (half an hour), paper
+    (GPUs).
+    scenes: what is looked at. optics: the lens and how its images are formed. sensor:
+    noise and exposure.
+    space: networks trained together. inner: training of weights and lens. search: of
+    architecture and pitch.
     run: budgets, steps and seed.
     """
 
@@ -84,7 +111,9 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         if min(self.checkpoint_every, self.validation_batches, self.test_batches) < 1:
-            raise ConfigError("checkpoint_every, validation_batches and test_batches must be 1 or more")
+            raise ConfigError(
+                "checkpoint_every, validation_batches and test_batches must be 1 or more"
+            )
         if 0 < self.scenes.pool < self.inner.batch or self.ambiguity_pairs < 0:
             raise ConfigError(
                 f"scenes.pool = {self.scenes.pool}, inner.batch = {self.inner.batch}, ambiguity_pairs = "
@@ -97,7 +126,11 @@ class RunConfig:
                 "lens (scenes.slip_mm, scenes.depth_sd_mm): widen it, beyond them too, for the faces about the eyes"
             )
         for resolution in (self.space.resolution[0], 1.0):
-            cost.input_size(self.scenes.pixels * self.optics.sample_um, self.run.pitch_um, resolution)
+            cost.input_size(
+                self.scenes.pixels * self.optics.sample_um,
+                self.run.pitch_um,
+                resolution,
+            )
 
 
 def load(path: str | Path) -> RunConfig:
@@ -112,9 +145,15 @@ def load(path: str | Path) -> RunConfig:
 
 
 def preset_table(name: str) -> dict[str, Any]:
-    """The settings of a preset; of laptop for a name that is none, which :func:`load` then refuses."""
+    """The settings of a preset; of laptop for a name that is none, which :func:`load`
+    then refuses.
+    """
     known = name if name in get_args(Preset) else "laptop"
-    return tomllib.loads(resources.files("codesign").joinpath("data", f"{known}.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(
+        resources.files("codesign")
+        .joinpath("data", f"{known}.toml")
+        .read_text(encoding="utf-8")
+    )
 
 
 @dataclass(eq=False)
@@ -131,9 +170,11 @@ class Run:
         return self.settings.scenes.pixels * self.settings.optics.sample_um
 
     def macs(self, architecture: Architecture) -> float:
-        """Multiply-accumulates that run for a frame of whole pixels at the pitch that was found.
+        """Multiply-accumulates that run for a frame of whole pixels at the pitch that
+        was found.
 
-        Training counts smoothly with the pitch (:func:`network_macs`), up to a row of pixels less.
+        Training counts smoothly with the pitch (:func:`network_macs`), up to a row of
+        pixels less.
         """
         pitch = float(self.trainer.model.pitch_um.detach())
         cost.input_size(self.window_um, pitch, architecture.resolution)
@@ -141,36 +182,59 @@ class Run:
 
     def counted(self, architecture: Architecture, pitch_um: float) -> float:
         """Multiply-accumulates of an architecture for the whole pixels of any pitch."""
-        pixels = pixel_count(self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um)
+        pixels = pixel_count(
+            self.settings.scenes.pixels, self.settings.optics.sample_um, pitch_um
+        )
         sizes = np.array([round(pixels * architecture.resolution)])
         return float(self.trainer.model.net.counts(architecture, sizes)[0])
 
     def scenes(self, stream: int) -> EyeScenes:
         """Frames of another stream than training's."""
         s = self.settings
-        return EyeScenes(s.scenes, s.optics.sample_um, s.optics.sensor_distance_mm * 1e3, s.inner.seed, stream)
+        return EyeScenes(
+            s.scenes,
+            s.optics.sample_um,
+            s.optics.sensor_distance_mm * 1e3,
+            s.inner.seed,
+            stream,
+        )
 
 
 def start(settings: RunConfig) -> Run:
-    """A fresh run; its pool of frames, where there is one, is rendered when the first batch is asked for.
+    """A fresh run; its pool of frames, where there is one, is rendered when the first
+    batch is asked for.
 
     Raises:
-        TrainingError: a budget is below the smallest network at the pitch that the run begins with.
+        TrainingError: a budget is below the smallest network at the pitch that the run
+            begins with.
     """
     seed, frozen = settings.inner.seed, settings.run.frozen
     inner = settings.inner
     inner = replace(inner, optics=Schedule(0.0)) if "optics" in frozen else inner
     inner = replace(inner, pitch=Schedule(0.0)) if "pitch" in frozen else inner
     made = model(
-        settings.optics, pitch_um=settings.run.pitch_um, seed=seed, space=settings.space, network=settings.network
+        settings.optics,
+        pitch_um=settings.run.pitch_um,
+        seed=seed,
+        space=settings.space,
+        network=settings.network,
     )
-    fresh = EyeScenes(settings.scenes, settings.optics.sample_um, settings.optics.sensor_distance_mm * 1e3, seed)
+    fresh = EyeScenes(
+        settings.scenes,
+        settings.optics.sample_um,
+        settings.optics.sensor_distance_mm * 1e3,
+        seed,
+    )
     scenes: Scenes = fresh
     if settings.scenes.pool:
-        pool = functools.partial(_pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed)
+        pool = functools.partial(
+            _pool, settings.scenes, fresh.sample_um, fresh.sensor_distance_um, seed
+        )
         scenes = PoolScenes(pool, fresh.margin, settings.scenes.scale, seed)
     if parallel.ranks() > 1 and settings.network != "supernet":
-        raise ConfigError(f"network {settings.network!r} trains in one process: its batch statistics are not shared")
+        raise ConfigError(
+            f"network {settings.network!r} trains in one process: its batch statistics are not shared"
+        )
     budgets = settings.run.budgets_mmacs if settings.network == "supernet" else ()
     trainer = Trainer(
         inner,
@@ -188,16 +252,22 @@ def start(settings: RunConfig) -> Run:
 
 
 @functools.lru_cache(maxsize=1)
-def _pool(scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int) -> Pool:
-    """The rendered frames of a run; kept for whoever goes on with it in this process, as its retraining does, until
-    another run asks for its own: an experiment over nine runs held nine of a gigabyte each."""
+def _pool(
+    scenes: SceneConfig, sample_um: float, sensor_distance_um: float, seed: int
+) -> Pool:
+    """The rendered frames of a run; kept for whoever goes on with it in this process,
+    as its retraining does, until
+    another run asks for its own: an experiment over nine runs held nine of a gigabyte
+    each."""
     return fill(EyeScenes(scenes, sample_um, sensor_distance_um, seed), scenes.pool)
 
 
 def _affordable(run: Run, *, moves: bool) -> float:
-    """The finest pitch that leaves the smallest network within every budget; 0 where the samples' own does.
+    """The finest pitch that leaves the smallest network within every budget; 0 where
+    the samples' own does.
 
-    By both counts: that which training goes by and that of whole pixels, which the search goes by.
+    By both counts: that which training goes by and that of whole pixels, which the
+    search goes by.
 
     Raises:
         TrainingError: it is coarser than the pitch that the run begins with.
@@ -206,28 +276,47 @@ def _affordable(run: Run, *, moves: bool) -> float:
     least, budget = smallest(settings.space), min(settings.run.budgets_mmacs) * 1e6
 
     def count(pitch_um: float) -> float:
-        smooth = network_macs(net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64))
+        smooth = network_macs(
+            net, least, run.window_um, torch.tensor(pitch_um, dtype=torch.float64)
+        )
         return max(float(smooth), run.counted(least, pitch_um))
 
-    begins, coarsest = settings.run.pitch_um, cost.coarsest_um(run.window_um, settings.space.resolution[0])
+    begins, coarsest = (
+        settings.run.pitch_um,
+        cost.coarsest_um(run.window_um, settings.space.resolution[0]),
+    )
     if count(begins) > budget:
         coarser = _finest(count, budget, begins, coarsest)
-        way = "" if coarser is None else f", or begin with run.pitch_um = {math.ceil(coarser * 100) / 100:g} or more"
+        way = (
+            ""
+            if coarser is None
+            else f", or begin with run.pitch_um = {math.ceil(coarser * 100) / 100:g} or more"
+        )
         raise TrainingError(
             f"budget of {budget / 1e6:g} MMACs is below the smallest network, {count(begins) / 1e6:.2f} MMACs at "
             f"run.pitch_um = {begins:g}: raise run.budgets_mmacs{way}"
         )
     finest = min(settings.optics.sample_um, begins)
-    return 0.0 if not moves or count(finest) <= budget else _finest(count, budget, finest, begins) or begins
+    return (
+        0.0
+        if not moves or count(finest) <= budget
+        else _finest(count, budget, finest, begins) or begins
+    )
 
 
-def _finest(count: Callable[[float], float], budget: float, low_um: float, high_um: float) -> float | None:
-    """The finest pitch within the budget, where the low one is beyond it; None where the high one is too."""
+def _finest(
+    count: Callable[[float], float], budget: float, low_um: float, high_um: float
+) -> float | None:
+    """The finest pitch within the budget, where the low one is beyond it; None where
+    the high one is too.
+    """
     if high_um <= low_um or count(high_um) > budget:
         return None
     for _ in range(40):
         middle = math.sqrt(low_um * high_um)
-        low_um, high_um = (low_um, middle) if count(middle) <= budget else (middle, high_um)
+        low_um, high_um = (
+            (low_um, middle) if count(middle) <= budget else (middle, high_um)
+        )
     return high_um
 
 
@@ -235,7 +324,10 @@ def save(path: Path, run: Run) -> None:
     """Checkpoint: training state and the searches so far; written by one process alone."""
     if parallel.rank():
         return
-    state = {"trainer": run.trainer.state(), "searches": [evolution.dumps(s) for s in run.searches]}
+    state = {
+        "trainer": run.trainer.state(),
+        "searches": [evolution.dumps(s) for s in run.searches],
+    }
     checkpoint.save(path, state, settings=run.settings)
 
 
@@ -243,7 +335,8 @@ def resume(path: Path, settings: RunConfig) -> Run:
     """Go on from a checkpoint.
 
     Raises:
-        TrainingError: no checkpoint, a damaged one, or one of other settings (the difference is named).
+        TrainingError: no checkpoint, a damaged one, or one of other settings (the
+            difference is named).
     """
     state = checkpoint.load(path, settings=settings)
     run = start(settings)
@@ -255,13 +348,19 @@ def resume(path: Path, settings: RunConfig) -> Run:
 def train(run: Run, path: Path) -> Iterator[Record]:
     """Advance the training to its end, with checkpoints; a record a step."""
     for record in run.trainer.run():
-        yield record  # first the caller's log, then the checkpoint: a log never lacks a step that is kept
-        if record.step % run.settings.checkpoint_every == 0 or record.step == run.settings.inner.steps:
+        # first the caller's log, then the checkpoint: a log never lacks a step that is
+        # kept
+        yield record
+        if (
+            record.step % run.settings.checkpoint_every == 0
+            or record.step == run.settings.inner.steps
+        ):
             save(path, run)
 
 
 def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
-    """Advance the searches to their end, budget by budget, with a checkpoint after every round of births.
+    """Advance the searches to their end, budget by budget, with a checkpoint after
+    every round of births.
 
     Yields:
         (budget in MMACs, the candidate that was born).
@@ -269,13 +368,17 @@ def search(run: Run, path: Path) -> Iterator[tuple[float, Candidate]]:
     settings = run.settings
     if settings.network != "supernet":
         return
-    frames = assess.frames(run.trainer, run.scenes(VALIDATION), settings.validation_batches)
+    frames = assess.frames(
+        run.trainer, run.scenes(VALIDATION), settings.validation_batches
+    )
     plan = settings.search
     if "architecture" in settings.run.frozen:
         plan = Plan(population=1, tournament=1, rounds=1)
 
     def error(architecture: Architecture) -> float:
-        return assess.assess(run.trainer.model.net, architecture, frames, settings.inner).slip_mm
+        return assess.assess(
+            run.trainer.model.net, architecture, frames, settings.inner
+        ).slip_mm
 
     for i, budget in enumerate(settings.run.budgets_mmacs):
         before = run.searches[i] if i < len(run.searches) else None

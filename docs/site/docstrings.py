@@ -1,4 +1,6 @@
-"""How docstrings become pages: fields of records as lists, roles as links (a griffe extension, see mkdocs.yml)."""
+"""How docstrings become pages: fields of records as lists, roles as links (a griffe
+extension, see mkdocs.yml).
+"""
 
 import importlib
 import re
@@ -30,12 +32,24 @@ class Docstrings(griffe.Extension):
             obj.docstring.value = _ROLE.sub(self._linked, obj.docstring.value)
 
     def on_class_members(self, *, cls: griffe.Class, **_: Any) -> None:
-        """Fields that a record tells run together ("a: of this. b: of that.") stand one by one."""
-        if not cls.docstring or not any("dataclass" in str(one.value) for one in cls.decorators):
+        """Fields that a record tells run together ("a: of this. b: of that.") stand one
+        by one.
+        """
+        if not cls.docstring or not any(
+            "dataclass" in str(one.value) for one in cls.decorators
+        ):
             return
-        told = config.described(getattr(importlib.import_module(cls.module.path), cls.name))
+        told = config.described(
+            getattr(importlib.import_module(cls.module.path), cls.name)
+        )
         texts = cls.docstring.value.split("\n\n")
-        other = [text for text in texts if text.partition(":")[0].partition(",")[0] not in told]
+        other = [
+            text
+            for text in texts
+            if text.partition(":")[0].partition(",")[0] not in told
+        ]
         if told:
             rows = [f"    {name}: {text}" for name, text in told.items()]
-            cls.docstring.value = "\n\n".join([*other, "\n".join(["Attributes:", *rows])])
+            cls.docstring.value = "\n\n".join(
+                [*other, "\n".join(["Attributes:", *rows])]
+            )

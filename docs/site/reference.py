@@ -1,6 +1,8 @@
-"""Pages that the site makes from the code: every command with its options, every settings file with its keys.
+"""Pages that the site makes from the code: every command with its options, every
+settings file with its keys.
 
-An mkdocs hook (``hooks`` in mkdocs.yml). The texts come from the docstrings of the records, so that they cannot go
+An mkdocs hook (``hooks`` in mkdocs.yml). The texts come from the docstrings of the
+records, so that they cannot go
 stale; a key without a text fails a test.
 """
 
@@ -34,7 +36,11 @@ SETTINGS = {
     "PUPIL.toml": ("characterize.pupil.record", "PupilSpec", "fit --pupil"),
     "SCENE.toml": ("codesign.commands.scene", "Scene", "scene"),
     "RUN.toml": ("codesign.train.run", "RunConfig", "codesign"),
-    "OPTICS.toml": ("codesign.commands.evaluate_optics", "Settings", "evaluate optics --config"),
+    "OPTICS.toml": (
+        "codesign.commands.evaluate_optics",
+        "Settings",
+        "evaluate optics --config",
+    ),
     "PLAN.toml": ("codesign.budget.plan", "PlanConfig", "plan"),
     "CHAIN.toml": ("metalens.chain.stages", "ChainFiles", "demo --config"),
 }
@@ -47,23 +53,43 @@ def _word(kind: Any) -> str:
     if origin is typing.Literal:
         return " \\| ".join(f"`{value}`" for value in typing.get_args(kind))
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_word(one) for one in typing.get_args(kind) if one is not type(None))
+        return " or ".join(
+            _word(one) for one in typing.get_args(kind) if one is not type(None)
+        )
     if origin is tuple:
         inside = [a for a in typing.get_args(kind) if a is not Ellipsis]
-        return f"list of {_word(inside[0])}" if Ellipsis in typing.get_args(kind) else f"{len(inside)} values"
+        return (
+            f"list of {_word(inside[0])}"
+            if Ellipsis in typing.get_args(kind)
+            else f"{len(inside)} values"
+        )
     if origin is dict:
         return "table"
-    names = {float: "number", int: "integer", str: "text", bool: "true or false", Path: "file"}
+    names = {
+        float: "number",
+        int: "integer",
+        str: "text",
+        bool: "true or false",
+        Path: "file",
+    }
     return names.get(kind, getattr(kind, "__name__", str(kind)))
 
 
 def _marks(kind: Any) -> list[Any]:
-    """What is written beside a type: of tyro an alias, a place among the words, or that it is hidden."""
-    return list(typing.get_args(kind)[1:]) if typing.get_origin(kind) is typing.Annotated else []
+    """What is written beside a type: of tyro an alias, a place among the words, or that
+    it is hidden.
+    """
+    return (
+        list(typing.get_args(kind)[1:])
+        if typing.get_origin(kind) is typing.Annotated
+        else []
+    )
 
 
 def _flag(name: str, kind: Any) -> str | None:
-    """The option as it is typed, with its other names; a positional word in capitals; None for what is hidden."""
+    """The option as it is typed, with its other names; a positional word in capitals;
+    None for what is hidden.
+    """
     marks = _marks(kind)
     if any(mark == tyro.conf.Suppress[int].__metadata__[0] for mark in marks):
         return None
@@ -103,7 +129,10 @@ def _table_of(kind: Any) -> type[Any] | None:
 
 def keys(record: type[Any], path: str = "") -> list[str]:
     """Markdown of a record's keys, then of the tables below it."""
-    hints, told = typing.get_type_hints(record, include_extras=True), config.described(record)
+    hints, told = (
+        typing.get_type_hints(record, include_extras=True),
+        config.described(record),
+    )
     lead = (inspect.getdoc(record) or "").split("\n\n")[0].replace("\n", " ")
     lines = [f"### `[{path}]`" if path else "### Top level", "", lead, ""]
     lines += ["| key | kind | default | |", "|---|---|---|---|"]
@@ -111,8 +140,14 @@ def keys(record: type[Any], path: str = "") -> list[str]:
     for field in dataclasses.fields(record):
         kind = hints[field.name]
         inner = _table_of(kind)
-        word = f"table `[{f'{path}.' if path else ''}{field.name}]`" if inner else _word(kind)
-        lines.append(f"| `{field.name}` | {word} | {_default(field)} | {told.get(field.name, '')} |")
+        word = (
+            f"table `[{f'{path}.' if path else ''}{field.name}]`"
+            if inner
+            else _word(kind)
+        )
+        lines.append(
+            f"| `{field.name}` | {word} | {_default(field)} | {told.get(field.name, '')} |"
+        )
         if inner is not None:
             below += ["", *keys(inner, f"{path}.{field.name}" if path else field.name)]
     return [*lines, *below]
@@ -122,16 +157,32 @@ def settings_page(name: str) -> str:
     """Every key of one settings file."""
     module, record, verb = SETTINGS[name]
     made = keys(getattr(importlib.import_module(module), record))
-    return "\n".join([f"# {name}", "", f"Read by `metalens {verb}`. An unknown key is refused.", "", *made, ""])
+    return "\n".join(
+        [
+            f"# {name}",
+            "",
+            f"Read by `metalens {verb}`. An unknown key is refused.",
+            "",
+            *made,
+            "",
+        ]
+    )
 
 
 def _options(verb: str, module: str) -> list[str]:
     loaded = importlib.import_module(module)
     parts = getattr(loaded, "PARTS", None)
     if parts:
-        return [line for part, (where, _) in parts.items() for line in _options(f"{verb} {part}", where)]
+        return [
+            line
+            for part, (where, _) in parts.items()
+            for line in _options(f"{verb} {part}", where)
+        ]
     record = loaded.Options
-    told, hints = config.described(record), typing.get_type_hints(record, include_extras=True)
+    told, hints = (
+        config.described(record),
+        typing.get_type_hints(record, include_extras=True),
+    )
     for base in reversed(record.__mro__[1:-1]):
         if dataclasses.is_dataclass(base):
             told = config.described(base) | told
@@ -167,20 +218,27 @@ def commands_page() -> str:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Links from docs/ to the pages of the root, as the site has them."""
-    return re.sub(r"\]\(\.\./([A-Z]+)\.md\)", lambda m: f"]({m[1].lower()}.md)", markdown)
+    return re.sub(
+        r"\]\(\.\./([A-Z]+)\.md\)", lambda m: f"]({m[1].lower()}.md)", markdown
+    )
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the made pages to the site."""
     root = Path(config.config_file_path).parent
-    pages = {f"reference/{name.removesuffix('.toml').lower()}.md": settings_page(name) for name in SETTINGS}
+    pages = {
+        f"reference/{name.removesuffix('.toml').lower()}.md": settings_page(name)
+        for name in SETTINGS
+    }
     pages["reference/commands.md"] = commands_page()
     for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG"):
         text = (root / f"{name}.md").read_text(encoding="utf-8")
         text = re.sub(r"\]\(docs/(\w[^)]*)\)", r"](\1)", text)
         where = "index.md" if name == "README" else f"{name.lower()}.md"
         pages[where] = re.sub(
-            r"\]\((ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md\)", lambda m: f"]({m[1].lower()}.md)", text
+            r"\]\((ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md\)",
+            lambda m: f"]({m[1].lower()}.md)",
+            text,
         )
     for where, text in pages.items():
         files.append(File.generated(config, where, content=text))

@@ -1,8 +1,10 @@
-"""Pictures of every page of a demo, for docs/gallery/pages: as on a desk, in the dark, on a phone, on paper.
+"""Pictures of every page of a demo, for docs/gallery/pages: as on a desk, in the dark,
+on a phone, on paper.
 
     metalens demo demo; python docs/site/screens.py demo
 
-Needs chromium; on paper also pypdfium2 (``pip install pypdfium2``), without which that picture is left out.
+Needs chromium; on paper also pypdfium2 (``pip install pypdfium2``), without which that
+picture is left out.
 """
 
 import importlib.util
@@ -31,10 +33,14 @@ FRAME = '<body style="margin:0"><iframe src="{}" width="{}" height="{}" style="b
 
 
 def shot(page: Path, folder: Path, *, width: int, dark: bool = False) -> Image.Image:
-    """The top of a page in a window of this width (a frame of it: windows have a least width)."""
+    """The top of a page in a window of this width (a frame of it: windows have a least
+    width).
+    """
     frame, picture = folder / "frame.html", folder / "shot.png"
     frame.write_text(FRAME.format(page.as_uri(), width, HIGH), encoding="utf-8")
-    mode = ["--force-dark-mode", "--blink-settings=preferredColorScheme=0"] if dark else []
+    mode = (
+        ["--force-dark-mode", "--blink-settings=preferredColorScheme=0"] if dark else []
+    )
     _browse(*mode, "--allow-file-access-from-files", f"--window-size={max(width, 600)},{HIGH}", "--hide-scrollbars",
             f"--screenshot={picture}", frame.as_uri())  # fmt: skip
     return Image.open(picture).convert("RGB").crop((0, 0, width, HIGH))
@@ -46,12 +52,24 @@ def paper(page: Path, folder: Path) -> list[Image.Image]:
         return []
     import pypdfium2
 
-    _browse("--no-pdf-header-footer", f"--print-to-pdf={folder / 'page.pdf'}", page.as_uri())
-    return [pypdfium2.PdfDocument(folder / "page.pdf")[0].render(scale=1.8).to_pil().convert("RGB")]
+    _browse(
+        "--no-pdf-header-footer", f"--print-to-pdf={folder / 'page.pdf'}", page.as_uri()
+    )
+    return [
+        pypdfium2.PdfDocument(folder / "page.pdf")[0]
+        .render(scale=1.8)
+        .to_pil()
+        .convert("RGB")
+    ]
 
 
 def _browse(*words: str) -> None:
-    common = ["--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
+    common = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--virtual-time-budget=20000",
+    ]
     subprocess.run([str(BROWSER), *common, *words], check=True, capture_output=True)
 
 
@@ -59,10 +77,20 @@ def sheet(page: Path, target: Path) -> None:
     """A page in its four forms beside each other, half as large, in 200 colours."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        parts = [shot(page, folder, width=1440), shot(page, folder, width=1440, dark=True)]
+        parts = [
+            shot(page, folder, width=1440),
+            shot(page, folder, width=1440, dark=True),
+        ]
         parts += [shot(page, folder, width=390), *paper(page, folder)]
-    small = [one.resize((one.width * HIGH // one.height // 2, HIGH // 2), Image.Resampling.LANCZOS) for one in parts]
-    made = Image.new("RGB", (sum(one.width + 20 for one in small) - 20, HIGH // 2), "white")
+    small = [
+        one.resize(
+            (one.width * HIGH // one.height // 2, HIGH // 2), Image.Resampling.LANCZOS
+        )
+        for one in parts
+    ]
+    made = Image.new(
+        "RGB", (sum(one.width + 20 for one in small) - 20, HIGH // 2), "white"
+    )
     at = 0
     for one in small:
         made.paste(one, (at, 0))
@@ -85,10 +113,23 @@ def main(demo: Path) -> int:
             if name not in lacking:
                 page = Path(folder) / f"{short}.html"
                 subprocess.run(
-                    [sys.executable, "-m", "metalens", "view", str(demo / name), "-o", str(page), "--quiet"], check=True
+                    [
+                        sys.executable,
+                        "-m",
+                        "metalens",
+                        "view",
+                        str(demo / name),
+                        "-o",
+                        str(page),
+                        "--quiet",
+                    ],
+                    check=True,
                 )
                 sheet(page, PAGES / f"{short}.png")
-                print(f"{short}.png: {(PAGES / f'{short}.png').stat().st_size / 1e3:.0f} kB", flush=True)
+                print(
+                    f"{short}.png: {(PAGES / f'{short}.png').stat().st_size / 1e3:.0f} kB",
+                    flush=True,
+                )
     return len(lacking)
 
 

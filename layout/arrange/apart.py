@@ -1,4 +1,6 @@
-"""Room between what is placed on a die: the rule for gaps, and how far the scattered electrons of a part reach."""
+"""Room between what is placed on a die: the rule for gaps, and how far the scattered
+electrons of a part reach.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -42,13 +44,17 @@ class _Standing:
         """(n, 4) boxes around the turned boxes."""
         corners = boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
         x, y = self.turn.apply(corners[..., 0], corners[..., 1])
-        return np.column_stack([x.min(1) + self.x, y.min(1) + self.y, x.max(1) + self.x, y.max(1) + self.y])
+        return np.column_stack(
+            [x.min(1) + self.x, y.min(1) + self.y, x.max(1) + self.x, y.max(1) + self.y]
+        )
 
 
 def reach_um(process: Process) -> float:
-    """Distance from a wide exposed area at which it adds less than the tolerance of the correction; 0 without one.
+    """Distance from a wide exposed area at which it adds less than the tolerance of the
+    correction; 0 without one.
 
-    The half-plane gives sum w/2 erfc(d / a) of the exposure of its own middle, and dose-to-size is half of that.
+    The half-plane gives sum w/2 erfc(d / a) of the exposure of its own middle, and
+    dose-to-size is half of that.
     """
     if not process.exposure.corrected:
         return 0.0
@@ -67,9 +73,11 @@ def reach_um(process: Process) -> float:
 
 
 def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
-    """Pairs of parts that are nearer than the least gap, or than one's backscatter lets the other's doses hold.
+    """Pairs of parts that are nearer than the least gap, or than one's backscatter lets
+    the other's doses hold.
 
-    Rectilinear shapes are taken as they are, lattices as boxes of some of their pillars (squares of a 64th of the
+    Rectilinear shapes are taken as they are, lattices as boxes of some of their pillars
+    (squares of a 64th of the
     lattice), any other shape as boxes around slices of it (5 um high, or a 64th).
 
     Raises:
@@ -77,12 +85,16 @@ def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
     """
     standing = list(_all(placed))
     if len(standing) > MOST_PLACED:
-        raise ProcessError(f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer")
+        raise ProcessError(
+            f"{len(standing)} parts on a die, at most {MOST_PLACED} are checked; step dies on a wafer"
+        )
     gap, far = process.rules.minimum_gap_nm * PER_UM / 1e3, reach_um(process) * PER_UM
     around = np.array([one.box() for one in standing])
     found: list[Violation] = []
     for n, one in enumerate(standing):
-        for m in np.flatnonzero(_apart(around[n + 1 :], around[n]) < max(gap, far)).tolist():
+        for m in np.flatnonzero(
+            _apart(around[n + 1 :], around[n]) < max(gap, far)
+        ).tolist():
             two = standing[n + 1 + m]
             scattered = far if one.part.corrected or two.part.corrected else 0.0
             found += _between(one, two, gap, scattered, process)
@@ -90,7 +102,9 @@ def check(placed: Sequence[Placing], process: Process) -> list[Violation]:
 
 
 def extent(placed: Sequence[Placing], *, exposed: bool = False) -> Array:
-    """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``: of what is exposed alone."""
+    """(4,) left, bottom, right, top of all copies in units, outlines too; ``exposed``:
+    of what is exposed alone.
+    """
     made = []
     for one in _all(placed):
         made.append(one.box() if exposed else one.moved(one.part.extent[None])[0])
@@ -105,18 +119,28 @@ def _all(placed: Sequence[Placing]) -> Iterator[_Standing]:
 
 def _each(part: Part, copies: Copies) -> Iterator[_Standing]:
     if copies.count > MOST_PLACED:
-        raise ProcessError(f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked")
+        raise ProcessError(
+            f"{copies.count} copies of {part.name} on a die, at most {MOST_PLACED} are checked"
+        )
     for x, y in zip(*(v.tolist() for v in copies.places()), strict=True):
         yield _Standing(part, copies.turn, x, y)
 
 
-def _between(one: _Standing, two: _Standing, gap: float, scattered: float, process: Process) -> Iterator[Violation]:
+def _between(
+    one: _Standing, two: _Standing, gap: float, scattered: float, process: Process
+) -> Iterator[Violation]:
     """At most one finding for each exposure that both have shapes of."""
     for kind in sorted(one.part.boxes.keys() & two.part.boxes.keys()):
         first, second = one.moved(one.part.boxes[kind]), two.moved(two.part.boxes[kind])
         need = gap if kind == APERTURE else max(gap, scattered)
-        first = first[_apart(first, _around(second)) < need] if len(first) and len(second) else first[:0]
-        second = second[_apart(second, _around(first)) < need] if len(first) else second[:0]
+        first = (
+            first[_apart(first, _around(second)) < need]
+            if len(first) and len(second)
+            else first[:0]
+        )
+        second = (
+            second[_apart(second, _around(first)) < need] if len(first) else second[:0]
+        )
         least, box = math.inf, np.zeros(4)
         for each in second if len(first) else ():
             apart = _apart(first, each)
@@ -128,7 +152,10 @@ def _between(one: _Standing, two: _Standing, gap: float, scattered: float, proce
         left, bottom, right, top = (int(v) for v in box)
         nm = least * 1e3 / PER_UM
         if least < gap:
-            limit, text = process.rules.minimum_gap_nm, f"{one.text} to {two.text}, {kind}"
+            limit, text = (
+                process.rules.minimum_gap_nm,
+                f"{one.text} to {two.text}, {kind}",
+            )
         else:
             limit = need * 1e3 / PER_UM
             text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"

@@ -1,4 +1,6 @@
-"""Parts put together: one table of doses, names that differ, a die of placed parts, a wafer of dies."""
+"""Parts put together: one table of doses, names that differ, a die of placed parts, a
+wafer of dies.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -30,7 +32,9 @@ class Placing:
 
 def _copies(child: str, at: At) -> Copies:
     x, y = round(at.x_um * PER_UM), round(at.y_um * PER_UM)
-    step = (0, 0) if at.step_um is None else tuple(round(s * PER_UM) for s in at.step_um)
+    step = (
+        (0, 0) if at.step_um is None else tuple(round(s * PER_UM) for s in at.step_um)
+    )
     turn = Turn(at.turn_deg % 360, at.mirrored)
     return Copies(child, x, y, turn, at.columns, at.rows, (step[0], 0), (0, step[1]))
 
@@ -39,7 +43,8 @@ def _copies(child: str, at: At) -> Copies:
 class Layers:
     """(layer, datatype) of all parts together: one dose each.
 
-    doses: of those that are exposed. names: shown by viewers. kept: numbers that mean something undosed.
+    doses: of those that are exposed. names: shown by viewers. kept: numbers that mean
+    something undosed.
     """
 
     kept: frozenset[LayerNumber]
@@ -47,7 +52,9 @@ class Layers:
     names: dict[LayerNumber, str] = field(default_factory=dict)
 
     def take(self, part: Part) -> dict[LayerNumber, LayerNumber]:
-        """New numbers of a part's layers: its own where these are free or mean the same dose, else a free datatype."""
+        """New numbers of a part's layers: its own where these are free or mean the same
+        dose, else a free datatype.
+        """
         new: dict[LayerNumber, LayerNumber] = {}
         for layer, dose in sorted(part.doses.items()):
             new[layer] = self._number(layer, dose)
@@ -63,12 +70,21 @@ class Layers:
             if other[0] == layer[0] and abs(known - dose) < _SAME:
                 return other
         for datatype in range(_MOST_DATATYPE + 1):
-            if (layer[0], datatype) not in self.doses and (layer[0], datatype) not in self.kept:
+            if (layer[0], datatype) not in self.doses and (
+                layer[0],
+                datatype,
+            ) not in self.kept:
                 return layer[0], datatype
         raise ProcessError(f"layer {layer[0]}: all datatypes hold doses")
 
 
-def die(name: str, placed: Sequence[Placing], *, kept: frozenset[LayerNumber], into: Part | None = None) -> Assembly:
+def die(
+    name: str,
+    placed: Sequence[Placing],
+    *,
+    kept: frozenset[LayerNumber],
+    into: Part | None = None,
+) -> Assembly:
     """All parts in one cell ``name``, or in the top cell of a file that takes them."""
     layers = Layers(kept)
     cells: dict[str, CellContent] = {}
@@ -83,7 +99,9 @@ def die(name: str, placed: Sequence[Placing], *, kept: frozenset[LayerNumber], i
         new = _take(one.part, layers, cells, copies, sites)
         here += one.copies(new[one.part.top])
     if into is None and name in cells:
-        raise ProcessError(f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another")
+        raise ProcessError(
+            f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another"
+        )
     cells.setdefault(top, CellContent(top))
     copies[top] = (*copies.get(top, ()), *here)
     return Assembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
@@ -105,10 +123,14 @@ def _take(
         left, found = compact(relayered(cell, numbers))
         children = tuple(new[child] for child in left.placed.children)
         cells[new[name]] = dataclasses.replace(
-            left, name=new[name], placed=dataclasses.replace(left.placed, children=children)
+            left,
+            name=new[name],
+            placed=dataclasses.replace(left.placed, children=children),
         )
         if found:
-            copies[new[name]] = tuple(dataclasses.replace(one, child=new[one.child]) for one in found)
+            copies[new[name]] = tuple(
+                dataclasses.replace(one, child=new[one.child]) for one in found
+            )
         if name in part.sites:
             sites[new[name]] = part.sites[name].renamed(new)
     return new
@@ -122,7 +144,9 @@ def _free(name: str, cells: Mapping[str, CellContent], new: Mapping[str, str]) -
     return made
 
 
-def wafer(name: str, one: Assembly, steps: tuple[Copies, ...], marks: Placing | None) -> Assembly:
+def wafer(
+    name: str, one: Assembly, steps: tuple[Copies, ...], marks: Placing | None
+) -> Assembly:
     """Dies, and the wafer's marks beside them, in one cell ``name``."""
     layers = Layers(frozenset(), dict(one.doses), dict(one.layer_names))
     cells, copies, sites = dict(one.cells), dict(one.copies), dict(one.sites)
@@ -131,9 +155,17 @@ def wafer(name: str, one: Assembly, steps: tuple[Copies, ...], marks: Placing | 
         new = _take(marks.part, layers, cells, copies, sites)
         here += marks.copies(new[marks.part.top])
     if name in cells:
-        raise ProcessError(f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another")
+        raise ProcessError(
+            f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another"
+        )
     cells[name] = CellContent(name)
     copies[name] = tuple(here)
     return dataclasses.replace(
-        one, name=name, cells=cells, copies=copies, sites=sites, doses=layers.doses, layer_names=layers.names
+        one,
+        name=name,
+        cells=cells,
+        copies=copies,
+        sites=sites,
+        doses=layers.doses,
+        layer_names=layers.names,
     )

@@ -1,4 +1,6 @@
-"""What is placed: the content of a lens's mask or of a file made elsewhere, its doses, and boxes around its shapes."""
+"""What is placed: the content of a lens's mask or of a file made elsewhere, its doses,
+and boxes around its shapes.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,7 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import NOTHING, CellContent, Copies, MaskContent, Sites, arrays, doses, flat
+from layout.files import (
+    NOTHING,
+    CellContent,
+    Copies,
+    MaskContent,
+    Sites,
+    arrays,
+    doses,
+    flat,
+)
 from layout.mask import UNDRAWN, Lattice, MaskPlan
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
@@ -24,10 +35,14 @@ _TILES = 64  # squares of a lattice, each way
 class Part:
     """A cell with all below it, in nanometres.
 
-    name: of the part. top: its cell. cells: by name, as they will be written. doses: relative dose of each layer that
-    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a
-    lattice, of some thousand squares of its pillars. extent: (4,) around everything, outline included. corrected:
-    whether its doses make up for the scattered electrons of its own shapes, and of no others. texts: that are left out,
+    name: of the part. top: its cell. cells: by name, as they will be written. doses:
+    relative dose of each layer that
+    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom,
+    right, top of its shapes}; of a
+    lattice, of some thousand squares of its pillars. extent: (4,) around everything,
+    outline included. corrected:
+    whether its doses make up for the scattered electrons of its own shapes, and of no
+    others. texts: that are left out,
     as they draw nothing.
     sites: of cells, beside what their content places.
     """
@@ -57,19 +72,34 @@ def of_plan(
 
     lattices: of cells of which only the sums were kept, which agree with them.
     """
-    new = {cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells}
+    new = {
+        cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells
+    }
     cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
-    boxes = {PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)], APERTURE: []}
+    boxes = {
+        PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)],
+        APERTURE: [],
+    }
     every = list(boxes[PILLARS])
     for figure in plan.figures:
         for layer, shapes in figure.polygons.items():
-            some = [box for shape in shapes for box in rectilinear.covering(np.asarray(shape, np.int64))]
+            some = [
+                box
+                for shape in shapes
+                for box in rectilinear.covering(np.asarray(shape, np.int64))
+            ]
             every += some
             if figure.name not in UNDRAWN:
-                boxes[APERTURE if layer[0] == process.layers.aperture[0] else PILLARS] += some
+                boxes[
+                    APERTURE if layer[0] == process.layers.aperture[0] else PILLARS
+                ] += some
     classes = tuple(new.get(made.name, "") for made in plan.classes)
     known = lattices or {}
-    sites = {new[c.name]: Sites(known[c.name], classes) for c in content.cells.values() if c.sums is not None}
+    sites = {
+        new[c.name]: Sites(known[c.name], classes)
+        for c in content.cells.values()
+        if c.sums is not None
+    }
     return Part(
         name,
         name,
@@ -84,16 +114,25 @@ def of_plan(
 
 
 def of_file(
-    name: str, path: Path, content: MaskContent, process: Process, *, cell: str, relative_dose: float, keep_top: bool
+    name: str,
+    path: Path,
+    content: MaskContent,
+    process: Process,
+    *,
+    cell: str,
+    relative_dose: float,
+    keep_top: bool,
 ) -> Part:
     """A cell of a file, or all of the file with this cell as its ``top``.
 
     Args:
-        cell: its name; empty: the only top cell. relative_dose: of its layers, where the file has no doses.csv.
+        cell: its name; empty: the only top cell. relative_dose: of its layers, where
+            the file has no doses.csv.
         keep_top: all cells of the file, not those below ``cell`` alone.
 
     Raises:
-        MaskFileError: no such cell, several top cells and none named, coordinates that are no whole nanometres.
+        MaskFileError: no such cell, several top cells and none named, coordinates that
+            are no whole nanometres.
     """
     top = _chosen(path, content, cell)
     whole = scaled(content, UNIT_NM, str(path))
@@ -103,20 +142,28 @@ def of_file(
     undrawn = {layers.outline, layers.fields}
     table = path.with_name("doses.csv")
     known = doses.read(table) if table.is_file() else {}
-    used = {layer for each in cells.values() for layer in (*each.polygons, *each.circles)}
+    used = {
+        layer for each in cells.values() for layer in (*each.polygons, *each.circles)
+    }
     dosed = {layer: known.get(layer, relative_dose) for layer in sorted(used - undrawn)}
     found = _file_boxes(dataclasses.replace(whole, cells=cells), top, process)
-    every = np.concatenate([box for box in found.values() if len(box)] or [np.zeros((1, 4))])
+    every = np.concatenate(
+        [box for box in found.values() if len(box)] or [np.zeros((1, 4))]
+    )
     exposed = {key: box for key, box in found.items() if key in (PILLARS, APERTURE)}
     texts = sum(each.texts for each in cells.values())
-    names = {layer: text for layer, text in content.layer_names.items() if layer in used}
+    names = {
+        layer: text for layer, text in content.layer_names.items() if layer in used
+    }
     return Part(name, top, cells, dosed, names, exposed, _around(every), texts=texts)
 
 
 def _chosen(path: Path, content: MaskContent, cell: str) -> str:
     if cell:
         if cell not in content.cells:
-            raise MaskFileError(f"{path}: no cell {cell!r}; the file holds {', '.join(list(content.cells)[:8])}")
+            raise MaskFileError(
+                f"{path}: no cell {cell!r}; the file holds {', '.join(list(content.cells)[:8])}"
+            )
         return cell
     if len(content.tops) != 1:
         raise MaskFileError(
@@ -131,7 +178,9 @@ def _below(content: MaskContent, top: str) -> set[str]:
     while waiting:
         for child in content.cells[waiting.pop()].placed.children:
             if child not in content.cells:
-                raise MaskFileError(f"cell {child!r} is placed, but the file does not hold it")
+                raise MaskFileError(
+                    f"cell {child!r} is placed, but the file does not hold it"
+                )
             if child not in found:
                 found.add(child)
                 waiting.append(child)
@@ -142,7 +191,8 @@ def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
     """The same mask in another database unit.
 
     Raises:
-        MaskFileError: a coordinate that is no whole number of new units, or beyond 32 bits.
+        MaskFileError: a coordinate that is no whole number of new units, or beyond 32
+            bits.
     """
     ratio = content.unit_nm / unit_nm
     if abs(ratio - 1) < 1e-9:
@@ -151,7 +201,10 @@ def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
     def made(values: Array, kind: type[np.int64 | np.int32] = np.int64) -> Array:
         new = np.asarray(values, float) * ratio
         whole = np.rint(new)
-        if np.abs(new - whole).max(initial=0.0) > _WHOLE or np.abs(whole).max(initial=0.0) > 2**31 - 1:
+        if (
+            np.abs(new - whole).max(initial=0.0) > _WHOLE
+            or np.abs(whole).max(initial=0.0) > 2**31 - 1
+        ):
             raise MaskFileError(
                 f"{where}: its database unit is {content.unit_nm:g} nm, and its coordinates are no whole multiples of "
                 f"{unit_nm:g} nm within 32 bits; bring the file to a unit of {unit_nm:g} nm"
@@ -160,15 +213,28 @@ def scaled(content: MaskContent, unit_nm: float, where: str) -> MaskContent:
 
     def cell(old: CellContent) -> CellContent:
         placed = old.kept()
-        moved = dataclasses.replace(placed, x=made(placed.x, np.int32), y=made(placed.y, np.int32))
-        polygons = {layer: [made(p) for p in shapes] for layer, shapes in old.polygons.items()}
+        moved = dataclasses.replace(
+            placed, x=made(placed.x, np.int32), y=made(placed.y, np.int32)
+        )
+        polygons = {
+            layer: [made(p) for p in shapes] for layer, shapes in old.polygons.items()
+        }
         circles = {
-            layer: [(int(x), int(y), int(r)) for x, y, r in made(np.array(some).reshape(-1, 3)).tolist()]
+            layer: [
+                (int(x), int(y), int(r))
+                for x, y, r in made(np.array(some).reshape(-1, 3)).tolist()
+            ]
             for layer, some in old.circles.items()
         }
-        return dataclasses.replace(old, polygons=polygons, circles=circles, placed=moved)
+        return dataclasses.replace(
+            old, polygons=polygons, circles=circles, placed=moved
+        )
 
-    return dataclasses.replace(content, unit_nm=unit_nm, cells={name: cell(c) for name, c in content.cells.items()})
+    return dataclasses.replace(
+        content,
+        unit_nm=unit_nm,
+        cells={name: cell(c) for name, c in content.cells.items()},
+    )
 
 
 def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
@@ -176,7 +242,10 @@ def _renamed(cell: CellContent, new: Mapping[str, str]) -> CellContent:
     placed = cell.placed if cell.sums is None else NOTHING
     children = tuple(new[child] for child in placed.children)
     return dataclasses.replace(
-        cell, name=new[cell.name], placed=dataclasses.replace(placed, children=children), sums=None
+        cell,
+        name=new[cell.name],
+        placed=dataclasses.replace(placed, children=children),
+        sums=None,
     )
 
 
@@ -198,7 +267,9 @@ def compact(cell: CellContent) -> tuple[CellContent, tuple[Copies, ...]]:
 
 
 def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
-    """Boxes around the pillars of squares of sites, at most 64 each way: single pillars where there are few."""
+    """Boxes around the pillars of squares of sites, at most 64 each way: single pillars
+    where there are few.
+    """
     reach = max(int(np.abs(made.outline).max()) for made in plan.classes)
     high, wide = -(-lattice.rows // _TILES), -(-lattice.columns // _TILES)
     found = []
@@ -206,24 +277,44 @@ def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
         for left in range(0, lattice.columns, wide):
             held = block[:, left : left + wide] != 0
             if held.any():
-                rows, columns = np.flatnonzero(held.any(1)) + first, np.flatnonzero(held.any(0)) + left
+                rows, columns = (
+                    np.flatnonzero(held.any(1)) + first,
+                    np.flatnonzero(held.any(0)) + left,
+                )
                 x = lattice.x0 + columns[[0, -1]] * lattice.pitch
                 y = lattice.y0 - rows[[-1, 0]] * lattice.down
-                found.append(np.array([x[0] - reach, y[0] - reach, x[1] + reach, y[1] + reach]))
+                found.append(
+                    np.array([x[0] - reach, y[0] - reach, x[1] + reach, y[1] + reach])
+                )
     return found
 
 
 def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, Array]:
-    """Boxes of all shapes below ``top`` by exposure; layers that no exposure of ours knows by their number."""
+    """Boxes of all shapes below ``top`` by exposure; layers that no exposure of ours
+    knows by their number.
+    """
     layers = process.layers
     ours = {layers.aperture[0]: APERTURE}
-    ours |= {n[0]: PILLARS for n in (layers.pillar, layers.marks, layers.labels, layers.dose, layers.witness)}
+    ours |= {
+        n[0]: PILLARS
+        for n in (
+            layers.pillar,
+            layers.marks,
+            layers.labels,
+            layers.dose,
+            layers.witness,
+        )
+    }
     found: dict[str, list[Array]] = {}
     for stack in flat.stacks(content, top):
-        pieces = np.concatenate([rectilinear.covering(outline) for outline in stack.outlines])
+        pieces = np.concatenate(
+            [rectilinear.covering(outline) for outline in stack.outlines]
+        )
         places = np.column_stack([stack.x, stack.y, stack.x, stack.y]).astype(np.int64)
         every = (pieces[None] + places[:, None]).reshape(-1, 4)
-        found.setdefault(ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []).append(every)
+        found.setdefault(
+            ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []
+        ).append(every)
     return {key: np.concatenate(some) for key, some in found.items()}
 
 

@@ -1,6 +1,8 @@
-"""What stands on a die and on a wafer, as ARRANGEMENT.toml says it: lenses, cells of other files, a raster of dies.
+"""What stands on a die and on a wafer, as ARRANGEMENT.toml says it: lenses, cells of
+other files, a raster of dies.
 
-Places are middles, in micrometres from the middle of the die; +y is up, as on the mask. A turn is counter-clockwise,
+Places are middles, in micrometres from the middle of the die; +y is up, as on the mask.
+A turn is counter-clockwise,
 after a mirror at the x axis.
 """
 
@@ -19,8 +21,10 @@ class At:
     """Where a lens or cell is placed, once or as an array.
 
     x_um, y_um: of its origin (the axis of a lens); of the first one of an array.
-    turn_deg: counter-clockwise. mirrored: at the x axis, before the turn (turns a lens's circular handedness too).
-    columns, rows: of an array. step_um: (x, y) from one to the next; needed where there are several.
+    turn_deg: counter-clockwise. mirrored: at the x axis, before the turn (turns a
+    lens's circular handedness too).
+    columns, rows: of an array. step_um: (x, y) from one to the next; needed where there
+    are several.
     """
 
     x_um: float = field(default=0.0, metadata={"signed": True})
@@ -33,21 +37,31 @@ class At:
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.x_um + self.y_um + self.turn_deg):
-            raise ProcessError(f"x_um, y_um, turn_deg = {self.x_um}, {self.y_um}, {self.turn_deg}: need finite numbers")
+            raise ProcessError(
+                f"x_um, y_um, turn_deg = {self.x_um}, {self.y_um}, {self.turn_deg}: need finite numbers"
+            )
         if min(self.columns, self.rows) < 1 or self.columns * self.rows > MOST_DIES:
-            raise ProcessError(f"columns x rows = {self.columns} x {self.rows}: need from 1 to {MOST_DIES} copies")
+            raise ProcessError(
+                f"columns x rows = {self.columns} x {self.rows}: need from 1 to {MOST_DIES} copies"
+            )
         if self.columns * self.rows > 1 and self.step_um is None:
-            raise ProcessError(f"step_um is missing for {self.columns} columns and {self.rows} rows")
+            raise ProcessError(
+                f"step_um is missing for {self.columns} columns and {self.rows} rows"
+            )
         if self.step_um is not None and not all(0 < s < math.inf for s in self.step_um):
-            raise ProcessError(f"step_um = {list(self.step_um)}: need two finite lengths above 0")
+            raise ProcessError(
+                f"step_um = {list(self.step_um)}: need two finite lengths above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class LensPart:
     """A lens on the die, drawn, corrected and checked by itself.
 
-    file: lens.h5, beside the arrangement. name: of its cell, and the beginning of the names of its pillars' cells.
-    furnished: with marks, label, dose test and witness cells of its own, else with its aperture alone; left out: where
+    file: lens.h5, beside the arrangement. name: of its cell, and the beginning of the
+    names of its pillars' cells.
+    furnished: with marks, label, dose test and witness cells of its own, else with its
+    aperture alone; left out: where
         neither [die] nor [into] is given.
     at: where it stands; left out: once, at (0, 0).
     """
@@ -65,8 +79,10 @@ class LensPart:
 class CellPart:
     """A cell of a GDSII or OASIS file made elsewhere.
 
-    file: beside the arrangement. cell: what is placed, with all below it; left out: the file's only top cell.
-    name: of the part in reports. relative_dose: of its layers, where no doses.csv of these lies beside the file.
+    file: beside the arrangement. cell: what is placed, with all below it; left out: the
+    file's only top cell.
+    name: of the part in reports. relative_dose: of its layers, where no doses.csv of
+    these lies beside the file.
     checked: whether it has to keep the design rules too.
     at: where it stands; left out: once, at (0, 0).
     """
@@ -81,14 +97,18 @@ class CellPart:
     def __post_init__(self) -> None:
         _named(self.name)
         if not 0 < self.relative_dose < 1e6:
-            raise ProcessError(f"relative_dose = {self.relative_dose}: need a finite dose above 0")
+            raise ProcessError(
+                f"relative_dose = {self.relative_dose}: need a finite dose above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Into:
-    """An existing file that everything is placed into; its cells, layers and datatypes stay as they are.
+    """An existing file that everything is placed into; its cells, layers and datatypes
+    stay as they are.
 
-    file: GDSII or OASIS, beside the arrangement. cell: that takes the new parts; left out: the file's only top cell.
+    file: GDSII or OASIS, beside the arrangement. cell: that takes the new parts; left
+    out: the file's only top cell.
     relative_dose: of its layers, where no doses.csv of these lies beside the file.
     """
 
@@ -98,14 +118,17 @@ class Into:
 
     def __post_init__(self) -> None:
         if not 0 < self.relative_dose < 1e6:
-            raise ProcessError(f"relative_dose = {self.relative_dose}: need a finite dose above 0")
+            raise ProcessError(
+                f"relative_dose = {self.relative_dose}: need a finite dose above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Furniture:
     """Marks, label, dose test and witness cells once for all lenses of the die.
 
-    size_um: (x, y) of the die. label: text on it; left out: the name of the arrangement.
+    size_um: (x, y) of the die. label: text on it; left out: the name of the
+    arrangement.
     """
 
     size_um: tuple[float, float]
@@ -113,7 +136,9 @@ class Furniture:
 
     def __post_init__(self) -> None:
         if not all(0 < s < math.inf for s in self.size_um):
-            raise ProcessError(f"size_um = {list(self.size_um)}: need two finite lengths above 0")
+            raise ProcessError(
+                f"size_um = {list(self.size_um)}: need two finite lengths above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +156,15 @@ class Mark:
 class Wafer:
     """Dies side by side on a round wafer, its flat or notch at the lowest y.
 
-    diameter_mm: of the wafer. edge_exclusion_mm: from its edge, flat or notch, where no part of a die may lie.
+    diameter_mm: of the wafer. edge_exclusion_mm: from its edge, flat or notch, where no
+    part of a die may lie.
     flat_mm: length of the flat; 0: none. notch_mm: depth of the notch; 0: none.
-    pitch_um: (x, y) from die to die. offset_um: of the middle of a die from the middle of the wafer.
-    mark_um, mark_width_um: arm length and line width of the wafer's alignment crosses, with a thin cross in their
-        middle for the fine alignment. marks: where they stand; dies that would touch one are left out.
+    pitch_um: (x, y) from die to die. offset_um: of the middle of a die from the middle
+    of the wafer.
+    mark_um, mark_width_um: arm length and line width of the wafer's alignment crosses,
+    with a thin cross in their
+        middle for the fine alignment. marks: where they stand; dies that would touch
+        one are left out.
     """
 
     pitch_um: tuple[float, float]
@@ -151,14 +180,20 @@ class Wafer:
     def __post_init__(self) -> None:
         _above("pitch_um", *self.pitch_um)
         if any(abs(1e3 * pitch - round(1e3 * pitch)) > 1e-6 for pitch in self.pitch_um):
-            raise ProcessError(f"pitch_um = {list(self.pitch_um)}: need whole nanometres, so that all dies are alike")
+            raise ProcessError(
+                f"pitch_um = {list(self.pitch_um)}: need whole nanometres, so that all dies are alike"
+            )
         for name in ("diameter_mm", "mark_um", "mark_width_um"):
             _above(name, getattr(self, name))
         for name in ("edge_exclusion_mm", "flat_mm", "notch_mm"):
             if not 0 <= getattr(self, name) < self.diameter_mm / 2:
-                raise ProcessError(f"{name} = {getattr(self, name)}: need from 0 to the radius of the wafer")
+                raise ProcessError(
+                    f"{name} = {getattr(self, name)}: need from 0 to the radius of the wafer"
+                )
         if self.flat_mm and self.notch_mm:
-            raise ProcessError(f"flat_mm = {self.flat_mm} and notch_mm = {self.notch_mm}: a wafer has one of them")
+            raise ProcessError(
+                f"flat_mm = {self.flat_mm} and notch_mm = {self.notch_mm}: a wafer has one of them"
+            )
         if self.mark_um < 10 * self.mark_width_um:
             raise ProcessError(
                 f"mark_um = {self.mark_um}: need ten times mark_width_um = {self.mark_width_um}, for the fine cross"
@@ -170,7 +205,8 @@ class Arrangement:
     """Lenses and cells on a die, the die alone or on a wafer.
 
     name: of the top cell; ``NAME_DIE`` is the die on a wafer.
-    lens, cell: what stands on the die. die: furniture for all lenses together. into: a file that takes everything.
+    lens, cell: what stands on the die. die: furniture for all lenses together. into: a
+    file that takes everything.
     wafer: step and repeat of the die.
     """
 
@@ -186,25 +222,41 @@ class Arrangement:
         if not self.lens and not self.cell:
             raise ProcessError("nothing to arrange: need a [[lens]] or a [[cell]]")
         if self.into is not None and self.wafer is not None:
-            raise ProcessError("[into] and [wafer] together: place into the file first, then step it as a [[cell]]")
+            raise ProcessError(
+                "[into] and [wafer] together: place into the file first, then step it as a [[cell]]"
+            )
         if self.die is not None and not self.lens:
-            raise ProcessError("[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars")
-        taken = [self.name, *(part.name for part in self.lens), *(part.name for part in self.cell)]
+            raise ProcessError(
+                "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
+            )
+        taken = [
+            self.name,
+            *(part.name for part in self.lens),
+            *(part.name for part in self.cell),
+        ]
         if self.die is not None:
             taken.append("DIE")
         names.distinct(taken)
 
     def furnished(self, part: LensPart) -> bool:
         """Whether a lens brings marks, label and test structures of its own."""
-        return (self.die is None and self.into is None) if part.furnished is None else part.furnished
+        return (
+            (self.die is None and self.into is None)
+            if part.furnished is None
+            else part.furnished
+        )
 
 
 def _named(name: str) -> None:
     names.check(name)
     if len(name) > 12:
-        raise ProcessError(f"name {name!r}: need at most 12 characters, cells of its parts begin with it")
+        raise ProcessError(
+            f"name {name!r}: need at most 12 characters, cells of its parts begin with it"
+        )
 
 
 def _above(name: str, *values: float) -> None:
     if not all(0 < value < math.inf for value in values):
-        raise ProcessError(f"{name} = {', '.join(map(str, values))}: need finite lengths above 0")
+        raise ProcessError(
+            f"{name} = {', '.join(map(str, values))}: need finite lengths above 0"
+        )

@@ -1,4 +1,6 @@
-"""Step and repeat: which dies of a raster lie whole on a wafer, and how few arrays hold them."""
+"""Step and repeat: which dies of a raster lie whole on a wafer, and how few arrays hold
+them.
+"""
 
 import itertools
 import math
@@ -16,7 +18,9 @@ Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Dies:
-    """Dies on a wafer. index: (n, 2) column and row in the raster, row by row from the lowest; place_um: (n, 2)."""
+    """Dies on a wafer. index: (n, 2) column and row in the raster, row by row from the
+    lowest; place_um: (n, 2).
+    """
 
     index: Array
     place_um: Array
@@ -25,7 +29,8 @@ class Dies:
 def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
     """Dies that lie whole within the usable part of the wafer and clear of its marks.
 
-    A point is usable where it is at least ``edge_exclusion_mm`` from the edge of the wafer: its circle, the chord of
+    A point is usable where it is at least ``edge_exclusion_mm`` from the edge of the
+    wafer: its circle, the chord of
     the flat, the tip of the notch. Without rounding, corner by corner.
 
     Args:
@@ -36,14 +41,26 @@ def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
         ProcessError: dies that overlap, or none that fits.
     """
     left, bottom, right, top = die_um
-    for size, pitch, axis in ((right - left, wafer.pitch_um[0], "x"), (top - bottom, wafer.pitch_um[1], "y")):
+    for size, pitch, axis in (
+        (right - left, wafer.pitch_um[0], "x"),
+        (top - bottom, wafer.pitch_um[1], "y"),
+    ):
         if size > pitch + 1e-9:
-            raise ProcessError(f"wafer.pitch_um is {pitch:g} along {axis}, but a die is {size:.3f} um long; raise it")
+            raise ProcessError(
+                f"wafer.pitch_um is {pitch:g} along {axis}, but a die is {size:.3f} um long; raise it"
+            )
     radius = 500 * wafer.diameter_mm
-    reach = [int((radius + abs(off)) / pitch) + 2 for pitch, off in zip(wafer.pitch_um, wafer.offset_um, strict=True)]
+    reach = [
+        int((radius + abs(off)) / pitch) + 2
+        for pitch, off in zip(wafer.pitch_um, wafer.offset_um, strict=True)
+    ]
     if (2 * reach[0] + 1) * (2 * reach[1] + 1) > 2 * MOST_DIES:
-        raise ProcessError(f"wafer.pitch_um = {list(wafer.pitch_um)}: more than {MOST_DIES} dies; raise it")
-    rows, columns = np.mgrid[-reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1].reshape(2, -1)
+        raise ProcessError(
+            f"wafer.pitch_um = {list(wafer.pitch_um)}: more than {MOST_DIES} dies; raise it"
+        )
+    rows, columns = np.mgrid[
+        -reach[1] : reach[1] + 1, -reach[0] : reach[0] + 1
+    ].reshape(2, -1)
     index = np.column_stack([columns, rows])
     place = index * wafer.pitch_um + wafer.offset_um
     boxes = place[:, [0, 1, 0, 1]] + die_um
@@ -66,11 +83,15 @@ def refuse_marks_off(wafer: Wafer) -> None:
     for mark in wafer.marks:
         x, y = 1e3 * mark.x_mm, 1e3 * mark.y_mm
         if not _usable(wafer, np.array([[x - half, y - half, x + half, y + half]]))[0]:
-            raise ProcessError(f"wafer.marks: the mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm is off the usable wafer")
+            raise ProcessError(
+                f"wafer.marks: the mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm is off the usable wafer"
+            )
 
 
 def chord_um(wafer: Wafer) -> float:
-    """Distance of the flat from the middle of the wafer; the radius where there is none."""
+    """Distance of the flat from the middle of the wafer; the radius where there is
+    none.
+    """
     radius, half = 500 * wafer.diameter_mm, 500 * wafer.flat_mm
     return math.sqrt(radius**2 - half**2)
 
@@ -79,7 +100,9 @@ def _usable(wafer: Wafer, boxes: Array) -> Array:
     """(n,) whether boxes (n, 4) lie whole on the usable part."""
     radius, exclusion = 500 * wafer.diameter_mm, 1e3 * wafer.edge_exclusion_mm
     far = np.hypot(np.abs(boxes[:, [0, 2]]).max(1), np.abs(boxes[:, [1, 3]]).max(1))
-    inside = (far <= radius - exclusion + 1e-6) & (boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6)
+    inside = (far <= radius - exclusion + 1e-6) & (
+        boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6
+    )
     if wafer.notch_mm:
         tip = -radius + 1e3 * wafer.notch_mm
         inside &= _apart(boxes, (0.0, tip, 0.0, tip)) >= exclusion - 1e-6
@@ -94,26 +117,48 @@ def _apart(boxes: Array, box: Box) -> Array:
 
 
 def stepped(child: str, found: Dies, *, units_per_um: float) -> tuple[Copies, ...]:
-    """The dies as arrays: neighbours of a row together, equal rows above each other together."""
+    """The dies as arrays: neighbours of a row together, equal rows above each other
+    together.
+    """
     spans: dict[int, list[tuple[int, int]]] = {}
     order = np.lexsort((found.index[:, 0], found.index[:, 1]))
     columns, rows = found.index[order].T.tolist()
-    for row, members in itertools.groupby(zip(rows, columns, strict=True), key=lambda pair: pair[0]):
+    for row, members in itertools.groupby(
+        zip(rows, columns, strict=True), key=lambda pair: pair[0]
+    ):
         line = [column for _, column in members]
-        breaks = [0, *(n for n in range(1, len(line)) if line[n] != line[n - 1] + 1), len(line)]
+        breaks = [
+            0,
+            *(n for n in range(1, len(line)) if line[n] != line[n - 1] + 1),
+            len(line),
+        ]
         spans[row] = [(line[a], line[b - 1] + 1) for a, b in itertools.pairwise(breaks)]
     at = {(int(i), int(j)): n for n, (i, j) in enumerate(found.index.tolist())}
     open_runs: dict[tuple[int, int], int] = {}
     made: list[tuple[tuple[int, int], int, int]] = []
     for row in range(min(spans), max(spans) + 2):
         here = set(spans.get(row, ()))
-        made += [(run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - here)]
+        made += [
+            (run, open_runs.pop(run), row) for run in sorted(open_runs.keys() - here)
+        ]
         open_runs.update(dict.fromkeys(here - open_runs.keys(), row))
     step = _steps(found, units_per_um)
     copies = []
     for (first, end), low, high in made:
-        x, y = (round(v * units_per_um) for v in found.place_um[at[first, low]].tolist())
-        copies.append(Copies(child, x, y, columns=end - first, rows=high - low, across=(step[0], 0), up=(0, step[1])))
+        x, y = (
+            round(v * units_per_um) for v in found.place_um[at[first, low]].tolist()
+        )
+        copies.append(
+            Copies(
+                child,
+                x,
+                y,
+                columns=end - first,
+                rows=high - low,
+                across=(step[0], 0),
+                up=(0, step[1]),
+            )
+        )
     return tuple(copies)
 
 
@@ -124,5 +169,9 @@ def _steps(found: Dies, units_per_um: float) -> tuple[int, int]:
         index, place = found.index[:, axis], found.place_um[:, axis]
         low, high = int(index.argmin()), int(index.argmax())
         count = int(index[high] - index[low])
-        steps.append(round(float(place[high] - place[low]) / count * units_per_um) if count else 0)
+        steps.append(
+            round(float(place[high] - place[low]) / count * units_per_um)
+            if count
+            else 0
+        )
     return steps[0], steps[1]

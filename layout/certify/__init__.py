@@ -1,4 +1,6 @@
-"""What the written files make: exposure and etch simulated from files and dose table alone."""
+"""What the written files make: exposure and etch simulated from files and dose table
+alone.
+"""
 
 from typing import TYPE_CHECKING
 

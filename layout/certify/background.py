@@ -1,7 +1,9 @@
 """Exposure by everything around a shape through wide Gaussians, on pixels.
 
-Masses go to the nine pixels around them by a quadratic B-spline, a separable Gaussian blurs the pixels, and values come
-from nine pixels by the same spline. Both splines widen the Gaussian by one squared pixel: the kernel is narrower by as
+Masses go to the nine pixels around them by a quadratic B-spline, a separable Gaussian
+blurs the pixels, and values come
+from nine pixels by the same spline. Both splines widen the Gaussian by one squared
+pixel: the kernel is narrower by as
 much. None of this is shared with the correction, whose doses it judges.
 """
 
@@ -22,7 +24,9 @@ _THREADS = 2
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Pixels for a Gaussian of 1/e radius ``range_um``: (rows, columns), the first one's middle at (left, bottom)."""
+    """Pixels for a Gaussian of 1/e radius ``range_um``: (rows, columns), the first
+    one's middle at (left, bottom).
+    """
 
     range_um: float
     left_um: float
@@ -31,11 +35,16 @@ class Raster:
     columns: int
 
     @classmethod
-    def over(cls, box_um: tuple[float, float, float, float], range_um: float) -> "Raster":
+    def over(
+        cls, box_um: tuple[float, float, float, float], range_um: float
+    ) -> "Raster":
         """Pixels around everything between left, bottom, right and top."""
         pixel = range_um / _PIXELS
         left, bottom, right, top = box_um
-        rows, columns = (int((high - low) / pixel) + 5 for low, high in ((bottom, top), (left, right)))
+        rows, columns = (
+            int((high - low) / pixel) + 5
+            for low, high in ((bottom, top), (left, right))
+        )
         return cls(range_um, left - 2 * pixel, bottom - 2 * pixel, rows, columns)
 
     @property
@@ -49,11 +58,20 @@ class Raster:
         return (_CUT + 3 / _PIXELS) * self.range_um
 
     def between(self, low_um: float, high_um: float) -> "Raster":
-        """Those rows that hold everything between two heights and as far around as the kernel reaches."""
-        first = max(0, int((low_um - self.halo_um - self.bottom_um) / self.pixel_um) - 2)
-        end = min(self.rows, int((high_um + self.halo_um - self.bottom_um) / self.pixel_um) + 3)
+        """Those rows that hold everything between two heights and as far around as the
+        kernel reaches.
+        """
+        first = max(
+            0, int((low_um - self.halo_um - self.bottom_um) / self.pixel_um) - 2
+        )
+        end = min(
+            self.rows,
+            int((high_um + self.halo_um - self.bottom_um) / self.pixel_um) + 3,
+        )
         bottom = self.bottom_um + first * self.pixel_um
-        return Raster(self.range_um, self.left_um, bottom, max(end - first, 3), self.columns)
+        return Raster(
+            self.range_um, self.left_um, bottom, max(end - first, 3), self.columns
+        )
 
     def put(self, x_um: Array, y_um: Array, mass: Array, image: Array) -> None:
         """Add masses (n,) to the pixels; what lies off them is passed over."""
@@ -68,7 +86,13 @@ class Raster:
         out = np.empty_like(image)
         edges = np.linspace(0, self.rows, _THREADS + 1).astype(int).tolist()
         with ThreadPoolExecutor(_THREADS) as pool:
-            list(pool.map(partial(_blur, image, kernel.astype(image.dtype), out), edges[:-1], edges[1:]))
+            list(
+                pool.map(
+                    partial(_blur, image, kernel.astype(image.dtype), out),
+                    edges[:-1],
+                    edges[1:],
+                )
+            )
         return out
 
     def take(self, x_um: Array, y_um: Array, image: Array) -> Array:
@@ -80,12 +104,22 @@ class Raster:
 
 @compiled
 def _spline(off: float) -> tuple[float, float, float]:
-    """Weights of the quadratic B-spline on three pixels, the middle one's centre ``off`` pixels before the place."""
+    """Weights of the quadratic B-spline on three pixels, the middle one's centre
+    ``off`` pixels before the place.
+    """
     return 0.5 * (0.5 - off) ** 2, 0.75 - off * off, 0.5 * (0.5 + off) ** 2
 
 
 @compiled
-def _put(x: Array, y: Array, mass: Array, left: float, bottom: float, pixel: float, image: Array) -> None:
+def _put(
+    x: Array,
+    y: Array,
+    mass: Array,
+    left: float,
+    bottom: float,
+    pixel: float,
+    image: Array,
+) -> None:
     rows, columns = image.shape
     for n in range(x.shape[0]):
         u, v = (x[n] - left) / pixel, (y[n] - bottom) / pixel
@@ -100,7 +134,15 @@ def _put(x: Array, y: Array, mass: Array, left: float, bottom: float, pixel: flo
 
 
 @compiled
-def _take(x: Array, y: Array, left: float, bottom: float, pixel: float, image: Array, out: Array) -> None:
+def _take(
+    x: Array,
+    y: Array,
+    left: float,
+    bottom: float,
+    pixel: float,
+    image: Array,
+    out: Array,
+) -> None:
     for n in range(x.shape[0]):
         u, v = (x[n] - left) / pixel, (y[n] - bottom) / pixel
         i = min(max(int(np.floor(u + 0.5)), 1), image.shape[1] - 2)
@@ -116,7 +158,9 @@ def _take(x: Array, y: Array, left: float, bottom: float, pixel: float, image: A
 
 @compiled
 def _blur(image: Array, kernel: Array, out: Array, first: int, end: int) -> None:
-    """Rows ``first`` to ``end`` of ``out``: along the rows, then across a ring of blurred rows; zero outside."""
+    """Rows ``first`` to ``end`` of ``out``: along the rows, then across a ring of
+    blurred rows; zero outside.
+    """
     rows, columns = image.shape
     taps = kernel.shape[0]
     reach = taps // 2
@@ -130,7 +174,11 @@ def _blur(image: Array, kernel: Array, out: Array, first: int, end: int) -> None
             for k in range(0, taps - 2, 3):
                 one, two, three = kernel[k], kernel[k + 1], kernel[k + 2]
                 for c in range(columns):
-                    line[c] += one * padded[c + k] + two * padded[c + k + 1] + three * padded[c + k + 2]
+                    line[c] += (
+                        one * padded[c + k]
+                        + two * padded[c + k + 1]
+                        + three * padded[c + k + 2]
+                    )
             for k in range(taps - taps % 3, taps):
                 for c in range(columns):
                     line[c] += kernel[k] * padded[c + k]

@@ -1,8 +1,12 @@
-"""Exposure of a pillar's rim by the discs beside it, through a Gaussian too narrow for pixels.
+"""Exposure of a pillar's rim by the discs beside it, through a Gaussian too narrow for
+pixels.
 
-The mean over the rim of one disc of what another exposes (non-central chi-square of two degrees) depends on the two
-radii and the gap g between them. Its logarithm plus (g / range)^2 is smooth, and interpolated in all three. Through a
-Gaussian wider than the discs each counts as one more Gaussian, of the same second moment.
+The mean over the rim of one disc of what another exposes (non-central chi-square of two
+degrees) depends on the two
+radii and the gap g between them. Its logarithm plus (g / range)^2 is smooth, and
+interpolated in all three. Through a
+Gaussian wider than the discs each counts as one more Gaussian, of the same second
+moment.
 """
 
 from dataclasses import dataclass
@@ -22,13 +26,19 @@ _NOTHING = 1e-30
 
 def reach_um(range_um: float, widest_um: float) -> float:
     """Distance of centres at which two discs no longer count."""
-    return _REACH * range_um if range_um > WIDER * widest_um else widest_um + _FAR * range_um
+    return (
+        _REACH * range_um
+        if range_um > WIDER * widest_um
+        else widest_um + _FAR * range_um
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pairs:
-    """log_mean: (radii, radii, gaps) of the mean over the rim of the first by the second, of unit exposure at its own
-    centre, plus the squared gap in ranges; radius from ``least`` in steps, gap from 0 in steps (nearer ones as those
+    """log_mean: (radii, radii, gaps) of the mean over the rim of the first by the
+    second, of unit exposure at its own
+    centre, plus the squared gap in ranges; radius from ``least`` in steps, gap from 0
+    in steps (nearer ones as those
     that touch). Empty where discs are as Gaussians. reach_um: as above.
     """
 
@@ -50,23 +60,46 @@ class Pairs:
         steps = float(radii[1] - radii[0]), float(gaps[1])
         return cls(range_um, least, *steps, reach_um(range_um, 2 * most), log)
 
-    def __call__(self, at: tuple[Array, Array, Array, Array], around: tuple[Array, Array, Array, Array]) -> Array:
-        """(n,) exposure of each rim; x, y, mass and radius of those looked at, and of all near them, themselves too."""
+    def __call__(
+        self,
+        at: tuple[Array, Array, Array, Array],
+        around: tuple[Array, Array, Array, Array],
+    ) -> Array:
+        """(n,) exposure of each rim; x, y, mass and radius of those looked at, and of
+        all near them, themselves too.
+        """
         squares = Squares.of(around[0], around[1], self.reach_um)
         x, y, strength, radius = (v[squares.order] for v in self._strong(around))
         order, key = squares.seen_by(at[0], at[1])
         steps = self.range_um, self.least_um, self.step_um, self.gap_um
         out = np.zeros(len(order))
         near = x, y, strength, radius
-        _sum(order, key, self._strong(at), near, squares.key, squares.columns, self.log_mean, steps, out)
+        _sum(
+            order,
+            key,
+            self._strong(at),
+            near,
+            squares.key,
+            squares.columns,
+            self.log_mean,
+            steps,
+            out,
+        )
         return out
 
-    def _strong(self, discs: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def _strong(
+        self, discs: tuple[Array, Array, Array, Array]
+    ) -> tuple[Array, Array, Array, Array]:
         """x, y, exposure at their own centres, radius; of Gaussians the mass over pi."""
         x, y, mass, radius = discs
         if not self.log_mean.size:
             return x, y, mass / np.pi, radius
-        return x, y, mass / (np.pi * radius**2) * -np.expm1(-((radius / self.range_um) ** 2)), radius
+        return (
+            x,
+            y,
+            mass / (np.pi * radius**2) * -np.expm1(-((radius / self.range_um) ** 2)),
+            radius,
+        )
 
 
 def _log_mean(radii: Array, gaps: Array, range_um: float) -> Array:
@@ -75,24 +108,37 @@ def _log_mean(radii: Array, gaps: Array, range_um: float) -> Array:
     seen, other, gap = np.meshgrid(radii, radii, gaps, indexing="ij")
     angle = np.pi * (np.arange(_RIM) + 0.5) / _RIM
     apart = seen + other + gap
-    square = apart[..., None] ** 2 + seen[..., None] ** 2 - 2 * (apart * seen)[..., None] * np.cos(angle)
-    mean = chndtr(2 * (other[..., None] / range_um) ** 2, 2.0, 2 * square / range_um**2).mean(-1)
+    square = (
+        apart[..., None] ** 2
+        + seen[..., None] ** 2
+        - 2 * (apart * seen)[..., None] * np.cos(angle)
+    )
+    mean = chndtr(
+        2 * (other[..., None] / range_um) ** 2, 2.0, 2 * square / range_um**2
+    ).mean(-1)
     log = np.log(np.maximum(np.nan_to_num(mean), _NOTHING))
-    return np.asarray(log + (gap / range_um) ** 2 - np.log(-np.expm1(-((other / range_um) ** 2))))
+    return np.asarray(
+        log + (gap / range_um) ** 2 - np.log(-np.expm1(-((other / range_um) ** 2)))
+    )
 
 
 @compiled
 def _mean(log_mean: Array, one: float, two: float, gap: float, square: float) -> float:
-    """Trilinear in steps of radius, radius and gap, less the ``square`` of the gap; straight on beyond the table."""
-    i, j = min(max(int(one), 0), log_mean.shape[0] - 2), min(max(int(two), 0), log_mean.shape[1] - 2)
+    """Trilinear in steps of radius, radius and gap, less the ``square`` of the gap;
+    straight on beyond the table.
+    """
+    i, j = (
+        min(max(int(one), 0), log_mean.shape[0] - 2),
+        min(max(int(two), 0), log_mean.shape[1] - 2),
+    )
     k = min(int(gap), log_mean.shape[2] - 2)
     a, b, c = one - i, two - j, gap - k
     low = (1 - a) * ((1 - b) * log_mean[i, j, k] + b * log_mean[i, j + 1, k]) + a * (
         (1 - b) * log_mean[i + 1, j, k] + b * log_mean[i + 1, j + 1, k]
     )
-    high = (1 - a) * ((1 - b) * log_mean[i, j, k + 1] + b * log_mean[i, j + 1, k + 1]) + a * (
-        (1 - b) * log_mean[i + 1, j, k + 1] + b * log_mean[i + 1, j + 1, k + 1]
-    )
+    high = (1 - a) * (
+        (1 - b) * log_mean[i, j, k + 1] + b * log_mean[i, j + 1, k + 1]
+    ) + a * ((1 - b) * log_mean[i + 1, j, k + 1] + b * log_mean[i + 1, j + 1, k + 1])
     return float(np.exp((1 - c) * low + c * high - square))
 
 
@@ -116,7 +162,11 @@ def _sum(
         n = order[m]
         here_x, here_y, own = at_x[n], at_y[n], at_radius[n]
         one = (own - least) / step
-        itself = 1 / (reach * reach + 1.5 * own * own) if wide else _mean(log_mean, one, one, 0.0, 0.0)
+        itself = (
+            1 / (reach * reach + 1.5 * own * own)
+            if wide
+            else _mean(log_mean, one, one, 0.0, 0.0)
+        )
         total = -at_strength[n] * itself  # which is among them
         for r in range(3):
             middle = at_key[m] + (r - 1) * columns
@@ -132,6 +182,8 @@ def _sum(
                 elif away < (own + other + _FAR * reach) * (own + other + _FAR * reach):
                     gap = max(np.sqrt(away) - own - other, 0.0)
                     two, square = (other - least) / step, (gap / reach) * (gap / reach)
-                    total += strength[k] * _mean(log_mean, one, two, gap / gap_step, square)
+                    total += strength[k] * _mean(
+                        log_mean, one, two, gap / gap_step, square
+                    )
                 k += 1
         out[n] = total

@@ -1,11 +1,15 @@
-"""Exposure at the edges of marks, labels and any other polygon, exact for every Gaussian (Owen's T function).
+"""Exposure at the edges of marks, labels and any other polygon, exact for every
+Gaussian (Owen's T function).
 
-The divergence theorem takes the integral of a Gaussian over a polygon to its edges. Seen from a point, with h the
+The divergence theorem takes the integral of a Gaussian over a polygon to its edges.
+Seen from a point, with h the
 distance to the line of an edge and theta the angle from its foot, range a:
 
-    integral = sum over edges of (theta2 - theta1) / (2 pi) - T(h sqrt(2) / a, tan theta2) + T(..., tan theta1)
+    integral = sum over edges of (theta2 - theta1) / (2 pi) - T(h sqrt(2) / a, tan
+    theta2) + T(..., tan theta1)
 
-with the sign of the side on which the point lies; T(h, t) = 1 / (2 pi) int_0^t exp(-h^2 (1 + x^2) / 2) / (1 + x^2) dx
+with the sign of the side on which the point lies; T(h, t) = 1 / (2 pi) int_0^t exp(-h^2
+(1 + x^2) / 2) / (1 + x^2) dx
 (D. B. Owen, Ann. Math. Stat. 27, 1075 (1956)).
 """
 
@@ -26,7 +30,9 @@ _ASIDE_UM = 2 * nm  # for the slope across an edge
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
-    """Points on the outer edges of shapes: (n, 2) places, (n, 2) outward normals, (n,) layer numbers."""
+    """Points on the outer edges of shapes: (n, 2) places, (n, 2) outward normals, (n,)
+    layer numbers.
+    """
 
     at_um: Array
     normal: Array
@@ -34,8 +40,14 @@ class Samples:
 
 
 def samples(polygons: Polygons, range_um: float) -> Samples:
-    """Every few um along the outline of what each layer number draws, two ranges and more away from corners."""
-    places, normals, layers = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0, np.int64)]
+    """Every few um along the outline of what each layer number draws, two ranges and
+    more away from corners.
+    """
+    places, normals, layers = (
+        [np.empty((0, 2))],
+        [np.empty((0, 2))],
+        [np.empty(0, np.int64)],
+    )
     for layer in np.unique(polygons.layer).tolist():
         drawn = zip(polygons.corners, polygons.layer.tolist(), strict=True)
         units = [np.rint(corners / nm) for corners, other in drawn if other == layer]
@@ -50,19 +62,30 @@ def samples(polygons: Polygons, range_um: float) -> Samples:
                 count = max(1, int(free / _STEP_UM))
                 share = (2 * range_um + (np.arange(count) + 0.5) / count * free) / long
                 places.append(a + share[:, None] * (b - a))
-                normals.append(np.tile([(b - a)[1] / long, -(b - a)[0] / long], (count, 1)))
+                normals.append(
+                    np.tile([(b - a)[1] / long, -(b - a)[0] / long], (count, 1))
+                )
                 layers.append(np.full(count, layer))
-    return Samples(np.concatenate(places), np.concatenate(normals), np.concatenate(layers))
+    return Samples(
+        np.concatenate(places), np.concatenate(normals), np.concatenate(layers)
+    )
 
 
 def _turns(contour: Array) -> Array:
     """(n,) which points are corners, not on the way between two others."""
-    before, after = contour - np.roll(contour, 1, axis=0), np.roll(contour, -1, axis=0) - contour
+    before, after = (
+        contour - np.roll(contour, 1, axis=0),
+        np.roll(contour, -1, axis=0) - contour,
+    )
     return np.asarray(before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0])
 
 
-def exposure(at_um: Array, polygons: Polygons, terms: Sequence[tuple[float, float]]) -> Array:
-    """(n,) exposure at points by the polygons with their doses, for (range, weight) of each Gaussian."""
+def exposure(
+    at_um: Array, polygons: Polygons, terms: Sequence[tuple[float, float]]
+) -> Array:
+    """(n,) exposure at points by the polygons with their doses, for (range, weight) of
+    each Gaussian.
+    """
     total = np.zeros(len(at_um))
     if not (len(at_um) and terms):
         return total
@@ -75,11 +98,16 @@ def exposure(at_um: Array, polygons: Polygons, terms: Sequence[tuple[float, floa
     after[first[1:] - 1] = first[:-1]  # the last corner leads back to the first
     end = start[after]
     point = np.repeat(one, count[two])
-    within = np.arange(len(point)) - np.repeat(np.cumsum(count[two]) - count[two], count[two])
+    within = np.arange(len(point)) - np.repeat(
+        np.cumsum(count[two]) - count[two], count[two]
+    )
     edge = np.repeat(first[two], count[two]) + within
     given = np.repeat(polygons.dose[two], count[two])
     for part in np.array_split(np.arange(len(point)), max(1, len(point) // 1_000_000)):
-        p, q = start[edge[part]] - at_um[point[part]], end[edge[part]] - at_um[point[part]]
+        p, q = (
+            start[edge[part]] - at_um[point[part]],
+            end[edge[part]] - at_um[point[part]],
+        )
         value = sum(weight * _edge(p, q, range_um) for range_um, weight in terms)
         total += np.bincount(point[part], given[part] * value, minlength=len(total))
     return total
@@ -87,7 +115,10 @@ def exposure(at_um: Array, polygons: Polygons, terms: Sequence[tuple[float, floa
 
 def slope_aside(found: Samples) -> tuple[Array, Array]:
     """Points just outside and just inside the edges."""
-    return found.at_um + _ASIDE_UM * found.normal, found.at_um - _ASIDE_UM * found.normal
+    return (
+        found.at_um + _ASIDE_UM * found.normal,
+        found.at_um - _ASIDE_UM * found.normal,
+    )
 
 
 def aside_um() -> float:
@@ -96,11 +127,18 @@ def aside_um() -> float:
 
 
 def _near(at_um: Array, polygons: Polygons, reach: float) -> tuple[Array, Array]:
-    """Pairs (point, polygon) that can matter to each other; small polygons through a tree of their middles."""
+    """Pairs (point, polygon) that can matter to each other; small polygons through a
+    tree of their middles.
+    """
     from scipy.spatial import cKDTree
 
     middle = np.array([(c.min(0) + c.max(0)) / 2 for c in polygons.corners])
-    radius = np.array([np.hypot(*(c - m).T).max() for c, m in zip(polygons.corners, middle, strict=True)])
+    radius = np.array(
+        [
+            np.hypot(*(c - m).T).max()
+            for c, m in zip(polygons.corners, middle, strict=True)
+        ]
+    )
     tree, ones, twos = cKDTree(at_um), [], []
     for n, found in enumerate(tree.query_ball_point(middle, radius + reach)):
         ones.append(np.asarray(found, np.int64))
@@ -109,7 +147,9 @@ def _near(at_um: Array, polygons: Polygons, reach: float) -> tuple[Array, Array]
 
 
 def _edge(p: Array, q: Array, range_um: float) -> Array:
-    """Contribution of edges from p to q (n, 2), seen from the origin, counter-clockwise around it positive."""
+    """Contribution of edges from p to q (n, 2), seen from the origin, counter-clockwise
+    around it positive.
+    """
     from scipy.special import owens_t
 
     along = q - p
@@ -118,28 +158,49 @@ def _edge(p: Array, q: Array, range_um: float) -> Array:
     height = np.maximum(np.abs(cross) / long, 1e-15)
     low, high = ((v * along).sum(1) / (long * height) for v in (p, q))
     h = height * np.sqrt(2) / range_um
-    value = (np.arctan(high) - np.arctan(low)) / (2 * np.pi) - owens_t(h, high) + owens_t(h, low)
+    value = (
+        (np.arctan(high) - np.arctan(low)) / (2 * np.pi)
+        - owens_t(h, high)
+        + owens_t(h, low)
+    )
     return np.asarray(np.sign(cross) * value)
 
 
 def spots(polygons: Polygons, step_um: float) -> tuple[Array, Array, Array]:
-    """(x, y, area times dose) of points that stand for the polygons in a Gaussian much wider than ``step_um``."""
+    """(x, y, area times dose) of points that stand for the polygons in a Gaussian much
+    wider than ``step_um``.
+    """
     places: list[Array] = [np.empty((0, 3))]
     for corners, dose in zip(polygons.corners, polygons.dose.tolist(), strict=True):
         after = np.roll(corners, -1, axis=0)
-        mass = dose * float((corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]).sum()) / 2
+        mass = (
+            dose
+            * float((corners[:, 0] * after[:, 1] - after[:, 0] * corners[:, 1]).sum())
+            / 2
+        )
         low, high = corners.min(0), corners.max(0)
         small = bool((high - low).max() <= step_um)
-        inside = corners.mean(0)[None] if small else _inside(corners, after, low, high, step_um)
-        places.append(np.column_stack([inside, np.full(len(inside), mass / len(inside))]))
+        inside = (
+            corners.mean(0)[None]
+            if small
+            else _inside(corners, after, low, high, step_um)
+        )
+        places.append(
+            np.column_stack([inside, np.full(len(inside), mass / len(inside))])
+        )
     found = np.concatenate(places)
     return found[:, 0], found[:, 1], found[:, 2]
 
 
 def _inside(start: Array, end: Array, low: Array, high: Array, step_um: float) -> Array:
-    """(n, 2) points of a raster within a polygon (crossings to the right are odd), on each side at least four."""
+    """(n, 2) points of a raster within a polygon (crossings to the right are odd), on
+    each side at least four.
+    """
     counts = np.maximum(np.ceil((high - low) / step_um).astype(int), 4)
-    x, y = (low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k] for k in (0, 1))
+    x, y = (
+        low[k] + (np.arange(counts[k]) + 0.5) * (high - low)[k] / counts[k]
+        for k in (0, 1)
+    )
     px, py = (v.ravel() for v in np.meshgrid(x, y))
     odd = np.zeros(len(px), bool)
     for (x0, y0), (x1, y1) in zip(start.tolist(), end.tolist(), strict=True):

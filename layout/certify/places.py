@@ -1,4 +1,6 @@
-"""Where the pillars stand, strip by strip from bottom to top: lattices in bands of rows."""
+"""Where the pillars stand, strip by strip from bottom to top: lattices in bands of
+rows.
+"""
 
 import math
 from collections.abc import Sequence
@@ -17,16 +19,22 @@ _LEAST_ROWS = 8
 
 
 def strip_of(places: "OnLattices", y_um: Array) -> Array:
-    """(n,) strips that hold some heights; those beyond the ends belong to the outer ones."""
-    found = np.floor((np.asarray(y_um) - places.box_um[1]) / places.height_um).astype(np.int64)
+    """(n,) strips that hold some heights; those beyond the ends belong to the outer
+    ones.
+    """
+    found = np.floor((np.asarray(y_um) - places.box_um[1]) / places.height_um).astype(
+        np.int64
+    )
     return np.asarray(np.clip(found, 0, places.strips - 1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OnLattices:
-    """Places on lattices of a plan, never all in memory; each pillar in one of the strips 0 to ``strips`` - 1.
+    """Places on lattices of a plan, never all in memory; each pillar in one of the
+    strips 0 to ``strips`` - 1.
 
-    kinds: (classes + 1,) kind of each class number, -1 for those that are passed over. centre_um: (kinds, 2) of the
+    kinds: (classes + 1,) kind of each class number, -1 for those that are passed over.
+    centre_um: (kinds, 2) of the
     shape, from its site. height: of a strip, in database units.
     """
 
@@ -39,22 +47,40 @@ class OnLattices:
 
     @classmethod
     def of(
-        cls, lattices: Sequence[Lattice], kinds: Array, centre_um: Array, *, unit_nm: float, count: int
+        cls,
+        lattices: Sequence[Lattice],
+        kinds: Array,
+        centre_um: Array,
+        *,
+        unit_nm: float,
+        count: int,
     ) -> "OnLattices":
         """With strips of some 130 000 sites."""
         down, columns = max(l.down for l in lattices), max(l.columns for l in lattices)
-        return cls(lattices, kinds, centre_um, unit_nm, count, down * max(_LEAST_ROWS, _SITES // columns))
+        return cls(
+            lattices,
+            kinds,
+            centre_um,
+            unit_nm,
+            count,
+            down * max(_LEAST_ROWS, _SITES // columns),
+        )
 
     @property
     def _ends(self) -> tuple[int, int]:
         """Bottom and top row, database units."""
-        return min(l.y0 - (l.rows - 1) * l.down for l in self.lattices), max(l.y0 for l in self.lattices)
+        return min(l.y0 - (l.rows - 1) * l.down for l in self.lattices), max(
+            l.y0 for l in self.lattices
+        )
 
     @property
     def box_um(self) -> Box:
         """Around all sites."""
         unit, (bottom, top) = self.unit_nm * nm, self._ends
-        left, right = min(l.x0 for l in self.lattices), max(l.x0 + (l.columns - 1) * l.pitch for l in self.lattices)
+        left, right = (
+            min(l.x0 for l in self.lattices),
+            max(l.x0 + (l.columns - 1) * l.pitch for l in self.lattices),
+        )
         return left * unit, bottom * unit, right * unit, top * unit
 
     @property
@@ -83,7 +109,11 @@ class OnLattices:
         if end <= top:
             return np.empty(0), np.empty(0), np.empty(0, np.int32)
         block, unit = np.ascontiguousarray(lattice.source(top, end)), self.unit_nm * nm
-        x, y, kind = np.empty(block.size), np.empty(block.size), np.empty(block.size, np.int32)
+        x, y, kind = (
+            np.empty(block.size),
+            np.empty(block.size),
+            np.empty(block.size, np.int32),
+        )
         at = lattice.x0, lattice.y0 - top * lattice.down, lattice.pitch, lattice.down
         count = _sites(block, self.kinds, self.centre_um, *at, unit, x, y, kind)
         return x[:count], y[:count], kind[:count]

@@ -1,7 +1,10 @@
-"""Exposure of the edges of pillars of any shape by those beside them, through a Gaussian too narrow for pixels.
+"""Exposure of the edges of pillars of any shape by those beside them, through a
+Gaussian too narrow for pixels.
 
-Each shape has an image of what it exposes around itself, and places along its edges. A pillar sees the images of its
-neighbours there. Through a Gaussian wider than the shapes each counts as one more Gaussian, of the same second moment.
+Each shape has an image of what it exposes around itself, and places along its edges. A
+pillar sees the images of its
+neighbours there. Through a Gaussian wider than the shapes each counts as one more
+Gaussian, of the same second moment.
 """
 
 from collections.abc import Sequence
@@ -29,7 +32,8 @@ Pillars = tuple[Array, Array, Array, Array]  # x, y, dose and shape, (n,) each
 class Shapes:
     """Shapes that differ. contours: of each, about its middle. area_um2: (shapes,).
 
-    edge_um: (shapes, places, 2) along the edges. given_um2, seen_um2: (shapes,) mean squared distance from the middle,
+    edge_um: (shapes, places, 2) along the edges. given_um2, seen_um2: (shapes,) mean
+    squared distance from the middle,
     over the area and over the edges. half_um: of the square that holds the widest.
     """
 
@@ -45,12 +49,21 @@ class Shapes:
         """Of contours about their middles."""
         edge = np.array([along(c, _SEEN) for c in contours])
         area, given = np.array([(m[0], m[2]) for m in map(moments, contours)]).T
-        return cls(contours, area, edge, given / area, (edge**2).sum(-1).mean(1), max(map(reach_um, contours)))
+        return cls(
+            contours,
+            area,
+            edge,
+            given / area,
+            (edge**2).sum(-1).mean(1),
+            max(map(reach_um, contours)),
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Beside:
-    """What neighbours give through one Gaussian. images: (shapes, n, n), empty where shapes count as Gaussians."""
+    """What neighbours give through one Gaussian. images: (shapes, n, n), empty where
+    shapes count as Gaussians.
+    """
 
     shapes: Shapes
     range_um: float
@@ -63,13 +76,26 @@ class Beside:
         """Images of all shapes, or none where the Gaussian is wider than they are."""
         if range_um > WIDER * shapes.half_um:
             square = range_um**2 + shapes.given_um2 + shapes.seen_um2
-            return cls(shapes, range_um, np.empty((0, 0, 0), np.float32), 1.0, shapes.area_um2 / np.pi / square)
+            return cls(
+                shapes,
+                range_um,
+                np.empty((0, 0, 0), np.float32),
+                1.0,
+                shapes.area_um2 / np.pi / square,
+            )
         half = shapes.half_um + _RANGES * range_um
         most = int(np.sqrt(_MOST / len(shapes.contours)))
         count = min(int(np.ceil(2 * half * _PIXELS / range_um)), most) | 1
         pixel = 2 * half / (count - 1)
-        images = np.array([_sampled(c, range_um, count, pixel) for c in shapes.contours], np.float32)
-        itself = np.array([_seen(edge, each, pixel) for edge, each in zip(shapes.edge_um, images, strict=True)])
+        images = np.array(
+            [_sampled(c, range_um, count, pixel) for c in shapes.contours], np.float32
+        )
+        itself = np.array(
+            [
+                _seen(edge, each, pixel)
+                for edge, each in zip(shapes.edge_um, images, strict=True)
+            ]
+        )
         return cls(shapes, range_um, images, pixel, itself)
 
     @property
@@ -77,11 +103,18 @@ class Beside:
         """From middle to middle."""
         s = self.shapes
         if not self.images.size:
-            return float(_REACH * np.sqrt(self.range_um**2 + s.given_um2.max() + s.seen_um2.max()))
-        return (len(self.images[0]) // 2) * self.pixel_um + float(np.hypot(*np.moveaxis(s.edge_um, -1, 0)).max())
+            return float(
+                _REACH
+                * np.sqrt(self.range_um**2 + s.given_um2.max() + s.seen_um2.max())
+            )
+        return (len(self.images[0]) // 2) * self.pixel_um + float(
+            np.hypot(*np.moveaxis(s.edge_um, -1, 0)).max()
+        )
 
     def __call__(self, at: Pillars, around: Pillars) -> Array:
-        """(n,) mean exposure along the edges of those looked at by all near them, who hold these too."""
+        """(n,) mean exposure along the edges of those looked at by all near them, who
+        hold these too.
+        """
         squares = Squares.of(around[0], around[1], self.reach_um)
         x, y, dose, shape = (v[squares.order] for v in around)
         order, key = squares.seen_by(at[0], at[1])
@@ -90,7 +123,19 @@ class Beside:
         moments = s.area_um2 / np.pi, s.given_um2, s.seen_um2
         steps = self.range_um**2, self.pixel_um
         near = x, y, dose, shape
-        _sum(order, key, at, near, squares.key, squares.columns, self.images, s.edge_um, moments, steps, out)
+        _sum(
+            order,
+            key,
+            at,
+            near,
+            squares.key,
+            squares.columns,
+            self.images,
+            s.edge_um,
+            moments,
+            steps,
+            out,
+        )
         return np.asarray(out)
 
 
@@ -99,13 +144,23 @@ def _sampled(contours: Contours, range_um: float, count: int, pixel_um: float) -
     from scipy.ndimage import map_coordinates
 
     found = image(contours, range_um)
-    axis = (np.arange(count) - count // 2) * (pixel_um / found.pixel_um) + len(found.value) // 2
-    return np.asarray(map_coordinates(found.value, np.meshgrid(axis, axis, indexing="ij"), order=3, cval=0.0))
+    axis = (np.arange(count) - count // 2) * (pixel_um / found.pixel_um) + len(
+        found.value
+    ) // 2
+    return np.asarray(
+        map_coordinates(
+            found.value, np.meshgrid(axis, axis, indexing="ij"), order=3, cval=0.0
+        )
+    )
 
 
 @compiled
-def _seen(edge: Array, image: Array, pixel: float, x: float = 0.0, y: float = 0.0) -> float:
-    """Mean of an image, its middle at (x, y), over places; straight between pixels, nothing beyond."""
+def _seen(
+    edge: Array, image: Array, pixel: float, x: float = 0.0, y: float = 0.0
+) -> float:
+    """Mean of an image, its middle at (x, y), over places; straight between pixels,
+    nothing beyond.
+    """
     count, total = image.shape[0], 0.0
     for n in range(edge.shape[0]):
         u = (edge[n, 0] - x) / pixel + count // 2
@@ -149,7 +204,9 @@ def _sum(
                 dx, dy, other = x[k] - at_x[n], y[k] - at_y[n], shape[k]
                 if wide:
                     s = square + given[other] + seen[mine]
-                    total += dose[k] * mass[other] * np.exp(-(dx * dx + dy * dy) / s) / s
+                    total += (
+                        dose[k] * mass[other] * np.exp(-(dx * dx + dy * dy) / s) / s
+                    )
                 else:
                     total += dose[k] * _seen(edges[mine], images[other], pixel, dx, dy)
                 k += 1

@@ -1,4 +1,6 @@
-"""What a certificate says of millions of pillars: extremes, a map and a histogram, gathered band by band."""
+"""What a certificate says of millions of pillars: extremes, a map and a histogram,
+gathered band by band.
+"""
 
 from dataclasses import dataclass
 
@@ -9,16 +11,23 @@ from layout.process import LayerNumber, compiled
 from metalens.ground.arrays import Array
 
 MOST_ERROR, MOST_NM = 0.01, 1.0  # what a sound exposure keeps
-EDGE_SHARE, EDGE_ERROR = 0.99, 0.02  # of marks: so many points keep it, and all of them this; doses step along an edge
+EDGE_SHARE, EDGE_ERROR = (
+    0.99,
+    0.02,
+)  # of marks: so many points keep it, and all of them this; doses step along an edge
 _SIDE = 160  # points of the map, each way
-_WIDEST_NM, _BIN_NM = 8.0, 1 / 16  # of the histogram; what is beyond counts in its last bins
+_WIDEST_NM, _BIN_NM = (
+    8.0,
+    1 / 16,
+)  # of the histogram; what is beyond counts in its last bins
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Edges:
     """Edges of marks, labels and other shapes that are no pillars.
 
-    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,) how far outside the drawn edge it
+    x_um, y_um: (n,) samples. exposure: (n,) relative to dose-to-size. shift_nm: (n,)
+    how far outside the drawn edge it
     comes out in the resist. layer: (n,) layer numbers.
     """
 
@@ -46,13 +55,25 @@ class Tally:
     def empty(cls) -> "Tally":
         """Of nothing."""
         bins = np.zeros(2 * round(_WIDEST_NM / _BIN_NM), np.int64)
-        return cls(np.array([0.0, 0.0, np.inf, -np.inf]), np.zeros((_SIDE, _SIDE)), np.zeros((_SIDE, _SIDE)), bins)
+        return cls(
+            np.array([0.0, 0.0, np.inf, -np.inf]),
+            np.zeros((_SIDE, _SIDE)),
+            np.zeros((_SIDE, _SIDE)),
+            bins,
+        )
 
     def take(
-        self, place: tuple[Array, Array], judged: Array, values: tuple[Array, Array, Array, Array], box_um: Box
+        self,
+        place: tuple[Array, Array],
+        judged: Array,
+        values: tuple[Array, Array, Array, Array],
+        box_um: Box,
     ) -> None:
         """Add pillars at x, y; values: (n,) exposure, drawn, resist and made diameter."""
-        scale = _SIDE / max(box_um[2] - box_um[0], 1e-9), _SIDE / max(box_um[3] - box_um[1], 1e-9)
+        scale = (
+            _SIDE / max(box_um[2] - box_um[0], 1e-9),
+            _SIDE / max(box_um[3] - box_um[1], 1e-9),
+        )
         sums = (self.ends, self.total, self.count, self.bins)
         _tally(*place, judged, *values, box_um[0], box_um[1], *scale, _BIN_NM, *sums)
 
@@ -61,8 +82,10 @@ class Tally:
 class Survey:
     """The verdict over everything that is written.
 
-    pillars: the dose test too. tally: sums over those that are judged. box_um: left, bottom, right, top of
-    the map. edges: of the other shapes. lean_nm: foot less half-height diameter. undosed: layers with shapes and no
+    pillars: the dose test too. tally: sums over those that are judged. box_um: left,
+    bottom, right, top of
+    the map. edges: of the other shapes. lean_nm: foot less half-height diameter.
+    undosed: layers with shapes and no
     dose.
     """
 
@@ -76,22 +99,37 @@ class Survey:
     @property
     def worst_exposure(self) -> float:
         """Largest |exposure - 1| of the judged pillars and of all edges."""
-        return float(max(self.tally.ends[0], np.abs(self.edges.exposure - 1).max(initial=0.0)))
+        return float(
+            max(self.tally.ends[0], np.abs(self.edges.exposure - 1).max(initial=0.0))
+        )
 
     @property
     def worst_nm(self) -> float:
-        """Largest |width in the resist - drawn|: diameters, and twice the shift of an edge."""
-        return float(max(self.tally.ends[1], 2 * np.abs(self.edges.shift_nm).max(initial=0.0)))
+        """Largest |width in the resist - drawn|: diameters, and twice the shift of an
+        edge.
+        """
+        return float(
+            max(self.tally.ends[1], 2 * np.abs(self.edges.shift_nm).max(initial=0.0))
+        )
 
     @property
     def ok(self) -> bool:
         """Whether every shape has a dose and keeps 1 % of dose-to-size and 1 nm.
 
-        Along the edges of marks and labels 99 of 100 points keep the 1 %, and all of them 2 %.
+        Along the edges of marks and labels 99 of 100 points keep the 1 %, and all of
+        them 2 %.
         """
         off = np.abs(self.edges.exposure - 1)
-        edges = not len(off) or (float((off <= MOST_ERROR).mean()) >= EDGE_SHARE and float(off.max()) <= EDGE_ERROR)
-        return not self.undosed and float(self.tally.ends[0]) <= MOST_ERROR and edges and self.worst_nm <= MOST_NM
+        edges = not len(off) or (
+            float((off <= MOST_ERROR).mean()) >= EDGE_SHARE
+            and float(off.max()) <= EDGE_ERROR
+        )
+        return (
+            not self.undosed
+            and float(self.tally.ends[0]) <= MOST_ERROR
+            and edges
+            and self.worst_nm <= MOST_NM
+        )
 
     @property
     def thinnest_top_nm(self) -> float:
@@ -105,16 +143,24 @@ class Survey:
 
     @property
     def map_nm(self) -> Array:
-        """(y, x) mean of resist less drawn diameter, the first row lowest; NaN where no pillar is judged."""
+        """(y, x) mean of resist less drawn diameter, the first row lowest; NaN where no
+        pillar is judged.
+        """
         t = self.tally
-        return np.divide(t.total, t.count, out=np.full_like(t.total, np.nan), where=t.count > 0)
+        return np.divide(
+            t.total, t.count, out=np.full_like(t.total, np.nan), where=t.count > 0
+        )
 
     @property
     def histogram(self) -> tuple[Array, Array]:
-        """(edges / nm, pillars) of resist less drawn diameter, from the first used bin to the last."""
+        """(edges / nm, pillars) of resist less drawn diameter, from the first used bin
+        to the last.
+        """
         held = np.flatnonzero(self.tally.bins)
         first, end = (int(held[0]), int(held[-1]) + 1) if len(held) else (0, 1)
-        return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[first:end]
+        return np.arange(first, end + 1) * _BIN_NM - _WIDEST_NM, self.tally.bins[
+            first:end
+        ]
 
 
 @compiled

@@ -1,4 +1,6 @@
-"""``metalens layout ARRANGEMENT.toml``: every lens made and checked by itself, then all put together in one mask."""
+"""``metalens layout ARRANGEMENT.toml``: every lens made and checked by itself, then all
+put together in one mask.
+"""
 
 import csv
 import dataclasses
@@ -27,15 +29,27 @@ _LISTED = 12  # gaps that are told one by one
 
 
 def run(options: Options) -> int:
-    """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does not read back as planned."""
+    """Make the mask; exit 1 where a rule is broken, a dose is missing or a file does
+    not read back as planned.
+    """
     record = config.load(options.lens, Arrangement)
     named = [part.file for part in record.lens] + [part.file for part in record.cell]
     named += [] if record.into is None else [record.into.file]
-    process = processes.Process() if options.process is None else processes.load(options.process)
+    process = (
+        processes.Process()
+        if options.process is None
+        else processes.load(options.process)
+    )
     if not options.dose:
-        process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, correct=False))
+        process = dataclasses.replace(
+            process, exposure=dataclasses.replace(process.exposure, correct=False)
+        )
     inputs = [options.lens.parent / file for file in named]
-    with options.claim_folder(options.output, inputs=inputs) as draft, options.shared(), noticed(options.console.say):
+    with (
+        options.claim_folder(options.output, inputs=inputs) as draft,
+        options.shared(),
+        noticed(options.console.say),
+    ):
         work = Work(options, record, process, draft.path, Stages(options.console.say))
         made = _whole(work)
         _write(work, made)
@@ -45,7 +59,9 @@ def run(options: Options) -> int:
 
 
 def _refuse_negative(work: Work) -> None:
-    """Raises: ProcessError: gaps are drawn, and something stands on the die that the frame of a lens does not know."""
+    """Raises: ProcessError: gaps are drawn, and something stands on the die that the
+    frame of a lens does not know.
+    """
     record, size = work.record, work.record.wafer
     alone = all(record.furnished(part) for part in record.lens) and not record.cell
     alone &= record.die is None and record.into is None and not (size and size.marks)
@@ -62,16 +78,29 @@ def _whole(work: Work) -> Assembly:
     _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
-    placed = [joined.Placing(standing.lens_part(work, part), part.at) for part in record.lens]
-    placed += [joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell]
+    placed = [
+        joined.Placing(standing.lens_part(work, part), part.at) for part in record.lens
+    ]
+    placed += [
+        joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell
+    ]
     if record.die is not None:
-        placed.append(joined.Placing(standing.surroundings(work, record.die, placed), (At(),)))
-    into = None if record.into is None else standing.file_part(work, "INTO", record.into)
+        placed.append(
+            joined.Placing(standing.surroundings(work, record.die, placed), (At(),))
+        )
+    into = (
+        None if record.into is None else standing.file_part(work, "INTO", record.into)
+    )
     every = placed if into is None else [*placed, joined.Placing(into, (At(),))]
     with work.stages("room between parts"):
         work.placed, work.near = every, apart.check(every, work.process)
-    told = [f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}" for v in work.near]
-    work.failures += told[:_LISTED] + ([f"{len(told) - _LISTED} more"] if len(told) > _LISTED else [])
+    told = [
+        f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
+        for v in work.near
+    ]
+    work.failures += told[:_LISTED] + (
+        [f"{len(told) - _LISTED} more"] if len(told) > _LISTED else []
+    )
     layers = work.process.layers
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
@@ -79,7 +108,9 @@ def _whole(work: Work) -> Assembly:
     return one if record.wafer is None else _stepped(work, record.wafer, one, placed)
 
 
-def _stepped(work: Work, size: Wafer, one: Assembly, placed: list[joined.Placing]) -> Assembly:
+def _stepped(
+    work: Work, size: Wafer, one: Assembly, placed: list[joined.Placing]
+) -> Assembly:
     """The wafer: as many whole dies as it holds, and its marks."""
     box = apart.extent(placed) / joined.PER_UM
     scattered = apart.reach_um(work.process)
@@ -88,9 +119,15 @@ def _stepped(work: Work, size: Wafer, one: Assembly, placed: list[joined.Placing
     for axis, pitch in enumerate(size.pitch_um):
         between = pitch - float(inner[2 + axis] - inner[axis])
         if between < need:
-            work.failures.append(f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, need {need:.4g}")
+            work.failures.append(
+                f"wafer.pitch_um: dies are {between:.3f} um apart along {'xy'[axis]}, need {need:.4g}"
+            )
     left, bottom, right, top = box.tolist()
-    work.dies = wafer.dies(size, (left, bottom, right, top), around_marks_um=max(scattered, joined.MARGIN_UM))
+    work.dies = wafer.dies(
+        size,
+        (left, bottom, right, top),
+        around_marks_um=max(scattered, joined.MARGIN_UM),
+    )
     steps = wafer.stepped(one.name, work.dies, units_per_um=joined.PER_UM)
     marks = None
     if size.marks:
@@ -109,7 +146,9 @@ def _write(work: Work, made: Assembly) -> None:
         _one(work, made, "mask.gds", gdsii_assemble.write)
 
 
-def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path], None]) -> None:
+def _one(
+    work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path], None]
+) -> None:
     path = work.folder / name
     with work.stages(f"write {name}"):
         write(made, path)
@@ -123,20 +162,29 @@ def _one(work: Work, made: Assembly, name: str, write: Callable[[Assembly, Path]
 def _accompany(work: Work, made: Assembly) -> None:
     """Dose table, list of dies, job sheet, values, report."""
     doses.write(made, work.process, work.folder / "doses.csv")
-    most, held = work.process.exposure.maximum_classes, len({round(dose, 6) for dose in made.doses.values()})
+    most, held = (
+        work.process.exposure.maximum_classes,
+        len({round(dose, 6) for dose in made.doses.values()}),
+    )
     if held > most:
-        work.failures.append(f"{held} doses on the mask, exposure.maximum_classes = {most}")
+        work.failures.append(
+            f"{held} doses on the mask, exposure.maximum_classes = {most}"
+        )
     if work.dies is not None:
         text = io.StringIO()
         out = csv.writer(text, lineterminator="\n")
         out.writerow(("die", "column", "row", "x_um", "y_um"))
-        for n, (index, place) in enumerate(zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True), 1):
+        for n, (index, place) in enumerate(
+            zip(work.dies.index.tolist(), work.dies.place_um.tolist(), strict=True), 1
+        ):
             out.writerow([n, *index, *(f"{v:.4f}" for v in place)])
         store.write_text(work.folder / "dies.csv", text.getvalue())
     store.write_text(work.folder / "process.toml", config.dumps(work.process))
     store.write_text(work.folder / "arrangement.toml", config.dumps(work.record))
     store.write_text(work.folder / "job.txt", "\n".join(_sheet(work, made)) + "\n")
-    store.write_text(work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n")
+    store.write_text(
+        work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n"
+    )
     arranged_page.write(work, made)
 
 
@@ -155,7 +203,9 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
 
 
 def _sheet(work: Work, made: Assembly) -> list[str]:
-    """The job sheet: what stands where, and its doses; what is said of each lens lies in its folder."""
+    """The job sheet: what stands where, and its doses; what is said of each lens lies
+    in its folder.
+    """
     process = work.process
     lines = [
         f"JOB SHEET  mask {made.name}  process {process.name!r}  tone {process.tone}",
@@ -163,7 +213,10 @@ def _sheet(work: Work, made: Assembly) -> list[str]:
         *work.notes,
         "",
         "Files:",
-        *(f"  {name:<16} {size:>14,} bytes" for name, size in sorted(work.written.items())),
+        *(
+            f"  {name:<16} {size:>14,} bytes"
+            for name, size in sorted(work.written.items())
+        ),
         "",
         "On the die (x, y in um, turn in degrees counter-clockwise after the mirror; +y up):",
     ]
@@ -171,29 +224,44 @@ def _sheet(work: Work, made: Assembly) -> list[str]:
     every += [(part.name, part.file, part.at) for part in work.record.cell]
     for name, file, places in every:
         for at in places:
-            many = f", {at.columns} x {at.rows} copies" if at.columns * at.rows > 1 else ""
+            many = (
+                f", {at.columns} x {at.rows} copies" if at.columns * at.rows > 1 else ""
+            )
             turned = f", turned by {at.turn_deg:g}" if at.turn_deg else ""
             mirrored = ", mirrored" if at.mirrored else ""
-            lines.append(f"  {name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {file}")
+            lines.append(
+                f"  {name:<12} ({at.x_um:.3f}, {at.y_um:.3f}){many}{turned}{mirrored}; {file}"
+            )
     if work.dies is not None and work.record.wafer is not None:
         size = work.record.wafer
         lines += [
             "",
             f"Wafer of {size.diameter_mm:g} mm: {len(work.dies.index)} whole dies, {size.edge_exclusion_mm:g} mm from "
             "its edge; dies.csv",
-            *(f"  alignment mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm" for mark in size.marks),
+            *(
+                f"  alignment mark at ({mark.x_mm:g}, {mark.y_mm:g}) mm"
+                for mark in size.marks
+            ),
         ]
-    lines += ["", "Doses (layer/datatype, relative, uC/cm2, name); the same in doses.csv:"]
+    lines += [
+        "",
+        "Doses (layer/datatype, relative, uC/cm2, name); the same in doses.csv:",
+    ]
     for layer, dose in sorted(made.doses.items()):
         absolute = dose * process.exposure.base_uC_cm2
-        lines.append(f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f}  {made.layer_names.get(layer, '')}")
+        lines.append(
+            f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f}  {made.layer_names.get(layer, '')}"
+        )
     return lines
 
 
 def _text(work: Work, made: Assembly) -> str:
     target = work.options.output
     lines = [*([] if work.failures else [work.verdict]), *work.notes]
-    lines += [f"  {target / name}: {size / 1e6:.3g} MB, read back" for name, size in work.written.items()]
+    lines += [
+        f"  {target / name}: {size / 1e6:.3g} MB, read back"
+        for name, size in work.written.items()
+    ]
     dies = "" if work.dies is None else f"{len(work.dies.index):,} dies, "
     lines.append(
         f"  {dies}{len(made.cells):,} cells; {target / 'report.html'}; {sum(work.stages.seconds.values()):.1f} s"

@@ -1,4 +1,6 @@
-"""report.html of an arrangement: what stands where on the die, its doses, counts and checks."""
+"""report.html of an arrangement: what stands where on the die, its doses, counts and
+checks.
+"""
 
 from typing import Any
 
@@ -31,7 +33,13 @@ def write(work: Work, made: Assembly) -> None:
         shot = _wafer(work, box)
         (work.folder / "wafer.png").write_bytes(shot)
         text = f"{len(work.dies.index):,} whole dies; dies.csv lists them."
-        sections.append(Section("Wafer", text, [Figure(shot, "Dies within the edge exclusion, and marks.", wide=True)]))
+        sections.append(
+            Section(
+                "Wafer",
+                text,
+                [Figure(shot, "Dies within the edge exclusion, and marks.", wide=True)],
+            )
+        )
     sections += [_checks(work), _doses(work, made), _files(work)]
     figures = [
         KeyFigure("parts", str(len(work.placed))),
@@ -49,13 +57,20 @@ def write(work: Work, made: Assembly) -> None:
 
 
 def _lead(work: Work) -> str:
-    pillars = sum(values["pillars"] * _number(work, name) for name, values in work.lenses.items())
+    pillars = sum(
+        values["pillars"] * _number(work, name) for name, values in work.lenses.items()
+    )
     return f"{len(work.lenses)} lenses with {pillars:,} pillars on a die; process “{work.process.name}”."
 
 
 def _number(work: Work, name: str) -> int:
     """Copies of a part on the die."""
-    return sum(c.count for one in work.placed if one.part.name == name for c in one.copies(one.part.top))
+    return sum(
+        c.count
+        for one in work.placed
+        if one.part.name == name
+        for c in one.copies(one.part.top)
+    )
 
 
 def _text(work: Work) -> str:
@@ -68,10 +83,19 @@ def _die(work: Work, box: Array) -> bytes:
     images = seen.covered(work.placed, work.process, view)
     count = max(1, len(images))
     figure, axes = report.canvas(1, count, size=(6.4 * count, 5.6), squeeze=False)
-    x, y = ((low, low + n * view.side) for low, n in ((view.left, view.columns), (view.bottom, view.rows)))
+    x, y = (
+        (low, low + n * view.side)
+        for low, n in ((view.left, view.columns), (view.bottom, view.rows))
+    )
     for ax, (kind, image) in zip(axes[0], sorted(images.items()), strict=False):
         extent = [v / joined.PER_UM for v in (*x, *y)]
-        shown = ax.imshow(100 * image, origin="lower", extent=extent, cmap="viridis", interpolation="nearest")
+        shown = ax.imshow(
+            100 * image,
+            origin="lower",
+            extent=extent,
+            cmap="viridis",
+            interpolation="nearest",
+        )
         ax.grid(False)
         ax.set(xlabel="x / µm", ylabel="y / µm", title=kind)
         figure.colorbar(shown, ax=ax, label="area covered / %", shrink=0.8)
@@ -83,7 +107,14 @@ def _named(ax: Any, work: Work) -> None:
     """Names of the parts where they stand, and crosses where they are too near."""
     for one in work.placed:
         for at in one.at[:_LISTED]:
-            ax.annotate(one.part.name, (at.x_um, at.y_um), color="white", fontsize=7, ha="center", va="center")
+            ax.annotate(
+                one.part.name,
+                (at.x_um, at.y_um),
+                color="white",
+                fontsize=7,
+                ha="center",
+                va="center",
+            )
     if work.near:
         x, y = np.array([v.centre for v in work.near]).T / joined.PER_UM
         ax.plot(x, y, "x", color="red", ms=6, mew=1.5)
@@ -99,7 +130,10 @@ def _wafer(work: Work, box: Array) -> bytes:
     corner = rectilinear.corners(box / joined.PER_UM / 1e3)
     ax.add_collection(
         PolyCollection(
-            list(dies.place_um[:, None] / 1e3 + corner), facecolors="#1f6feb55", edgecolors="#355070", linewidths=0.4
+            list(dies.place_um[:, None] / 1e3 + corner),
+            facecolors="#1f6feb55",
+            edgecolors="#355070",
+            linewidths=0.4,
         )
     )
     turn, radius = np.linspace(0, 2 * np.pi, 400), size.diameter_mm / 2
@@ -121,10 +155,22 @@ def _places(work: Work) -> Table:
             turned = f"{at.turn_deg:g}{' mirrored' if at.mirrored else ''}"
             size = f"{right - left:.3f} x {top - bottom:.3f}"
             rows.append(
-                [one.part.name, files.get(one.part.name, "own"), at.x_um, at.y_um, turned, at.columns * at.rows, size]
+                [
+                    one.part.name,
+                    files.get(one.part.name, "own"),
+                    at.x_um,
+                    at.y_um,
+                    turned,
+                    at.columns * at.rows,
+                    size,
+                ]
             )
     head = ("part", "file", "x / µm", "y / µm", "turn / degrees", "copies", "size / µm")
-    most = f"The first {_LISTED} of {len(rows)} places." if len(rows) > _LISTED else "Where each part stands."
+    most = (
+        f"The first {_LISTED} of {len(rows)} places."
+        if len(rows) > _LISTED
+        else "Where each part stands."
+    )
     return Table(head, rows[:_LISTED], most, digits=8)
 
 
@@ -133,7 +179,12 @@ def _checks(work: Work) -> Section:
     rows = [_lens_row(name, values) for name, values in work.lenses.items()]
     for name, found in work.rules.items():
         broken = sum(found.counts.values())
-        sizes = [f"{found.pillars:,}", told(found.minimum_gap_nm), told(found.minimum_feature_nm), broken]
+        sizes = [
+            f"{found.pillars:,}",
+            told(found.minimum_gap_nm),
+            told(found.minimum_feature_nm),
+            broken,
+        ]
         rows.append([name, *sizes, "", "", "FAILS" if broken else "passes"])
     head = (
         "part",
@@ -145,22 +196,44 @@ def _checks(work: Work) -> Section:
         "read back",
         "verdict",
     )
-    items: list[Figure | Table] = [Table(head, rows, "Each lens has a report of its own, in the folder of its name.")]
+    items: list[Figure | Table] = [
+        Table(
+            head, rows, "Each lens has a report of its own, in the folder of its name."
+        )
+    ]
     if work.near:
         near = [[v.text, v.value / 1e3, v.limit / 1e3] for v in work.near[:_LISTED]]
-        items.append(Table(("what", "apart / µm", "needed / µm"), near, "Parts that stand too near each other."))
-    wrong = "\n\n".join(work.failures) or "Every part keeps its rules, and all stand far enough from each other."
+        items.append(
+            Table(
+                ("what", "apart / µm", "needed / µm"),
+                near,
+                "Parts that stand too near each other.",
+            )
+        )
+    wrong = (
+        "\n\n".join(work.failures)
+        or "Every part keeps its rules, and all stand far enough from each other."
+    )
     return Section("Checks", wrong, items)
 
 
 def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     """Of layout.json of a lens."""
     exposed = [
-        f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm" for e in values["exposure"].values()
+        f"{100 * e['worst_relative']:.2f} %, {e['worst_diameter_nm']:.2f} nm"
+        for e in values["exposure"].values()
     ]
     same = "DIFFERENT" if any(values["differences"].values()) else "as planned"
-    sizes = [f"{values['pillars']:,}", told(values["minimum_gap_nm"]), told(values["minimum_feature_nm"])]
-    found = [sum(values["violations"].values()), exposed[0] if exposed else "not certified", same]
+    sizes = [
+        f"{values['pillars']:,}",
+        told(values["minimum_gap_nm"]),
+        told(values["minimum_feature_nm"]),
+    ]
+    found = [
+        sum(values["violations"].values()),
+        exposed[0] if exposed else "not certified",
+        same,
+    ]
     return [name, *sizes, *found, "passes" if values["ok"] else "FAILS"]
 
 
@@ -171,12 +244,24 @@ def _doses(work: Work, made: Assembly) -> Section:
         for layer, dose in sorted(made.doses.items())
     ]
     head = ("layer", "datatype", "relative dose", "µC/cm²", "name")
-    return Section("Dose", "One dose for each layer and datatype, as in doses.csv.", [Table(head, rows)])
+    return Section(
+        "Dose",
+        "One dose for each layer and datatype, as in doses.csv.",
+        [Table(head, rows)],
+    )
 
 
 def _files(work: Work) -> Section:
     written = work.written.items()
-    rows = [[n, f"{s / 1e6:.3f}", "DIFFERENT" if n in work.unlike else "as planned"] for n, s in written]
+    rows = [
+        [n, f"{s / 1e6:.3f}", "DIFFERENT" if n in work.unlike else "as planned"]
+        for n, s in written
+    ]
     times = [[stage, seconds] for stage, seconds in work.stages.seconds.items()]
-    items = [Table(("file", "MB", "read back"), rows), Table(("stage", "seconds"), times, digits=3)]
-    return Section("Files", "Each file was read back: every cell, shape and copy.", items)
+    items = [
+        Table(("file", "MB", "read back"), rows),
+        Table(("stage", "seconds"), times, digits=3),
+    ]
+    return Section(
+        "Files", "Each file was read back: every cell, shape and copy.", items
+    )

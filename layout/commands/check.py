@@ -1,4 +1,6 @@
-"""Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid; violations as markers for KLayout."""
+"""Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid;
+violations as markers for KLayout.
+"""
 
 import contextlib
 import math
@@ -28,11 +30,15 @@ class Options(Common):
         mask: GDSII or OASIS file, told apart by its first bytes.
         process: PROCESS.toml with the rules; left out: the defaults.
         output: marker database to write (.lyrdb for KLayout); left out: none.
-        ignore: layer numbers that are not drawn in the resist, besides outline and write fields of the process.
-        most_shapes: shapes that may be taken apart, some 25 bytes of memory for each copy of a cell and 150 for each
-            shape that is drawn by itself; a large cell that is placed again and again counts once. Left out: 4
+        ignore: layer numbers that are not drawn in the resist, besides outline and
+            write fields of the process.
+        most_shapes: shapes that may be taken apart, some 25 bytes of memory for each
+            copy of a cell and 150 for each
+            shape that is drawn by itself; a large cell that is placed again and again
+            counts once. Left out: 4
             million, and 20 more for each byte of the file.
-        strict: also what readers let pass and a mask shop might not: names of cells, one top cell, doubled vertices,
+        strict: also what readers let pass and a mask shop might not: names of cells,
+            one top cell, doubled vertices,
             strict tables and the checksum of OASIS.
     """
 
@@ -47,35 +53,64 @@ class Options(Common):
 def run(options: Options) -> int:
     """Check the mask; exit 1 where a rule is broken."""
     if min(options.ignore, default=0) < 0:
-        raise MaskFileError(f"--ignore {min(options.ignore)}: need numbers of layers, 0 or more")
-    process = processes.Process() if options.process is None else processes.load(options.process)
+        raise MaskFileError(
+            f"--ignore {min(options.ignore)}: need numbers of layers, 0 or more"
+        )
+    process = (
+        processes.Process()
+        if options.process is None
+        else processes.load(options.process)
+    )
     if not options.mask.is_file():
-        raise MaskFileError(f"{options.mask}: {reading.absent(options.mask)}; need a GDSII or OASIS mask")
-    output = options.claim(options.output) if options.output is not None else contextlib.nullcontext()
+        raise MaskFileError(
+            f"{options.mask}: {reading.absent(options.mask)}; need a GDSII or OASIS mask"
+        )
+    output = (
+        options.claim(options.output)
+        if options.output is not None
+        else contextlib.nullcontext()
+    )
     with output as draft:
-        most = foreign.most_of(options.mask) if options.most_shapes is None else options.most_shapes
+        most = (
+            foreign.most_of(options.mask)
+            if options.most_shapes is None
+            else options.most_shapes
+        )
         content = read(options.mask, most)
         skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
         form = validate(options.mask, content) if options.strict else []
         negative, tops = _negative(content, process), content.tops
-        found = foreign.check(content, process.rules, skip=skip, negative=negative, most=most, last=True)
+        found = foreign.check(
+            content, process.rules, skip=skip, negative=negative, most=most, last=True
+        )
         if draft is not None:
-            markers.write_lyrdb(markers.Top(tops[0], content.unit_nm), found, draft.path)
-    values = _values(found) | ({"form": [finding.text for finding in form]} if options.strict else {})
+            markers.write_lyrdb(
+                markers.Top(tops[0], content.unit_nm), found, draft.path
+            )
+    values = _values(found) | (
+        {"form": [finding.text for finding in form]} if options.strict else {}
+    )
     failures = [f"design rules broken: {found.broken}"] if found.broken else []
     failures += [f"form: {finding.text}" for finding in form]
     return options.console.judged(values, _text(options.mask, found), failures)
 
 
 def _negative(content: MaskContent, process: processes.Process) -> set[int]:
-    """Layer numbers whose clear areas stay: with tone ``negative`` all but the openings of the aperture."""
+    """Layer numbers whose clear areas stay: with tone ``negative`` all but the openings
+    of the aperture.
+    """
     if process.tone == "positive":
         return set()
-    return {number for number, _ in hierarchy.shapes(content)} - {process.layers.aperture[0]}
+    return {number for number, _ in hierarchy.shapes(content)} - {
+        process.layers.aperture[0]
+    }
 
 
-def read(path: Path, most: int | None = None, *, keep: int | None = None) -> MaskContent:
-    """A mask of either format; more placements than ``most`` (by default what its size allows) are not taken apart.
+def read(
+    path: Path, most: int | None = None, *, keep: int | None = None
+) -> MaskContent:
+    """A mask of either format; more placements than ``most`` (by default what its size
+    allows) are not taken apart.
 
     keep: most placements of a cell that are kept; of more only their sums. None: all.
 
@@ -94,7 +129,11 @@ def _values(found: DrcReport) -> dict[str, Any]:
     return {
         "ok": found.ok,
         "shapes": found.pillars,
-        **{name: size for name, size in found.sizes.items() if name != "minimum_foot_gap_nm"},
+        **{
+            name: size
+            for name, size in found.sizes.items()
+            if name != "minimum_foot_gap_nm"
+        },
         "violations": found.counts,
     }
 
@@ -102,7 +141,11 @@ def _values(found: DrcReport) -> dict[str, Any]:
 def _gap(found: DrcReport) -> str:
     """Only gaps that break the rule are all looked at."""
     least = found.minimum_gap_nm
-    return f"smallest gap {told(least)}" if math.isfinite(least) else f"no gap below {found.limits['gap']:g} nm"
+    return (
+        f"smallest gap {told(least)}"
+        if math.isfinite(least)
+        else f"no gap below {found.limits['gap']:g} nm"
+    )
 
 
 def _text(path: Path, found: DrcReport) -> str:

@@ -18,7 +18,9 @@ from metalens.commands import Distributed, Output
 from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
 
-MOST_ANSWERS_ERROR = 0.5  # relative error of how pillars answer, above which a study of them is none
+MOST_ANSWERS_ERROR = (
+    0.5  # relative error of how pillars answer, above which a study of them is none
+)
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Options(Distributed):
     """Options of ``metalens layout``.
 
     Attributes:
-        lens: the lens file, or an ARRANGEMENT.toml of lenses, cells of other files, and a wafer.
+        lens: the lens file, or an ARRANGEMENT.toml of lenses, cells of other files, and
+            a wafer.
         process: PROCESS.toml; left out: 100 kV electron-beam defaults.
         output: folder for the mask and its report.
         oasis: write OASIS (with --gds the default where neither is asked for).
@@ -39,7 +42,8 @@ class Options(Distributed):
         window: of DXF and STL.
         name: of the top cell.
         dose: proximity correction, where the process asks for it.
-        study: add stitching, tolerance (Monte Carlo) and the tolerant choice to the report.
+        study: add stitching, tolerance (Monte Carlo) and the tolerant choice to the
+            report.
     """
 
     lens: tyro.conf.Positional[Path]
@@ -61,10 +65,13 @@ class Options(Distributed):
         """Where the work of --study is done.
 
         Raises:
-            ConfigError, WorkerError: as of other verbs; workers without --study, which is all that they share.
+            ConfigError, WorkerError: as of other verbs; workers without --study, which
+                is all that they share.
         """
         if self.spread and not self.study:
-            raise ConfigError("--workers and --scheduler share out the work of --study: ask for it too, or leave them")
+            raise ConfigError(
+                "--workers and --scheduler share out the work of --study: ask for it too, or leave them"
+            )
         return super().shared()
 
     @property
@@ -82,9 +89,12 @@ class Options(Distributed):
 class Job:
     """What a run of the command has made so far.
 
-    stages: what the time went to. written: {file name: bytes}. compared: {file name: outcome of reading it back}.
-    certified: {file name: what the file and the dose table make, by the simulator}. made_rows: the lens that comes out.
-    answers_error: of --study, by how much the solver may miss how pillars answer to the process, relative.
+    stages: what the time went to. written: {file name: bytes}. compared: {file name:
+    outcome of reading it back}.
+    certified: {file name: what the file and the dose table make, by the simulator}.
+    made_rows: the lens that comes out.
+    answers_error: of --study, by how much the solver may miss how pillars answer to the
+    process, relative.
     undosed: {file name: layers with shapes that the dose table lacks}.
     """
 
@@ -110,40 +120,63 @@ class Job:
 
     @property
     def failures(self) -> list[str]:
-        """What is wrong with the mask, in words, worst first; empty where it may go to the writer."""
+        """What is wrong with the mask, in words, worst first; empty where it may go to
+        the writer.
+        """
         found = [
             f"{name}: no dose for layer {', '.join(f'{a}/{b}' for a, b in layers[:8])}"
             for name, layers in self.undosed.items()
             if layers
         ]
-        found += [f"{name} does not read back as planned" for name, outcome in self.compared.items() if not outcome.ok]
+        found += [
+            f"{name} does not read back as planned"
+            for name, outcome in self.compared.items()
+            if not outcome.ok
+        ]
         if self.process.exposure.corrected and self.options.dose:
             found += [
                 f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm{self._too_few}"
                 for name, c in self.certified.items()
                 if not c.ok
             ]
-        return found + ([f"design rules broken: {self.drc.broken}"] if self.drc.broken else [])
+        return found + (
+            [f"design rules broken: {self.drc.broken}"] if self.drc.broken else []
+        )
 
     @property
     def _too_few(self) -> str:
-        """That the writer holds fewer doses than the tolerance needs; empty where it holds enough."""
-        needed, most = 0 if self.made.dose is None else self.made.dose.needed, self.process.exposure.maximum_classes
-        return f" ({needed} doses are needed, exposure.maximum_classes = {most})" if needed > most else ""
+        """That the writer holds fewer doses than the tolerance needs; empty where it
+        holds enough.
+        """
+        needed, most = (
+            0 if self.made.dose is None else self.made.dose.needed,
+            self.process.exposure.maximum_classes,
+        )
+        return (
+            f" ({needed} doses are needed, exposure.maximum_classes = {most})"
+            if needed > most
+            else ""
+        )
 
     @property
     def sheet(self) -> str:
         """The job sheet."""
-        return handover.job_sheet(self.plan, self.process, self.fields, self.written, self.verdict)
+        return handover.job_sheet(
+            self.plan, self.process, self.fields, self.written, self.verdict
+        )
 
     @property
     def ok(self) -> bool:
-        """Whether the rules hold, every dose is there and every file reads back as planned."""
+        """Whether the rules hold, every dose is there and every file reads back as
+        planned.
+        """
         return not self.failures
 
     @property
     def hardly_known(self) -> str:
-        """Why the study of --study is none, for a person; empty where it is one. The mask is not touched by it."""
+        """Why the study of --study is none, for a person; empty where it is one. The
+        mask is not touched by it.
+        """
         if self.answers_error <= MOST_ANSWERS_ERROR:
             return ""
         return (
@@ -154,4 +187,8 @@ class Job:
     @property
     def verdict(self) -> str:
         """First line of everything that tells about the mask."""
-        return "FAILS: " + "; ".join(self.failures) if self.failures else "The mask passes its own checks."
+        return (
+            "FAILS: " + "; ".join(self.failures)
+            if self.failures
+            else "The mask passes its own checks."
+        )

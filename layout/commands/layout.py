@@ -1,4 +1,6 @@
-"""One lens to its mask, or an arrangement of lenses and cells to that of a die or wafer."""
+"""One lens to its mask, or an arrangement of lenses and cells to that of a die or
+wafer.
+"""
 
 from pathlib import Path
 
@@ -10,21 +12,37 @@ ARRANGEMENT = ".toml"  # the ending of a file that arranges lenses
 
 
 def run(options: Options) -> int:
-    """Make the mask; exit 1 where a rule is broken, a file does not read back as planned or a study is none."""
+    """Make the mask; exit 1 where a rule is broken, a file does not read back as
+    planned or a study is none.
+    """
     if options.lens.suffix.lower() == ARRANGEMENT:
         from layout.commands import arranged
 
         return arranged.run(options)
-    with options.claim_folder(options.output) as draft, options.shared(), noticed(options.console.say):
+    with (
+        options.claim_folder(options.output) as draft,
+        options.shared(),
+        noticed(options.console.say),
+    ):
         job = make.make(options, draft.path)
-    return options.console.judged(make.values_of(job), _text(job, options.output), [*job.failures, job.hardly_known])
+    return options.console.judged(
+        make.values_of(job),
+        _text(job, options.output),
+        [*job.failures, job.hardly_known],
+    )
 
 
 def _text(job: Job, target: Path) -> str:
     lines = [*([job.verdict] if job.ok else []), job.drc.summary]
     for name, size in job.written.items():
         outcome = job.compared.get(name)
-        verdict = "" if outcome is None else (", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN")
+        verdict = (
+            ""
+            if outcome is None
+            else (
+                ", reads back as planned" if outcome.ok else ", DIFFERS FROM THE PLAN"
+            )
+        )
         lines.append(f"  {target / name}: {size / 1e6:.3g} MB{verdict}")
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]

@@ -1,4 +1,6 @@
-"""One lens to its mask in a folder: quantised, dosed, checked, written, read back, certified, with its companions."""
+"""One lens to its mask in a folder: quantised, dosed, checked, written, read back,
+certified, with its companions.
+"""
 
 import json
 import math
@@ -29,8 +31,12 @@ from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 from metalens.lens import Lens
 
-MOST_MADE = 1 << 24  # sites of a lens whose predicted diameters are handed on as made.h5
-KEPT = 1 << 16  # placements of a cell that are kept when a file is read back; of more only sums are
+MOST_MADE = (
+    1 << 24
+)  # sites of a lens whose predicted diameters are handed on as made.h5
+KEPT = (
+    1 << 16
+)  # placements of a cell that are kept when a file is read back; of more only sums are
 MOST_READ = 2**40
 
 
@@ -46,7 +52,9 @@ def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") 
         _write_masks(job, folder)
         with job.stages("report"):
             _accompany(job, shots.result(), folder)
-    store.write_text(folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n")
+    store.write_text(
+        folder / "layout.json", json.dumps(values_of(job), indent=1) + "\n"
+    )
     return job
 
 
@@ -58,10 +66,20 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
             from layout import study
 
             study.check(source)
-        rules = processes.Process() if options.process is None else processes.load(options.process)
+        rules = (
+            processes.Process()
+            if options.process is None
+            else processes.load(options.process)
+        )
         transaction.check_room(options.output, _room(options, source))
     with stages("classes and dose"):
-        made = build.prepare(source, rules, name=options.name, furniture=furniture, with_doses=options.dose)
+        made = build.prepare(
+            source,
+            rules,
+            name=options.name,
+            furniture=furniture,
+            with_doses=options.dose,
+        )
     with stages("write fields"):
         split = fields.split(source.diameters, rules, drawn=made.cells)
         plan = stages.rows.watched(with_fields(made.plan, split, rules))
@@ -71,13 +89,21 @@ def _prepare(options: Options, furniture: build.Furniture) -> Job:
 
 
 def _room(options: Options, source: Lens) -> int:
-    """Bytes that the mask files need: a reference of GDSII for each pillar, of OASIS a byte for each site at most."""
+    """Bytes that the mask files need: a reference of GDSII for each pillar, of OASIS a
+    byte for each site at most.
+    """
     small = math.prod(source.diameters.diameter_um.shape)
-    return gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small if options.writes_gds else small
+    return (
+        gdsii_write.REFERENCE_BYTES * source.diameters.pillars + small
+        if options.writes_gds
+        else small
+    )
 
 
 def _feet(plan: MaskPlan, source: Lens, rules: processes.Process) -> Array:
-    """(classes,) diameters at the foot of what the etch makes of each class; isolated pillars count where wider."""
+    """(classes,) diameters at the foot of what the etch makes of each class; isolated
+    pillars count where wider.
+    """
     drawn = np.array([made.diameter_nm for made in plan.classes])
     made = rules.made_diameter_nm(drawn) + max(0.0, rules.bias.isolated_nm)
     top, foot = rules.top_foot_nm(made, source.cell.height_um / nm)
@@ -101,7 +127,9 @@ def _write_masks(job: Job, target: Path) -> None:
         with job.stages("write DXF"):
             count = dxf.write(plan, path, window=options.window)
         with job.stages("read back dxf"):
-            job.compared[path.name] = verify.Comparison(count, dxf.differences(plan, path, window=options.window))
+            job.compared[path.name] = verify.Comparison(
+                count, dxf.differences(plan, path, window=options.window)
+            )
         job.written[path.name] = path.stat().st_size
     if options.stl or options.step:
         _write_solids(job, target)
@@ -113,14 +141,20 @@ def _write_solids(job: Job, target: Path) -> None:
     options, made = job.options, []
     if options.stl:
         with job.stages("write STL"):
-            made += solid_files.write_stl(job.source, job.process, target, options.window)
+            made += solid_files.write_stl(
+                job.source, job.process, target, options.window
+            )
     if options.step:
         with job.stages("write STEP"):
-            made += solid_files.write_step(job.source, job.process, target, options.window)
+            made += solid_files.write_step(
+                job.source, job.process, target, options.window
+            )
     job.written |= {path.name: path.stat().st_size for path in made}
     with job.stages("read back solids"):
         found = solid_files.differences(job.source, job.process, target, options.window)
-    job.compared |= {name: verify.Comparison(count, wrong) for name, (count, wrong) in found.items()}
+    job.compared |= {
+        name: verify.Comparison(count, wrong) for name, (count, wrong) in found.items()
+    }
 
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
@@ -141,15 +175,26 @@ def _certifiable(job: Job) -> bool:
     return exposure.known and exposure.csv is None and job.process.tone == "positive"
 
 
-def _certified(job: Job, content: MaskContent, table: Mapping[LayerNumber, float]) -> Survey:
-    """What a file makes that holds the plan's places; two files of the same polygons make the same."""
+def _certified(
+    job: Job, content: MaskContent, table: Mapping[LayerNumber, float]
+) -> Survey:
+    """What a file makes that holds the plan's places; two files of the same polygons
+    make the same.
+    """
     if job.certified and not job.options.circles:
         return next(iter(job.certified.values()))
     lattice = job.plan.lattices[0]
     small = not job.certified and lattice.rows * lattice.columns <= MOST_MADE
     job.made_rows = MadeRows(job.plan) if small else job.made_rows
     keep = job.made_rows.take if small and job.made_rows else None
-    return survey(content, job.plan, table, job.process, height_um=job.source.cell.height_um, keep=keep)
+    return survey(
+        content,
+        job.plan,
+        table,
+        job.process,
+        height_um=job.source.cell.height_um,
+        keep=keep,
+    )
 
 
 def _accompany(job: Job, shots: dict[str, bytes], target: Path) -> None:
@@ -186,7 +231,9 @@ def values_of(job: Job) -> dict[str, Any]:
             }
             for name, c in job.certified.items()
         },
-        "differences": {name: list(outcome.differences) for name, outcome in job.compared.items()},
+        "differences": {
+            name: list(outcome.differences) for name, outcome in job.compared.items()
+        },
         "answers_error": job.answers_error,
         "seconds": job.seconds,
     }

@@ -1,4 +1,6 @@
-"""report.html of a mask: what will be made, whether it can be, what was written and how it was checked."""
+"""report.html of a mask: what will be made, whether it can be, what was written and how
+it was checked.
+"""
 
 from pathlib import Path
 
@@ -24,7 +26,9 @@ def drawn(plan: MaskPlan, found: DrcReport) -> dict[str, bytes]:
     """{file name: picture} of what will be written."""
     return {
         "die.png": pictures.whole_die(plan, found),
-        "pillars.png": pictures.pillars(plan, (Window(0, 0, 8), pictures.edge_window(plan, 8))),
+        "pillars.png": pictures.pillars(
+            plan, (Window(0, 0, 8), pictures.edge_window(plan, 8))
+        ),
         "diameters.png": pictures.diameters(plan),
         "margins.png": pictures.margins(found),
     }
@@ -48,7 +52,9 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
 
         answers = study_page.answers_of(job.source)
         job.answers_error = max(one.error for one in answers.values())
-        sections[-1:-1] = study_page.sections(job.source, job.process, job.fields, answers)
+        sections[-1:-1] = study_page.sections(
+            job.source, job.process, job.fields, answers
+        )
     report.write(
         target / "report.html",
         f"Mask {job.plan.name}",
@@ -61,7 +67,11 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
 def _lead(job: Job) -> str:
     source, lattice = job.source, job.plan.lattices[0]
     own = sum(int(np.count_nonzero(block)) for _, block in lattice.blocks(_ROWS))
-    die = f" ({job.drc.pillars:,} on the die, with its test arrays)" if job.drc.pillars != own else ""
+    die = (
+        f" ({job.drc.pillars:,} on the die, with its test arrays)"
+        if job.drc.pillars != own
+        else ""
+    )
     return (
         f"{job.verdict} A {source.profile} lens for {source.wavelength_um / nm:.0f} nm, "
         f"{2 * job.made.radius_um / 1e3:.4g} mm "
@@ -75,8 +85,16 @@ def _key_figures(job: Job) -> list[KeyFigure]:
     same = all(outcome.ok for outcome in job.compared.values())
     return [
         KeyFigure("pillars", f"{found.pillars:,}"),
-        KeyFigure("smallest gap", told(found.minimum_gap_nm), found.counts["gap"] + found.counts["overlap"] == 0),
-        KeyFigure("thinnest pillar", told(found.minimum_feature_nm), found.counts["feature"] == 0),
+        KeyFigure(
+            "smallest gap",
+            told(found.minimum_gap_nm),
+            found.counts["gap"] + found.counts["overlap"] == 0,
+        ),
+        KeyFigure(
+            "thinnest pillar",
+            told(found.minimum_feature_nm),
+            found.counts["feature"] == 0,
+        ),
         KeyFigure("violations", f"{broken:,}", broken == 0),
         KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
     ]
@@ -95,24 +113,52 @@ def _overview(job: Job, shots: dict[str, bytes]) -> Section:
             "The whole die. Colour: share of the area that pillars cover, averaged.",
             wide=True,
         ),
-        Figure(shots["pillars.png"], "Polygons as they are written, in the middle and at the rim.", wide=True),
+        Figure(
+            shots["pillars.png"],
+            "Polygons as they are written, in the middle and at the rim.",
+            wide=True,
+        ),
     ]
     return Section("Die", text, items)
 
 
 def _rules(job: Job, shots: dict[str, bytes]) -> Section:
     found = job.drc
-    rows = [[rule, _limit(rule, found.limits[rule]), count] for rule, count in found.counts.items()]
+    rows = [
+        [rule, _limit(rule, found.limits[rule]), count]
+        for rule, count in found.counts.items()
+    ]
     items: list[Figure | Table] = [
-        Figure(shots["margins.png"], "What was found (bar) beside what is allowed (line).", wide=True),
-        Table(("rule", "limit", "violations"), rows, "Checked on the drawn polygons, all pillars."),
+        Figure(
+            shots["margins.png"],
+            "What was found (bar) beside what is allowed (line).",
+            wide=True,
+        ),
+        Table(
+            ("rule", "limit", "violations"),
+            rows,
+            "Checked on the drawn polygons, all pillars.",
+        ),
     ]
     if found.violations:
         places = [
-            [v.rule, f"({v.centre[0]:.0f}, {v.centre[1]:.0f})", v.value, v.limit, v.text] for v in found.violations[:50]
+            [
+                v.rule,
+                f"({v.centre[0]:.0f}, {v.centre[1]:.0f})",
+                v.value,
+                v.limit,
+                v.text,
+            ]
+            for v in found.violations[:50]
         ]
         head = ("rule", "(x, y) / nm", "found", "needed", "where")
-        items.append(Table(head, places, "The first violations; mask.lyrdb marks up to 500 of each rule."))
+        items.append(
+            Table(
+                head,
+                places,
+                "The first violations; mask.lyrdb marks up to 500 of each rule.",
+            )
+        )
     return Section("Design rules", found.summary + ".", items)
 
 
@@ -123,11 +169,23 @@ def _limit(rule: str, value: float) -> str:
 def _shaped(job: Job) -> Section:
     """Of pillars that are not round."""
     turned = job.source.diameters.angle_rad is not None
-    turns = f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees" if turned else ""
+    turns = (
+        f" and turns in steps of {job.process.rules.angle_step_deg:g} degrees"
+        if turned
+        else ""
+    )
     two = job.source.pairs is not None
-    shape = f"{job.source.cell.shape.kind} of its own width and length" if two else job.source.cell.shape.name
+    shape = (
+        f"{job.source.cell.shape.kind} of its own width and length"
+        if two
+        else job.source.cell.shape.name
+    )
     area = [made.twice_area / 2 for made in job.plan.classes]
-    rows = [["classes", len(area)], ["least area / nm²", min(area)], ["largest area / nm²", max(area)]]
+    rows = [
+        ["classes", len(area)],
+        ["least area / nm²", min(area)],
+        ["largest area / nm²", max(area)],
+    ]
     text = (
         f"Each is a {shape}, drawn in sizes in steps of {job.process.rules.diameter_step_nm} nm"
         f"{turns}, its corners on the grid; rounding by the etch is not made up for."
@@ -140,11 +198,19 @@ def _classes(job: Job, shots: dict[str, bytes]) -> Section:
         return _shaped(job)
     shapes = {made.diameter_units: made for made in job.plan.classes}
     grid = job.plan.grid
-    made = [polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)]
+    made = [
+        polygon.PillarShape(shapes[d].outline / grid, d / grid) for d in sorted(shapes)
+    ]
     picked = np.unique(np.linspace(0, len(made) - 1, 12).round().astype(int))
     unit = grid * job.plan.unit_nm
     rows = [
-        [m.diameter * unit, len(m.points), m.shots, f"{100 * m.area_error:+.3f}", m.edge_error * unit]
+        [
+            m.diameter * unit,
+            len(m.points),
+            m.shots,
+            f"{100 * m.area_error:+.3f}",
+            m.edge_error * unit,
+        ]
         for m in (made[i] for i in picked)
     ]
     worst = max(abs(m.area_error) for m in made)
@@ -164,11 +230,31 @@ def _frontier(made: list[polygon.PillarShape], unit_nm: float) -> Table:
     picked = np.unique(np.linspace(0, len(made) - 1, 5).round().astype(int))
     sizes = [made[i].diameter * unit_nm for i in picked]
     rows = [
-        [p.shape, p.vertices, *(f"{v:.2f}" for v in (1e4 * p.area_error, p.edge_error_nm, p.corners, p.shots))]
-        for p in polygon.frontier(sizes, grid_nm=unit_nm, vertices=(12, 16, 24, 32, 48, 64))
+        [
+            p.shape,
+            p.vertices,
+            *(
+                f"{v:.2f}"
+                for v in (1e4 * p.area_error, p.edge_error_nm, p.corners, p.shots)
+            ),
+        ]
+        for p in polygon.frontier(
+            sizes, grid_nm=unit_nm, vertices=(12, 16, 24, 32, 48, 64)
+        )
     ]
-    head = ("shape", "at most", "area error / 1e-4", "edge error / nm", "vertices", "shots")
-    return Table(head, rows, "Worst errors and mean cost of a pillar by number of vertices, on this grid.")
+    head = (
+        "shape",
+        "at most",
+        "area error / 1e-4",
+        "edge error / nm",
+        "vertices",
+        "shots",
+    )
+    return Table(
+        head,
+        rows,
+        "Worst errors and mean cost of a pillar by number of vertices, on this grid.",
+    )
 
 
 def _doses(job: Job) -> Section | None:
@@ -177,13 +263,24 @@ def _doses(job: Job) -> Section | None:
         return None
     count = len(doses.ladder.factors)
     rows = [
-        ["one dose", 100 * doses.before.worst, 100 * doses.before.rms, doses.before.diameter_nm],
-        [f"{count} doses", 100 * doses.after.worst, 100 * doses.after.rms, doses.after.diameter_nm],
+        [
+            "one dose",
+            100 * doses.before.worst,
+            100 * doses.before.rms,
+            doses.before.diameter_nm,
+        ],
+        [
+            f"{count} doses",
+            100 * doses.after.worst,
+            100 * doses.after.rms,
+            doses.after.diameter_nm,
+        ],
     ]
     head = ("", "worst / %", "rms / %", "diameter / nm")
     used = [made.dose for made in job.plan.classes]
     table = [
-        [*layer, f"{dose:.4f}", job.plan.layer_names.get(layer, "")] for layer, dose in sorted(job.plan.doses.items())
+        [*layer, f"{dose:.4f}", job.plan.layer_names.get(layer, "")]
+        for layer, dose in sorted(job.plan.doses.items())
     ]
     text = (
         f"Proximity correction of lens, dose test, witness cells, marks and label together: relative dose "
@@ -191,16 +288,29 @@ def _doses(job: Job) -> Section | None:
         f"{100 * doses.worst:.2g} % of what it should be; known to {100 * doses.error:.2g} %."
         f"{_table_said(job.process.exposure, doses.point)}"
     )
-    sheet = Table(("layer", "datatype", "relative dose", "name"), table, "The dose table, as in doses.csv.")
+    sheet = Table(
+        ("layer", "datatype", "relative dose", "name"),
+        table,
+        "The dose table, as in doses.csv.",
+    )
     return Section(
         "Dose",
         text,
-        [Table(head, rows, "Error of the exposure at the pillar edges of the lens, and what it does."), sheet],
+        [
+            Table(
+                head,
+                rows,
+                "Error of the exposure at the pillar edges of the lens, and what it does.",
+            ),
+            sheet,
+        ],
     )
 
 
 def _table_said(exposure: Exposure, point: PointExposure) -> str:
-    """What the Gaussians leave out of a measured table: energy that the two figures before it do not know of."""
+    """What the Gaussians leave out of a measured table: energy that the two figures
+    before it do not know of.
+    """
     if exposure.csv is None:
         return ""
     return (
@@ -241,7 +351,10 @@ def _certified(job: Job) -> Section | None:
         "labels; the dose test is predicted and not judged. made.h5 (up to 16 million sites) is the lens of "
         "the predicted diameters: give it to metalens psf, or to this command with --study."
     )
-    items: list[Figure | Table] = [Table(head, rows), Figure(picture, "Predicted less drawn diameter.", wide=True)]
+    items: list[Figure | Table] = [
+        Table(head, rows),
+        Figure(picture, "Predicted less drawn diameter.", wide=True),
+    ]
     return Section("Exposure as written", text, items)
 
 
@@ -255,16 +368,34 @@ def _fields(job: Job) -> Section:
     )
     steps = handover.sequence(split)
     rows = [
-        [s.sequence, f"{s.x_um:.3f}", f"{s.y_um:.3f}", f"{s.width_um:.3f}", f"{s.height_um:.3f}", f"{s.pillars:,}"]
+        [
+            s.sequence,
+            f"{s.x_um:.3f}",
+            f"{s.y_um:.3f}",
+            f"{s.width_um:.3f}",
+            f"{s.height_um:.3f}",
+            f"{s.pillars:,}",
+        ]
         for s in steps[:_LISTED]
     ]
-    fields = Table(handover.FIELD_HEAD, rows, f"The first {len(rows)} of {len(steps)} fields.")
+    fields = Table(
+        handover.FIELD_HEAD, rows, f"The first {len(rows)} of {len(steps)} fields."
+    )
     charges = [
         [step, f"{charge:.4g}", f"{charge * 1e3 / 3600:.3g}"]
         for step, charge in handover.charge_uC(job.plan, job.process).items()
     ]
-    charge = Table(("step", "charge / µC", "hours at 1 nA"), charges, "Without stage and settling times.")
-    marks = Table(("x / µm", "y / µm", "width / µm", "height / µm"), handover.marks_um(job.plan), "Marks.", digits=6)
+    charge = Table(
+        ("step", "charge / µC", "hours at 1 nA"),
+        charges,
+        "Without stage and settling times.",
+    )
+    marks = Table(
+        ("x / µm", "y / µm", "width / µm", "height / µm"),
+        handover.marks_um(job.plan),
+        "Marks.",
+        digits=6,
+    )
     return Section("Job sheet", text, [charge, fields, marks])
 
 
@@ -273,12 +404,20 @@ def _files(job: Job) -> Section:
     for name, size in job.written.items():
         outcome = job.compared.get(name)
         verdict = (
-            "not read back" if outcome is None else ("as planned" if outcome.ok else "; ".join(outcome.differences))
+            "not read back"
+            if outcome is None
+            else ("as planned" if outcome.ok else "; ".join(outcome.differences))
         )
         rows.append([name, f"{size / 1e6:.3f}", verdict])
     times = [[stage, seconds] for stage, seconds in job.seconds.items()]
     items = [
         Table(("file", "MB", "read back and compared"), rows),
-        Table(("stage", "seconds"), times, "On the machine that made the mask.", digits=3),
+        Table(
+            ("stage", "seconds"), times, "On the machine that made the mask.", digits=3
+        ),
     ]
-    return Section("Files", "Each mask file was read back: every pillar at its site, every polygon vertex.", items)
+    return Section(
+        "Files",
+        "Each mask file was read back: every pillar at its site, every polygon vertex.",
+        items,
+    )

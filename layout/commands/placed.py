@@ -1,11 +1,24 @@
-"""The parts of an arrangement: every lens as a mask of its own, cells of other files, what stands around them."""
+"""The parts of an arrangement: every lens as a mask of its own, cells of other files,
+what stands around them.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import Arrangement, CellPart, Furniture, Into, LensPart, Wafer, apart, joined, parts, wafer
+from layout.arrange import (
+    Arrangement,
+    CellPart,
+    Furniture,
+    Into,
+    LensPart,
+    Wafer,
+    apart,
+    joined,
+    parts,
+    wafer,
+)
 from layout.certify import survey
 from layout.commands import make
 from layout.commands.check import read
@@ -26,8 +39,10 @@ from metalens.lens import Lens
 class Work:
     """What is known so far of an arrangement.
 
-    failures: what keeps the mask from the writer. notes: what a person should know. placed: parts on the die. near:
-    those that stand too near each other. rules: what was found of each part that is checked here. unlike: files that do
+    failures: what keeps the mask from the writer. notes: what a person should know.
+    placed: parts on the die. near:
+    those that stand too near each other. rules: what was found of each part that is
+    checked here. unlike: files that do
     not read back as planned.
     """
 
@@ -49,7 +64,11 @@ class Work:
     @property
     def verdict(self) -> str:
         """First line of everything that tells about the mask."""
-        return "FAILS: " + "; ".join(self.failures) if self.failures else "The mask passes its own checks."
+        return (
+            "FAILS: " + "; ".join(self.failures)
+            if self.failures
+            else "The mask passes its own checks."
+        )
 
     def broken(self, name: str, found: DrcReport) -> None:
         """Enter what was found of the rules of a part."""
@@ -66,17 +85,33 @@ def lens_part(work: Work, part: LensPart) -> parts.Part:
     """A lens, with mask, report and job sheet in a folder of its own."""
     folder = work.folder / part.name
     folder.mkdir()
-    options = dataclasses.replace(work.options, lens=work.beside(part.file), name=part.name)
+    options = dataclasses.replace(
+        work.options, lens=work.beside(part.file), name=part.name
+    )
     work.options.console.say(f"{part.name}: {part.file}")
-    job = make.make(options, folder, furniture="die" if work.record.furnished(part) else "aperture")
+    job = make.make(
+        options, folder, furniture="die" if work.record.furnished(part) else "aperture"
+    )
     work.failures += [f"{part.name}: {text}" for text in job.failures]
     work.lenses[part.name] = make.values_of(job)
     for stage, seconds in job.seconds.items():
         work.stages.seconds[f"{part.name}: {stage}"] = seconds
-    path = next(path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file())
-    content, lattices = read(path, make.MOST_READ, keep=make.KEPT), oasis_write.placed_lattices(job.plan)
+    path = next(
+        path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file()
+    )
+    content, lattices = (
+        read(path, make.MOST_READ, keep=make.KEPT),
+        oasis_write.placed_lattices(job.plan),
+    )
     corrected = job.made.dose is not None
-    return parts.of_plan(part.name, job.plan, content, work.process, corrected=corrected, lattices=lattices)
+    return parts.of_plan(
+        part.name,
+        job.plan,
+        content,
+        work.process,
+        corrected=corrected,
+        lattices=lattices,
+    )
 
 
 def cell_part(work: Work, part: CellPart) -> parts.Part:
@@ -87,7 +122,12 @@ def cell_part(work: Work, part: CellPart) -> parts.Part:
         with work.stages(f"{part.name}: check"):
             content = MaskContent("cell", parts.UNIT_NM, dict(made.cells))
             skip = (layers.outline[0], layers.fields[0])
-            found = foreign.check(content, work.process.rules, skip=skip, most=foreign.most_of(work.beside(part.file)))
+            found = foreign.check(
+                content,
+                work.process.rules,
+                skip=skip,
+                most=foreign.most_of(work.beside(part.file)),
+            )
         work.broken(part.name, found)
     return made
 
@@ -96,19 +136,31 @@ def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
     """A cell of a file, or all of a file that takes the others."""
     path, keep = work.beside(record.file), isinstance(record, Into)
     if not path.is_file():
-        raise MaskFileError(f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask")
+        raise MaskFileError(
+            f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
+        )
     most = foreign.most_of(path)
     content = read(path, most)
     hierarchy.refuse_beyond(content, most)
     made = parts.of_file(
-        name, path, content, work.process, cell=record.cell, relative_dose=record.relative_dose, keep_top=keep
+        name,
+        path,
+        content,
+        work.process,
+        cell=record.cell,
+        relative_dose=record.relative_dose,
+        keep_top=keep,
     )
     if made.texts:
-        work.notes.append(f"{made.texts} texts of {path.name} are left out: they draw nothing")
+        work.notes.append(
+            f"{made.texts} texts of {path.name} are left out: they draw nothing"
+        )
     return made
 
 
-def surroundings(work: Work, die: Furniture, placed: list[joined.Placing]) -> parts.Part:
+def surroundings(
+    work: Work, die: Furniture, placed: list[joined.Placing]
+) -> parts.Part:
     """Marks, label and test structures around all that is placed."""
     box = apart.extent(placed, exposed=True) / joined.PER_UM
     made = build.surroundings(
@@ -125,7 +177,11 @@ def surroundings(work: Work, die: Furniture, placed: list[joined.Placing]) -> pa
 def wafer_mark(work: Work, size: Wafer) -> parts.Part:
     """The alignment mark of a wafer."""
     made = build.wafer_mark(
-        _source(work), work.process, name="WMARK", mark_um=size.mark_um, width_um=size.mark_width_um
+        _source(work),
+        work.process,
+        name="WMARK",
+        mark_um=size.mark_um,
+        width_um=size.mark_width_um,
     )
     return _written(work, made)
 
@@ -136,7 +192,9 @@ def _source(work: Work) -> Lens:
 
 
 def _written(work: Work, made: build.MadePlan) -> parts.Part:
-    """What stands beside the lenses: checked, written, read back and certified as they are."""
+    """What stands beside the lenses: checked, written, read back and certified as they
+    are.
+    """
     plan, process = made.plan, work.process
     name = plan.name
     with work.stages(f"{name}: check"):
@@ -145,7 +203,9 @@ def _written(work: Work, made: build.MadePlan) -> parts.Part:
     oasis_write.write(plan, path)
     content = read(path, make.MOST_READ)
     path.unlink()
-    work.failures += [f"{name}: {text}" for text in verify.compare(plan, content).differences]
+    work.failures += [
+        f"{name}: {text}" for text in verify.compare(plan, content).differences
+    ]
     if made.dose is not None and process.exposure.csv is None:
         with work.stages(f"{name}: certify"):
             seen = survey(content, plan, plan.doses, process)

@@ -1,4 +1,6 @@
-"""Stages of a command: how long each took, and a line now and then while one takes longer than two seconds."""
+"""Stages of a command: how long each took, and a line now and then while one takes
+longer than two seconds.
+"""
 
 import dataclasses
 import threading
@@ -35,7 +37,11 @@ class Rows:
 
     def unwatched(self, plan: MaskPlan) -> MaskPlan:
         """A watched plan as it was, for what is made beside the stages."""
-        return plan if self._lens is None else plan.replace(lattices=(self._lens, *plan.lattices[1:]))
+        return (
+            plan
+            if self._lens is None
+            else plan.replace(lattices=(self._lens, *plan.lattices[1:]))
+        )
 
     @property
     def text(self) -> str:
@@ -51,7 +57,13 @@ class Rows:
 class Stages:
     """Times of the stages; ``say`` hears of those that last."""
 
-    def __init__(self, say: Callable[[str], None], *, first_s: float = _FIRST_S, next_s: float = _NEXT_S) -> None:
+    def __init__(
+        self,
+        say: Callable[[str], None],
+        *,
+        first_s: float = _FIRST_S,
+        next_s: float = _NEXT_S,
+    ) -> None:
         self.seconds: dict[str, float] = {}
         self.rows = Rows()
         self._say, self._waits = say, (first_s, next_s)
@@ -61,7 +73,9 @@ class Stages:
         """Time what happens inside as ``stage``."""
         start, over = time.perf_counter(), threading.Event()
         self.rows.end = 0
-        ticker = threading.Thread(target=self._tick, args=(stage, start, over), daemon=True)
+        ticker = threading.Thread(
+            target=self._tick, args=(stage, start, over), daemon=True
+        )
         ticker.start()
         try:
             yield

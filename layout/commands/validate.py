@@ -26,14 +26,17 @@ _TABLES = (
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that breaks the format or its good practice. byte: where, -1 where it has no single place."""
+    """Something that breaks the format or its good practice. byte: where, -1 where it
+    has no single place.
+    """
 
     byte: int
     text: str
 
 
 def validate(path: str | Path, content: MaskContent | None = None) -> list[Finding]:
-    """All findings about a GDSII or OASIS file, told apart by its first bytes; an empty list is a clean file.
+    """All findings about a GDSII or OASIS file, told apart by its first bytes; an empty
+    list is a clean file.
 
     content: what was read of it, where it was read already.
 
@@ -60,7 +63,10 @@ def _offset(error: MaskFileError) -> int:
 def _any(content: MaskContent) -> Iterator[Finding]:
     """What holds for both formats."""
     if len(content.tops) != 1:
-        yield Finding(-1, f"{len(content.tops)} top cells ({', '.join(content.tops[:5])}), need one")
+        yield Finding(
+            -1,
+            f"{len(content.tops)} top cells ({', '.join(content.tops[:5])}), need one",
+        )
     for cell in content.cells.values():
         try:
             names.check(cell.name)
@@ -68,7 +74,10 @@ def _any(content: MaskContent) -> Iterator[Finding]:
             yield Finding(-1, str(error))
         for child in cell.placed.children:
             if child not in content.cells:
-                yield Finding(-1, f"cell {cell.name!r} places {child!r}, which the file does not hold")
+                yield Finding(
+                    -1,
+                    f"cell {cell.name!r} places {child!r}, which the file does not hold",
+                )
         yield from _shapes(cell)
     try:
         hierarchy.ordered(content)
@@ -80,10 +89,15 @@ def _shapes(cell: CellContent) -> Iterator[Finding]:
     for layer, polygons in cell.polygons.items():
         for points in polygons:
             if len({(int(x), int(y)) for x, y in points}) != len(points):
-                yield Finding(-1, f"cell {cell.name!r}, layer {layer}: a polygon with a vertex twice")
+                yield Finding(
+                    -1,
+                    f"cell {cell.name!r}, layer {layer}: a polygon with a vertex twice",
+                )
     for layer, circles in cell.circles.items():
         if any(radius == 0 for _, _, radius in circles):
-            yield Finding(-1, f"cell {cell.name!r}, layer {layer}: a circle of radius 0")
+            yield Finding(
+                -1, f"cell {cell.name!r}, layer {layer}: a circle of radius 0"
+            )
 
 
 def _gdsii(content: MaskContent, data: Array) -> Iterator[Finding]:
@@ -92,11 +106,15 @@ def _gdsii(content: MaskContent, data: Array) -> Iterator[Finding]:
     for cell in content.cells.values():
         for layer, polygons in cell.polygons.items():
             if max(layer) > 32767:
-                yield Finding(-1, f"cell {cell.name!r}: layer {layer} is negative as a signed number")
+                yield Finding(
+                    -1,
+                    f"cell {cell.name!r}: layer {layer} is negative as a signed number",
+                )
             longest = max(map(len, polygons)) + 1
             if longest > gdsii_bytes.MOST_POINTS:
                 yield Finding(
-                    -1, f"cell {cell.name!r}: boundary of {longest} points, at most {gdsii_bytes.MOST_POINTS}"
+                    -1,
+                    f"cell {cell.name!r}: boundary of {longest} points, at most {gdsii_bytes.MOST_POINTS}",
                 )
 
 
@@ -109,8 +127,15 @@ def _oasis(path: str | Path, data: Array) -> Iterator[Finding]:
     end = start if start.unsigned() == 0 else Cursor(str(path), data, at=at + 1)
     for table, kinds in _TABLES:
         strict, offset = end.unsigned(), end.unsigned()
-        if strict and offset and (offset >= at or int(data[offset]) not in (*kinds, oasis_bytes.CBLOCK)):
-            yield Finding(at, f"the table of {table} is said to start at byte {offset}, where it does not")
+        if (
+            strict
+            and offset
+            and (offset >= at or int(data[offset]) not in (*kinds, oasis_bytes.CBLOCK))
+        ):
+            yield Finding(
+                at,
+                f"the table of {table} is said to start at byte {offset}, where it does not",
+            )
         if not strict:
             yield Finding(at, f"{table} may stand anywhere; strict tables are wanted")
     if int(data[-5]) != 1:

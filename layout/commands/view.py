@@ -1,4 +1,6 @@
-"""Panels of a mask: every shape of the file on its layers, with size, dose and broken rules."""
+"""Panels of a mask: every shape of the file on its layers, with size, dose and broken
+rules.
+"""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,7 +23,8 @@ def mask_of(folder: Path) -> Path | None:
 
 
 def panels(path: Path) -> list[Panel]:
-    """The drawing of a mask file, or of the one in a folder, and its layers with their doses.
+    """The drawing of a mask file, or of the one in a folder, and its layers with their
+    doses.
 
     Raises:
         MaskFileError: no mask file, one that cannot be read, or that draws nothing.
@@ -48,15 +51,24 @@ def panels(path: Path) -> list[Panel]:
     return [drawn, _layers(content, outlines, dose)]
 
 
-def _outline(content: MaskContent, group: list[flat.Shapes], dose: dict[LayerNumber, float]) -> Outline:
+def _outline(
+    content: MaskContent, group: list[flat.Shapes], dose: dict[LayerNumber, float]
+) -> Outline:
     """Copies of one polygon."""
     shape = group[0]
     size = np.ptp(shape.outline, axis=0) * content.unit_nm
     number = "/".join(map(str, shape.layer))
-    notes = {"layer": number, "cell": shape.cell, "width / nm": float(size[0]), "height / nm": float(size[1])}
+    notes = {
+        "layer": number,
+        "cell": shape.cell,
+        "width / nm": float(size[0]),
+        "height / nm": float(size[1]),
+    }
     if shape.layer in dose:
         notes["relative dose"] = dose[shape.layer]
-    places = np.concatenate([np.column_stack([some.x, some.y]) for some in group]).astype(np.int32)
+    places = np.concatenate(
+        [np.column_stack([some.x, some.y]) for some in group]
+    ).astype(np.int32)
     return Outline(_name(content, shape.layer), shape.outline, places, notes)
 
 
@@ -66,20 +78,45 @@ def _name(content: MaskContent, layer: LayerNumber) -> str:
     return f"{layer[0]} {name.replace('_', ' ')}".strip()
 
 
-def _layers(content: MaskContent, outlines: list[Outline], dose: dict[LayerNumber, float]) -> Numbers:
+def _layers(
+    content: MaskContent, outlines: list[Outline], dose: dict[LayerNumber, float]
+) -> Numbers:
     """Shapes, area and dose of each (layer, datatype)."""
     rows = []
-    for layer in sorted({layer for cell in content.cells.values() for layer in (*cell.polygons, *cell.circles)}):
+    for layer in sorted(
+        {
+            layer
+            for cell in content.cells.values()
+            for layer in (*cell.polygons, *cell.circles)
+        }
+    ):
         number = "/".join(map(str, layer))
         some = [o for o in outlines if o.notes["layer"] == number]
-        area = sum(len(o.places) * abs(polygon.twice_area(o.corners)) / 2 for o in some) * (1e-3 * content.unit_nm) ** 2
+        area = (
+            sum(len(o.places) * abs(polygon.twice_area(o.corners)) / 2 for o in some)
+            * (1e-3 * content.unit_nm) ** 2
+        )
         name = content.layer_names.get(layer, "")
-        rows.append((number, name, sum(len(o.places) for o in some), area, dose.get(layer, "none stated")))
-    return Numbers("Layers", ("layer/datatype", "name", "shapes", "area / µm²", "relative dose"), rows)
+        rows.append(
+            (
+                number,
+                name,
+                sum(len(o.places) for o in some),
+                area,
+                dose.get(layer, "none stated"),
+            )
+        )
+    return Numbers(
+        "Layers",
+        ("layer/datatype", "name", "shapes", "area / µm²", "relative dose"),
+        rows,
+    )
 
 
 def _marks(path: Path) -> list[tuple[float, float, str]]:
-    """Centres and rules of a marker database of this toolchain; none where there is no such file."""
+    """Centres and rules of a marker database of this toolchain; none where there is no
+    such file.
+    """
     if not path.is_file():
         return []
     try:
@@ -88,9 +125,19 @@ def _marks(path: Path) -> list[tuple[float, float, str]]:
         raise MaskFileError(f"{path}: no marker database ({error})") from None
     found = []
     for item in items:
-        box = next((v.text or "" for v in item.iter("value") if (v.text or "").startswith("box:")), "")
+        box = next(
+            (
+                v.text or ""
+                for v in item.iter("value")
+                if (v.text or "").startswith("box:")
+            ),
+            "",
+        )
         try:
-            corners = [float(number) for number in box[4:].strip(" ()").replace(";", ",").split(",")]
+            corners = [
+                float(number)
+                for number in box[4:].strip(" ()").replace(";", ",").split(",")
+            ]
             x, y = (corners[0] + corners[2]) / 2, (corners[1] + corners[3]) / 2
         except (ValueError, IndexError):
             continue

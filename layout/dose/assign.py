@@ -1,4 +1,6 @@
-"""Dose classes: equal steps of the logarithm, one for each pillar and piece, and how even the edges then are."""
+"""Dose classes: equal steps of the logarithm, one for each pillar and piece, and how
+even the edges then are.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,9 +23,11 @@ _SOFTEST_UM = 0.7e-3  # that rounded doses may change a width by
 class Fields:
     """Everything that is exposed, and its backgrounds.
 
-    far: (y, x) on the nodes with the wanted doses; alone: with dose 1. near, near_alone: (rows, columns) for each
+    far: (y, x) on the nodes with the wanted doses; alone: with dose 1. near,
+    near_alone: (rows, columns) for each
     body, the middle ranges; empty lists where there is none.
-    own: (pieces,) as in :func:`layout.dose.rects.own`; points, piece: outer edges of the pieces and whose they are.
+    own: (pieces,) as in :func:`layout.dose.rects.own`; points, piece: outer edges of
+    the pieces and whose they are.
     spots: points, areas and pieces that stand for the rectangles on the nodes.
     """
 
@@ -43,12 +47,21 @@ class Fields:
     piece: Array
     spots: tuple[Array, Array, Array]
 
-    def at(self, field: Array, number: int, first: int, count: int, near: Sequence[Array]) -> Array:
+    def at(
+        self, field: Array, number: int, first: int, count: int, near: Sequence[Array]
+    ) -> Array:
         """(rows, columns) float32 background at the sites of rows of a body."""
         body = self.bodies[number]
         out = np.empty((count, body.columns), np.float32)
-        spread(field, *self.grid.y.at(body.rows_um(first, count)), *self.grid.x.at(body.columns_um), out)
-        return np.asarray(out + near[number][first : first + count]) if len(near) else out
+        spread(
+            field,
+            *self.grid.y.at(body.rows_um(first, count)),
+            *self.grid.x.at(body.columns_um),
+            out,
+        )
+        return (
+            np.asarray(out + near[number][first : first + count]) if len(near) else out
+        )
 
     def of_rects(self, field: Array) -> Array:
         """(pieces,) mean background at the outer edges."""
@@ -79,7 +92,9 @@ class Ladder:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Assigned:
-    """Uniformity over the first body, worst error over everything, the far and middle fields of the rounded doses."""
+    """Uniformity over the first body, worst error over everything, the far and middle
+    fields of the rounded doses.
+    """
 
     before: Uniformity
     after: Uniformity
@@ -91,38 +106,75 @@ class Assigned:
 def ladder(fields: Fields, settings: Exposure) -> tuple[Ladder, int]:
     """The doses, and how many the tolerance needs.
 
-    A quarter of it is left for the background of rounded doses and for what changes across a piece of a mark. Where the
-    edge is so soft that the tolerance moves it by more than a nanometre of width, as much finer steps are taken.
+    A quarter of it is left for the background of rounded doses and for what changes
+    across a piece of a mark. Where the
+    edge is so soft that the tolerance moves it by more than a nanometre of width, as
+    much finer steps are taken.
     """
-    span = np.array([np.inf, 0.0, 0.0])  # least and most dose, largest log step that is the other way round
+    span = np.array(
+        [np.inf, 0.0, 0.0]
+    )  # least and most dose, largest log step that is the other way round
     t, most = fields.table, settings.tolerance
     for number, body in enumerate(fields.bodies):
         for first, block in body.blocks():
             field = fields.at(fields.far, number, first, len(block), fields.near)
-            _span(block, field, t.own, CLEARS * t.goal, _SOFTEST_UM * t.slope / 2, most, span)
+            _span(
+                block,
+                field,
+                t.own,
+                CLEARS * t.goal,
+                _SOFTEST_UM * t.slope / 2,
+                most,
+                span,
+            )
     if len(fields.own):
         goal = CLEARS * fields.rects.goal
         left = goal - fields.of_rects(fields.far)
         dose = left / fields.own
-        rise = fields.ranges.near if len(fields.ranges.near.widths_um) else fields.ranges.middle
+        rise = (
+            fields.ranges.near
+            if len(fields.ranges.near.widths_um)
+            else fields.ranges.middle
+        )
         allowed = np.minimum(most, straight_edge_error(rise) * dose / fields.rects.goal)
         span = np.array(
-            [min(span[0], dose.min()), max(span[1], dose.max()), max(span[2], (left / goal / allowed).max())]
+            [
+                min(span[0], dose.min()),
+                max(span[1], dose.max()),
+                max(span[2], (left / goal / allowed).max()),
+            ]
         )
     least, most_dose, share = span.tolist()
-    needed = max(1, int(np.ceil(np.log(most_dose / least) / (2 * np.log1p(_ROUNDED / share)) - 1e-9)))
+    needed = max(
+        1,
+        int(
+            np.ceil(np.log(most_dose / least) / (2 * np.log1p(_ROUNDED / share)) - 1e-9)
+        ),
+    )
     count = min(needed, settings.maximum_classes)
-    return Ladder(least * (most_dose / least) ** ((np.arange(count) + 0.5) / count)), needed
+    return Ladder(
+        least * (most_dose / least) ** ((np.arange(count) + 0.5) / count)
+    ), needed
 
 
 def straight_edge_error(point: PointExposure) -> float:
-    """Relative error of the exposure that moves both edges of a line of dose 1 by what rounded doses may."""
+    """Relative error of the exposure that moves both edges of a line of dose 1 by what
+    rounded doses may.
+    """
     steep = float((point.weights / point.widths_um).sum()) / np.sqrt(np.pi)
     return float(_SOFTEST_UM * steep / 2 / CLEARS)
 
 
 @compiled
-def _span(block: Array, field: Array, own: Array, goal: Array, soft: Array, most: float, span: Array) -> None:
+def _span(
+    block: Array,
+    field: Array,
+    own: Array,
+    goal: Array,
+    soft: Array,
+    most: float,
+    span: Array,
+) -> None:
     for row in range(block.shape[0]):
         for column in range(block.shape[1]):
             k = block[row, column]
@@ -131,24 +183,50 @@ def _span(block: Array, field: Array, own: Array, goal: Array, soft: Array, most
                 dose = left / own[k]
                 span[0] = min(span[0], dose)
                 span[1] = max(span[1], dose)
-                span[2] = max(span[2], left / goal[k] / min(most, soft[k] * dose / goal[k]))
+                span[2] = max(
+                    span[2], left / goal[k] / min(most, soft[k] * dose / goal[k])
+                )
 
 
-def classes(fields: Fields, number: int, first: int, block: Array, steps: Ladder, *, aside: float = 0.0) -> Array:
-    """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is none.
+def classes(
+    fields: Fields,
+    number: int,
+    first: int,
+    block: Array,
+    steps: Ladder,
+    *,
+    aside: float = 0.0,
+) -> Array:
+    """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is
+    none.
 
-    aside: steps of the ladder by which the wanted doses are moved before they are rounded.
+    aside: steps of the ladder by which the wanted doses are moved before they are
+    rounded.
     """
     t, out = fields.table, np.empty(block.shape, np.uint8)
     field = fields.at(fields.far, number, first, len(block), fields.near)
     shift = np.log(np.where(t.used, t.own, 1.0) * steps.factors[0])
-    _classes(block, field, shift, CLEARS * t.goal, (steps.per_log, aside), len(steps.factors), out)
+    _classes(
+        block,
+        field,
+        shift,
+        CLEARS * t.goal,
+        (steps.per_log, aside),
+        len(steps.factors),
+        out,
+    )
     return out
 
 
 @compiled
 def _classes(
-    block: Array, field: Array, shift: Array, goal: Array, scale: tuple[float, float], count: int, out: Array
+    block: Array,
+    field: Array,
+    shift: Array,
+    goal: Array,
+    scale: tuple[float, float],
+    count: int,
+    out: Array,
 ) -> None:
     per_log, aside = scale
     for row in range(block.shape[0]):
@@ -163,38 +241,75 @@ def _classes(
 
 
 def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
-    """((entries, doses) pillars, (pieces,) class, outcome) of the nearest doses, over everything."""
+    """((entries, doses) pillars, (pieces,) class, outcome) of the nearest doses, over
+    everything.
+    """
     t, mass = fields.table, np.zeros(fields.grid.shape)
     pairs = np.zeros((len(t.own), NONE + 1), np.int64)
     dose = np.zeros(NONE + 1)
     dose[: len(steps.factors)] = steps.factors
     mean = _mean_edge(fields)
-    tallies = [Tally() for _ in range(3)]  # first body with dose 1, first body, the others
+    tallies = [
+        Tally() for _ in range(3)
+    ]  # first body with dose 1, first body, the others
     given: list[Array] = []
     for number, body in enumerate(fields.bodies):
         xn, xw = fields.grid.x.at(body.columns_um)
-        given.append(np.zeros((body.rows, body.columns) if len(fields.near) else (0, 0), np.float32))
+        given.append(
+            np.zeros(
+                (body.rows, body.columns) if len(fields.near) else (0, 0), np.float32
+            )
+        )
         for first, block in body.blocks():
             chosen = classes(fields, number, first, block, steps)
             field = fields.at(fields.far, number, first, len(block), fields.near)
             yn, yw = fields.grid.y.at(body.rows_um(first, len(block)))
             ends = np.zeros((2, 4))
             ends[:, 0], ends[:, 1] = np.inf, -np.inf
-            alone = fields.at(fields.alone, number, first, len(block), fields.near_alone) if not number else _NOTHING
+            alone = (
+                fields.at(fields.alone, number, first, len(block), fields.near_alone)
+                if not number
+                else _NOTHING
+            )
             tables = np.stack([t.own, t.area_um2, CLEARS * t.goal])
-            _take(block, chosen, field, alone, tables, dose, mean, ends, pairs, yn, yw, xn, xw, mass)
+            _take(
+                block,
+                chosen,
+                field,
+                alone,
+                tables,
+                dose,
+                mean,
+                ends,
+                pairs,
+                yn,
+                yw,
+                xn,
+                xw,
+                mass,
+            )
             if len(fields.near):
-                given[number][first : first + len(block)] = t.area_um2.take(block) * dose.take(chosen)
-            for tally, row in ((tallies[1 if not number else 2], ends[0]), (tallies[0], ends[1])):
+                given[number][first : first + len(block)] = t.area_um2.take(
+                    block
+                ) * dose.take(chosen)
+            for tally, row in (
+                (tallies[1 if not number else 2], ends[0]),
+                (tallies[0], ends[1]),
+            ):
                 tally.merge(row)
-    own_class = steps.nearest((CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own)
+    own_class = steps.nearest(
+        (CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
+    )
     worst_rect = _rect_error(fields, own_class, dose, mass)
     after = fields.reach(mass)
     inside = fields.alone > 1e-3 * fields.alone.max()
     shift = float(np.abs(after - fields.far)[inside].max(initial=0))
     near = [middle(own) for middle, own in zip(fields.middles, given, strict=False)]
     shift += max(
-        (float(np.abs(a - b)[m > 0].max(initial=0)) for a, b, m in zip(near, fields.near, given, strict=False)),
+        (
+            float(np.abs(a - b)[m > 0].max(initial=0))
+            for a, b, m in zip(near, fields.near, given, strict=False)
+        ),
         default=0,
     )
     shift /= CLEARS * float(t.goal[t.used].min())
@@ -202,7 +317,11 @@ def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
     before = tallies[0].result(gentle / mean, 0.0)
     found = tallies[1].result(gentle * float(steps.factors[0]) / CLEARS, shift)
     worst = max(found.worst, tallies[2].worst + shift, worst_rect + shift)
-    return pairs[:, : len(steps.factors)], own_class, Assigned(before, found, worst, after, near)
+    return (
+        pairs[:, : len(steps.factors)],
+        own_class,
+        Assigned(before, found, worst, after, near),
+    )
 
 
 def _mean_edge(fields: Fields) -> float:
@@ -234,7 +353,9 @@ def _take(
     xw: Array,
     out: Array,
 ) -> None:
-    """Relative errors into ``ends`` (least, most, squares, count; with the doses and with dose 1), masses to nodes."""
+    """Relative errors into ``ends`` (least, most, squares, count; with the doses and
+    with dose 1), masses to nodes.
+    """
     line, single = np.zeros(out.shape[1]), alone.shape[0] > 0
     for row in range(block.shape[0]):
         line[:] = 0
@@ -262,7 +383,9 @@ def _take(
 
 
 def _rect_error(fields: Fields, own_class: Array, dose: Array, mass: Array) -> float:
-    """Worst relative error over the outer edges of the pieces; their masses are added to the nodes."""
+    """Worst relative error over the outer edges of the pieces; their masses are added
+    to the nodes.
+    """
     if not len(own_class):
         return 0.0
     spots, area, of = fields.spots

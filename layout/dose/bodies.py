@@ -1,4 +1,6 @@
-"""What is exposed: lattices of pillars in blocks of rows, rectangles, and the table of what each pillar exposes."""
+"""What is exposed: lattices of pillars in blocks of rows, rectangles, and the table of
+what each pillar exposes.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,7 +25,8 @@ class Body:
 
     source: (first row, end row) -> (rows, columns) entries of the table, 0 for none.
     x_um: of the first column; y_um: of the first row; rows run towards -y.
-    row_um: from row to row, 0 for the pitch of the columns. centred: every other site stays empty (a hexagonal
+    row_um: from row to row, 0 for the pitch of the columns. centred: every other site
+    stays empty (a hexagonal
     lattice).
     """
 
@@ -39,13 +42,23 @@ class Body:
     @classmethod
     def of(cls, index: Array, pitch_um: float) -> "Body":
         """A lattice in memory, its first site at (0, 0)."""
-        return cls(index.shape[0], index.shape[1], pitch_um, 0.0, 0.0, lambda first, end: index[first:end])
+        return cls(
+            index.shape[0],
+            index.shape[1],
+            pitch_um,
+            0.0,
+            0.0,
+            lambda first, end: index[first:end],
+        )
 
     def blocks(self) -> Iterator[tuple[int, Array]]:
         """(first row, entries) of blocks of rows."""
         size = max(1, _BLOCK_SITES // max(1, self.columns))
         for first in range(0, self.rows, size):
-            yield first, np.ascontiguousarray(self.source(first, min(first + size, self.rows)))
+            yield (
+                first,
+                np.ascontiguousarray(self.source(first, min(first + size, self.rows))),
+            )
 
     @property
     def down_um(self) -> float:
@@ -59,7 +72,10 @@ class Body:
         straight = [(x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)]
         if not self.centred:
             return np.array(straight)
-        return np.array([(2 * i, 2 * j) for i, j in straight] + [(i, j) for i in (x, -x) for j in (y, -y)])
+        return np.array(
+            [(2 * i, 2 * j) for i, j in straight]
+            + [(i, j) for i in (x, -x) for j in (y, -y)]
+        )
 
     @property
     def apart_um(self) -> float:
@@ -78,7 +94,10 @@ class Body:
     @property
     def box_um(self) -> tuple[float, float, float, float]:
         """Left, bottom, right, top."""
-        right, bottom = self.x_um + (self.columns - 1) * self.pitch_um, self.y_um - (self.rows - 1) * self.down_um
+        right, bottom = (
+            self.x_um + (self.columns - 1) * self.pitch_um,
+            self.y_um - (self.rows - 1) * self.down_um,
+        )
         return self.x_um, bottom, right, self.y_um
 
 
@@ -86,7 +105,8 @@ class Body:
 class Rects:
     """Rectangles that are written in the same exposure, a dose each.
 
-    box_um: (n, 4) left, bottom, right, top. group: (n,) which shape each is a piece of. goal: (n,) as in Table.
+    box_um: (n, 4) left, bottom, right, top. group: (n,) which shape each is a piece of.
+    goal: (n,) as in Table.
     """
 
     box_um: Array
@@ -101,7 +121,10 @@ class Rects:
     @property
     def area_um2(self) -> Array:
         """(n,) areas."""
-        return np.asarray((self.box_um[:, 2] - self.box_um[:, 0]) * (self.box_um[:, 3] - self.box_um[:, 1]))
+        return np.asarray(
+            (self.box_um[:, 2] - self.box_um[:, 0])
+            * (self.box_um[:, 3] - self.box_um[:, 1])
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,8 +133,10 @@ class Table:
 
     drawn: the kinds. area_um2: (entries,), 0 for those that do not occur.
     goal: (entries,) wanted exposure of the edge, in units of what clears.
-    own: (entries,) exposure at the edge by the pillar itself, less what the far field counts for it.
-    slope: (entries,) its fall per um that the edges move out. count: (entries,) pillars of each.
+    own: (entries,) exposure at the edge by the pillar itself, less what the far field
+    counts for it.
+    slope: (entries,) its fall per um that the edges move out. count: (entries,) pillars
+    of each.
     """
 
     drawn: Drawn
@@ -131,9 +156,12 @@ class Table:
 class Ranges:
     """The point exposure split by how far its Gaussians reach.
 
-    far: at least six times as wide as neighbours are apart, summed on nodes over the whole die. middle: reach
-    neighbours only, summed on the sites of each lattice. near: reach no neighbour. Widths of far and middle are widened
-    by the mean pillar: a disc adds R^2 / 2 to the squared width of a Gaussian, the ring on which it is seen R^2; any
+    far: at least six times as wide as neighbours are apart, summed on nodes over the
+    whole die. middle: reach
+    neighbours only, summed on the sites of each lattice. near: reach no neighbour.
+    Widths of far and middle are widened
+    by the mean pillar: a disc adds R^2 / 2 to the squared width of a Gaussian, the ring
+    on which it is seen R^2; any
     other shape the mean squared distances from its centre of its area and of its edges.
     """
 
@@ -157,18 +185,26 @@ def split(point: PointExposure, drawn: Drawn, number: Array, body: Body) -> Rang
     mass = number * drawn.area_um2
     total = float(mass.sum())
     wider = float((mass * drawn.wider_um2).sum() / total) if total else 0.0
-    reach = np.array([_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um])
+    reach = np.array(
+        [_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um]
+    )
     far = point.widths_um >= _COARSE * body.apart_um
-    middle = ~far & ((reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.apart_um))
+    middle = ~far & (
+        (reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.apart_um)
+    )
 
     def some(chosen: Array, wider: float) -> PointExposure:
-        return PointExposure(np.sqrt(point.widths_um[chosen] ** 2 + wider), point.weights[chosen])
+        return PointExposure(
+            np.sqrt(point.widths_um[chosen] ** 2 + wider), point.weights[chosen]
+        )
 
     return Ranges(some(far, wider), some(middle, wider), some(~far & ~middle, 0.0))
 
 
 def _given(drawn: Drawn, used: Array, steps_um: Array, width_um: float) -> float:
-    """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind that receives most."""
+    """Mean exposure of the edges of a pillar by neighbours of its kind, of the kind
+    that receives most.
+    """
     found = [0.0]
     for entry in drawn.widest(used, steps_um) if used.any() else []:
         at = drawn.edge_um(entry)[:, None] - steps_um
@@ -176,14 +212,23 @@ def _given(drawn: Drawn, used: Array, steps_um: Array, width_um: float) -> float
     return max(found)
 
 
-def table(drawn: Drawn, goal: Array, number: Array, *, point: PointExposure, ranges: Ranges, body: Body) -> Table:
+def table(
+    drawn: Drawn,
+    goal: Array,
+    number: Array,
+    *,
+    point: PointExposure,
+    ranges: Ranges,
+    body: Body,
+) -> Table:
     """The table of a mask.
 
     Args:
         body: the densest of the lattices.
 
     Raises:
-        ProcessError: no pillar, or pillars so much finer than the point exposure that their own dose hardly tells.
+        ProcessError: no pillar, or pillars so much finer than the point exposure that
+            their own dose hardly tells.
     """
     used = number > 0
     if not used.any():
@@ -202,12 +247,17 @@ def table(drawn: Drawn, goal: Array, number: Array, *, point: PointExposure, ran
 
 
 def _beside(middle: PointExposure, body: Body) -> float:
-    """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to each other, per um^2.
+    """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to
+    each other, per um^2.
 
-    The sum over all other sites; or, as the whole kernel has no negative ones, what a site would give to itself.
+    The sum over all other sites; or, as the whole kernel has no negative ones, what a
+    site would give to itself.
     """
     reach = 5 * float(middle.widths_um.max(initial=0.0))
-    i, j = (np.arange(-n, n + 1) for n in (int(np.ceil(reach / step)) for step in (body.pitch_um, body.down_um)))
+    i, j = (
+        np.arange(-n, n + 1)
+        for n in (int(np.ceil(reach / step)) for step in (body.pitch_um, body.down_um))
+    )
     apart = np.hypot(i * body.pitch_um, (j * body.down_um)[:, None])
     sites = apart[(i + j[:, None]) % 2 == 0] if body.centred else apart
     itself = float(middle.density(np.array(0.0)))

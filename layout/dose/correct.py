@@ -1,10 +1,16 @@
-"""Proximity correction: a dose for each shape, so that all edges receive the exposure that clears the resist.
+"""Proximity correction: a dose for each shape, so that all edges receive the exposure
+that clears the resist.
 
-The exposure at the edge of pillar i is d_i s_i + B_i: by itself (:mod:`layout.dose.drawn`: s(D) of a disc), and the
-background B = K * (A d) of all other shapes of the die. Setting it to g_i / 2 (1/2: the edge of a wide area of dose 1;
-g: the goal, 1 but for a dose test) gives d = (g / 2 - B) / s, and for the background the linear equation
-B = K * [(g / 2 - B) A / s], solved on a coarse grid of nodes over the die. What varies from pillar to pillar is then a
-product of a number per kind and a smooth function of place. Gaussians too narrow for coarse nodes are solved on the
+The exposure at the edge of pillar i is d_i s_i + B_i: by itself
+(:mod:`layout.dose.drawn`: s(D) of a disc), and the
+background B = K * (A d) of all other shapes of the die. Setting it to g_i / 2 (1/2: the
+edge of a wide area of dose 1;
+g: the goal, 1 but for a dose test) gives d = (g / 2 - B) / s, and for the background
+the linear equation
+B = K * [(g / 2 - B) A / s], solved on a coarse grid of nodes over the die. What varies
+from pillar to pillar is then a
+product of a number per kind and a smooth function of place. Gaussians too narrow for
+coarse nodes are solved on the
 sites of each lattice.
 """
 
@@ -36,11 +42,14 @@ _SPOTS = 10  # of a piece on the nodes, along the same
 class DoseResult:
     """Doses of a mask.
 
-    factors: (classes,) relative dose of each class, rising; dose_uC_cm2: (classes,) the doses.
+    factors: (classes,) relative dose of each class, rising; dose_uC_cm2: (classes,) the
+    doses.
     classes: (y, x) uint8 class of each pillar, 255 where there is none.
-    needed: classes that meet the tolerance; met: whether ``after`` keeps it (the writer may hold fewer).
+    needed: classes that meet the tolerance; met: whether ``after`` keeps it (the writer
+    may hold fewer).
     before, after: uniformity with the best single dose, and with these classes.
-    error: largest difference of the relative exposure from the exact sum, at sample pillars.
+    error: largest difference of the relative exposure from the exact sum, at sample
+    pillars.
     point: the point-exposure function that was used.
     """
 
@@ -57,10 +66,13 @@ class DoseResult:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solution:
-    """Doses of everything on a die; ``before`` and ``after`` as in DoseResult, over the pillars of the first body.
+    """Doses of everything on a die; ``before`` and ``after`` as in DoseResult, over the
+    pillars of the first body.
 
-    ladder: the doses. pairs: (entries, doses) pillars of each, over all bodies. rects: pieces, and ``rect_class`` (n,)
-    the dose class of each. worst: largest relative exposure error over all pillars and pieces.
+    ladder: the doses. pairs: (entries, doses) pillars of each, over all bodies. rects:
+    pieces, and ``rect_class`` (n,)
+    the dose class of each. worst: largest relative exposure error over all pillars and
+    pieces.
     """
 
     ladder: Ladder
@@ -75,12 +87,18 @@ class Solution:
     point: PointExposure
     _fields: assign.Fields
 
-    def classes(self, number: int, first: int, block: Array, *, aside: float = 0.0) -> Array:
-        """(rows, columns) uint8 dose class of the pillars of a block of body ``number``, 255 where there is none.
+    def classes(
+        self, number: int, first: int, block: Array, *, aside: float = 0.0
+    ) -> Array:
+        """(rows, columns) uint8 dose class of the pillars of a block of body
+        ``number``, 255 where there is none.
 
-        aside: steps of the ladder by which the wanted doses are moved before they are rounded.
+        aside: steps of the ladder by which the wanted doses are moved before they are
+            rounded.
         """
-        return assign.classes(self._fields, number, first, block, self.ladder, aside=aside)
+        return assign.classes(
+            self._fields, number, first, block, self.ladder, aside=aside
+        )
 
 
 def solve(
@@ -97,7 +115,8 @@ def solve(
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
         kinds, goal: (entries,) of the table, entry 0 for none.
-        cut: rectangles along whose outer sides the background hardly changes (:func:`pieces`).
+        cut: rectangles along whose outer sides the background hardly changes
+            (:func:`pieces`).
 
     Raises:
         ProcessError: as :func:`correct`.
@@ -112,22 +131,38 @@ def solve(
     pairs, rect_class, after = assign.assign(fields, ladder)
     error = sampled_error(fields, ladder, after, point=point, samples=samples)
     return Solution(
-        ladder, needed, pairs, fields.rects, rect_class, after.before, after.after, after.worst, error, point, fields
+        ladder,
+        needed,
+        pairs,
+        fields.rects,
+        rect_class,
+        after.before,
+        after.after,
+        after.worst,
+        error,
+        point,
+        fields,
     )
 
 
 def correct(written: DiameterMap, process: Process, *, samples: int = 8) -> DoseResult:
-    """Dose classes for drawn pillars (``written``: the drawn diameters, bias taken off).
+    """Dose classes for drawn pillars (``written``: the drawn diameters, bias taken
+    off).
 
     Accuracy:
-        the background is interpolated to some 1e-4 of itself; neighbours count as Gaussians of matched second
-        moment. ``error`` of the result is measured at ``samples`` pillars against exact discs.
+        the background is interpolated to some 1e-4 of itself; neighbours count as
+        Gaussians of matched second
+        moment. ``error`` of the result is measured at ``samples`` pillars against exact
+        discs.
 
     Raises:
-        ProcessError: tone ``negative``; no pillar; no or an unreadable point exposure; pillars finer than its core;
+        ProcessError: tone ``negative``; no pillar; no or an unreadable point exposure;
+            pillars finer than its core;
             a lens too large for a middle range of the point exposure.
     """
-    index = np.empty(written.diameter_um.shape, np.uint16 if written.pitch_um < 6 else np.uint32)
+    index = np.empty(
+        written.diameter_um.shape, np.uint16 if written.pitch_um < 6 else np.uint32
+    )
     for band in np.array_split(np.arange(len(index)), max(1, len(index) // 64)):
         rows = slice(band[0], band[-1] + 1)
         index[rows] = np.rint(written.diameter_um[rows] * (1 / _UNIT_UM))
@@ -136,12 +171,25 @@ def correct(written: DiameterMap, process: Process, *, samples: int = 8) -> Dose
 
 
 def correct_table(
-    index: Array, diameter_um: Array, pitch_um: float, process: Process, *, samples: int = 8
+    index: Array,
+    diameter_um: Array,
+    pitch_um: float,
+    process: Process,
+    *,
+    samples: int = 8,
 ) -> DoseResult:
-    """As :func:`correct`, for pillars given as (y, x) ``index`` into a table of diameters, entry 0 for none."""
+    """As :func:`correct`, for pillars given as (y, x) ``index`` into a table of
+    diameters, entry 0 for none.
+    """
     refuse_negative(process)
     body = Body.of(index, pitch_um)
-    found = solve([body], Discs(diameter_um), np.ones(len(diameter_um)), process.exposure, samples=samples)
+    found = solve(
+        [body],
+        Discs(diameter_um),
+        np.ones(len(diameter_um)),
+        process.exposure,
+        samples=samples,
+    )
     classes = np.empty(index.shape, np.uint8)
     for first, block in body.blocks():
         classes[first : first + len(block)] = found.classes(0, first, block)
@@ -160,7 +208,9 @@ def correct_table(
 
 
 def refuse_negative(process: Process) -> None:
-    """Raises: ProcessError: a dose for each pillar is asked for where the gaps are drawn."""
+    """Raises: ProcessError: a dose for each pillar is asked for where the gaps are
+    drawn.
+    """
     if process.tone == "negative":
         raise ProcessError(
             "a dose per pillar needs drawn pillars, but tone is 'negative' (the gaps are drawn); "
@@ -168,8 +218,11 @@ def refuse_negative(process: Process) -> None:
         )
 
 
-def pieces(boxes: Array, parts: Sequence[Body], settings: Exposure, *, step_um: float) -> tuple[Array, Array]:
-    """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and (m,) the box of each.
+def pieces(
+    boxes: Array, parts: Sequence[Body], settings: Exposure, *, step_um: float
+) -> tuple[Array, Array]:
+    """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and
+    (m,) the box of each.
 
     Raises:
         ProcessError: too many pieces.
@@ -185,20 +238,35 @@ def _box(parts: Sequence[Body], cut: Rects) -> tuple[float, float, float, float]
     return *boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()
 
 
-def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> assign.Fields:
+def _fields(
+    parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects
+) -> assign.Fields:
     """Backgrounds that belong to the wanted doses, and to dose 1 everywhere."""
     width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
     grid = Grid.over(_box(parts, cut), width)
     beside = PointExposure(
-        np.r_[ranges.near.widths_um, ranges.middle.widths_um], np.r_[ranges.near.weights, ranges.middle.weights]
+        np.r_[ranges.near.widths_um, ranges.middle.widths_um],
+        np.r_[ranges.near.weights, ranges.middle.weights],
     )
     own, points, piece = rects.own(cut, beside)
     pads = _Pads(cut, own, (points, piece), rects.samples(cut, width / _SPOTS), grid)
     plain, wanted, goal = _masses(parts, drawn, grid)
     plain += pads.deposited(np.ones(len(own)))
-    reach = convolution(grid.shape, (grid.y.spacing_um, grid.x.spacing_um), point=ranges.far, hollow=False)
-    middles = [_middle(body, ranges) for body in parts] if len(ranges.middle.widths_um) else []
-    alone = [_times(body, drawn.area_um2, middle) for body, middle in zip(parts, middles, strict=False)]
+    reach = convolution(
+        grid.shape,
+        (grid.y.spacing_um, grid.x.spacing_um),
+        point=ranges.far,
+        hollow=False,
+    )
+    middles = (
+        [_middle(body, ranges) for body in parts]
+        if len(ranges.middle.widths_um)
+        else []
+    )
+    alone = [
+        _times(body, drawn.area_um2, middle)
+        for body, middle in zip(parts, middles, strict=False)
+    ]
     field, near = _backgrounds(parts, drawn, grid, reach, (wanted, goal), middles, pads)
     return assign.Fields(
         parts,
@@ -221,9 +289,11 @@ def _fields(parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects) -> 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pads:
-    """Pieces of marks as masses on the nodes; the dose of each is the one that its outer edges need.
+    """Pieces of marks as masses on the nodes; the dose of each is the one that its
+    outer edges need.
 
-    own: (pieces,) exposure by its shape at unit dose; edges: points (n, 2), and the piece of each; spots: points,
+    own: (pieces,) exposure by its shape at unit dose; edges: points (n, 2), and the
+    piece of each; spots: points,
     areas and pieces that stand for them.
     """
 
@@ -244,14 +314,25 @@ class _Pads:
             return np.zeros(self.grid.shape)
         points, piece = self.edges
         number = np.bincount(piece, minlength=len(self.own))
-        around = np.bincount(piece, self.grid.sample(field, *points.T), minlength=len(self.own)) / number
+        around = (
+            np.bincount(
+                piece, self.grid.sample(field, *points.T), minlength=len(self.own)
+            )
+            / number
+        )
         return self.deposited((CLEARS * self.rects.goal - around) / self.own)
 
 
-def _masses(parts: Sequence[Body], drawn: Table, grid: Grid) -> tuple[Array, Array, Array]:
+def _masses(
+    parts: Sequence[Body], drawn: Table, grid: Grid
+) -> tuple[Array, Array, Array]:
     """Node sums of area, area / own, and goal area / own."""
-    per_own = np.divide(drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used)
-    value = np.stack([np.where(drawn.used, drawn.area_um2, 0.0), per_own, per_own * drawn.goal])
+    per_own = np.divide(
+        drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used
+    )
+    value = np.stack(
+        [np.where(drawn.used, drawn.area_um2, 0.0), per_own, per_own * drawn.goal]
+    )
     out = np.zeros((3, *grid.shape))
     for body in parts:
         xn, xw = grid.x.at(body.columns_um)
@@ -262,14 +343,21 @@ def _masses(parts: Sequence[Body], drawn: Table, grid: Grid) -> tuple[Array, Arr
 
 
 def _middle(body: Body, ranges: Ranges) -> Convolution:
-    """Convolution on the sites of a lattice with the Gaussians that reach neighbours only."""
+    """Convolution on the sites of a lattice with the Gaussians that reach neighbours
+    only.
+    """
     if body.rows * body.columns > _MOST_SITES:
         raise ProcessError(
             f"a lens of {body.rows} x {body.columns} sites with a point exposure that holds Gaussians of "
             f"{np.array2string(ranges.middle.widths_um, precision=3)} um: such middle ranges are corrected on at most "
             f"{_MOST_SITES:,} sites; give a point exposure of core and backscatter alone"
         )
-    return convolution((body.rows, body.columns), (body.down_um, body.pitch_um), point=ranges.middle, hollow=True)
+    return convolution(
+        (body.rows, body.columns),
+        (body.down_um, body.pitch_um),
+        point=ranges.middle,
+        hollow=True,
+    )
 
 
 def _times(body: Body, value: Array, middle: Convolution) -> Array:
@@ -287,11 +375,15 @@ def _backgrounds(
     middles: Sequence[Convolution],
     pads: _Pads,
 ) -> tuple[Array, list[Array]]:
-    """Far field on the nodes and middle field on the sites that belong to the wanted doses, in turn until they rest."""
+    """Far field on the nodes and middle field on the sites that belong to the wanted
+    doses, in turn until they rest.
+    """
     wanted, goal = masses
     field = _relaxed(reach, wanted, CLEARS * goal, pads=pads)
     near: list[Array] = []
-    per_own = np.divide(drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used)
+    per_own = np.divide(
+        drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used
+    )
     for _ in range(12 if middles else 0):
         near, taken = [], np.zeros(grid.shape)
         for body, middle in zip(parts, middles, strict=True):
@@ -301,7 +393,12 @@ def _backgrounds(
             far = np.empty(index.shape, np.float32)
             spread(field, yn, yw, xn, xw, far)
             mass = per_own.take(index)
-            own = _relaxed(middle, mass, (CLEARS * drawn.goal.take(index) - far) * mass, bound_below=0.9)
+            own = _relaxed(
+                middle,
+                mass,
+                (CLEARS * drawn.goal.take(index) - far) * mass,
+                bound_below=0.9,
+            )
             near.append(own.astype(np.float32))
             rows, columns = np.nonzero(index)
             x, y = body.columns_um[columns], body.rows_um(0, body.rows)[rows]
@@ -313,9 +410,15 @@ def _backgrounds(
 
 
 def _relaxed(
-    reach: Convolution, mass: Array, drive: Array, *, bound_below: float = 0.0, pads: _Pads | None = None
+    reach: Convolution,
+    mass: Array,
+    drive: Array,
+    *,
+    bound_below: float = 0.0,
+    pads: _Pads | None = None,
 ) -> Array:
-    """B = K * [drive - B mass + pads(B)], to 1e-8; eigenvalues of K * mass lie between -bound_below and the largest
+    """B = K * [drive - B mass + pads(B)], to 1e-8; eigenvalues of K * mass lie between
+    -bound_below and the largest
     row sum.
     """
     all_mass = mass if pads is None else mass + pads.deposited(1 / pads.own)

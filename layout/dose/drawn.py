@@ -1,11 +1,15 @@
-"""What each kind of pillar exposes at unit dose: discs in closed form, any other shape by its polygons.
+"""What each kind of pillar exposes at unit dose: discs in closed form, any other shape
+by its polygons.
 
-The edge that counts is the one in the resist. At dose d on a background B it is where d E(x) + B = 1/2, E the exposure
-by the pillar itself at unit dose; the pillar keeps its area A where E's level set of area A lies there:
+The edge that counts is the one in the resist. At dose d on a background B it is where d
+E(x) + B = 1/2, E the exposure
+by the pillar itself at unit dose; the pillar keeps its area A where E's level set of
+area A lies there:
 
     d own + B = 1/2,   own: the level that E exceeds on the area A.
 
-Of a disc that is the exposure of its rim; rounded corners are made up for by the straight edges. Turns about the site
+Of a disc that is the exposure of its rim; rounded corners are made up for by the
+straight edges. Turns about the site
 leave ``own`` as it is, so that the table is smooth in turn and size.
 """
 
@@ -42,18 +46,23 @@ class Drawn(Protocol):
 
     @property
     def wider_um2(self) -> Array:
-        """(entries,) added to the squared width of a Gaussian: mean squared distances from the middle, over the area of
+        """(entries,) added to the squared width of a Gaussian: mean squared distances
+        from the middle, over the area of
         the pillar that gives plus over the edge that sees.
         """
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """(entries,) ``own`` at unit dose, and its fall per um that all edges move out; 0 where not ``used``."""
+        """(entries,) ``own`` at unit dose, and its fall per um that all edges move out;
+        0 where not ``used``.
+        """
 
     def edge_um(self, entry: int) -> Array:
         """(n, 2) places along the edges, from the site."""
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
-        """(...) exposure at (..., 2) places from the site, by one Gaussian, at unit dose."""
+        """(...) exposure at (..., 2) places from the site, by one Gaussian, at unit
+        dose.
+        """
 
     def widest(self, used: Array, steps_um: Array) -> list[int]:
         """Entries that come nearest to others at these (n, 2) steps."""
@@ -77,17 +86,26 @@ class Discs:
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
         """As in :class:`Drawn`, exact."""
-        d, terms = np.where(used, self.diameter_um, 0.0), list(zip(point.widths_um, point.weights, strict=True))
-        own, slope = (sum(w * f(d, a) for a, w in terms) for f in (rim_of_own_disc, slope_at_rim))
+        d, terms = (
+            np.where(used, self.diameter_um, 0.0),
+            list(zip(point.widths_um, point.weights, strict=True)),
+        )
+        own, slope = (
+            sum(w * f(d, a) for a, w in terms) for f in (rim_of_own_disc, slope_at_rim)
+        )
         return np.asarray(own), np.where(used, slope, 0)
 
     def edge_um(self, entry: int) -> Array:
         """As in :class:`Drawn`."""
-        return np.asarray(self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1))
+        return np.asarray(
+            self.diameter_um[entry] / 2 * np.stack([np.cos(_RIM), np.sin(_RIM)], -1)
+        )
 
     def given(self, entry: int, at_um: Array, width_um: float) -> Array:
         """As in :class:`Drawn`, exact."""
-        return disc(np.hypot(at_um[..., 0], at_um[..., 1]), self.diameter_um[entry], width_um)
+        return disc(
+            np.hypot(at_um[..., 0], at_um[..., 1]), self.diameter_um[entry], width_um
+        )
 
     def widest(self, used: Array, steps_um: Array) -> list[int]:
         """The thickest."""
@@ -116,7 +134,9 @@ class Outlines:
         return np.array([_wider(each) if each else 0.0 for each in self.contours])
 
     def edges(self, used: Array, point: PointExposure) -> tuple[Array, Array]:
-        """As in :class:`Drawn`; to 5e-4 of itself (pixels of a sixth of the narrowest Gaussian)."""
+        """As in :class:`Drawn`; to 5e-4 of itself (pixels of a sixth of the narrowest
+        Gaussian).
+        """
         found = np.zeros((2, len(self.contours)))
         for k in np.flatnonzero(used).tolist():
             found[:, k] = _level(self.contours[k], float(self.area_um2[k]), point)
@@ -130,13 +150,21 @@ class Outlines:
         """As in :class:`Drawn`; four Gauss points to 0.8 widths, 1e-6."""
         places = at_um.reshape(-1, 2)
         y, weight, crossing = _lines(self.contours[entry], width_um)
-        bell = weight * np.exp(-(((places[:, 1:] - y) / width_um) ** 2)) / (np.sqrt(np.pi) * width_um)
-        return np.asarray((bell * _erf((crossing - places[:, :1]) / width_um)).sum(1) / 2).reshape(at_um.shape[:-1])
+        bell = (
+            weight
+            * np.exp(-(((places[:, 1:] - y) / width_um) ** 2))
+            / (np.sqrt(np.pi) * width_um)
+        )
+        return np.asarray(
+            (bell * _erf((crossing - places[:, :1]) / width_um)).sum(1) / 2
+        ).reshape(at_um.shape[:-1])
 
     def widest(self, used: Array, steps_um: Array) -> list[int]:
         """The one that reaches farthest along each of the steps."""
         some = np.flatnonzero(used).tolist()
-        far = np.array([(np.concatenate(list(self.contours[k])) @ steps_um.T).max(0) for k in some])
+        far = np.array(
+            [(np.concatenate(list(self.contours[k])) @ steps_um.T).max(0) for k in some]
+        )
         return sorted({some[k] for k in far.argmax(0).tolist()})
 
 
@@ -148,7 +176,8 @@ def _wider(contours: Contours) -> float:
 
 
 def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
-    """Crossings of level lines with edges: (n,) heights, Gauss weights (below 0 where the edge runs down), and places.
+    """Crossings of level lines with edges: (n,) heights, Gauss weights (below 0 where
+    the edge runs down), and places.
 
     The integral over the shape of f(x) g(y) is the sum of weight g(y) F(place), F' = f.
     """
@@ -156,7 +185,12 @@ def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
     end = np.concatenate([np.roll(c, -1, axis=0) for c in contours])
     stops = np.unique(start[:, 1])
     counts = np.maximum(np.ceil(np.diff(stops) / (_PANEL * narrow_um)).astype(int), 1)
-    left = np.concatenate([a + (b - a) / n * np.arange(n) for a, b, n in zip(stops, stops[1:], counts, strict=False)])
+    left = np.concatenate(
+        [
+            a + (b - a) / n * np.arange(n)
+            for a, b, n in zip(stops, stops[1:], counts, strict=False)
+        ]
+    )
     wide = np.repeat(np.diff(stops) / counts, counts)
     node, share = np.polynomial.legendre.leggauss(4)
     y = (left[:, None] + wide[:, None] * (node + 1) / 2).ravel()
@@ -168,18 +202,29 @@ def _lines(contours: Contours, narrow_um: float) -> tuple[Array, Array, Array]:
     return y[line], weight[line] * np.sign(rise[:, 1]), place
 
 
-def _level(contours: Contours, area_um2: float, point: PointExposure) -> tuple[float, float]:
-    """Level that the exposure of a shape by itself exceeds on its own area, and its fall per um that edges move out."""
+def _level(
+    contours: Contours, area_um2: float, point: PointExposure
+) -> tuple[float, float]:
+    """Level that the exposure of a shape by itself exceeds on its own area, and its
+    fall per um that edges move out.
+    """
     corners = np.concatenate(list(contours))
     core = float(point.widths_um.min())
     size = float(np.ptp(corners, axis=0).max())
     pixel = max(_PIXEL * core, size / _MOST_PIXELS)
     margin = min(2 * core, size)
-    x, y = (np.arange(low - margin, high + margin + pixel, pixel) for low, high in zip(*_box(corners), strict=True))
+    x, y = (
+        np.arange(low - margin, high + margin + pixel, pixel)
+        for low, high in zip(*_box(corners), strict=True)
+    )
     height, weight, place = _lines(contours, core)
     image = np.zeros((len(y), len(x)))
     for width, share in zip(point.widths_um, point.weights, strict=True):
-        bell = weight * np.exp(-(((y[:, None] - height) / width) ** 2)) / (np.sqrt(np.pi) * width)
+        bell = (
+            weight
+            * np.exp(-(((y[:, None] - height) / width) ** 2))
+            / (np.sqrt(np.pi) * width)
+        )
         image += share / 2 * (bell @ _erf((place[:, None] - x) / width))
     down, across = np.gradient(image)  # per pixel
 
@@ -192,14 +237,18 @@ def _level(contours: Contours, area_um2: float, point: PointExposure) -> tuple[f
         low, high = (middle, high) if larger(middle) > area_um2 else (low, middle)
     level = (low + high) / 2
     off = 0.15 * level  # a few pixels, so that their places do not tell
-    return level, perimeter(contours) / max((larger(level - off) - larger(level + off)) / (2 * off), 1e-12)
+    return level, perimeter(contours) / max(
+        (larger(level - off) - larger(level + off)) / (2 * off), 1e-12
+    )
 
 
 @compiled
 def _above(image: Array, down: Array, across: Array, level: float) -> float:
-    """Pixels on which a picture is above a level: of each the share of the half plane by its slope.
+    """Pixels on which a picture is above a level: of each the share of the half plane
+    by its slope.
 
-    Straight edges of any turn are cut exactly: along one at 45 degrees all pixels are cut alike, and what is off in
+    Straight edges of any turn are cut exactly: along one at 45 degrees all pixels are
+    cut alike, and what is off in
     one is off in all.
     """
     total = 0.0
@@ -207,7 +256,9 @@ def _above(image: Array, down: Array, across: Array, level: float) -> float:
         for column in range(image.shape[1]):
             p, q = abs(down[row, column]), abs(across[row, column])
             steep, flat, over = max(p, q), min(p, q), image[row, column] - level
-            beyond = (p + q) / 2 - abs(over)  # of the corner that the edge comes to last
+            beyond = (p + q) / 2 - abs(
+                over
+            )  # of the corner that the edge comes to last
             if beyond <= 0:
                 share = 0.0
             elif beyond >= flat:

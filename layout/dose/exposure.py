@@ -1,8 +1,12 @@
-"""Point exposure of an electron beam as a sum of Gaussians, and the exact exposure that discs make of it.
+"""Point exposure of an electron beam as a sum of Gaussians, and the exact exposure that
+discs make of it.
 
-A beam at one point deposits the energy density f(r) = sum_k w_k exp(-r^2 / a_k^2) / (pi a_k^2) with sum w_k = 1:
-the double Gaussian of forward and back-scattered electrons (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)) has
-w = (1, eta) / (1 + eta), a = (alpha, beta). Measured functions have longer tails; they are fitted with a ladder
+A beam at one point deposits the energy density f(r) = sum_k w_k exp(-r^2 / a_k^2) / (pi
+a_k^2) with sum w_k = 1:
+the double Gaussian of forward and back-scattered electrons (Chang, J. Vac. Sci.
+Technol. 12, 1271 (1975)) has
+w = (1, eta) / (1 + eta), a = (alpha, beta). Measured functions have longer tails; they
+are fitted with a ladder
 of Gaussians.
 """
 
@@ -23,7 +27,8 @@ class PointExposure:
     """f(r) = sum weights exp(-r^2 / widths^2) / (pi widths^2).
 
     widths_um, weights: (terms,), the weights sum to 1.
-    fit_error: largest difference between the energy within a radius of the fit and of the table; 0 if exact.
+    fit_error: largest difference between the energy within a radius of the fit and of
+    the table; 0 if exact.
     """
 
     widths_um: Array
@@ -43,7 +48,8 @@ class PointExposure:
 
 
 def point_exposure(exposure: Exposure) -> PointExposure:
-    """What the process file describes: the double or triple Gaussian, or the fit of its measured table.
+    """What the process file describes: the double or triple Gaussian, or the fit of its
+    measured table.
 
     Raises:
         ProcessError: it describes none, or the table cannot be used.
@@ -52,54 +58,85 @@ def point_exposure(exposure: Exposure) -> PointExposure:
         radius, density = np.array(read_csv(exposure.csv)).T
         return fit(radius, density, where=str(exposure.csv))
     if exposure.alpha_um is None or exposure.beta_um is None or exposure.eta is None:
-        raise ProcessError(f"no point exposure is given: [exposure] needs {exposure.missing}")
-    third = ([], []) if exposure.gamma_um is None else ([exposure.gamma_um], [exposure.nu])
+        raise ProcessError(
+            f"no point exposure is given: [exposure] needs {exposure.missing}"
+        )
+    third = (
+        ([], []) if exposure.gamma_um is None else ([exposure.gamma_um], [exposure.nu])
+    )
     weights = np.array([1.0, exposure.eta, *third[1]])
-    return PointExposure(np.array([exposure.alpha_um, exposure.beta_um, *third[0]]), weights / weights.sum())
+    return PointExposure(
+        np.array([exposure.alpha_um, exposure.beta_um, *third[0]]),
+        weights / weights.sum(),
+    )
 
 
-def fit(radius_um: Array, density: Array, *, where: str = "point exposure") -> PointExposure:
-    """Gaussians of non-negative weight through a measured radial function, by relative error at each sample.
+def fit(
+    radius_um: Array, density: Array, *, where: str = "point exposure"
+) -> PointExposure:
+    """Gaussians of non-negative weight through a measured radial function, by relative
+    error at each sample.
 
     Args:
-        radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above 0.
+        radius_um: (n,) rising, above 0; density: (n,) energy density in any unit, above
+            0.
 
     Raises:
-        ProcessError: fewer than 4 samples, radii that do not rise, values that are not above 0.
+        ProcessError: fewer than 4 samples, radii that do not rise, values that are not
+            above 0.
     """
     from scipy.optimize import nnls
 
     radius, value = np.asarray(radius_um, float), np.asarray(density, float)
-    sound = np.isfinite(value).all() and np.isfinite(radius).all() and (value > 0).all() and (np.diff(radius) > 0).all()
+    sound = (
+        np.isfinite(value).all()
+        and np.isfinite(radius).all()
+        and (value > 0).all()
+        and (np.diff(radius) > 0).all()
+    )
     if radius.size < 4 or not sound or radius[0] <= 0:
-        raise ProcessError(f"{where}: need at least 4 rising radii above 0 um, each with an energy density above 0")
+        raise ProcessError(
+            f"{where}: need at least 4 rising radii above 0 um, each with an energy density above 0"
+        )
     steps = max(8, int(np.ceil(4 * np.log2(radius[-1] / radius[0]))))
     widths = np.geomspace(radius[0], radius[-1], steps + 1)
     energy = radius**2 * value
-    heed = (0.02 + energy / energy.max()) / value  # relative errors count, most where the energy is
-    design = np.exp(-((radius[:, None] / widths) ** 2)) / (np.pi * widths**2) * heed[:, None]
+    heed = (
+        0.02 + energy / energy.max()
+    ) / value  # relative errors count, most where the energy is
+    design = (
+        np.exp(-((radius[:, None] / widths) ** 2)) / (np.pi * widths**2) * heed[:, None]
+    )
     scale = design.max(axis=0)
     weights = nnls(design / scale, value * heed)[0] / scale
     total = weights.sum()
     keep = weights > 1e-9 * total
     found = PointExposure(widths[keep], weights[keep] / total)
-    return PointExposure(found.widths_um, found.weights, _fit_error(found, radius, value / total))
+    return PointExposure(
+        found.widths_um, found.weights, _fit_error(found, radius, value / total)
+    )
 
 
 def _fit_error(found: PointExposure, radius: Array, density: Array) -> float:
-    """Largest difference of the energy between the first radius and each other one, table by power laws."""
+    """Largest difference of the energy between the first radius and each other one,
+    table by power laws.
+    """
     slope = np.diff(np.log(density)) / np.diff(np.log(radius)) + 2
     start, end = density[:-1] * radius[:-1] ** 2, density[1:] * radius[1:] ** 2
     flat = abs(slope) < 1e-9
-    ring = np.where(flat, start * np.diff(np.log(radius)), (end - start) / np.where(flat, 1, slope))
+    ring = np.where(
+        flat, start * np.diff(np.log(radius)), (end - start) / np.where(flat, 1, slope)
+    )
     table = 2 * np.pi * np.r_[0, np.cumsum(ring)]
     return float(abs(found.within(radius) - found.within(radius[:1]) - table).max())
 
 
 def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
-    """Exposure at the rim of a disc of unit dose by one Gaussian: (1 - exp(-x) I0(x)) / 2, x = 2 R^2 / a^2.
+    """Exposure at the rim of a disc of unit dose by one Gaussian: (1 - exp(-x) I0(x)) /
+    2, x = 2 R^2 / a^2.
 
-    From the Marcum Q function at equal arguments, Q1(c, c) = (1 + exp(-c^2) I0(c^2)) / 2. Exact.
+    From the Marcum Q function at equal arguments, Q1(c, c) = (1 + exp(-c^2) I0(c^2)) /
+    2. Exact.
     """
     from scipy.special import i0e
 
@@ -108,19 +145,27 @@ def rim_of_own_disc(diameter_um: Array | float, width_um: float) -> Array:
 
 
 def slope_at_rim(diameter_um: Array | float, width_um: float) -> Array:
-    """How fast that exposure falls with the radius there, per um: (2 R / a^2) exp(-x) I1(x). Exact."""
+    """How fast that exposure falls with the radius there, per um: (2 R / a^2) exp(-x)
+    I1(x). Exact.
+    """
     from scipy.special import i1e
 
     radius = np.asarray(diameter_um, float) / 2
     return np.asarray(2 * radius / width_um**2 * i1e(2 * (radius / width_um) ** 2))
 
 
-def disc(distance_um: Array | float, diameter_um: Array | float, width_um: float) -> Array:
-    """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one Gaussian. Exact.
+def disc(
+    distance_um: Array | float, diameter_um: Array | float, width_um: float
+) -> Array:
+    """Exposure at ``distance_um`` from the centre of a disc of unit dose, by one
+    Gaussian. Exact.
 
-    The probability that a Gaussian displacement ends within the disc: non-central chi-square of 2 degrees.
+    The probability that a Gaussian displacement ends within the disc: non-central
+    chi-square of 2 degrees.
     """
     from scipy.special import chndtr
 
     scale = 2 / width_um**2
-    return np.asarray(chndtr(scale * np.square(diameter_um) / 4, 2.0, scale * np.square(distance_um)))
+    return np.asarray(
+        chndtr(scale * np.square(diameter_um) / 4, 2.0, scale * np.square(distance_um))
+    )

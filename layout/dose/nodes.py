@@ -1,9 +1,14 @@
-"""Sums over all shapes of a smooth kernel, through a coarse grid: cubic interpolation and its transpose.
+"""Sums over all shapes of a smooth kernel, through a coarse grid: cubic interpolation
+and its transpose.
 
-A kernel that is smooth over some pitches needs no sum over sites: spread each pillar to the four nearest nodes of
-each axis with the weights of cubic interpolation, convolve on the nodes, and interpolate back. Both interpolations
-are of order 4, also at the edge of the lens, since what is interpolated is the kernel and not the pattern. The nodes
-lie anywhere: lattices of any place and pitch, and shapes off any lattice, share one grid.
+A kernel that is smooth over some pitches needs no sum over sites: spread each pillar to
+the four nearest nodes of
+each axis with the weights of cubic interpolation, convolve on the nodes, and
+interpolate back. Both interpolations
+are of order 4, also at the edge of the lens, since what is interpolated is the kernel
+and not the pattern. The nodes
+lie anywhere: lattices of any place and pitch, and shapes off any lattice, share one
+grid.
 """
 
 from dataclasses import dataclass
@@ -30,10 +35,16 @@ class Axis:
     @classmethod
     def over(cls, low_um: float, high_um: float, spacing_um: float) -> "Axis":
         """Nodes that hold four around every position from ``low_um`` to ``high_um``."""
-        return cls(low_um - 1.5 * spacing_um, spacing_um, int((high_um - low_um) / spacing_um) + 5)
+        return cls(
+            low_um - 1.5 * spacing_um,
+            spacing_um,
+            int((high_um - low_um) / spacing_um) + 5,
+        )
 
     def at(self, position_um: Array) -> tuple[Array, Array]:
-        """First of the four nodes around each position (n,), and their cubic Lagrange weights (n, 4)."""
+        """First of the four nodes around each position (n,), and their cubic Lagrange
+        weights (n, 4).
+        """
         steps = (np.asarray(position_um, float) - self.origin_um) / self.spacing_um
         first = np.clip(np.floor(steps).astype(np.int64) - 1, 0, self.count - 4)
         t = steps - first - 1
@@ -51,7 +62,8 @@ class Grid:
 
     @classmethod
     def over(cls, box_um: tuple[float, float, float, float], width_um: float) -> "Grid":
-        """Nodes over (left, bottom, right, top), fine enough for Gaussians of ``width_um`` (1/e radius).
+        """Nodes over (left, bottom, right, top), fine enough for Gaussians of
+        ``width_um`` (1/e radius).
 
         Raises:
             ProcessError: more than 4e7 nodes.
@@ -81,12 +93,16 @@ class Grid:
     def sample(self, field: Array, x_um: Array, y_um: Array) -> Array:
         """(n,) values of a node field at any places."""
         out = np.zeros(len(np.atleast_1d(x_um)))
-        _sample(*self.x.at(np.atleast_1d(x_um)), *self.y.at(np.atleast_1d(y_um)), field, out)
+        _sample(
+            *self.x.at(np.atleast_1d(x_um)), *self.y.at(np.atleast_1d(y_um)), field, out
+        )
         return out
 
 
 @compiled
-def _deposit(xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array) -> None:
+def _deposit(
+    xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array
+) -> None:
     for n in range(mass.shape[0]):
         for i in range(4):
             for j in range(4):
@@ -94,7 +110,9 @@ def _deposit(xn: Array, xw: Array, yn: Array, yw: Array, mass: Array, out: Array
 
 
 @compiled
-def _sample(xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array) -> None:
+def _sample(
+    xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array
+) -> None:
     for n in range(out.shape[0]):
         total = 0.0
         for i in range(4):
@@ -104,10 +122,13 @@ def _sample(xn: Array, xw: Array, yn: Array, yw: Array, field: Array, out: Array
 
 
 @compiled
-def gather(block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array) -> None:
+def gather(
+    block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
+) -> None:
     """Add what the pillars of a block of rows carry to the nodes.
 
-    block: (rows, columns) entries; value: (fields, entries), 0 for none; yn, yw: (rows,), (rows, 4) nodes and weights
+    block: (rows, columns) entries; value: (fields, entries), 0 for none; yn, yw:
+    (rows,), (rows, 4) nodes and weights
     of the rows, xn, xw of the columns; out: (fields, y, x).
     """
     fields, wide = out.shape[0], out.shape[2]
@@ -127,7 +148,9 @@ def gather(block: Array, value: Array, yn: Array, yw: Array, xn: Array, xw: Arra
 
 
 @compiled
-def spread(field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array) -> None:
+def spread(
+    field: Array, yn: Array, yw: Array, xn: Array, xw: Array, out: Array
+) -> None:
     """The node field (y, x) at the sites of a block of rows: (rows, columns) float32."""
     line = np.zeros(field.shape[1])
     for row in range(out.shape[0]):
@@ -162,9 +185,14 @@ class Convolution:
 
 
 def convolution(
-    shape: tuple[int, int], spacing_um: tuple[float, float], *, point: PointExposure, hollow: bool
+    shape: tuple[int, int],
+    spacing_um: tuple[float, float],
+    *,
+    point: PointExposure,
+    hollow: bool,
 ) -> Convolution:
-    """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5 widths out (exp(-25)).
+    """Convolution with a sum of Gaussians on nodes ``spacing_um`` (y, x) apart, cut 5
+    widths out (exp(-25)).
 
     hollow: leave out what a node gives to itself.
     """
@@ -172,11 +200,21 @@ def convolution(
 
     reach = 5 * float(point.widths_um.max(initial=0.0))
     far = (int(np.ceil(reach / step)) for step in spacing_um)
-    ny, nx = (fft.next_fast_len(n + min(n, m), real=True) for n, m in zip(shape, far, strict=True))
-    y, x = (np.minimum(np.arange(n), n - np.arange(n)) * step for n, step in zip((ny, nx), spacing_um, strict=True))
+    ny, nx = (
+        fft.next_fast_len(n + min(n, m), real=True)
+        for n, m in zip(shape, far, strict=True)
+    )
+    y, x = (
+        np.minimum(np.arange(n), n - np.arange(n)) * step
+        for n, step in zip((ny, nx), spacing_um, strict=True)
+    )
     kernel = np.zeros((ny, nx))
     for width, weight in zip(point.widths_um, point.weights, strict=True):
-        kernel += weight / (np.pi * width**2) * np.outer(np.exp(-((y / width) ** 2)), np.exp(-((x / width) ** 2)))
+        kernel += (
+            weight
+            / (np.pi * width**2)
+            * np.outer(np.exp(-((y / width) ** 2)), np.exp(-((x / width) ** 2)))
+        )
     if hollow:
         kernel[0, 0] = 0
     return Convolution(fft.rfft2(kernel), shape, (ny, nx))

@@ -1,7 +1,10 @@
-"""Rectangles of marks and labels cut into pieces of one dose each: short where the background changes, long elsewhere.
+"""Rectangles of marks and labels cut into pieces of one dose each: short where the
+background changes, long elsewhere.
 
-The background along a straight edge changes next to its ends and next to other shapes only, over a range of the
-Gaussian; so the number of pieces goes with the number of corners, and not with area over range squared.
+The background along a straight edge changes next to its ends and next to other shapes
+only, over a range of the
+Gaussian; so the number of pieces goes with the number of corners, and not with area
+over range squared.
 """
 
 from dataclasses import dataclass
@@ -15,18 +18,22 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
 MOST_PIECES = 500_000
-_SHARE = 0.2  # of the tolerance, which the background may change from the middle of a side to its end
+# of the tolerance, which the background may change from the middle of a side to its end
+_SHARE = 0.2
 _SHORTEST = 64  # pieces along the range, at most
 _LONGEST = (0.5, 1.0, 2.0, 4.0)  # ranges: of a piece, the first that the limits allow
 _FEW_PIECES = 100_000
-_EVEN = 1.0  # ranges: where longer pieces meet, doses change so far into a shape that edges are 1 to 2 % off
+# ranges: where longer pieces meet, doses change so far into a shape that edges are 1 to
+# 2 % off
+_EVEN = 1.0
 _BESIDE = 8  # pieces along the range next to a lens, whose edge is no box
 _FEW = 3.0  # ranges at which a lens, or a corner, no longer counts
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pieces:
-    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these sides the box has of its
+    """box: (n, 4) left, bottom, right, top in grid steps. outer: (n, 4) which of these
+    sides the box has of its
     shape, in part at least.
 
     of: (n,) the box it was cut from.
@@ -50,14 +57,23 @@ class _Pieces:
 
 
 def cut(
-    boxes: Array, lattices: Array, *, step_um: float, point: PointExposure, tolerance: float
+    boxes: Array,
+    lattices: Array,
+    *,
+    step_um: float,
+    point: PointExposure,
+    tolerance: float,
 ) -> tuple[Array, Array]:
-    """Boxes (n, 4) on the grid cut to pieces (m, 4) on the grid, and (m,) the box of each.
+    """Boxes (n, 4) on the grid cut to pieces (m, 4) on the grid, and (m,) the box of
+    each.
 
     Args:
-        boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the pillars, um.
-        tolerance: of the exposure; the background changes by a fifth of it between middle and end of a side, or
-            the piece is a 64th of the range or two of the core short (doses that step so often are even once blurred).
+        boxes: whole grid steps; step_um: one of them. lattices: (l, 4) boxes around the
+            pillars, um.
+        tolerance: of the exposure; the background changes by a fifth of it between
+            middle and end of a side, or
+            the piece is a 64th of the range or two of the core short (doses that step
+            so often are even once blurred).
 
     Raises:
         ProcessError: more than 500 000 pieces.
@@ -66,7 +82,13 @@ def cut(
     if not wide.any() or not len(boxes):
         return np.asarray(boxes, np.int64), np.arange(len(boxes))
     around = PointExposure(point.widths_um[wide], point.weights[wide])
-    shortest = max(float(around.widths_um.min()) / _SHORTEST, CORNER * float(point.widths_um.min())) / step_um
+    shortest = (
+        max(
+            float(around.widths_um.min()) / _SHORTEST,
+            CORNER * float(point.widths_um.min()),
+        )
+        / step_um
+    )
     change = _SHARE * tolerance * CLEARS
     usual, corners = _ranges(around, change)
     sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
@@ -74,7 +96,12 @@ def cut(
         most = MOST_PIECES if ranges >= _EVEN else min(_FEW_PIECES, MOST_PIECES)
         if np.ceil(sides / (ranges * usual)).prod(1).sum() > most:
             continue
-        caps = _Caps(shortest, ranges * usual, [(_FEW * width, ranges * width) for width in corners], change)
+        caps = _Caps(
+            shortest,
+            ranges * usual,
+            [(_FEW * width, ranges * width) for width in corners],
+            change,
+        )
         every = _halved(boxes, lattices, step_um, around, caps, most=most)
         if every is not None:
             order = np.argsort(every.of, kind="stable")
@@ -87,7 +114,8 @@ def cut(
 
 @dataclass(frozen=True, slots=True)
 class _Caps:
-    """shortest: side in grid steps, which is halved no more. longest_um: of a piece, and ``corners`` how near to a
+    """shortest: side in grid steps, which is halved no more. longest_um: of a piece,
+    and ``corners`` how near to a
     corner it is what, um. change: of the background from the middle of a piece.
     """
 
@@ -98,10 +126,13 @@ class _Caps:
 
 
 def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
-    """Width that half of the scattered energy reaches, and the narrower ones, falling, whose energy counts at corners.
+    """Width that half of the scattered energy reaches, and the narrower ones, falling,
+    whose energy counts at corners.
 
-    There a Gaussian gives an eighth of its weight less than in the middle of what it changes by. All that together
-    change by less than ``change`` are left out: the doses beside them are as even without.
+    There a Gaussian gives an eighth of its weight less than in the middle of what it
+    changes by. All that together
+    change by less than ``change`` are left out: the doses beside them are as even
+    without.
     """
     order = np.argsort(around.widths_um)
     widths, total = around.widths_um[order], np.cumsum(around.weights[order])
@@ -110,14 +141,29 @@ def _ranges(around: PointExposure, change: float) -> tuple[float, list[float]]:
 
 
 def _halved(
-    boxes: Array, lattices: Array, step_um: float, around: PointExposure, caps: _Caps, *, most: int
+    boxes: Array,
+    lattices: Array,
+    step_um: float,
+    around: PointExposure,
+    caps: _Caps,
+    *,
+    most: int,
 ) -> _Pieces | None:
-    """Boxes halved until they keep the limits; None where that takes more than ``most``."""
+    """Boxes halved until they keep the limits; None where that takes more than
+    ``most``.
+    """
     every = np.asarray(boxes) * step_um
-    pairs, whole = pairs_near(every, np.zeros(len(every)), around), np.asarray(boxes, np.int64)
+    pairs, whole = (
+        pairs_near(every, np.zeros(len(every)), around),
+        np.asarray(boxes, np.int64),
+    )
     first = np.searchsorted(pairs[0], np.arange(len(every) + 1))
     done: list[_Pieces] = []
-    open_ = _Pieces(np.asarray(boxes, np.int64), np.ones((len(boxes), 4), bool), np.arange(len(boxes)))
+    open_ = _Pieces(
+        np.asarray(boxes, np.int64),
+        np.ones((len(boxes), 4), bool),
+        np.arange(len(boxes)),
+    )
     while len(open_.box):
         if len(open_.box) + sum(len(p.box) for p in done) > most:
             return None
@@ -125,16 +171,28 @@ def _halved(
         longest = _longest(open_, lattices, every, step_um, around, caps)
         change = _change(open_, every, pairs, step_um, around) / caps.change
         side = open_.box[:, 2:] - open_.box[:, :2]
-        split = (side >= 2 * caps.shortest) & ((side > longest[:, None] / step_um) | (change > 1))
-        across = split & ~(split[:, ::-1] & (side < side[:, ::-1]))  # the longer side where both need it
+        split = (side >= 2 * caps.shortest) & (
+            (side > longest[:, None] / step_um) | (change > 1)
+        )
+        across = split & ~(
+            split[:, ::-1] & (side < side[:, ::-1])
+        )  # the longer side where both need it
         done.append(open_.some(np.asarray(~split.any(1))))
-        open_ = _joined([open_.some(across[:, 0]).halved(0), open_.some(across[:, 1] & ~across[:, 0]).halved(1)])
+        open_ = _joined(
+            [
+                open_.some(across[:, 0]).halved(0),
+                open_.some(across[:, 1] & ~across[:, 0]).halved(1),
+            ]
+        )
     return _joined(done)
 
 
 @compiled
-def _uncover(box: Array, of: Array, whole: Array, first: Array, near: Array, outer: Array) -> None:
-    """Take sides that other boxes cover from end to end out of ``outer``: no edge is there.
+def _uncover(
+    box: Array, of: Array, whole: Array, first: Array, near: Array, outer: Array
+) -> None:
+    """Take sides that other boxes cover from end to end out of ``outer``: no edge is
+    there.
 
     near: numbers of the boxes around each of ``whole``, from ``first`` on.
     """
@@ -149,23 +207,42 @@ def _uncover(box: Array, of: Array, whole: Array, first: Array, near: Array, out
                 reached = low
                 for m in beside:
                     b = whole[m]
-                    over = b[across] < at <= b[across + 2] if side < 2 else b[across] <= at < b[across + 2]
+                    over = (
+                        b[across] < at <= b[across + 2]
+                        if side < 2
+                        else b[across] <= at < b[across + 2]
+                    )
                     if over and b[along] <= low:
                         low = max(low, b[along + 2])
             outer[n, side] = low < box[n, along + 2]
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
-    return _Pieces(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("box", "outer", "of")))
+    return _Pieces(
+        *(
+            np.concatenate([getattr(p, name) for p in parts])
+            for name in ("box", "outer", "of")
+        )
+    )
 
 
 def _longest(
-    pieces: _Pieces, lattices: Array, every: Array, step_um: float, around: PointExposure, caps: _Caps
+    pieces: _Pieces,
+    lattices: Array,
+    every: Array,
+    step_um: float,
+    around: PointExposure,
+    caps: _Caps,
 ) -> Array:
-    """(n,) largest side, um: that of ``caps``, less near a corner of the box it is of, least beside a lens."""
+    """(n,) largest side, um: that of ``caps``, less near a corner of the box it is of,
+    least beside a lens.
+    """
     box, whole = pieces.box * step_um, every[pieces.of]
     out = np.full(len(box), caps.longest_um)
-    ends = [np.minimum(box[:, k] - whole[:, k], whole[:, k + 2] - box[:, k + 2]) for k in (0, 1)]
+    ends = [
+        np.minimum(box[:, k] - whole[:, k], whole[:, k + 2] - box[:, k + 2])
+        for k in (0, 1)
+    ]
     from_corner = np.hypot(*ends)
     for near, most in caps.corners:
         out[from_corner < near] = most
@@ -177,19 +254,31 @@ def _longest(
     return out
 
 
-def _change(pieces: _Pieces, every: Array, pairs: tuple[Array, Array], step_um: float, around: PointExposure) -> Array:
-    """(n, 2) half the change of the background of all boxes at unit dose along x and y: along outer sides, and from
-    one outer side to the opposite one. every: (boxes, 4) um, and ``pairs`` of them that see each other.
+def _change(
+    pieces: _Pieces,
+    every: Array,
+    pairs: tuple[Array, Array],
+    step_um: float,
+    around: PointExposure,
+) -> Array:
+    """(n, 2) half the change of the background of all boxes at unit dose along x and y:
+    along outer sides, and from
+    one outer side to the opposite one. every: (boxes, 4) um, and ``pairs`` of them that
+    see each other.
     """
     box = pieces.box * step_um
     middle = (box[:, :2] + box[:, 2:]) / 2
     xs = np.stack([box[:, 0], middle[:, 0], box[:, 2]], -1)
     ys = np.stack([box[:, 1], middle[:, 1], box[:, 3]], -1)
     field = sums_of_boxes(xs, ys, pieces.of, every, pairs, around)
-    along_x, along_y = (np.ptp(field, axis=axis) / 2 for axis in (2, 1))  # of the lines bottom to top, left to right
+    along_x, along_y = (
+        np.ptp(field, axis=axis) / 2 for axis in (2, 1)
+    )  # of the lines bottom to top, left to right
     held = pieces.outer
     x = np.maximum(along_x[:, 0] * held[:, 1], along_x[:, 2] * held[:, 3])
     y = np.maximum(along_y[:, 0] * held[:, 0], along_y[:, 2] * held[:, 2])
-    over = np.abs(field[:, :, 2] - field[:, :, 0]).max(1) / 2 * (held[:, 0] & held[:, 2])
+    over = (
+        np.abs(field[:, :, 2] - field[:, :, 0]).max(1) / 2 * (held[:, 0] & held[:, 2])
+    )
     up = np.abs(field[:, 2] - field[:, 0]).max(1) / 2 * (held[:, 1] & held[:, 3])
     return np.stack([np.maximum(x, over), np.maximum(y, up)], -1)

@@ -12,7 +12,8 @@ class Uniformity:
     """Relative error of the exposure at the pillar edges, over all pillars.
 
     worst, rms: of exposure / wanted - 1.
-    diameter_nm: the largest change of a made diameter that follows from it, through the slope of the exposure.
+    diameter_nm: the largest change of a made diameter that follows from it, through the
+    slope of the exposure.
     """
 
     worst: float
@@ -38,9 +39,15 @@ class Tally:
         return max(self._high, -self._low) if self._count else 0.0
 
     def result(self, slope: float, shift: float) -> Uniformity:
-        """Over all that was taken in, of edges that fall by ``slope`` per um, in units of the wanted exposure.
+        """Over all that was taken in, of edges that fall by ``slope`` per um, in units
+        of the wanted exposure.
 
-        shift: largest error of the background that was taken in; it is added to all numbers.
+        shift: largest error of the background that was taken in; it is added to all
+            numbers.
         """
         worst = self.worst + shift
-        return Uniformity(worst, (self._square / max(self._count, 1)) ** 0.5 + shift, 2e3 * worst / slope)
+        return Uniformity(
+            worst,
+            (self._square / max(self._count, 1)) ** 0.5 + shift,
+            2e3 * worst / slope,
+        )

@@ -1,4 +1,6 @@
-"""Cells of several masks and files put together in one: what a writer needs, arrays of copies kept as arrays."""
+"""Cells of several masks and files put together in one: what a writer needs, arrays of
+copies kept as arrays.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -18,7 +20,9 @@ _MOST = 1 << 20  # placements of a cell that are looked through for arrays
 
 @dataclass(frozen=True, slots=True)
 class Copies:
-    """A cell placed once, or as an array: copy (i, j) stands at (x, y) + i across + j up, in database units."""
+    """A cell placed once, or as an array: copy (i, j) stands at (x, y) + i across + j
+    up, in database units.
+    """
 
     child: str
     x: int
@@ -37,26 +41,39 @@ class Copies:
     def places(self) -> tuple[Array, Array]:
         """x and y of all copies, (count,) each, row by row."""
         i, j = np.arange(self.columns), np.arange(self.rows)[:, None]
-        x, y = (at + i * a + j * u for at, a, u in zip((self.x, self.y), self.across, self.up, strict=True))
+        x, y = (
+            at + i * a + j * u
+            for at, a, u in zip((self.x, self.y), self.across, self.up, strict=True)
+        )
         return x.ravel(), y.ravel()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sites:
-    """What a cell of pillars places, never all in memory: class k of ``lattice`` is the cell ``children[k - 1]``."""
+    """What a cell of pillars places, never all in memory: class k of ``lattice`` is the
+    cell ``children[k - 1]``.
+    """
 
     lattice: Lattice
     children: tuple[str, ...]
 
     def renamed(self, new: Mapping[str, str]) -> "Sites":
         """With cells of other names; classes that do not occur have none."""
-        return dataclasses.replace(self, children=tuple(new.get(child, "") for child in self.children))
+        return dataclasses.replace(
+            self, children=tuple(new.get(child, "") for child in self.children)
+        )
 
     def numbered(self, number: Mapping[str, int]) -> Lattice:
-        """The lattice with ``number`` + 1 of each cell in place of its class; 0 for those without one."""
-        lookup = np.array([0, *(number.get(child, -1) + 1 for child in self.children)], np.int32)
+        """The lattice with ``number`` + 1 of each cell in place of its class; 0 for
+        those without one.
+        """
+        lookup = np.array(
+            [0, *(number.get(child, -1) + 1 for child in self.children)], np.int32
+        )
         source = self.lattice.source
-        made: Lattice = dataclasses.replace(self.lattice, source=lambda a, b: lookup[source(a, b)], array=None)
+        made: Lattice = dataclasses.replace(
+            self.lattice, source=lambda a, b: lookup[source(a, b)], array=None
+        )
         return made
 
     def sums(self) -> dict[str, tuple[int, ...]]:
@@ -66,15 +83,21 @@ class Sites:
             digest.sites(block, l.x0, l.y0 - first * l.down, (l.pitch, l.down))
         found = digest.of(np.arange(1, len(self.children) + 1))
         every = (tuple(int(v[k]) for v in found) for k in range(len(self.children)))
-        return {child: sums for child, sums in zip(self.children, every, strict=True) if sums[0]}
+        return {
+            child: sums
+            for child, sums in zip(self.children, every, strict=True)
+            if sums[0]
+        }
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Assembly:
     """A mask file to be written.
 
-    name: of the library. cells: by name, all that are placed among them. copies, sites: of a cell, beside what its
-    content places. layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
+    name: of the library. cells: by name, all that are placed among them. copies, sites:
+    of a cell, beside what its
+    content places. layer_names: shown by viewers. doses: relative dose of each (layer,
+    datatype) that is exposed.
     """
 
     name: str
@@ -87,20 +110,31 @@ class Assembly:
 
 
 def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
-    """Rows and rectangles of equally spaced copies as arrays, and the placements that are in none.
+    """Rows and rectangles of equally spaced copies as arrays, and the placements that
+    are in none.
 
-    Files made elsewhere come with their arrays taken apart; put together again they do not grow. Rows of four or more
-    are found along x, columns along y, and equal rows at equal distances are one array. Cells of more than a million
+    Files made elsewhere come with their arrays taken apart; put together again they do
+    not grow. Rows of four or more
+    are found along x, columns along y, and equal rows at equal distances are one array.
+    Cells of more than a million
     placements stay as they are.
     """
     if not _LEAST <= len(placed.child) <= _MOST:
         return (), placed
     key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
     order = np.lexsort((placed.x, placed.y, key))
-    first, count, step = _runs(key[order], placed.y[order].astype(np.int64), placed.x[order].astype(np.int64))
-    kind, x, y = key[order][first], placed.x[order][first].astype(np.int64), placed.y[order][first].astype(np.int64)
+    first, count, step = _runs(
+        key[order], placed.y[order].astype(np.int64), placed.x[order].astype(np.int64)
+    )
+    kind, x, y = (
+        key[order][first],
+        placed.x[order][first].astype(np.int64),
+        placed.y[order][first].astype(np.int64),
+    )
     again = np.lexsort((y, step, count, x, kind))
-    alike = np.unique(np.column_stack([kind, x, count, step]), axis=0, return_inverse=True)[1].ravel()
+    alike = np.unique(
+        np.column_stack([kind, x, count, step]), axis=0, return_inverse=True
+    )[1].ravel()
     begin, rows, up = _runs(alike[again], np.zeros(len(again), np.int64), y[again])
     made: list[Copies] = []
     single = np.zeros(len(placed.child), bool)
@@ -113,13 +147,30 @@ def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
             continue
         child, turn = divmod(int(kind[n]), len(placed.turns))
         place, across = (int(x[n]), int(y[n])), (int(step[n]), 0)
-        made.append(Copies(placed.children[child], *place, placed.turns[turn], wide, height, across, (0, int(rise))))
-    left = (placed.child[single], placed.x[single], placed.y[single], placed.turn[single])
+        made.append(
+            Copies(
+                placed.children[child],
+                *place,
+                placed.turns[turn],
+                wide,
+                height,
+                across,
+                (0, int(rise)),
+            )
+        )
+    left = (
+        placed.child[single],
+        placed.x[single],
+        placed.y[single],
+        placed.turn[single],
+    )
     return tuple(made), Placed(placed.children, *left, placed.turns)
 
 
 def _runs(key: Array, line: Array, at: Array) -> tuple[Array, Array, Array]:
-    """First, count and step of runs of equal steps along ``at`` (sorted by key, line, at); pairs are no run."""
+    """First, count and step of runs of equal steps along ``at`` (sorted by key, line,
+    at); pairs are no run.
+    """
     first, count, step = [], [], []
     for start, end, by in _spans(key, line, at):
         if end - start >= 3:
@@ -134,10 +185,16 @@ def _runs(key: Array, line: Array, at: Array) -> tuple[Array, Array, Array]:
 
 
 def _spans(key: Array, line: Array, at: Array) -> Iterator[tuple[int, int, int]]:
-    """(start, end, step) that cover all places, each as long as the step stays the same; greedy from the left."""
+    """(start, end, step) that cover all places, each as long as the step stays the
+    same; greedy from the left.
+    """
     same = (np.diff(key) == 0) & (np.diff(line) == 0)
     by = np.where(same, np.diff(at), -1)
-    change = np.flatnonzero(np.r_[True, by[1:] != by[:-1], True]) if len(by) else np.array([0])
+    change = (
+        np.flatnonzero(np.r_[True, by[1:] != by[:-1], True])
+        if len(by)
+        else np.array([0])
+    )
     start = 0
     for a, b in zip(change[:-1].tolist(), change[1:].tolist(), strict=True):
         if by[a] <= 0:  # to another key or line, or onto the same place

@@ -1,4 +1,6 @@
-"""What a mask file holds, as it was read: cells, their polygons, circles and placements."""
+"""What a mask file holds, as it was read: cells, their polygons, circles and
+placements.
+"""
 
 import math
 import mmap
@@ -25,24 +27,36 @@ class Turn:
 
     @property
     def quarter(self) -> bool:
-        """Whether lengths and right angles stay as they are: no scale, and quarter turns alone."""
+        """Whether lengths and right angles stay as they are: no scale, and quarter
+        turns alone.
+        """
         return self.scale == 1 and self.angle_deg % 90 == 0
 
     @property
     def back(self) -> "Turn":
         """The turn that undoes this one."""
-        return Turn(self.angle_deg if self.mirrored else -self.angle_deg % 360, self.mirrored, 1 / self.scale)
+        return Turn(
+            self.angle_deg if self.mirrored else -self.angle_deg % 360,
+            self.mirrored,
+            1 / self.scale,
+        )
 
     def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Points turned; exact for quarter turns without a scale, else rounded to whole units."""
+        """Points turned; exact for quarter turns without a scale, else rounded to whole
+        units.
+        """
         if self.mirrored:
             y = -y
         if self.quarter:
             for _ in range(int(self.angle_deg // 90) & 3):
                 x, y = -y, x
             return x, y
-        c, s = (self.scale * f(math.radians(self.angle_deg)) for f in (math.cos, math.sin))
-        return np.rint(c * x - s * y).astype(np.int64), np.rint(s * x + c * y).astype(np.int64)
+        c, s = (
+            self.scale * f(math.radians(self.angle_deg)) for f in (math.cos, math.sin)
+        )
+        return np.rint(c * x - s * y).astype(np.int64), np.rint(s * x + c * y).astype(
+            np.int64
+        )
 
     def boxes(self, boxes: Array) -> Array:
         """(n, 4) left, bottom, right, top of boxes that are turned by quarters."""
@@ -51,8 +65,12 @@ class Turn:
 
     def after(self, inner: "Turn") -> "Turn":
         """The turn that equals ``inner`` followed by this one."""
-        angle = self.angle_deg + (-inner.angle_deg if self.mirrored else inner.angle_deg)
-        return Turn(angle % 360, self.mirrored != inner.mirrored, self.scale * inner.scale)
+        angle = self.angle_deg + (
+            -inner.angle_deg if self.mirrored else inner.angle_deg
+        )
+        return Turn(
+            angle % 360, self.mirrored != inner.mirrored, self.scale * inner.scale
+        )
 
 
 QUARTERS = tuple(Turn(90.0 * (k & 3), bool(k & 4)) for k in range(8))
@@ -63,7 +81,8 @@ class Placed:
     """Placements in one cell.
 
     children: names. child: (n,) index into them. x, y: (n,) int32 database units.
-    turn: (n,) index into ``turns``. The first eight are quarter turns counter-clockwise (bits 0-1) after a mirror at
+    turn: (n,) index into ``turns``. The first eight are quarter turns counter-clockwise
+    (bits 0-1) after a mirror at
     the x axis (bit 2); any other follows where the file has it.
     """
 
@@ -80,21 +99,32 @@ class Placed:
         found = np.zeros(size, np.int64)
         for first in range(0, len(self.child), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            found += np.bincount(self.child[some].astype(np.int64) * kinds + self.turn[some], minlength=size)
+            found += np.bincount(
+                self.child[some].astype(np.int64) * kinds + self.turn[some],
+                minlength=size,
+            )
         return found.reshape(-1, kinds)
 
 
 _DEEPEST = 64
 _AT_ONCE = 1 << 20  # placements that are counted at once
 _LARGE = 1 << 23  # placements of which each column has 32 MB
-NOTHING = Placed((), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint8))
+NOTHING = Placed(
+    (),
+    np.empty(0, np.int32),
+    np.empty(0, np.int32),
+    np.empty(0, np.int32),
+    np.empty(0, np.uint8),
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CellContent:
-    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n, 3) of x, y, radius}.
+    """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n,
+    3) of x, y, radius}.
 
-    sums: where the cell has more placements than are kept, their sums, one for each of ``placed.children``; ``placed``
+    sums: where the cell has more placements than are kept, their sums, one for each of
+    ``placed.children``; ``placed``
     then holds none.
     """
 
@@ -112,7 +142,9 @@ class CellContent:
             MaskFileError: only their sums were kept.
         """
         if self.sums is not None:
-            raise MaskFileError(f"cell {self.name!r}: of its placements only the sums were kept; read all of them")
+            raise MaskFileError(
+                f"cell {self.name!r}: of its placements only the sums were kept; read all of them"
+            )
         return self.placed
 
     def counts(self) -> Array:
@@ -123,8 +155,12 @@ class CellContent:
 
     @property
     def taken(self) -> int:
-        """Shapes that are taken up for each copy: its own; 1 for a cell that holds nothing at all."""
-        own = sum(map(len, self.polygons.values())) + sum(map(len, self.circles.values()))
+        """Shapes that are taken up for each copy: its own; 1 for a cell that holds
+        nothing at all.
+        """
+        own = sum(map(len, self.polygons.values())) + sum(
+            map(len, self.circles.values())
+        )
         return own or int(not self.placed.children)
 
 
@@ -132,7 +168,8 @@ class CellContent:
 class MaskContent:
     """All of a mask file.
 
-    kind: ``GDSII`` or ``OASIS``. unit_nm: database unit. cells: by name, in the order of the file.
+    kind: ``GDSII`` or ``OASIS``. unit_nm: database unit. cells: by name, in the order
+    of the file.
     """
 
     kind: str
@@ -147,25 +184,36 @@ class MaskContent:
         return [name for name in self.cells if name not in used]
 
     def leaves(self, top: str) -> Iterator[Placed]:
-        """All placements below ``top`` of cells that place nothing themselves, at their final places.
+        """All placements below ``top`` of cells that place nothing themselves, at their
+        final places.
 
         Raises:
-            MaskFileError: a cell that places itself, or one that is placed and not there.
+            MaskFileError: a cell that places itself, or one that is placed and not
+                there.
         """
         yield from self._walk(top, 0, 0, QUARTERS[0], ())
 
     def sites(self, top: str) -> dict[str, tuple[Array, Array]]:
-        """{leaf cell: (x, y) of all its placements below ``top``}, the hierarchy taken apart."""
+        """{leaf cell: (x, y) of all its placements below ``top``}, the hierarchy taken
+        apart.
+        """
         found: dict[str, list[tuple[Array, Array]]] = {}
         for placed in self.leaves(top):
             order = np.argsort(placed.child, kind="stable")
-            edges = np.searchsorted(placed.child[order], np.arange(len(placed.children) + 1))
+            edges = np.searchsorted(
+                placed.child[order], np.arange(len(placed.children) + 1)
+            )
             for k, child in enumerate(placed.children):
                 chosen = order[edges[k] : edges[k + 1]]
                 if len(chosen):
-                    found.setdefault(child, []).append((placed.x[chosen], placed.y[chosen]))
+                    found.setdefault(child, []).append(
+                        (placed.x[chosen], placed.y[chosen])
+                    )
         return {
-            name: (np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts]))
+            name: (
+                np.concatenate([x for x, _ in parts]),
+                np.concatenate([y for _, y in parts]),
+            )
             for name, parts in found.items()
         }
 
@@ -173,33 +221,61 @@ class MaskContent:
         """{leaf cell: number of placements below ``top``}."""
         found: dict[str, int] = {}
         for placed in self.leaves(top):
-            for k, count in enumerate(np.bincount(placed.child, minlength=len(placed.children)).tolist()):
+            for k, count in enumerate(
+                np.bincount(placed.child, minlength=len(placed.children)).tolist()
+            ):
                 if count:
                     found[placed.children[k]] = found.get(placed.children[k], 0) + count
         return found
 
-    def _walk(self, name: str, x: int, y: int, turn: Turn, above: tuple[str, ...]) -> Iterator[Placed]:
+    def _walk(
+        self, name: str, x: int, y: int, turn: Turn, above: tuple[str, ...]
+    ) -> Iterator[Placed]:
         if name in above or len(above) > _DEEPEST:
-            raise MaskFileError(f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask")
+            raise MaskFileError(
+                f"cell {name!r} places itself through {' > '.join(above[:9])}; the file is no mask"
+            )
         placed = self._cell(name).kept()
         if not len(placed.child):
             return
-        deep = np.array([bool(len(self._cell(child).kept().child)) for child in placed.children], bool)
+        deep = np.array(
+            [bool(len(self._cell(child).kept().child)) for child in placed.children],
+            bool,
+        )
         px, py = (_within(v, name) for v in _moved(placed, turn, x, y))
-        turns = placed.turns if turn == QUARTERS[0] else tuple(turn.after(inner) for inner in placed.turns)
+        turns = (
+            placed.turns
+            if turn == QUARTERS[0]
+            else tuple(turn.after(inner) for inner in placed.turns)
+        )
         if not deep.any():
             yield Placed(placed.children, placed.child, px, py, placed.turn, turns)
             return
         inner = deep[placed.child]
         for i in np.flatnonzero(inner):
             down = turns[int(placed.turn[i])]
-            yield from self._walk(placed.children[placed.child[i]], int(px[i]), int(py[i]), down, (*above, name))
+            yield from self._walk(
+                placed.children[placed.child[i]],
+                int(px[i]),
+                int(py[i]),
+                down,
+                (*above, name),
+            )
         if not inner.all():
-            yield Placed(placed.children, placed.child[~inner], px[~inner], py[~inner], placed.turn[~inner], turns)
+            yield Placed(
+                placed.children,
+                placed.child[~inner],
+                px[~inner],
+                py[~inner],
+                placed.turn[~inner],
+                turns,
+            )
 
     def _cell(self, name: str) -> CellContent:
         if name not in self.cells:
-            raise MaskFileError(f"cell {name!r} is placed, but the file does not hold it")
+            raise MaskFileError(
+                f"cell {name!r} is placed, but the file does not hold it"
+            )
         return self.cells[name]
 
 
@@ -213,7 +289,9 @@ def _within(places: Array, name: str) -> Array:
     """``places`` as int32; MaskFileError where nested places leave 32 bits."""
     farthest = int(np.abs(places).max(initial=0))
     if farthest > 2**31 - 1:
-        raise MaskFileError(f"cell {name!r} is placed {farthest} units from the origin, beyond 32 bits")
+        raise MaskFileError(
+            f"cell {name!r} is placed {farthest} units from the origin, beyond 32 bits"
+        )
     return np.asarray(places, np.int32)
 
 
@@ -226,21 +304,31 @@ def mapped(path: str | Path) -> Array:
     if not os.stat(path).st_size:
         raise MaskFileError(f"{path}: byte 0: empty file, need a mask")
     with open(path, "rb") as file:
-        return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
+        return np.frombuffer(
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8
+        )
 
 
 def forget(data: Array, end: int) -> None:
-    """Give back the memory of the bytes before ``end`` of a mapped file; they are read again if they are looked at."""
+    """Give back the memory of the bytes before ``end`` of a mapped file; they are read
+    again if they are looked at.
+    """
     base: object = data.base.obj if isinstance(data.base, memoryview) else data.base
-    if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED") and end >= mmap.PAGESIZE:
+    if (
+        isinstance(base, mmap.mmap)
+        and hasattr(mmap, "MADV_DONTNEED")
+        and end >= mmap.PAGESIZE
+    ):
         base.madvise(mmap.MADV_DONTNEED, 0, end // mmap.PAGESIZE * mmap.PAGESIZE)
 
 
 @dataclass(eq=False, slots=True)
 class Gathered:
-    """Placements of a cell while it is read: kept up to a number (None: all), beyond it only their sums.
+    """Placements of a cell while it is read: kept up to a number (None: all), beyond it
+    only their sums.
 
-    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged: how many of them are large;
+    parts: (child, x, y, turn) of what is kept; child as the reader numbers it. merged:
+    how many of them are large;
     small: placements in the others.
     """
 
@@ -267,15 +355,22 @@ class Gathered:
         self.digest.take(child, x, y, turn)
 
     def _merge(self, more: int) -> None:
-        """Make one of the last parts where they are many: large arrays go back to the system when they are let go."""
+        """Make one of the last parts where they are many: large arrays go back to the
+        system when they are let go.
+        """
         self.small += more
         if self.small >= _LARGE:
-            child, x, y, turn = (np.concatenate(part) for part in zip(*self.parts[self.merged :], strict=True))
+            child, x, y, turn = (
+                np.concatenate(part)
+                for part in zip(*self.parts[self.merged :], strict=True)
+            )
             self.parts[self.merged :] = [(child, x, y, turn)]
             self.merged, self.small = self.merged + 1, 0
 
     def columns(self) -> tuple[Array, Array, Array, Array]:
-        """child, x, y, turn of all that is kept; the parts are let go, one column after the other."""
+        """child, x, y, turn of all that is kept; the parts are let go, one column after
+        the other.
+        """
         columns = [list(part) for part in zip(*self.parts, strict=True)]
         self.parts, made = [], []
         while columns:

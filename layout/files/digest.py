@@ -1,7 +1,10 @@
-"""Millions of placements by their sums alone: for each child how many, where on average, and a hash of all places.
+"""Millions of placements by their sums alone: for each child how many, where on
+average, and a hash of all places.
 
-Each place (x, y) becomes 64 well-mixed bits (splitmix64), times an odd number for its quarter turn (1 for none); their
-sum over the placements of a child, modulo 2^64, does not depend on their order. Two different sets of places agree in
+Each place (x, y) becomes 64 well-mixed bits (splitmix64), times an odd number for its
+quarter turn (1 for none); their
+sum over the placements of a child, modulo 2^64, does not depend on their order. Two
+different sets of places agree in
 count, both sums and hash by chance once in 2^64.
 """
 
@@ -14,7 +17,11 @@ from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-_FIRST, _SECOND, _THIRD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_FIRST, _SECOND, _THIRD = (
+    np.uint64(0x9E3779B97F4A7C15),
+    np.uint64(0xBF58476D1CE4E5B9),
+    np.uint64(0x94D049BB133111EB),
+)
 _ROOM = 256
 _MOST = 1 << 24  # children
 _OTHER = 8  # turns from here on are no quarter turns: alike in the hash
@@ -22,7 +29,8 @@ _OTHER = 8  # turns from here on are no quarter turns: alike in the hash
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sums:
-    """Of the placements of each child. count, x, y, turned: (children,) int64; hashed: (children,) uint64.
+    """Of the placements of each child. count, x, y, turned: (children,) int64; hashed:
+    (children,) uint64.
 
     x, y: sums of the places. turned: placements that are turned, mirrored or scaled.
     """
@@ -42,18 +50,26 @@ class Digest:
     """Running sums over placements; children are numbered from any integer."""
 
     def __init__(self) -> None:
-        self._sums, self._hashes = np.zeros((_ROOM, 4), np.int64), np.zeros(_ROOM, np.uint64)
+        self._sums, self._hashes = (
+            np.zeros((_ROOM, 4), np.int64),
+            np.zeros(_ROOM, np.uint64),
+        )
 
     def take(self, child: Array, x: Array, y: Array, turn: Array) -> None:
         """Add placements: (n,) numbers, places and turns (0: as it is)."""
         if not len(child):
             return
-        slot = np.where(child >= 0, 2 * child.astype(np.int64), -2 * child.astype(np.int64) - 1)
+        slot = np.where(
+            child >= 0, 2 * child.astype(np.int64), -2 * child.astype(np.int64) - 1
+        )
         self._grow(int(slot.max()) + 1)
-        _take(slot, x.astype(np.int64), y.astype(np.int64), turn, self._sums, self._hashes)
+        _take(
+            slot, x.astype(np.int64), y.astype(np.int64), turn, self._sums, self._hashes
+        )
 
     def sites(self, block: Array, x0: int, y0: int, pitch: tuple[int, int]) -> None:
-        """Add the sites of a block of class numbers (0: none), its first site at (x0, y0), rows towards -y.
+        """Add the sites of a block of class numbers (0: none), its first site at (x0,
+        y0), rows towards -y.
 
         pitch: of columns and of rows.
         """
@@ -75,7 +91,9 @@ class Digest:
 
     def _grow(self, size: int) -> None:
         if size > _MOST:
-            raise MaskFileError(f"cells numbered beyond {_MOST // 2}: too many for sums; read all placements")
+            raise MaskFileError(
+                f"cells numbered beyond {_MOST // 2}: too many for sums; read all placements"
+            )
         if size > len(self._hashes):
             more = 2 * size - len(self._hashes)
             self._sums = np.concatenate([self._sums, np.zeros((more, 4), np.int64)])
@@ -93,7 +111,9 @@ def _mixed(x: int, y: int) -> np.uint64:
 
 
 @compiled
-def _take(slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Array) -> None:
+def _take(
+    slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Array
+) -> None:
     for n in range(slot.shape[0]):
         k = slot[n]
         sums[k, 0] += 1
@@ -104,7 +124,9 @@ def _take(slot: Array, x: Array, y: Array, turn: Array, sums: Array, hashes: Arr
 
 
 @compiled
-def _sites(block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array) -> None:
+def _sites(
+    block: Array, x0: int, y0: int, pitch: int, down: int, sums: Array, hashes: Array
+) -> None:
     for row in range(block.shape[0]):
         y = y0 - row * down
         for column in range(block.shape[1]):

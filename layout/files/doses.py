@@ -1,7 +1,10 @@
-"""The dose table beside a mask: relative dose of each (layer, datatype), as CSV, and what it leaves out.
+"""The dose table beside a mask: relative dose of each (layer, datatype), as CSV, and
+what it leaves out.
 
-Pattern-preparation programs (BEAMER, and the job files of JEOL, Raith and Elionix writers) take doses by layer and
-datatype from a table of those columns; the first three are theirs, the others are for people.
+Pattern-preparation programs (BEAMER, and the job files of JEOL, Raith and Elionix
+writers) take doses by layer and
+datatype from a table of those columns; the first three are theirs, the others are for
+people.
 """
 
 import csv
@@ -40,7 +43,15 @@ def write(plan: Dosed, process: Process, path: str | Path) -> None:
     for layer, dose in sorted(plan.doses.items()):
         step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
         name = plan.layer_names.get(layer, "")
-        out.writerow([*layer, f"{dose:.6f}", f"{dose * process.exposure.base_uC_cm2:.3f}", step, name])
+        out.writerow(
+            [
+                *layer,
+                f"{dose:.6f}",
+                f"{dose * process.exposure.base_uC_cm2:.3f}",
+                step,
+                name,
+            ]
+        )
     store.write_text(path, text.getvalue())
 
 
@@ -48,27 +59,45 @@ def read(path: str | Path) -> dict[LayerNumber, float]:
     """{(layer, datatype): relative dose} of a table.
 
     Raises:
-        MaskFileError: missing file, missing columns, a line that is no dose or comes twice (line named).
+        MaskFileError: missing file, missing columns, a line that is no dose or comes
+            twice (line named).
     """
     path = Path(path)
     try:
         rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MaskFileError(f"{path}: cannot be read as a dose table ({error})") from None
+        raise MaskFileError(
+            f"{path}: cannot be read as a dose table ({error})"
+        ) from None
     found: dict[LayerNumber, float] = {}
     for number, row in enumerate(rows, 2):
         try:
-            layer, dose = (int(row["layer"]), int(row["datatype"])), float(row["relative_dose"])
+            layer, dose = (
+                (int(row["layer"]), int(row["datatype"])),
+                float(row["relative_dose"]),
+            )
         except (KeyError, TypeError, ValueError):
-            raise MaskFileError(f"{path}, line {number}: need columns {', '.join(HEAD[:3])} of numbers") from None
+            raise MaskFileError(
+                f"{path}, line {number}: need columns {', '.join(HEAD[:3])} of numbers"
+            ) from None
         if layer in found or not 0 < dose < 1e6:
-            raise MaskFileError(f"{path}, line {number}: layer {layer} with dose {dose}: twice, or no dose above 0")
+            raise MaskFileError(
+                f"{path}, line {number}: layer {layer} with dose {dose}: twice, or no dose above 0"
+            )
         found[layer] = dose
     return found
 
 
-def missing(content: MaskContent, doses: Mapping[LayerNumber, float], process: Process) -> tuple[LayerNumber, ...]:
-    """Layers of a file that hold shapes to be exposed and have no dose; outline and write fields are not exposed."""
+def missing(
+    content: MaskContent, doses: Mapping[LayerNumber, float], process: Process
+) -> tuple[LayerNumber, ...]:
+    """Layers of a file that hold shapes to be exposed and have no dose; outline and
+    write fields are not exposed.
+    """
     layers = process.layers
-    drawn = {layer for cell in content.cells.values() for layer in (*cell.polygons, *cell.circles)}
+    drawn = {
+        layer
+        for cell in content.cells.values()
+        for layer in (*cell.polygons, *cell.circles)
+    }
     return tuple(sorted(drawn - {layers.outline, layers.fields} - set(doses)))

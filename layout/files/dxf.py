@@ -1,6 +1,8 @@
-"""DXF of a window of the mask (ezdxf): closed polylines in micrometres, one DXF layer for each mask layer; read back.
+"""DXF of a window of the mask (ezdxf): closed polylines in micrometres, one DXF layer
+for each mask layer; read back.
 
-The header says the unit ($INSUNITS 13, micrometres); a layer's name is that of the mask layer, its description the
+The header says the unit ($INSUNITS 13, micrometres); a layer's name is that of the mask
+layer, its description the
 layer and datatype. Same input, same bytes.
 """
 
@@ -20,7 +22,8 @@ from metalens.ground.errors import MaskFileError, ProcessError
 
 MOST_PILLARS = 200_000
 _UM = 13  # of $INSUNITS
-_COLOURS = 7  # of the colour index that have names: red, yellow, green, cyan, blue, magenta, white
+# of the colour index that have names: red, yellow, green, cyan, blue, magenta, white
+_COLOURS = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,15 +35,19 @@ class Window:
     size_um: float = 20.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.x_um, self.y_um, self.size_um]).all() and self.size_um > 0):
+        if not (
+            np.isfinite([self.x_um, self.y_um, self.size_um]).all() and self.size_um > 0
+        ):
             raise ProcessError(f"window {self}: need a finite place and a size above 0")
 
 
 def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
-    """Write the pillars whose site lies in the window, and all figures; the number of pillars.
+    """Write the pillars whose site lies in the window, and all figures; the number of
+    pillars.
 
     Raises:
-        ProcessError: more than 200 000 pillars in the window, or ezdxf is not installed.
+        ProcessError: more than 200 000 pillars in the window, or ezdxf is not
+            installed.
         OSError: the target cannot be written.
     """
     sites = _sites(plan, window)
@@ -55,7 +62,12 @@ def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
         made.description = f"{layer[0]}/{layer[1]}"
     space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
     for name, points in _drawn(plan, sites):
-        space.add_lwpolyline((points * scale).tolist(), format="xy", close=True, dxfattribs={"layer": name})
+        space.add_lwpolyline(
+            (points * scale).tolist(),
+            format="xy",
+            close=True,
+            dxfattribs={"layer": name},
+        )
     text = io.StringIO()
     drawing.write(text)
     store.write_text(path, text.getvalue())
@@ -63,7 +75,8 @@ def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
 
 
 def differences(plan: MaskPlan, path: str | Path, *, window: Window) -> tuple[str, ...]:
-    """What a DXF file, read by ezdxf, holds that the window of the plan does not, and the other way, in words.
+    """What a DXF file, read by ezdxf, holds that the window of the plan does not, and
+    the other way, in words.
 
     Raises:
         MaskFileError: the file cannot be read as DXF.
@@ -73,15 +86,21 @@ def differences(plan: MaskPlan, path: str | Path, *, window: Window) -> tuple[st
         drawing = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError) as error:
         raise MaskFileError(f"{path}: cannot be read as DXF ({error})") from None
-    found = [] if drawing.units == _UM else [f"unit {drawing.units}, planned {_UM} (um)"]
+    found = (
+        [] if drawing.units == _UM else [f"unit {drawing.units}, planned {_UM} (um)"]
+    )
     scale = plan.unit_nm * 1e-3
     read = Counter(
         (line.dxf.layer, _key(np.rint(np.array(line.get_points("xy")) / scale)))
         for line in drawing.modelspace().query("LWPOLYLINE")
     )
-    planned = Counter((name, _key(points)) for name, points in _drawn(plan, _sites(plan, window)))
+    planned = Counter(
+        (name, _key(points)) for name, points in _drawn(plan, _sites(plan, window))
+    )
     for text, unlike in (("missing", planned - read), ("not planned", read - planned)):
-        for layer, number in sorted(Counter(name for name, _ in unlike.elements()).items()):
+        for layer, number in sorted(
+            Counter(name for name, _ in unlike.elements()).items()
+        ):
             found.append(f"layer {layer}: {number} polygons {text}")
     return tuple(found)
 
@@ -90,29 +109,44 @@ def _ezdxf() -> Any:
     try:
         import ezdxf
     except ImportError:
-        raise ProcessError("DXF needs ezdxf: pip install 'metalens-toolchain[cad]'") from None
+        raise ProcessError(
+            "DXF needs ezdxf: pip install 'metalens-toolchain[cad]'"
+        ) from None
     options = vars(ezdxf)["options"]  # exported, and not said to be
-    options.write_fixed_meta_data_for_testing = True  # no time stamps, no random identifiers
+    options.write_fixed_meta_data_for_testing = (
+        True  # no time stamps, no random identifiers
+    )
     return ezdxf
 
 
 def _sites(plan: MaskPlan, window: Window) -> list[tuple[int, int, int]]:
-    return [site for lattice in plan.lattices for site in sites_in(plan, lattice, window)]
+    return [
+        site for lattice in plan.lattices for site in sites_in(plan, lattice, window)
+    ]
 
 
-def sites_in(plan: MaskPlan, lattice: Lattice, window: Window) -> Iterator[tuple[int, int, int]]:
+def sites_in(
+    plan: MaskPlan, lattice: Lattice, window: Window
+) -> Iterator[tuple[int, int, int]]:
     """(class, x, y) of the pillars whose site lies in the window, database units."""
     scale = 1e3 / plan.unit_nm
     half = window.size_um / 2
-    left = _ceil((window.x_um - half) * scale - lattice.x0, lattice.pitch, lattice.columns)
-    right = _ceil((window.x_um + half) * scale - lattice.x0, lattice.pitch, lattice.columns)
+    left = _ceil(
+        (window.x_um - half) * scale - lattice.x0, lattice.pitch, lattice.columns
+    )
+    right = _ceil(
+        (window.x_um + half) * scale - lattice.x0, lattice.pitch, lattice.columns
+    )
     first = _ceil(lattice.y0 - (window.y_um + half) * scale, lattice.down, lattice.rows)
     end = _ceil(lattice.y0 - (window.y_um - half) * scale, lattice.down, lattice.rows)
     if left >= right or first >= end:
         return
     block = lattice.source(first, end)[:, left:right]
     for row, column in np.argwhere(block > 0).tolist():
-        x, y = lattice.x0 + (left + column) * lattice.pitch, lattice.y0 - (first + row) * lattice.down
+        x, y = (
+            lattice.x0 + (left + column) * lattice.pitch,
+            lattice.y0 - (first + row) * lattice.down,
+        )
         yield int(block[row, column]), x, y
 
 
@@ -120,7 +154,9 @@ def _ceil(distance: float, pitch: int, count: int) -> int:
     return int(np.clip(np.ceil(distance / pitch), 0, count))
 
 
-def _drawn(plan: MaskPlan, sites: list[tuple[int, int, int]]) -> Iterator[tuple[str, Array]]:
+def _drawn(
+    plan: MaskPlan, sites: list[tuple[int, int, int]]
+) -> Iterator[tuple[str, Array]]:
     """(DXF layer, polygon) of everything that is written."""
     names = _names(plan)
     for k, x, y in sites:
@@ -135,18 +171,29 @@ def _drawn(plan: MaskPlan, sites: list[tuple[int, int, int]]) -> Iterator[tuple[
 
 def _names(plan: MaskPlan) -> dict[tuple[int, int], str]:
     """{(layer, datatype): DXF layer}, each its own."""
-    used = {made.layer for made in plan.classes} | {layer for figure in plan.figures for layer in figure.polygons}
+    used = {made.layer for made in plan.classes} | {
+        layer for figure in plan.figures for layer in figure.polygons
+    }
     found: dict[tuple[int, int], str] = {}
     for layer in sorted(used):
-        name = plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}").upper().replace(".", "_")
-        found[layer] = name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
+        name = (
+            plan.layer_names.get(layer, f"L{layer[0]}D{layer[1]}")
+            .upper()
+            .replace(".", "_")
+        )
+        found[layer] = (
+            name if name not in found.values() else f"{name}_L{layer[0]}D{layer[1]}"
+        )
     return found
 
 
 def _key(points: Array) -> tuple[tuple[int, int], ...]:
     """Corners from the smallest on, counter-clockwise."""
     p = [(int(x), int(y)) for x, y in points]
-    if sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(p, p[1:] + p[:1], strict=True)) < 0:
+    if (
+        sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(p, p[1:] + p[:1], strict=True))
+        < 0
+    ):
         p.reverse()
     first = p.index(min(p))
     return tuple(p[first:] + p[:first])

@@ -1,7 +1,10 @@
-"""What the writer's operator gets beside the mask: the write fields in their order, and a job sheet as text.
+"""What the writer's operator gets beside the mask: the write fields in their order, and
+a job sheet as text.
 
-Fields go in rows from the lower left, every other row backwards, so that the stage moves least. Beam current, resist
-and file format of the machine are left open: the sheet says the charge, from which any current gives the time.
+Fields go in rows from the lower left, every other row backwards, so that the stage
+moves least. Beam current, resist
+and file format of the machine are left open: the sheet says the charge, from which any
+current gives the time.
 """
 
 import csv
@@ -24,7 +27,9 @@ _OPEN = "________"
 
 @dataclass(frozen=True, slots=True)
 class WriteStep:
-    """One write field, in the order of writing: middle and sides (lens axis at 0, +y up), pillars in it."""
+    """One write field, in the order of writing: middle and sides (lens axis at 0, +y
+    up), pillars in it.
+    """
 
     sequence: int
     x_um: float
@@ -43,7 +48,9 @@ def sequence(split: FieldPlan) -> list[WriteStep]:
         for j in (held if i % 2 == 0 else held[::-1]).tolist():
             middle_x, middle_y = (x[j] + x[j + 1]) / 2, (y[i] + y[i + 1]) / 2
             wide, high = x[j + 1] - x[j], y[i + 1] - y[i]
-            made.append(WriteStep(len(made) + 1, middle_x, middle_y, wide, high, int(row[j])))
+            made.append(
+                WriteStep(len(made) + 1, middle_x, middle_y, wide, high, int(row[j]))
+            )
     return made
 
 
@@ -83,19 +90,49 @@ def charge_uC(plan: MaskPlan, process: Process) -> dict[str, float]:
 def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
     """(x, y, width, height) of each mark, from the lower left on."""
     source = plan if plan.standing is None else plan.standing
-    shapes = [p for f in source.figures if f.name == "MARKS" for drawn in f.polygons.values() for p in drawn]
-    boxes = [(c.min(0), c.max(0)) for c in region.union(shapes) if polygon.twice_area(c) > 0] if shapes else []
+    shapes = [
+        p
+        for f in source.figures
+        if f.name == "MARKS"
+        for drawn in f.polygons.values()
+        for p in drawn
+    ]
+    boxes = (
+        [
+            (c.min(0), c.max(0))
+            for c in region.union(shapes)
+            if polygon.twice_area(c) > 0
+        ]
+        if shapes
+        else []
+    )
     scale = plan.unit_nm * nm
-    found = [(*((a + b) / 2 * scale).tolist(), *((b - a) * scale).tolist()) for a, b in boxes]
+    found = [
+        (*((a + b) / 2 * scale).tolist(), *((b - a) * scale).tolist()) for a, b in boxes
+    ]
     return sorted(found, key=lambda m: (round(m[1]), round(m[0])))
 
 
-def job_sheet(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[str, int], verdict: str) -> str:
-    """Everything that an operator needs to set up the job, as text; what the machine decides is left open."""
+def job_sheet(
+    plan: MaskPlan,
+    process: Process,
+    split: FieldPlan,
+    files: Mapping[str, int],
+    verdict: str,
+) -> str:
+    """Everything that an operator needs to set up the job, as text; what the machine
+    decides is left open.
+    """
     return "\n".join(_lines(plan, process, split, files, verdict)) + "\n"
 
 
-def _lines(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[str, int], verdict: str) -> Iterator[str]:
+def _lines(
+    plan: MaskPlan,
+    process: Process,
+    split: FieldPlan,
+    files: Mapping[str, int],
+    verdict: str,
+) -> Iterator[str]:
     yield f"JOB SHEET  mask {plan.name}  process {process.name!r}  tone {process.tone}"
     yield verdict
     yield ""
@@ -112,7 +149,10 @@ def _lines(plan: MaskPlan, process: Process, split: FieldPlan, files: Mapping[st
     yield "Doses (layer/datatype, relative, uC/cm2, area um2, name); the same in doses.csv:"
     areas = areas_um2(plan)
     for layer, dose in sorted(plan.doses.items()):
-        absolute, name = dose * process.exposure.base_uC_cm2, plan.layer_names.get(layer, "")
+        absolute, name = (
+            dose * process.exposure.base_uC_cm2,
+            plan.layer_names.get(layer, ""),
+        )
         yield f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} {areas[layer]:>14,.1f}  {name}"
     yield ""
     steps = sequence(split)

@@ -1,4 +1,6 @@
-"""How often each cell of a mask is drawn, by products from the top down: no hierarchy is taken apart."""
+"""How often each cell of a mask is drawn, by products from the top down: no hierarchy
+is taken apart.
+"""
 
 import graphlib
 from collections import Counter
@@ -18,7 +20,9 @@ def ordered(content: MaskContent) -> list[str]:
     for name, cell in content.cells.items():
         for child in cell.placed.children:
             if child not in above:
-                raise MaskFileError(f"cell {child!r} is placed, but the file does not hold it")
+                raise MaskFileError(
+                    f"cell {child!r} is placed, but the file does not hold it"
+                )
             above[child].append(name)
     try:
         return list(graphlib.TopologicalSorter(above).static_order())
@@ -30,7 +34,8 @@ def ordered(content: MaskContent) -> list[str]:
 
 
 def drawn(content: MaskContent) -> dict[str, int]:
-    """{cell: how often it is drawn below the top cells}, each after those that place it; 1 for a top cell.
+    """{cell: how often it is drawn below the top cells}, each after those that place
+    it; 1 for a top cell.
 
     Raises:
         MaskFileError: as :func:`ordered`.
@@ -39,7 +44,9 @@ def drawn(content: MaskContent) -> dict[str, int]:
     times |= dict.fromkeys(content.tops, 1)
     for name in times:
         cell = content.cells[name]
-        for child, count in zip(cell.placed.children, cell.counts().tolist(), strict=True):
+        for child, count in zip(
+            cell.placed.children, cell.counts().tolist(), strict=True
+        ):
             times[child] += times[name] * count
     return times
 
@@ -62,10 +69,13 @@ def refuse_beyond(content: MaskContent, most: int) -> None:
     """Count what the hierarchy would draw when taken apart.
 
     Raises:
-        MaskFileError: more than ``most`` shapes (copies of a cell that holds nothing count as one), with the number; as
+        MaskFileError: more than ``most`` shapes (copies of a cell that holds nothing
+            count as one), with the number; as
             :func:`ordered`.
     """
-    total = sum(times * content.cells[name].taken for name, times in drawn(content).items())
+    total = sum(
+        times * content.cells[name].taken for name, times in drawn(content).items()
+    )
     if total > most:
         raise MaskFileError(
             f"the mask draws {total:,} shapes when its arrays are taken apart, at most {most:,} are taken "

@@ -1,4 +1,6 @@
-"""The loops of the readers over millions of placements. They never read beyond the bytes they are given."""
+"""The loops of the readers over millions of placements. They never read beyond the
+bytes they are given.
+"""
 
 import numpy as np
 
@@ -14,7 +16,8 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
     """Plain GDSII references from byte ``at`` on, all with names of one length.
 
     Returns:
-        (names, index into names, x, y, byte after the last); nothing where the next record is something else.
+        (names, index into names, x, y, byte after the last); nothing where the next
+        record is something else.
     """
     nothing = np.empty(0, np.int32)
     if len(data) - at < 28 or bytes(data[at : at + 5]) != b"\0\x04\x0a\0\0":
@@ -31,20 +34,45 @@ def sref_run(data: Array, at: int) -> tuple[list[bytes], Array, Array, Array, in
 
 
 @compiled
-def _srefs(data: Array, at: int, size: int, out: Array, slots: Array, first: Array) -> tuple[int, int]:
-    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where each stands first."""
+def _srefs(
+    data: Array, at: int, size: int, out: Array, slots: Array, first: Array
+) -> tuple[int, int]:
+    """Fill (3, n) child, x, y; ``slots`` is a hash table of the names, ``first`` where
+    each stands first.
+    """
     child, x, y = out[0], out[1], out[2]
     names, mask = 0, slots.shape[0] - 1
     for n in range(out.shape[1]):
         p = at + n * size
         q = p + size - 16
-        if not (data[p] == 0 and data[p + 1] == 4 and data[p + 2] == 10 and data[p + 3] == 0 and data[p + 4] == 0):
+        if not (
+            data[p] == 0
+            and data[p + 1] == 4
+            and data[p + 2] == 10
+            and data[p + 3] == 0
+            and data[p + 4] == 0
+        ):
             return n, names
-        if not (data[p + 5] == size - 20 and size > 24 and data[p + 6] == 18 and data[p + 7] == 6):
+        if not (
+            data[p + 5] == size - 20
+            and size > 24
+            and data[p + 6] == 18
+            and data[p + 7] == 6
+        ):
             return n, names
-        if not (data[q] == 0 and data[q + 1] == 12 and data[q + 2] == 16 and data[q + 3] == 3):
+        if not (
+            data[q] == 0
+            and data[q + 1] == 12
+            and data[q + 2] == 16
+            and data[q + 3] == 3
+        ):
             return n, names
-        if not (data[q + 12] == 0 and data[q + 13] == 4 and data[q + 14] == 17 and data[q + 15] == 0):
+        if not (
+            data[q + 12] == 0
+            and data[q + 13] == 4
+            and data[q + 14] == 17
+            and data[q + 15] == 0
+        ):
             return n, names
         key = 0
         for i in range(p + 8, q):
@@ -80,7 +108,9 @@ def _big_endian(data: Array, at: int) -> int:
 
 @compiled
 def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
-    """A variable-length integer of at most 6 bytes and the position after it; -1 where it is cut or longer."""
+    """A variable-length integer of at most 6 bytes and the position after it; -1 where
+    it is cut or longer.
+    """
     value, shift = 0, 0
     while at < end and shift < 42:
         byte = int(data[at]) + 0  # 64 bits wide, compiled or not
@@ -93,11 +123,15 @@ def unsigned_at(data: Array, at: int, end: int) -> tuple[int, int]:
 
 
 @compiled
-def placements(data: Array, at: int, end: int, state: Array, out: Array) -> tuple[int, int]:
-    """OASIS placements by reference number without repetition, and switches of the coordinate mode.
+def placements(
+    data: Array, at: int, end: int, state: Array, out: Array
+) -> tuple[int, int]:
+    """OASIS placements by reference number without repetition, and switches of the
+    coordinate mode.
 
     out: (4, n) child, x, y, turn of each, filled.
-    state: (4,) placement x, y, whether relative, and the cell placed last (-1: none), kept up to date.
+    state: (4,) placement x, y, whether relative, and the cell placed last (-1: none),
+    kept up to date.
 
     Returns:
         (position of the first record that is something else or broken, placements read)
@@ -109,7 +143,12 @@ def placements(data: Array, at: int, end: int, state: Array, out: Array) -> tupl
             state[2] = kind - 15
             at += 1
             continue
-        if kind != 17 or at + 1 >= end or data[at + 1] & 8 or data[at + 1] & 0xC0 == 0x80:
+        if (
+            kind != 17
+            or at + 1 >= end
+            or data[at + 1] & 8
+            or data[at + 1] & 0xC0 == 0x80
+        ):
             break
         info, p, number = data[at + 1], at + 2, state[3]
         if info & 0x80:
@@ -121,7 +160,10 @@ def placements(data: Array, at: int, end: int, state: Array, out: Array) -> tupl
             dy, p = unsigned_at(data, p, end)
         if p < 0 or number < 0:
             break
-        new_x, new_y = -(dx >> 1) if dx & 1 else dx >> 1, -(dy >> 1) if dy & 1 else dy >> 1
+        new_x, new_y = (
+            -(dx >> 1) if dx & 1 else dx >> 1,
+            -(dy >> 1) if dy & 1 else dy >> 1,
+        )
         new_x = new_x + state[0] if state[2] or not info & 0x20 else new_x
         new_y = new_y + state[1] if state[2] or not info & 0x10 else new_y
         if abs(new_x) > FARTHEST or abs(new_y) > FARTHEST or number > FARTHEST:
@@ -152,8 +194,16 @@ def deltas(data: Array, at: int, end: int, grid: int, x: Array, y: Array) -> int
             dy = -(word >> 1) if word & 1 else word >> 1
         else:
             direction, size = word >> 1 & 7, word >> 4
-            dx = 0 if direction == 1 or direction == 3 else (-size if direction in (2, 5, 6) else size)
-            dy = 0 if direction == 0 or direction == 2 else (-size if direction in (3, 6, 7) else size)
+            dx = (
+                0
+                if direction == 1 or direction == 3
+                else (-size if direction in (2, 5, 6) else size)
+            )
+            dy = (
+                0
+                if direction == 0 or direction == 2
+                else (-size if direction in (3, 6, 7) else size)
+            )
         if abs(dx) > FARTHEST or abs(dy) > FARTHEST:
             return -1
         far_x, far_y = x[n - 1] + dx * grid, y[n - 1] + dy * grid

@@ -1,7 +1,10 @@
-"""Places sorted into squares: what is near a place lies in the squares beside its own, found in sorted order, no tree.
+"""Places sorted into squares: what is near a place lies in the squares beside its own,
+found in sorted order, no tree.
 
-Squares are numbered row by row, with an empty one at either end of each row: those beside square k are k - 1 and k + 1
-in its row and follow each other in the rows below and above. Only places take memory, not the room between them.
+Squares are numbered row by row, with an empty one at either end of each row: those
+beside square k are k - 1 and k + 1
+in its row and follow each other in the rows below and above. Only places take memory,
+not the room between them.
 """
 
 from dataclasses import dataclass
@@ -14,7 +17,9 @@ from metalens.ground.arrays import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Squares:
-    """Places by square: order (n,) numbers, key (n,) squares, rising; rows of ``columns`` from (left, bottom)."""
+    """Places by square: order (n,) numbers, key (n,) squares, rising; rows of
+    ``columns`` from (left, bottom).
+    """
 
     order: Array
     key: Array
@@ -25,9 +30,17 @@ class Squares:
 
     @classmethod
     def of(
-        cls, x: Array, y: Array, side: float, *, kind: Array | None = None, middle: Array | None = None
+        cls,
+        x: Array,
+        y: Array,
+        side: float,
+        *,
+        kind: Array | None = None,
+        middle: Array | None = None,
     ) -> "Squares":
-        """Squares of ``side`` around places (n,), each moved by ``middle`` (kinds, 2) of its ``kind``."""
+        """Squares of ``side`` around places (n,), each moved by ``middle`` (kinds, 2)
+        of its ``kind``.
+        """
         kind, middle = _moved(len(x), kind, middle)
         low, high = middle.min(0), middle.max(0)
         left, bottom = float(x.min() + low[0]), float(y.min() + low[1])
@@ -40,7 +53,16 @@ class Squares:
     def seen_by(self, x: Array, y: Array) -> tuple[Array, Array]:
         """(n,) order and key of other places in these squares."""
         key = np.empty(len(x), np.int64)
-        _keys(x, y, *_moved(len(x), None, None), self.left, self.bottom, self.side, self.columns, key)
+        _keys(
+            x,
+            y,
+            *_moved(len(x), None, None),
+            self.left,
+            self.bottom,
+            self.side,
+            self.columns,
+            key,
+        )
         order = np.argsort(key, kind="stable").astype(np.int32)
         return order, key[order]
 
@@ -71,7 +93,9 @@ def _keys(
 
 @compiled
 def first_from(key: Array, wanted: int, at: int) -> int:
-    """First place from ``at`` on whose square is ``wanted`` or beyond; for squares asked for in rising order."""
+    """First place from ``at`` on whose square is ``wanted`` or beyond; for squares
+    asked for in rising order.
+    """
     while at < key.shape[0] and key[at] < wanted:
         at += 1
     return at

@@ -5,17 +5,69 @@ import struct
 from metalens.ground.arrays import Array
 
 HEADER, BGNLIB, LIBNAME, UNITS, ENDLIB, BGNSTR, STRNAME, ENDSTR = range(8)
-BOUNDARY, PATH, SREF, AREF, TEXT, LAYER, DATATYPE, WIDTH, XY, ENDEL, SNAME = range(8, 19)
-COLROW, NODE, TEXTTYPE, PRESENTATION, STRING, STRANS, MAG, ANGLE = 0x13, 0x15, 0x16, 0x17, 0x19, 0x1A, 0x1B, 0x1C
+BOUNDARY, PATH, SREF, AREF, TEXT, LAYER, DATATYPE, WIDTH, XY, ENDEL, SNAME = range(
+    8, 19
+)
+COLROW, NODE, TEXTTYPE, PRESENTATION, STRING, STRANS, MAG, ANGLE = (
+    0x13,
+    0x15,
+    0x16,
+    0x17,
+    0x19,
+    0x1A,
+    0x1B,
+    0x1C,
+)
 BGNEXTN, ENDEXTN = 0x30, 0x31
-PATHTYPE, ELFLAGS, NODETYPE, PROPATTR, PROPVALUE, BOX, BOXTYPE, PLEX = 0x21, 0x26, 0x2A, 0x2B, 0x2C, 0x2D, 0x2E, 0x2F
+PATHTYPE, ELFLAGS, NODETYPE, PROPATTR, PROPVALUE, BOX, BOXTYPE, PLEX = (
+    0x21,
+    0x26,
+    0x2A,
+    0x2B,
+    0x2C,
+    0x2D,
+    0x2E,
+    0x2F,
+)
 
 NO_DATA, BITS, INT2, INT4, REAL8, ASCII = 0, 1, 2, 3, 5, 6
-DATA = {HEADER: INT2, BGNLIB: INT2, LIBNAME: ASCII, UNITS: REAL8, ENDLIB: NO_DATA, BGNSTR: INT2, STRNAME: ASCII}
-DATA |= {ENDSTR: NO_DATA, BOUNDARY: NO_DATA, PATH: NO_DATA, SREF: NO_DATA, AREF: NO_DATA, TEXT: NO_DATA, LAYER: INT2}
-DATA |= {DATATYPE: INT2, WIDTH: INT4, XY: INT4, ENDEL: NO_DATA, SNAME: ASCII, COLROW: INT2, TEXTTYPE: INT2}
+DATA = {
+    HEADER: INT2,
+    BGNLIB: INT2,
+    LIBNAME: ASCII,
+    UNITS: REAL8,
+    ENDLIB: NO_DATA,
+    BGNSTR: INT2,
+    STRNAME: ASCII,
+}
+DATA |= {
+    ENDSTR: NO_DATA,
+    BOUNDARY: NO_DATA,
+    PATH: NO_DATA,
+    SREF: NO_DATA,
+    AREF: NO_DATA,
+    TEXT: NO_DATA,
+    LAYER: INT2,
+}
+DATA |= {
+    DATATYPE: INT2,
+    WIDTH: INT4,
+    XY: INT4,
+    ENDEL: NO_DATA,
+    SNAME: ASCII,
+    COLROW: INT2,
+    TEXTTYPE: INT2,
+}
 DATA |= {BGNEXTN: INT4, ENDEXTN: INT4}
-DATA |= {PRESENTATION: BITS, STRING: ASCII, STRANS: BITS, MAG: REAL8, ANGLE: REAL8, PATHTYPE: INT2, ELFLAGS: BITS}
+DATA |= {
+    PRESENTATION: BITS,
+    STRING: ASCII,
+    STRANS: BITS,
+    MAG: REAL8,
+    ANGLE: REAL8,
+    PATHTYPE: INT2,
+    ELFLAGS: BITS,
+}
 DATA |= {
     PROPATTR: INT2,
     PROPVALUE: ASCII,
@@ -27,14 +79,27 @@ DATA |= {
     NODETYPE: INT2,
     PLEX: INT4,
 }
-NAMES = {value: name for name, value in list(globals().items()) if name.isupper() and isinstance(value, int)}
+NAMES = {
+    value: name
+    for name, value in list(globals().items())
+    if name.isupper() and isinstance(value, int)
+}
 
-TIMES = (1970, 1, 1, 0, 0, 0) * 2  # last change, last access: the same bytes for the same mask
+TIMES = (
+    1970,
+    1,
+    1,
+    0,
+    0,
+    0,
+) * 2  # last change, last access: the same bytes for the same mask
 MOST_POINTS = 8190  # of one boundary, closing point included
 
 
 def real(value: float) -> bytes:
-    """Excess-64 base-16 floating point: 1 sign bit, 7 bits of exponent, 56 bits of fraction."""
+    """Excess-64 base-16 floating point: 1 sign bit, 7 bits of exponent, 56 bits of
+    fraction.
+    """
     if value == 0:
         return bytes(8)
     sign, value, exponent = 128 if value < 0 else 0, abs(value), 64

@@ -26,7 +26,14 @@ from layout.gdsii import bytes as gds
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-_HEADS = {0x00, 0x05} | {0x1F, 0x20, 0x22, 0x36, 0x23, 0x39}  # header records that libraries may add
+_HEADS = {0x00, 0x05} | {
+    0x1F,
+    0x20,
+    0x22,
+    0x36,
+    0x23,
+    0x39,
+}  # header records that libraries may add
 _SHAPES = {gds.BOUNDARY, gds.BOX, gds.PATH, gds.TEXT, gds.NODE, gds.SREF, gds.AREF}
 LIMIT = 2**29
 _AT_ONCE = 1 << 20  # copies of an array
@@ -38,18 +45,26 @@ class _Batch:
 
     held: Gathered
     names: dict[bytes, int] = field(default_factory=dict)
-    turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
+    turns: dict[Turn, int] = field(
+        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
+    )
 
     def add(self, child: Array, x: Array, y: Array, turn: Turn) -> None:
         number = self.turns.setdefault(turn, len(self.turns))
         turned = np.full(len(child), number, np.uint8 if number < 256 else np.int32)
-        self.held.add(child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned)
+        self.held.add(
+            child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned
+        )
 
     def number(self, name: bytes) -> int:
         return self.names.setdefault(name, len(self.names))
 
     def sums(self) -> Sums | None:
-        return None if self.held.digest is None else self.held.digest.of(np.arange(len(self.names)))
+        return (
+            None
+            if self.held.digest is None
+            else self.held.digest.of(np.arange(len(self.names)))
+        )
 
     def placed(self) -> Placed:
         if not self.held.count:
@@ -60,23 +75,31 @@ class _Batch:
         return Placed(names, *self.held.columns(), tuple(self.turns))
 
 
-def read(path: str | Path, *, limit: int = LIMIT, keep: int | None = None) -> MaskContent:
+def read(
+    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+) -> MaskContent:
     """Read a GDSII file.
 
     Args:
         limit: most placements, arrays of references taken apart, that are read.
-        keep: most placements of one structure that are kept; of more only the sums are (:mod:`layout.files.digest`),
+        keep: most placements of one structure that are kept; of more only the sums are
+            (:mod:`layout.files.digest`),
             in bounded memory. None: all are kept.
 
     Raises:
-        MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte offset.
+        MaskFileError: not GDSII, cut, or broken anywhere; the message gives the byte
+            offset.
         OSError: the file cannot be opened.
     """
     return parse(mapped(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data") -> MaskContent:
-    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them in errors."""
+def parse(
+    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+) -> MaskContent:
+    """As :func:`read`, from the bytes of a GDSII stream as uint8; ``where`` names them
+    in errors.
+    """
     return _Reader(where, data, limit, keep).library()
 
 
@@ -84,27 +107,45 @@ class _Reader:
     """A cursor over the records."""
 
     def __init__(self, path: str, data: Array, limit: int, keep: int | None) -> None:
-        self.path, self.data, self.at, self.limit, self.keep = path, data, 0, limit, keep
+        self.path, self.data, self.at, self.limit, self.keep = (
+            path,
+            data,
+            0,
+            limit,
+            keep,
+        )
         self.begin = 0  # of the latest record
         self.placed = 0
 
     def fail(self, text: str, at: int | None = None) -> MaskFileError:
-        return MaskFileError(f"{self.path}: byte {self.begin if at is None else at}: {text}")
+        return MaskFileError(
+            f"{self.path}: byte {self.begin if at is None else at}: {text}"
+        )
 
     def next(self, *wanted: int) -> tuple[int, bytes]:
-        """Kind and data of the next record, which must be one of ``wanted`` (any, if none is named)."""
+        """Kind and data of the next record, which must be one of ``wanted`` (any, if
+        none is named).
+        """
         self.begin, left = self.at, len(self.data) - self.at
         if left < 4:
-            raise self.fail(f"the file ends within a record ({left} bytes left); it is cut")
+            raise self.fail(
+                f"the file ends within a record ({left} bytes left); it is cut"
+            )
         high, low, kind, data_type = (int(v) for v in self.data[self.at : self.at + 4])
         length = high << 8 | low
         if length < 4 or length % 2 or length > left:
-            raise self.fail(f"record of {length} bytes, {left} left in the file; need an even length from 4 on")
+            raise self.fail(
+                f"record of {length} bytes, {left} left in the file; need an even length from 4 on"
+            )
         if kind in gds.DATA and gds.DATA[kind] != data_type:
-            raise self.fail(f"{gds.NAMES[kind]} with data type {data_type}, need {gds.DATA[kind]}")
+            raise self.fail(
+                f"{gds.NAMES[kind]} with data type {data_type}, need {gds.DATA[kind]}"
+            )
         if wanted and kind not in wanted:
             needed = " or ".join(gds.NAMES[k] for k in wanted)
-            raise self.fail(f"found {gds.NAMES.get(kind, f'record 0x{kind:02x}')}, need {needed}")
+            raise self.fail(
+                f"found {gds.NAMES.get(kind, f'record 0x{kind:02x}')}, need {needed}"
+            )
         self.at += length
         return kind, self.data[self.begin + 4 : self.at].tobytes()
 
@@ -146,14 +187,18 @@ class _Reader:
             self.references(batch)
             kind, _ = self.next(*_SHAPES, gds.ENDSTR)
             if kind == gds.ENDSTR:
-                return CellContent(name, polygons, {}, batch.placed(), texts, batch.sums())
+                return CellContent(
+                    name, polygons, {}, batch.placed(), texts, batch.sums()
+                )
             if kind in (gds.SREF, gds.AREF):
                 self.reference(batch, kind)
             elif kind in (gds.BOUNDARY, gds.BOX, gds.PATH):
                 layer, points = self.line() if kind == gds.PATH else self.boundary(kind)
                 polygons.setdefault(layer, []).append(points)
             elif kind == gds.NODE:
-                raise self.fail("NODE, which marks a net and draws nothing, is not read; remove it from the file")
+                raise self.fail(
+                    "NODE, which marks a net and draws nothing, is not read; remove it from the file"
+                )
             else:
                 texts += 1
                 while self.next()[0] != gds.ENDEL:
@@ -193,15 +238,25 @@ class _Reader:
                 return found
             self.refuse_outside_element()
             if kind in found and kind not in (gds.PROPATTR, gds.PROPVALUE):
-                more = "; an outline over several records is no GDSII" if kind == gds.XY else ""
-                raise self.fail(f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice{more}")
+                more = (
+                    "; an outline over several records is no GDSII"
+                    if kind == gds.XY
+                    else ""
+                )
+                raise self.fail(
+                    f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice{more}"
+                )
             found[kind] = data
 
     def numbers(self, found: dict[int, bytes], kind: int, count: int | None) -> Array:
         """Integers of a record that an element needs."""
         size = 4 if kind == gds.XY else 2
         data = found.get(kind)
-        if data is None or len(data) % size or (count is not None and len(data) != count * size):
+        if (
+            data is None
+            or len(data) % size
+            or (count is not None and len(data) != count * size)
+        ):
             raise self.fail(f"element with a wrong or missing {gds.NAMES[kind]}")
         return np.frombuffer(data, f">i{size}").astype(np.int64)
 
@@ -209,10 +264,17 @@ class _Reader:
         start = self.begin
         found = self.fields()
         layer = int(self.numbers(found, gds.LAYER, 1)[0])
-        datatype = int(self.numbers(found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1)[0])
+        datatype = int(
+            self.numbers(
+                found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
+            )[0]
+        )
         points = self.numbers(found, gds.XY, None)
         if len(points) % 2 or len(points) < 8:
-            raise self.fail(f"boundary of {len(points) // 2} points, need at least 4 (first and last alike)", start)
+            raise self.fail(
+                f"boundary of {len(points) // 2} points, need at least 4 (first and last alike)",
+                start,
+            )
         points = points.reshape(-1, 2)
         if (points[0] != points[-1]).any():
             raise self.fail("boundary that is not closed", start)
@@ -230,51 +292,102 @@ class _Reader:
         for x, y in self.array(found, xy, start):
             batch.add(np.full(len(x), number, np.int32), x, y, turn)
 
-    def array(self, found: dict[int, bytes], xy: Array, start: int) -> Iterator[tuple[Array, Array]]:
-        """Places of an array of references, some rows at a time, so that no memory is taken before it is counted.
+    def array(
+        self, found: dict[int, bytes], xy: Array, start: int
+    ) -> Iterator[tuple[Array, Array]]:
+        """Places of an array of references, some rows at a time, so that no memory is
+        taken before it is counted.
 
-        Steps are parts of its ends: where they are no whole units, each copy stands on the unit next to its place.
+        Steps are parts of its ends: where they are no whole units, each copy stands on
+        the unit next to its place.
         """
         columns, rows = (int(v) for v in self.numbers(found, gds.COLROW, 2))
         if columns < 1 or rows < 1:
             raise self.fail(f"array of {columns} x {rows}", start)
         self.count(columns * rows)
         across, along = xy[2:4] - xy[:2], xy[4:] - xy[:2]
-        ends = [xy[:2] + across * i + along * j for i in (0, 1 - 1 / columns) for j in (0, 1 - 1 / rows)]
+        ends = [
+            xy[:2] + across * i + along * j
+            for i in (0, 1 - 1 / columns)
+            for j in (0, 1 - 1 / rows)
+        ]
         if np.abs(ends).max() > FARTHEST:
             raise self.fail("array that reaches beyond 32 bits", start)
         i = np.arange(columns)
         for part in np.array_split(np.arange(rows), -(-columns * rows // _AT_ONCE)):
-            off = (part[:, None] * along[k] / rows + i * across[k] / columns for k in (0, 1))
-            x, y = (xy[k] + np.floor(v + 0.5).astype(np.int64).ravel() for k, v in enumerate(off))
+            off = (
+                part[:, None] * along[k] / rows + i * across[k] / columns
+                for k in (0, 1)
+            )
+            x, y = (
+                xy[k] + np.floor(v + 0.5).astype(np.int64).ravel()
+                for k, v in enumerate(off)
+            )
             yield x, y
 
     def turn(self, found: dict[int, bytes], start: int) -> Turn:
         flags = found.get(gds.STRANS, b"\0\0")
-        angle, size = (gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d for k, d in _DEFAULTS)
+        angle, size = (
+            gds.to_float(found[k]) if len(found.get(k, b"")) == 8 else d
+            for k, d in _DEFAULTS
+        )
         if len(flags) != 2 or not 0 < size < 1e9:
-            raise self.fail(f"reference scaled by {size}, or with broken STRANS; need a scale above 0", start)
+            raise self.fail(
+                f"reference scaled by {size}, or with broken STRANS; need a scale above 0",
+                start,
+            )
         if flags[1] & 6:
-            raise self.fail("reference of absolute angle or size, which the format allows and writers ignore", start)
+            raise self.fail(
+                "reference of absolute angle or size, which the format allows and writers ignore",
+                start,
+            )
         return Turn(angle % 360, bool(flags[0] & 128), size)
 
     def line(self) -> tuple[tuple[int, int], Array]:
         start = self.begin
         found = self.fields()
-        layer, datatype = (int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE))
+        layer, datatype = (
+            int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE)
+        )
         points = self.numbers(found, gds.XY, None)
-        width, begin, end = (self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN))
-        ends = int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
-        if len(points) % 2 or len(points) < 4 or (points.reshape(-1, 2) == points[:2]).all():
-            raise self.fail(f"path of {len(points) // 2} points, need 2 that differ", start)
-        if width <= 0 or ends not in (0, 1, 2, 4):
-            absolute = ", which no magnification changes and readers take differently" if width < 0 else ""
+        width, begin, end = (
+            self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
+        )
+        ends = (
+            int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
+        )
+        if (
+            len(points) % 2
+            or len(points) < 4
+            or (points.reshape(-1, 2) == points[:2]).all()
+        ):
             raise self.fail(
-                f"path of width {width}{absolute}, and type {ends}: need a width above 0, and type 0, 1, 2 or 4", start
+                f"path of {len(points) // 2} points, need 2 that differ", start
+            )
+        if width <= 0 or ends not in (0, 1, 2, 4):
+            absolute = (
+                ", which no magnification changes and readers take differently"
+                if width < 0
+                else ""
+            )
+            raise self.fail(
+                f"path of width {width}{absolute}, and type {ends}: need a width above 0, and type 0, 1, 2 or 4",
+                start,
             )
         half = width / 2
-        longer = {0: (0.0, 0.0), 1: (0.0, 0.0), 2: (half, half), 4: (float(begin), float(end))}[ends]
-        made = paths.outline(points.reshape(-1, 2), half, begin=longer[0], end=longer[1], rounded=ends == 1)
+        longer = {
+            0: (0.0, 0.0),
+            1: (0.0, 0.0),
+            2: (half, half),
+            4: (float(begin), float(end)),
+        }[ends]
+        made = paths.outline(
+            points.reshape(-1, 2),
+            half,
+            begin=longer[0],
+            end=longer[1],
+            rounded=ends == 1,
+        )
         return (layer & 0xFFFF, datatype & 0xFFFF), made
 
     def whole(self, found: dict[int, bytes], kind: int) -> int:

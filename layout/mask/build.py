@@ -16,14 +16,17 @@ from metalens.ground.units import nm
 from metalens.lens import DiameterMap, Lens
 
 UNIT_NM = 1.0
-Furniture = Literal["die", "aperture", "none"]  # marks, label and test structures, or the opening of the lens alone
+Furniture = Literal[
+    "die", "aperture", "none"
+]  # marks, label and test structures, or the opening of the lens alone
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MadePlan:
     """A plan and what was found while it was made.
 
-    rounding_nm: largest difference between wanted and drawn diameter. dose: None where no correction was asked for.
+    rounding_nm: largest difference between wanted and drawn diameter. dose: None where
+    no correction was asked for.
     """
 
     plan: MaskPlan
@@ -32,7 +35,13 @@ class MadePlan:
     radius_um: float
 
 
-def plan(source: Lens | DiameterMap, process: Process, *, name: str = "METALENS", furnished: bool = True) -> MaskPlan:
+def plan(
+    source: Lens | DiameterMap,
+    process: Process,
+    *,
+    name: str = "METALENS",
+    furnished: bool = True,
+) -> MaskPlan:
     """The mask of a lens.
 
     Args:
@@ -41,11 +50,19 @@ def plan(source: Lens | DiameterMap, process: Process, *, name: str = "METALENS"
         furnished: with aperture, marks, label, dose-test array and witness cells.
 
     Raises:
-        ProcessError: a pitch off the grid, pillars that the process cannot draw (row and column named), too many
-            classes, a die that is too small, coordinates beyond 32 bits, an illegal name.
+        ProcessError: a pitch off the grid, pillars that the process cannot draw (row
+            and column named), too many
+            classes, a die that is too small, coordinates beyond 32 bits, an illegal
+            name.
         LensError: invalid diameters.
     """
-    return prepare(source, process, name=name, furniture="die" if furnished else "none", with_doses=False).plan
+    return prepare(
+        source,
+        process,
+        name=name,
+        furniture="die" if furnished else "none",
+        with_doses=False,
+    ).plan
 
 
 def prepare(
@@ -56,14 +73,23 @@ def prepare(
     furniture: Furniture = "die",
     with_doses: bool = True,
 ) -> MadePlan:
-    """As :func:`plan`, with everything that a report needs; ``with_doses``: with the correction of the process."""
+    """As :func:`plan`, with everything that a report needs; ``with_doses``: with the
+    correction of the process.
+    """
     names.check(name)
     diameters = source.diameters if isinstance(source, Lens) else source
-    steps = pitch_units(diameters.steps_um[0], process), pitch_units(diameters.steps_um[1], process)
+    steps = (
+        pitch_units(diameters.steps_um[0], process),
+        pitch_units(diameters.steps_um[1], process),
+    )
     found, classes = _drawn(source, process)
     x0, y0, axis = _origin(found.sites.shape, steps, process.rules.grid_nm)
-    lattice = found.sites.lattice("LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True)
-    lattice = dataclasses.replace(lattice, row_pitch=steps[1], centred=diameters.lattice.centred)
+    lattice = found.sites.lattice(
+        "LENS", pitch=steps[0], x0=x0, y0=y0, upside_down=True
+    )
+    lattice = dataclasses.replace(
+        lattice, row_pitch=steps[1], centred=diameters.lattice.centred
+    )
     bare = MaskPlan(
         name=name,
         classes=classes,
@@ -76,7 +102,9 @@ def prepare(
     )
     radius_um = diameters.radius_um + diameters.pitch_um / 2
     if furniture == "die":
-        bare = die.furnish(bare, process, radius_um=radius_um, label=_label(source, radius_um))
+        bare = die.furnish(
+            bare, process, radius_um=radius_um, label=_label(source, radius_um)
+        )
     elif furniture == "aperture":
         bare = die.opened(bare, process, radius_um=radius_um)
     if process.tone == "negative":
@@ -90,7 +118,9 @@ def prepare(
 
 def _word(source: Lens | DiameterMap) -> str:
     """What the drawn shapes of a lens are called."""
-    return "opening" if isinstance(source, Lens) and source.cell.shape.hole else "pillar"
+    return (
+        "opening" if isinstance(source, Lens) and source.cell.shape.hole else "pillar"
+    )
 
 
 def surroundings(
@@ -102,26 +132,39 @@ def surroundings(
     clear_um: float,
     label: str,
 ) -> MadePlan:
-    """Marks, label, dose test and witness cells of the pillars of ``source`` around a die of other things.
+    """Marks, label, dose test and witness cells of the pillars of ``source`` around a
+    die of other things.
 
     clear_um: half the width, about the middle, that the test structures leave free.
 
     Raises:
         ProcessError: as :func:`plan`.
     """
-    own = dataclasses.replace(process, die=dataclasses.replace(process.die, size_um=size_um, label=label))
+    own = dataclasses.replace(
+        process, die=dataclasses.replace(process.die, size_um=size_um, label=label)
+    )
     made = prepare(source, own, name=name, furniture="none", with_doses=False)
     whole = die.furnish(made.plan, own, radius_um=clear_um, label=label, around=True)
     figures = [f for f in whole.figures if f.name != "APERTURE"]
     aperture = next(f for f in whole.figures if f.name == "APERTURE")
-    openings = {layer: shapes[1:] for layer, shapes in aperture.polygons.items()}  # without that of the lens
+    openings = {
+        layer: shapes[1:] for layer, shapes in aperture.polygons.items()
+    }  # without that of the lens
     bare = whole.replace(
-        lattices=whole.lattices[:0:-1], figures=(dataclasses.replace(aperture, polygons=openings), *figures)
+        lattices=whole.lattices[:0:-1],
+        figures=(dataclasses.replace(aperture, polygons=openings), *figures),
     )
     return _dosed(bare, made, own)
 
 
-def wafer_mark(source: Lens | DiameterMap, process: Process, *, name: str, mark_um: float, width_um: float) -> MadePlan:
+def wafer_mark(
+    source: Lens | DiameterMap,
+    process: Process,
+    *,
+    name: str,
+    mark_um: float,
+    width_um: float,
+) -> MadePlan:
     """An alignment cross of a wafer, with witness cells of the pillars of ``source``.
 
     Raises:
@@ -141,13 +184,17 @@ def _dosed(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
     return MadePlan(bare, made.cells, solution, made.radius_um)
 
 
-def _drawn(source: Lens | DiameterMap, process: Process) -> tuple[cells.Cells, tuple[PillarClass, ...]]:
+def _drawn(
+    source: Lens | DiameterMap, process: Process
+) -> tuple[cells.Cells, tuple[PillarClass, ...]]:
     """The pillars as classes, and what is drawn for each."""
     if isinstance(source, Lens):
         disc = isinstance(source.cell.shape, Circle) and not source.cell.shape.hole
         if source.diameters.angle_rad is not None or not disc:
             return shaped.classes(source, process, unit_nm=UNIT_NM)
-    found = cells.quantise(source.diameters if isinstance(source, Lens) else source, process)
+    found = cells.quantise(
+        source.diameters if isinstance(source, Lens) else source, process
+    )
     return found, _plain_classes(found.diameters_nm, process)
 
 
@@ -166,8 +213,12 @@ def pitch_units(pitch_um: float, process: Process) -> int:
     return round(steps) * process.rules.grid_nm
 
 
-def _origin(shape: tuple[int, ...], steps: tuple[int, int], grid: int) -> tuple[int, int, tuple[float, float]]:
-    """First site on the grid such that the axis is at (0, 0), or half a grid step off where it cannot be."""
+def _origin(
+    shape: tuple[int, ...], steps: tuple[int, int], grid: int
+) -> tuple[int, int, tuple[float, float]]:
+    """First site on the grid such that the axis is at (0, 0), or half a grid step off
+    where it cannot be.
+    """
     half_x, half_y = (shape[1] - 1) * steps[0] / 2, (shape[0] - 1) * steps[1] / 2
     x0, y0 = math.floor(-half_x / grid) * grid, math.ceil(half_y / grid) * grid
     return x0, y0, (x0 + half_x, y0 - half_y)
@@ -191,8 +242,16 @@ def _check_layers(plan: MaskPlan, process: Process) -> None:
     fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
     kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
     seen: dict[LayerNumber, str] = {}
-    drawn = [(made.layer, {"T": "dose", "W": "witness"}.get(made.name[0], "pillar")) for made in plan.classes]
-    drawn += [(layer, kinds[layer[0]]) for figure in plan.figures for layer in figure.polygons if layer[0] in kinds]
+    drawn = [
+        (made.layer, {"T": "dose", "W": "witness"}.get(made.name[0], "pillar"))
+        for made in plan.classes
+    ]
+    drawn += [
+        (layer, kinds[layer[0]])
+        for figure in plan.figures
+        for layer in figure.polygons
+        if layer[0] in kinds
+    ]
     for layer, kind in drawn:
         taken = seen.setdefault(layer, kind)
         if fixed.get(layer, kind) != kind or taken != kind:

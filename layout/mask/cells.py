@@ -1,4 +1,6 @@
-"""Diameter map to pillar classes: equal drawn diameters become one class, a site becomes a class number."""
+"""Diameter map to pillar classes: equal drawn diameters become one class, a site
+becomes a class number.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,8 +23,10 @@ _BLOCK_SITES = 1 << 20
 class Cells:
     """Quantised drawn pillars.
 
-    sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,) whole nm, thinnest first.
-    counts: (k,) pillars of each class. rounding_nm: largest difference between wanted and drawn diameter.
+    sites: (y, x) class numbers, uint8 or uint16, 0 for no pillar. diameters_nm: (k,)
+    whole nm, thinnest first.
+    counts: (k,) pillars of each class. rounding_nm: largest difference between wanted
+    and drawn diameter.
     """
 
     sites: Held
@@ -37,10 +41,12 @@ class Cells:
 
 
 def quantise(diameters: DiameterMap, process: Process) -> Cells:
-    """Drawn diameters (bias taken off) rounded to the diameter step of the process, as classes; blocks of rows.
+    """Drawn diameters (bias taken off) rounded to the diameter step of the process, as
+    classes; blocks of rows.
 
     Raises:
-        ProcessError: more than 65 535 classes, a drawn pillar below one step, or one as wide as the pitch
+        ProcessError: more than 65 535 classes, a drawn pillar below one step, or one as
+            wide as the pitch
             (row and column named).
         LensError: no pillar at all.
     """
@@ -58,18 +64,27 @@ def quantise(diameters: DiameterMap, process: Process) -> Cells:
     used = np.flatnonzero(counts)
     used = used[used > 0]
     if len(used) > MOST_CLASSES:
-        raise ProcessError(f"{len(used)} different diameters, at most {MOST_CLASSES}; raise diameter_step_nm")
+        raise ProcessError(
+            f"{len(used)} different diameters, at most {MOST_CLASSES}; raise diameter_step_nm"
+        )
     lookup = np.zeros(len(counts), np.uint8 if len(used) <= 255 else np.uint16)
     lookup[used] = np.arange(1, len(used) + 1)
-    blocks = ((first, lookup.take(block)) for first, block in drawn.blocks(_BLOCK_SITES))
+    blocks = (
+        (first, lookup.take(block)) for first, block in drawn.blocks(_BLOCK_SITES)
+    )
     step = process.rules.diameter_step_nm
-    return Cells(hold(drawn.shape, lookup.dtype, blocks), used * step, counts[used], step / 2)
+    return Cells(
+        hold(drawn.shape, lookup.dtype, blocks), used * step, counts[used], step / 2
+    )
 
 
-def drawn_blocks(diameters: DiameterMap, process: Process) -> Iterator[tuple[int, Array]]:
+def drawn_blocks(
+    diameters: DiameterMap, process: Process
+) -> Iterator[tuple[int, Array]]:
     """(first row, drawn diameters in steps) of blocks of rows.
 
-    The bias is looked up in a table of 1/16 nm; isolation is worked out where the process knows it.
+    The bias is looked up in a table of 1/16 nm; isolation is worked out where the
+    process knows it.
     """
     design, pitch = diameters.diameter_um, diameters.pitch_um
     step = process.rules.diameter_step_nm
@@ -78,20 +93,27 @@ def drawn_blocks(diameters: DiameterMap, process: Process) -> Iterator[tuple[int
     straight[0] = 0
     lookup = np.clip(straight, 0, 65535).astype(np.uint16)
     for first, block, alone in with_isolation(diameters, process, _BLOCK_SITES):
-        drawn = lookup.take(np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32))
+        drawn = lookup.take(
+            np.rint(np.multiply(block, _FINE / nm, dtype=np.float32)).astype(np.int32)
+        )
         if alone is not None:
             _add_isolation(drawn, block, alone, process)
         _refuse_impossible(drawn, block, first, pitch, step)
         yield first, drawn
 
 
-def with_isolation(diameters: DiameterMap, process: Process, sites: int) -> Iterator[tuple[int, Array, Array | None]]:
-    """(first row, designed sizes, how alone each pillar stands) of blocks of rows of some ``sites``.
+def with_isolation(
+    diameters: DiameterMap, process: Process, sites: int
+) -> Iterator[tuple[int, Array, Array | None]]:
+    """(first row, designed sizes, how alone each pillar stands) of blocks of rows of
+    some ``sites``.
 
     The third is None where the process asks for none.
     """
     design, bias = diameters.diameter_um, process.bias
-    reach = isolation.halo(diameters.steps_um[1], bias.range_um) if bias.isolated_nm else 0
+    reach = (
+        isolation.halo(diameters.steps_um[1], bias.range_um) if bias.isolated_nm else 0
+    )
     size = max(1, sites // max(1, design.shape[1]), 4 * reach)
     for first in range(0, design.shape[0], size):
         end, begin = min(first + size, design.shape[0]), max(0, first - reach)
@@ -100,7 +122,9 @@ def with_isolation(diameters: DiameterMap, process: Process, sites: int) -> Iter
         alone = None
         if reach:
             lattice = diameters.lattice.centred
-            alone = isolation.isolation(around > 0, diameters.steps_um, bias.range_um, centred=lattice)[here]
+            alone = isolation.isolation(
+                around > 0, diameters.steps_um, bias.range_um, centred=lattice
+            )[here]
         yield first, around[here], alone
 
 
@@ -109,11 +133,17 @@ def _add_isolation(drawn: Array, design: Array, alone: Array, process: Process) 
     rows, columns = np.nonzero((alone > 0) & (design > 0))
     if not len(rows):
         return
-    wanted = process.written_diameter_nm(design[rows, columns] / nm, alone[rows, columns])
-    drawn[rows, columns] = np.clip(np.rint(wanted / process.rules.diameter_step_nm), 0, 65535)
+    wanted = process.written_diameter_nm(
+        design[rows, columns] / nm, alone[rows, columns]
+    )
+    drawn[rows, columns] = np.clip(
+        np.rint(wanted / process.rules.diameter_step_nm), 0, 65535
+    )
 
 
-def _refuse_impossible(drawn: Array, design: Array, first: int, pitch_um: float, step: int) -> None:
+def _refuse_impossible(
+    drawn: Array, design: Array, first: int, pitch_um: float, step: int
+) -> None:
     widest = int(drawn.max(initial=0)) * step * nm
     if widest >= pitch_um:
         row, column = divmod(int(drawn.argmax()), drawn.shape[1])

@@ -1,6 +1,8 @@
-"""The die around the lens: aperture, alignment and orientation marks, label, dose-test array, witness cells.
+"""The die around the lens: aperture, alignment and orientation marks, label, dose-test
+array, witness cells.
 
-Two lithography steps: the pillars with their marks, dose array, witness cells and label; and the aperture, drawn as
+Two lithography steps: the pillars with their marks, dose array, witness cells and
+label; and the aperture, drawn as
 the openings of an opaque film over the lens, the marks and the test structures.
 """
 
@@ -18,23 +20,37 @@ from layout.process import Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-DOSES = tuple(0.8 + 0.05 * k for k in range(9))  # of the test array, relative to dose-to-size
+DOSES = tuple(
+    0.8 + 0.05 * k for k in range(9)
+)  # of the test array, relative to dose-to-size
 _BLOCK = 16  # pillars along a block of the dose array
 _WITNESS = 40  # pillars along a witness block
 _SPACE = 8  # empty sites between blocks
-_TESTED, _WITNESSED = 6, 8  # diameters that are repeated in the dose array and in the witness cells
+_TESTED, _WITNESSED = (
+    6,
+    8,
+)  # diameters that are repeated in the dose array and in the witness cells
 _ON_WAFER = 3  # diameters that are repeated at a mark of the wafer
 
 
-def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str, around: bool = False) -> MaskPlan:
+def furnish(
+    plan: MaskPlan,
+    process: Process,
+    *,
+    radius_um: float,
+    label: str,
+    around: bool = False,
+) -> MaskPlan:
     """``plan`` (the lens alone) with everything else that stands on its die.
 
     Args:
         radius_um: of the aperture. label: text, where the process gives none.
-        around: other things stand there, which ``radius_um`` from the middle leaves room for along x.
+        around: other things stand there, which ``radius_um`` from the middle leaves
+            room for along x.
 
     Raises:
-        ProcessError: the die is too small for the aperture and its test structures, which would lie on each other, or
+        ProcessError: the die is too small for the aperture and its test structures,
+            which would lie on each other, or
             the label cannot be drawn.
     """
     unit = Units(plan)
@@ -48,7 +64,9 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str, a
             "DOSETEST": windows[:1],
             "WITNESS": windows[1:],
             "MARKS": mark_windows,
-            "VERNIERS": [marks.around(shape) for shape in (*scales.drawn, *scales.openings)],
+            "VERNIERS": [
+                marks.around(shape) for shape in (*scales.drawn, *scales.openings)
+            ],
             "LABEL": [label_window],
         },
         (plan.axis, 0.0 if around else radius_um * unit.per_um),
@@ -56,7 +74,9 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str, a
         die,
     )
     openings = [disc(radius_um * unit.per_um, plan.axis, plan.grid)]
-    openings += [unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)]
+    openings += [
+        unit.snapped(box).polygon for box in (*windows, *mark_windows, label_window)
+    ]
     openings += scales.openings
     layers = process.layers
     figures = (
@@ -71,14 +91,20 @@ def furnish(plan: MaskPlan, process: Process, *, radius_um: float, label: str, a
         lattices=(*plan.lattices, *lattices),
         figures=(*plan.figures, *figures),
         layer_names={**plan.layer_names, **_layer_names(process, classes)},
-        doses={**plan.doses, **{made.layer: made.dose for made in classes}, **_plain_doses(process)},
+        doses={
+            **plan.doses,
+            **{made.layer: made.dose for made in classes},
+            **_plain_doses(process),
+        },
     )
 
 
 def opened(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
     """``plan`` (the lens alone) with the opening of its aperture and nothing else."""
     layer, unit = process.layers.aperture, Units(plan)
-    figure = Figure("APERTURE", {layer: (disc(radius_um * unit.per_um, plan.axis, plan.grid),)})
+    figure = Figure(
+        "APERTURE", {layer: (disc(radius_um * unit.per_um, plan.axis, plan.grid),)}
+    )
     return plan.replace(
         figures=(*plan.figures, figure),
         layer_names={**plan.layer_names, layer: "aperture"},
@@ -86,25 +112,39 @@ def opened(plan: MaskPlan, process: Process, *, radius_um: float) -> MaskPlan:
     )
 
 
-def wafer_mark(plan: MaskPlan, process: Process, *, mark_um: float, width_um: float) -> MaskPlan:
-    """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells between two of its arms.
+def wafer_mark(
+    plan: MaskPlan, process: Process, *, mark_um: float, width_um: float
+) -> MaskPlan:
+    """An alignment cross of a wafer about (0, 0), coarse and fine, with witness cells
+    between two of its arms.
 
     plan: of a lens, whose pillars the witness cells repeat.
     """
     unit, layers = Units(plan), process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
-    some = [_variant(made, f"W{n}", layers.witness, 1.0) for n, made in enumerate(_spread(sizes, _ON_WAFER))]
-    sites = _blocks(np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK, plan.lattices[0])
+    some = [
+        _variant(made, f"W{n}", layers.witness, 1.0)
+        for n, made in enumerate(_spread(sizes, _ON_WAFER))
+    ]
+    sites = _blocks(
+        np.arange(len(some))[None] + len(plan.classes) + 1, _BLOCK, plan.lattices[0]
+    )
     middle = unit(mark_um / 4)
     lattice = _centred("WITNESS", sites, plan, middle)
     lattice = dataclasses.replace(lattice, y0=lattice.y0 + middle)
     half = unit(mark_um / 2)
-    window = unit.snapped(Box(-half, -half, half, half).grown(unit(CLEAR_UM / 2))).polygon
+    window = unit.snapped(
+        Box(-half, -half, half, half).grown(unit(CLEAR_UM / 2))
+    ).polygon
     figures = (
         Figure("APERTURE", {layers.aperture: (window,)}),
         Figure("MARKS", {layers.marks: marks.wafer_cross(unit, mark_um, width_um)}),
     )
-    names = {layers.aperture: "aperture", layers.marks: "marks", layers.witness: "witness"}
+    names = {
+        layers.aperture: "aperture",
+        layers.marks: "marks",
+        layers.witness: "witness",
+    }
     return plan.replace(
         classes=(*plan.classes, *_same_length(some, plan)),
         lattices=(lattice,),
@@ -115,7 +155,9 @@ def wafer_mark(plan: MaskPlan, process: Process, *, mark_um: float, width_um: fl
 
 
 def disc(radius: float, centre: tuple[float, float], grid: int) -> Array:
-    """Polygon of the area of a circle whose edges stay within half a grid step of it, at most 8000 vertices."""
+    """Polygon of the area of a circle whose edges stay within half a grid step of it,
+    at most 8000 vertices.
+    """
     count = 4 * min(2000, max(8, math.ceil(math.pi / math.sqrt(grid / radius) / 4)))
     angle = (np.arange(count) + 0.5) * 2 * math.pi / count
     reach = radius * math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
@@ -133,31 +175,58 @@ def _outline(process: Process, unit: Units, radius_um: float) -> Box:
 def _tests(
     plan: MaskPlan, process: Process, unit: Units, radius_um: float, die: Box
 ) -> tuple[list[PillarClass], list[Lattice], list[Box]]:
-    """Dose array left of the lens, witness cells right of it: classes, lattices, openings."""
+    """Dose array left of the lens, witness cells right of it: classes, lattices,
+    openings.
+    """
     undosed = {made.diameter_units: made for made in plan.classes}
     sizes = [undosed[d] for d in sorted(undosed)]
     doses = [
-        _variant(made, f"T{k}{made.name[1:4]}_{n}", (process.layers.dose[0], process.layers.dose[1] + k), dose)
+        _variant(
+            made,
+            f"T{k}{made.name[1:4]}_{n}",
+            (process.layers.dose[0], process.layers.dose[1] + k),
+            dose,
+        )
         for k, dose in enumerate(DOSES)
         for n, made in enumerate(_spread(sizes, _TESTED))
     ]
     witnesses = [
-        _variant(made, f"W{n}", process.layers.witness, 1.0) for n, made in enumerate(_spread(sizes, _WITNESSED))
+        _variant(made, f"W{n}", process.layers.witness, 1.0)
+        for n, made in enumerate(_spread(sizes, _WITNESSED))
     ]
     first = len(plan.classes) + 1
     own = plan.lattices[0]
-    dose_map = _blocks(np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK, own)
+    dose_map = _blocks(
+        np.arange(first, first + len(doses)).reshape(len(DOSES), -1), _BLOCK, own
+    )
     columns = 2 if len(witnesses) > 1 else 1
     numbers = np.arange(first + len(doses), first + len(doses) + len(witnesses))
-    witness_map = _blocks(np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns), _WITNESS, own)
-    inner, outer = unit(radius_um + CLEAR_UM), die.right - unit(process.die.street_um + CLEAR_UM)
+    witness_map = _blocks(
+        np.pad(numbers, (0, -len(numbers) % columns)).reshape(-1, columns),
+        _WITNESS,
+        own,
+    )
+    inner, outer = (
+        unit(radius_um + CLEAR_UM),
+        die.right - unit(process.die.street_um + CLEAR_UM),
+    )
     middle = (inner + outer) // 2
     lattices, windows = [], []
-    for name, sites, x in (("DOSETEST", dose_map, -middle), ("WITNESS", witness_map, middle)):
+    for name, sites, x in (
+        ("DOSETEST", dose_map, -middle),
+        ("WITNESS", witness_map, middle),
+    ):
         lattice = _centred(name, sites, plan, x)
         box = _extent(lattice)
-        if min(abs(box.left), abs(box.right)) < inner or max(abs(box.left), abs(box.right)) > outer:
-            need = (box.right - box.left) / unit.per_um + 2 * CLEAR_UM + process.die.street_um
+        if (
+            min(abs(box.left), abs(box.right)) < inner
+            or max(abs(box.left), abs(box.right)) > outer
+        ):
+            need = (
+                (box.right - box.left) / unit.per_um
+                + 2 * CLEAR_UM
+                + process.die.street_um
+            )
             raise ProcessError(
                 f"the die is too small for {name}: {need:.0f} um are needed between aperture and die edge; "
                 "raise die.margin_um or die.size_um"
@@ -168,15 +237,23 @@ def _tests(
 
 
 def _refuse_overlaps(
-    boxes: dict[str, list[Box]], aperture: tuple[tuple[float, float], float], unit: Units, die: Box
+    boxes: dict[str, list[Box]],
+    aperture: tuple[tuple[float, float], float],
+    unit: Units,
+    die: Box,
 ) -> None:
-    """Raises: ProcessError: a structure stands on another one or on the aperture, by name."""
+    """Raises: ProcessError: a structure stands on another one or on the aperture, by
+    name.
+    """
     (x, y), radius = aperture
     found = [
         f"{name} and the aperture"
         for name, own in boxes.items()
         for box in own
-        if math.hypot(max(box.left - x, x - box.right, 0), max(box.bottom - y, y - box.top, 0)) < radius
+        if math.hypot(
+            max(box.left - x, x - box.right, 0), max(box.bottom - y, y - box.top, 0)
+        )
+        < radius
     ]
     found += [
         f"{one} and {other}"
@@ -185,12 +262,19 @@ def _refuse_overlaps(
     ]
     if found:
         size = f"{(die.right - die.left) / unit.per_um:.0f} x {(die.top - die.bottom) / unit.per_um:.0f} um"
-        ways = {"VERNIERS": "set die.verniers = false", "MARKS": "draw smaller marks (die.mark_um)"}
+        ways = {
+            "VERNIERS": "set die.verniers = false",
+            "MARKS": "draw smaller marks (die.mark_um)",
+        }
         more = "".join(f", or {way}" for name, way in ways.items() if name in found[0])
-        raise ProcessError(f"{found[0]} overlap on a die of {size}; raise die.margin_um or die.size_um{more}")
+        raise ProcessError(
+            f"{found[0]} overlap on a die of {size}; raise die.margin_um or die.size_um{more}"
+        )
 
 
-def _variant(made: PillarClass, name: str, layer: tuple[int, int], dose: float) -> PillarClass:
+def _variant(
+    made: PillarClass, name: str, layer: tuple[int, int], dose: float
+) -> PillarClass:
     return dataclasses.replace(made, name=name, layer=layer, dose=dose, goal=dose)
 
 
@@ -199,22 +283,36 @@ def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass
     length = len(plan.classes[0].name)
     digits = length - 1
     if len(classes) >= 10**digits:
-        raise ProcessError(f"{len(classes)} test classes, names of {length} characters; take fewer")
-    return [dataclasses.replace(c, name=f"{c.name[0]}{n:0{digits}}") for n, c in enumerate(classes)]
+        raise ProcessError(
+            f"{len(classes)} test classes, names of {length} characters; take fewer"
+        )
+    return [
+        dataclasses.replace(c, name=f"{c.name[0]}{n:0{digits}}")
+        for n, c in enumerate(classes)
+    ]
 
 
 def _spread(sizes: Sequence[PillarClass], count: int) -> list[PillarClass]:
     """At most ``count`` of the sizes, evenly from the thinnest to the widest."""
-    picked = np.unique(np.linspace(0, len(sizes) - 1, min(count, len(sizes))).round().astype(int))
+    picked = np.unique(
+        np.linspace(0, len(sizes) - 1, min(count, len(sizes))).round().astype(int)
+    )
     return [sizes[i] for i in picked]
 
 
 def _blocks(numbers: Array, side: int, lattice: Lattice) -> Array:
-    """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with spaces between, on a lattice."""
+    """Class numbers (rows, columns) as blocks of ``side`` by ``side`` pillars with
+    spaces between, on a lattice.
+    """
     step, wide = side + _SPACE, 2 if lattice.centred else 1
-    sites = np.zeros((numbers.shape[0] * step - _SPACE, wide * (numbers.shape[1] * step - _SPACE)), np.uint16)
+    sites = np.zeros(
+        (numbers.shape[0] * step - _SPACE, wide * (numbers.shape[1] * step - _SPACE)),
+        np.uint16,
+    )
     for (i, j), number in np.ndenumerate(numbers):
-        sites[i * step : i * step + side, wide * j * step : wide * (j * step + side)] = number
+        sites[
+            i * step : i * step + side, wide * j * step : wide * (j * step + side)
+        ] = number
     if lattice.centred:  # every other site, those of neighbouring rows in turn
         sites[np.add.outer(*map(np.arange, sites.shape)) % 2 == 1] = 0
     return sites
@@ -224,34 +322,51 @@ def _centred(name: str, sites: Array, plan: MaskPlan, x: int) -> Lattice:
     """Sites about (x, 0), as far apart as those of the lens."""
     (rows, columns), grid, like = sites.shape, plan.grid, plan.lattices[0]
     left, top = x - (columns - 1) * like.pitch // 2, (rows - 1) * like.down // 2
-    made = Lattice.of(name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid)
+    made = Lattice.of(
+        name, sites, pitch=like.pitch, x0=left // grid * grid, y0=top // grid * grid
+    )
     return dataclasses.replace(made, row_pitch=like.row_pitch, centred=like.centred)
 
 
 def _extent(lattice: Lattice) -> Box:
-    right, bottom = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
+    right, bottom = (
+        (lattice.columns - 1) * lattice.pitch,
+        (lattice.rows - 1) * lattice.down,
+    )
     box = Box(lattice.x0, lattice.y0 - bottom, lattice.x0 + right, lattice.y0)
     return box.grown(max(lattice.constant, lattice.down) // 2)
 
 
-def _label(process: Process, unit: Units, die: Box, default: str) -> tuple[tuple[Array, ...], Box]:
-    """Along the lower edge, between the crosses; letters as large as fit, 35 um high at most."""
+def _label(
+    process: Process, unit: Units, die: Box, default: str
+) -> tuple[tuple[Array, ...], Box]:
+    """Along the lower edge, between the crosses; letters as large as fit, 35 um high at
+    most.
+    """
     words = process.die.label or default
     inset = unit(process.die.street_um + CLEAR_UM)
     room = die.right - die.left - 2 * (inset + unit(process.die.mark_um + 2 * CLEAR_UM))
     even = 2 * unit.grid  # halves of a square join letters
     square = min(unit(5.0), room // max(1, 6 * len(words))) // even * even
     if square < unit(0.5):
-        raise ProcessError(f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um")
+        raise ProcessError(
+            f"label {words!r} does not fit on the die; shorten die.label or raise die.margin_um"
+        )
     long = font.width(words, square)
     x, y = -(long // 2) // unit.grid * unit.grid, die.bottom + inset
     box = Box(x, y, x + long, y + 7 * square).grown(unit(CLEAR_UM / 2))
     return font.text(words, x=x, y=y, square=square), box
 
 
-def _layer_names(process: Process, classes: Sequence[PillarClass]) -> dict[tuple[int, int], str]:
+def _layer_names(
+    process: Process, classes: Sequence[PillarClass]
+) -> dict[tuple[int, int], str]:
     layers = process.layers
-    found = {made.layer: f"dose_test_dose_{made.dose:.2f}" for made in classes if made.layer[0] == layers.dose[0]}
+    found = {
+        made.layer: f"dose_test_dose_{made.dose:.2f}"
+        for made in classes
+        if made.layer[0] == layers.dose[0]
+    }
     return found | {
         layers.aperture: "aperture",
         layers.marks: "marks",

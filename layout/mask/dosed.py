@@ -1,4 +1,6 @@
-"""A mask with its doses: everything that is exposed together is corrected together, a datatype for each dose."""
+"""A mask with its doses: everything that is exposed together is corrected together, a
+datatype for each dose.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +19,14 @@ from metalens.ground.units import nm
 
 _KINDS = {"T": "dose", "W": "witness"}  # by the first letter of a class
 _BLOCK_SITES = 1 << 22
-_ALIKE = 1e-2  # of a step of the doses: images of a pillar that differ by less get one dose
+_ALIKE = (
+    1e-2  # of a step of the doses: images of a pillar that differ by less get one dose
+)
 
 
 def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
-    """``plan`` with corrected doses: classes of diameter and dose, marks and labels in pieces of one dose each.
+    """``plan`` with corrected doses: classes of diameter and dose, marks and labels in
+    pieces of one dose each.
 
     Raises:
         ProcessError: as :func:`layout.dose.correct.correct`.
@@ -37,14 +42,24 @@ def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
     lattices = tuple(_redrawn(l, n, found, lookup) for n, l in enumerate(plan.lattices))
     figures, more = _figures(plan, found, (boxes, of))
     doses = {**{made.layer: made.dose for made in classes}, **more}
-    kept = {layer: level for layer, level in plan.doses.items() if layer not in _replaced(plan, process)}
+    kept = {
+        layer: level
+        for layer, level in plan.doses.items()
+        if layer not in _replaced(plan, process)
+    }
     titled = {
         **_untitled(plan, process),
         **names,
         **{layer: _name(plan, layer, level) for layer, level in more.items()},
     }
     return (
-        plan.replace(classes=classes, lattices=lattices, figures=figures, doses={**kept, **doses}, layer_names=titled),
+        plan.replace(
+            classes=classes,
+            lattices=lattices,
+            figures=figures,
+            doses={**kept, **doses},
+            layer_names=titled,
+        ),
         found,
     )
 
@@ -66,17 +81,25 @@ def _drawn(plan: MaskPlan, unit: float) -> Drawn:
 def _replaced(plan: MaskPlan, process: Process) -> set[LayerNumber]:
     """Layers whose shapes get datatypes of their own."""
     return {made.layer for made in plan.classes} | {
-        layer for figure in plan.figures if figure.name in EXPOSED for layer in figure.polygons
+        layer
+        for figure in plan.figures
+        if figure.name in EXPOSED
+        for layer in figure.polygons
     }
 
 
 def _untitled(plan: MaskPlan, process: Process) -> dict[LayerNumber, str]:
     gone = _replaced(plan, process)
-    return {layer: name for layer, name in plan.layer_names.items() if layer not in gone}
+    return {
+        layer: name for layer, name in plan.layer_names.items() if layer not in gone
+    }
 
 
 def _name(plan: MaskPlan, layer: LayerNumber, level: float) -> str:
-    kind = next((name for (number, _), name in plan.layer_names.items() if number == layer[0]), "shape")
+    kind = next(
+        (name for (number, _), name in plan.layer_names.items() if number == layer[0]),
+        "shape",
+    )
     return title(kind, level)
 
 
@@ -85,9 +108,17 @@ def title(kind: str, level: float) -> str:
     return f"{kind}_dose_{level:.4f}"
 
 
-def _pieces(plan: MaskPlan, parts: Sequence[Body], process: Process) -> tuple[Array, Array, Array]:
-    """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer number, (n,) shape."""
-    whole, of, group = [np.empty((0, 4), np.int64)], [np.empty((0, 2), np.int64)], [np.empty(0, np.int64)]
+def _pieces(
+    plan: MaskPlan, parts: Sequence[Body], process: Process
+) -> tuple[Array, Array, Array]:
+    """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer
+    number, (n,) shape.
+    """
+    whole, of, group = (
+        [np.empty((0, 4), np.int64)],
+        [np.empty((0, 2), np.int64)],
+        [np.empty(0, np.int64)],
+    )
     shapes = 0
     for f, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:
@@ -100,7 +131,9 @@ def _pieces(plan: MaskPlan, parts: Sequence[Body], process: Process) -> tuple[Ar
             shapes = int(group[-1].max()) + 1
     every = np.concatenate(whole)
     step_um = plan.grid * plan.unit_nm * nm
-    made, box = dose.pieces(every // plan.grid, parts, process.exposure, step_um=step_um)
+    made, box = dose.pieces(
+        every // plan.grid, parts, process.exposure, step_um=step_um
+    )
     return made * plan.grid, np.concatenate(of)[box], np.concatenate(group)[box]
 
 
@@ -109,24 +142,37 @@ def _touching(boxes: Array) -> Array:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    low, high = boxes[:, None, :2] <= boxes[None, :, 2:], boxes[:, None, 2:] >= boxes[None, :, :2]
+    low, high = (
+        boxes[:, None, :2] <= boxes[None, :, 2:],
+        boxes[:, None, 2:] >= boxes[None, :, :2],
+    )
     i, j = np.nonzero((low & high).all(-1))
-    return np.asarray(connected_components(coo_matrix((np.ones(len(i)), (i, j))))[1], np.int64)
+    return np.asarray(
+        connected_components(coo_matrix((np.ones(len(i)), (i, j))))[1], np.int64
+    )
 
 
 def _classes(
     plan: MaskPlan, found: Solution, process: Process
 ) -> tuple[tuple[PillarClass, ...], Array, dict[LayerNumber, str]]:
-    """Classes of diameter and dose, (old class, dose) -> new class number, and names of their layers."""
+    """Classes of diameter and dose, (old class, dose) -> new class number, and names of
+    their layers.
+    """
     used = np.argwhere(found.pairs > 0)
-    bases = {kind: getattr(process.layers, kind) for kind in ("pillar", "dose", "witness")}
+    bases = {
+        kind: getattr(process.layers, kind) for kind in ("pillar", "dose", "witness")
+    }
     datatypes: dict[str, list[int]] = {kind: [] for kind in bases}
     for k, j in used.tolist():
         kind = _kind(plan.classes[k - 1])
         if j not in datatypes[kind]:
             datatypes[kind].append(j)
-    number = {kind: {j: n for n, j in enumerate(sorted(js))} for kind, js in datatypes.items()}
-    lookup = np.zeros((len(plan.classes) + 1, 256), np.uint8 if len(used) <= 255 else np.uint16)
+    number = {
+        kind: {j: n for n, j in enumerate(sorted(js))} for kind, js in datatypes.items()
+    }
+    lookup = np.zeros(
+        (len(plan.classes) + 1, 256), np.uint8 if len(used) <= 255 else np.uint16
+    )
     made, names = [], {}
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
@@ -151,10 +197,14 @@ def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> L
     blocks = ((first, lookup[block, level]) for first, block, level in levels)
     kept = hold((lattice.rows, lattice.columns), lookup.dtype, blocks)
     made = kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
-    return dataclasses.replace(made, row_pitch=lattice.row_pitch, centred=lattice.centred)
+    return dataclasses.replace(
+        made, row_pitch=lattice.row_pitch, centred=lattice.centred
+    )
 
 
-def _levels(lattice: Lattice, number: int, found: Solution) -> Iterator[tuple[int, Array, Array]]:
+def _levels(
+    lattice: Lattice, number: int, found: Solution
+) -> Iterator[tuple[int, Array, Array]]:
     """(first row, class numbers, dose classes) of blocks of rows."""
     for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
         whole = np.ascontiguousarray(block)
@@ -162,12 +212,18 @@ def _levels(lattice: Lattice, number: int, found: Solution) -> Iterator[tuple[in
 
 
 def _alike(
-    lattice: Lattice, number: int, found: Solution, levels: Iterator[tuple[int, Array, Array]]
+    lattice: Lattice,
+    number: int,
+    found: Solution,
+    levels: Iterator[tuple[int, Array, Array]],
 ) -> Iterator[tuple[int, Array, Array]]:
-    """The doses of a lens whose eighths are alike, alike as well where only rounding parts them.
+    """The doses of a lens whose eighths are alike, alike as well where only rounding
+    parts them.
 
-    Images of a pillar whose doses lie on either side of the middle of a step get the lower one; a lens whose
-    surroundings ask for more than :data:`_ALIKE` of a step keeps its own doses. Without that a handful of millions of
+    Images of a pillar whose doses lie on either side of the middle of a step get the
+    lower one; a lens whose
+    surroundings ask for more than :data:`_ALIKE` of a step keeps its own doses. Without
+    that a handful of millions of
     pillars keeps a lens from being stored as an eighth.
     """
     whole = lattice.whole()
@@ -184,11 +240,16 @@ def _alike(
 def _figures(
     plan: MaskPlan, found: Solution, cut: tuple[Array, Array]
 ) -> tuple[tuple[Figure, ...], Mapping[LayerNumber, float]]:
-    """The exposed figures in pieces, each on the datatype of its dose, and the doses of these."""
+    """The exposed figures in pieces, each on the datatype of its dose, and the doses of
+    these.
+    """
     (boxes, of), doses = cut, {}
     figures = list(plan.figures)
     layers = {layer for f in plan.figures if f.name in EXPOSED for layer in f.polygons}
-    sharing = {layer[0]: sorted({int(j) for j in found.rect_class[_on(plan, of, layer[0])]}) for layer in layers}
+    sharing = {
+        layer[0]: sorted({int(j) for j in found.rect_class[_on(plan, of, layer[0])]})
+        for layer in layers
+    }
     for f, figure in enumerate(plan.figures):
         if figure.name not in EXPOSED:
             continue

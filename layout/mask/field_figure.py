@@ -20,9 +20,16 @@ def with_fields(plan: MaskPlan, split: FieldPlan, process: Process) -> MaskPlan:
     first_row = lattice.y0 - (lattice.rows - 1) * lattice.down
     ys = [first_row + v for v in edges(split.rows, lattice.rows, lattice.down)]
     boxes = tuple(
-        np.array([[left, bottom], [right, bottom], [right, top], [left, top]]) // plan.grid * plan.grid
-        for (left, right), (bottom, top) in itertools.product(itertools.pairwise(xs), itertools.pairwise(ys))
+        np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        // plan.grid
+        * plan.grid
+        for (left, right), (bottom, top) in itertools.product(
+            itertools.pairwise(xs), itertools.pairwise(ys)
+        )
     )
     layer = process.layers.fields
     figure = Figure("FIELDS", {layer: boxes})
-    return plan.replace(figures=(*plan.figures, figure), layer_names={**plan.layer_names, layer: "fields"})
+    return plan.replace(
+        figures=(*plan.figures, figure),
+        layer_names={**plan.layer_names, layer: "fields"},
+    )

@@ -1,7 +1,9 @@
 """Write fields: the e-beam tool writes squares, and no border may cut a pillar.
 
-Borders run midway between lattice sites, so that every pillar lies whole in one field and keeps at least half a gap
-from the border. A field is then a block of rows and columns: no pillar needs a field number of its own.
+Borders run midway between lattice sites, so that every pillar lies whole in one field
+and keeps at least half a gap
+from the border. A field is then a block of rows and columns: no pillar needs a field
+number of its own.
 """
 
 import itertools
@@ -24,12 +26,14 @@ _BLOCK_SITES = 1 << 20
 class FieldPlan:
     """Fields of a lens, as blocks of lattice rows and columns.
 
-    rows, columns: (fields + 1,) first row (column) of each field and the end of the last; a fixed raster may begin
+    rows, columns: (fields + 1,) first row (column) of each field and the end of the
+    last; a fixed raster may begin
         before the first site and end after the last.
     shape: (y, x) sites; pitch_um: from column to column; row_um: from row to row.
     mode: ``floating`` or ``shift``, see :class:`layout.process.process.WriteField`.
     pillars: (y fields, x fields) pillars in each.
-    cut_before: pillars that the same raster, left where the axis of the lens is a field corner, would cut.
+    cut_before: pillars that the same raster, left where the axis of the lens is a field
+    corner, would cut.
     clearance_um: least distance from a border to the edge of a pillar as it is drawn.
     """
 
@@ -56,7 +60,9 @@ class FieldPlan:
     @property
     def y_um(self) -> Array:
         """Positions of the borders along y."""
-        return np.asarray((self.rows - self.shape[0] / 2) * (self.row_um or self.pitch_um))
+        return np.asarray(
+            (self.rows - self.shape[0] / 2) * (self.row_um or self.pitch_um)
+        )
 
     @property
     def size_um(self) -> tuple[float, float]:
@@ -72,36 +78,62 @@ class FieldPlan:
     def blocks(self) -> list[tuple[slice, slice]]:
         """(rows, columns) of the sites of each field, in the order of :meth:`of`."""
         spans = [
-            [slice(*np.clip(pair, 0, count)) for pair in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+            [
+                slice(*np.clip(pair, 0, count))
+                for pair in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+            ]
             for edges, count in zip((self.rows, self.columns), self.shape, strict=True)
         ]
         return [(row, column) for row in spans[0] for column in spans[1]]
 
 
-def split(diameters: DiameterMap, process: Process, *, drawn: Cells | None = None) -> FieldPlan:
-    """Fields for the pillars as they are drawn (bias taken off), found in blocks of rows.
+def split(
+    diameters: DiameterMap, process: Process, *, drawn: Cells | None = None
+) -> FieldPlan:
+    """Fields for the pillars as they are drawn (bias taken off), found in blocks of
+    rows.
 
     Args:
         drawn: the pillars of this map, quantised; left out: quantised here.
 
     Raises:
-        ProcessError: a field smaller than the pitch; as :func:`layout.mask.cells.quantise`.
+        ProcessError: a field smaller than the pitch; as
+            :func:`layout.mask.cells.quantise`.
     """
     settings, (pitch, down) = process.write_field, diameters.steps_um
     across, sites = (int(settings.size_um / step + 1e-9) for step in (pitch, down))
     if min(across, sites) < 1:
-        raise ProcessError(f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it")
+        raise ProcessError(
+            f"a write field of {settings.size_um} um is smaller than the pitch {pitch} um; enlarge it"
+        )
     made = quantise(diameters, process) if drawn is None else drawn
     seen = _Seen.of(diameters, made, settings.size_um)
-    rows, columns = _edges(settings, seen.rows, sites), _edges(settings, seen.columns, across)
-    clearance = (min(pitch, down) - float(made.diameters_nm[-1]) * nm) / 2  # below 0 where borders cut pillars
+    rows, columns = (
+        _edges(settings, seen.rows, sites),
+        _edges(settings, seen.columns, across),
+    )
+    clearance = (
+        min(pitch, down) - float(made.diameters_nm[-1]) * nm
+    ) / 2  # below 0 where borders cut pillars
     counts = _counted(made, rows, columns)
-    return FieldPlan(rows, columns, made.sites.shape, pitch, settings.mode, counts, seen.cut, clearance, down)
+    return FieldPlan(
+        rows,
+        columns,
+        made.sites.shape,
+        pitch,
+        settings.mode,
+        counts,
+        seen.cut,
+        clearance,
+        down,
+    )
 
 
 @dataclass(eq=False, slots=True)
 class _Seen:
-    """rows, columns: which hold pillars; cut: pillars that a raster about the axis cuts."""
+    """rows, columns: which hold pillars; cut: pillars that a raster about the axis
+    cuts.
+    """
 
     rows: Array
     columns: Array
@@ -120,19 +152,26 @@ class _Seen:
             rows = np.flatnonzero(near_y[first : first + len(block)] < np.inf)
             upright = table[block[:, columns]] > 2 * near_x[columns]
             level = table[block[rows]] > 2 * near_y[first + rows, None]
-            found.cut += int(upright.sum() + level.sum() - (upright[rows] & level[:, columns]).sum())
+            found.cut += int(
+                upright.sum() + level.sum() - (upright[rows] & level[:, columns]).sum()
+            )
         return found
 
 
 def _counted(made: Cells, rows: Array, columns: Array) -> Array:
     """(y fields, x fields) pillars in each field."""
-    down, across = np.clip(rows, 0, made.sites.shape[0]).tolist(), np.clip(columns, 0, made.sites.shape[1]).tolist()
+    down, across = (
+        np.clip(rows, 0, made.sites.shape[0]).tolist(),
+        np.clip(columns, 0, made.sites.shape[1]).tolist(),
+    )
     step = max(1, _BLOCK_SITES // max(1, made.sites.shape[1]))
     found = np.zeros((len(rows) - 1, len(columns) - 1), np.int64)
     for i, (first, end) in enumerate(itertools.pairwise(down)):
         held = np.zeros(made.sites.shape[1], np.int64)
         for begin in range(first, end, step):
-            held += np.count_nonzero(made.sites.source(begin, min(begin + step, end)), axis=0)
+            held += np.count_nonzero(
+                made.sites.source(begin, min(begin + step, end)), axis=0
+            )
         found[i] = [held[a:b].sum() for a, b in itertools.pairwise(across)]
     return found
 
@@ -144,11 +183,15 @@ def _edges(settings: WriteField, occupied: Array, sites: int) -> Array:
     count = -(-span // sites)
     if settings.mode == "floating":
         return np.asarray(first + np.arange(count + 1) * span // count)
-    return np.asarray(first - (count * sites - span) // 2 + sites * np.arange(count + 1))
+    return np.asarray(
+        first - (count * sites - span) // 2 + sites * np.arange(count + 1)
+    )
 
 
 def _near(positions_um: Array, size_um: float) -> Array:
-    """Distance from each lattice line to the nearest border, inf where it is beyond the pitch."""
+    """Distance from each lattice line to the nearest border, inf where it is beyond the
+    pitch.
+    """
     away = abs(positions_um - size_um * np.rint(positions_um / size_um))
     pitch = positions_um[1] - positions_um[0] if len(positions_um) > 1 else np.inf
     return np.asarray(np.where(away < pitch / 2 + 1e-9, away, np.inf))

@@ -1,6 +1,8 @@
-"""Letters of 5 x 7 squares for labels: rectangles only, so that any writer draws them exactly.
+"""Letters of 5 x 7 squares for labels: rectangles only, so that any writer draws them
+exactly.
 
-Where two squares of a letter meet at a corner alone, two quarter squares beside it join them: no width of a letter and
+Where two squares of a letter meet at a corner alone, two quarter squares beside it join
+them: no width of a letter and
 no gap in it is 0. Nothing lies on another, which a writer would expose twice.
 """
 
@@ -13,7 +15,8 @@ from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-# seven rows from top to bottom, five bits each, leftmost highest, as two hexadecimal digits a row
+# seven rows from top to bottom, five bits each, leftmost highest, as two hexadecimal
+# digits a row
 _GLYPHS = {
     "A": "0e11111f111111", "B": "1e11111e11111e", "C": "0e11101010110e", "D": "1e11111111111e",
     "E": "1f10101e10101f", "F": "1f10101e101010", "G": "0e11101713110f", "H": "1111111f111111",
@@ -34,7 +37,8 @@ def text(words: str, *, x: int, y: int, square: int) -> tuple[Array, ...]:
     """Rectangles of a line of text, small letters as capitals.
 
     Args:
-        x, y: lower left corner; square: side of one square of the letters, even; all in database units.
+        x, y: lower left corner; square: side of one square of the letters, even; all in
+            database units.
 
     Raises:
         ProcessError: a character that the font does not hold.
@@ -50,15 +54,23 @@ def width(words: str, square: int) -> int:
 def _rectangles(words: str, x: int, y: int, square: int) -> Iterator[Array]:
     for n, letter in enumerate(words.upper()):
         if letter not in _GLYPHS:
-            raise ProcessError(f"label {words!r}: no {letter!r} in the font; use letters, digits and {_others()}")
+            raise ProcessError(
+                f"label {words!r}: no {letter!r} in the font; use letters, digits and {_others()}"
+            )
         rows = bytes.fromhex(_GLYPHS[letter])
         for row, bits in enumerate(rows):
             bottom = y + (6 - row) * square
             for first, end in _runs(bits):
-                yield _box(x + (n * 6 + first) * square, bottom, (end - first) * square, square)
+                yield _box(
+                    x + (n * 6 + first) * square, bottom, (end - first) * square, square
+                )
         for row, (above, below) in enumerate(itertools.pairwise(rows)):
             for column, rises in _joints(above, below):
-                left, at, half = x + (n * 6 + column) * square, y + (6 - row) * square, square // 2
+                left, at, half = (
+                    x + (n * 6 + column) * square,
+                    y + (6 - row) * square,
+                    square // 2,
+                )
                 yield _box(left - half * rises, at, half, half)
                 yield _box(left - half * (not rises), at - half, half, half)
 
@@ -68,10 +80,14 @@ def _box(left: int, bottom: int, wide: int, high: int) -> Array:
 
 
 def _joints(above: int, below: int) -> Iterator[tuple[int, bool]]:
-    """Columns at whose left end two rows meet at a corner alone, and whether the upper square is the right one."""
+    """Columns at whose left end two rows meet at a corner alone, and whether the upper
+    square is the right one.
+    """
     for column in range(1, 5):
         left, right = 5 - column, 4 - column
-        upper, lower = ((bits >> left & 1, bits >> right & 1) for bits in (above, below))
+        upper, lower = (
+            (bits >> left & 1, bits >> right & 1) for bits in (above, below)
+        )
         if {upper, lower} == {(0, 1), (1, 0)}:
             yield column, upper == (0, 1)
 

@@ -1,4 +1,6 @@
-"""Class numbers of a lattice between the stages: in memory, or in a scratch file where they would fill it."""
+"""Class numbers of a lattice between the stages: in memory, or in a scratch file where
+they would fill it.
+"""
 
 import os
 import tempfile
@@ -16,7 +18,9 @@ MOST_BYTES = 1 << 27  # kept in memory
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Held:
-    """(rows, columns) class numbers; ``source`` gives blocks of rows, ``array`` all, where they are in memory."""
+    """(rows, columns) class numbers; ``source`` gives blocks of rows, ``array`` all,
+    where they are in memory.
+    """
 
     shape: tuple[int, int]
     source: RowSource
@@ -32,23 +36,32 @@ class Held:
         for first in range(0, self.shape[0], size):
             yield first, self.source(first, min(first + size, self.shape[0]))
 
-    def lattice(self, name: str, *, pitch: int, x0: int, y0: int, upside_down: bool = False) -> Lattice:
+    def lattice(
+        self, name: str, *, pitch: int, x0: int, y0: int, upside_down: bool = False
+    ) -> Lattice:
         """As a lattice of the mask; ``upside_down``: the last row on top."""
         rows, columns = self.shape
         if self.array is not None:
-            array = np.ascontiguousarray(self.array[::-1]) if upside_down else self.array
+            array = (
+                np.ascontiguousarray(self.array[::-1]) if upside_down else self.array
+            )
             return Lattice.of(name, array, pitch=pitch, x0=x0, y0=y0)
 
         def turned(first: int, end: int) -> Array:
             return np.ascontiguousarray(self.source(rows - end, rows - first)[::-1])
 
-        return Lattice(name, rows, columns, pitch, x0, y0, turned if upside_down else self.source)
+        return Lattice(
+            name, rows, columns, pitch, x0, y0, turned if upside_down else self.source
+        )
 
 
-def hold(shape: tuple[int, ...], dtype: "np.dtype[Any]", blocks: Iterable[tuple[int, Array]]) -> Held:
+def hold(
+    shape: tuple[int, ...], dtype: "np.dtype[Any]", blocks: Iterable[tuple[int, Array]]
+) -> Held:
     """Keep blocks of rows (first row, class numbers), which together are all of them.
 
-    Beyond 128 MB they go to a nameless file in the folder for temporary files (``TMPDIR``), gone with the last use.
+    Beyond 128 MB they go to a nameless file in the folder for temporary files
+    (``TMPDIR``), gone with the last use.
     """
     rows, columns = shape[0], shape[1]
     if rows * columns * dtype.itemsize <= MOST_BYTES:

@@ -1,8 +1,12 @@
-"""Marks of a die: crosses, coarse and fine, an F for its orientation, verniers and boxes in boxes for its two steps.
+"""Marks of a die: crosses, coarse and fine, an F for its orientation, verniers and
+boxes in boxes for its two steps.
 
-A vernier is two scales side by side: bars of pitch p1 drawn with the pillars, and of pitch p2 > p1 opened in the film
-of the aperture. Where the film lies d to the right of the pillars, bar n of both meets where n p1 = n p2 + d, so the
-reading is d = n (p1 - p2), with n counted from the middle bar, which is longer, to the right (upwards for the upright
+A vernier is two scales side by side: bars of pitch p1 drawn with the pillars, and of
+pitch p2 > p1 opened in the film
+of the aperture. Where the film lies d to the right of the pillars, bar n of both meets
+where n p1 = n p2 + d, so the
+reading is d = n (p1 - p2), with n counted from the middle bar, which is longer, to the
+right (upwards for the upright
 scale). A box in a box shows the same shift as a difference of the two margins, twice.
 """
 
@@ -38,7 +42,12 @@ class Box:
     def polygon(self) -> Array:
         """Its corners."""
         return np.array(
-            [[self.left, self.bottom], [self.right, self.bottom], [self.right, self.top], [self.left, self.top]]
+            [
+                [self.left, self.bottom],
+                [self.right, self.bottom],
+                [self.right, self.top],
+                [self.left, self.top],
+            ]
         )
 
     def grown(self, by: int) -> "Box":
@@ -60,7 +69,11 @@ class Units:
     """From micrometres to database units on the grid."""
 
     def __init__(self, plan: MaskPlan) -> None:
-        self.per_um, self.grid, self.pitch = 1e3 / plan.unit_nm, plan.grid, plan.lattices[0].constant
+        self.per_um, self.grid, self.pitch = (
+            1e3 / plan.unit_nm,
+            plan.grid,
+            plan.lattices[0].constant,
+        )
 
     def __call__(self, length_um: float) -> int:
         return round(length_um * self.per_um / self.grid) * self.grid
@@ -68,7 +81,12 @@ class Units:
     def snapped(self, box: Box) -> Box:
         """The box on the grid, no smaller."""
         g = self.grid
-        return Box(box.left // g * g, box.bottom // g * g, -(-box.right // g) * g, -(-box.top // g) * g)
+        return Box(
+            box.left // g * g,
+            box.bottom // g * g,
+            -(-box.right // g) * g,
+            -(-box.top // g) * g,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +97,20 @@ class Scales:
     openings: tuple[Array, ...]
 
 
-def crosses(process: Process, unit: Units, die: Box) -> tuple[tuple[Array, ...], list[Box]]:
-    """A cross in each corner, a fine one beside it, and beside the upper left an F, unlike all its turns and mirrors.
+def crosses(
+    process: Process, unit: Units, die: Box
+) -> tuple[tuple[Array, ...], list[Box]]:
+    """A cross in each corner, a fine one beside it, and beside the upper left an F,
+    unlike all its turns and mirrors.
 
     Shapes, and the windows that the aperture opens around them.
     """
     arm, width = unit(process.die.mark_um / 2), unit(process.die.mark_width_um / 2)
     inset = unit(process.die.street_um + CLEAR_UM) + arm
-    fine, thin = max(unit.grid, arm // _FINE // unit.grid * unit.grid), _thin(width, unit)
+    fine, thin = (
+        max(unit.grid, arm // _FINE // unit.grid * unit.grid),
+        _thin(width, unit),
+    )
     shapes: list[Array] = []
     boxes = []
     for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
@@ -94,16 +118,26 @@ def crosses(process: Process, unit: Units, die: Box) -> tuple[tuple[Array, ...],
         away = y - sy * (arm + unit(CLEAR_UM) + fine)
         for at, reach, half in (((x, y), arm, width), ((x, away), fine, thin)):
             shapes.append(cross(*at, reach, half))
-            boxes.append(Box(at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach).grown(unit(CLEAR_UM / 2)))
+            boxes.append(
+                Box(at[0] - reach, at[1] - reach, at[0] + reach, at[1] + reach).grown(
+                    unit(CLEAR_UM / 2)
+                )
+            )
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
     left, bottom = die.left + inset + arm + unit(CLEAR_UM), die.top - inset - arm
     shapes.append(_letter_f(left, bottom, square))
-    boxes.append(Box(left, bottom, left + 5 * square, bottom + 7 * square).grown(unit(CLEAR_UM / 2)))
+    boxes.append(
+        Box(left, bottom, left + 5 * square, bottom + 7 * square).grown(
+            unit(CLEAR_UM / 2)
+        )
+    )
     return tuple(shapes), boxes
 
 
 def cross(x: int, y: int, arm: int, half: int) -> Array:
-    """(12, 2) corners of a cross at (x, y): arms of length ``arm`` from its middle, twice ``half`` wide."""
+    """(12, 2) corners of a cross at (x, y): arms of length ``arm`` from its middle,
+    twice ``half`` wide.
+    """
     w, a = half, arm
     corners = [
         (w, w),
@@ -123,7 +157,9 @@ def cross(x: int, y: int, arm: int, half: int) -> Array:
 
 
 def wafer_cross(unit: Units, mark_um: float, width_um: float) -> tuple[Array, ...]:
-    """Four bars for the coarse alignment about (0, 0), and a fine cross in the middle that they leave free."""
+    """Four bars for the coarse alignment about (0, 0), and a fine cross in the middle
+    that they leave free.
+    """
     arm, half = unit(mark_um / 2), unit(width_um / 2)
     inner, thin = arm // _FINE // unit.grid * unit.grid * 2, _thin(half, unit)
     upright = np.array([[-half, inner], [half, inner], [half, arm], [-half, arm]])
@@ -139,14 +175,19 @@ def _thin(half: int, unit: Units) -> int:
 
 
 def scales(process: Process, unit: Units, die: Box) -> Scales:
-    """Verniers along x and y and a box in a box, from the upper right cross to the left; none where none are wanted.
+    """Verniers along x and y and a box in a box, from the upper right cross to the
+    left; none where none are wanted.
 
     Raises:
-        ProcessError: the die is too narrow for them, or the step of the vernier is below the grid.
+        ProcessError: the die is too narrow for them, or the step of the vernier is
+            below the grid.
     """
     if not process.die.verniers:
         return Scales((), ())
-    pitch, step = unit(process.die.vernier_pitch_um), unit(process.die.vernier_step_nm * 1e-3)
+    pitch, step = (
+        unit(process.die.vernier_pitch_um),
+        unit(process.die.vernier_step_nm * 1e-3),
+    )
     if step < unit.grid:
         raise ProcessError(
             f"die.vernier_step_nm = {process.die.vernier_step_nm}: need at least the grid of {process.rules.grid_nm} nm"
@@ -163,7 +204,9 @@ def scales(process: Process, unit: Units, die: Box) -> Scales:
     level = middle[0] - outer - clear - long, top
     square = max(unit.grid, arm // 5 // unit.grid * unit.grid)
     if level[0] - long < die.left + inset + 2 * arm + 2 * clear + 5 * square:
-        need = (die.right - level[0] + long + inset + 2 * arm + 2 * clear + 5 * square) / unit.per_um
+        need = (
+            die.right - level[0] + long + inset + 2 * arm + 2 * clear + 5 * square
+        ) / unit.per_um
         raise ProcessError(
             f"the die is too narrow for VERNIERS: {need:.0f} um are needed; raise die.margin_um or die.size_um, or set "
             "die.verniers = false"
@@ -181,12 +224,26 @@ def scales(process: Process, unit: Units, die: Box) -> Scales:
 
 
 def _vernier(unit: Units, pitch: int, step: int) -> tuple[list[Array], list[Array]]:
-    """Bars about (0, 0): drawn ones above, within a window of the film; openings of the film below."""
-    half, gap = max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid), unit(_GAP_UM)
-    drawn = [Box(x - half, gap, x + half, gap + long).polygon for x, long in _bars(unit, pitch)]
-    opened = [Box(x - half, -gap - long, x + half, -gap).polygon for x, long in _bars(unit, pitch + step)]
+    """Bars about (0, 0): drawn ones above, within a window of the film; openings of the
+    film below.
+    """
+    half, gap = (
+        max(unit.grid, round(pitch * _SHARE / 2 / unit.grid) * unit.grid),
+        unit(_GAP_UM),
+    )
+    drawn = [
+        Box(x - half, gap, x + half, gap + long).polygon
+        for x, long in _bars(unit, pitch)
+    ]
+    opened = [
+        Box(x - half, -gap - long, x + half, -gap).polygon
+        for x, long in _bars(unit, pitch + step)
+    ]
     reach = BARS * pitch + pitch // 2
-    return drawn, [*opened, unit.snapped(Box(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon]
+    return drawn, [
+        *opened,
+        unit.snapped(Box(-reach, 0, reach, 2 * gap + unit(_LONG_UM))).polygon,
+    ]
 
 
 def _bars(unit: Units, pitch: int) -> Iterator[tuple[int, int]]:
@@ -196,11 +253,24 @@ def _bars(unit: Units, pitch: int) -> Iterator[tuple[int, int]]:
 
 
 def _placed(shape: Array, at: tuple[int, int], upright: bool) -> Array:
-    """A shape of a scale where the scale stands; the upright one runs upwards, drawn bars on its left."""
+    """A shape of a scale where the scale stands; the upright one runs upwards, drawn
+    bars on its left.
+    """
     turned = shape @ np.array([[0, 1], [-1, 0]]) if upright else shape
     return np.asarray(turned + at, np.int64)
 
 
 def _letter_f(x: int, y: int, s: int) -> Array:
-    corners = [(0, 0), (1, 0), (1, 3), (4, 3), (4, 4), (1, 4), (1, 6), (5, 6), (5, 7), (0, 7)]
+    corners = [
+        (0, 0),
+        (1, 0),
+        (1, 3),
+        (4, 3),
+        (4, 4),
+        (1, 4),
+        (1, 6),
+        (5, 6),
+        (5, 7),
+        (0, 7),
+    ]
     return np.add(np.multiply(corners, s), (x, y))

@@ -1,9 +1,14 @@
-"""The mask as a record: lattices of pillar classes, fixed figures, layers. Writers and checks need nothing else.
+"""The mask as a record: lattices of pillar classes, fixed figures, layers. Writers and
+checks need nothing else.
 
-Coordinates are whole database units (``unit_nm``, 1 nm by default) along the axes of the lens: a pillar of the map at
-(x, y) um is drawn at (x, y). Mask readers show +y upwards, and the mask is seen from the pillar side, against the
-light: along the light (+x right, +y down, +z away, right-handed) the same lens shows +y downwards. So the first row
-of a diameter map is the lowest of the mask, and the first row of a lattice here, its topmost, is the last of the
+Coordinates are whole database units (``unit_nm``, 1 nm by default) along the axes of
+the lens: a pillar of the map at
+(x, y) um is drawn at (x, y). Mask readers show +y upwards, and the mask is seen from
+the pillar side, against the
+light: along the light (+x right, +y down, +z away, right-handed) the same lens shows +y
+downwards. So the first row
+of a diameter map is the lowest of the mask, and the first row of a lattice here, its
+topmost, is the last of the
 map. Millions of pillars stay an array of class numbers: 0 for no
 pillar, k for ``classes[k - 1]``.
 """
@@ -22,19 +27,30 @@ from metalens.ground.errors import ProcessError
 MOST_CLASSES = 65535
 FARTHEST = 2**31 - 1
 UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
-EXPOSED = ("MARKS", "LABEL", "VERNIERS")  # figures that are written in the same exposure as the pillars
-RowSource = Callable[[int, int], Array]  # (first row, end row) -> (rows, columns) class numbers
+EXPOSED = (
+    "MARKS",
+    "LABEL",
+    "VERNIERS",
+)  # figures that are written in the same exposure as the pillars
+RowSource = Callable[
+    [int, int], Array
+]  # (first row, end row) -> (rows, columns) class numbers
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PillarClass:
     """All pillars of one diameter (and dose): one cell of the mask.
 
-    name: of the cell. diameter_nm, diameter_units: of the circle that ``outline`` stands for, as drawn.
-    layer: (layer, datatype). outline: (n, 2) of the pillar, convex or not, counter-clockwise. drawn: polygons that are
-    written (the outline itself; in pieces where it has holes; or what is left of the lattice square for a negative
-    tone). dose: relative to the base dose. goal: wanted exposure of the edge, relative to dose-to-size (1 but in a dose
-    test). round: whether the outline stands for a circle of that diameter; else the diameter is the size of the shape.
+    name: of the cell. diameter_nm, diameter_units: of the circle that ``outline``
+    stands for, as drawn.
+    layer: (layer, datatype). outline: (n, 2) of the pillar, convex or not,
+    counter-clockwise. drawn: polygons that are
+    written (the outline itself; in pieces where it has holes; or what is left of the
+    lattice square for a negative
+    tone). dose: relative to the base dose. goal: wanted exposure of the edge, relative
+    to dose-to-size (1 but in a dose
+    test). round: whether the outline stands for a circle of that diameter; else the
+    diameter is the size of the shape.
     holes: what is left out of the outline, clockwise.
     """
 
@@ -69,10 +85,13 @@ class PillarClass:
 class Lattice:
     """Pillars on a lattice, written as one cell.
 
-    rows, columns: of sites. source: gives any block of rows as class numbers (0: none); array: all of them, where
+    rows, columns: of sites. source: gives any block of rows as class numbers (0: none);
+    array: all of them, where
     they are in memory.
-    x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row * down.
-    row_pitch: from row to row, 0 for that of the columns. centred: every other site stays empty (a hexagonal lattice:
+    x0, y0: site of the first row and column; x = x0 + column * pitch, y = y0 - row *
+    down.
+    row_pitch: from row to row, 0 for that of the columns. centred: every other site
+    stays empty (a hexagonal lattice:
     the pitch is half its constant).
     """
 
@@ -89,7 +108,12 @@ class Lattice:
 
     def __post_init__(self) -> None:
         names.check(self.name)
-        corners = (self.x0, self.y0, self.x0 + self.columns * self.pitch, self.y0 - self.rows * self.down)
+        corners = (
+            self.x0,
+            self.y0,
+            self.x0 + self.columns * self.pitch,
+            self.y0 - self.rows * self.down,
+        )
         if max(map(abs, corners)) > FARTHEST:
             raise ProcessError(
                 f"lattice {self.name} reaches {max(map(abs, corners))} database units from the origin, beyond 32 bits "
@@ -103,7 +127,9 @@ class Lattice:
 
     @property
     def square(self) -> bool:
-        """Whether rows and columns are as far apart, and every site is one of the lattice."""
+        """Whether rows and columns are as far apart, and every site is one of the
+        lattice.
+        """
         return self.down == self.pitch and not self.centred
 
     @property
@@ -112,12 +138,25 @@ class Lattice:
         return self.pitch * (2 if self.centred else 1)
 
     @classmethod
-    def of(cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int) -> "Lattice":
+    def of(
+        cls, name: str, classes: Array, *, pitch: int, x0: int, y0: int
+    ) -> "Lattice":
         """A square lattice held in memory: (rows, columns) uint8 or uint16."""
         if classes.ndim != 2 or classes.dtype not in (np.uint8, np.uint16):
-            raise ProcessError(f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 (rows, columns)")
+            raise ProcessError(
+                f"classes are {classes.dtype} {classes.shape}, need uint8 or uint16 (rows, columns)"
+            )
         rows, columns = classes.shape
-        return cls(name, rows, columns, pitch, x0, y0, lambda first, end: classes[first:end], classes)
+        return cls(
+            name,
+            rows,
+            columns,
+            pitch,
+            x0,
+            y0,
+            lambda first, end: classes[first:end],
+            classes,
+        )
 
     def blocks(self, size: int) -> Iterator[tuple[int, Array]]:
         """(first row, class numbers) in blocks of ``size`` rows."""
@@ -131,7 +170,9 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Figure:
-    """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database units."""
+    """A cell of fixed polygons: {(layer, datatype): polygons}, each (n, 2) in database
+    units.
+    """
 
     name: str
     polygons: Mapping[LayerNumber, tuple[Array, ...]]
@@ -141,19 +182,26 @@ class Figure:
         for shapes in self.polygons.values():
             for shape in shapes:
                 if len(shape) and np.abs(np.asarray(shape, np.int64)).max() > FARTHEST:
-                    raise ProcessError(f"figure {self.name} reaches beyond 32 bits; take a smaller die")
+                    raise ProcessError(
+                        f"figure {self.name} reaches beyond 32 bits; take a smaller die"
+                    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MaskPlan:
     """Everything that goes into a mask file.
 
-    name: of the top cell. unit_nm: database unit. grid: step of all coordinates, in database units.
-    classes: pillar classes; number k of a lattice is ``classes[k - 1]``. lattices: the lens first.
-    layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that is exposed.
-    axis: of the lens in database units (off (0, 0) by at most half a grid step, where the lattice cannot be centred
+    name: of the top cell. unit_nm: database unit. grid: step of all coordinates, in
+    database units.
+    classes: pillar classes; number k of a lattice is ``classes[k - 1]``. lattices: the
+    lens first.
+    layer_names: shown by viewers. doses: relative dose of each (layer, datatype) that
+    is exposed.
+    axis: of the lens in database units (off (0, 0) by at most half a grid step, where
+    the lattice cannot be centred
     on the grid).
-    standing: for a negative tone, the mask of what stays; None where the drawn shapes stay.
+    standing: for a negative tone, the mask of what stays; None where the drawn shapes
+    stay.
     """
 
     name: str
@@ -182,13 +230,18 @@ class MaskPlan:
     @property
     def placed_names(self) -> list[str]:
         """Cells that the top cell places: figures and lattices."""
-        return [*(figure.name for figure in self.figures), *(lattice.name for lattice in self.lattices)]
+        return [
+            *(figure.name for figure in self.figures),
+            *(lattice.name for lattice in self.lattices),
+        ]
 
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
         total = np.zeros(len(self.classes) + 1, np.int64)
         for lattice in self.lattices:
-            for _, block in lattice.blocks(max(1, (1 << 20) // max(1, lattice.columns))):
+            for _, block in lattice.blocks(
+                max(1, (1 << 20) // max(1, lattice.columns))
+            ):
                 total += np.bincount(block.ravel(), minlength=len(total))
         return total
 
@@ -198,12 +251,31 @@ class MaskPlan:
 
 
 def pillar_classes(
-    diameters: Array, *, layer: LayerNumber, grid: int, unit_nm: float, vertices: int, shape: str, prefix: str = "D"
+    diameters: Array,
+    *,
+    layer: LayerNumber,
+    grid: int,
+    unit_nm: float,
+    vertices: int,
+    shape: str,
+    prefix: str = "D",
 ) -> tuple[PillarClass, ...]:
-    """One class for each drawn diameter (database units, whole), thinnest first; equally long names."""
+    """One class for each drawn diameter (database units, whole), thinnest first;
+    equally long names.
+    """
     digits = max((len(str(int(d))) for d in diameters), default=1)
     made = []
     for d in diameters:
-        outline = polygon.pillar(int(d) / grid, vertices=vertices, shape=shape).points * grid
-        made.append(PillarClass(f"{prefix}{int(d):0{digits}}", float(d) * unit_nm, int(d), layer, outline))
+        outline = (
+            polygon.pillar(int(d) / grid, vertices=vertices, shape=shape).points * grid
+        )
+        made.append(
+            PillarClass(
+                f"{prefix}{int(d):0{digits}}",
+                float(d) * unit_nm,
+                int(d),
+                layer,
+                outline,
+            )
+        )
     return tuple(made)

@@ -1,8 +1,12 @@
-"""Pillars that are not round, or turned one by one: a class for every drawn size and turn.
+"""Pillars that are not round, or turned one by one: a class for every drawn size and
+turn.
 
-Of a film with openings the openings are drawn. All edges of a pillar (or opening) move alike, by the bias of the
-process at its size; its turn is rounded to a step, its corners to the grid (a circle, also that of a ring's hole, keeps
-its area as round pillars do). A pillar with a hole is written as polygons that share the cut through the middle of the
+Of a film with openings the openings are drawn. All edges of a pillar (or opening) move
+alike, by the bias of the
+process at its size; its turn is rounded to a step, its corners to the grid (a circle,
+also that of a ring's hole, keeps
+its area as round pillars do). A pillar with a hole is written as polygons that share
+the cut through the middle of the
 hole. Rounding of the corners by the etch is not made up for.
 """
 
@@ -31,11 +35,14 @@ _LENGTHS = 1 << 20  # above any drawn size in nm
 _TABLED = 1 << 20  # keys below are counted and numbered by a table, others by sorting
 
 
-def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, tuple[PillarClass, ...]]:
+def classes(
+    source: Lens, process: Process, *, unit_nm: float
+) -> tuple[Cells, tuple[PillarClass, ...]]:
     """The pillars of a lens as classes, and what is drawn for each.
 
     Raises:
-        ProcessError: too many classes, a pillar of less than a step, a hole that the grid or the bias closes.
+        ProcessError: too many classes, a pillar of less than a step, a hole that the
+            grid or the bias closes.
         LensError: no pillar.
     """
     d, cell = source.diameters, source.cell
@@ -52,10 +59,15 @@ def classes(source: Lens, process: Process, *, unit_nm: float) -> tuple[Cells, t
             f"{len(used)} classes of size and turn, at most {MOST_CLASSES}; raise angle_step_deg or diameter_step_nm"
         )
     kind: np.dtype[Any] = np.dtype(np.uint8 if len(used) <= 255 else np.uint16)
-    numbered = ((first, _numbered(block, used, kind)) for first, block in _keys(d, process, turns))
+    numbered = (
+        (first, _numbered(block, used, kind))
+        for first, block in _keys(d, process, turns)
+    )
     sites = hold(d.diameter_um.shape, kind, numbered)
     made = tuple(_class(source, int(key), process, turns, unit_nm) for key in used)
-    across = np.array([2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made])
+    across = np.array(
+        [2 * float(np.hypot(*one.outline.T).max()) * unit_nm for one in made]
+    )
     found = np.array([counts[int(key)] for key in used])
     return Cells(sites, across, found, process.rules.diameter_step_nm / 2), made
 
@@ -71,9 +83,12 @@ def _turns(cell: Cell, d: DiameterMap, process: Process) -> int:
 def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, Array]]:
     """(first row, key) of blocks of rows; 0 for no pillar.
 
-    key: drawn size in nm, plus ``_LENGTHS`` times the second number of the shape; times the turns, plus the turn. The
-    second number is the drawn length of pillars of two sizes; of others the whole nm that the bias of the lone one
-    differs by, less the least (0 where the process knows none): two pillars that are drawn as wide, one of them
+    key: drawn size in nm, plus ``_LENGTHS`` times the second number of the shape; times
+    the turns, plus the turn. The
+    second number is the drawn length of pillars of two sizes; of others the whole nm
+    that the bias of the lone one
+    differs by, less the least (0 where the process knows none): two pillars that are
+    drawn as wide, one of them
     alone, are not of one design.
     """
     lone = process.bias.isolated_nm
@@ -82,13 +97,17 @@ def _keys(d: DiameterMap, process: Process, turns: int) -> Iterator[tuple[int, A
         design, beside = np.asarray(block, float) / nm, 0.0 if alone is None else alone
         drawn = _steps(design, design, process, beside)
         if d.length_um is not None:
-            drawn += _LENGTHS * _steps(np.asarray(d.length_um[rows], float) / nm, design, process, beside)
+            drawn += _LENGTHS * _steps(
+                np.asarray(d.length_um[rows], float) / nm, design, process, beside
+            )
         elif alone is not None:
             drawn += _LENGTHS * np.rint(alone * abs(lone)).astype(np.int64)
         turn = np.zeros(design.shape, np.int64)
         if d.angle_rad is not None:
             degrees = np.degrees(np.asarray(d.angle_rad[rows], float))
-            turn = np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
+            turn = (
+                np.rint(degrees / process.rules.angle_step_deg).astype(np.int64) % turns
+            )
         yield first, np.where(design > 0, drawn * turns + turn, 0)
 
 
@@ -111,52 +130,83 @@ def _numbered(block: Array, used: Array, kind: np.dtype[Any]) -> Array:
     return table[block]
 
 
-def _steps(size_nm: Array, design_nm: Array, process: Process, alone: Array | float) -> Array:
-    """Sizes as they are drawn, in whole steps; ``alone``: as :meth:`metalens.made.Bias.drawn_nm` takes it."""
+def _steps(
+    size_nm: Array, design_nm: Array, process: Process, alone: Array | float
+) -> Array:
+    """Sizes as they are drawn, in whole steps; ``alone``: as
+    :meth:`metalens.made.Bias.drawn_nm` takes it.
+    """
     step = process.rules.diameter_step_nm
-    drawn = np.rint(process.bias.drawn_nm(size_nm, alone) / step).astype(np.int64) * step
+    drawn = (
+        np.rint(process.bias.drawn_nm(size_nm, alone) / step).astype(np.int64) * step
+    )
     if ((drawn < step) & (design_nm > 0)).any():
-        raise ProcessError(f"a pillar would be drawn below one step of {step} nm; check the bias")
+        raise ProcessError(
+            f"a pillar would be drawn below one step of {step} nm; check the bias"
+        )
     return np.asarray(np.where(design_nm > 0, drawn, 0))
 
 
-def _class(source: Lens, key: int, process: Process, turns: int, unit_nm: float) -> PillarClass:
+def _class(
+    source: Lens, key: int, process: Process, turns: int, unit_nm: float
+) -> PillarClass:
     """What is drawn for a key."""
     both, turn = divmod(key, turns)
     second, drawn = divmod(both, _LENGTHS)
     name = f"D{drawn:06}" if turns == 1 else f"D{drawn:05}R{turn:0{len(str(turns))}}"
     if source.diameters.length_um is not None:
         name = f"D{drawn:05}L{second:05}"
-        made = sized(source.cell, float(drawn), float(second)).outline(drawn * nm)  # each axis by the bias of its size
+        made = sized(source.cell, float(drawn), float(second)).outline(
+            drawn * nm
+        )  # each axis by the bias of its size
     else:
         lone = process.bias.isolated_nm
         name += f"I{second}" if second else ""
         made = _biased(source.cell, drawn, process, second / abs(lone) if lone else 0.0)
     step_nm = process.rules.grid_nm * unit_nm
     turn_rad = math.radians(turn * process.rules.angle_step_deg)
-    contours = [_gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm for part in made.parts]
+    contours = [
+        _gridded(part, turn_rad, step_nm, process, name) * process.rules.grid_nm
+        for part in made.parts
+    ]
     outline, holes = contours[0], tuple(hole[::-1] for hole in contours[1:])
-    pieces = tuple(region.without_holes([outline, *holes], grid=process.rules.grid_nm)) if holes else ()
+    pieces = (
+        tuple(region.without_holes([outline, *holes], grid=process.rules.grid_nm))
+        if holes
+        else ()
+    )
     layer, units = process.layers.pillar, round(drawn / unit_nm)
-    return PillarClass(name, float(drawn), units, layer, outline, pieces, round=False, holes=holes)
+    return PillarClass(
+        name, float(drawn), units, layer, outline, pieces, round=False, holes=holes
+    )
 
 
-def _gridded(part: Conic | Loop, turn_rad: float, step_nm: float, process: Process, name: str) -> Array:
-    """(n, 2) whole grid steps about the site, counter-clockwise: a circle of its area, any other part corner by corner.
+def _gridded(
+    part: Conic | Loop, turn_rad: float, step_nm: float, process: Process, name: str
+) -> Array:
+    """(n, 2) whole grid steps about the site, counter-clockwise: a circle of its area,
+    any other part corner by corner.
 
     Raises:
-        ProcessError: fewer than three corners are left, or a circle of less than four steps.
+        ProcessError: fewer than three corners are left, or a circle of less than four
+            steps.
     """
     if isinstance(part, Conic) and part.half_x_um == part.half_y_um:
         across = 2 * part.half_x_um / nm / step_nm
         if across < 4:
-            raise ProcessError(f"class {name}: a circle of {across * step_nm:.3g} nm; need four steps of the grid")
-        return polygon.pillar(across, vertices=process.rules.vertices, shape=process.rules.shape).points
+            raise ProcessError(
+                f"class {name}: a circle of {across * step_nm:.3g} nm; need four steps of the grid"
+            )
+        return polygon.pillar(
+            across, vertices=process.rules.vertices, shape=process.rules.shape
+        ).points
     corners = turned(part.vertices(process.rules.vertices), turn_rad) / nm / step_nm
     points = np.asarray(np.rint(corners), np.int64)
     points = points[np.any(points != np.roll(points, 1, axis=0), axis=1)]
     if len(points) < 3 or polygon.twice_area(points) <= 0:
-        raise ProcessError(f"class {name}: nothing is left on a grid of {step_nm:g} nm; take a finer grid_nm")
+        raise ProcessError(
+            f"class {name}: nothing is left on a grid of {step_nm:g} nm; take a finer grid_nm"
+        )
     return points
 
 
@@ -169,5 +219,7 @@ def _biased(cell: Cell, drawn: int, process: Process, alone: float) -> Outline:
     made = float(process.bias.made_nm(np.array(float(drawn)), alone)) * nm
     outline = cell.outline(made, grow_um=drawn * nm - made)
     if len(outline.parts) != len(cell.outline(made).parts):
-        raise ProcessError(f"a {cell.shape.name} drawn {drawn} nm wide would have no hole; need a larger size")
+        raise ProcessError(
+            f"a {cell.shape.name} drawn {drawn} nm wide would have no hole; need a larger size"
+        )
     return outline

@@ -1,4 +1,6 @@
-"""A lens that looks the same under all turns and mirrors of the square is stored once, as an eighth, and placed."""
+"""A lens that looks the same under all turns and mirrors of the square is stored once,
+as an eighth, and placed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,34 +16,53 @@ FOUR_TURNS = tuple((quarter, False) for quarter in range(4))
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Piece:
-    """Part of a lattice, and how it is placed at (0, 0): (quarter turns counter-clockwise, mirrored at x first)."""
+    """Part of a lattice, and how it is placed at (0, 0): (quarter turns
+    counter-clockwise, mirrored at x first).
+    """
 
     lattice: Lattice
     placed: Sequence[tuple[int, bool]]
 
 
 def is_square_symmetric(lattice: Lattice) -> bool:
-    """Whether the lattice, centred at (0, 0), is the same under the eight symmetries of the square."""
+    """Whether the lattice, centred at (0, 0), is the same under the eight symmetries of
+    the square.
+    """
     a = lattice.array
-    if a is None or not lattice.square or lattice.rows != lattice.columns or lattice.rows < 4:
+    if (
+        a is None
+        or not lattice.square
+        or lattice.rows != lattice.columns
+        or lattice.rows < 4
+    ):
         return False
     span = (lattice.columns - 1) * lattice.pitch
     if (2 * lattice.x0, 2 * lattice.y0) != (-span, span):
         return False
-    return np.array_equal(a, a[::-1]) and np.array_equal(a, a[:, ::-1]) and np.array_equal(a, a.T)
+    return (
+        np.array_equal(a, a[::-1])
+        and np.array_equal(a, a[:, ::-1])
+        and np.array_equal(a, a.T)
+    )
 
 
 def least(values: Array) -> Array:
-    """(n, n) the least of the values at a site and its seven images, which makes all eighths alike."""
+    """(n, n) the least of the values at a site and its seven images, which makes all
+    eighths alike.
+    """
     up = np.minimum(values, values[::-1])
     quarters = np.minimum(up, up[:, ::-1])
     return np.minimum(quarters, quarters.T)
 
 
 def pieces(lattice: Lattice) -> list[Piece]:
-    """The open eighth between the +x axis and the diagonal, the diagonal, and (odd counts) axis and centre."""
+    """The open eighth between the +x axis and the diagonal, the diagonal, and (odd
+    counts) axis and centre.
+    """
     quarter = _upper_right(lattice)
-    n = len(quarter)  # row n - 1 is the one nearest to the x axis, column 0 nearest to the y axis
+    n = len(
+        quarter
+    )  # row n - 1 is the one nearest to the x axis, column 0 nearest to the y axis
     row, column = np.indices((n, n), sparse=True)
     height = n - 1 - row
     odd = lattice.rows % 2
@@ -66,4 +87,6 @@ def _upper_right(lattice: Lattice) -> Array:
 
 def _lattice(lattice: Lattice, part: Array, letter: str) -> Lattice:
     x0 = lattice.x0 + (lattice.columns - part.shape[1]) * lattice.pitch
-    return Lattice.of(f"{lattice.name[:29]}_{letter}", part, pitch=lattice.pitch, x0=x0, y0=lattice.y0)
+    return Lattice.of(
+        f"{lattice.name[:29]}_{letter}", part, pitch=lattice.pitch, x0=x0, y0=lattice.y0
+    )

@@ -1,10 +1,16 @@
-"""Negative tone: what the mask of the standing structures leaves empty is drawn, and nothing else.
+"""Negative tone: what the mask of the standing structures leaves empty is drawn, and
+nothing else.
 
-The exposed area is the die without pillars, marks, verniers and labels. It is written as lattice squares without their
-pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around the marks and labels without
-these, each on its own layer, and the rest of the die (FRAME). All of them abut; none overlaps another. Without a die a
-frame one pitch wide (RIM) goes around the lattice: the squares of its last pillars would end in slits half a gap wide.
-A lattice square is a rectangle where rows lie closer or farther than columns; of a hexagonal lattice it is a brick, two
+The exposed area is the die without pillars, marks, verniers and labels. It is written
+as lattice squares without their
+pillar (a cell for each class), squares of sites without pillar (CLEAR), windows around
+the marks and labels without
+these, each on its own layer, and the rest of the die (FRAME). All of them abut; none
+overlaps another. Without a die a
+frame one pitch wide (RIM) goes around the lattice: the squares of its last pillars
+would end in slits half a gap wide.
+A lattice square is a rectangle where rows lie closer or farther than columns; of a
+hexagonal lattice it is a brick, two
 columns of the grid wide, and those of the next row stand half a brick off.
 """
 
@@ -23,12 +29,16 @@ _BLOCK_SITES = 1 << 20
 
 
 def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
-    """The mask that leaves standing what ``plan`` draws; the layers of a second step (aperture) stay as they are.
+    """The mask that leaves standing what ``plan`` draws; the layers of a second step
+    (aperture) stay as they are.
 
     Raises:
-        ProcessError: a pillar wider than its lattice square, lattices of different pitches.
+        ProcessError: a pillar wider than its lattice square, lattices of different
+            pitches.
     """
-    kinds = {(lattice.pitch, lattice.down, lattice.centred) for lattice in plan.lattices}
+    kinds = {
+        (lattice.pitch, lattice.down, lattice.centred) for lattice in plan.lattices
+    }
     if len(kinds) > 1:
         raise ProcessError(
             f"tone 'negative' with lattices of pitches {sorted({each[0] for each in kinds})}: put them on masks of "
@@ -37,20 +47,35 @@ def inverted(plan: MaskPlan, process: Process) -> MaskPlan:
     square = _square(plan.lattices[0], plan.grid)
     classes = tuple(_around(made, square, plan.grid) for made in plan.classes)
     boxes = [lattice_box(lattice, plan.grid) for lattice in plan.lattices]
-    clear = [box for lattice in plan.lattices for box in _empty(lattice, square[0], square[3])]
-    figures = _surroundings(plan, process, boxes) or [_rim(boxes, plan.lattices[0].constant, process)]
+    clear = [
+        box
+        for lattice in plan.lattices
+        for box in _empty(lattice, square[0], square[3])
+    ]
+    figures = _surroundings(plan, process, boxes) or [
+        _rim(boxes, plan.lattices[0].constant, process)
+    ]
     if clear:
         figures.append(Figure("CLEAR", {process.layers.pillar: tuple(clear)}))
-    kept = [figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)]
+    kept = [
+        figure for figure in plan.figures if set(figure.polygons) <= _unexposed(process)
+    ]
     return plan.replace(classes=classes, figures=(*kept, *figures), standing=plan)
 
 
 def lattice_box(lattice: Lattice, grid: int) -> Array:
-    """(4, 2) corners of all lattice squares together (of bricks: with the half ones at the ends of every other row)."""
+    """(4, 2) corners of all lattice squares together (of bricks: with the half ones at
+    the ends of every other row).
+    """
     left, bottom, right, top = _square(lattice, grid)
-    across, down = (lattice.columns - 1) * lattice.pitch, (lattice.rows - 1) * lattice.down
+    across, down = (
+        (lattice.columns - 1) * lattice.pitch,
+        (lattice.rows - 1) * lattice.down,
+    )
     x, y = lattice.x0, lattice.y0
-    return rectilinear.corners(np.array([x + left, y - down + bottom, x + across + right, y + top]))
+    return rectilinear.corners(
+        np.array([x + left, y - down + bottom, x + across + right, y + top])
+    )
 
 
 def _unexposed(process: Process) -> set[LayerNumber]:
@@ -59,12 +84,18 @@ def _unexposed(process: Process) -> set[LayerNumber]:
 
 
 def _square(lattice: Lattice, grid: int) -> tuple[int, int, int, int]:
-    """Left, bottom, right, top of the lattice square about a site, on the grid; squares of neighbours abut."""
-    left, bottom = (-(step // 2 // grid) * grid for step in (lattice.constant, lattice.down))
+    """Left, bottom, right, top of the lattice square about a site, on the grid; squares
+    of neighbours abut.
+    """
+    left, bottom = (
+        -(step // 2 // grid) * grid for step in (lattice.constant, lattice.down)
+    )
     return left, bottom, left + lattice.constant, bottom + lattice.down
 
 
-def _around(made: PillarClass, square: tuple[int, int, int, int], grid: int) -> PillarClass:
+def _around(
+    made: PillarClass, square: tuple[int, int, int, int], grid: int
+) -> PillarClass:
     (left, bottom), (right, top) = made.outline.min(0), made.outline.max(0)
     if left < square[0] or bottom < square[1] or right > square[2] or top > square[3]:
         raise ProcessError(
@@ -72,21 +103,30 @@ def _around(made: PillarClass, square: tuple[int, int, int, int], grid: int) -> 
             f"{square[2] - square[0]} by {square[3] - square[1]}: tone 'negative' draws what is left of the square; "
             "widen the pitch"
         )
-    left_over = region.difference([rectilinear.corners(np.array(square))], made.contours)
-    return dataclasses.replace(made, drawn=tuple(region.without_holes(left_over, grid=grid)))
+    left_over = region.difference(
+        [rectilinear.corners(np.array(square))], made.contours
+    )
+    return dataclasses.replace(
+        made, drawn=tuple(region.without_holes(left_over, grid=grid))
+    )
 
 
 def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
-    """Rectangles over what no pillar's square covers: equal runs of neighbouring rows together.
+    """Rectangles over what no pillar's square covers: equal runs of neighbouring rows
+    together.
 
-    left_of, top_of: edges of a square about its site. In columns of the grid: a brick covers two of them.
+    left_of, top_of: edges of a square about its site. In columns of the grid: a brick
+    covers two of them.
     """
     made: list[Array] = []
     open_runs: dict[tuple[int, int], int] = {}
 
     def close(run: tuple[int, int], end: int) -> Array:
         left, right = (lattice.x0 + column * lattice.pitch + left_of for column in run)
-        top, bottom = (lattice.y0 - row * lattice.down + top_of for row in (open_runs.pop(run), end))
+        top, bottom = (
+            lattice.y0 - row * lattice.down + top_of
+            for row in (open_runs.pop(run), end)
+        )
         return rectilinear.corners(np.array([left, bottom, right, top]))
 
     wide = 2 if lattice.centred else 1
@@ -104,21 +144,43 @@ def _empty(lattice: Lattice, left_of: int, top_of: int) -> list[Array]:
 
 def _surroundings(plan: MaskPlan, process: Process, boxes: list[Array]) -> list[Figure]:
     """Windows without their marks and labels, and the rest of the die."""
-    die = [p for figure in plan.figures if figure.name == "OUTLINE" for p in figure.polygons[process.layers.outline]]
+    die = [
+        p
+        for figure in plan.figures
+        if figure.name == "OUTLINE"
+        for p in figure.polygons[process.layers.outline]
+    ]
     if not die:
         return []
     margin = round(_WINDOW_UM * 1e3 / plan.unit_nm / plan.grid) * plan.grid
-    drawn = [f for f in plan.figures if f.name not in UNDRAWN and not set(f.polygons) <= _unexposed(process)]
-    standing = [shape for figure in drawn for shapes in figure.polygons.values() for shape in shapes]
+    drawn = [
+        f
+        for f in plan.figures
+        if f.name not in UNDRAWN and not set(f.polygons) <= _unexposed(process)
+    ]
+    standing = [
+        shape
+        for figure in drawn
+        for shapes in figure.polygons.values()
+        for shape in shapes
+    ]
     taken, made = list(boxes), []
     for figure in drawn:
         left = {}
         for layer, shapes in figure.polygons.items():
-            window = region.overlap(region.difference([_grown(s, margin) for s in shapes], taken), die)
-            left[layer] = tuple(region.without_holes(region.difference(window, standing), grid=plan.grid))
+            window = region.overlap(
+                region.difference([_grown(s, margin) for s in shapes], taken), die
+            )
+            left[layer] = tuple(
+                region.without_holes(
+                    region.difference(window, standing), grid=plan.grid
+                )
+            )
             taken += [_grown(s, margin) for s in shapes]
         made.append(Figure(figure.name, left))
-    rest = region.without_holes(region.difference(die, [*taken, *standing]), grid=plan.grid)
+    rest = region.without_holes(
+        region.difference(die, [*taken, *standing]), grid=plan.grid
+    )
     return [*made, Figure("FRAME", {process.layers.pillar: tuple(rest)})]
 
 
@@ -128,11 +190,18 @@ def _rim(boxes: list[Array], width: int, process: Process) -> Figure:
     for box in boxes:
         (left, bottom), (right, top) = box.min(0).tolist(), box.max(0).tolist()
         x0, y0, x1, y1 = left - width, bottom - width, right + width, top + width
-        sides = (x0, y0, x1, bottom), (x0, top, x1, y1), (x0, bottom, left, top), (right, bottom, x1, top)
+        sides = (
+            (x0, y0, x1, bottom),
+            (x0, top, x1, y1),
+            (x0, bottom, left, top),
+            (right, bottom, x1, top),
+        )
         shapes += [rectilinear.corners(np.array(side)) for side in sides]
     return Figure("RIM", {process.layers.pillar: tuple(shapes)})
 
 
 def _grown(shape: Array, margin: int) -> Array:
     """Box around a shape, wider by a margin on all sides."""
-    return rectilinear.corners(np.array([*(shape.min(0) - margin), *(shape.max(0) + margin)]))
+    return rectilinear.corners(
+        np.array([*(shape.min(0) - margin), *(shape.max(0) + margin)])
+    )

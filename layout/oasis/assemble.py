@@ -25,11 +25,14 @@ def write(made: Assembly, path: str | Path) -> None:
     """Write an assembly; the file appears whole or not at all.
 
     Raises:
-        OSError: the target cannot be written, or the disk is full; what was there before stays.
+        OSError: the target cannot be written, or the disk is full; what was there
+            before stays.
     """
     with store.replacing(path) as part, open(part, "wb", buffering=1 << 16) as file:
         head = oasis.start(made.unit_nm)
-        layers = b"".join(layer_name(layer, name) for layer, name in sorted(made.layer_names.items()))
+        layers = b"".join(
+            layer_name(layer, name) for layer, name in sorted(made.layer_names.items())
+        )
         number = {name: k for k, name in enumerate(made.cells)}
         checksum, written = 0, 0
         for piece in itertools.chain((head, layers), _cells(made, number)):
@@ -45,9 +48,17 @@ def _cells(made: Assembly, number: dict[str, int]) -> Iterator[bytes]:
     for name, cell in made.cells.items():
         yield cell_begin(number[name])
         for layer, polygons in cell.polygons.items():
-            yield oasis.compressed(b"".join(polygon(layer, points) for points in polygons), _LEVEL)
-        yield b"".join(_circle(layer, *one) for layer, circles in cell.circles.items() for one in circles)
-        yield b"".join(_array(one, number[one.child]) for one in made.copies.get(name, ()))
+            yield oasis.compressed(
+                b"".join(polygon(layer, points) for points in polygons), _LEVEL
+            )
+        yield b"".join(
+            _circle(layer, *one)
+            for layer, circles in cell.circles.items()
+            for one in circles
+        )
+        yield b"".join(
+            _array(one, number[one.child]) for one in made.copies.get(name, ())
+        )
         yield from _placements(cell, number)
         if name in made.sites:
             counts = np.zeros(len(number) + 1, np.int64)
@@ -55,8 +66,12 @@ def _cells(made: Assembly, number: dict[str, int]) -> Iterator[bytes]:
 
 
 def _circle(layer: LayerNumber, x: int, y: int, radius: int) -> bytes:
-    numbers = oasis.unsigned(layer[0]) + oasis.unsigned(layer[1]) + oasis.unsigned(radius)
-    return bytes([oasis.CIRCLE, 0b00111011]) + numbers + oasis.signed(x) + oasis.signed(y)
+    numbers = (
+        oasis.unsigned(layer[0]) + oasis.unsigned(layer[1]) + oasis.unsigned(radius)
+    )
+    return (
+        bytes([oasis.CIRCLE, 0b00111011]) + numbers + oasis.signed(x) + oasis.signed(y)
+    )
 
 
 def _array(one: Copies, number: int) -> bytes:
@@ -66,7 +81,9 @@ def _array(one: Copies, number: int) -> bytes:
         return placed
     if min(one.columns, one.rows) > 1:
         sizes = oasis.unsigned(one.columns - 2) + oasis.unsigned(one.rows - 2)
-        return placed + oasis.unsigned(8) + sizes + vector(*one.across) + vector(*one.up)
+        return (
+            placed + oasis.unsigned(8) + sizes + vector(*one.across) + vector(*one.up)
+        )
     along = one.across if one.rows == 1 else one.up
     return placed + oasis.unsigned(9) + oasis.unsigned(one.count - 2) + vector(*along)
 
@@ -77,9 +94,18 @@ def _one(number: int, turn: Turn, x: int, y: int, *, repeated: bool = False) -> 
     place = oasis.signed(x) + oasis.signed(y)
     if turn in QUARTERS:
         k = QUARTERS.index(turn)
-        return bytes([oasis.PLACEMENT, info | (k & 3) << 1 | k >> 2]) + oasis.unsigned(number) + place
+        return (
+            bytes([oasis.PLACEMENT, info | (k & 3) << 1 | k >> 2])
+            + oasis.unsigned(number)
+            + place
+        )
     info |= 6 | turn.mirrored
-    size = b"\7" + struct.pack("<d", turn.scale) + b"\7" + struct.pack("<d", turn.angle_deg)
+    size = (
+        b"\7"
+        + struct.pack("<d", turn.scale)
+        + b"\7"
+        + struct.pack("<d", turn.angle_deg)
+    )
     return bytes([oasis.PLACEMENT_ANY, info]) + oasis.unsigned(number) + size + place
 
 
@@ -88,7 +114,12 @@ def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
     own = np.array([number[name] for name in placed.children], np.int64)
     quarter = placed.turn < len(QUARTERS)
     yield b"".join(
-        _one(int(own[placed.child[n]]), placed.turns[int(placed.turn[n])], int(placed.x[n]), int(placed.y[n]))
+        _one(
+            int(own[placed.child[n]]),
+            placed.turns[int(placed.turn[n])],
+            int(placed.x[n]),
+            int(placed.y[n]),
+        )
         for n in np.flatnonzero(~quarter).tolist()
     )
     where = slice(None) if quarter.all() else np.flatnonzero(quarter)
@@ -96,10 +127,16 @@ def _placements(cell: CellContent, number: dict[str, int]) -> Iterator[bytes]:
 
 
 def _listed(own: Array, placed: Placed, where: "slice | Array") -> Iterator[bytes]:
-    child, x, y, turn = (v[where] for v in (placed.child, placed.x, placed.y, placed.turn))
+    child, x, y, turn = (
+        v[where] for v in (placed.child, placed.x, placed.y, placed.turn)
+    )
     out = np.empty(min(len(x), _AT_ONCE) * tiles.LARGEST_RECORD + 2, np.uint8)
     for first in range(0, len(x), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        at = x[some].astype(np.int64), y[some].astype(np.int64), turn[some].astype(np.int64)
+        at = (
+            x[some].astype(np.int64),
+            y[some].astype(np.int64),
+            turn[some].astype(np.int64),
+        )
         used = tiles.encode_list(own[child[some]], *at, out)
         yield oasis.compressed(out[:used].tobytes(), _LEVEL)

@@ -1,13 +1,54 @@
-"""Bytes of the OASIS format (SEMI P39): integers, reals, strings, compressed blocks, start and end."""
+"""Bytes of the OASIS format (SEMI P39): integers, reals, strings, compressed blocks,
+start and end.
+"""
 
 import struct
 import zlib
 
 MAGIC = b"%SEMI-OASIS\r\n"
-PAD, START, END, CELLNAME, CELLNAME_REF, TEXTSTRING, TEXTSTRING_REF, PROPNAME, PROPNAME_REF = range(9)
-PROPSTRING, PROPSTRING_REF, LAYERNAME, LAYERNAME_TEXT, CELL_REF, CELL, XYABSOLUTE, XYRELATIVE = range(9, 17)
-PLACEMENT, PLACEMENT_ANY, TEXT, RECTANGLE, POLYGON, PATH, TRAPEZOID, TRAPEZOID_A, TRAPEZOID_B = range(17, 26)
-CTRAPEZOID, CIRCLE, PROPERTY, PROPERTY_REPEAT, XNAME, XNAME_REF, XELEMENT, XGEOMETRY, CBLOCK = range(26, 35)
+(
+    PAD,
+    START,
+    END,
+    CELLNAME,
+    CELLNAME_REF,
+    TEXTSTRING,
+    TEXTSTRING_REF,
+    PROPNAME,
+    PROPNAME_REF,
+) = range(9)
+(
+    PROPSTRING,
+    PROPSTRING_REF,
+    LAYERNAME,
+    LAYERNAME_TEXT,
+    CELL_REF,
+    CELL,
+    XYABSOLUTE,
+    XYRELATIVE,
+) = range(9, 17)
+(
+    PLACEMENT,
+    PLACEMENT_ANY,
+    TEXT,
+    RECTANGLE,
+    POLYGON,
+    PATH,
+    TRAPEZOID,
+    TRAPEZOID_A,
+    TRAPEZOID_B,
+) = range(17, 26)
+(
+    CTRAPEZOID,
+    CIRCLE,
+    PROPERTY,
+    PROPERTY_REPEAT,
+    XNAME,
+    XNAME_REF,
+    XELEMENT,
+    XGEOMETRY,
+    CBLOCK,
+) = range(26, 35)
 
 END_SIZE = 256
 
@@ -51,14 +92,18 @@ def compressed(raw: bytes | memoryview, level: int) -> bytes:
 
 
 def start(unit_nm: float) -> bytes:
-    """Magic and START: version 1.0, grid steps in a micrometre, table offsets in the END record."""
+    """Magic and START: version 1.0, grid steps in a micrometre, table offsets in the
+    END record.
+    """
     return MAGIC + bytes([START]) + string("1.0") + real(1e3 / unit_nm) + unsigned(1)
 
 
 def end(offsets: tuple[int, int, int, int, int, int], checksum: int) -> bytes:
-    """The 256 bytes of END: strict name tables (0 where there is none), padding, CRC-32 of all before the CRC.
+    """The 256 bytes of END: strict name tables (0 where there is none), padding, CRC-32
+    of all before the CRC.
 
-    offsets: of the tables of cell names, text strings, property names, property strings, layer names, XNAMEs.
+    offsets: of the tables of cell names, text strings, property names, property
+    strings, layer names, XNAMEs.
     checksum: CRC-32 of the file so far.
     """
     head = bytes([END]) + b"".join(unsigned(1) + unsigned(offset) for offset in offsets)

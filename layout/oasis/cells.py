@@ -1,4 +1,6 @@
-"""What stands in the cells of an OASIS file: placements, rectangles, polygons, circles, texts, with modal values."""
+"""What stands in the cells of an OASIS file: placements, rectangles, polygons, circles,
+texts, with modal values.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -6,7 +8,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from layout.files import NOTHING, QUARTERS, CellContent, Gathered, Placed, Turn, paths, placements
+from layout.files import (
+    NOTHING,
+    QUARTERS,
+    CellContent,
+    Gathered,
+    Placed,
+    Turn,
+    paths,
+    placements,
+)
 from layout.oasis import bytes as oasis
 from layout.oasis import trapezoids
 from layout.oasis.cursor import Cursor, Repetition
@@ -33,7 +44,9 @@ class Budget:
 
 @dataclass(eq=False, slots=True)
 class Modal:
-    """Values that a record may leave out because an earlier one gave them; forgotten at each cell."""
+    """Values that a record may leave out because an earlier one gave them; forgotten at
+    each cell.
+    """
 
     relative: bool = False
     placement_x: int = 0
@@ -58,21 +71,29 @@ class Modal:
 
 @dataclass(eq=False, slots=True)
 class OpenCell:
-    """A cell while it is read. names: of children that are placed by name, numbered from -2 down."""
+    """A cell while it is read. names: of children that are placed by name, numbered
+    from -2 down.
+    """
 
     key: Child
     polygons: dict[tuple[int, int], list[Array]] = field(default_factory=dict)
-    circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(default_factory=dict)
+    circles: dict[tuple[int, int], list[tuple[int, int, int]]] = field(
+        default_factory=dict
+    )
     held: Gathered = field(default_factory=Gathered)
     names: dict[str, int] = field(default_factory=dict)
-    turns: dict[Turn, int] = field(default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)})
+    turns: dict[Turn, int] = field(
+        default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
+    )
     texts: int = 0
 
     def close(self, name: str, table: dict[int, str]) -> CellContent:
         """The finished cell; KeyError names a reference number without a name."""
         digest = self.held.digest
         sums = None if digest is None else digest.of(digest.children)
-        return CellContent(name, self.polygons, self.circles, self._placed(table), self.texts, sums)
+        return CellContent(
+            name, self.polygons, self.circles, self._placed(table), self.texts, sums
+        )
 
     def _placed(self, table: dict[int, str]) -> Placed:
         if not self.held.count:
@@ -80,7 +101,9 @@ class OpenCell:
         own = {number: name for name, number in self.names.items()}
         if self.held.digest is not None:
             every = self.held.digest.children.tolist()
-            return dataclasses.replace(NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every))
+            return dataclasses.replace(
+                NOTHING, children=tuple(own[k] if k < 0 else table[k] for k in every)
+            )
         child, x, y, turn = self.held.columns()
         used, index = _numbered(child)
         names = tuple(own[k] if k < 0 else table[k] for k in used.tolist())
@@ -88,13 +111,17 @@ class OpenCell:
 
 
 def _numbered(child: Array) -> tuple[Array, Array]:
-    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it is changed in place."""
+    """Numbers that occur, rising, and which of them each of ``child`` (n,) int32 is; it
+    is changed in place.
+    """
     low, high = int(child.min()), int(child.max())
     if high - low >= 1 << 22:
         used, index = np.unique(child, return_inverse=True)
         return used, index.astype(np.int32)
     occurs = np.zeros(high - low + 1, bool)
-    pieces = [child[n : n + _BATCH] for n in range(0, len(child), _BATCH)]  # numpy widens what it indexes by
+    pieces = [
+        child[n : n + _BATCH] for n in range(0, len(child), _BATCH)
+    ]  # numpy widens what it indexes by
     for some in pieces:
         some -= low
         occurs[some] = True
@@ -111,7 +138,9 @@ class CellReader:
         self.cell, self.budget, self.modal = cell, budget, Modal()
 
     def record(self, c: Cursor, kind: int) -> bool:
-        """Read the record of this kind that stands at the cursor; False where cells hold no such record."""
+        """Read the record of this kind that stands at the cursor; False where cells
+        hold no such record.
+        """
         if kind in (oasis.XYABSOLUTE, oasis.XYRELATIVE):
             self.modal.relative = kind == oasis.XYRELATIVE
         elif kind in (oasis.PLACEMENT, oasis.PLACEMENT_ANY):
@@ -135,9 +164,18 @@ class CellReader:
         return True
 
     def plain_placements(self, c: Cursor) -> None:
-        """Placements in a row, by the compiled loop; stops before anything that it does not know."""
+        """Placements in a row, by the compiled loop; stops before anything that it does
+        not know.
+        """
         m = self.modal
-        state = np.array([m.placement_x, m.placement_y, m.relative, m.child if isinstance(m.child, int) else -1])
+        state = np.array(
+            [
+                m.placement_x,
+                m.placement_y,
+                m.relative,
+                m.child if isinstance(m.child, int) else -1,
+            ]
+        )
         while True:
             size = min(_BATCH, c.left // 2 + 1)
             out = np.empty((4, size), np.int32)
@@ -146,7 +184,11 @@ class CellReader:
             if count:
                 child, x, y, turn = (row.copy() for row in out[:, :count])
                 self._add(c, child, x, y, turn.astype(np.uint8))
-                m.placement_x, m.placement_y, m.child = int(state[0]), int(state[1]), int(state[3])
+                m.placement_x, m.placement_y, m.child = (
+                    int(state[0]),
+                    int(state[1]),
+                    int(state[3]),
+                )
             m.relative = bool(state[2])
             if not moved:
                 return
@@ -168,15 +210,21 @@ class CellReader:
             raise c.fail(f"record without {what}, and none before it in this cell")
         return value
 
-    def _position(self, c: Cursor, info: int, bits: tuple[int, int], now: tuple[int, int]) -> tuple[int, int]:
+    def _position(
+        self, c: Cursor, info: int, bits: tuple[int, int], now: tuple[int, int]
+    ) -> tuple[int, int]:
         place = []
         for bit, old in zip(bits, now, strict=True):
             new = c.coordinate() if info & bit else None
             relative = self.modal.relative
-            place.append(old if new is None else c.within(old + new) if relative else new)
+            place.append(
+                old if new is None else c.within(old + new) if relative else new
+            )
         return place[0], place[1]
 
-    def _repeated(self, c: Cursor, info: int, bit: int, x: int, y: int) -> tuple[Array, Array]:
+    def _repeated(
+        self, c: Cursor, info: int, bit: int, x: int, y: int
+    ) -> tuple[Array, Array]:
         if not info & bit:
             return np.array([x]), np.array([y])
         self.modal.repetition = c.repetition(self.modal.repetition, self.budget.left)
@@ -198,13 +246,29 @@ class CellReader:
             size = c.real() if info & 4 else 1.0
             angle = c.real() if info & 2 else 0.0
             if not 0 < size < 1e9 or not abs(angle) < 1e9:
-                raise c.fail(f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0")
-            turn = self.cell.turns.setdefault(Turn(angle % 360, bool(info & 1), size), len(self.cell.turns))
-        m.placement_x, m.placement_y = self._position(c, info, (0x20, 0x10), (m.placement_x, m.placement_y))
+                raise c.fail(
+                    f"placement turned by {angle} degrees and scaled by {size}; need a scale above 0"
+                )
+            turn = self.cell.turns.setdefault(
+                Turn(angle % 360, bool(info & 1), size), len(self.cell.turns)
+            )
+        m.placement_x, m.placement_y = self._position(
+            c, info, (0x20, 0x10), (m.placement_x, m.placement_y)
+        )
         x, y = self._repeated(c, info, 8, m.placement_x, m.placement_y)
-        number = self.cell.names.setdefault(child, -2 - len(self.cell.names)) if isinstance(child, str) else child
-        small = (np.full(len(x), number, np.int32), x.astype(np.int32), y.astype(np.int32))
-        self._add(c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32))
+        number = (
+            self.cell.names.setdefault(child, -2 - len(self.cell.names))
+            if isinstance(child, str)
+            else child
+        )
+        small = (
+            np.full(len(x), number, np.int32),
+            x.astype(np.int32),
+            y.astype(np.int32),
+        )
+        self._add(
+            c, *small, np.full(len(x), turn, np.uint8 if turn < 256 else np.int32)
+        )
 
     def _layer(self, c: Cursor, info: int) -> None:
         if info & 1:
@@ -212,19 +276,28 @@ class CellReader:
         if info & 2:
             self.modal.datatype = c.unsigned()
 
-    def _place(self, c: Cursor, info: int, corners: int) -> tuple[tuple[int, int], Array, Array]:
+    def _place(
+        self, c: Cursor, info: int, corners: int
+    ) -> tuple[tuple[int, int], Array, Array]:
         """Layer and positions of a shape, from the end of its record."""
         m = self.modal
         m.x, m.y = self._position(c, info, (0x10, 8), (m.x, m.y))
         x, y = self._repeated(c, info, 4, m.x, m.y)
         self._count(c, len(x) * (_DRAWN + corners))
-        return (self._need(c, m.layer, "layer"), self._need(c, m.datatype, "datatype")), x, y
+        return (
+            (self._need(c, m.layer, "layer"), self._need(c, m.datatype, "datatype")),
+            x,
+            y,
+        )
 
     def _polygons(self, c: Cursor, info: int, points: Array) -> None:
         layer, x, y = self._place(c, info, len(points))
         c.within(int(np.abs(points).max()) + max(abs(self.modal.x), abs(self.modal.y)))
         shapes = self.cell.polygons.setdefault(layer, [])
-        shapes.extend(points + np.array(place) for place in zip(x.tolist(), y.tolist(), strict=True))
+        shapes.extend(
+            points + np.array(place)
+            for place in zip(x.tolist(), y.tolist(), strict=True)
+        )
 
     def _rectangle(self, c: Cursor) -> None:
         info, m = c.byte(), self.modal
@@ -256,14 +329,19 @@ class CellReader:
             m.path_ends = self._ends(c, c.unsigned())
         if info & 0x20:
             m.path_points = c.points(closed=False)
-        points, half = self._need(c, m.path_points, "point list"), self._need(c, m.half_width, "width")
+        points, half = (
+            self._need(c, m.path_points, "point list"),
+            self._need(c, m.half_width, "width"),
+        )
         begin, end = self._need(c, m.path_ends, "ends")
         if half == 0 or (points == points[0]).all():
             raise c.fail("path without width or length")
         self._polygons(c, info, paths.outline(points, half, begin=begin, end=end))
 
     def _ends(self, c: Cursor, scheme: int) -> tuple[int, int]:
-        """By how much a path goes on at its begin and end: as before, not, by its half width, or as told."""
+        """By how much a path goes on at its begin and end: as before, not, by its half
+        width, or as told.
+        """
         old, half = self.modal.path_ends or (0, 0), self.modal.half_width or 0
         made = []
         for n, form in enumerate((scheme >> 2 & 3, scheme & 3)):
@@ -278,8 +356,12 @@ class CellReader:
         b = c.coordinate() if kind != oasis.TRAPEZOID_A else 0
         w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
         if max(abs(a), abs(b), abs(a - b)) > (h if info & 0x80 else w):
-            raise c.fail(f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross")
-        self._polygons(c, info, trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80)))
+            raise c.fail(
+                f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross"
+            )
+        self._polygons(
+            c, info, trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80))
+        )
 
     def _size(self, c: Cursor, info: int) -> None:
         if info & 0x40:
@@ -295,7 +377,9 @@ class CellReader:
         self._size(c, info)
         kind = self._need(c, m.kind, "type")
         if kind >= trapezoids.KINDS:
-            raise c.fail(f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}")
+            raise c.fail(
+                f"compact trapezoid of type {kind}, need 0 to {trapezoids.KINDS - 1}"
+            )
         wide, high = trapezoids.needs(kind)
         w = self._need(c, m.width, "width") if wide else 0
         h = self._need(c, m.height, "height") if high else 0
@@ -309,7 +393,9 @@ class CellReader:
         radius = self._need(c, m.radius, "radius")
         layer, x, y = self._place(c, info, 1)
         shapes = self.cell.circles.setdefault(layer, [])
-        shapes.extend((px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True))
+        shapes.extend(
+            (px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True)
+        )
 
     def _text(self, c: Cursor) -> None:
         """Texts are counted, no more."""

@@ -1,4 +1,6 @@
-"""Reading the elements of OASIS: integers, reals, strings, point lists, repetitions. Errors name the byte offset."""
+"""Reading the elements of OASIS: integers, reals, strings, point lists, repetitions.
+Errors name the byte offset.
+"""
 
 import struct
 from dataclasses import dataclass
@@ -16,7 +18,9 @@ DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Repetition:
-    """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32 bits."""
+    """Offsets of all copies from the first, which is (0, 0): (n,) x and y, within 32
+    bits.
+    """
 
     x: Array
     y: Array
@@ -25,15 +29,27 @@ class Repetition:
 class Cursor:
     """A position in the bytes of a file, or in those of one decompressed block of it."""
 
-    def __init__(self, path: str, data: Array, *, at: int = 0, end: int | None = None, block: int = -1) -> None:
+    def __init__(
+        self,
+        path: str,
+        data: Array,
+        *,
+        at: int = 0,
+        end: int | None = None,
+        block: int = -1,
+    ) -> None:
         self.path, self.data, self.at, self.block = path, data, at, block
         self.end = len(data) if end is None else end
         self.begin = at  # of the latest record
 
     def fail(self, text: str) -> MaskFileError:
-        """An error that says where: the byte in the file, or in a compressed block that starts there."""
+        """An error that says where: the byte in the file, or in a compressed block that
+        starts there.
+        """
         where = (
-            f"byte {self.begin}" if self.block < 0 else f"byte {self.block} (compressed block, its byte {self.begin})"
+            f"byte {self.begin}"
+            if self.block < 0
+            else f"byte {self.block} (compressed block, its byte {self.begin})"
         )
         return MaskFileError(f"{self.path}: {where}: {text}")
 
@@ -52,12 +68,16 @@ class Cursor:
     def take(self, count: int) -> bytes:
         """The next ``count`` bytes."""
         if count > self.left:
-            raise self.fail(f"{count} bytes are announced, {self.left} are left; the file is cut or broken")
+            raise self.fail(
+                f"{count} bytes are announced, {self.left} are left; the file is cut or broken"
+            )
         self.at += count
         return self.data[self.at - count : self.at].tobytes()
 
     def unsigned(self) -> int:
-        """A variable-length integer, below 2^63; some writers fill up space with zeros at its end."""
+        """A variable-length integer, below 2^63; some writers fill up space with zeros
+        at its end.
+        """
         value = shift = 0
         while True:
             byte = self.byte()
@@ -100,7 +120,9 @@ class Cursor:
         raise self.fail(f"real number of form {form}, need 0 to 7")
 
     def string(self, *, name: bool = False) -> str:
-        """Characters; a ``name`` is not empty and holds printable characters without blanks."""
+        """Characters; a ``name`` is not empty and holds printable characters without
+        blanks.
+        """
         data = self.take(self.unsigned())
         if name and (not data or any(c <= 32 or c > 126 for c in data)):
             raise self.fail(f"name {data[:40]!r}, need printable characters")
@@ -115,7 +137,9 @@ class Cursor:
         return dx * (word >> 4), dy * (word >> 4)
 
     def points(self, *, closed: bool = True) -> Array:
-        """A point list, from (0, 0) on: (n, 2), as it closes to a polygon, or as a path has it."""
+        """A point list, from (0, 0) on: (n, 2), as it closes to a polygon, or as a path
+        has it.
+        """
         form, count = self.unsigned(), self.unsigned()
         if form > 5:
             raise self.fail(f"point list of type {form}, need 0 to 5")
@@ -123,12 +147,20 @@ class Cursor:
             raise self.fail(f"point list of {count} points with {self.left} bytes left")
         steps = [self._step(form, n) for n in range(count)]
         if form == 5:
-            steps = list(zip(*(np.cumsum(axis).tolist() for axis in np.array(steps, object).T), strict=True))
+            steps = list(
+                zip(
+                    *(np.cumsum(axis).tolist() for axis in np.array(steps, object).T),
+                    strict=True,
+                )
+            )
         x, y = [0], [0]
         for dx, dy in steps:
             x.append(self.within(x[-1] + dx))
             y.append(self.within(y[-1] + dy))
-        if closed and form in (0, 1):  # the last corner of a rectilinear polygon is implied
+        if closed and form in (
+            0,
+            1,
+        ):  # the last corner of a rectilinear polygon is implied
             along = (form + count) % 2 == 0
             x.append(x[-1] if not along else 0)
             y.append(0 if not along else y[-1])
@@ -149,7 +181,9 @@ class Cursor:
         form = self.unsigned()
         if form == 0:
             if last is None:
-                raise self.fail("a repetition that repeats an earlier one, and there is none")
+                raise self.fail(
+                    "a repetition that repeats an earlier one, and there is none"
+                )
             return last
         if form in (1, 2, 3):
             return self._matrix(form, limit)
@@ -157,7 +191,9 @@ class Cursor:
             count, grid = self._count(limit), self.unsigned() if form % 2 else 1
             steps = [0, *(self.unsigned() * grid for _ in range(count - 1))]
             line = self._sums(steps)
-            return Repetition(line, 0 * line) if form < 6 else Repetition(0 * line, line)
+            return (
+                Repetition(line, 0 * line) if form < 6 else Repetition(0 * line, line)
+            )
         if form in (8, 9):
             return self._vectors(form, limit)
         if form in (10, 11):
@@ -165,7 +201,9 @@ class Cursor:
             x, y = np.zeros(count, np.int64), np.zeros(count, np.int64)
             at = deltas(self.data, self.at, self.end, self.within(grid), x, y)
             if at < 0:
-                raise self.fail(f"list of {count - 1} steps that is cut or leaves 32 bits")
+                raise self.fail(
+                    f"list of {count - 1} steps that is cut or leaves 32 bits"
+                )
             self.at = at
             return Repetition(x, y)
         raise self.fail(f"repetition of type {form}, need 0 to 11")
@@ -193,14 +231,23 @@ class Cursor:
         first = self.unsigned() + 2
         second = self.unsigned() + 2 if form == 8 else 1
         along = self.delta()
-        return self._grid(first, second, along, self.delta() if form == 8 else (0, 0), limit)
+        return self._grid(
+            first, second, along, self.delta() if form == 8 else (0, 0), limit
+        )
 
-    def _grid(self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int) -> Repetition:
+    def _grid(
+        self, n: int, m: int, a: tuple[int, int], b: tuple[int, int], limit: int
+    ) -> Repetition:
         if n * m > min(limit, MOST_COPIES):
             most = min(limit, MOST_COPIES)
-            raise self.fail(f"repetition of {n} x {m} = {n * m:,} copies, at most {most:,} more are read")
+            raise self.fail(
+                f"repetition of {n} x {m} = {n * m:,} copies, at most {most:,} more are read"
+            )
         for i in (0, 1):
             self.within(abs(n * a[i]) + abs(m * b[i]))
         along, across = np.arange(n), np.arange(m)[:, None]
-        x, y = ((along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32) for k in (0, 1))
+        x, y = (
+            (along * a[k]).astype(np.int32) + (across * b[k]).astype(np.int32)
+            for k in (0, 1)
+        )
         return Repetition(x.ravel(), y.ravel())

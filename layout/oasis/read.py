@@ -1,4 +1,5 @@
-"""OASIS reader for mask files: names, cells, compressed blocks, checksum; what is wrong is named with its byte.
+"""OASIS reader for mask files: names, cells, compressed blocks, checksum; what is wrong
+is named with its byte.
 
 Extension records (XELEMENT, XGEOMETRY) are refused by their number.
 """
@@ -20,24 +21,32 @@ _BYTES_EACH = 16  # of a compressed block, for each placement that may be read
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
 
-def read(path: str | Path, *, limit: int = LIMIT, keep: int | None = None) -> MaskContent:
+def read(
+    path: str | Path, *, limit: int = LIMIT, keep: int | None = None
+) -> MaskContent:
     """Read an OASIS file.
 
     Args:
         limit: most placements and copies that are read.
-        keep: most placements of one cell that are kept; of more only the sums are (:mod:`layout.files.digest`), in
+        keep: most placements of one cell that are kept; of more only the sums are
+            (:mod:`layout.files.digest`), in
             bounded memory. None: all are kept.
 
     Raises:
-        MaskFileError: not OASIS, cut, broken anywhere, of a wrong checksum, or with records that no mask of
+        MaskFileError: not OASIS, cut, broken anywhere, of a wrong checksum, or with
+            records that no mask of
             pillars holds; the message gives the byte offset.
         OSError: the file cannot be opened.
     """
     return parse(mapped(path), limit=limit, keep=keep, where=str(path))
 
 
-def parse(data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data") -> MaskContent:
-    """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them in errors."""
+def parse(
+    data: Array, *, limit: int = LIMIT, keep: int | None = None, where: str = "data"
+) -> MaskContent:
+    """As :func:`read`, from the bytes of an OASIS file as uint8; ``where`` names them
+    in errors.
+    """
     return _Reader(Cursor(where, data), limit, keep).whole_file()
 
 
@@ -99,7 +108,11 @@ class _Reader:
 
     def _record(self, c: Cursor, kind: int) -> None:
         if kind in (oasis.CELL_REF, oasis.CELL):
-            self._begin_cell(c.within(c.unsigned()) if kind == oasis.CELL_REF else c.string(name=True))
+            self._begin_cell(
+                c.within(c.unsigned())
+                if kind == oasis.CELL_REF
+                else c.string(name=True)
+            )
         elif kind == oasis.CBLOCK:
             self._block(c)
         elif kind in (oasis.PROPERTY, oasis.PROPERTY_REPEAT):
@@ -128,17 +141,25 @@ class _Reader:
             raise c.fail("a compressed block of an unknown method, need deflate")
         size, packed = c.unsigned(), c.unsigned()
         if packed > c.left or size > packed * _LARGEST_RATIO + 64:
-            raise c.fail(f"compressed block of {packed} bytes for {size}, with {c.left} left in the file")
+            raise c.fail(
+                f"compressed block of {packed} bytes for {size}, with {c.left} left in the file"
+            )
         if size > _BYTES_EACH * self.budget.limit:
             most = _BYTES_EACH * self.budget.limit
-            raise c.fail(f"compressed block of {size:,} bytes, at most {most:,} are unpacked")
+            raise c.fail(
+                f"compressed block of {size:,} bytes, at most {most:,} are unpacked"
+            )
         try:
             engine = zlib.decompressobj(-15)
             raw = engine.decompress(c.take(packed), size + 1)
         except zlib.error as error:
-            raise c.fail(f"compressed block that cannot be unpacked ({error})") from None
+            raise c.fail(
+                f"compressed block that cannot be unpacked ({error})"
+            ) from None
         if len(raw) != size or not engine.eof or engine.unused_data:
-            raise c.fail(f"compressed block of {len(raw)} bytes where {size} are announced")
+            raise c.fail(
+                f"compressed block of {len(raw)} bytes where {size} are announced"
+            )
         self._records(Cursor(c.path, np.frombuffer(raw, np.uint8), block=c.begin))
 
     def _cell_name(self, c: Cursor, explicit: bool) -> None:
@@ -146,7 +167,9 @@ class _Reader:
         self.explicit.add(explicit)
         number = c.within(c.unsigned()) if explicit else len(self.names)
         if len(self.explicit) > 1 or number in self.names:
-            raise c.fail(f"cell name {name!r}: number {number} is taken, or two ways of numbering are mixed")
+            raise c.fail(
+                f"cell name {name!r}: number {number} is taken, or two ways of numbering are mixed"
+            )
         self.names[number] = name
         self.cell = None
 
@@ -202,7 +225,9 @@ class _Reader:
         c = self.file
         c.begin = self.end_at or 0
         if c.end - c.begin != oasis.END_SIZE:
-            raise c.fail(f"END of {c.end - c.begin} bytes to the end of the file, need {oasis.END_SIZE}")
+            raise c.fail(
+                f"END of {c.end - c.begin} bytes to the end of the file, need {oasis.END_SIZE}"
+            )
         if not offsets_before:
             self._offsets(c)
         c.string()
@@ -210,9 +235,14 @@ class _Reader:
         if scheme not in (0, 1, 2) or c.left != (4 if scheme else 0):
             raise c.fail(f"validation scheme {scheme} with {c.left} bytes left")
         if scheme == 1:
-            found, wanted = zlib.crc32(c.data[: c.at].data), struct.unpack("<I", c.take(4))[0]
+            found, wanted = (
+                zlib.crc32(c.data[: c.at].data),
+                struct.unpack("<I", c.take(4))[0],
+            )
             if found != wanted:
-                raise c.fail(f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged")
+                raise c.fail(
+                    f"checksum {found:08x}, the file says {wanted:08x}; the file is damaged"
+                )
 
     def _contents(self) -> dict[str, CellContent]:
         made: dict[str, CellContent] = {}

@@ -1,7 +1,9 @@
 """Pillars as OASIS placements, encoded from an array of class numbers.
 
-Raster order inside narrow tiles: the rows above stay within the 32 KiB that deflate looks back on, and a lens
-repeats itself from row to row. That halves the file against whole rows. The other form lists all sites of a
+Raster order inside narrow tiles: the rows above stay within the 32 KiB that deflate
+looks back on, and a lens
+repeats itself from row to row. That halves the file against whole rows. The other form
+lists all sites of a
 class as one repetition.
 """
 
@@ -32,11 +34,15 @@ def _put_signed(out: Array, at: int, value: int) -> int:
 
 
 @compiled
-def encode_tile(tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array) -> int:
-    """Placements of a tile in raster order: the first at its place, each other relative to the one before.
+def encode_tile(
+    tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array
+) -> int:
+    """Placements of a tile in raster order: the first at its place, each other relative
+    to the one before.
 
     Args:
-        tile: (rows, columns) class numbers; pitch, down: of columns and rows; x0, y0: its first site.
+        tile: (rows, columns) class numbers; pitch, down: of columns and rows; x0, y0:
+            its first site.
         out: room for LARGEST_RECORD bytes a site.
 
     Returns:
@@ -69,17 +75,25 @@ def encode_tile(tile: Array, pitch: int, down: int, x0: int, y0: int, out: Array
 
 @compiled
 def encode_list(child: Array, x: Array, y: Array, turn: Array, out: Array) -> int:
-    """Placements in their order: the first at its place, each other relative to the one before; bytes used.
+    """Placements in their order: the first at its place, each other relative to the one
+    before; bytes used.
 
     Args:
-        child: (n,) reference numbers. turn: (n,) quarter turns and mirror, 0 to 7. out: as for :func:`encode_tile`.
+        child: (n,) reference numbers. turn: (n,) quarter turns and mirror, 0 to 7. out:
+            as for :func:`encode_tile`.
     """
     out[0] = 15  # XYABSOLUTE
     at, last_x, last_y = 1, 0, 0
     for n in range(x.shape[0]):
         move_x, move_y = n == 0 or x[n] != last_x, n == 0 or y[n] != last_y
         out[at] = 17  # PLACEMENT
-        out[at + 1] = 0xC0 | (0x20 if move_x else 0) | (0x10 if move_y else 0) | (turn[n] & 3) << 1 | turn[n] >> 2
+        out[at + 1] = (
+            0xC0
+            | (0x20 if move_x else 0)
+            | (0x10 if move_y else 0)
+            | (turn[n] & 3) << 1
+            | turn[n] >> 2
+        )
         at = put_unsigned(out, at + 2, child[n])
         if move_x:
             at = _put_signed(out, at, x[n] - last_x)
@@ -118,11 +132,22 @@ def _put_delta(out: Array, at: int, dx: int, dy: int) -> int:
 
 
 @compiled
-def walk_classes(classes: Array, strip: int, first: Array, last: Array, ends: Array, out: Array, write: bool) -> None:
-    """List the sites of each class, strip by strip and row by row, as g-deltas in lattice steps (y up).
+def walk_classes(
+    classes: Array,
+    strip: int,
+    first: Array,
+    last: Array,
+    ends: Array,
+    out: Array,
+    write: bool,
+) -> None:
+    """List the sites of each class, strip by strip and row by row, as g-deltas in
+    lattice steps (y up).
 
-    first, last: (classes + 1, 2) column and row of the first and latest site (-1: none yet).
-    ends: (classes + 1,) where the bytes of each class go on; without ``write`` only the lengths are summed.
+    first, last: (classes + 1, 2) column and row of the first and latest site (-1: none
+    yet).
+    ends: (classes + 1,) where the bytes of each class go on; without ``write`` only the
+    lengths are summed.
     """
     scratch = np.empty(_LARGEST_DELTA * 2, np.uint8)
     for left in range(0, classes.shape[1], strip):
@@ -134,7 +159,11 @@ def walk_classes(classes: Array, strip: int, first: Array, last: Array, ends: Ar
                 if last[kind, 0] < 0:
                     first[kind, 0], first[kind, 1] = column, row
                 elif write:
-                    ends[kind] = _put_delta(out, ends[kind], column - last[kind, 0], last[kind, 1] - row)
+                    ends[kind] = _put_delta(
+                        out, ends[kind], column - last[kind, 0], last[kind, 1] - row
+                    )
                 else:
-                    ends[kind] += _put_delta(scratch, 0, column - last[kind, 0], last[kind, 1] - row)
+                    ends[kind] += _put_delta(
+                        scratch, 0, column - last[kind, 0], last[kind, 1] - row
+                    )
                 last[kind, 0], last[kind, 1] = column, row

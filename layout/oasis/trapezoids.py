@@ -1,4 +1,6 @@
-"""The trapezoids of OASIS: three records with two slopes, and 26 compact ones (SEMI P39, figures of CTRAPEZOID)."""
+"""The trapezoids of OASIS: three records with two slopes, and 26 compact ones (SEMI
+P39, figures of CTRAPEZOID).
+"""
 
 import numpy as np
 
@@ -19,8 +21,19 @@ KINDS = len(_CORNERS)
 
 def compact(kind: int, w: int, h: int) -> Array:
     """(n, 2) corners of compact trapezoid ``kind``, from 0 to 25."""
-    value = {"0": 0, "w": w, "h": h, "w-h": w - h, "h-w": h - w, "2h": 2 * h, "2w": 2 * w}
-    return np.array([[value[c] for c in corner.split(",")] for corner in _CORNERS[kind].split()], np.int64)
+    value = {
+        "0": 0,
+        "w": w,
+        "h": h,
+        "w-h": w - h,
+        "h-w": h - w,
+        "2h": 2 * h,
+        "2w": 2 * w,
+    }
+    return np.array(
+        [[value[c] for c in corner.split(",")] for corner in _CORNERS[kind].split()],
+        np.int64,
+    )
 
 
 def needs(kind: int) -> tuple[bool, bool]:
@@ -32,7 +45,17 @@ def needs(kind: int) -> tuple[bool, bool]:
 def sloped(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
     """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans."""
     if upright:
-        corners = [(0, max(a, 0)), (0, h + min(b, 0)), (w, h - max(b, 0)), (w, -min(a, 0))]
+        corners = [
+            (0, max(a, 0)),
+            (0, h + min(b, 0)),
+            (w, h - max(b, 0)),
+            (w, -min(a, 0)),
+        ]
     else:
-        corners = [(max(a, 0), h), (w + min(b, 0), h), (w - max(b, 0), 0), (-min(a, 0), 0)]
+        corners = [
+            (max(a, 0), h),
+            (w + min(b, 0), h),
+            (w - max(b, 0), 0),
+            (-min(a, 0), 0),
+        ]
     return np.array(corners, np.int64)

@@ -1,6 +1,8 @@
-"""OASIS: one cell for each pillar class, placed in tiles (small, fast) or by one repetition a class (reader).
+"""OASIS: one cell for each pillar class, placed in tiles (small, fast) or by one
+repetition a class (reader).
 
-Strict name tables, layer names, CRC-32. Memory is a block of rows, except for the reader's form, which needs the
+Strict name tables, layer names, CRC-32. Memory is a block of rows, except for the
+reader's form, which needs the
 lens at once. Bytes are the same for the same plan.
 """
 
@@ -33,25 +35,38 @@ _QUARTER, _MIRROR = np.array([[0, 1], [-1, 0]]), np.array([[-1, 0], [0, 1]])
 
 @dataclass(frozen=True, slots=True)
 class _Settings:
-    """level: of deflate. circles: CIRCLE records for pillars. reader: one repetition a class."""
+    """level: of deflate. circles: CIRCLE records for pillars. reader: one repetition a
+    class.
+    """
 
     level: int
     circles: bool
     reader: bool
 
 
-def write(plan: MaskPlan, path: str | Path, *, form: Form = "small", circles: bool = False, fold: bool = True) -> None:
+def write(
+    plan: MaskPlan,
+    path: str | Path,
+    *,
+    form: Form = "small",
+    circles: bool = False,
+    fold: bool = True,
+) -> None:
     """Write ``plan`` as OASIS; the file appears whole or not at all.
 
     Args:
-        form: ``small``: least bytes; ``fast``: least time; ``reader``: one repetition for each class.
-        circles: pillars as true circles in place of polygons (the diameter must be an even number of units).
+        form: ``small``: least bytes; ``fast``: least time; ``reader``: one repetition
+            for each class.
+        circles: pillars as true circles in place of polygons (the diameter must be an
+            even number of units).
         fold: store a lens that is symmetric under the square once, as an eighth.
 
     Raises:
-        ProcessError: an odd diameter with ``circles``; a drawn shape that is no pillar (negative tone) or not round;
+        ProcessError: an odd diameter with ``circles``; a drawn shape that is no pillar
+            (negative tone) or not round;
             the reader's form of another lattice than a square one.
-        OSError: the target cannot be written, or the disk is full; what was there before stays.
+        OSError: the target cannot be written, or the disk is full; what was there
+            before stays.
     """
     if form not in _LEVELS:
         raise ProcessError(f"OASIS form {form!r}: need small, fast or reader")
@@ -60,27 +75,41 @@ def write(plan: MaskPlan, path: str | Path, *, form: Form = "small", circles: bo
         _write_file(file, plan, settings, fold)
 
 
-def _write_file(file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool) -> None:
+def _write_file(
+    file: BinaryIO, plan: MaskPlan, settings: _Settings, fold: bool
+) -> None:
     alike = fold and all(_square_symmetric(made) for made in plan.classes)
     placed = [_piece_list(lattice, alike) for lattice in plan.lattices]
     if settings.reader and not all(lattice.square for lattice in plan.lattices):
-        raise ProcessError("OASIS form 'reader' lists sites of a square lattice; take small or fast")
+        raise ProcessError(
+            "OASIS form 'reader' lists sites of a square lattice; take small or fast"
+        )
     folded = [piece.lattice.name for made in placed if len(made) > 1 for piece in made]
     cell_names = [*plan.cell_names[:-1], *folded, plan.name]
     names.distinct(cell_names)
     number = {name: k for k, name in enumerate(cell_names)}
     head = oasis.start(plan.unit_nm)
-    layer_table = b"".join(layer_name(layer, name) for layer, name in sorted(plan.layer_names.items()))
+    layer_table = b"".join(
+        layer_name(layer, name) for layer, name in sorted(plan.layer_names.items())
+    )
     counts = np.zeros(len(plan.classes) + 1, np.int64)
     written, checksum = 0, 0
-    for piece in itertools.chain([head, layer_table], _cells(plan, placed, number, settings, counts)):
+    for piece in itertools.chain(
+        [head, layer_table], _cells(plan, placed, number, settings, counts)
+    ):
         file.write(piece)
         checksum, written = zlib.crc32(piece, checksum), written + len(piece)
-    unused = {made.name for made, n in zip(plan.classes, counts[1:], strict=True) if not n}
-    cell_table = b"".join(cell_name(k, name) for name, k in number.items() if name not in unused)
+    unused = {
+        made.name for made, n in zip(plan.classes, counts[1:], strict=True) if not n
+    }
+    cell_table = b"".join(
+        cell_name(k, name) for name, k in number.items() if name not in unused
+    )
     file.write(cell_table)
     layers_at = len(head) if layer_table else 0
-    file.write(oasis.end((written, 0, 0, 0, layers_at, 0), zlib.crc32(cell_table, checksum)))
+    file.write(
+        oasis.end((written, 0, 0, 0, layers_at, 0), zlib.crc32(cell_table, checksum))
+    )
 
 
 def cell_name(number: int, name: str) -> bytes:
@@ -89,18 +118,26 @@ def cell_name(number: int, name: str) -> bytes:
 
 
 def _square_symmetric(made: PillarClass) -> bool:
-    """Whether a quarter turn and a mirror leave the pillar, and what is drawn around it, as it is."""
+    """Whether a quarter turn and a mirror leave the pillar, and what is drawn around
+    it, as it is.
+    """
 
     def corners(*shapes: Array) -> set[tuple[int, int]]:
         return {(int(x), int(y)) for shape in shapes for x, y in shape}
 
     def edges(*shapes: Array) -> set[frozenset[tuple[int, int]]]:
-        ends = [np.concatenate([s, np.roll(s, -1, axis=0)], axis=1).tolist() for s in shapes]
-        return {frozenset(((a, b), (c, d))) for a, b, c, d in itertools.chain.from_iterable(ends)}
+        ends = [
+            np.concatenate([s, np.roll(s, -1, axis=0)], axis=1).tolist() for s in shapes
+        ]
+        return {
+            frozenset(((a, b), (c, d)))
+            for a, b, c, d in itertools.chain.from_iterable(ends)
+        }
 
     own, drawn = edges(*made.contours), corners(*made.polygons)
     return all(
-        edges(*(c @ m for c in made.contours)) == own and corners(*(p @ m for p in made.polygons)) == drawn
+        edges(*(c @ m for c in made.contours)) == own
+        and corners(*(p @ m for p in made.polygons)) == drawn
         for m in (_QUARTER, _MIRROR)
     )
 
@@ -121,11 +158,21 @@ def layer_name(layer: tuple[int, int], name: str) -> bytes:
 
 
 def _cells(
-    plan: MaskPlan, placed: list[list[symmetry.Piece]], number: dict[str, int], settings: _Settings, counts: Array
+    plan: MaskPlan,
+    placed: list[list[symmetry.Piece]],
+    number: dict[str, int],
+    settings: _Settings,
+    counts: Array,
 ) -> Iterator[bytes]:
-    """All cells, those of the pillar classes that occur last; ``counts`` adds up the sites of each class."""
+    """All cells, those of the pillar classes that occur last; ``counts`` adds up the
+    sites of each class.
+    """
     for figure in plan.figures:
-        shapes = [polygon(layer, p) for layer, polygons in figure.polygons.items() for p in polygons]
+        shapes = [
+            polygon(layer, p)
+            for layer, polygons in figure.polygons.items()
+            for p in polygons
+        ]
         yield cell_begin(number[figure.name]) + b"".join(shapes)
     for lattice, parts in zip(plan.lattices, placed, strict=True):
         if len(parts) > 1:
@@ -133,12 +180,18 @@ def _cells(
                 yield cell_begin(number[part.lattice.name])
                 yield from _sites(part.lattice, settings, counts)
             yield cell_begin(number[lattice.name])
-            yield b"".join(_placement(number[p.lattice.name], turn) for p in parts for turn in p.placed)
+            yield b"".join(
+                _placement(number[p.lattice.name], turn)
+                for p in parts
+                for turn in p.placed
+            )
         else:
             yield cell_begin(number[lattice.name])
             yield from _sites(lattice, settings, counts)
     used = [made for made, n in zip(plan.classes, counts[1:], strict=True) if n]
-    yield b"".join(cell_begin(number[made.name]) + _pillar(made, settings.circles) for made in used)
+    yield b"".join(
+        cell_begin(number[made.name]) + _pillar(made, settings.circles) for made in used
+    )
     top = b"".join(_placement(number[name]) for name in plan.placed_names)
     yield cell_begin(number[plan.name]) + top
 
@@ -149,16 +202,24 @@ def cell_begin(number: int) -> bytes:
 
 
 def _placement(number: int, turn: tuple[int, bool] = (0, False)) -> bytes:
-    return bytes([oasis.PLACEMENT, 0xF0 | turn[0] << 1 | turn[1]]) + oasis.unsigned(number) + b"\0\0"
+    return (
+        bytes([oasis.PLACEMENT, 0xF0 | turn[0] << 1 | turn[1]])
+        + oasis.unsigned(number)
+        + b"\0\0"
+    )
 
 
 def _pillar(made: PillarClass, circles: bool) -> bytes:
     if not circles:
         return b"".join(polygon(made.layer, points) for points in made.polygons)
     if not made.round:
-        raise ProcessError(f"class {made.name} is not round: circles cannot stand for it; leave circles out")
+        raise ProcessError(
+            f"class {made.name} is not round: circles cannot stand for it; leave circles out"
+        )
     if made.drawn:
-        raise ProcessError("circles can be written for a positive tone only; leave circles out")
+        raise ProcessError(
+            "circles can be written for a positive tone only; leave circles out"
+        )
     width = made.diameter_units
     if width % 2:
         raise ProcessError(
@@ -166,16 +227,28 @@ def _pillar(made: PillarClass, circles: bool) -> bytes:
             "diameter_step_nm, or polygons"
         )
     layer = oasis.unsigned(made.layer[0]) + oasis.unsigned(made.layer[1])
-    return bytes([oasis.CIRCLE, 0b00111011]) + layer + oasis.unsigned(width // 2) + b"\0\0"
+    return (
+        bytes([oasis.CIRCLE, 0b00111011]) + layer + oasis.unsigned(width // 2) + b"\0\0"
+    )
 
 
 def polygon(layer: tuple[int, int], points: Array) -> bytes:
-    """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last one implied."""
+    """POLYGON with a point list of type 4: any vectors from vertex to vertex, the last
+    one implied.
+    """
     numbers = oasis.unsigned(layer[0]) + oasis.unsigned(layer[1])
     steps = np.diff(points.astype(np.int64), axis=0)
     moves = b"".join(vector(int(dx), int(dy)) for dx, dy in steps)
     x, y = (oasis.signed(int(v)) for v in points[0])
-    return bytes([oasis.POLYGON, 0b00111011]) + numbers + b"\x04" + oasis.unsigned(len(steps)) + moves + x + y
+    return (
+        bytes([oasis.POLYGON, 0b00111011])
+        + numbers
+        + b"\x04"
+        + oasis.unsigned(len(steps))
+        + moves
+        + x
+        + y
+    )
 
 
 def vector(dx: int, dy: int) -> bytes:
@@ -189,21 +262,32 @@ def _sites(lattice: Lattice, settings: _Settings, counts: Array) -> Iterator[byt
 
 
 def placed_lattices(plan: MaskPlan) -> dict[str, Lattice]:
-    """{cell: its lattice} of the files of a plan: of all lattices, and of the pieces of those that are folded."""
+    """{cell: its lattice} of the files of a plan: of all lattices, and of the pieces of
+    those that are folded.
+    """
     alike = all(_square_symmetric(made) for made in plan.classes)
-    folded = [piece.lattice for lattice in plan.lattices for piece in _piece_list(lattice, alike)]
+    folded = [
+        piece.lattice
+        for lattice in plan.lattices
+        for piece in _piece_list(lattice, alike)
+    ]
     return {lattice.name: lattice for lattice in (*folded, *plan.lattices)}
 
 
 def tiled(lattice: Lattice, level: int, counts: Array) -> Iterator[bytes]:
-    """Placements, tile by tile, of the cells 0, 1, ... that a lattice numbers from 1; ``counts`` adds them up."""
+    """Placements, tile by tile, of the cells 0, 1, ... that a lattice numbers from 1;
+    ``counts`` adds them up.
+    """
 
     def jobs() -> Iterator[Callable[[], bytes]]:
         for first, block in lattice.blocks(tiles.TILE_ROWS):
             tiles.count_classes(block, counts)
             y = lattice.y0 - first * lattice.down
             for left in range(0, lattice.columns, tiles.TILE_COLUMNS):
-                tile, x = block[:, left : left + tiles.TILE_COLUMNS], lattice.x0 + left * lattice.pitch
+                tile, x = (
+                    block[:, left : left + tiles.TILE_COLUMNS],
+                    lattice.x0 + left * lattice.pitch,
+                )
                 yield partial(_tile, tile, (lattice.pitch, lattice.down), x, y, level)
 
     yield from _in_order(jobs())
@@ -216,13 +300,17 @@ def _tile(tile: Array, pitch: tuple[int, int], x0: int, y0: int, level: int) -> 
 
 
 def _repetitions(lattice: Lattice, level: int, total: Array) -> Iterator[bytes]:
-    """One placement a class, at its first site, repeated at all others by a list of lattice steps."""
+    """One placement a class, at its first site, repeated at all others by a list of
+    lattice steps.
+    """
     sites = lattice.whole()
     counts, lengths = np.zeros_like(total), np.zeros_like(total)
     tiles.count_classes(sites, counts)
     total += counts
     first, last = np.full((len(total), 2), -1), np.full((len(total), 2), -1)
-    tiles.walk_classes(sites, _STRIP, first, last, lengths, np.empty(0, np.uint8), False)
+    tiles.walk_classes(
+        sites, _STRIP, first, last, lengths, np.empty(0, np.uint8), False
+    )
     ends = np.cumsum(lengths)
     begins, out = ends - lengths, np.empty(int(ends[-1]), np.uint8)
     last[:] = -1
@@ -234,7 +322,11 @@ def _repetitions(lattice: Lattice, level: int, total: Array) -> Iterator[bytes]:
         head = bytes([oasis.PLACEMENT, 0xF0 | many << 3]) + oasis.unsigned(kind - 1)
         head += oasis.signed(lattice.x0 + x) + oasis.signed(lattice.y0 - y)
         if many:
-            head += b"\x0b" + oasis.unsigned(int(counts[kind]) - 2) + oasis.unsigned(lattice.pitch)
+            head += (
+                b"\x0b"
+                + oasis.unsigned(int(counts[kind]) - 2)
+                + oasis.unsigned(lattice.pitch)
+            )
         return oasis.compressed(head + out[begins[kind] : ends[kind]].tobytes(), level)
 
     used = np.flatnonzero(counts[1:]) + 1

@@ -7,22 +7,36 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-_LEAST = 4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
+_LEAST = (
+    4e-4  # weight of all neighbours together: sums in float32 tell it to a few percent
+)
 
 
-def isolation(present: Array, steps_um: tuple[float, float], range_um: float, *, centred: bool = False) -> Array:
-    """How alone each site is: 0 where all neighbours of its lattice stand, 1 where none does (y, x), float32.
+def isolation(
+    present: Array,
+    steps_um: tuple[float, float],
+    range_um: float,
+    *,
+    centred: bool = False,
+) -> Array:
+    """How alone each site is: 0 where all neighbours of its lattice stand, 1 where none
+    does (y, x), float32.
 
-    Neighbours count by exp(-r^2 / range^2) from middle to middle, within 3 ranges along each axis; the site itself does
-    not. Only tiles that are neither empty nor full with all their surroundings are worked on.
+    Neighbours count by exp(-r^2 / range^2) from middle to middle, within 3 ranges along
+    each axis; the site itself does
+    not. Only tiles that are neither empty nor full with all their surroundings are
+    worked on.
 
     Args:
-        present: (y, x) true where a pillar stands. steps_um: (x, y) distance of neighbouring columns and rows.
+        present: (y, x) true where a pillar stands. steps_um: (x, y) distance of
+            neighbouring columns and rows.
         centred: every other place alone is a site, as on a hexagonal lattice
-            (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none, or those with it even.
+            (:class:`metalens.lens.DiameterMap`): those with row + column odd hold none,
+            or those with it even.
 
     Raises:
-        ProcessError: a range so short that nobody has neighbours, and a lone pillar nothing to lack.
+        ProcessError: a range so short that nobody has neighbours, and a lone pillar
+            nothing to lack.
     """
     from scipy.ndimage import correlate1d
 
@@ -40,7 +54,9 @@ def isolation(present: Array, steps_um: tuple[float, float], range_um: float, *,
     padded = np.pad(np.asarray(present, bool), ((up, up), (across, across)))
     alone = np.zeros(present.shape, np.float32)
     for rows, columns in _tiles(present.shape):
-        around = padded[rows.start : rows.stop + 2 * up, columns.start : columns.stop + 2 * across]
+        around = padded[
+            rows.start : rows.stop + 2 * up, columns.start : columns.stop + 2 * across
+        ]
         here = np.asarray(present[rows, columns], np.float32)
         every = around[:, 1:] | around[:, :-1] if centred else around
         if every.all() or not here.any():
@@ -57,15 +73,23 @@ def halo(step_um: float, range_um: float) -> int:
 
 
 def _full(along_x: Array, along_y: Array, centred: bool) -> float:
-    """Weight of all neighbours: of every place, or of those whose row and column are odd or even together."""
+    """Weight of all neighbours: of every place, or of those whose row and column are
+    odd or even together.
+    """
     every = float(along_x.sum()) * float(along_y.sum())
     if not centred:
         return every - 1
-    x, y = (float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2) for w in (along_x, along_y))
+    x, y = (
+        float((w * (-1.0) ** np.arange(len(w))).sum()) * (-1) ** (len(w) // 2)
+        for w in (along_x, along_y)
+    )
     return float((every + x * y) / 2 - 1)
 
 
 def _tiles(shape: tuple[int, ...], side: int = 96) -> Iterator[tuple[slice, slice]]:
     for row in range(0, shape[0], side):
         for column in range(0, shape[1], side):
-            yield slice(row, min(row + side, shape[0])), slice(column, min(column + side, shape[1]))
+            yield (
+                slice(row, min(row + side, shape[0])),
+                slice(column, min(column + side, shape[1])),
+            )

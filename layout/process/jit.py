@@ -11,13 +11,19 @@ _NOTICE = "first run after an installation: compiling the loops over pillars, wh
 
 
 def compiled(function: Function) -> Function:
-    """Machine code of ``function``, kept on disk between runs; it releases the interpreter lock."""
-    return cast(Function, numba.njit(cache=True, nogil=True, boundscheck=False)(function))
+    """Machine code of ``function``, kept on disk between runs; it releases the
+    interpreter lock.
+    """
+    return cast(
+        Function, numba.njit(cache=True, nogil=True, boundscheck=False)(function)
+    )
 
 
 @contextmanager
 def noticed(say: Callable[[str], None]) -> Iterator[None]:
-    """Say once that loops are compiled, if any must be: what is on disk already is loaded without a word."""
+    """Say once that loops are compiled, if any must be: what is on disk already is
+    loaded without a word.
+    """
     from numba.core import event
 
     class Notice(event.Listener):

@@ -16,12 +16,16 @@ def check(name: str) -> str:
     """
     if 0 < len(name) <= LONGEST and not _ILLEGAL.search(name):
         return name
-    raise ProcessError(f"cell name {name!r}: need 1 to {LONGEST} of A-Z a-z 0-9 _ $; for example {legal(name)!r}")
+    raise ProcessError(
+        f"cell name {name!r}: need 1 to {LONGEST} of A-Z a-z 0-9 _ $; for example {legal(name)!r}"
+    )
 
 
 def legal(text: str) -> str:
     """The nearest legal name to any text."""
-    return _ILLEGAL.sub("_", text.encode("ascii", "replace").decode())[:LONGEST] or "LENS"
+    return (
+        _ILLEGAL.sub("_", text.encode("ascii", "replace").decode())[:LONGEST] or "LENS"
+    )
 
 
 def distinct(names: list[str]) -> None:

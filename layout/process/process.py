@@ -1,7 +1,9 @@
 """The process: what the writer and the etch can do, read from PROCESS.toml.
 
-Lengths in nm where a mask is meant and in um where a machine is, as the names say. The defaults suit 100 kV
-electron-beam lithography and a pseudo-Bosch etch of 700 nm amorphous silicon on fused silica.
+Lengths in nm where a mask is meant and in um where a machine is, as the names say. The
+defaults suit 100 kV
+electron-beam lithography and a pseudo-Bosch etch of 700 nm amorphous silicon on fused
+silica.
 """
 
 import dataclasses
@@ -25,7 +27,8 @@ LayerNumber = tuple[int, int]  # layer, datatype
 class Zone:
     """A rectangle of the die, lens axis at (0, 0), in which no pillar may stand.
 
-    x_um, y_um: lower left corner. width_um, height_um: of the rectangle. name: in the report.
+    x_um, y_um: lower left corner. width_um, height_um: of the rectangle. name: in the
+    report.
     """
 
     x_um: float
@@ -42,14 +45,20 @@ class Zone:
 class Rules:
     """What can be printed, and on which grid.
 
-    minimum_feature_nm, minimum_gap_nm: thinnest pillar and narrowest gap, of the written polygons.
-    minimum_foot_gap_nm: narrowest gap at the foot of the pillars as they come out of the etch, with tilted walls.
+    minimum_feature_nm, minimum_gap_nm: thinnest pillar and narrowest gap, of the
+    written polygons.
+    minimum_foot_gap_nm: narrowest gap at the foot of the pillars as they come out of
+    the etch, with tilted walls.
     grid_nm: step of all mask coordinates (whole nm).
-    diameter_step_nm: step of the diameters, a multiple of the grid: one class of pillars each.
-    angle_step_deg: step of the turns of pillars that are turned one by one, a divisor of 180: one class each.
+    diameter_step_nm: step of the diameters, a multiple of the grid: one class of
+    pillars each.
+    angle_step_deg: step of the turns of pillars that are turned one by one, a divisor
+    of 180: one class each.
     vertices: of a pillar polygon, 8 to 64, a multiple of 4.
-    shape: ``round``: equal-area polygon of ``vertices``; ``shot``: only horizontal, vertical and diagonal edges.
-    maximum_density, density_window_um: share of the area that pillars may cover in any window of that size.
+    shape: ``round``: equal-area polygon of ``vertices``; ``shot``: only horizontal,
+    vertical and diagonal edges.
+    maximum_density, density_window_um: share of the area that pillars may cover in any
+    window of that size.
     exclusion: zones without pillars.
     """
 
@@ -81,18 +90,25 @@ class Rules:
                 f"{self.diameter_step_nm}; make the step a multiple of the grid"
             )
         if abs(180 / self.angle_step_deg - round(180 / self.angle_step_deg)) > 1e-9:
-            raise ProcessError(f"angle_step_deg = {self.angle_step_deg}: need a divisor of 180, as 1, 2.5 or 15")
+            raise ProcessError(
+                f"angle_step_deg = {self.angle_step_deg}: need a divisor of 180, as 1, 2.5 or 15"
+            )
         if not 8 <= self.vertices <= 64 or self.vertices % 4:
-            raise ProcessError(f"vertices = {self.vertices}: need a multiple of 4 from 8 to 64")
+            raise ProcessError(
+                f"vertices = {self.vertices}: need a multiple of 4 from 8 to 64"
+            )
         if not 0 < self.maximum_density <= 1:
-            raise ProcessError(f"maximum_density = {self.maximum_density}: need a share above 0 and at most 1")
+            raise ProcessError(
+                f"maximum_density = {self.maximum_density}: need a share above 0 and at most 1"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Layers:
     """(layer, datatype) of each kind of shape; ``dose`` holds the dose-test array.
 
-    pillar, aperture, marks, labels, dose, witness, fields, outline: (layer, datatype) of these shapes.
+    pillar, aperture, marks, labels, dose, witness, fields, outline: (layer, datatype)
+    of these shapes.
     """
 
     pillar: LayerNumber = (1, 0)
@@ -109,9 +125,13 @@ class Layers:
         for entry in dataclasses.fields(self):
             number = getattr(self, entry.name)
             if not all(0 <= n <= 65535 for n in number):
-                raise ProcessError(f"layer {entry.name} = {list(number)}: need numbers from 0 to 65535")
+                raise ProcessError(
+                    f"layer {entry.name} = {list(number)}: need numbers from 0 to 65535"
+                )
             if number in seen:
-                raise ProcessError(f"layers {seen[number]} and {entry.name} are both {list(number)}; give each its own")
+                raise ProcessError(
+                    f"layers {seen[number]} and {entry.name} are both {list(number)}; give each its own"
+                )
             seen[number] = entry.name
 
 
@@ -119,7 +139,8 @@ class Layers:
 class Etch:
     """Shape of what is made.
 
-    sidewall_deg: tilt of the wall from the vertical, above 0 where the foot is wider than the top.
+    sidewall_deg: tilt of the wall from the vertical, above 0 where the foot is wider
+    than the top.
     corner_radius_nm: radius to which convex corners of the drawn shape round off.
     """
 
@@ -128,9 +149,13 @@ class Etch:
 
     def __post_init__(self) -> None:
         if not abs(self.sidewall_deg) < 45:
-            raise ProcessError(f"sidewall_deg = {self.sidewall_deg}: need an angle within +-45")
+            raise ProcessError(
+                f"sidewall_deg = {self.sidewall_deg}: need an angle within +-45"
+            )
         if not (self.corner_radius_nm >= 0 and math.isfinite(self.corner_radius_nm)):
-            raise ProcessError(f"corner_radius_nm = {self.corner_radius_nm}: need a finite length >= 0")
+            raise ProcessError(
+                f"corner_radius_nm = {self.corner_radius_nm}: need a finite length >= 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,14 +163,21 @@ class Exposure:
     """Electron exposure: base dose, point-exposure function, dose classes.
 
     base_uC_cm2: dose that just clears the edge of a wide, uniformly written area.
-    alpha_um, beta_um, eta: double Gaussian of the point exposure (forward range, backscatter range, ratio of
-        the two energies), as measured for your resist, film and voltage: there is no default.
-    gamma_um, nu: a third Gaussian between them (range, ratio of its energy to the forward one), where you have it.
-    csv: a measured radial point-exposure function instead (radius in um, energy density in any unit).
-    tolerance: largest relative exposure error at a pillar's edge that the dose classes may leave.
-    maximum_classes: how many doses the writer can hold in one job, at most 255; no more than the tolerance needs are
+    alpha_um, beta_um, eta: double Gaussian of the point exposure (forward range,
+    backscatter range, ratio of
+        the two energies), as measured for your resist, film and voltage: there is no
+        default.
+    gamma_um, nu: a third Gaussian between them (range, ratio of its energy to the
+    forward one), where you have it.
+    csv: a measured radial point-exposure function instead (radius in um, energy density
+    in any unit).
+    tolerance: largest relative exposure error at a pillar's edge that the dose classes
+    may leave.
+    maximum_classes: how many doses the writer can hold in one job, at most 255; no more
+    than the tolerance needs are
         used.
-    correct: whether the mask carries corrected doses (a datatype each) or a single one; left out: where a point
+    correct: whether the mask carries corrected doses (a datatype each) or a single one;
+    left out: where a point
         exposure is given.
     """
 
@@ -162,29 +194,57 @@ class Exposure:
 
     def __post_init__(self) -> None:
         _positive(self, "base_uC_cm2", "tolerance", "maximum_classes")
-        _positive(self, *(n for n in ("alpha_um", "beta_um", "gamma_um") if getattr(self, n) is not None))
+        _positive(
+            self,
+            *(
+                n
+                for n in ("alpha_um", "beta_um", "gamma_um")
+                if getattr(self, n) is not None
+            ),
+        )
         for name in ("eta", "nu"):
             value = getattr(self, name)
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise ProcessError(f"{name} = {value}: need a finite ratio >= 0")
-        if self.beta_um is not None and self.alpha_um is not None and self.beta_um <= self.alpha_um:
-            raise ProcessError(f"beta_um = {self.beta_um} must exceed alpha_um = {self.alpha_um}")
+        if (
+            self.beta_um is not None
+            and self.alpha_um is not None
+            and self.beta_um <= self.alpha_um
+        ):
+            raise ProcessError(
+                f"beta_um = {self.beta_um} must exceed alpha_um = {self.alpha_um}"
+            )
         if (self.gamma_um is None) != (self.nu == 0):
-            raise ProcessError(f"gamma_um = {self.gamma_um} and nu = {self.nu}: a third Gaussian needs both")
+            raise ProcessError(
+                f"gamma_um = {self.gamma_um} and nu = {self.nu}: a third Gaussian needs both"
+            )
         if self.maximum_classes > 255:
-            raise ProcessError(f"maximum_classes = {self.maximum_classes}: need at most 255")
+            raise ProcessError(
+                f"maximum_classes = {self.maximum_classes}: need at most 255"
+            )
         if self.correct and not self.known:
-            raise ProcessError(f"exposure.correct = true needs {self.missing}; measure them, or leave correct out")
+            raise ProcessError(
+                f"exposure.correct = true needs {self.missing}; measure them, or leave correct out"
+            )
 
     @property
     def known(self) -> bool:
         """Whether a point exposure is given."""
-        return self.csv is not None or None not in (self.alpha_um, self.beta_um, self.eta)
+        return self.csv is not None or None not in (
+            self.alpha_um,
+            self.beta_um,
+            self.eta,
+        )
 
     @property
     def missing(self) -> str:
         """Names of what a point exposure still needs."""
-        return ", ".join(n for n in ("alpha_um", "beta_um", "eta") if getattr(self, n) is None) + " (or csv)"
+        return (
+            ", ".join(
+                n for n in ("alpha_um", "beta_um", "eta") if getattr(self, n) is None
+            )
+            + " (or csv)"
+        )
 
     @property
     def corrected(self) -> bool:
@@ -197,7 +257,8 @@ class WriteField:
     """Write fields of the e-beam tool.
 
     size_um: largest side of a field.
-    mode: ``shift``: equal fields on a fixed raster that is shifted between the pillars; ``floating``: each border
+    mode: ``shift``: equal fields on a fixed raster that is shifted between the pillars;
+    ``floating``: each border
         lies where it is best, fields are as few and as equal as possible.
     stitching_nm: how far two fields may be misplaced (largest error along x and y).
     """
@@ -209,7 +270,9 @@ class WriteField:
     def __post_init__(self) -> None:
         _positive(self, "size_um")
         if not (self.stitching_nm >= 0 and math.isfinite(self.stitching_nm)):
-            raise ProcessError(f"stitching_nm = {self.stitching_nm}: need a finite length >= 0")
+            raise ProcessError(
+                f"stitching_nm = {self.stitching_nm}: need a finite length >= 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,10 +281,13 @@ class Die:
 
     size_um: (x, y) of the die; left out: the aperture and ``margin_um`` on each side.
     street_um: strip along the edge that stays empty.
-    mark_um, mark_width_um: length and line width of the alignment crosses; fine ones beside them have a fifth of both.
-    verniers: whether verniers and a box in a box show how far pillars and aperture lie apart.
+    mark_um, mark_width_um: length and line width of the alignment crosses; fine ones
+    beside them have a fifth of both.
+    verniers: whether verniers and a box in a box show how far pillars and aperture lie
+    apart.
     vernier_pitch_um: from bar to bar of the scale that is drawn with the pillars.
-    vernier_step_nm: by how much the pitch of the other scale, opened with the aperture, is longer: what a bar reads.
+    vernier_step_nm: by how much the pitch of the other scale, opened with the aperture,
+    is longer: what a bar reads.
     thickness_um: of the substrate.
     label: text on the die; left out: made from the lens.
     margin_um: around the aperture, where no size is given.
@@ -239,23 +305,41 @@ class Die:
     label: str = ""
 
     def __post_init__(self) -> None:
-        _positive(self, "margin_um", "mark_um", "mark_width_um", "thickness_um", "vernier_pitch_um", "vernier_step_nm")
+        _positive(
+            self,
+            "margin_um",
+            "mark_um",
+            "mark_width_um",
+            "thickness_um",
+            "vernier_pitch_um",
+            "vernier_step_nm",
+        )
         if self.vernier_pitch_um < 4:
-            raise ProcessError(f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for bars that can be seen")
+            raise ProcessError(
+                f"vernier_pitch_um = {self.vernier_pitch_um}: need 4 or more, for bars that can be seen"
+            )
         if self.size_um is not None and not all(0 < s < math.inf for s in self.size_um):
-            raise ProcessError(f"size_um = {list(self.size_um)}: need two finite lengths above 0")
+            raise ProcessError(
+                f"size_um = {list(self.size_um)}: need two finite lengths above 0"
+            )
         if not 0 <= self.street_um < math.inf:
-            raise ProcessError(f"street_um = {self.street_um}: need a finite length >= 0")
+            raise ProcessError(
+                f"street_um = {self.street_um}: need a finite length >= 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Process:
     """A fabrication process.
 
-    tone: ``positive``: the drawn shapes become pillars; ``negative``: the gaps between pillars are drawn.
-    name: on report and job sheet. rules: what can be made. layers: where shapes are drawn. bias: made less drawn size.
-    etch: how widths change with the density around. exposure: spread of the dose. write_field: fields of the writer.
-    die: what stands around the lens. spread: of the process, for ``--study`` and the error budget.
+    tone: ``positive``: the drawn shapes become pillars; ``negative``: the gaps between
+    pillars are drawn.
+    name: on report and job sheet. rules: what can be made. layers: where shapes are
+    drawn. bias: made less drawn size.
+    etch: how widths change with the density around. exposure: spread of the dose.
+    write_field: fields of the writer.
+    die: what stands around the lens. spread: of the process, for ``--study`` and the
+    error budget.
     """
 
     name: str = "e-beam, a-Si on fused silica"
@@ -269,8 +353,11 @@ class Process:
     die: Die = field(default_factory=Die)
     spread: Spread = field(default_factory=Spread)
 
-    def made_diameter_nm(self, written_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Diameter at half height that comes out of a drawn pillar: bias, and corners that round off.
+    def made_diameter_nm(
+        self, written_nm: Array | float, isolation: Array | float = 0.0
+    ) -> Array:
+        """Diameter at half height that comes out of a drawn pillar: bias, and corners
+        that round off.
 
         Args:
             written_nm: equal-area diameter of the drawn polygon.
@@ -279,8 +366,12 @@ class Process:
         written = np.asarray(written_nm, float)
         return self.bias.made_nm(written - self._rounding_nm(written), isolation)
 
-    def written_diameter_nm(self, design_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Inverse of :meth:`made_diameter_nm`, to 1e-9 nm: draw this, and the designed diameter is made."""
+    def written_diameter_nm(
+        self, design_nm: Array | float, isolation: Array | float = 0.0
+    ) -> Array:
+        """Inverse of :meth:`made_diameter_nm`, to 1e-9 nm: draw this, and the designed
+        diameter is made.
+        """
         goal = self.bias.drawn_nm(design_nm, isolation)
         written = goal.copy()
         for _ in range(30):
@@ -289,14 +380,20 @@ class Process:
                 break
         return np.asarray(written)
 
-    def top_foot_nm(self, diameter_nm: Array | float, height_nm: float) -> tuple[Array, Array]:
-        """Diameters at the top and at the foot of a pillar whose half-height diameter is given."""
+    def top_foot_nm(
+        self, diameter_nm: Array | float, height_nm: float
+    ) -> tuple[Array, Array]:
+        """Diameters at the top and at the foot of a pillar whose half-height diameter
+        is given.
+        """
         lean = height_nm * math.tan(self.etch.sidewall_deg * deg)
         middle = np.asarray(diameter_nm, float)
         return middle - lean, middle + lean
 
     def _rounding_nm(self, written_nm: Array) -> Array:
-        """Equal-area diameter lost at n corners: the area n r^2 (tan(pi/n) - pi/n), r within the pillar."""
+        """Equal-area diameter lost at n corners: the area n r^2 (tan(pi/n) - pi/n), r
+        within the pillar.
+        """
         n = self.rules.vertices
         radius = np.minimum(self.etch.corner_radius_nm, written_nm / 2)
         area = n * radius**2 * (math.tan(math.pi / n) - math.pi / n)
@@ -307,7 +404,8 @@ def load(path: str | Path) -> Process:
     """Read PROCESS.toml; CSV files that it names lie beside it.
 
     Raises:
-        ConfigError: missing file, unknown key, wrong type or impossible value, with file and key.
+        ConfigError: missing file, unknown key, wrong type or impossible value, with
+            file and key.
         ProcessError: a bias table that is unreadable or impossible.
     """
     path = Path(path)
@@ -322,8 +420,12 @@ def resolve(process: Process, folder: str | Path) -> Process:
     if process.exposure.csv is not None:
         found = folder / process.exposure.csv
         if not found.is_file():
-            raise ConfigError(f"exposure.csv: {found}: no such file; need radius and energy density in two columns")
-        process = dataclasses.replace(process, exposure=dataclasses.replace(process.exposure, csv=found))
+            raise ConfigError(
+                f"exposure.csv: {found}: no such file; need radius and energy density in two columns"
+            )
+        process = dataclasses.replace(
+            process, exposure=dataclasses.replace(process.exposure, csv=found)
+        )
     return process
 
 

@@ -1,6 +1,8 @@
-"""Design-rule check of the drawn polygons, exact, from the classes of neighbouring pillars.
+"""Design-rule check of the drawn polygons, exact, from the classes of neighbouring
+pillars.
 
-Five million pillars have some ten thousand kinds of neighbouring pairs. Count the pairs of each kind, and measure
+Five million pillars have some ten thousand kinds of neighbouring pairs. Count the pairs
+of each kind, and measure
 each kind once, polygon to polygon.
 """
 
@@ -26,16 +28,20 @@ _MOST_KINDS = 1500
 
 
 def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcReport:
-    """Check gap, overlap, feature, grid, density and exclusion zones of all pillars and figures as they are drawn.
+    """Check gap, overlap, feature, grid, density and exclusion zones of all pillars and
+    figures as they are drawn.
 
-    With a negative tone the gaps and features are those of what stays; what is drawn is held to the same limits.
+    With a negative tone the gaps and features are those of what stays; what is drawn is
+    held to the same limits.
 
     Args:
-        foot_nm: (classes,) diameter of each class at its foot, as it comes out of the etch: the gaps there are
+        foot_nm: (classes,) diameter of each class at its foot, as it comes out of the
+            etch: the gaps there are
             checked too.
 
     Accuracy:
-        exact for gap, overlap, feature and grid; density in windows that step by half their size.
+        exact for gap, overlap, feature and grid; density in windows that step by half
+        their size.
     """
     report = DrcReport.empty(plan, rules)
     _off_grid(plan, report)
@@ -54,10 +60,16 @@ def check(plan: MaskPlan, rules: Rules, *, foot_nm: Array | None = None) -> DrcR
     return report
 
 
-def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) -> tuple[Array, float]:
-    """Pillars of each class, and the largest density of any window; dense windows are reported."""
+def _count(
+    plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport
+) -> tuple[Array, float]:
+    """Pillars of each class, and the largest density of any window; dense windows are
+    reported.
+    """
     window = rules.density_window_um * 1e3 / plan.unit_nm / 2
-    side, down = (max(1, round(window / step)) for step in (lattice.pitch, lattice.down))
+    side, down = (
+        max(1, round(window / step)) for step in (lattice.pitch, lattice.down)
+    )
     tiles = (math.ceil(lattice.rows / down) + 1, math.ceil(lattice.columns / side) + 1)
     area = np.array([0.0, *(made.twice_area / 2 for made in plan.classes)])
     counts, cover = np.zeros(len(area), np.int64), np.zeros(tiles)
@@ -68,30 +80,59 @@ def _count(plan: MaskPlan, lattice: Lattice, rules: Rules, report: DrcReport) ->
     wide, high = 2 * side * lattice.pitch, 2 * down * lattice.down
     share = windows / (float(wide) * high)
     for i, j in np.argwhere(share > rules.maximum_density):
-        x, y = lattice.x0 + j * side * lattice.pitch, lattice.y0 - i * down * lattice.down
+        x, y = (
+            lattice.x0 + j * side * lattice.pitch,
+            lattice.y0 - i * down * lattice.down,
+        )
         box = (int(x), int(y) - high, int(x) + wide, int(y))
-        report.add("density", 1, Violation("density", box, float(share[i, j]), rules.maximum_density, lattice.name))
+        report.add(
+            "density",
+            1,
+            Violation(
+                "density", box, float(share[i, j]), rules.maximum_density, lattice.name
+            ),
+        )
     return counts, float(share.max(initial=0.0))
 
 
-def _features(plan: MaskPlan, lattice: Lattice, rules: Rules, found: tuple[Outlines, Array], report: DrcReport) -> None:
-    """Widths of the pillars, and the spaces between edges of one pillar: its hole, its hollows."""
+def _features(
+    plan: MaskPlan,
+    lattice: Lattice,
+    rules: Rules,
+    found: tuple[Outlines, Array],
+    report: DrcReport,
+) -> None:
+    """Widths of the pillars, and the spaces between edges of one pillar: its hole, its
+    hollows.
+    """
     shapes, counts = found
     used = np.flatnonzero(counts[1:]) + 1
     of = shapes.kind[used] - 1
     widths, spaces = shapes.widths[of] * plan.unit_nm, shapes.spaces[of] * plan.unit_nm
-    report.minimum_feature_nm = min(report.minimum_feature_nm, float(widths.min(initial=math.inf)))
-    report.minimum_gap_nm = min(report.minimum_gap_nm, float(spaces.min(initial=math.inf)))
+    report.minimum_feature_nm = min(
+        report.minimum_feature_nm, float(widths.min(initial=math.inf))
+    )
+    report.minimum_gap_nm = min(
+        report.minimum_gap_nm, float(spaces.min(initial=math.inf))
+    )
     for rule, value, limit in (
         ("feature", widths, rules.minimum_feature_nm),
         ("gap", spaces, rules.minimum_gap_nm),
     ):
-        bad = dict(zip(used[value < limit - 1e-9].tolist(), value[value < limit - 1e-9].tolist(), strict=True))
+        bad = dict(
+            zip(
+                used[value < limit - 1e-9].tolist(),
+                value[value < limit - 1e-9].tolist(),
+                strict=True,
+            )
+        )
         for k in bad:
             report.add(rule, int(counts[k]), None)
         for x, y, k in itertools.islice(_sites_of(lattice, list(bad)), _SHOWN):
             box = _box(plan.classes[k - 1].outline, x, y)
-            report.add(rule, 0, Violation(rule, box, bad[k], limit, plan.classes[k - 1].name))
+            report.add(
+                rule, 0, Violation(rule, box, bad[k], limit, plan.classes[k - 1].name)
+            )
 
 
 def _sites_of(lattice: Lattice, classes: list[int]) -> Iterator[tuple[int, int, int]]:
@@ -111,13 +152,17 @@ def _gaps(
     report: DrcReport,
     foot_nm: Array | None,
 ) -> None:
-    """Measure each kind of pair that can be closer than the rule, or closer than all others."""
+    """Measure each kind of pair that can be closer than the rule, or closer than all
+    others.
+    """
     shapes, counts = found
     kinds = np.unique(shapes.kind[1:][counts[1:] > 0])
     if not len(kinds):
         return
     if len(kinds) > _MOST_KINDS:
-        raise ProcessError(f"{len(kinds)} different outlines, the check takes {_MOST_KINDS}; raise diameter_step_nm")
+        raise ProcessError(
+            f"{len(kinds)} different outlines, the check takes {_MOST_KINDS}; raise diameter_step_nm"
+        )
     narrow = np.zeros(len(shapes.contours) + 1, np.int64)
     narrow[kinds] = np.arange(1, len(kinds) + 1)
     kind = narrow[shapes.kind]
@@ -126,7 +171,9 @@ def _gaps(
     foot = np.zeros(len(kinds) + 1)
     if foot_nm is not None:
         np.maximum.at(foot, kind[1:][counts[1:] > 0], foot_nm[counts[1:] > 0])
-    reach = max(2 * widest + limit, (foot.max() + rules.minimum_foot_gap_nm) / plan.unit_nm)
+    reach = max(
+        2 * widest + limit, (foot.max() + rules.minimum_foot_gap_nm) / plan.unit_nm
+    )
     offsets = _offsets(lattice, reach)
     steps = np.array([lattice.pitch, lattice.down])
     table = np.zeros((len(offsets), len(kinds) + 1, len(kinds) + 1), np.int64)
@@ -138,7 +185,14 @@ def _gaps(
     if bad:
         _report_gaps(plan, lattice, (kind, offsets, table), bad, report)
     if foot_nm is not None:
-        _all_feet(plan, lattice, rules, (offsets * steps, table, foot), (foot_nm, counts, least), report)
+        _all_feet(
+            plan,
+            lattice,
+            rules,
+            (offsets * steps, table, foot),
+            (foot_nm, counts, least),
+            report,
+        )
 
 
 def _all_feet(
@@ -149,18 +203,30 @@ def _all_feet(
     found: tuple[Array, Array, float],
     report: DrcReport,
 ) -> None:
-    """Gaps between feet; of pillars that are not round by the least gap drawn, less what the widest wall leans out."""
+    """Gaps between feet; of pillars that are not round by the least gap drawn, less
+    what the widest wall leans out.
+    """
     foot_nm, counts, least = found
-    used = [k for k, made in enumerate(plan.classes) if counts[k + 1] and not made.round]
+    used = [
+        k for k, made in enumerate(plan.classes) if counts[k + 1] and not made.round
+    ]
     if not used:
         _feet(lattice, rules, pairs, report)
         return
-    apart = least * plan.unit_nm - max(float(foot_nm[k]) - plan.classes[k].diameter_nm for k in used)
-    _feet_found(lattice, rules, apart, int(apart < rules.minimum_foot_gap_nm - 1e-9), report)
+    apart = least * plan.unit_nm - max(
+        float(foot_nm[k]) - plan.classes[k].diameter_nm for k in used
+    )
+    _feet_found(
+        lattice, rules, apart, int(apart < rules.minimum_foot_gap_nm - 1e-9), report
+    )
 
 
-def _feet(lattice: Lattice, rules: Rules, pairs: tuple[Array, Array, Array], report: DrcReport) -> None:
-    """Gaps between round feet, for each kind of pair; one violation is listed for each lattice."""
+def _feet(
+    lattice: Lattice, rules: Rules, pairs: tuple[Array, Array, Array], report: DrcReport
+) -> None:
+    """Gaps between round feet, for each kind of pair; one violation is listed for each
+    lattice.
+    """
     moves, table, foot = pairs
     m, a, b = np.nonzero(table)
     standing = (a > 0) & (b > 0)
@@ -171,18 +237,31 @@ def _feet(lattice: Lattice, rules: Rules, pairs: tuple[Array, Array, Array], rep
     _feet_found(lattice, rules, least, int(table[m[bad], a[bad], b[bad]].sum()), report)
 
 
-def _feet_found(lattice: Lattice, rules: Rules, least: float, pairs: int, report: DrcReport) -> None:
+def _feet_found(
+    lattice: Lattice, rules: Rules, least: float, pairs: int, report: DrcReport
+) -> None:
     """Enter the least gap between feet, and how many pairs are nearer than the rule."""
     report.minimum_foot_gap_nm = min(report.minimum_foot_gap_nm, least)
     if pairs:
-        box = (lattice.x0, lattice.y0 - lattice.rows * lattice.down, lattice.x0 + lattice.columns * lattice.pitch)
+        box = (
+            lattice.x0,
+            lattice.y0 - lattice.rows * lattice.down,
+            lattice.x0 + lattice.columns * lattice.pitch,
+        )
         text = f"feet of etched pillars in {lattice.name}"
         report.add("foot", pairs, None)
-        report.add("foot", 0, Violation("foot", (*box, lattice.y0), least, rules.minimum_foot_gap_nm, text))
+        report.add(
+            "foot",
+            0,
+            Violation(
+                "foot", (*box, lattice.y0), least, rules.minimum_foot_gap_nm, text
+            ),
+        )
 
 
 def _offsets(lattice: Lattice, reach: float) -> Array:
-    """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each opposite pair; the nearest
+    """(m, 2) lattice steps (right, up) to all neighbours within ``reach``, one of each
+    opposite pair; the nearest
     sites on all sides in any case (of a centred lattice two columns off, too).
     """
     pitch, down, beside = lattice.pitch, lattice.down, 2 if lattice.centred else 1
@@ -191,13 +270,16 @@ def _offsets(lattice: Lattice, reach: float) -> Array:
         (i, j)
         for j in range(up + 1)
         for i in range(-across, across + 1)
-        if (j > 0 or i > 0) and ((abs(i) <= beside and j <= 1) or math.hypot(i * pitch, j * down) < reach)
+        if (j > 0 or i > 0)
+        and ((abs(i) <= beside and j <= 1) or math.hypot(i * pitch, j * down) < reach)
     ]
     return np.array(steps)
 
 
 def _with_rows_above(lattice: Lattice, above: int) -> Iterator[tuple[Array, int, int]]:
-    """(block with up to ``above`` rows of the block before it, number of those rows, row number of its first)."""
+    """(block with up to ``above`` rows of the block before it, number of those rows,
+    row number of its first).
+    """
     kept = None
     for first, block in lattice.blocks(max(above, _BLOCK_SITES // lattice.columns, 1)):
         whole = block if kept is None else np.concatenate([kept, block])
@@ -209,7 +291,9 @@ def _with_rows_above(lattice: Lattice, above: int) -> Iterator[tuple[Array, int,
 def _measure(
     table: Array, moves: Array, drawn: tuple[Outlines, Array], limit: float
 ) -> tuple[dict[tuple[int, int, int], float], float]:
-    """{(offset, kind, kind): gap} below the limit, and the least gap of all, in database units."""
+    """{(offset, kind, kind): gap} below the limit, and the least gap of all, in
+    database units.
+    """
     shapes, kinds = drawn
     reach = np.array([0.0, *shapes.reach[kinds]])
     m, a, b = np.nonzero(table)
@@ -249,12 +333,28 @@ def _report_gaps(
             right, up = offsets[m].tolist()
             one, two = int(block[row, column]), int(block[row - up, column + right])
             gap = bad[m, int(kind[one]), int(kind[two])] * plan.unit_nm
-            here = _box(plan.classes[one - 1].outline, *_place(lattice, first + row, column))
-            there = _box(plan.classes[two - 1].outline, *_place(lattice, first + row - up, column + right))
-            box = (min(here[0], there[0]), min(here[1], there[1]), max(here[2], there[2]), max(here[3], there[3]))
+            here = _box(
+                plan.classes[one - 1].outline, *_place(lattice, first + row, column)
+            )
+            there = _box(
+                plan.classes[two - 1].outline,
+                *_place(lattice, first + row - up, column + right),
+            )
+            box = (
+                min(here[0], there[0]),
+                min(here[1], there[1]),
+                max(here[2], there[2]),
+                max(here[3], there[3]),
+            )
             text = f"{plan.classes[one - 1].name} to {plan.classes[two - 1].name} in {lattice.name}"
             rule = "overlap" if gap <= 0 else "gap"
-            report.add(rule, 0, Violation(rule, box, max(gap, 0.0), plan.unit_nm * report.limit_gap, text))
+            report.add(
+                rule,
+                0,
+                Violation(
+                    rule, box, max(gap, 0.0), plan.unit_nm * report.limit_gap, text
+                ),
+            )
         if sum(v.rule in ("gap", "overlap") for v in report.violations) >= _SHOWN:
             return
 
@@ -264,15 +364,36 @@ def _off_grid(plan: MaskPlan, report: DrcReport) -> None:
     for made in plan.classes:
         for shape in made.polygons:
             if (np.asarray(shape) % grid).any():
-                report.add("off-grid", 1, Violation("off-grid", _box(shape, 0, 0), 0.0, float(grid), made.name))
+                report.add(
+                    "off-grid",
+                    1,
+                    Violation(
+                        "off-grid", _box(shape, 0, 0), 0.0, float(grid), made.name
+                    ),
+                )
     for lattice in plan.lattices:
-        if lattice.pitch % grid or lattice.down % grid or lattice.x0 % grid or lattice.y0 % grid:
+        if (
+            lattice.pitch % grid
+            or lattice.down % grid
+            or lattice.x0 % grid
+            or lattice.y0 % grid
+        ):
             box = (lattice.x0, lattice.y0, lattice.x0, lattice.y0)
-            report.add("off-grid", 1, Violation("off-grid", box, 0.0, float(grid), lattice.name))
+            report.add(
+                "off-grid",
+                1,
+                Violation("off-grid", box, 0.0, float(grid), lattice.name),
+            )
     for figure in plan.figures:
         for shape in itertools.chain.from_iterable(figure.polygons.values()):
             if (np.asarray(shape) % grid).any():
-                report.add("off-grid", 1, Violation("off-grid", _box(shape, 0, 0), 0.0, float(grid), figure.name))
+                report.add(
+                    "off-grid",
+                    1,
+                    Violation(
+                        "off-grid", _box(shape, 0, 0), 0.0, float(grid), figure.name
+                    ),
+                )
 
 
 def _place(lattice: Lattice, row: int, column: int) -> tuple[int, int]:

@@ -1,4 +1,6 @@
-"""Widths, notches and spaces of any polygons, edge against edge: exact where two of them see each other."""
+"""Widths, notches and spaces of any polygons, edge against edge: exact where two of
+them see each other.
+"""
 
 import numpy as np
 
@@ -7,25 +9,34 @@ from metalens.ground.arrays import Array
 
 WIDTH, SPACE = 0, 1
 KNOWN = -1  # shape number of contours whose widths are measured elsewhere
-_TRIES = 400  # parts of two edges that are looked at, nearest first, where others stand between them
+# parts of two edges that are looked at, nearest first, where others stand between them
+_TRIES = 400
 _SHORTEST = 1 / 16  # of the rule: parts so short are not halved
-# start of each strip among its edges, their numbers, how far along x they go up to each; of each edge its lowest strip;
+# start of each strip among its edges, their numbers, how far along x they go up to
+# each; of each edge its lowest strip;
 # bottom and height of the strips
 Strips = tuple[Array, Array, Array, Array, float, float]
 _NEAR = 1e-7  # units: a line that ends that near to an edge does not cross it
 
 
-def facing(edges: Array, shape: Array, feature: float, gap: float, *, hole: Array | None = None) -> Array:
-    """(n, 4) pairs of edges that face each other too near: first edge, second edge, kind, distance.
+def facing(
+    edges: Array, shape: Array, feature: float, gap: float, *, hole: Array | None = None
+) -> Array:
+    """(n, 4) pairs of edges that face each other too near: first edge, second edge,
+    kind, distance.
 
     Args:
-        edges: (m, 4) x, y to x, y, the inside to the left. shape: (m,) which polygon each belongs to; of ``KNOWN`` no
+        edges: (m, 4) x, y to x, y, the inside to the left. shape: (m,) which polygon
+            each belongs to; of ``KNOWN`` no
             widths are measured.
-        hole: (m,) numbers from 0 on of holes in which no spaces are measured, -1 elsewhere. None: in all they are.
-        feature: least width (edges of one shape that face through its inside). gap: least space (through the outside,
+        hole: (m,) numbers from 0 on of holes in which no spaces are measured, -1
+            elsewhere. None: in all they are.
+        feature: least width (edges of one shape that face through its inside). gap:
+            least space (through the outside,
             of one shape or two).
 
-    Edges that share a corner face nowhere; of any other pair the parts count that lie before each other and see each
+    Edges that share a corner face nowhere; of any other pair the parts count that lie
+    before each other and see each
     other: through the inside for a width, through the outside for a space.
     """
     edges = np.asarray(edges, float)
@@ -45,13 +56,29 @@ def facing(edges: Array, shape: Array, feature: float, gap: float, *, hole: Arra
 
 
 def _strips(edges: Array, most: float) -> Strips:
-    """Edges, sorted along x, in strips along x in which each keeps its order: some three places for each edge."""
+    """Edges, sorted along x, in strips along x in which each keeps its order: some
+    three places for each edge.
+    """
     low, high = edges[:, 1::2].min(1), edges[:, 1::2].max(1)
-    bottom, extent = float(low.min(initial=0)), float(np.ptp(edges[:, 1::2])) if len(edges) else 0.0
-    height = max(most, float((high - low).mean()) if len(edges) else 0.0, extent / (4 * len(edges) + 1024))
+    bottom, extent = (
+        float(low.min(initial=0)),
+        float(np.ptp(edges[:, 1::2])) if len(edges) else 0.0,
+    )
+    height = max(
+        most,
+        float((high - low).mean()) if len(edges) else 0.0,
+        extent / (4 * len(edges) + 1024),
+    )
     first, last = ((v - bottom) // height for v in (low, high))
     first, last = first.astype(np.int64), last.astype(np.int64)
-    start = np.concatenate([[0], np.cumsum(_counted(first, last, np.zeros(int(last.max(initial=0)) + 1, np.int64)))])
+    start = np.concatenate(
+        [
+            [0],
+            np.cumsum(
+                _counted(first, last, np.zeros(int(last.max(initial=0)) + 1, np.int64))
+            ),
+        ]
+    )
     member, reach = np.empty(start[-1], np.int64), np.empty(start[-1])
     _filled(edges, first, last, start[:-1].copy(), start, member, reach)
     return start, member, reach, first, bottom, height
@@ -66,7 +93,15 @@ def _counted(first: Array, last: Array, out: Array) -> Array:
 
 
 @compiled
-def _filled(edges: Array, first: Array, last: Array, at: Array, start: Array, member: Array, reach: Array) -> None:
+def _filled(
+    edges: Array,
+    first: Array,
+    last: Array,
+    at: Array,
+    start: Array,
+    member: Array,
+    reach: Array,
+) -> None:
     """``reach``: how far along x the edges of a strip go up to each of them."""
     for k in range(edges.shape[0]):
         right = max(edges[k, 0], edges[k, 2])
@@ -84,13 +119,24 @@ def _strip_of(y: float, strips: Strips) -> int:
 
 
 @compiled
-def _sweep(edges: Array, shape: Array, hole: Array, strips: Strips, feature: float, gap: float, found: Array) -> int:
+def _sweep(
+    edges: Array,
+    shape: Array,
+    hole: Array,
+    strips: Strips,
+    feature: float,
+    gap: float,
+    found: Array,
+) -> int:
     """Fill ``found``; the number of pairs, or its length where it is full."""
     count, most = 0, max(feature, gap)
     start, member, _, first, _, _ = strips
     for i in range(edges.shape[0]):
         right = max(edges[i, 0], edges[i, 2]) + most
-        low, high = min(edges[i, 1], edges[i, 3]) - most, max(edges[i, 1], edges[i, 3]) + most
+        low, high = (
+            min(edges[i, 1], edges[i, 3]) - most,
+            max(edges[i, 1], edges[i, 3]) + most,
+        )
         lowest = _strip_of(low, strips)
         for strip in range(lowest, _strip_of(high, strips) + 1):
             some = member[start[strip] : start[strip + 1]]
@@ -100,7 +146,10 @@ def _sweep(edges: Array, shape: Array, hole: Array, strips: Strips, feature: flo
                     break
                 if strip != max(lowest, first[j]):  # seen in a strip below
                     continue
-                if min(edges[j, 1], edges[j, 3]) > high or max(edges[j, 1], edges[j, 3]) < low:
+                if (
+                    min(edges[j, 1], edges[j, 3]) > high
+                    or max(edges[j, 1], edges[j, 3]) < low
+                ):
                     continue
                 if not _opposite(edges[i], edges[j]):
                     continue
@@ -109,11 +158,23 @@ def _sweep(edges: Array, shape: Array, hole: Array, strips: Strips, feature: flo
                         continue
                     if kind == 1 and hole[i] >= 0 and hole[i] == hole[j]:
                         continue
-                    away = _seen(i, j, edges, strips, 1.0 if kind == 0 else -1.0, feature if kind == 0 else gap)
+                    away = _seen(
+                        i,
+                        j,
+                        edges,
+                        strips,
+                        1.0 if kind == 0 else -1.0,
+                        feature if kind == 0 else gap,
+                    )
                     if away > 0:
                         if count == found.shape[0]:
                             return count
-                        found[count, 0], found[count, 1], found[count, 2], found[count, 3] = i, j, kind, away
+                        (
+                            found[count, 0],
+                            found[count, 1],
+                            found[count, 2],
+                            found[count, 3],
+                        ) = i, j, kind, away
                         count += 1
     return count
 
@@ -121,12 +182,18 @@ def _sweep(edges: Array, shape: Array, hole: Array, strips: Strips, feature: flo
 @compiled
 def _opposite(one: Array, two: Array) -> bool:
     """Whether two edges run against each other."""
-    return bool((one[2] - one[0]) * (two[2] - two[0]) + (one[3] - one[1]) * (two[3] - two[1]) < 0)
+    return bool(
+        (one[2] - one[0]) * (two[2] - two[0]) + (one[3] - one[1]) * (two[3] - two[1])
+        < 0
+    )
 
 
 @compiled
-def _seen(i: int, j: int, edges: Array, strips: Strips, side: float, limit: float) -> float:
-    """Distance of the parts of two edges that lie before each other, to the left (side 1) or right (-1), and see each
+def _seen(
+    i: int, j: int, edges: Array, strips: Strips, side: float, limit: float
+) -> float:
+    """Distance of the parts of two edges that lie before each other, to the left (side
+    1) or right (-1), and see each
     other; -1 where none does, or none nearer than ``limit``.
     """
     p, q = _before(edges[i], edges[j], side), _before(edges[j], edges[i], side)
@@ -156,9 +223,19 @@ def _seen(i: int, j: int, edges: Array, strips: Strips, side: float, limit: floa
 
 @compiled
 def _halves(pair: Array, limit: float, parts: Array, count: int) -> int:
-    """Put both halves of both edges of a pair, that are nearer than ``limit``, behind the first ``count`` parts."""
+    """Put both halves of both edges of a pair, that are nearer than ``limit``, behind
+    the first ``count`` parts.
+    """
     line, least = np.empty(4), _SHORTEST * limit
-    if max(abs(pair[0] - pair[2]), abs(pair[1] - pair[3]), abs(pair[4] - pair[6]), abs(pair[5] - pair[7])) < least:
+    if (
+        max(
+            abs(pair[0] - pair[2]),
+            abs(pair[1] - pair[3]),
+            abs(pair[4] - pair[6]),
+            abs(pair[5] - pair[7]),
+        )
+        < least
+    ):
         return count
     for k in range(4):
         made = parts[count]
@@ -174,13 +251,22 @@ def _halves(pair: Array, limit: float, parts: Array, count: int) -> int:
 
 @compiled
 def _nearest(pair: Array, line: Array) -> float:
-    """Distance of two edges (the first eight numbers) that do not cross; ``line``: between their nearest points."""
+    """Distance of two edges (the first eight numbers) that do not cross; ``line``:
+    between their nearest points.
+    """
     best = np.inf
     for k in range(4):
         end, edge = (pair[2 * k : 2 * k + 2], pair[4:8] if k < 2 else pair[:4])
         dx, dy = edge[2] - edge[0], edge[3] - edge[1]
         long = dx * dx + dy * dy
-        t = 0.0 if long == 0 else min(max(((end[0] - edge[0]) * dx + (end[1] - edge[1]) * dy) / long, 0.0), 1.0)
+        t = (
+            0.0
+            if long == 0
+            else min(
+                max(((end[0] - edge[0]) * dx + (end[1] - edge[1]) * dy) / long, 0.0),
+                1.0,
+            )
+        )
         x, y = edge[0] + t * dx, edge[1] + t * dy
         away = (end[0] - x) ** 2 + (end[1] - y) ** 2
         if away < best:
@@ -191,11 +277,18 @@ def _nearest(pair: Array, line: Array) -> float:
 
 
 @compiled
-def _is_free(line: Array, i: int, j: int, edges: Array, strips: Strips, side: float) -> bool:
-    """Whether a line between edges ``i`` and ``j`` crosses no other, and leaves corners on the wanted side."""
+def _is_free(
+    line: Array, i: int, j: int, edges: Array, strips: Strips, side: float
+) -> bool:
+    """Whether a line between edges ``i`` and ``j`` crosses no other, and leaves corners
+    on the wanted side.
+    """
     low, high = min(line[0], line[2]), max(line[0], line[2])
     bottom, top = min(line[1], line[3]), max(line[1], line[3])
-    corners, numbers = np.zeros((2, 4)), np.zeros(4, np.int64)  # directions into and out of the corner at each end
+    corners, numbers = (
+        np.zeros((2, 4)),
+        np.zeros(4, np.int64),
+    )  # directions into and out of the corner at each end
     start, member, reach, first, _, _ = strips
     lowest = _strip_of(bottom, strips)
     for strip in range(lowest, _strip_of(top, strips) + 1):
@@ -207,7 +300,11 @@ def _is_free(line: Array, i: int, j: int, edges: Array, strips: Strips, side: fl
                 break
             if strip != max(lowest, first[k]):  # seen in a strip below
                 continue
-            if max(e[0], e[2]) < low or min(e[1], e[3]) > top or max(e[1], e[3]) < bottom:
+            if (
+                max(e[0], e[2]) < low
+                or min(e[1], e[3]) > top
+                or max(e[1], e[3]) < bottom
+            ):
                 continue
             _at_ends(e, line, corners, numbers)
             if k not in (i, j) and _cross(line, e):
@@ -215,18 +312,28 @@ def _is_free(line: Array, i: int, j: int, edges: Array, strips: Strips, side: fl
     for end in range(2):
         if numbers[2 * end] == 1 and numbers[2 * end + 1] == 1:
             away = 1.0 if end == 0 else -1.0
-            if not _leaves(corners[end], away * (line[2] - line[0]), away * (line[3] - line[1]), side):
+            if not _leaves(
+                corners[end],
+                away * (line[2] - line[0]),
+                away * (line[3] - line[1]),
+                side,
+            ):
                 return False
     return True
 
 
 @compiled
 def _at_ends(e: Array, line: Array, corners: Array, numbers: Array) -> None:
-    """Enter an edge that leads into or out of an end of the line: its direction, and that there is one."""
+    """Enter an edge that leads into or out of an end of the line: its direction, and
+    that there is one.
+    """
     for end in range(2):
         for tip in range(2):
             if e[2 - 2 * tip] == line[2 * end] and e[3 - 2 * tip] == line[2 * end + 1]:
-                corners[end, 2 * tip], corners[end, 2 * tip + 1] = e[2] - e[0], e[3] - e[1]
+                corners[end, 2 * tip], corners[end, 2 * tip + 1] = (
+                    e[2] - e[0],
+                    e[3] - e[1],
+                )
                 numbers[2 * end + tip] += 1
 
 
@@ -241,12 +348,16 @@ def _cross(line: Array, e: Array) -> bool:
     ex, ey = e[2] - e[0], e[3] - e[1]
     one = ex * (line[1] - e[1]) - ey * (line[0] - e[0])
     two = ex * (line[3] - e[1]) - ey * (line[2] - e[0])
-    return bool(one * two < 0 and min(abs(one), abs(two)) > _NEAR * (ex * ex + ey * ey) ** 0.5)
+    return bool(
+        one * two < 0 and min(abs(one), abs(two)) > _NEAR * (ex * ex + ey * ey) ** 0.5
+    )
 
 
 @compiled
 def _leaves(corner: Array, dx: float, dy: float, side: float) -> bool:
-    """Whether a direction from a corner (directions in and out of it) goes to its left (side 1) or right (-1)."""
+    """Whether a direction from a corner (directions in and out of it) goes to its left
+    (side 1) or right (-1).
+    """
     of_one = side * (corner[0] * dy - corner[1] * dx) >= 0
     of_two = side * (corner[2] * dy - corner[3] * dx) >= 0
     turned = side * (corner[0] * corner[3] - corner[1] * corner[2]) > 0
@@ -255,7 +366,9 @@ def _leaves(corner: Array, dx: float, dy: float, side: float) -> bool:
 
 @compiled
 def _before(line: Array, edge: Array, side: float) -> Array:
-    """The part of ``edge`` on the wanted side of ``line``: x, y, x, y, and 1 where there is any."""
+    """The part of ``edge`` on the wanted side of ``line``: x, y, x, y, and 1 where
+    there is any.
+    """
     dx, dy = line[2] - line[0], line[3] - line[1]
     s = side * (dx * (edge[1] - line[1]) - dy * (edge[0] - line[0]))
     e = side * (dx * (edge[3] - line[1]) - dy * (edge[2] - line[0]))

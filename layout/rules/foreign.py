@@ -1,7 +1,10 @@
-"""Rules on a mask made anywhere: pillars at any place and turn, shapes of any outline, checked layer by layer.
+"""Rules on a mask made anywhere: pillars at any place and turn, shapes of any outline,
+checked layer by layer.
 
-Shapes that touch are one shape, as a writer exposes them. Convex ones that stand alone are measured polygon to
-polygon, wherever they stand, those that can be near each other found by sorting their places; all others edge against
+Shapes that touch are one shape, as a writer exposes them. Convex ones that stand alone
+are measured polygon to
+polygon, wherever they stand, those that can be near each other found by sorting their
+places; all others edge against
 edge.
 """
 
@@ -25,8 +28,11 @@ from layout.shapes import convex, region
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-MOST_SHAPES = 4_000_000  # that are checked or shown at once in less than 1 GB, however small the file
-_EACH_BYTE = 20  # more of them for each byte: our lenses, not folded, hold 4 pillars in each, of two sizes 17
+# that are checked or shown at once in less than 1 GB, however small the file
+MOST_SHAPES = 4_000_000
+# more of them for each byte: our lenses, not folded, hold 4 pillars in each, of two
+# sizes 17
+_EACH_BYTE = 20
 _AT_ONCE = 1 << 18  # shapes that are held to the grid at once
 _CLEAR = -1  # number of all layers together whose clear areas stay
 _ROUNDED = 1e-6  # of a step of a grid that is no whole number of units
@@ -46,24 +52,30 @@ def check(
     most: int = MOST_SHAPES,
     last: bool = False,
 ) -> DrcReport:
-    """Gap, feature and grid of every shape below the top cells, each layer number (all its datatypes) by itself.
+    """Gap, feature and grid of every shape below the top cells, each layer number (all
+    its datatypes) by itself.
 
-    Large cells that are placed again and again are looked at once, but for what stands near other shapes: a wafer of
+    Large cells that are placed again and again are looked at once, but for what stands
+    near other shapes: a wafer of
     one die takes little more than the die, and every copy is counted.
 
     Args:
         skip: layer numbers that are not drawn in the resist (outlines, write fields).
-        negative: layer numbers that are exposed together, and what they leave empty stays: it is held to the least
+        negative: layer numbers that are exposed together, and what they leave empty
+            stays: it is held to the least
             feature, what they draw to the least gap.
         most: shapes that are taken apart.
         last: the cells of ``content`` are let go once their shapes are gathered.
 
     Raises:
-        MaskFileError: no top cell, a hierarchy that is broken, more than ``most`` shapes or 4e6
+        MaskFileError: no top cell, a hierarchy that is broken, more than ``most``
+            shapes or 4e6
             pairs of shapes that can be closer than the rule.
     """
     if not content.tops:
-        raise MaskFileError("the mask has no top cell: its cells place each other in a circle")
+        raise MaskFileError(
+            "the mask has no top cell: its cells place each other in a circle"
+        )
     parts = copies.found(content)
     copies.refuse_beyond(parts, content, most)
     parts = copies.with_places(parts, content)
@@ -71,35 +83,66 @@ def check(
     step = rules.grid_nm / content.unit_nm
     whole, offsets = parts.times.keys() - {copies.ROOT}, parts.offsets(step)
     number_of = {number: _CLEAR for number in negative}
-    groups = {name: layers.groups(content, parts.tops(content, name), skip, whole, number_of) for name in parts.times}
+    groups = {
+        name: layers.groups(content, parts.tops(content, name), skip, whole, number_of)
+        for name in parts.times
+    }
     if last:
         content.cells.clear()
     for number in sorted({number for some in groups.values() for number in some}):
-        drawn = {name: layers.gathered(some.pop(number)) for name, some in groups.items() if number in some}
+        drawn = {
+            name: layers.gathered(some.pop(number))
+            for name, some in groups.items()
+            if number in some
+        }
         held = _exchanged(rules) if number == _CLEAR else rules
         said = f"layer {number}" if number != _CLEAR else "what is drawn"
-        for name, layer in nested.separate(parts, drawn, held.minimum_gap_nm / content.unit_nm, most):
+        for name, layer in nested.separate(
+            parts, drawn, held.minimum_gap_nm / content.unit_nm, most
+        ):
             report.pillars += len(layer.kind) * parts.times[name]
             own = DrcReport.empty(content, held)
             _check_layer(layer, held, own, said)
             own = own.exchanged() if number == _CLEAR else own
-            _copied(report, own, parts.times[name], name, partial(parts.copies, name, MOST_SHOWN))
+            _copied(
+                report,
+                own,
+                parts.times[name],
+                name,
+                partial(parts.copies, name, MOST_SHOWN),
+            )
             for offset, times in offsets[name].items():
                 own = DrcReport.empty(content, rules)
                 _off_grid(layer, rules, own, offset)
-                _copied(report, own, times, name, partial(parts.copies, name, MOST_SHOWN, step=step, offset=offset))
+                _copied(
+                    report,
+                    own,
+                    times,
+                    name,
+                    partial(parts.copies, name, MOST_SHOWN, step=step, offset=offset),
+                )
     return report
 
 
 def _exchanged(rules: Rules) -> Rules:
     """Limits of what is drawn, where what is not drawn stays."""
-    return dataclasses.replace(rules, minimum_gap_nm=rules.minimum_feature_nm, minimum_feature_nm=rules.minimum_gap_nm)
+    return dataclasses.replace(
+        rules,
+        minimum_gap_nm=rules.minimum_feature_nm,
+        minimum_feature_nm=rules.minimum_gap_nm,
+    )
 
 
 def _copied(
-    report: DrcReport, own: DrcReport, times: int, name: str, places: Callable[[], list[tuple[Turn, int, int]]]
+    report: DrcReport,
+    own: DrcReport,
+    times: int,
+    name: str,
+    places: Callable[[], list[tuple[Turn, int, int]]],
 ) -> None:
-    """Enter what was found of a cell for all its copies; it is listed for the first of them, as far as lists go."""
+    """Enter what was found of a cell for all its copies; it is listed for the first of
+    them, as far as lists go.
+    """
     for rule, count in own.counts.items():
         report.counts[rule] += times * count
     report.minimum_gap_nm = min(report.minimum_gap_nm, own.minimum_gap_nm)
@@ -111,7 +154,11 @@ def _copied(
             return
         boxes = turn.boxes(np.array([v.box for v in listed])) + np.array([x, y, x, y])
         for found, box in zip(listed, boxes.tolist(), strict=True):
-            report.add(found.rule, 0, dataclasses.replace(found, box=tuple(box), text=found.text + said))
+            report.add(
+                found.rule,
+                0,
+                dataclasses.replace(found, box=tuple(box), text=found.text + said),
+            )
 
 
 def _check_layer(layer: Layer, rules: Rules, report: DrcReport, name: str) -> None:
@@ -128,22 +175,43 @@ def _check_layer(layer: Layer, rules: Rules, report: DrcReport, name: str) -> No
     if len(other):
         groups = _joined(other, one[touch], two[touch])
         beside = alone[one] != alone[two]
-        _beside(layer, alone, groups, (one[beside & close], two[beside & close], apart[beside & close]), rules, report)
-        hiding = np.concatenate([one[beside & (apart < gap)], two[beside & (apart < gap)]])
+        _beside(
+            layer,
+            alone,
+            groups,
+            (one[beside & close], two[beside & close], apart[beside & close]),
+            rules,
+            report,
+        )
+        hiding = np.concatenate(
+            [one[beside & (apart < gap)], two[beside & (apart < gap)]]
+        )
         _by_edges(layer, groups, np.unique(hiding[alone[hiding]]), rules, report, name)
 
 
-def _too_near(layer: Layer, pairs: tuple[Array, Array, Array], rules: Rules, report: DrcReport, name: str) -> None:
+def _too_near(
+    layer: Layer,
+    pairs: tuple[Array, Array, Array],
+    rules: Rules,
+    report: DrcReport,
+    name: str,
+) -> None:
     """Pairs of convex shapes that stand alone: first, second, distance."""
     value = pairs[2] * report.unit_nm
 
     def shown() -> Iterator[Violation]:
-        for a, b, apart in zip(pairs[0].tolist(), pairs[1].tolist(), value.tolist(), strict=True):
-            text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
+        for a, b, apart in zip(
+            pairs[0].tolist(), pairs[1].tolist(), value.tolist(), strict=True
+        ):
+            text = (
+                f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}, {name}"
+            )
             yield Violation("gap", layer.box(a, b), apart, rules.minimum_gap_nm, text)
 
     report.add_all("gap", len(value), shown())
-    report.minimum_gap_nm = min(report.minimum_gap_nm, float(value.min(initial=math.inf)))
+    report.minimum_gap_nm = min(
+        report.minimum_gap_nm, float(value.min(initial=math.inf))
+    )
 
 
 def _beside(
@@ -154,7 +222,9 @@ def _beside(
     rules: Rules,
     report: DrcReport,
 ) -> None:
-    """Convex shapes that stand alone, near others: each with each group is one gap, of its nearest shape."""
+    """Convex shapes that stand alone, near others: each with each group is one gap, of
+    its nearest shape.
+    """
     group = np.zeros(len(layer.kind), np.int64)
     for number, members in enumerate(groups):
         group[members] = number
@@ -164,7 +234,9 @@ def _beside(
     new = (np.diff(own, prepend=-1) != 0) | (np.diff(group[other], prepend=-1) != 0)
 
     def shown() -> Iterator[Violation]:
-        for a, b, value in zip(own[new].tolist(), other[new].tolist(), apart[new].tolist(), strict=True):
+        for a, b, value in zip(
+            own[new].tolist(), other[new].tolist(), apart[new].tolist(), strict=True
+        ):
             left, bottom, right, top = layer.box(a)
             room = math.ceil(value / report.unit_nm)
             text = f"{layer.cells[layer.kind[a]]} to {layer.cells[layer.kind[b]]}"
@@ -172,7 +244,9 @@ def _beside(
             yield Violation("gap", box, value, rules.minimum_gap_nm, text)
 
     report.add_all("gap", int(new.sum()), shown())
-    report.minimum_gap_nm = min(report.minimum_gap_nm, float(apart.min(initial=math.inf)))
+    report.minimum_gap_nm = min(
+        report.minimum_gap_nm, float(apart.min(initial=math.inf))
+    )
 
 
 def _joined(members: Array, one: Array, two: Array) -> list[list[int]]:
@@ -190,17 +264,27 @@ def _joined(members: Array, one: Array, two: Array) -> list[list[int]]:
 
 def _features(layer: Layer, alone: Array, rules: Rules, report: DrcReport) -> None:
     """Widths of convex shapes that stand alone."""
-    for kind in np.flatnonzero(counted(layer.kind, alone, np.zeros(len(layer.outlines), np.int64))).tolist():
+    for kind in np.flatnonzero(
+        counted(layer.kind, alone, np.zeros(len(layer.outlines), np.int64))
+    ).tolist():
         width = convex.width(layer.outlines[kind]) * report.unit_nm
         report.minimum_feature_nm = min(report.minimum_feature_nm, width)
         if width < rules.minimum_feature_nm - 1e-9:
             some = np.flatnonzero((layer.kind == kind) & alone)
-            report.add_all("feature", len(some), _narrow_ones(layer, some, width, rules.minimum_feature_nm))
+            report.add_all(
+                "feature",
+                len(some),
+                _narrow_ones(layer, some, width, rules.minimum_feature_nm),
+            )
 
 
-def _narrow_ones(layer: Layer, some: Array, width: float, limit: float) -> Iterator[Violation]:
+def _narrow_ones(
+    layer: Layer, some: Array, width: float, limit: float
+) -> Iterator[Violation]:
     for n in some.tolist():
-        yield Violation("feature", layer.box(n), width, limit, layer.cells[layer.kind[n]])
+        yield Violation(
+            "feature", layer.box(n), width, limit, layer.cells[layer.kind[n]]
+        )
 
 
 @compiled
@@ -212,8 +296,17 @@ def counted(kind: Array, alone: Array, out: Array) -> Array:
     return out
 
 
-def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules, report: DrcReport, name: str) -> None:
-    """Groups of shapes that are not convex or touch, as merged contours; the convex shapes beside them hide edges."""
+def _by_edges(
+    layer: Layer,
+    groups: list[list[int]],
+    beside: Array,
+    rules: Rules,
+    report: DrcReport,
+    name: str,
+) -> None:
+    """Groups of shapes that are not convex or touch, as merged contours; the convex
+    shapes beside them hide edges.
+    """
     lines: list[Array] = []
     owner: list[Array] = []
     hiding: list[Array] = []
@@ -221,10 +314,14 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
     for number, members in enumerate([*groups, *([n] for n in beside.tolist())]):
         shapes = [layer.points(n) for n in members]
         whole = len(shapes) == 1 and layers.is_convex(shapes[0])
-        contours = [layers.plain(c) for c in (shapes if whole else region.union(shapes))]
+        contours = [
+            layers.plain(c) for c in (shapes if whole else region.union(shapes))
+        ]
         contours = [c for c in contours if len(c) > 2]  # lines draw nothing
         for contour in contours:
-            known = layers.is_convex(contour) and (whole or not _holds(contour, contours))
+            known = layers.is_convex(contour) and (
+                whole or not _holds(contour, contours)
+            )
             if known and number < len(groups):
                 _narrow(contour, rules, report, name)
             open_ = layers.is_convex(contour[::-1])
@@ -236,8 +333,14 @@ def _by_edges(layer: Layer, groups: list[list[int]], beside: Array, rules: Rules
             hiding.append(np.full(len(contour), number >= len(groups)))
     if not lines:
         return
-    edge, shape, hides = np.concatenate(lines), np.concatenate(owner), np.concatenate(hiding)
-    feature, gap = (v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm))
+    edge, shape, hides = (
+        np.concatenate(lines),
+        np.concatenate(owner),
+        np.concatenate(hiding),
+    )
+    feature, gap = (
+        v / report.unit_nm for v in (rules.minimum_feature_nm, rules.minimum_gap_nm)
+    )
     found = facing.facing(edge, shape, feature, gap, hole=np.concatenate(within))
     found = found[~hides[found[:, :2].astype(np.int64)].any(1)]
     limits = ("feature", rules.minimum_feature_nm), ("gap", rules.minimum_gap_nm)
@@ -249,26 +352,49 @@ def _holds(contour: Array, others: list[Array]) -> bool:
     edges = np.roll(contour, -1, axis=0) - contour
     for other in others:
         to = other[0] - contour
-        if other is not contour and (edges[:, 0] * to[:, 1] >= edges[:, 1] * to[:, 0]).all():
+        if (
+            other is not contour
+            and (edges[:, 0] * to[:, 1] >= edges[:, 1] * to[:, 0]).all()
+        ):
             return True
     return False
 
 
-def _narrow(contour: Array, rules: Rules, report: DrcReport, name: str, *, hole: bool = False) -> None:
-    """Width of a convex contour that shapes have together, or of a convex hole in them, which is a gap."""
+def _narrow(
+    contour: Array, rules: Rules, report: DrcReport, name: str, *, hole: bool = False
+) -> None:
+    """Width of a convex contour that shapes have together, or of a convex hole in them,
+    which is a gap.
+    """
     width = convex.width(contour) * report.unit_nm
-    rule, limit = ("gap", rules.minimum_gap_nm) if hole else ("feature", rules.minimum_feature_nm)
+    rule, limit = (
+        ("gap", rules.minimum_gap_nm) if hole else ("feature", rules.minimum_feature_nm)
+    )
     if hole:
-        report.minimum_gap_nm = min(report.minimum_gap_nm, width) if width < limit - 1e-9 else report.minimum_gap_nm
+        report.minimum_gap_nm = (
+            min(report.minimum_gap_nm, width)
+            if width < limit - 1e-9
+            else report.minimum_gap_nm
+        )
     else:
         report.minimum_feature_nm = min(report.minimum_feature_nm, width)
     if width < limit - 1e-9:
         box = (*contour.min(0).tolist(), *contour.max(0).tolist())
-        report.add(rule, 1, Violation(rule, box, width, limit, f"{'hole' if hole else 'shape'} of {name}"))
+        report.add(
+            rule,
+            1,
+            Violation(
+                rule, box, width, limit, f"{'hole' if hole else 'shape'} of {name}"
+            ),
+        )
 
 
-def _off_grid(layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offset) -> None:
-    """Corners that do not lie on the grid of the process, which the cell lies off by ``offset``."""
+def _off_grid(
+    layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offset
+) -> None:
+    """Corners that do not lie on the grid of the process, which the cell lies off by
+    ``offset``.
+    """
     step = rules.grid_nm / report.unit_nm
     if step == 1:
         return
@@ -276,16 +402,31 @@ def _off_grid(layer: Layer, rules: Rules, report: DrcReport, offset: copies.Offs
     bad = [_residue(outline, step) for outline in layer.outlines]
     for first in range(0, len(layer.kind), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        kind, place = layer.kind[some], np.column_stack([layer.x[some], layer.y[some]]) + np.array(offset)
-        off = np.mod(place + np.array([r if r is not None else (0.0, 0.0) for r in bad])[kind], step)
+        kind, place = (
+            layer.kind[some],
+            np.column_stack([layer.x[some], layer.y[some]]) + np.array(offset),
+        )
+        off = np.mod(
+            place + np.array([r if r is not None else (0.0, 0.0) for r in bad])[kind],
+            step,
+        )
         apart = (np.minimum(off, step - off) > (0 if whole else _ROUNDED)).any(1)
         apart |= np.array([r is None for r in bad])[kind]
         found, limit = np.flatnonzero(apart) + first, float(rules.grid_nm)
-        shown = (Violation("off-grid", layer.box(n), 0.0, limit, layer.cells[layer.kind[n]]) for n in found.tolist())
+        shown = (
+            Violation("off-grid", layer.box(n), 0.0, limit, layer.cells[layer.kind[n]])
+            for n in found.tolist()
+        )
         report.add_all("off-grid", len(found), shown)
 
 
 def _residue(outline: Array, step: float) -> tuple[float, float] | None:
-    """Where all corners lie on a grid of ``step``, from its points; None where they lie on different ones."""
+    """Where all corners lie on a grid of ``step``, from its points; None where they lie
+    on different ones.
+    """
     off = np.mod(outline - outline[0] + step / 2, step) - step / 2
-    return None if np.abs(off).max() > _ROUNDED else tuple(np.mod(outline[0], step).tolist())
+    return (
+        None
+        if np.abs(off).max() > _ROUNDED
+        else tuple(np.mod(outline[0], step).tolist())
+    )

@@ -1,4 +1,6 @@
-"""Shapes of one layer number of a mask made anywhere: different outlines once, and where each stands."""
+"""Shapes of one layer number of a mask made anywhere: different outlines once, and
+where each stands.
+"""
 
 import math
 from collections.abc import Mapping, Sequence, Set
@@ -15,7 +17,9 @@ from metalens.ground.arrays import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Layer:
-    """Shapes of one layer number: different outlines, and (n,) int32 which each is, with its place x, y."""
+    """Shapes of one layer number: different outlines, and (n,) int32 which each is,
+    with its place x, y.
+    """
 
     outlines: list[Array]
     cells: list[str]
@@ -26,13 +30,22 @@ class Layer:
     @property
     def discs(self) -> near.Discs:
         """Circles around the shapes, about the middles of their boxes."""
-        middle = np.array([(o.min(0) + o.max(0)) / 2 for o in self.outlines]).reshape(-1, 2)
-        reach = np.array([np.hypot(*(o - m).T).max() for o, m in zip(self.outlines, middle, strict=True)])
+        middle = np.array([(o.min(0) + o.max(0)) / 2 for o in self.outlines]).reshape(
+            -1, 2
+        )
+        reach = np.array(
+            [
+                np.hypot(*(o - m).T).max()
+                for o, m in zip(self.outlines, middle, strict=True)
+            ]
+        )
         return near.Discs(self.x, self.y, self.kind, middle, reach)
 
     def points(self, n: int) -> Array:
         """(m, 2) corners of shape ``n``."""
-        return np.asarray(self.outlines[self.kind[n]] + np.array([self.x[n], self.y[n]], np.int64))
+        return np.asarray(
+            self.outlines[self.kind[n]] + np.array([self.x[n], self.y[n]], np.int64)
+        )
 
     def box(self, *members: int) -> tuple[int, int, int, int]:
         """Left, bottom, right, top of some shapes."""
@@ -42,21 +55,33 @@ class Layer:
 
     def boxes(self, members: "Array | slice" = slice(None)) -> Array:
         """(n, 4) left, bottom, right, top of each of some shapes."""
-        own = np.array([[*o.min(0), *o.max(0)] for o in self.outlines], np.int64).reshape(-1, 4)
+        own = np.array(
+            [[*o.min(0), *o.max(0)] for o in self.outlines], np.int64
+        ).reshape(-1, 4)
         place = np.column_stack([self.x[members], self.y[members]]).astype(np.int64)
         return np.asarray(own[self.kind[members]] + np.hstack([place, place]))
 
     def distances(self, one: Array, two: Array, most: float) -> Array:
-        """(n,) between shapes: 0 where they touch or overlap, ``most`` where they are further apart."""
-        moved = (self.x[two].astype(np.int64) - self.x[one], self.y[two].astype(np.int64) - self.y[one])
+        """(n,) between shapes: 0 where they touch or overlap, ``most`` where they are
+        further apart.
+        """
+        moved = (
+            self.x[two].astype(np.int64) - self.x[one],
+            self.y[two].astype(np.int64) - self.y[one],
+        )
         return apart(self.outlines, (self.kind[one], self.kind[two]), moved, most=most)
 
     @property
     def around(self) -> Array:
-        """(1, 4) left, bottom, right, top of all shapes together; (0, 4) where there are none."""
+        """(1, 4) left, bottom, right, top of all shapes together; (0, 4) where there
+        are none.
+        """
         if not len(self.kind):
             return np.empty((0, 4), np.int64)
-        low, high = (np.array([f(o, 0) for o in self.outlines], np.int64) for f in (np.min, np.max))
+        low, high = (
+            np.array([f(o, 0) for o in self.outlines], np.int64)
+            for f in (np.min, np.max)
+        )
         places = (self.x, self.y)
         ends = [np.min(v + low[self.kind, n]) for n, v in enumerate(places)]
         ends += [np.max(v + high[self.kind, n]) for n, v in enumerate(places)]
@@ -64,14 +89,23 @@ class Layer:
 
     def only(self, members: Array) -> "Layer":
         """Some of the shapes: (n,) bool or numbers."""
-        return Layer(self.outlines, self.cells, self.kind[members], self.x[members], self.y[members])
+        return Layer(
+            self.outlines,
+            self.cells,
+            self.kind[members],
+            self.x[members],
+            self.y[members],
+        )
 
     def copied(self, turn: Turn, x: Array, y: Array) -> "Layer":
         """A copy of all shapes, turned by quarters, at each of (m,) places."""
         outlines = [np.column_stack(turn.apply(*o.T)) for o in self.outlines]
         outlines = [o[::-1] for o in outlines] if turn.mirrored else outlines
         u, v = turn.apply(self.x.astype(np.int64), self.y.astype(np.int64))
-        px, py = ((a[:, None] + b).ravel().astype(np.int32) for a, b in ((x.astype(np.int64), u), (y, v)))
+        px, py = (
+            (a[:, None] + b).ravel().astype(np.int32)
+            for a, b in ((x.astype(np.int64), u), (y, v))
+        )
         return Layer(outlines, self.cells, np.tile(self.kind, len(x)), px, py)
 
 
@@ -88,7 +122,9 @@ def joined(some: Sequence[Layer]) -> Layer:
     kinds: list[Array] = []
     for layer in some:
         new = np.empty(len(layer.outlines), np.int32)
-        for k, (outline, cell) in enumerate(zip(layer.outlines, layer.cells, strict=True)):
+        for k, (outline, cell) in enumerate(
+            zip(layer.outlines, layer.cells, strict=True)
+        ):
             key = np.ascontiguousarray(outline, np.int64).tobytes()
             if key not in number:
                 number[key] = len(outlines)
@@ -110,22 +146,31 @@ def groups(
     whole: Set[str],
     number_of: Mapping[int, int] = MappingProxyType({}),
 ) -> Groups:
-    """{layer number: shapes below ``tops``, those of one outline together}, without cells that are kept ``whole``.
+    """{layer number: shapes below ``tops``, those of one outline together}, without
+    cells that are kept ``whole``.
 
     number_of: layer numbers that count as another.
     """
     found: Groups = {}
 
     def number(shape: flat.Shapes) -> int | None:
-        return None if shape.layer[0] in skip else number_of.get(shape.layer[0], shape.layer[0])
+        return (
+            None
+            if shape.layer[0] in skip
+            else number_of.get(shape.layer[0], shape.layer[0])
+        )
 
     for group in flat.alike(content, number, tops=tops, whole=whole).values():
-        found.setdefault(number_of.get(group[0].layer[0], group[0].layer[0]), []).append(group)
+        found.setdefault(
+            number_of.get(group[0].layer[0], group[0].layer[0]), []
+        ).append(group)
     return found
 
 
 def gathered(some: list[list[flat.Shapes]]) -> Layer:
-    """All of them, those of one outline together; they are let go on the way. Points and lines draw nothing."""
+    """All of them, those of one outline together; they are let go on the way. Points
+    and lines draw nothing.
+    """
     corners = [plain(np.asarray(group[0].outline, np.int64)) for group in some]
     some = [group for group, own in zip(some, corners, strict=True) if len(own) > 2]
     outlines = [filled(own) for own in corners if len(own) > 2]
@@ -144,12 +189,17 @@ def gathered(some: list[list[flat.Shapes]]) -> Layer:
 def plain(points: Array) -> Array:
     """Corners without repeats and without those on a straight line."""
     points = points[(points != np.roll(points, 1, axis=0)).any(1)]
-    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    before, after = (
+        points - np.roll(points, 1, axis=0),
+        np.roll(points, -1, axis=0) - points,
+    )
     return np.asarray(points[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]])
 
 
 def filled(points: Array) -> Array:
-    """Corners without dents shallower than a unit, which rounding leaves in turned and round shapes."""
+    """Corners without dents shallower than a unit, which rounding leaves in turned and
+    round shapes.
+    """
     if is_convex(points) or len(points) < 4:
         return points
     from scipy.spatial import ConvexHull
@@ -161,7 +211,10 @@ def filled(points: Array) -> Array:
 
 def is_convex(points: Array) -> bool:
     """Whether corners turn left all the way around, once."""
-    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    before, after = (
+        points - np.roll(points, 1, axis=0),
+        np.roll(points, -1, axis=0) - points,
+    )
     if (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).min() <= 0:
         return False
     turned = np.unwrap(np.arctan2(after[:, 1], after[:, 0]))

@@ -1,4 +1,6 @@
-"""Files beside the mask for KLayout: the layers with names and colours (.lyp), the violations as markers (.lyrdb)."""
+"""Files beside the mask for KLayout: the layers with names and colours (.lyp), the
+violations as markers (.lyrdb).
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +11,16 @@ from layout.mask import MaskPlan
 from layout.rules.report import DrcReport, Violation
 from metalens.ground import store
 
-_COLOURS = ("#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#4b7f52", "#b56576", "#355070")
+_COLOURS = (
+    "#1f6feb",
+    "#d1495b",
+    "#2a9d8f",
+    "#e9a23b",
+    "#6d597a",
+    "#4b7f52",
+    "#b56576",
+    "#355070",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +46,10 @@ def write_lyp(plan: MaskPlan, path: str | Path) -> None:
         for key, value in (
             ("frame-color", colour),
             ("fill-color", colour),
-            ("dither-pattern", _HOLLOW if name in ("aperture", "outline", "fields") else _DOTTED),
+            (
+                "dither-pattern",
+                _HOLLOW if name in ("aperture", "outline", "fields") else _DOTTED,
+            ),
             ("visible", "true"),
             ("name", name),
             ("source", f"{layer[0]}/{layer[1]}@1"),
@@ -52,7 +66,9 @@ def layers(plan: MaskPlan) -> list[tuple[int, int]]:
 
 
 def write_lyrdb(plan: Named, report: DrcReport, path: str | Path) -> None:
-    """Marker database of a check: one category for each rule, one box for each listed violation."""
+    """Marker database of a check: one category for each rule, one box for each listed
+    violation.
+    """
     root = ElementTree.Element("report-database")
     for key, value in (
         ("description", "design-rule check of pillars as drawn"),
@@ -66,7 +82,9 @@ def write_lyrdb(plan: Named, report: DrcReport, path: str | Path) -> None:
     for rule, count in report.counts.items():
         category = ElementTree.SubElement(categories, "category")
         ElementTree.SubElement(category, "name").text = rule
-        ElementTree.SubElement(category, "description").text = f"{count:,} violations, limit {report.limits[rule]:g}"
+        ElementTree.SubElement(
+            category, "description"
+        ).text = f"{count:,} violations, limit {report.limits[rule]:g}"
         ElementTree.SubElement(category, "categories")
     cell = ElementTree.SubElement(ElementTree.SubElement(root, "cells"), "cell")
     for key, value in (("name", plan.name), ("variant", ""), ("layout-name", "")):
@@ -102,4 +120,8 @@ def _values(plan: Named, violation: Violation) -> Iterator[str]:
 
 def _text(root: ElementTree.Element) -> str:
     ElementTree.indent(root, " ")
-    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return (
+        '<?xml version="1.0" encoding="utf-8"?>\n'
+        + ElementTree.tostring(root, encoding="unicode")
+        + "\n"
+    )

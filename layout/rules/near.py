@@ -1,7 +1,10 @@
-"""Pairs of shapes that can be nearer than a rule, of any sizes, by bins in sorted order: no tree, no object for each.
+"""Pairs of shapes that can be nearer than a rule, of any sizes, by bins in sorted
+order: no tree, no object for each.
 
-Shapes of like size (within a factor of four) are sorted into squares as wide as two of the largest and the rule: those
-that can be near each other lie in neighbouring squares. Of many shapes a band of rows is sorted after the other.
+Shapes of like size (within a factor of four) are sorted into squares as wide as two of
+the largest and the rule: those
+that can be near each other lie in neighbouring squares. Of many shapes a band of rows
+is sorted after the other.
 """
 
 import itertools
@@ -26,7 +29,9 @@ _BEYOND = 1 << 31  # above all places
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Discs:
-    """Circles around shapes: x, y, kind (n,) int32; middle (kinds, 2), seen from the place, and reach (kinds,)."""
+    """Circles around shapes: x, y, kind (n,) int32; middle (kinds, 2), seen from the
+    place, and reach (kinds,).
+    """
 
     x: Array
     y: Array
@@ -37,7 +42,8 @@ class Discs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Group:
-    """Shapes of like size by square. order: (n,) their numbers, in the order of the squares; widest: largest reach.
+    """Shapes of like size by square. order: (n,) their numbers, in the order of the
+    squares; widest: largest reach.
 
     seeks: pairs with them are wanted.
     """
@@ -48,8 +54,11 @@ class _Group:
     seeks: bool
 
 
-def pairs(discs: Discs, gap: float, *, beside: Array | None = None) -> tuple[Array, Array]:
-    """(m,) first and second of all pairs whose circles are nearer than ``gap``, each once.
+def pairs(
+    discs: Discs, gap: float, *, beside: Array | None = None
+) -> tuple[Array, Array]:
+    """(m,) first and second of all pairs whose circles are nearer than ``gap``, each
+    once.
 
     beside: (kinds,) bool: only pairs with one of these kinds at least. None: all pairs.
 
@@ -70,11 +79,15 @@ def pairs(discs: Discs, gap: float, *, beside: Array | None = None) -> tuple[Arr
     return np.concatenate([nothing, *ones]), np.concatenate([nothing, *twos])
 
 
-def _banded(discs: Discs, gap: float, beside: Array | None) -> Iterator[tuple[Array, Array]]:
+def _banded(
+    discs: Discs, gap: float, beside: Array | None
+) -> Iterator[tuple[Array, Array]]:
     """As :func:`pairs`, piece by piece.
 
-    A band holds its own rows and those above them that its shapes can reach; a pair counts where its lower place is.
-    The few widest kinds, which reach over many rows, join every band, and count with the other one of their pair.
+    A band holds its own rows and those above them that its shapes can reach; a pair
+    counts where its lower place is.
+    The few widest kinds, which reach over many rows, join every band, and count with
+    the other one of their pair.
     """
     if len(discs.kind) <= _BAND:
         yield from _found(discs, _groups(discs, gap, beside), gap)
@@ -92,7 +105,9 @@ def _banded(discs: Discs, gap: float, beside: Array | None) -> Iterator[tuple[Ar
 
 
 def _bands(discs: Discs, gap: float) -> tuple[Array, list[int], int]:
-    """(kinds,) which join every band; edges of the bands along y; how far above its band a place can be reached."""
+    """(kinds,) which join every band; edges of the bands along y; how far above its
+    band a place can be reached.
+    """
     extent = np.abs(discs.middle[:, 1]) + discs.reach
     order = np.argsort(-extent)
     before = np.cumsum(np.bincount(discs.kind, minlength=len(extent))[order])
@@ -101,7 +116,9 @@ def _bands(discs: Discs, gap: float) -> tuple[Array, list[int], int]:
     reach = int(np.ceil(2 * extent[~wide].max() + gap))
     low, high = int(discs.y.min()), int(discs.y.max())
     count = int(np.clip((high - low) // (2 * reach), 1, -(-len(discs.kind) // _BAND)))
-    inner = np.quantile(discs.y[:: max(1, len(discs.kind) >> 16)], np.arange(1, count) / count).astype(np.int64)
+    inner = np.quantile(
+        discs.y[:: max(1, len(discs.kind) >> 16)], np.arange(1, count) / count
+    ).astype(np.int64)
     return wide, [low, *inner.tolist(), _BEYOND + 1], reach
 
 
@@ -126,32 +143,66 @@ def _group(discs: Discs, kinds: Array, gap: float, *, seeks: bool) -> _Group:
     return _Group(members[squares.order], squares, widest, seeks)
 
 
-def _found(discs: Discs, groups: list[_Group], gap: float) -> Iterator[tuple[Array, Array]]:
+def _found(
+    discs: Discs, groups: list[_Group], gap: float
+) -> Iterator[tuple[Array, Array]]:
     """Pairs within each group, and of each with all before it, that are not larger."""
     shapes = (discs.x, discs.y, discs.kind, discs.middle, discs.reach)
     out = np.empty((2, _AT_ONCE), np.int32)
     for n, one in enumerate(groups):
         own: tuple[Any, ...] = (one.order, one.squares.key, one.squares.columns)
         if one.seeks:
-            yield from _collected(partial(_within, *own, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
+            yield from _collected(
+                partial(_within, *own, *shapes, gap),  # type: ignore[call-arg]
+                len(one.order),
+                out,
+            )
         for two in (some for some in groups[:n] if one.seeks or some.seeks):
             s = two.squares
-            other: tuple[Any, ...] = (one.order, two.order, s.key, s.left, s.bottom, s.side, s.columns, two.widest)
-            yield from _collected(partial(_across, *other, *shapes, gap), len(one.order), out)  # type: ignore[call-arg]
+            other: tuple[Any, ...] = (
+                one.order,
+                two.order,
+                s.key,
+                s.left,
+                s.bottom,
+                s.side,
+                s.columns,
+                two.widest,
+            )
+            yield from _collected(
+                partial(_across, *other, *shapes, gap),  # type: ignore[call-arg]
+                len(one.order),
+                out,
+            )
 
 
-def _collected(step: Callable[[int, Array], tuple[int, int]], total: int, out: Array) -> Iterator[tuple[Array, Array]]:
-    """Pairs of all shapes, as many at once as ``out`` holds; ``step``: from a shape on, (next shape, pairs)."""
+def _collected(
+    step: Callable[[int, Array], tuple[int, int]], total: int, out: Array
+) -> Iterator[tuple[Array, Array]]:
+    """Pairs of all shapes, as many at once as ``out`` holds; ``step``: from a shape on,
+    (next shape, pairs).
+    """
     first = 0
     while first < total:
         first, count = step(first, out)
         if count == 0 and first < total:
-            raise MaskFileError(f"more than {out.shape[1]:,} shapes lie on one; the file is no mask")
+            raise MaskFileError(
+                f"more than {out.shape[1]:,} shapes lie on one; the file is no mask"
+            )
         yield out[0, :count].copy(), out[1, :count].copy()
 
 
 @compiled
-def _close(i: int, j: int, x: Array, y: Array, kind: Array, middle: Array, reach: Array, gap: float) -> bool:
+def _close(
+    i: int,
+    j: int,
+    x: Array,
+    y: Array,
+    kind: Array,
+    middle: Array,
+    reach: Array,
+    gap: float,
+) -> bool:
     a, b = kind[i], kind[j]
     dx = (x[i] + middle[a, 0]) - (x[j] + middle[b, 0])
     dy = (y[i] + middle[a, 1]) - (y[j] + middle[b, 1])
@@ -173,14 +224,20 @@ def _within(
     first: int,
     out: Array,
 ) -> tuple[int, int]:
-    """Pairs of a group from its shape ``first`` on, until ``out`` is full: next shape, pairs."""
+    """Pairs of a group from its shape ``first`` on, until ``out`` is full: next shape,
+    pairs.
+    """
     count, total = 0, key.shape[0]
     above = np.searchsorted(key, key[first] + columns - 1)
     for at in range(first, total):
         begin, i, here = count, order[at], key[at]
         above = first_from(key, here + columns - 1, above)
         for part in range(2):
-            other, last = (at + 1, here + 1) if part == 0 else (max(above, at + 1), here + columns + 1)
+            other, last = (
+                (at + 1, here + 1)
+                if part == 0
+                else (max(above, at + 1), here + columns + 1)
+            )
             while other < total and key[other] <= last:
                 if _close(i, order[other], x, y, kind, middle, reach, gap):
                     if count == out.shape[1]:
@@ -210,15 +267,22 @@ def _across(
     first: int,
     out: Array,
 ) -> tuple[int, int]:
-    """Pairs of shapes ``some`` from ``first`` on with a sorted group of smaller ones: next shape, pairs."""
+    """Pairs of shapes ``some`` from ``first`` on with a sorted group of smaller ones:
+    next shape, pairs.
+    """
     count, total = 0, key.shape[0]
     last_row = key[total - 1] // columns
     for n in range(first, some.shape[0]):
         begin, i = count, some[n]
         px, py = x[i] + middle[kind[i], 0] - left, y[i] + middle[kind[i], 1] - bottom
         far = reach[kind[i]] + widest + gap
-        low, high = max(int((px - far) // side) + 1, 0), min(int((px + far) // side) + 1, columns - 1)
-        for row in range(max(int((py - far) // side), 0), min(int((py + far) // side), last_row) + 1):
+        low, high = (
+            max(int((px - far) // side) + 1, 0),
+            min(int((px + far) // side) + 1, columns - 1),
+        )
+        for row in range(
+            max(int((py - far) // side), 0), min(int((py + far) // side), last_row) + 1
+        ):
             if low > high:
                 break
             other = np.searchsorted(key, row * columns + low)

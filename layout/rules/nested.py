@@ -1,8 +1,12 @@
-"""Large cells that are placed again and again, looked at once: what stands near other shapes is taken out of them.
+"""Large cells that are placed again and again, looked at once: what stands near other
+shapes is taken out of them.
 
-Shapes that are nearer to each other than the gap form groups, and groups are checked one by one. A group of a cell that
-stays further than the gap from all that is drawn around every copy of the cell is the same in each copy: it is checked
-once. The others are drawn in the cells that hold the copies, and checked there or, by the same rule, further up.
+Shapes that are nearer to each other than the gap form groups, and groups are checked
+one by one. A group of a cell that
+stays further than the gap from all that is drawn around every copy of the cell is the
+same in each copy: it is checked
+once. The others are drawn in the cells that hold the copies, and checked there or, by
+the same rule, further up.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,13 +22,16 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
 _AT_ONCE = 1 << 18  # shapes whose boxes are looked at together
-_SQUARES = 1024  # each way, in which a cell is marked where others are near it, or where it draws
+# each way, in which a cell is marked where others are near it, or where it draws
+_SQUARES = 1024
 _MOST_BOXES = 1 << 22  # that are told to copies for what other copies draw
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Held:
-    """Copies within one cell that draw anything: which of ``copies`` each is (n,), its place and (n, 4) its box."""
+    """Copies within one cell that draw anything: which of ``copies`` each is (n,), its
+    place and (n, 4) its box.
+    """
 
     copies: list[Copies]
     which: Array
@@ -35,10 +42,13 @@ class _Held:
 
 @dataclass(eq=False, slots=True)
 class _Work:
-    """One layer number. drawn: shapes of each cell; those that are taken out of others join them. count: of all these.
+    """One layer number. drawn: shapes of each cell; those that are taken out of others
+    join them. count: of all these.
 
-    box: (4,) around all of a cell. held: its copies. met: boxes (n, 4) of what is drawn around the copies of a cell, as
-    they see it. covered: boxes (n, 4) of what a cell draws, in so many squares each way.
+    box: (4,) around all of a cell. held: its copies. met: boxes (n, 4) of what is drawn
+    around the copies of a cell, as
+    they see it. covered: boxes (n, 4) of what a cell draws, in so many squares each
+    way.
     """
 
     parts: Parts
@@ -52,8 +62,11 @@ class _Work:
     covered: dict[tuple[str, int], Array] = field(default_factory=dict)
 
 
-def separate(parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int) -> Iterator[tuple[str, Layer]]:
-    """(cell, shapes) that are to be checked by themselves, each as often as ``parts.times`` tells.
+def separate(
+    parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int
+) -> Iterator[tuple[str, Layer]]:
+    """(cell, shapes) that are to be checked by themselves, each as often as
+    ``parts.times`` tells.
 
     Args:
         drawn: shapes of each cell of ``parts.times`` without the copies that it holds.
@@ -66,7 +79,13 @@ def separate(parts: Parts, drawn: Mapping[str, Layer], gap: float, most: int) ->
         yield from ((name, layer) for name, layer in drawn.items() if len(layer.kind))
         return
     every = {name: [drawn.get(name, EMPTY)] for name in parts.times}
-    work = _Work(parts, max(gap, 1.0), most, every, sum(len(layer.kind) for layer in drawn.values()))
+    work = _Work(
+        parts,
+        max(gap, 1.0),
+        most,
+        every,
+        sum(len(layer.kind) for layer in drawn.values()),
+    )
     for name in reversed(parts.times):
         _around(work, name)
     if ROOT in work.box and np.abs(work.box[ROOT]).max() > 2**31 - 1:
@@ -83,8 +102,15 @@ def _around(work: _Work, name: str) -> None:
     """Boxes of the copies that a cell holds, and around all of it."""
     copies = [some for some in work.parts.placed[name] if some.child in work.box]
     which = np.repeat(np.arange(len(copies)), [len(some.x) for some in copies])
-    x, y = (np.concatenate([np.empty(0, np.int64), *(getattr(some, axis) for some in copies)]) for axis in "xy")
-    own = np.array([some.turn.boxes(work.box[some.child][None])[0] for some in copies]).reshape(-1, 4)
+    x, y = (
+        np.concatenate(
+            [np.empty(0, np.int64), *(getattr(some, axis) for some in copies)]
+        )
+        for axis in "xy"
+    )
+    own = np.array(
+        [some.turn.boxes(work.box[some.child][None])[0] for some in copies]
+    ).reshape(-1, 4)
     boxes = own.astype(np.int64)[which] + np.column_stack([x, y, x, y])
     work.held[name] = _Held(copies, which, x, y, boxes)
     every = np.concatenate([boxes, work.drawn[name][0].around])
@@ -97,7 +123,9 @@ def _meet(work: _Work, name: str) -> None:
     held, layer = work.held[name], work.drawn[name][0]
     if not len(held.which):
         return
-    met = np.unique(np.concatenate(work.met.get(name, [np.empty((0, 4), np.int64)])), axis=0)
+    met = np.unique(
+        np.concatenate(work.met.get(name, [np.empty((0, 4), np.int64)])), axis=0
+    )
     _enter_each(work, held, np.arange(len(held.which)), met)
     shapes = len(layer.kind)
     for one, two in _near(held, layer, work.gap):
@@ -113,30 +141,45 @@ def _meet(work: _Work, name: str) -> None:
 
 
 def _meet_copies(work: _Work, held: _Held, one: Array, two: Array) -> None:
-    """Tell copies ``one`` what copies ``two`` draw near them: in finer squares, the fewer these pairs are."""
+    """Tell copies ``one`` what copies ``two`` draw near them: in finer squares, the
+    fewer these pairs are.
+    """
     touching = _touch(held.box[one], held.box[two], work.gap)
     one, two = one[touching], two[touching]
     squares = _squares(len(two), _SQUARES)
     for n in np.unique(two).tolist():
         some = held.copies[held.which[n]]
         place = np.array([held.x[n], held.y[n]] * 2)
-        _enter_each(work, held, one[two == n], some.turn.boxes(_covered(work, some.child, squares)) + place)
+        _enter_each(
+            work,
+            held,
+            one[two == n],
+            some.turn.boxes(_covered(work, some.child, squares)) + place,
+        )
 
 
 def _covered(work: _Work, name: str, squares: int) -> Array:
-    """(n, 4) boxes that cover all that a cell draws, its own copies included, in ``squares`` each way."""
+    """(n, 4) boxes that cover all that a cell draws, its own copies included, in
+    ``squares`` each way.
+    """
     if squares == 1:
         return work.box[name][None]
     if (name, squares) not in work.covered:
         every = _boxes_drawn(work, name, squares)
-        work.covered[name, squares] = squared.Squared.of(work.box[name], squares, every).boxes()
+        work.covered[name, squares] = squared.Squared.of(
+            work.box[name], squares, every
+        ).boxes()
     return work.covered[name, squares]
 
 
 def _boxes_drawn(work: _Work, name: str, squares: int) -> Iterator[Array]:
-    """Boxes (n, 4) of what a cell draws: of its shapes, those that are wide in pieces, and of its copies."""
+    """Boxes (n, 4) of what a cell draws: of its shapes, those that are wide in pieces,
+    and of its copies.
+    """
     layer, held = work.drawn[name][0], work.held[name]
-    wide = np.array([np.ptp(o, axis=0).max() for o in layer.outlines]) > 4 / squares * np.ptp(work.box[name][[0, 2]])
+    wide = np.array(
+        [np.ptp(o, axis=0).max() for o in layer.outlines]
+    ) > 4 / squares * np.ptp(work.box[name][[0, 2]])
     for first in range(0, len(layer.kind), _AT_ONCE):
         some = np.arange(first, min(first + _AT_ONCE, len(layer.kind)))
         in_pieces = wide[layer.kind[some]]
@@ -151,7 +194,9 @@ def _boxes_drawn(work: _Work, name: str, squares: int) -> Iterator[Array]:
 
 
 def _squares(times: int, most: int) -> int:
-    """Squares each way of a cell whose boxes are told so many times: as fine as their number allows."""
+    """Squares each way of a cell whose boxes are told so many times: as fine as their
+    number allows.
+    """
     return 1 << int(np.log2(np.clip(_MOST_BOXES // (4 * max(times, 1)), 1, most)))
 
 
@@ -162,11 +207,18 @@ def _pieces(layer: Layer, kind: int, shapes: Array) -> Array:
 
 
 def _near(held: _Held, layer: Layer, gap: float) -> Iterator[tuple[Array, Array]]:
-    """(copies, others) that can be nearer than ``gap``: numbers of shapes, and behind these of copies."""
+    """(copies, others) that can be nearer than ``gap``: numbers of shapes, and behind
+    these of copies.
+    """
     wide = np.array([held.box[held.which == n][0] for n in range(len(held.copies))])
-    first = np.array([np.flatnonzero(held.which == n)[0] for n in range(len(held.copies))])
+    first = np.array(
+        [np.flatnonzero(held.which == n)[0] for n in range(len(held.copies))]
+    )
     place = np.column_stack([held.x[first], held.y[first]])
-    middle, reach = (wide[:, :2] + wide[:, 2:]) / 2 - place, np.hypot(*(wide[:, 2:] - wide[:, :2]).T) / 2
+    middle, reach = (
+        (wide[:, :2] + wide[:, 2:]) / 2 - place,
+        np.hypot(*(wide[:, 2:] - wide[:, :2]).T) / 2,
+    )
     own, kinds = layer.discs, len(layer.outlines)
     every = near.Discs(
         np.concatenate([own.x, held.x.astype(np.int32)]),
@@ -188,7 +240,9 @@ def _enter_each(work: _Work, held: _Held, copy: Array, boxes: Array) -> None:
 
 
 def _enter(work: _Work, held: _Held, copy: Array, boxes: Array) -> None:
-    """Boxes (n, 4) that are drawn beside copies (n,), where they are near: as the copies see them."""
+    """Boxes (n, 4) that are drawn beside copies (n,), where they are near: as the
+    copies see them.
+    """
     near_by = _touch(held.box[copy], boxes, work.gap)
     copy, boxes = copy[near_by], boxes[near_by]
     for n in np.unique(held.which[copy]).tolist():
@@ -201,25 +255,37 @@ def _enter(work: _Work, held: _Held, copy: Array, boxes: Array) -> None:
 def _covering(outline: Array) -> Array:
     """Boxes that cover a polygon: the one around it where it overlaps itself."""
     pieces = rectilinear.covering(outline)
-    overlapping = ((pieces[:, 2:] - pieces[:, :2]).prod(1)).sum() < abs(polygon.twice_area(outline)) / 2
+    overlapping = ((pieces[:, 2:] - pieces[:, :2]).prod(1)).sum() < abs(
+        polygon.twice_area(outline)
+    ) / 2
     return np.array([[*outline.min(0), *outline.max(0)]]) if overlapping else pieces
 
 
 def _taken_out(work: _Work, name: str) -> Layer:
-    """The shapes of a cell that are the same in all copies; the others are drawn where the copies are."""
+    """The shapes of a cell that are the same in all copies; the others are drawn where
+    the copies are.
+    """
     layer, met = joined(work.drawn.pop(name)), work.met.pop(name, [])
     if not met or not len(layer.kind):
         return layer
     boxes = np.unique(np.concatenate(met), axis=0) + work.gap * np.array([-1, -1, 1, 1])
     around = squared.Squared.of(work.box[name], _SQUARES, [boxes])
     hit = np.concatenate(
-        [around.touched(layer.boxes(slice(n, n + _AT_ONCE))) for n in range(0, len(layer.kind), _AT_ONCE)]
+        [
+            around.touched(layer.boxes(slice(n, n + _AT_ONCE)))
+            for n in range(0, len(layer.kind), _AT_ONCE)
+        ]
     )
     if not hit.any():
         return layer
     taken = _with_their_groups(layer, hit, work.gap)
     some = layer.only(taken)
-    holding = [(above, c) for above in work.drawn for c in work.parts.placed[above] if c.child == name]
+    holding = [
+        (above, c)
+        for above in work.drawn
+        for c in work.parts.placed[above]
+        if c.child == name
+    ]
     copies = sum(len(c.x) for _, c in holding)
     work.count += len(some.kind) * copies
     if work.count > work.most:
@@ -252,4 +318,6 @@ def _with_their_groups(layer: Layer, hit: Array, gap: float) -> Array:
 
 def _touch(one: Array, two: Array, gap: float) -> Array:
     """(n,) whether boxes (n, 4) are as near as ``gap``, along x and along y."""
-    return np.asarray(((one[:, :2] - two[:, 2:] <= gap) & (two[:, :2] - one[:, 2:] <= gap)).all(1))
+    return np.asarray(
+        ((one[:, :2] - two[:, 2:] <= gap) & (two[:, :2] - one[:, 2:] <= gap)).all(1)
+    )

@@ -19,7 +19,16 @@ class HasUnit(Protocol):
         ...
 
 
-RULES = ("gap", "overlap", "foot", "feature", "off-grid", "density", "exclusion", "structures")
+RULES = (
+    "gap",
+    "overlap",
+    "foot",
+    "feature",
+    "off-grid",
+    "density",
+    "exclusion",
+    "structures",
+)
 MOST_SHOWN = 500  # of one rule
 
 
@@ -27,7 +36,8 @@ MOST_SHOWN = 500  # of one rule
 class Violation:
     """One place where a rule is broken.
 
-    box: (left, bottom, right, top) around it, database units. value, limit: found and allowed (nm, or a share).
+    box: (left, bottom, right, top) around it, database units. value, limit: found and
+    allowed (nm, or a share).
     text: the cells that are concerned.
     """
 
@@ -45,15 +55,19 @@ class Violation:
 
 def told(size_nm: float | None) -> str:
     """A size that was found, with its unit; "none" where there was nothing to measure."""
-    return "none" if size_nm is None or not math.isfinite(size_nm) else f"{size_nm:.1f} nm"
+    return (
+        "none" if size_nm is None or not math.isfinite(size_nm) else f"{size_nm:.1f} nm"
+    )
 
 
 @dataclass(eq=False, slots=True)
 class DrcReport:
     """Result of the check.
 
-    pillars: all that were checked. counts: {rule: violations}, all of them; ``violations`` lists up to 500 of each.
-    minimum_gap_nm, minimum_foot_gap_nm, minimum_feature_nm: the smallest found (inf where there is none).
+    pillars: all that were checked. counts: {rule: violations}, all of them;
+    ``violations`` lists up to 500 of each.
+    minimum_gap_nm, minimum_foot_gap_nm, minimum_feature_nm: the smallest found (inf
+    where there is none).
     maximum_density: of any window.
     limits: {rule: limit}. limit_gap: in database units.
     """
@@ -92,10 +106,18 @@ class DrcReport:
 
     @property
     def sizes(self) -> dict[str, float | None]:
-        """The smallest gap and feature that were found; None where there was nothing to measure."""
-        found = {"minimum_gap_nm": self.minimum_gap_nm, "minimum_feature_nm": self.minimum_feature_nm}
+        """The smallest gap and feature that were found; None where there was nothing to
+        measure.
+        """
+        found = {
+            "minimum_gap_nm": self.minimum_gap_nm,
+            "minimum_feature_nm": self.minimum_feature_nm,
+        }
         found |= {"minimum_foot_gap_nm": self.minimum_foot_gap_nm}
-        return {name: value if math.isfinite(value) else None for name, value in found.items()}
+        return {
+            name: value if math.isfinite(value) else None
+            for name, value in found.items()
+        }
 
     def has_room(self, rule: str) -> bool:
         """Whether another violation of a rule would be listed."""
@@ -106,29 +128,40 @@ class DrcReport:
         self.add_all(rule, count, () if violation is None else (violation,))
 
     def add_all(self, rule: str, count: int, shown: Iterable[Violation]) -> None:
-        """Count violations; list the first of them, as many as lists hold: no more of ``shown`` are made."""
+        """Count violations; list the first of them, as many as lists hold: no more of
+        ``shown`` are made.
+        """
         self.counts[rule] += count
         before = len(self.violations)
         self.violations += itertools.islice(shown, MOST_SHOWN - self._listed[rule])
         self._listed[rule] += len(self.violations) - before
 
     def exchanged(self) -> "DrcReport":
-        """The report with gaps as features and features as gaps, of a mask whose clear areas stay."""
+        """The report with gaps as features and features as gaps, of a mask whose clear
+        areas stay.
+        """
         name = {"gap": "feature", "feature": "gap"}
         other = dataclasses.replace(
             self,
             minimum_gap_nm=self.minimum_feature_nm,
             minimum_feature_nm=self.minimum_gap_nm,
             counts={rule: self.counts[name.get(rule, rule)] for rule in RULES},
-            violations=[dataclasses.replace(v, rule=name.get(v.rule, v.rule)) for v in self.violations],
+            violations=[
+                dataclasses.replace(v, rule=name.get(v.rule, v.rule))
+                for v in self.violations
+            ],
         )
         other._listed = {rule: self._listed[name.get(rule, rule)] for rule in RULES}
         return other
 
     @property
     def broken(self) -> str:
-        """The rules that are broken, with how often, for a person; empty where all are kept."""
-        return ", ".join(f"{count:,} {rule}" for rule, count in self.counts.items() if count)
+        """The rules that are broken, with how often, for a person; empty where all are
+        kept.
+        """
+        return ", ".join(
+            f"{count:,} {rule}" for rule, count in self.counts.items() if count
+        )
 
     @property
     def summary(self) -> str:

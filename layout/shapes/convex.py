@@ -20,7 +20,9 @@ def hull(points: Array) -> Array:
 
 
 def width(points: Array) -> float:
-    """Least distance of two parallel lines with the polygon between them: one of them runs along an edge."""
+    """Least distance of two parallel lines with the polygon between them: one of them
+    runs along an edge.
+    """
     edges = np.roll(points, -1, axis=0) - points
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])
     spans = normals @ points.T
@@ -28,7 +30,9 @@ def width(points: Array) -> float:
 
 
 def gap(first: Array, second: Array, dx: int, dy: int) -> float:
-    """Distance from ``first`` to ``second`` moved by (dx, dy); 0 where they touch, -1 where they overlap."""
+    """Distance from ``first`` to ``second`` moved by (dx, dy); 0 where they touch, -1
+    where they overlap.
+    """
     moved = second + np.array([dx, dy])
     apart = max(_separation(first, moved), _separation(moved, first))
     if apart <= 0:
@@ -37,7 +41,9 @@ def gap(first: Array, second: Array, dx: int, dy: int) -> float:
 
 
 def _separation(a: Array, b: Array) -> int:
-    """Above 0 where a line along an edge of ``a`` separates them, 0 where one touches, else below."""
+    """Above 0 where a line along an edge of ``a`` separates them, 0 where one touches,
+    else below.
+    """
     edges = np.roll(a, -1, axis=0) - a
     normals = np.column_stack([edges[:, 1], -edges[:, 0]])
     return int(((normals @ b.T).min(1) - (normals * a).sum(1)).max())

@@ -1,4 +1,6 @@
-"""Polygons with holes: area, moments and edges, by Green's theorem; outlines counter-clockwise, holes clockwise."""
+"""Polygons with holes: area, moments and edges, by Green's theorem; outlines
+counter-clockwise, holes clockwise.
+"""
 
 from collections.abc import Sequence
 
@@ -10,7 +12,9 @@ Contours = Sequence[Array]  # (n, 2) each
 
 
 def moments(contours: Contours) -> tuple[float, Array, float]:
-    """Area, (2,) integral of x and y over it, and integral of x² + y²; of a hole alone the area is below 0."""
+    """Area, (2,) integral of x and y over it, and integral of x² + y²; of a hole alone
+    the area is below 0.
+    """
     area, first, second = 0.0, np.zeros(2), 0.0
     for a in contours:
         b = np.roll(a, -1, axis=0)

@@ -13,14 +13,20 @@ _SLICE = 5000  # units
 
 
 def rectangles(points: Array) -> Array:
-    """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by slab.
+    """(n, 4) left, bottom, right, top of a simple rectilinear polygon (m, 2), slab by
+    slab.
 
     Raises:
         ProcessError: an edge that is neither horizontal nor vertical.
     """
-    start, end = np.asarray(points, np.int64), np.roll(np.asarray(points, np.int64), -1, axis=0)
+    start, end = (
+        np.asarray(points, np.int64),
+        np.roll(np.asarray(points, np.int64), -1, axis=0),
+    )
     if ((start != end).all(axis=1)).any():
-        raise ProcessError("a shape with slanted edges where horizontal and vertical ones are needed")
+        raise ProcessError(
+            "a shape with slanted edges where horizontal and vertical ones are needed"
+        )
     upright = start[:, 0] == end[:, 0]
     x = start[upright, 0]
     low, high = np.minimum(start, end)[upright, 1], np.maximum(start, end)[upright, 1]
@@ -28,12 +34,17 @@ def rectangles(points: Array) -> Array:
     found = []
     for bottom, top in zip(levels[:-1].tolist(), levels[1:].tolist(), strict=True):
         cut = np.sort(x[(low <= bottom) & (high >= top)])
-        found += [(left, bottom, right, top) for left, right in zip(cut[::2].tolist(), cut[1::2].tolist(), strict=True)]
+        found += [
+            (left, bottom, right, top)
+            for left, right in zip(cut[::2].tolist(), cut[1::2].tolist(), strict=True)
+        ]
     return np.array(found, np.int64).reshape(-1, 4)
 
 
 def covering(shape: Array) -> Array:
-    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of slices 5 um high or more."""
+    """(n, 4) rectangles of a rectilinear polygon; any other one as boxes around it, of
+    slices 5 um high or more.
+    """
     step = np.roll(shape, -1, axis=0) - shape
     if not (step != 0).all(1).any():
         return rectangles(shape)
@@ -46,26 +57,44 @@ def covering(shape: Array) -> Array:
     for bottom, top in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
         inside = (np.maximum(y0, y1) >= bottom) & (np.minimum(y0, y1) <= top)
         along = [np.clip((y - y0) / steep, 0, 1) for y in (bottom, top)]
-        along = [np.where(step[:, 1] == 0, whole, t) for whole, t in zip((0.0, 1.0), along, strict=True)]
+        along = [
+            np.where(step[:, 1] == 0, whole, t)
+            for whole, t in zip((0.0, 1.0), along, strict=True)
+        ]
         x = np.concatenate([(start[:, 0] + t * step[:, 0])[inside] for t in along])
-        made.append([math.floor(x.min()), math.floor(bottom), math.ceil(x.max()), math.ceil(top)])
+        made.append(
+            [
+                math.floor(x.min()),
+                math.floor(bottom),
+                math.ceil(x.max()),
+                math.ceil(top),
+            ]
+        )
     return np.array(made, np.int64)
 
 
 def cut(boxes: Array, side: float, grid: int) -> tuple[Array, Array]:
-    """Boxes (n, 4) cut on the grid to sides of some ``side`` at most: (m, 4), and (m,) the box of each."""
+    """Boxes (n, 4) cut on the grid to sides of some ``side`` at most: (m, 4), and (m,)
+    the box of each.
+    """
     pieces: list[tuple[int, int, int, int]] = []
     of: list[int] = []
     for n, (left, bottom, right, top) in enumerate(np.asarray(boxes).tolist()):
         xs, ys = _steps(left, right, side, grid), _steps(bottom, top, side, grid)
-        pieces += [(a, c, b, d) for a, b in itertools.pairwise(xs) for c, d in itertools.pairwise(ys)]
+        pieces += [
+            (a, c, b, d)
+            for a, b in itertools.pairwise(xs)
+            for c, d in itertools.pairwise(ys)
+        ]
         of += [n] * (len(pieces) - len(of))
     return np.array(pieces, np.int64).reshape(-1, 4), np.array(of, np.int64)
 
 
 def _steps(low: int, high: int, side: float, grid: int) -> list[int]:
     count = max(1, int(np.ceil((high - low) / side)))
-    return np.unique(low + np.rint(np.linspace(0, high - low, count + 1) / grid).astype(np.int64) * grid).tolist()  # type: ignore[no-any-return]
+    offsets = np.rint(np.linspace(0, high - low, count + 1) / grid).astype(np.int64)
+    steps: list[int] = np.unique(low + offsets * grid).tolist()
+    return steps
 
 
 def corners(box: Array) -> Array:

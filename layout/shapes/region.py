@@ -1,4 +1,6 @@
-"""Unions and differences of polygons, by the CrossSection of manifold3d; corners on whole units."""
+"""Unions and differences of polygons, by the CrossSection of manifold3d; corners on
+whole units.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,7 +16,9 @@ def union(polygons: Iterable[Array]) -> list[Array]:
 
 
 def difference(contours: Iterable[Array], taken: Iterable[Array]) -> list[Array]:
-    """Contours of what is left of ``contours`` (outlines counter-clockwise, holes clockwise) without ``taken``."""
+    """Contours of what is left of ``contours`` (outlines counter-clockwise, holes
+    clockwise) without ``taken``.
+    """
     return _contours(_section(contours, filled=False) - _section(taken))
 
 
@@ -24,9 +28,11 @@ def overlap(contours: Iterable[Array], polygons: Iterable[Array]) -> list[Array]
 
 
 def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
-    """The same area as polygons that any mask file holds: cut upright through the middle of each hole, and again.
+    """The same area as polygons that any mask file holds: cut upright through the
+    middle of each hole, and again.
 
-    A cut that slanted edges would end off whole units goes from corner to corner instead, where there is one hole.
+    A cut that slanted edges would end off whole units goes from corner to corner
+    instead, where there is one hole.
 
     Args:
         grid: step of the places of the cuts.
@@ -35,12 +41,16 @@ def without_holes(contours: Sequence[Array], *, grid: int = 1) -> list[Array]:
 
 
 def triangles(contours: Sequence[Array]) -> Array:
-    """(n, 3) corners, numbered on through all contours, of triangles that fill outlines (counter-clockwise) but for
+    """(n, 3) corners, numbered on through all contours, of triangles that fill outlines
+    (counter-clockwise) but for
     their holes (clockwise); they run counter-clockwise.
     """
     from manifold3d import triangulate
 
-    return np.asarray(triangulate([np.asarray(c, float) for c in contours], allow_convex=False), np.int64)
+    return np.asarray(
+        triangulate([np.asarray(c, float) for c in contours], allow_convex=False),
+        np.int64,
+    )
 
 
 def _section(polygons: Iterable[Array], *, filled: bool = True) -> Any:
@@ -66,12 +76,22 @@ def _cut(section: Any, grid: int) -> Iterable[Array]:
             continue
         hole = contours[1]
         x = round(float(hole[:, 0].min() + hole[:, 0].max()) / 2 / grid) * grid
-        if len(contours) == 2 and not all(_ends_exactly(x, contour, grid) for contour in contours):
+        if len(contours) == 2 and not all(
+            _ends_exactly(x, contour, grid) for contour in contours
+        ):
             yield from _bridged(*contours)
             continue
         left, bottom, right, top = part.bounds()
         for low, high in ((left - 1, x), (x, right + 1)):
-            box = np.array([[low, bottom - 1], [high, bottom - 1], [high, top + 1], [low, top + 1]], float)
+            box = np.array(
+                [
+                    [low, bottom - 1],
+                    [high, bottom - 1],
+                    [high, top + 1],
+                    [low, top + 1],
+                ],
+                float,
+            )
             yield from _cut(part ^ CrossSection([box]), grid)
 
 
@@ -86,9 +106,11 @@ def _ends_exactly(x: int, contour: Array, grid: int) -> bool:
 
 
 def _bridged(outer: Array, hole: Array) -> tuple[Array, Array]:
-    """The area between an outline (counter-clockwise) and its hole (clockwise) in two, without further corners.
+    """The area between an outline (counter-clockwise) and its hole (clockwise) in two,
+    without further corners.
 
-    Cut from the hole's corners to those of the outline: the shortest way that meets no edge, and one as far from it
+    Cut from the hole's corners to those of the outline: the shortest way that meets no
+    edge, and one as far from it
     along the hole as there is (of those, the shortest).
     """
     i, j = (v.ravel() for v in np.indices((len(outer), len(hole))))
@@ -103,8 +125,12 @@ def _bridged(outer: Array, hole: Array) -> tuple[Array, Array]:
     others[others] = _free(outer[i[others]], hole[j[others]], (ends,))
     last = min(np.flatnonzero(others).tolist(), key=lambda n: (-away[n], long[n]))
     return (
-        np.concatenate([_between(outer, i[first], i[last]), _between(hole, j[last], j[first])]),
-        np.concatenate([_between(outer, i[last], i[first]), _between(hole, j[first], j[last])]),
+        np.concatenate(
+            [_between(outer, i[first], i[last]), _between(hole, j[last], j[first])]
+        ),
+        np.concatenate(
+            [_between(outer, i[last], i[first]), _between(hole, j[first], j[last])]
+        ),
     )
 
 
@@ -114,7 +140,9 @@ def _between(contour: Array, first: int, last: int) -> Array:
 
 
 def _free(start: Array, end: Array, contours: Sequence[Array]) -> Array:
-    """(n,) whether lines between whole points touch no edge, but for edges that end where they do."""
+    """(n,) whether lines between whole points touch no edge, but for edges that end
+    where they do.
+    """
     free = np.ones(len(start), bool)
     for contour in contours:
         for p, q in zip(contour, np.roll(contour, -1, axis=0), strict=True):

@@ -1,7 +1,10 @@
-"""The camera module around the lens as solids: filter, die with aperture, mount, sensor, flex, held by joints.
+"""The camera module around the lens as solids: filter, die with aperture, mount,
+sensor, flex, held by joints.
 
-The stack that the paper proposes for smart glasses (Sec. 6): 0.5 mm NIR filter, 0.3 mm substrate, 2 mm to the sensor,
-a package of 0.5 mm, a flex of 0.2 mm: 3.5 mm in all, less than 2 mm wide. z runs with the light from the pillars' feet.
+The stack that the paper proposes for smart glasses (Sec. 6): 0.5 mm NIR filter, 0.3 mm
+substrate, 2 mm to the sensor,
+a package of 0.5 mm, a flex of 0.2 mm: 3.5 mm in all, less than 2 mm wide. z runs with
+the light from the pillars' feet.
 """
 
 from dataclasses import dataclass, replace
@@ -29,10 +32,14 @@ COLOURS = {
 class Module:
     """Sizes in mm.
 
-    filter_mm, substrate_mm, spacing_mm, sensor_mm, flex_mm: thicknesses along the light.
-    side_mm: of the mount; filter_side_mm, die_side_mm, sensor_side_mm: of what it holds.
-    aperture_mm: diameter of the lens. clearance_mm: on each side between the mount and what slides into it.
-    ledge_mm: thickness of the shelf that the die rests on. film_mm: of the aperture metal. height_mm: of the pillars.
+    filter_mm, substrate_mm, spacing_mm, sensor_mm, flex_mm: thicknesses along the
+    light.
+    side_mm: of the mount; filter_side_mm, die_side_mm, sensor_side_mm: of what it
+    holds.
+    aperture_mm: diameter of the lens. clearance_mm: on each side between the mount and
+    what slides into it.
+    ledge_mm: thickness of the shelf that the die rests on. film_mm: of the aperture
+    metal. height_mm: of the pillars.
     """
 
     filter_mm: float = 0.5
@@ -54,8 +61,14 @@ class Module:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
             if not 0 < value < 100:
-                raise ProcessError(f"{name} = {value}: need a length above 0 (and below 100 mm)")
-        for held, room in (("die_side_mm", "side_mm"), ("sensor_side_mm", "side_mm"), ("aperture_mm", "die_side_mm")):
+                raise ProcessError(
+                    f"{name} = {value}: need a length above 0 (and below 100 mm)"
+                )
+        for held, room in (
+            ("die_side_mm", "side_mm"),
+            ("sensor_side_mm", "side_mm"),
+            ("aperture_mm", "die_side_mm"),
+        ):
             wall = (getattr(self, room) - getattr(self, held)) / 2 - self.clearance_mm
             if wall < 0.1:
                 raise ProcessError(
@@ -63,18 +76,28 @@ class Module:
                     f"{getattr(self, room)}, need 0.1: make it smaller"
                 )
         if self.ledge_mm >= self.spacing_mm:
-            raise ProcessError(f"ledge_mm = {self.ledge_mm} fills the spacing of {self.spacing_mm} mm")
+            raise ProcessError(
+                f"ledge_mm = {self.ledge_mm} fills the spacing of {self.spacing_mm} mm"
+            )
 
     @property
     def stack_mm(self) -> float:
         """Thickness of the module."""
-        return self.filter_mm + self.substrate_mm + self.spacing_mm + self.sensor_mm + self.flex_mm
+        return (
+            self.filter_mm
+            + self.substrate_mm
+            + self.spacing_mm
+            + self.sensor_mm
+            + self.flex_mm
+        )
 
 
 def around(lens: Lens, process: Process) -> Module:
-    """A module for a lens: its aperture, height, substrate to sensor distance; wider parts for a wider lens.
+    """A module for a lens: its aperture, height, substrate to sensor distance; wider
+    parts for a wider lens.
 
-    The substrate is that of the paper's stack (0.3 mm), or the die's own where it is thinner.
+    The substrate is that of the paper's stack (0.3 mm), or the die's own where it is
+    thinner.
     """
     default = Module()
     aperture = 2 * (lens.diameters.radius_um + lens.diameters.pitch_um / 2) / 1e3
@@ -96,7 +119,9 @@ def around(lens: Lens, process: Process) -> Module:
 
 @dataclass(frozen=True, slots=True)
 class Clearance:
-    """Two neighbouring parts: their least distance, and the volume they share (0 unless they collide)."""
+    """Two neighbouring parts: their least distance, and the volume they share (0 unless
+    they collide).
+    """
 
     first: str
     second: str
@@ -105,7 +130,9 @@ class Clearance:
 
 
 def assemble(module: Module) -> Any:
-    """build123d ``Compound`` of the module: each part modelled at its own origin and seated by its joint."""
+    """build123d ``Compound`` of the module: each part modelled at its own origin and
+    seated by its joint.
+    """
     from build123d import Color, Compound
 
     parts = _parts(module)
@@ -149,8 +176,12 @@ def _parts(module: Module) -> dict[str, Any]:
     mount -= Pos(0, 0, -module.substrate_mm) * box(die_room, module.substrate_mm + rest)
     mount -= Cylinder(opening / 2, module.spacing_mm, align=bottom)
     below = rest + module.ledge_mm
-    mount -= Pos(0, 0, below) * box(sensor_room, module.spacing_mm + module.sensor_mm - below)
-    film = box(module.die_side_mm, module.film_mm) - Cylinder(module.aperture_mm / 2, module.film_mm, align=bottom)
+    mount -= Pos(0, 0, below) * box(
+        sensor_room, module.spacing_mm + module.sensor_mm - below
+    )
+    film = box(module.die_side_mm, module.film_mm) - Cylinder(
+        module.aperture_mm / 2, module.film_mm, align=bottom
+    )
     return {
         "nir_filter": box(module.filter_side_mm, module.filter_mm),
         "die": box(module.die_side_mm, module.substrate_mm),
@@ -181,13 +212,20 @@ def clearances(assembly: Any) -> list[Clearance]:
             common = first & second
             shared = float(common.volume) if common is not None else 0.0
             if shared > 1e-9:
-                raise ProcessError(f"{first.label} and {second.label} collide: they share {shared:.2g} mm^3")
-            found.append(Clearance(first.label, second.label, float(first.distance_to(second)), shared))
+                raise ProcessError(
+                    f"{first.label} and {second.label} collide: they share {shared:.2g} mm^3"
+                )
+            found.append(
+                Clearance(
+                    first.label, second.label, float(first.distance_to(second)), shared
+                )
+            )
     return found
 
 
 def write_module(path: str | Path, module: Module) -> list[Clearance]:
-    """STEP of the module with labels and colours; returns the clearances that were checked before.
+    """STEP of the module with labels and colours; returns the clearances that were
+    checked before.
 
     Raises:
         ProcessError: parts collide. OSError: the target cannot be written.
@@ -200,13 +238,21 @@ def write_module(path: str | Path, module: Module) -> list[Clearance]:
     for part in assembly.children:
         place = part.location.position
         solid = part.solid().wrapped.Located(TopLoc_Location())
-        pieces.append(Piece(part.label, solid, COLOURS[part.label][:3], [(place.X, place.Y, place.Z)]))
+        pieces.append(
+            Piece(
+                part.label,
+                solid,
+                COLOURS[part.label][:3],
+                [(place.X, place.Y, place.Z)],
+            )
+        )
     write_pieces(path, assembly.label, pieces, unit_m=1e-3)
     return checked
 
 
 def picture(module: Module, *, cut: bool = True) -> bytes:
-    """PNG of the module in perspective, for reports; ``cut`` takes a quarter of the mount away.
+    """PNG of the module in perspective, for reports; ``cut`` takes a quarter of the
+    mount away.
 
     The shades are of a lamp over the left shoulder.
     """
@@ -218,7 +264,11 @@ def picture(module: Module, *, cut: bool = True) -> bytes:
     figure, axes = report.canvas(1, 1, size=(5.2, 5.6), subplot_kw={"projection": "3d"})
     parts = assemble(module).children
     for part in parts:
-        shown = _without_quarter(part) if cut and part.label in ("mount", "nir_filter", "flex") else part
+        shown = (
+            _without_quarter(part)
+            if cut and part.label in ("mount", "nir_filter", "flex")
+            else part
+        )
         if shown is None:
             continue
         points, faces = shown.tessellate(0.02, 0.2)
@@ -227,11 +277,19 @@ def picture(module: Module, *, cut: bool = True) -> bytes:
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
         light = 0.55 + 0.45 * abs(normal @ np.array([0.35, -0.6, 0.72]))
         red, green, blue, opacity = COLOURS[part.label]
-        shade = np.column_stack([light[:, None] * [red, green, blue], np.full(len(light), opacity)])
-        axes.add_collection3d(Poly3DCollection(corners, facecolors=np.clip(shade, 0, 1), linewidths=0))
+        shade = np.column_stack(
+            [light[:, None] * [red, green, blue], np.full(len(light), opacity)]
+        )
+        axes.add_collection3d(
+            Poly3DCollection(corners, facecolors=np.clip(shade, 0, 1), linewidths=0)
+        )
     half = module.side_mm / 2
     low = -(module.spacing_mm + module.sensor_mm + module.flex_mm)
-    axes.set(xlim=(-half, half), ylim=(-half, half), zlim=(low, module.substrate_mm + module.filter_mm))
+    axes.set(
+        xlim=(-half, half),
+        ylim=(-half, half),
+        zlim=(low, module.substrate_mm + module.filter_mm),
+    )
     axes.set_box_aspect((module.side_mm, module.side_mm, module.stack_mm))
     axes.view_init(elev=22, azim=-50)
     axes.set_axis_off()

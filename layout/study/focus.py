@@ -1,8 +1,12 @@
-"""The light of pillars on a small window of the sensor, for many amplitude maps at once, without torch.
+"""The light of pillars on a small window of the sensor, for many amplitude maps at
+once, without torch.
 
-The field is that of :mod:`metalens.propagate.paths`, films and all. Its phase is fast over the lens, but what differs
-between depths and window points is slow: with the phase to the middle of the window taken off, it is a polynomial on
-Chebyshev nodes, and the pillars enter only by their sums against that polynomial basis: two matrix products for each
+The field is that of :mod:`metalens.propagate.paths`, films and all. Its phase is fast
+over the lens, but what differs
+between depths and window points is slow: with the phase to the middle of the window
+taken off, it is a polynomial on
+Chebyshev nodes, and the pillars enter only by their sums against that polynomial basis:
+two matrix products for each
 map, exact to the tolerance that sets the number of nodes.
 """
 
@@ -42,7 +46,8 @@ class Window:
 class Focus:
     """Sums over the pillars of a lens, prepared for one window.
 
-    case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um, nodes_y_um: of the nodes.
+    case: the lens with its films. x_um, y_um: positions of the sites. nodes_x_um,
+    nodes_y_um: of the nodes.
     onto_x, onto_y: (nodes, sites) polynomial basis, float32.
     curvature: 1 / depth of the reference source whose phase is taken off.
     """
@@ -57,14 +62,20 @@ class Focus:
     onto_y: Array
     curvature: float
 
-    def project(self, amplitudes: Array, rows: slice = slice(None), columns: slice = slice(None)) -> Array:
-        """(maps, nodes y, nodes x) sums of the amplitudes (maps, y, x) of a block of sites against the basis."""
+    def project(
+        self, amplitudes: Array, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Array:
+        """(maps, nodes y, nodes x) sums of the amplitudes (maps, y, x) of a block of
+        sites against the basis.
+        """
         x, y = self.x_um[columns], self.y_um[rows, None]
         carried = amplitudes * np.exp(1j * self._carrier_rad(x, y)).astype(np.complex64)
         along = carried @ self.onto_x[:, columns].T.astype(np.complex64)
         return np.asarray(self.onto_y[:, rows].astype(np.complex64) @ along)
 
-    def light(self, moments: Array, shift_um: tuple[float, float] = (0.0, 0.0)) -> Array:
+    def light(
+        self, moments: Array, shift_um: tuple[float, float] = (0.0, 0.0)
+    ) -> Array:
         """(maps, depths, y, x) complex amplitude on the window.
 
         Args:
@@ -72,25 +83,44 @@ class Focus:
             shift_um: (x, y) by which the pillars stand off their sites.
         """
         window, k = self.window, self.case.wavenumber
-        nodes_x, nodes_y = self.nodes_x_um + shift_um[0], self.nodes_y_um[:, None] + shift_um[1]
+        nodes_x, nodes_y = (
+            self.nodes_x_um + shift_um[0],
+            self.nodes_y_um[:, None] + shift_um[1],
+        )
         slow = self._carrier_rad(self.nodes_x_um, self.nodes_y_um[:, None])
         inverse = np.array(self.case.inverse_depths_per_um)[:, None, None]
-        sources = np.exp(1j * (self._phase_rad(nodes_x, nodes_y, inverse) - slow)).reshape(len(inverse), -1)
+        sources = np.exp(
+            1j * (self._phase_rad(nodes_x, nodes_y, inverse) - slow)
+        ).reshape(len(inverse), -1)
         weights = moments.reshape(len(moments), 1, -1) * sources
         weights = weights.reshape(-1, weights.shape[-1]).T.astype(np.complex64)
         rows = []
         for y in window.y_um:
-            level, away = paths.beyond(self.case, nodes_x, nodes_y, window.x_um[:, None, None], y)
-            kernel = self.case.area_um2 * level * np.exp(1j * np.remainder(k * away, 2 * np.pi))
-            rows.append(kernel.reshape(len(window.x_um), -1).astype(np.complex64) @ weights)
+            level, away = paths.beyond(
+                self.case, nodes_x, nodes_y, window.x_um[:, None, None], y
+            )
+            kernel = (
+                self.case.area_um2
+                * level
+                * np.exp(1j * np.remainder(k * away, 2 * np.pi))
+            )
+            rows.append(
+                kernel.reshape(len(window.x_um), -1).astype(np.complex64) @ weights
+            )
         field = np.stack(rows).transpose(2, 0, 1)
-        return np.asarray(field.reshape(len(moments), len(window.depths_um), *field.shape[1:]))
+        return np.asarray(
+            field.reshape(len(moments), len(window.depths_um), *field.shape[1:])
+        )
 
     def _carrier_rad(self, x_um: Array, y_um: Array) -> Array:
-        """Phase that is taken off: from the reference source over the lens to the middle of the window."""
+        """Phase that is taken off: from the reference source over the lens to the
+        middle of the window.
+        """
         return self._phase_rad(x_um, y_um, self.curvature)
 
-    def _phase_rad(self, x_um: Array, y_um: Array, inverse_depth: Array | float) -> Array:
+    def _phase_rad(
+        self, x_um: Array, y_um: Array, inverse_depth: Array | float
+    ) -> Array:
         path = paths.to_sensor(self.case, x_um, y_um) + paths.from_source(
             self.case, x_um, y_um, _ON_AXIS, inverse_depth
         )
@@ -107,18 +137,23 @@ def check(lens: Lens) -> None:
 
 
 def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
-    """Basis for a lens and a window; as many nodes as the phase between them turns, and ``margin`` more.
+    """Basis for a lens and a window; as many nodes as the phase between them turns, and
+    ``margin`` more.
 
     Accuracy:
         float32 sums, about 1e-5 of the largest amplitude of the window.
 
     Raises:
-        PropagationError: a window of fewer than 2 samples a side, a lens of fewer than 2 sites a side, or one behind a
-            stop, whose shadow is another at each depth where these sums are shared by all.
+        PropagationError: a window of fewer than 2 samples a side, a lens of fewer than
+            2 sites a side, or one behind a
+            stop, whose shadow is another at each depth where these sums are shared by
+            all.
     """
     check(lens)
     if min(len(window.x_um), len(window.y_um), *lens.diameters.diameter_um.shape) < 2:
-        raise PropagationError("the window and the lens need 2 samples and sites a side or more")
+        raise PropagationError(
+            "the window and the lens need 2 samples and sites a side or more"
+        )
     seen = case(
         lens.diameters.diameter_um.shape,
         **lens.diameters.grid._asdict(),
@@ -138,13 +173,16 @@ def prepare(lens: Lens, window: Window, *, margin: int = 12) -> Focus:
 
 
 def window(lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0) -> Window:
-    """A window around the axis that holds the blur at all depths and ``rings`` diffraction widths around it.
+    """A window around the axis that holds the blur at all depths and ``rings``
+    diffraction widths around it.
 
     Samples are a quarter of wavelength / NA apart, the Nyquist step of the intensity.
 
     depths_um: left out: the source distance of the design.
     """
-    depths = np.array([lens.source_distance_um] if depths_um is None else depths_um, float)
+    depths = np.array(
+        [lens.source_distance_um] if depths_um is None else depths_um, float
+    )
     step = reach.diffraction_um(lens) / 4
     blur = max(reach.blur_um(lens, depth) for depth in depths)
     half = int(np.ceil((blur + 2 * rings * step) / step))
@@ -153,9 +191,11 @@ def window(lens: Lens, *, depths_um: Array | None = None, rings: float = 6.0) ->
 
 
 def peak(psf: Array) -> Array:
-    """(...) largest value between the samples of (..., y, x) intensities that are sampled finely enough.
+    """(...) largest value between the samples of (..., y, x) intensities that are
+    sampled finely enough.
 
-    Band-limited interpolation to quarter steps, then a parabola along each axis: 1e-4 for a focus at Nyquist steps.
+    Band-limited interpolation to quarter steps, then a parabola along each axis: 1e-4
+    for a focus at Nyquist steps.
     """
     from scipy.signal import resample
 
@@ -172,26 +212,40 @@ def peak(psf: Array) -> Array:
             (image[row - 1, column], image[(row + 1) % rows, column]),
             (image[row, column - 1], image[row, (column + 1) % columns]),
         )
-        found.append(value + sum((a - b) ** 2 / (8 * max(2 * value - a - b, 1e-300)) for a, b in sides))
+        found.append(
+            value
+            + sum((a - b) ** 2 / (8 * max(2 * value - a - b, 1e-300)) for a, b in sides)
+        )
     return np.array(found).reshape(psf.shape[:-2])
 
 
 def _count(seen: Case, edge_um: float, reach_um: float, middle: float) -> int:
-    """Half the turns of phase across the lens that are left, plus what Chebyshev series need beyond (Bessel decay)."""
+    """Half the turns of phase across the lens that are left, plus what Chebyshev series
+    need beyond (Bessel decay).
+    """
     x = np.linspace(-edge_um, edge_um, 1001)
-    away = paths.beyond(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(seen, x, 0.0, _ON_AXIS, middle)
-    differences = [away + paths.from_source(seen, x, 0.0, _ON_AXIS, c) for c in seen.inverse_depths_per_um]
+    away = paths.beyond(seen, x, 0.0, reach_um, 0.0)[1] - paths.from_source(
+        seen, x, 0.0, _ON_AXIS, middle
+    )
+    differences = [
+        away + paths.from_source(seen, x, 0.0, _ON_AXIS, c)
+        for c in seen.inverse_depths_per_um
+    ]
     slope = max(float(abs(np.gradient(path, x)).max()) for path in differences)
     turns = seen.wavenumber * slope * edge_um
     return int(np.ceil(turns + 4 * turns ** (1 / 3)))
 
 
 def _basis(sites_um: Array, count: int) -> tuple[Array, Array]:
-    """(nodes, (nodes, sites) Lagrange basis on Chebyshev points, by their discrete orthogonality)."""
+    """(nodes, (nodes, sites) Lagrange basis on Chebyshev points, by their discrete
+    orthogonality).
+    """
     edge = sites_um[-1]
     angle = np.pi * (np.arange(count) + 0.5) / count
     order = np.arange(count)
     at_nodes = np.cos(np.outer(order, angle))
     at_nodes[0] /= 2
     at_sites = np.cos(np.outer(order, np.arccos(sites_um / edge)))
-    return np.asarray(edge * np.cos(angle)), (2 / count * at_nodes.T @ at_sites).astype(np.float32)
+    return np.asarray(edge * np.cos(angle)), (2 / count * at_nodes.T @ at_sites).astype(
+        np.float32
+    )

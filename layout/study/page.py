@@ -1,4 +1,6 @@
-"""Sections of a mask's report on what the process does to the light: stitching, tolerance, tolerant choice."""
+"""Sections of a mask's report on what the process does to the light: stitching,
+tolerance, tolerant choice.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,7 +21,9 @@ from metalens.lens import Lens
 from metalens.made import PairSensitivities, Spread, pair_sensitivities
 
 CHOICE_RAD = (0.1, 0.2, 0.3)
-Answers = Mapping[str, Sensitivities | PairSensitivities]  # of light along "x" and "y"; of pillars of one size under ""
+Answers = Mapping[
+    str, Sensitivities | PairSensitivities
+]  # of light along "x" and "y"; of pillars of one size under ""
 
 
 def answers_of(lens: Lens) -> Answers:
@@ -31,11 +35,16 @@ def answers_of(lens: Lens) -> Answers:
     return {"": sensitivities(lens)} if lens.pairs is None else pair_sensitivities(lens)
 
 
-def sections(lens: Lens, process: Process, plan: FieldPlan, answers: Answers) -> list[Section]:
-    """The three sections; half a minute for a 1 mm lens, most of it for the solver and the Monte Carlo.
+def sections(
+    lens: Lens, process: Process, plan: FieldPlan, answers: Answers
+) -> list[Section]:
+    """The three sections; half a minute for a 1 mm lens, most of it for the solver and
+    the Monte Carlo.
 
-    Pillars that are turned one by one have no choice of sizes: their turn gives any phase at the size that is best.
-    Those of two sizes have none either, and two sections for light along x and two for light along y.
+    Pillars that are turned one by one have no choice of sizes: their turn gives any
+    phase at the size that is best.
+    Those of two sizes have none either, and two sections for light along x and two for
+    light along y.
 
     answers: :func:`answers_of` the lens.
     """
@@ -43,15 +52,24 @@ def sections(lens: Lens, process: Process, plan: FieldPlan, answers: Answers) ->
         return [
             replace(section, title=f"{section.title}, light along {light}")
             for light, answer in answers.items()
-            for section in _of_light(lens.seen("x" if light == "x" else "y"), process, plan, answer)
+            for section in _of_light(
+                lens.seen("x" if light == "x" else "y"), process, plan, answer
+            )
         ]
     answer = answers[""]
     found = _of_light(lens, process, plan, answer)
-    return found if lens.hand or isinstance(answer, PairSensitivities) else [*found, _choice(lens, process, answer)]
+    return (
+        found
+        if lens.hand or isinstance(answer, PairSensitivities)
+        else [*found, _choice(lens, process, answer)]
+    )
 
 
 def _of_light(
-    lens: Lens, process: Process, plan: FieldPlan, answers: Sensitivities | PairSensitivities
+    lens: Lens,
+    process: Process,
+    plan: FieldPlan,
+    answers: Sensitivities | PairSensitivities,
 ) -> list[Section]:
     return [_stitching(lens, plan, process), tolerances(lens, process, answers)]
 
@@ -60,15 +78,27 @@ def _stitching(lens: Lens, plan: FieldPlan, process: Process) -> Section:
     found = stitching.stitching(lens, plan, process)
     rows = [
         ["peak of the PSF", float(found.strehl.mean()), float(found.strehl.min())],
-        ["change of the PSF, relative L2", float(found.change.mean()), float(found.change.max())],
-        ["move of its centroid / nm", float(found.moved_nm.mean()), float(found.moved_nm.max())],
+        [
+            "change of the PSF, relative L2",
+            float(found.change.mean()),
+            float(found.change.max()),
+        ],
+        [
+            "move of its centroid / nm",
+            float(found.moved_nm.mean()),
+            float(found.moved_nm.max()),
+        ],
     ]
     text = (
         f"Each of {found.fields} fields misplaced by up to ±{found.stitching_nm:g} nm along x and y, evenly spread, "
         f"{len(found.strehl)} draws; the common shift, which only moves the image, is taken out."
     )
     items: list[Figure | Table] = [
-        Figure(_stitched(found), "The focus, and what the worst draw changes in it.", wide=True),
+        Figure(
+            _stitched(found),
+            "The focus, and what the worst draw changes in it.",
+            wide=True,
+        ),
         Table(("", "mean", "worst"), rows, digits=5),
     ]
     return Section("Stitching", text, items)
@@ -78,7 +108,9 @@ def _stitched(found: StitchReport) -> bytes:
     from scipy.signal import resample
 
     perfect, worst = (
-        resample(resample(image, 6 * image.shape[0], axis=0), 6 * image.shape[1], axis=1)
+        resample(
+            resample(image, 6 * image.shape[0], axis=0), 6 * image.shape[1], axis=1
+        )
         for image in (found.psf, found.worst_psf)
     )
     figure, axes = report.canvas(1, 2, size=(7.8, 3.2))
@@ -91,26 +123,51 @@ def _stitched(found: StitchReport) -> bytes:
         axes[0].imshow(level, extent=extent, vmin=-40, vmax=0),
         axes[1].imshow(change, extent=extent, vmin=-most, vmax=most, cmap="RdBu_r"),
     ]
-    for ax, shown, title, unit in zip(axes, pictures, ("perfect fields", "change"), ("dB", "% of peak"), strict=True):
+    for ax, shown, title, unit in zip(
+        axes, pictures, ("perfect fields", "change"), ("dB", "% of peak"), strict=True
+    ):
         ax.set(title=title, xlabel="x / µm", ylabel="y / µm")
         ax.grid(visible=False)
         figure.colorbar(shown, ax=ax, label=unit)
     return report.png(figure)
 
 
-def tolerances(lens: Lens, process: Process, answers: Sensitivities | PairSensitivities) -> Section:
+def tolerances(
+    lens: Lens, process: Process, answers: Sensitivities | PairSensitivities
+) -> Section:
     """Each cause alone and all together, and what the numbers are not of."""
     study = tolerance.analyse(lens, process, sens=answers)
     rows = [
-        [e.cause, e.deviation, e.phase_rad, *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information))]
+        [
+            e.cause,
+            e.deviation,
+            e.phase_rad,
+            *(100 * v for v in (e.strehl, e.efficiency, e.psf, e.information)),
+        ]
         for e in study.effects
     ]
-    head = ("cause", "deviation", "phase / rad", "peak / %", "efficiency / %", "PSF / %", "I(z) / %")
+    head = (
+        "cause",
+        "deviation",
+        "phase / rad",
+        "peak / %",
+        "efficiency / %",
+        "PSF / %",
+        "I(z) / %",
+    )
     bands = [
-        [name, *(float(v) for v in study.band(name)), float(getattr(study.nominal, name)[0])]
+        [
+            name,
+            *(float(v) for v in study.band(name)),
+            float(getattr(study.nominal, name)[0]),
+        ]
         for name in ("strehl", "efficiency", "psf_change")
     ]
-    through = "the diameter through the proxy" if lens.pairs is None else "both sizes through the table of the library"
+    through = (
+        "the diameter through the proxy"
+        if lens.pairs is None
+        else "both sizes through the table of the library"
+    )
     text = (
         "Each cause alone, the worse of both signs of its standard deviation; phase: rms over the pillars about their "
         f"mean. Then all together, {len(study.draws.strehl)} draws. Height, wall and index enter through "
@@ -118,9 +175,16 @@ def tolerances(lens: Lens, process: Process, answers: Sensitivities | PairSensit
         f"reduced model of {study.rank} dimensions misses {100 * study.error:.1g} % of t."
     ) + _beside(lens, process)
     items: list[Figure | Table] = [
-        Table(head, rows, "Effect of each cause. I(z): axial information (Eq. 11), summed over the depths.", digits=3),
+        Table(
+            head,
+            rows,
+            "Effect of each cause. I(z): axial information (Eq. 11), summed over the depths.",
+            digits=3,
+        ),
         Figure(
-            _bands(study), "5 to 95 % of the draws (shade, bars), median, and the designed lens (dashes).", wide=True
+            _bands(study),
+            "5 to 95 % of the draws (shade, bars), median, and the designed lens (dashes).",
+            wide=True,
         ),
         Table(("", "5 %", "50 %", "95 %", "as designed"), bands),
     ]
@@ -128,7 +192,9 @@ def tolerances(lens: Lens, process: Process, answers: Sensitivities | PairSensit
 
 
 def _beside(lens: Lens, process: Process) -> str:
-    """What the numbers are not of: light that keeps its hand, and walls that the process leans otherwise."""
+    """What the numbers are not of: light that keeps its hand, and walls that the
+    process leans otherwise.
+    """
     told, wall, made = "", lens.cell.sidewall_rad / deg, process.etch.sidewall_deg
     if lens.hand:
         told += (
@@ -150,12 +216,16 @@ def _bands(study: ToleranceReport) -> bytes:
     figure, axes = report.canvas(1, 2, size=(7.8, 3.0))
     x = study.window.x_um
     fine = np.arange(8 * len(x)) * (x[1] - x[0]) / 8 + x[0]
-    low, middle, high = (_finer(curve, resample(curve, len(fine))) for curve in study.band("psf"))
+    low, middle, high = (
+        _finer(curve, resample(curve, len(fine))) for curve in study.band("psf")
+    )
     axes[0].fill_between(fine, low, high, alpha=0.3)
     axes[0].plot(fine, middle)
     axes[0].plot(fine, resample(study.nominal.psf[0], len(fine)), "k--", lw=0.8)
     reach = 8 * float(x[1] - x[0])
-    axes[0].set(xlabel="x / µm", ylabel="intensity / designed peak", xlim=(-reach, reach))
+    axes[0].set(
+        xlabel="x / µm", ylabel="intensity / designed peak", xlim=(-reach, reach)
+    )
     low, middle, high = study.band("information")
     depth = study.depths_um / 1e3
     axes[1].errorbar(depth, middle, [middle - low, high - middle], fmt="o", capsize=4)
@@ -173,13 +243,29 @@ def _choice(lens: Lens, process: Process, answers: Sensitivities) -> Section:
     sigma = max(process.spread.bias_nm, 1.0)
     only = replace(process, spread=Spread.only(bias_nm=sigma))
     before = tolerance.analyse(lens, only, sens=answers, draws=10).effects[0]
-    rows: list[list[float | str]] = [["as designed", 0.0, "-", before.phase_rad, 100 * before.psf]]
+    rows: list[list[float | str]] = [
+        ["as designed", 0.0, "-", before.phase_rad, 100 * before.psf]
+    ]
     for allowed in CHOICE_RAD:
         chosen = tolerant.choose(lens, process, tolerance_rad=allowed)
         after = tolerance.analyse(chosen.lens, only, sens=answers, draws=10).effects[0]
         spread = f"{chosen.before:.4f} → {chosen.after:.4f}"
-        rows.append([f"within {allowed} rad", chosen.phase_error_rad, spread, after.phase_rad, 100 * after.psf])
-    head = ("choice", "phase error / rad", "spread of d ln t/dD per nm", "phase / rad", "PSF / %")
+        rows.append(
+            [
+                f"within {allowed} rad",
+                chosen.phase_error_rad,
+                spread,
+                after.phase_rad,
+                100 * after.psf,
+            ]
+        )
+    head = (
+        "choice",
+        "phase error / rad",
+        "spread of d ln t/dD per nm",
+        "phase / rad",
+        "PSF / %",
+    )
     text = (
         "Several diameters often do for one phase. Taking those whose light answers most alike to the bias costs some "
         f"phase and buys tolerance; effect of a bias of ±{sigma:g} nm."

@@ -1,4 +1,6 @@
-"""What t of the pillars of a lens follows from, each kind of them once, under any local bias and answering cause."""
+"""What t of the pillars of a lens follows from, each kind of them once, under any local
+bias and answering cause.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,7 +24,9 @@ class Pillars(Protocol):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OneSize:
-    """t by the proxy of the lens at its wavelength, and the answers of a solver; diameter_um: (kinds,)."""
+    """t by the proxy of the lens at its wavelength, and the answers of a solver;
+    diameter_um: (kinds,).
+    """
 
     proxy: Proxy
     wavelength_um: float
@@ -33,12 +37,15 @@ class OneSize:
         """(bias, kinds) complex t for local biases and one made lens."""
         bias = np.reshape(bias_um, (-1, 1))
         d = self.diameter_um + bias
-        return transmission(self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias)
+        return transmission(
+            self.proxy, self.sens, d, self.wavelength_um, state.answers(), bias_um=bias
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TwoSizes:
-    """t by a table over both sizes, and the answers of a solver; a bias moves all edges, so both sizes alike.
+    """t by a table over both sizes, and the answers of a solver; a bias moves all
+    edges, so both sizes alike.
 
     width_um, length_um: (kinds,). rates: (causes, kinds) of ln t.
     """
@@ -52,14 +59,28 @@ class TwoSizes:
         """(bias, kinds) complex t for local biases and one made lens."""
         bias = np.reshape(bias_um, (-1, 1))
         change = np.exp(np.tensordot(state.answers(), self.rates, 1))
-        return np.asarray(self.table.t(self.width_um + bias, self.length_um + bias) * change)
+        return np.asarray(
+            self.table.t(self.width_um + bias, self.length_um + bias) * change
+        )
 
 
-def kinds(lens: Lens, sens: Sensitivities | PairSensitivities) -> tuple[Array, Array, Pillars]:
-    """((y, x) kind of each site from 1 on, 0 none; (kinds,) how many of each; what their t follows from)."""
+def kinds(
+    lens: Lens, sens: Sensitivities | PairSensitivities
+) -> tuple[Array, Array, Pillars]:
+    """((y, x) kind of each site from 1 on, 0 none; (kinds,) how many of each; what
+    their t follows from).
+    """
     own = Kinds.of(lens.diameters)
     index = (own.index(lens.diameters) + 1) % (len(own.count) + 1)
     if isinstance(sens, Sensitivities):
-        return index, own.count, OneSize(lens.proxy, lens.wavelength_um, sens, own.width_um)
+        return (
+            index,
+            own.count,
+            OneSize(lens.proxy, lens.wavelength_um, sens, own.width_um),
+        )
     rates = sens.at(own.width_um, own.length_um)
-    return index, own.count, TwoSizes(PairTable.of(lens), own.width_um, own.length_um, rates)
+    return (
+        index,
+        own.count,
+        TwoSizes(PairTable.of(lens), own.width_um, own.length_um, rates),
+    )

@@ -1,4 +1,6 @@
-"""How the transmission of a pillar answers to height, index, wall and every other cause of the table, by a solver."""
+"""How the transmission of a pillar answers to height, index, wall and every other cause
+of the table, by a solver.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,12 +19,16 @@ _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer trunc
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivities:
-    """Logarithmic derivatives of t: the real part changes |t|, the imaginary part is a phase in rad.
+    """Logarithmic derivatives of t: the real part changes |t|, the imaginary part is a
+    phase in rad.
 
-    diameter_um: (n,) rising. rates: (answering causes, n) complex, by the base unit of each (um, rad, 1); rows that are
+    diameter_um: (n,) rising. rates: (answering causes, n) complex, by the base unit of
+    each (um, rad, 1); rows that are
         not there are 0.
-    error: largest relative change (rms over the diameters) of one of them from a coarser truncation.
-    edges: (n,) by a bias of all edges less that by the size, per um; None where that is nothing.
+    error: largest relative change (rms over the diameters) of one of them from a
+    coarser truncation.
+    edges: (n,) by a bias of all edges less that by the size, per um; None where that is
+    nothing.
     """
 
     diameter_um: Array
@@ -31,26 +37,37 @@ class Sensitivities:
     edges: Array | None = None
 
     def at(self, diameter_um: Array) -> Array:
-        """(answering causes, *shape) derivatives of ln t; beyond the ends the end value holds."""
-        return with_missing([np.interp(diameter_um, self.diameter_um, row) for row in self.rates])
+        """(answering causes, *shape) derivatives of ln t; beyond the ends the end value
+        holds.
+        """
+        return with_missing(
+            [np.interp(diameter_um, self.diameter_um, row) for row in self.rates]
+        )
 
     def by_edges(self, diameter_um: Array) -> Array | None:
-        """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""
+        """(*shape) what a bias of all edges changes ln t by beyond the same change of
+        the size; None for nothing.
+        """
         if self.edges is None or not self.edges.any():
             return None
         return np.asarray(np.interp(diameter_um, self.diameter_um, self.edges))
 
 
-def sensitivities(lens: Lens, *, count: int = 15, solver: Solver | None = None) -> Sensitivities:
-    """Derivatives of ln t at ``count`` diameters (of shapes: sizes) over the proxy's domain, by every answering cause.
+def sensitivities(
+    lens: Lens, *, count: int = 15, solver: Solver | None = None
+) -> Sensitivities:
+    """Derivatives of ln t at ``count`` diameters (of shapes: sizes) over the proxy's
+    domain, by every answering cause.
 
-    Exact ones of RCWA at a fixed truncation, for the light that the proxy is of; central differences of a solver where
+    Exact ones of RCWA at a fixed truncation, for the light that the proxy is of;
+    central differences of a solver where
     one is given.
 
     Args:
         solver: (cell, diameters, wavelength, finer) to t of each.
 
-    Accuracy: ``error`` of the result, the change from a coarser truncation: a few percent.
+    Accuracy: ``error`` of the result, the change from a coarser truncation: a few
+    percent.
 
     Raises:
         CellError, MaterialError: from the solver.
@@ -91,18 +108,26 @@ def _answering() -> list[Answers]:
 
 
 def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
-    """Solves of one cause after the other: the coarser and the finer, each below and above."""
+    """Solves of one cause after the other: the coarser and the finer, each below and
+    above.
+    """
     for acts in _answering():
         if acts.changed is None:
             continue
-        ends = [acts.changed(lens.cell, sign * acts.step, lens.wavelength_um) for sign in (-1, 1)]
+        ends = [
+            acts.changed(lens.cell, sign * acts.step, lens.wavelength_um)
+            for sign in (-1, 1)
+        ]
         some = _some(lens, acts, diameter_um)
         yield from ((end, some, finer) for finer in (False, True) for end in ends)
 
 
 def _some(lens: Lens, acts: Answers, diameter_um: Array) -> Array:
     """Diameters that a cause is solved at: every other one where walls tilt."""
-    tilted = acts.changed and acts.changed(lens.cell, acts.step, lens.wavelength_um).sidewall_rad
+    tilted = (
+        acts.changed
+        and acts.changed(lens.cell, acts.step, lens.wavelength_um).sidewall_rad
+    )
     return np.asarray(diameter_um[:: 2 if tilted else 1])
 
 

@@ -1,9 +1,14 @@
-"""A lens reduced to what draws of its process need: few sums over the pillars, weighted anew for each draw.
+"""A lens reduced to what draws of its process need: few sums over the pillars, weighted
+anew for each draw.
 
-A draw changes t of every pillar through a local bias b(x) and, for the whole lens, through what all pillars answer
-alike (height, wall, index). Over all such changes the curve t(D) stays in a space of few dimensions, found by a
-singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are summed once for each B_k (times
-the phase of their turn, which no draw changes but for all alike); a draw only weights these sums, at the nodes of
+A draw changes t of every pillar through a local bias b(x) and, for the whole lens,
+through what all pillars answer
+alike (height, wall, index). Over all such changes the curve t(D) stays in a space of
+few dimensions, found by a
+singular value decomposition: t(D; b, ...) = sum_k B_k(D) c_k(b, ...). The pillars are
+summed once for each B_k (times
+the phase of their turn, which no draw changes but for all alike); a draw only weights
+these sums, at the nodes of
 :mod:`layout.study.focus`, since c_k(b(x)) is as smooth as the bias.
 """
 
@@ -22,7 +27,10 @@ from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.made import Draw, PairSensitivities, Spread, State, draws
 
-_BAND, _PARTS = 16, 16  # rows that are summed at once, by any one worker; parts of a lens that workers take
+_BAND, _PARTS = (
+    16,
+    16,
+)  # rows that are summed at once, by any one worker; parts of a lens that workers take
 _LEFT_OUT = 3e-4  # share (in amplitude) of the variation of t that the basis may miss
 _DEGREE = 10  # of the dependence on the local bias
 _SAMPLES = 160
@@ -32,7 +40,8 @@ _SAMPLES = 160
 class Model:
     """Sums over the pillars of a lens for all draws of its process.
 
-    pillars: the kinds of them (sizes to 0.05 nm), and what their t answers to. count: (kinds,) how many of each.
+    pillars: the kinds of them (sizes to 0.05 nm), and what their t answers to. count:
+    (kinds,) how many of each.
     basis: (rank, kinds) B_k, orthonormal over pillars.
     moments: (rank, nodes y, nodes x) sums of the pillars. radius_um: of the lens.
     """
@@ -45,71 +54,125 @@ class Model:
     radius_um: float
 
     def drawn(self, lenses: Sequence[State]) -> Array:
-        """(lenses, nodes y, nodes x) moments of lenses that a process makes of this one."""
-        x, y = self.focus.nodes_x_um / self.radius_um, self.focus.nodes_y_um[:, None] / self.radius_um
+        """(lenses, nodes y, nodes x) moments of lenses that a process makes of this
+        one.
+        """
+        x, y = (
+            self.focus.nodes_x_um / self.radius_um,
+            self.focus.nodes_y_um[:, None] / self.radius_um,
+        )
         knots = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
         found = []
         for state in lenses:
             bias = state.bias_um(x, y)
-            middle, half = (bias.max() + bias.min()) / 2, (bias.max() - bias.min()) / 2 + 1e-9
+            middle, half = (
+                (bias.max() + bias.min()) / 2,
+                (bias.max() - bias.min()) / 2 + 1e-9,
+            )
             curves = self.pillars.curve(middle + half * knots, state)
             weights = (curves * self.count) @ self.basis.conj().T
             series = np.polynomial.chebyshev.chebfit(knots, weights, _DEGREE)
             at_nodes = np.polynomial.chebyshev.chebval((bias - middle) / half, series)
             moments = (at_nodes * self.moments).sum(0)
-            found.append(moments * np.exp(1j * state.phase_rad(x, y)) if state.bends() else moments)
+            found.append(
+                moments * np.exp(1j * state.phase_rad(x, y))
+                if state.bends()
+                else moments
+            )
         return np.stack(found)
 
 
-def reduce(lens: Lens, sens: Sensitivities | PairSensitivities, focus: Focus, spread: Spread, *, seed: int) -> Model:
-    """Find the basis from random draws of the spread, and sum the pillars for each of its functions."""
+def reduce(
+    lens: Lens,
+    sens: Sensitivities | PairSensitivities,
+    focus: Focus,
+    spread: Spread,
+    *,
+    seed: int,
+) -> Model:
+    """Find the basis from random draws of the spread, and sum the pillars for each of
+    its functions.
+    """
     index, count, pillars = kinds(lens, sens)
     states = [draw.state() for draw in draws(spread, _SAMPLES, seed=seed)]
     rng = np.random.default_rng(seed)
     place = np.sqrt(rng.uniform(0, 1, _SAMPLES))
     angle = rng.uniform(0, 2 * np.pi, _SAMPLES)
     u, v = place * np.cos(angle), place * np.sin(angle)
-    curves = [pillars.curve(state.bias_um(x, y), state)[0] for state, x, y in zip(states, u, v, strict=True)]
+    curves = [
+        pillars.curve(state.bias_um(x, y), state)[0]
+        for state, x, y in zip(states, u, v, strict=True)
+    ]
     weight = np.sqrt(count)
     with threads.one_blas_thread():  # the same bits on any machine's number of them
-        size, directions = np.linalg.svd(np.stack(curves) * weight, full_matrices=False)[1:]
+        size, directions = np.linalg.svd(
+            np.stack(curves) * weight, full_matrices=False
+        )[1:]
     missed = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
     rank = max(1, int((missed > _LEFT_OUT).sum()))
     basis = directions[:rank] / weight
     columns = np.concatenate([np.zeros((rank, 1)), basis], axis=1).astype(np.complex64)
     edges = [len(index) * i // _PARTS for i in range(_PARTS + 1)]
-    parts = [(start, index[start:stop], _turned(lens, slice(start, stop))) for start, stop in itertools.pairwise(edges)]
-    moments = functools.reduce(np.add, executor.gather(_summed, (focus, columns), parts))
+    parts = [
+        (start, index[start:stop], _turned(lens, slice(start, stop)))
+        for start, stop in itertools.pairwise(edges)
+    ]
+    moments = functools.reduce(
+        np.add, executor.gather(_summed, (focus, columns), parts)
+    )
     return Model(pillars, focus, count, basis, moments, lens.diameters.radius_um)
 
 
 def _turned(lens: Lens, rows: slice) -> Array | None:
-    """(rows, x) factor that the turn of each pillar gives circular light; None where none is turned."""
-    return np.exp(1j * np.asarray(lens.geometric_rad(rows))).astype(np.complex64) if lens.hand else None
+    """(rows, x) factor that the turn of each pillar gives circular light; None where
+    none is turned.
+    """
+    return (
+        np.exp(1j * np.asarray(lens.geometric_rad(rows))).astype(np.complex64)
+        if lens.hand
+        else None
+    )
 
 
 def _summed(about: tuple[Focus, Array], part: tuple[int, Array, Array | None]) -> Array:
     """(rank, nodes y, nodes x) sums over rows of pillars.
 
-    about: and the (rank, 1 + kinds) basis. part: first row; (rows, x) kind of each site; (rows, x) factor of each.
+    about: and the (rank, 1 + kinds) basis. part: first row; (rows, x) kind of each
+    site; (rows, x) factor of each.
     """
     (focus, columns), (first, index, turned) = about, part
-    moments = np.zeros((len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex)
+    moments = np.zeros(
+        (len(columns), len(focus.nodes_y_um), len(focus.nodes_x_um)), complex
+    )
     for start in range(0, len(index), _BAND):
         band = slice(start, start + _BAND)
-        some = columns[:, index[band]] if turned is None else columns[:, index[band]] * turned[band]
-        moments += focus.project(some, slice(first + start, first + start + some.shape[1]))
+        some = (
+            columns[:, index[band]]
+            if turned is None
+            else columns[:, index[band]] * turned[band]
+        )
+        moments += focus.project(
+            some, slice(first + start, first + start + some.shape[1])
+        )
     return moments
 
 
 def missed(model: Model, lenses: Sequence[Draw]) -> float:
-    """Largest rms relative error of t over the pillars in any draw, at the centre and on both sides of the edge."""
+    """Largest rms relative error of t over the pillars in any draw, at the centre and
+    on both sides of the edge.
+    """
     worst = 0.0
     for draw in lenses:
         state, along = draw.state(), np.array([0.0, 1.0, -1.0])
-        bias = state.bias_um(along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad))
+        bias = state.bias_um(
+            along * np.cos(draw.turn_rad), along * np.sin(draw.turn_rad)
+        )
         curves = model.pillars.curve(bias, state)
         weights = (curves * model.count) @ model.basis.conj().T
-        rest = (abs(curves - weights @ model.basis) ** 2) @ model.count / (abs(curves) ** 2 @ model.count)
+        rest = (
+            (abs(curves - weights @ model.basis) ** 2)
+            @ model.count
+            / (abs(curves) ** 2 @ model.count)
+        )
         worst = max(worst, float(np.sqrt(rest.max())))
     return worst

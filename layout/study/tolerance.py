@@ -1,4 +1,6 @@
-"""What the spread of the process does to a lens: effect of each cause, and Monte Carlo with confidence bands."""
+"""What the spread of the process does to a lens: effect of each cause, and Monte Carlo
+with confidence bands.
+"""
 
 from dataclasses import dataclass
 
@@ -14,7 +16,9 @@ from metalens.ground.errors import ProcessError
 from metalens.lens import Lens, reach
 from metalens.made import Draw, PairSensitivities, State, pair_sensitivities, spread
 
-STEPS = 50  # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16 to 26 mm
+# of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16
+# to 26 mm
+STEPS = 50
 _BATCH = 25
 
 
@@ -24,9 +28,12 @@ class Outcome:
 
     strehl: (draws,) peak at the design depth relative to the nominal lens.
     efficiency: (draws,) share of the light on the aperture that reaches the window.
-    psf_change: (draws,) relative L2 change of the PSF at the design depth from the nominal one.
-    information: (draws, depths) axial Fisher information of the normalised PSF (paper Eq. 11), 1 / um^2.
-    psf: (draws, x) intensity along x through the middle at the design depth, 1 at the nominal peak.
+    psf_change: (draws,) relative L2 change of the PSF at the design depth from the
+    nominal one.
+    information: (draws, depths) axial Fisher information of the normalised PSF (paper
+    Eq. 11), 1 / um^2.
+    psf: (draws, x) intensity along x through the middle at the design depth, 1 at the
+    nominal peak.
     """
 
     strehl: Array
@@ -38,10 +45,13 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One cause at its standard deviation, both signs; the worse of the two for each number.
+    """One cause at its standard deviation, both signs; the worse of the two for each
+    number.
 
-    phase_rad: rms change of the pillars' phases about their mean. transmission: rms change of |T|.
-    strehl, efficiency, information (summed over the depths): relative change; psf: relative L2 change.
+    phase_rad: rms change of the pillars' phases about their mean. transmission: rms
+    change of |T|.
+    strehl, efficiency, information (summed over the depths): relative change; psf:
+    relative L2 change.
     """
 
     cause: str
@@ -58,9 +68,12 @@ class Effect:
 class ToleranceReport:
     """Result of :func:`analyse`.
 
-    effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte Carlo.
-    depths_um: of the information, by differences over step_um; window: where the light was looked at.
-    rank: dimensions of the space of t(D). error: largest rms relative error of t over the pillars in any draw.
+    effects: of each cause alone. nominal: the lens as designed (one draw). draws: Monte
+    Carlo.
+    depths_um: of the information, by differences over step_um; window: where the light
+    was looked at.
+    rank: dimensions of the space of t(D). error: largest rms relative error of t over
+    the pillars in any draw.
     """
 
     effects: tuple[Effect, ...]
@@ -87,49 +100,93 @@ def analyse(
     draws: int = 100,
     seed: int = 0,
 ) -> ToleranceReport:
-    """Effects of each cause at its standard deviation (``process.spread``), and Monte Carlo over all of them.
+    """Effects of each cause at its standard deviation (``process.spread``), and Monte
+    Carlo over all of them.
 
     Args:
         sens: answers to height, wall and index; left out: from the RCWA solver.
-        depths_um: where the axial information is wanted; left out: both ends and the middle of the depths at which
-            the lens blurs (:mod:`metalens.lens.reach`). The design source is always looked at as well.
+        depths_um: where the axial information is wanted; left out: both ends and the
+            middle of the depths at which
+            the lens blurs (:mod:`metalens.lens.reach`). The design source is always
+            looked at as well.
 
-    Accuracy: see ``error`` of the report (measured); bands of percentiles carry the sampling error of ``draws``.
+    Accuracy: see ``error`` of the report (measured); bands of percentiles carry the
+    sampling error of ``draws``.
 
     Raises:
-        ProcessError: fewer than 10 draws, or a spread that pillars of this shape cannot have.
+        ProcessError: fewer than 10 draws, or a spread that pillars of this shape cannot
+            have.
     """
     if draws < 10:
         raise ProcessError(f"draws = {draws}: need 10 or more for confidence bands")
     process.spread.check(lens.cell)
     if sens is None:
-        sens = sensitivities(lens) if lens.pairs is None else pair_sensitivities(lens)[lens.light]
+        sens = (
+            sensitivities(lens)
+            if lens.pairs is None
+            else pair_sensitivities(lens)[lens.light]
+        )
     near, far = reach.depth_range_um(lens)
-    depths_um, step_um = depths_um or (near, (near + far) / 2, far), (far - near) / STEPS
-    every = np.array([lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))])
+    depths_um, step_um = (
+        depths_um or (near, (near + far) / 2, far),
+        (far - near) / STEPS,
+    )
+    every = np.array(
+        [lens.source_distance_um, *(z for d in depths_um for z in (d, d + step_um))]
+    )
     focus = prepare(lens, window(lens, depths_um=every))
     model = reduce(lens, sens, focus, process.spread, seed=seed)
-    single = [Draw({name: sign * s}) for name, s in process.spread.stated.items() for sign in (-1, 1)]
-    everything = [Draw({}), *single, *spread.draws(process.spread, draws, seed=seed + 1)]
+    single = [
+        Draw({name: sign * s})
+        for name, s in process.spread.stated.items()
+        for sign in (-1, 1)
+    ]
+    everything = [
+        Draw({}),
+        *single,
+        *spread.draws(process.spread, draws, seed=seed + 1),
+    ]
     outcome = _outcome(model, [draw.state() for draw in everything], step_um)
     nominal, alone, many = (
-        _part(outcome, part) for part in (slice(0, 1), slice(1, 1 + len(single)), slice(1 + len(single), None))
+        _part(outcome, part)
+        for part in (
+            slice(0, 1),
+            slice(1, 1 + len(single)),
+            slice(1 + len(single), None),
+        )
     )
     effects = tuple(
-        _effect(model, tuple(single[2 * n : 2 * n + 2]), _part(alone, slice(2 * n, 2 * n + 2)), nominal)
+        _effect(
+            model,
+            tuple(single[2 * n : 2 * n + 2]),
+            _part(alone, slice(2 * n, 2 * n + 2)),
+            nominal,
+        )
         for n in range(len(single) // 2)
     )
     error = missed(model, everything)
     return ToleranceReport(
-        effects, nominal, many, np.array(depths_um), step_um, focus.window, len(model.basis), error, seed
+        effects,
+        nominal,
+        many,
+        np.array(depths_um),
+        step_um,
+        focus.window,
+        len(model.basis),
+        error,
+        seed,
     )
 
 
 def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
     """Everything that is looked at, lens by lens; the first is the nominal one."""
     with threads.one_blas_thread():  # as workers have
-        reference = np.asarray(abs(model.focus.light(model.drawn(lenses[:1]))[0, 0]) ** 2)
-    batches = [lenses[start : start + _BATCH] for start in range(0, len(lenses), _BATCH)]
+        reference = np.asarray(
+            abs(model.focus.light(model.drawn(lenses[:1]))[0, 0]) ** 2
+        )
+    batches = [
+        lenses[start : start + _BATCH] for start in range(0, len(lenses), _BATCH)
+    ]
     parts = executor.gather(_seen, (model, reference, step_um), batches)
     return Outcome(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -137,7 +194,8 @@ def _outcome(model: Model, lenses: list[State], step_um: float) -> Outcome:
 def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array, ...]:
     """Fields of :class:`Outcome` of some lenses.
 
-    about: model, (y, x) intensity of the nominal lens at the design depth, step of the depths in um.
+    about: model, (y, x) intensity of the nominal lens at the design depth, step of the
+    depths in um.
     """
     model, reference, step_um = about
     view = model.focus.window
@@ -156,12 +214,22 @@ def _seen(about: tuple[Model, Array, float], lenses: list[State]) -> tuple[Array
 
 
 def _part(outcome: Outcome, rows: slice) -> Outcome:
-    every = (outcome.strehl, outcome.efficiency, outcome.psf_change, outcome.information, outcome.psf)
+    every = (
+        outcome.strehl,
+        outcome.efficiency,
+        outcome.psf_change,
+        outcome.information,
+        outcome.psf,
+    )
     return Outcome(*(values[rows] for values in every))
 
 
-def _effect(model: Model, signs: tuple[Draw, ...], found: Outcome, nominal: Outcome) -> Effect:
-    """The worse of both signs of one cause; pillar statistics at the bias that the cause has at the edge."""
+def _effect(
+    model: Model, signs: tuple[Draw, ...], found: Outcome, nominal: Outcome
+) -> Effect:
+    """The worse of both signs of one cause; pillar statistics at the bias that the
+    cause has at the edge.
+    """
     ((cause, deviation),) = signs[1].amounts.items()
     changes = [_pillar_change(model, draw.state()) for draw in signs]
 
@@ -181,13 +249,23 @@ def _effect(model: Model, signs: tuple[Draw, ...], found: Outcome, nominal: Outc
 
 
 def _pillar_change(model: Model, state: State) -> tuple[float, float]:
-    """(rms phase change about the mean, rms change of |T|) over pillars spread evenly over the aperture."""
-    radius, angle = np.sqrt((np.arange(64) + 0.5) / 64), np.arange(64) * np.pi * (3 - np.sqrt(5))
+    """(rms phase change about the mean, rms change of |T|) over pillars spread evenly
+    over the aperture.
+    """
+    radius, angle = (
+        np.sqrt((np.arange(64) + 0.5) / 64),
+        np.arange(64) * np.pi * (3 - np.sqrt(5)),
+    )
     u, v = radius * np.cos(angle), radius * np.sin(angle)
-    before, after = (model.pillars.curve(np.zeros(1), State.of()), model.pillars.curve(state.bias_um(u, v), state))
+    before, after = (
+        model.pillars.curve(np.zeros(1), State.of()),
+        model.pillars.curve(state.bias_um(u, v), state),
+    )
     weight = np.broadcast_to(model.count, after.shape) / (model.count.sum() * len(u))
     turn = after / before * np.exp(1j * state.phase_rad(u, v))[:, None]
     turn = turn * np.exp(-1j * np.angle((turn * weight).sum()))
     phase = np.angle(turn)
     level = abs(after) - abs(before)
-    return float(np.sqrt((phase**2 * weight).sum())), float(np.sqrt((level**2 * weight).sum()))
+    return float(np.sqrt((phase**2 * weight).sum())), float(
+        np.sqrt((level**2 * weight).sum())
+    )

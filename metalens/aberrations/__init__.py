@@ -1,4 +1,6 @@
-"""Aberrations over the field: chief rays, distortion, field curvature, vignetting, illumination, MTF."""
+"""Aberrations over the field: chief rays, distortion, field curvature, vignetting,
+illumination, MTF.
+"""
 
 from typing import TYPE_CHECKING
 

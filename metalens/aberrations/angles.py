@@ -1,4 +1,6 @@
-"""What an optical designer looks at first, over field angles: distortion, foci, vignetting, illumination, MTF."""
+"""What an optical designer looks at first, over field angles: distortion, foci,
+vignetting, illumination, MTF.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +16,9 @@ from metalens.lens import Lens, media, reach
 from metalens.psf import passed_um2
 
 SHARES = 0.125, 0.25, 0.5  # of 2 NA / wavelength: frequencies where none are given
-BEYOND = 4.0  # depths of focus on either side of the foci of close rays where the sharpest line is looked for
+# depths of focus on either side of the foci of close rays where the sharpest line is
+# looked for
+BEYOND = 4.0
 STEPS = 2.0  # of a depth of focus, wavelength index / NA²
 MOST_STEPS = 400
 SETTLED = 1e-3  # of a depth of focus
@@ -23,20 +27,29 @@ PATCHES = 512  # along an axis, over what a stop lights
 
 @dataclass(frozen=True, eq=False, slots=True)
 class OverField:
-    """Aberrations of a lens at its design wavelength; NaN where ``left_out`` says why there is no number.
+    """Aberrations of a lens at its design wavelength; NaN where ``left_out`` says why
+    there is no number.
 
-    angles_deg: (n,) field angles along x. depth_um: of the source. sensor_distance_um: of the lens.
+    angles_deg: (n,) field angles along x. depth_um: of the source. sensor_distance_um:
+    of the lens.
     chief_um: (n, 2) where the chief ray meets the sensor, [x, y] from the axis.
-    distortion: (n,) by how much farther it lies from that of angle 0 than the linear image about angle 0 has it, along
+    distortion: (n,) by how much farther it lies from that of angle 0 than the linear
+    image about angle 0 has it, along
         the latter: (X - X0)·u / |M s| - 1, u = M s / |M s|, s the source from the one at angle 0.
-    close_um: (n, 2) tangential and sagittal focus of rays close to the chief ray, behind the sensor (+) or before it.
+    close_um: (n, 2) tangential and sagittal focus of rays close to the chief ray,
+    behind the sensor (+) or before it.
     close_error_um: (n, 2) one sigma of these.
-    sharpest_um: (n, 2) the same of the whole aperture: where the line image along x (tangential) and along y
+    sharpest_um: (n, 2) the same of the whole aperture: where the line image along x
+    (tangential) and along y
         (sagittal) is sharpest, largest ∫ L² / (∫ L)².
-    vignetting: (n,) share of the light through the stop's hole that misses the pillars; 0 where the lens is its own.
-    illumination: (n,) irradiance in the image of an evenly bright (Lambertian) plane, over that at angle 0.
-    frequencies_per_mm: (m,). mtf: (n, 2, m) modulation along x (tangential) and y (sagittal), of all light that passes
-        the lens. held: (n,) share of it in the waves about the rays, beyond which is light without detail.
+    vignetting: (n,) share of the light through the stop's hole that misses the pillars;
+    0 where the lens is its own.
+    illumination: (n,) irradiance in the image of an evenly bright (Lambertian) plane,
+    over that at angle 0.
+    frequencies_per_mm: (m,). mtf: (n, 2, m) modulation along x (tangential) and y
+    (sagittal), of all light that passes
+        the lens. held: (n,) share of it in the waves about the rays, beyond which is
+        light without detail.
     left_out: what has no number, and why; one line each.
     """
 
@@ -57,8 +70,12 @@ class OverField:
 
 
 def frequencies_per_mm(lens: Lens) -> tuple[float, ...]:
-    """An eighth, a quarter and a half of where a perfect lens of this aperture ends, 2 NA / wavelength; 2 digits."""
-    return tuple(float(f"{2e3 * share / reach.diffraction_um(lens):.2g}") for share in SHARES)
+    """An eighth, a quarter and a half of where a perfect lens of this aperture ends, 2
+    NA / wavelength; 2 digits.
+    """
+    return tuple(
+        float(f"{2e3 * share / reach.diffraction_um(lens):.2g}") for share in SHARES
+    )
 
 
 def over_field(
@@ -68,28 +85,39 @@ def over_field(
     depth_um: float | None = None,
     frequencies: tuple[float, ...] | None = None,
 ) -> OverField:
-    """Distortion, field curvature, vignetting, relative illumination and MTF of a lens over field angles along x.
+    """Distortion, field curvature, vignetting, relative illumination and MTF of a lens
+    over field angles along x.
 
     Args:
         angles_deg: of the rays to the middle of the lens, in air; either sign.
-        depth_um: of the sources, a plane; left out, the depth of best focus that the lens was made for.
-        frequencies: in periods per mm on the sensor; left out, :func:`frequencies_per_mm`.
+        depth_um: of the sources, a plane; left out, the depth of best focus that the
+            lens was made for.
+        frequencies: in periods per mm on the sensor; left out,
+            :func:`frequencies_per_mm`.
 
     Raises:
-        PropagationError: no angle, one of 85 degrees or more, a frequency or depth that is not above 0, a source behind
-            the stop or in the films, light beyond a critical angle; DomainError: an angle outside the lens's library.
+        PropagationError: no angle, one of 85 degrees or more, a frequency or depth that
+            is not above 0, a source behind
+            the stop or in the films, light beyond a critical angle; DomainError: an
+            angle outside the lens's library.
 
-    Accuracy: MTF 1e-3 (waves beyond those in the directions of the rays); the sharpest line to a thousandth of a depth
-        of focus, wavelength / NA²; vignetting 1e-4; rays as in :func:`metalens.aberrations.chief_ray`.
+    Accuracy: MTF 1e-3 (waves beyond those in the directions of the rays); the sharpest
+    line to a thousandth of a depth
+        of focus, wavelength / NA²; vignetting 1e-4; rays as in
+        :func:`metalens.aberrations.chief_ray`.
     """
     depth = lens.source_distance_um if depth_um is None else float(depth_um)
-    wanted = np.array(frequencies_per_mm(lens) if frequencies is None else frequencies, float)
+    wanted = np.array(
+        frequencies_per_mm(lens) if frequencies is None else frequencies, float
+    )
     _check(angles_deg, depth, wanted)
     told: list[str] = []
     origin = _chief(lens, 0.0, depth, told)
     base = math.nan
     if origin is not None:
-        base = _brightness(lens, 0.0, depth, origin) * float(passed_um2(lens, (0.0, 0.0), (depth,))[0])
+        base = _brightness(lens, 0.0, depth, origin) * float(
+            passed_um2(lens, (0.0, 0.0), (depth,))[0]
+        )
     rows = []
     for angle in angles_deg:
         chief = origin if angle == 0 else _chief(lens, angle, depth, told)
@@ -106,14 +134,24 @@ def over_field(
 
 def _check(angles_deg: tuple[float, ...], depth_um: float, frequencies: Array) -> None:
     if not angles_deg or not np.all(np.abs(angles_deg) < 85):
-        raise PropagationError(f"angles_deg = {tuple(angles_deg)}: need one field angle or more, between -85 and 85")
-    if not (frequencies.size and np.isfinite(frequencies).all() and frequencies.min() > 0):
-        raise PropagationError(f"frequencies_per_mm = {frequencies.tolist()}: need one or more, all above 0")
+        raise PropagationError(
+            f"angles_deg = {tuple(angles_deg)}: need one field angle or more, between -85 and 85"
+        )
+    if not (
+        frequencies.size and np.isfinite(frequencies).all() and frequencies.min() > 0
+    ):
+        raise PropagationError(
+            f"frequencies_per_mm = {frequencies.tolist()}: need one or more, all above 0"
+        )
     if not depth_um > 0:
-        raise PropagationError(f"depth of the sources: {depth_um} um; need one above 0, or inf")
+        raise PropagationError(
+            f"depth of the sources: {depth_um} um; need one above 0, or inf"
+        )
 
 
-def _chief(lens: Lens, angle_deg: float, depth_um: float, told: list[str]) -> ChiefRay | None:
+def _chief(
+    lens: Lens, angle_deg: float, depth_um: float, told: list[str]
+) -> ChiefRay | None:
     try:
         return chief_ray(lens, (math.radians(angle_deg), 0.0), depth_um)
     except PropagationError as error:
@@ -122,7 +160,11 @@ def _chief(lens: Lens, angle_deg: float, depth_um: float, told: list[str]) -> Ch
 
 
 def _row(
-    lens: Lens, angle_deg: float, depth_um: float, rays: tuple[ChiefRay | None, ChiefRay | None], per_um: Array
+    lens: Lens,
+    angle_deg: float,
+    depth_um: float,
+    rays: tuple[ChiefRay | None, ChiefRay | None],
+    per_um: Array,
 ) -> dict[str, Array | float]:
     """One field angle; the rays are those of angle 0 and of this angle."""
     angle, chief = (math.radians(angle_deg), 0.0), rays[1]
@@ -135,8 +177,11 @@ def _row(
         "distortion": _distortion(*rays),
         "close_um": close,
         "close_error_um": none if chief is None else chief.focus_error_um,
-        "sharpest_um": _sharpest(lens, light, angle[0], close) - lens.sensor_distance_um,
-        "illumination": math.nan if chief is None else light.passed_um2 * _brightness(lens, angle_deg, depth_um, chief),
+        "sharpest_um": _sharpest(lens, light, angle[0], close)
+        - lens.sensor_distance_um,
+        "illumination": math.nan
+        if chief is None
+        else light.passed_um2 * _brightness(lens, angle_deg, depth_um, chief),
         "vignetting": vignetting(lens, angle, depth_um),
         "mtf": np.stack([transfer(light, here, axis, per_um) for axis in (0, 1)]),
         "held": min(light.held, 1.0),
@@ -148,55 +193,88 @@ def _distortion(origin: ChiefRay | None, chief: ChiefRay | None) -> float:
         return math.nan
     linear = origin.moves @ (chief.source - origin.source)
     size2 = float(linear @ linear)
-    return float((chief.meets_um - origin.meets_um) @ linear / size2 - 1) if size2 > 0 else 0.0
+    return (
+        float((chief.meets_um - origin.meets_um) @ linear / size2 - 1)
+        if size2 > 0
+        else 0.0
+    )
 
 
-def _brightness(lens: Lens, angle_deg: float, depth_um: float, chief: ChiefRay) -> float:
-    """Irradiance in the image of a Lambertian plane, over the light through the lens for unit irradiance on it.
+def _brightness(
+    lens: Lens, angle_deg: float, depth_um: float, chief: ChiefRay
+) -> float:
+    """Irradiance in the image of a Lambertian plane, over the light through the lens
+    for unit irradiance on it.
 
-    Irradiance on the lens by an element of the plane (by its tangents at infinity), cos⁴ or 1 / spread of the media
+    Irradiance on the lens by an element of the plane (by its tangents at infinity),
+    cos⁴ or 1 / spread of the media
     before, over the area of the element's image; of an arbitrary unit.
     """
     tangents = np.array([math.tan(math.radians(angle_deg)), 0.0])
-    slope = float(np.hypot(*lens.layers.through_middle(tangents, depth_um, lens.wavelength_um)))
+    slope = float(
+        np.hypot(*lens.layers.through_middle(tangents, depth_um, lens.wavelength_um))
+    )
     p = slope / math.hypot(1, slope)
     if math.isinf(depth_um):
         falls = (1 - p * p) ** 2
     else:
-        falls = 1 / float(media.spread(lens.layers.before(depth_um, lens.wavelength_um), p))
+        falls = 1 / float(
+            media.spread(lens.layers.before(depth_um, lens.wavelength_um), p)
+        )
     return falls / abs(float(np.linalg.det(chief.moves)))
 
 
 def vignetting(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> float:
-    """Share of the light through the stop's hole that falls beside the pillars; 0 without a stop.
+    """Share of the light through the stop's hole that falls beside the pillars; 0
+    without a stop.
 
-    Shares of patches of the pillars' plane that the hole lights (:meth:`metalens.lens.Layers.lit`); the light is taken
+    Shares of patches of the pillars' plane that the hole lights
+    (:meth:`metalens.lens.Layers.lit`); the light is taken
     as even there, as PSFs take it.
 
     Accuracy: 1e-4, and that of sites at the rim of the lens.
     """
     if lens.layers.stop is None:
         return 0.0
-    tangents, wave, d = (math.tan(angle_rad[0]), math.tan(angle_rad[1])), lens.wavelength_um, lens.diameters
+    tangents, wave, d = (
+        (math.tan(angle_rad[0]), math.tan(angle_rad[1])),
+        lens.wavelength_um,
+        lens.diameters,
+    )
     middle = middle_um(lens, source_at(lens, angle_rad, depth_um), depth_um)
-    half = 1.5 * max(lens.layers.footprint_um(depth_um, wave), lens.layers.stop.radius_um)
+    half = 1.5 * max(
+        lens.layers.footprint_um(depth_um, wave), lens.layers.stop.radius_um
+    )
     place, step = np.linspace(-half, half, PATCHES, retstep=True)
     there = middle[0] + place, (middle[1] + place)[:, None]
-    hole = float(np.sum(lens.layers.lit(tangents, depth_um, wave, there, float(step)))) * float(step) ** 2
+    hole = (
+        float(np.sum(lens.layers.lit(tangents, depth_um, wave, there, float(step))))
+        * float(step) ** 2
+    )
     sites = d.x_um, d.y_um[:, None]
-    lit = lens.layers.lit(tangents, depth_um, wave, sites, math.sqrt(d.site_um2)) * (np.asarray(d.diameter_um) > 0)
+    lit = lens.layers.lit(tangents, depth_um, wave, sites, math.sqrt(d.site_um2)) * (
+        np.asarray(d.diameter_um) > 0
+    )
     return max(0.0, 1 - float(lit.sum()) * d.site_um2 / hole)
 
 
 def _sharpest(lens: Lens, light: Waves, angle_rad: float, close_um: Array) -> Array:
-    """(2,) distance behind the pillars where the line images along x and along y are sharpest; NaN at an end."""
-    sensor, flat = lens.sensor_distance_um, lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
+    """(2,) distance behind the pillars where the line images along x and along y are
+    sharpest; NaN at an end.
+    """
+    sensor, flat = (
+        lens.sensor_distance_um,
+        lens.layers.after(lens.sensor_distance_um, lens.wavelength_um),
+    )
     aperture = max(min(light.aperture), 1e-6)
     deep = lens.wavelength_um * flat.index[0] / aperture**2
     close = sensor + close_um[np.abs(close_um) < sensor]
     known = [*close, sensor, sensor * math.cos(angle_rad) ** 3]
     films = sum(flat.thickness_um[1:])
-    low, high = max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films)), max(known) + BEYOND * deep
+    low, high = (
+        max(min(known) - BEYOND * deep, films + 0.05 * (sensor - films)),
+        max(known) + BEYOND * deep,
+    )
     count = min(max(math.ceil((high - low) / deep * STEPS), 8), MOST_STEPS)
     places, step = np.linspace(low, high, count, retstep=True)
     field = light.at(float(places[0]))
@@ -205,10 +283,14 @@ def _sharpest(lens: Lens, light: Waves, angle_rad: float, close_um: Array) -> Ar
     for row in found:
         row[:] = [sharpness_per_um(light, field, axis) for axis in (0, 1)]
         field = field * ahead
-    return np.array([_settled(light, places, found[:, axis], axis, deep) for axis in (0, 1)])
+    return np.array(
+        [_settled(light, places, found[:, axis], axis, deep) for axis in (0, 1)]
+    )
 
 
-def _settled(light: Waves, places: Array, sharp: Array, axis: int, deep: float) -> float:
+def _settled(
+    light: Waves, places: Array, sharp: Array, axis: int, deep: float
+) -> float:
     """The best of a scan, settled between its neighbours."""
     best = int(np.argmax(sharp))
     if best in (0, len(places) - 1):

@@ -1,16 +1,22 @@
-"""The chief ray of a field angle by the local grating equation, and the rays close to it.
+"""The chief ray of a field angle by the local grating equation, and the rays close to
+it.
 
-Behind the pillars light goes on along p = p_in + grad φ / k (n sin θ as a vector) and meets the sensor at
-X = x + b(p) p, b = Σ t / √(n² - p²) over the media behind (:mod:`metalens.lens.media`). Close rays, with Q = ∂p/∂x on
+Behind the pillars light goes on along p = p_in + grad φ / k (n sin θ as a vector) and
+meets the sensor at
+X = x + b(p) p, b = Σ t / √(n² - p²) over the media behind (:mod:`metalens.lens.media`).
+Close rays, with Q = ∂p/∂x on
 the pillars and B = ∂(b p)/∂p:
 
     ∂X/∂x = 1 + B Q,        B = Σ t [1 / √(n² - p²) + p pᵀ / √(n² - p²)³]
 
-B is linear in the distance. Along a direction u of the sensor close rays spread as |uᵀ(1 + B Q)|, least at one
-distance: the tangential focus for u along the field angle, the sagittal one for u across it (Coddington's where Q has
+B is linear in the distance. Along a direction u of the sensor close rays spread as
+|uᵀ(1 + B Q)|, least at one
+distance: the tangential focus for u along the field angle, the sagittal one for u
+across it (Coddington's where Q has
 these axes).
 
-The slope of the phase and its curvature are those of a polynomial of fourth degree through the pillars about the ray.
+The slope of the phase and its curvature are those of a polynomial of fourth degree
+through the pillars about the ray.
 """
 
 import math
@@ -28,23 +34,33 @@ from metalens.psf import incidence
 ZONES = 2.0  # radius of the pillars that are looked at, in √(wavelength focal length)
 LEAST = 60  # pillars, for 15 terms
 SPARSE = 0.3  # of the sites about the ray: with fewer pillars it has missed the lens
-ROUGH = 0.6  # rad rms of the phase about its polynomial, beyond which there is no wave front; 1.81 is that of any phase
+# rad rms of the phase about its polynomial, beyond which there is no wave front; 1.81
+# is that of any phase
+ROUGH = 0.6
 POWERS = [(i, j) for i in range(5) for j in range(5 - i)]
 TURNS = 4  # of the polynomial, each taken off the phase before the next
 FAR = 5  # of the width of what is looked at: how far apart slopes are compared
-PARALLEL = 1e-16  # squared change of where rays meet over the distance, below which they are parallel to rounding
+# squared change of where rays meet over the distance, below which they are parallel to
+# rounding
+PARALLEL = 1e-16
 STEP = 1e-4  # of differences, in tangents or depths
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChiefRay:
-    """Where the ray through the middle of the stop goes, and the rays close to it; vectors are [x, y].
+    """Where the ray through the middle of the stop goes, and the rays close to it;
+    vectors are [x, y].
 
-    at_um: (2,) on the pillars. p: (2,) n sin θ behind them. meets_um: (2,) on the sensor.
-    focus_um: (2,) distance behind the pillars where close rays spread least along x and along y of the sensor, the
-        films behind kept and the gap before them changed; below 0 for a virtual focus, inf for parallel rays.
-    focus_error_um: (2,) one sigma of it, by how the pillars' phases scatter about their polynomial.
-    source: (2,) where the source lies from the axis, in um; for collimated light its tangents.
+    at_um: (2,) on the pillars. p: (2,) n sin θ behind them. meets_um: (2,) on the
+    sensor.
+    focus_um: (2,) distance behind the pillars where close rays spread least along x and
+    along y of the sensor, the
+        films behind kept and the gap before them changed; below 0 for a virtual focus,
+        inf for parallel rays.
+    focus_error_um: (2,) one sigma of it, by how the pillars' phases scatter about their
+    polynomial.
+    source: (2,) where the source lies from the axis, in um; for collimated light its
+    tangents.
     moves: (2, 2) ∂ meets_um / ∂ source.
     """
 
@@ -57,19 +73,26 @@ class ChiefRay:
     moves: Array
 
 
-def chief_ray(lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um: float = math.inf) -> ChiefRay:
-    """The chief ray at the design wavelength: through the middle of the stop, or of the pillars where there is none.
+def chief_ray(
+    lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um: float = math.inf
+) -> ChiefRay:
+    """The chief ray at the design wavelength: through the middle of the stop, or of the
+    pillars where there is none.
 
     Args:
-        angle_rad: (x, y) field angle, arctangents of the slopes in air of the ray to the middle of the lens.
+        angle_rad: (x, y) field angle, arctangents of the slopes in air of the ray to
+            the middle of the lens.
         depth_um: of the source, inf for collimated light.
 
     Raises:
-        PropagationError: the ray misses the pillars, or is totally reflected; the phase about it is no wave front (a
+        PropagationError: the ray misses the pillars, or is totally reflected; the phase
+            about it is no wave front (a
             vortex, a hologram); DomainError: an angle outside the lens's library.
 
-    Accuracy: landing and foci to ``focus_error_um`` where pillars err at random; of a smooth phase 2e-6 of the distance
-        and a twentieth of a wavelength. The factor of unlike neighbours (``lens.neighbours``) is left out.
+    Accuracy: landing and foci to ``focus_error_um`` where pillars err at random; of a
+    smooth phase 2e-6 of the distance
+        and a twentieth of a wavelength. The factor of unlike neighbours
+        (``lens.neighbours``) is left out.
     """
     source = source_at(lens, angle_rad, depth_um)
     at = middle_um(lens, source, depth_um)
@@ -78,18 +101,36 @@ def chief_ray(lens: Lens, angle_rad: tuple[float, float] = (0.0, 0.0), depth_um:
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     w = float(p @ p)
     if w >= 0.999 * after.layers[0][0] ** 2:
-        raise PropagationError(_lost(lens, angle_rad, f"leaves with n sin θ = {math.sqrt(w):.3f}, beyond the media"))
+        raise PropagationError(
+            _lost(
+                lens,
+                angle_rad,
+                f"leaves with n sin θ = {math.sqrt(w):.3f}, beyond the media",
+            )
+        )
     q = curved + _change(lambda x: _arriving(lens, x, source, depth_um), at, 1.0)
     focus = _foci(after, p, q)
     real = np.isfinite(focus)
     error = np.where(
-        real, np.sqrt(sum((_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2 for d in doubt)), np.inf
+        real,
+        np.sqrt(
+            sum((_foci(after, p, q + d) - np.where(real, focus, 0)) ** 2 for d in doubt)
+        ),
+        np.inf,
     )
     step = STEP if math.isinf(depth_um) else STEP * depth_um
     moved = _change(lambda s: _arriving(lens, at, s, depth_um), source, step)
     walks = _change(lambda s: middle_um(lens, s, depth_um), source, step)
     moves = _bent(after, p) @ moved + (np.eye(2) + _bent(after, p) @ q) @ walks
-    return ChiefRay(at, p, at + media.bend(after.layers, w) * p, focus, np.asarray(error), source, moves)
+    return ChiefRay(
+        at,
+        p,
+        at + media.bend(after.layers, w) * p,
+        focus,
+        np.asarray(error),
+        source,
+        moves,
+    )
 
 
 def _lost(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
@@ -99,13 +140,19 @@ def _lost(lens: Lens, angle_rad: tuple[float, float], why: str) -> str:
 
 
 def source_at(lens: Lens, angle_rad: tuple[float, float], depth_um: float) -> Array:
-    """(2,) where the source of a field angle lies from the axis, in um; the tangents of collimated light."""
+    """(2,) where the source of a field angle lies from the axis, in um; the tangents of
+    collimated light.
+    """
     tangents: Array = np.tan(np.asarray(angle_rad, float))
     slope = float(np.hypot(*tangents))
     if math.isinf(depth_um) or slope == 0:
         return tangents
     p = slope / math.hypot(1, slope)
-    return np.asarray(-media.reach(lens.layers.before(depth_um, lens.wavelength_um), p) / slope * tangents)
+    return np.asarray(
+        -media.reach(lens.layers.before(depth_um, lens.wavelength_um), p)
+        / slope
+        * tangents
+    )
 
 
 def _arriving(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
@@ -117,7 +164,9 @@ def _arriving(lens: Lens, x: Array, source: Array, depth_um: float) -> Array:
 
 
 def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
-    """(2,) where the ray through the middle of the stop meets the pillars; the middle of these without a stop."""
+    """(2,) where the ray through the middle of the stop meets the pillars; the middle
+    of these without a stop.
+    """
     stop, between = lens.layers.stop, lens.layers.from_stop(lens.wavelength_um)
     if stop is None:
         there = lens.diameters.diameter_um > 0
@@ -127,41 +176,61 @@ def middle_um(lens: Lens, source: Array, depth_um: float) -> Array:
     if between is None:
         return np.array(stop.centre_um)
     p = _arriving(lens, np.zeros(2), source, depth_um)
-    slopes = lens.layers.through_middle(p / math.sqrt(1 - float(p @ p)), depth_um, lens.wavelength_um)
+    slopes = lens.layers.through_middle(
+        p / math.sqrt(1 - float(p @ p)), depth_um, lens.wavelength_um
+    )
     p = slopes / math.sqrt(1 + float(slopes @ slopes))
     return np.asarray(stop.centre_um + media.bend(between.layers, float(p @ p)) * p)
 
 
 def _change(function: Callable[[Array], Array], x: Array, step: float) -> Array:
     """(2, 2) ∂function_i / ∂x_j by central differences."""
-    columns = [(function(x + e) - function(x - e)) / (2 * step) for e in np.eye(2) * step]
+    columns = [
+        (function(x + e) - function(x - e)) / (2 * step) for e in np.eye(2) * step
+    ]
     return np.stack(columns, axis=1)
 
 
 def _bent(after: Media, p: Array) -> Array:
     """(2, 2) B of the heading."""
     w, outer = float(p @ p), np.outer(p, p)
-    return np.asarray(sum(t * (np.eye(2) / (n * n - w) ** 0.5 + outer / (n * n - w) ** 1.5) for n, t in after.layers))
+    return np.asarray(
+        sum(
+            t * (np.eye(2) / (n * n - w) ** 0.5 + outer / (n * n - w) ** 1.5)
+            for n, t in after.layers
+        )
+    )
 
 
 def _foci(after: Media, p: Array, q: Array) -> Array:
-    """(2,) distances behind the pillars where close rays spread least along x and along y."""
+    """(2,) distances behind the pillars where close rays spread least along x and along
+    y.
+    """
     w, cover = float(p @ p), after.index[0]
     per_um = np.eye(2) / (cover**2 - w) ** 0.5 + np.outer(p, p) / (cover**2 - w) ** 1.5
     rest, change = np.eye(2) + _bent(after, p) @ q, per_um @ q
     power = (change**2).sum(1)
     more = np.divide(
-        -(rest * change).sum(1), power, out=np.full(2, np.inf), where=power > PARALLEL / sum(after.thickness_um) ** 2
+        -(rest * change).sum(1),
+        power,
+        out=np.full(2, np.inf),
+        where=power > PARALLEL / sum(after.thickness_um) ** 2,
     )
     return np.asarray(sum(after.thickness_um) + more)
 
 
-def _wave_front(lens: Lens, at: Array, angle_rad: tuple[float, float]) -> tuple[Array, Array, list[Array]]:
-    """Slope (2,) and curvature (2, 2) of the pillars' phase over k about a place, and changes of the curvature whose
+def _wave_front(
+    lens: Lens, at: Array, angle_rad: tuple[float, float]
+) -> tuple[Array, Array, list[Array]]:
+    """Slope (2,) and curvature (2, 2) of the pillars' phase over k about a place, and
+    changes of the curvature whose
     squares add up to its variance."""
     focal = 1 / (1 / lens.reduced_um + 1 / lens.source_distance_um)
     k, site = 2 * math.pi / lens.wavelength_um, lens.diameters.site_um2
-    radius = max(ZONES * math.sqrt(lens.wavelength_um * focal), math.sqrt(2 * LEAST * site / math.pi))
+    radius = max(
+        ZONES * math.sqrt(lens.wavelength_um * focal),
+        math.sqrt(2 * LEAST * site / math.pi),
+    )
     x, y, phase, near = _about(lens, at, radius, incidence(lens, angle_rad))
     wanted = SPARSE * min(math.pi * radius**2 / site, lens.diameters.pillars)
     if np.count_nonzero(near) < max(wanted, LEAST):
@@ -170,15 +239,35 @@ def _wave_front(lens: Lens, at: Array, angle_rad: tuple[float, float]) -> tuple[
             f"{np.count_nonzero(near)} pillars; need {max(wanted, LEAST):.0f} about it")
         )  # fmt: skip
     turn = np.where(near, np.exp(1j * phase), 0.0)
-    first = _guessed(turn, (x[0] + x[-1], y[0] + y[-1]), lens.diameters.steps_um, lens.diameters.lattice.centred)
-    terms = np.stack([(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1)[near]
-    series, scatter = _fitted(terms, turn[near], {(i, j): c * radius ** (i + j) for (i, j), c in first.items()})
+    first = _guessed(
+        turn,
+        (x[0] + x[-1], y[0] + y[-1]),
+        lens.diameters.steps_um,
+        lens.diameters.lattice.centred,
+    )
+    terms = np.stack(
+        [(x / radius) ** i * (y[:, None] / radius) ** j for i, j in POWERS], -1
+    )[near]
+    series, scatter = _fitted(
+        terms,
+        turn[near],
+        {(i, j): c * radius ** (i + j) for (i, j), c in first.items()},
+    )
     if scatter > ROUGH:
-        raise PropagationError(_lost(lens, angle_rad, f"meets no wave front: phases scatter by {scatter:.2f} rad rms"))
+        raise PropagationError(
+            _lost(
+                lens,
+                angle_rad,
+                f"meets no wave front: phases scatter by {scatter:.2f} rad rms",
+            )
+        )
     named = dict(zip(POWERS, series / k, strict=True))
     slope = np.array([named[1, 0], named[0, 1]]) / radius
     inverse = np.linalg.cholesky(np.linalg.inv(terms.T @ terms)) * scatter / k
-    doubt = [_curvature(dict(zip(POWERS, column, strict=True)), radius) for column in inverse.T]
+    doubt = [
+        _curvature(dict(zip(POWERS, column, strict=True)), radius)
+        for column in inverse.T
+    ]
     return slope, _curvature(named, radius), doubt
 
 
@@ -187,25 +276,47 @@ def _curvature(named: dict[tuple[int, int], float], radius: float) -> Array:
     return np.array([[2 * named[2, 0], both], [both, 2 * named[0, 2]]]) / radius**2
 
 
-def _about(lens: Lens, at: Array, radius: float, tilt_rad: float) -> tuple[Array, Array, Array, Array]:
-    """x (x,) and y (y,) from a place, phase of the pillars (y, x), and which of them lie within a radius."""
+def _about(
+    lens: Lens, at: Array, radius: float, tilt_rad: float
+) -> tuple[Array, Array, Array, Array]:
+    """x (x,) and y (y,) from a place, phase of the pillars (y, x), and which of them
+    lie within a radius.
+    """
     d = lens.diameters
-    columns, rows = (np.flatnonzero(abs(a - c) <= radius) for a, c in zip((d.x_um, d.y_um), at, strict=True))
+    columns, rows = (
+        np.flatnonzero(abs(a - c) <= radius)
+        for a, c in zip((d.x_um, d.y_um), at, strict=True)
+    )
     if not (columns.size and rows.size):
         return np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0), bool)
     across, down = slice(columns[0], columns[-1] + 1), slice(rows[0], rows[-1] + 1)
     x, y = d.x_um[across] - at[0], d.y_um[down] - at[1]
-    near = (x * x + y[:, None] ** 2 <= radius**2) & (np.asarray(d.diameter_um[down, across]) > 0)
-    return x, y, lens.rows_phase_rad(down, lens.wavelength_um, tilt_rad)[:, across], near
+    near = (x * x + y[:, None] ** 2 <= radius**2) & (
+        np.asarray(d.diameter_um[down, across]) > 0
+    )
+    return (
+        x,
+        y,
+        lens.rows_phase_rad(down, lens.wavelength_um, tilt_rad)[:, across],
+        near,
+    )
 
 
 def _guessed(
-    turn: Array, twice_um: tuple[float, float], steps: tuple[float, float], centred: bool
+    turn: Array,
+    twice_um: tuple[float, float],
+    steps: tuple[float, float],
+    centred: bool,
 ) -> dict[tuple[int, int], float]:
-    """Slopes and halves of curvatures, by power of x and y, of the phase of (y, x) unit numbers: of neighbours, and of
-    how that differs some pillars on. twice_um: twice the middle (x, y) of the map from where the slopes are wanted."""
+    """Slopes and halves of curvatures, by power of x and y, of the phase of (y, x) unit
+    numbers: of neighbours, and of
+    how that differs some pillars on. twice_um: twice the middle (x, y) of the map from
+    where the slopes are wanted."""
     hop, found = 2 if centred else 1, {}
-    beside, below = turn[:, hop:] * turn[:, :-hop].conj(), turn[hop:] * turn[:-hop].conj()
+    beside, below = (
+        turn[:, hop:] * turn[:, :-hop].conj(),
+        turn[hop:] * turn[:-hop].conj(),
+    )
     far = [max(hop, n // FAR // hop * hop) for n in turn.shape[::-1]]
     across = beside[:, far[0] :] * beside[:, : -far[0]].conj()
     down = below[far[1] :] * below[: -far[1]].conj()
@@ -216,13 +327,24 @@ def _guessed(
     ]
     twist = np.angle(mixed.sum()) / (hop * far[1] * steps[0] * steps[1])
     found = {(2, 0): bent[0] / 2, (1, 1): twist, (0, 2): bent[1] / 2}
-    found[1, 0] = np.angle(beside.sum()) / (hop * steps[0]) - bent[0] * twice_um[0] / 2 - twist * twice_um[1] / 2
-    found[0, 1] = np.angle(below.sum()) / (hop * steps[1]) - bent[1] * twice_um[1] / 2 - twist * twice_um[0] / 2
+    found[1, 0] = (
+        np.angle(beside.sum()) / (hop * steps[0])
+        - bent[0] * twice_um[0] / 2
+        - twist * twice_um[1] / 2
+    )
+    found[0, 1] = (
+        np.angle(below.sum()) / (hop * steps[1])
+        - bent[1] * twice_um[1] / 2
+        - twist * twice_um[0] / 2
+    )
     return found
 
 
-def _fitted(terms: Array, turn: Array, first: dict[tuple[int, int], float]) -> tuple[Array, float]:
-    """(terms,) polynomial of the phase of (pillars,) unit numbers from a guess of some of its terms, and the rms of
+def _fitted(
+    terms: Array, turn: Array, first: dict[tuple[int, int], float]
+) -> tuple[Array, float]:
+    """(terms,) polynomial of the phase of (pillars,) unit numbers from a guess of some
+    of its terms, and the rms of
     what it leaves, rad."""
     series = np.array([first.get(power, 0.0) for power in POWERS])
     solve = np.linalg.pinv(terms)

@@ -1,4 +1,6 @@
-"""What a pillar cell is: geometry, materials, propagating orders, the answer of a solver."""
+"""What a pillar cell is: geometry, materials, propagating orders, the answer of a
+solver.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,10 @@
-"""Pages of the refractiveindex.info database as they come: dispersion formulas 1 to 9 and tables nk, n or k in YAML.
+"""Pages of the refractiveindex.info database as they come: dispersion formulas 1 to 9
+and tables nk, n or k in YAML.
 
-Wavelengths in um. A page without k is that of a transparent material: k = 0. Where n and k have their own ranges, both
-must hold. The formulas are those of the database's own description (https://refractiveindex.info/about).
+Wavelengths in um. A page without k is that of a transparent material: k = 0. Where n
+and k have their own ranges, both
+must hold. The formulas are those of the database's own description
+(https://refractiveindex.info/about).
 """
 
 import math
@@ -15,14 +18,29 @@ import yaml
 from metalens.ground.arrays import Array
 from metalens.ground.errors import DAMAGE, MaterialError
 
-LEAST = {1: 3, 2: 3, 3: 3, 4: 5, 5: 3, 6: 3, 7: 2, 8: 3, 9: 3}  # coefficients without which a formula says nothing
-MOST = {7: 6, 8: 4, 9: 6}  # coefficients that a formula has; of all others the terms go on in pairs, after one alone
+LEAST = {
+    1: 3,
+    2: 3,
+    3: 3,
+    4: 5,
+    5: 3,
+    6: 3,
+    7: 2,
+    8: 3,
+    9: 3,
+}  # coefficients without which a formula says nothing
+MOST = {
+    7: 6,
+    8: 4,
+    9: 6,
+}  # coefficients that a formula has; of all others the terms go on in pairs, after one alone
 _NOISE = 1e-3  # by how far k of a measured table may lie below 0: it is 0 there
 
 
 @dataclass(frozen=True, slots=True)
 class Formula:
-    """n of a wavelength by one of the nine formulas; it holds from range_um[0] to range_um[1].
+    """n of a wavelength by one of the nine formulas; it holds from range_um[0] to
+    range_um[1].
 
     where: file and formula, in the words of a refusal.
     """
@@ -41,7 +59,9 @@ class Formula:
         step = 1e-20
         n = self._index(complex(wavelength_um, step))
         if not (math.isfinite(n.real) and n.real > 0 and abs(n.imag) < 1e-6):
-            raise MaterialError(f"{self.where} gives n = {n.real:g} at {wavelength_um} um: no real index there")
+            raise MaterialError(
+                f"{self.where} gives n = {n.real:g} at {wavelength_um} um: no real index there"
+            )
         return complex(n.real), complex(n.imag / step)
 
     def _index(self, w: complex) -> complex:
@@ -49,9 +69,13 @@ class Formula:
         first, pairs = c[0], list(zip(c[1::2], c[2::2], strict=False))
         w2 = w * w
         if self.number == 1:
-            return complex(np.sqrt(1 + first + sum(b * w2 / (w2 - d * d) for b, d in pairs)))
+            return complex(
+                np.sqrt(1 + first + sum(b * w2 / (w2 - d * d) for b, d in pairs))
+            )
         if self.number == 2:
-            return complex(np.sqrt(1 + first + sum(b * w2 / (w2 - d) for b, d in pairs)))
+            return complex(
+                np.sqrt(1 + first + sum(b * w2 / (w2 - d) for b, d in pairs))
+            )
         if self.number == 3:
             return complex(np.sqrt(first + sum(b * w**d for b, d in pairs)))
         if self.number == 4:
@@ -70,7 +94,11 @@ class Formula:
             if len(c) > start:
                 a, p, b, q = (*c[start : start + 4], 0.0, 0.0, 0.0)[:4]
                 square += a * w**p / (w * w - b**q)
-        return complex(np.sqrt(square + sum(a * w**p for a, p in zip(c[9::2], c[10::2], strict=False))))
+        return complex(
+            np.sqrt(
+                square + sum(a * w**p for a, p in zip(c[9::2], c[10::2], strict=False))
+            )
+        )
 
     def _rare(self, w: complex) -> complex:
         """Formulas 7 (Herzberger), 8 (Lorentz-Lorenz) and 9."""
@@ -78,7 +106,14 @@ class Formula:
         w2 = w * w
         if self.number == 7:
             near = 1 / (w2 - 0.028)
-            return c[0] + c[1] * near + c[2] * near**2 + c[3] * w2 + c[4] * w2**2 + c[5] * w2**3
+            return (
+                c[0]
+                + c[1] * near
+                + c[2] * near**2
+                + c[3] * w2
+                + c[4] * w2**2
+                + c[5] * w2**3
+            )
         if self.number == 8:
             polar = c[0] + c[1] * w2 / (w2 - c[2]) + c[3] * w2
             return complex(np.sqrt((1 + 2 * polar) / (1 - polar)))
@@ -102,7 +137,9 @@ class Table:
     def at(self, wavelength_um: float) -> tuple[complex, complex]:
         """Value and slope."""
         x, y = self.rows
-        i = int(np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2))
+        i = int(
+            np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2)
+        )
         rate = (y[i + 1] - y[i]) / (x[i + 1] - x[i])
         return complex(y[i] + rate * (wavelength_um - x[i])), complex(rate)
 
@@ -114,20 +151,30 @@ def read(text: str, where: str) -> tuple[Part, Part | None, str]:
     """n, k (None: transparent) and the source in words of a page.
 
     Raises:
-        MaterialError: not such a page, an unknown formula, a bad row (``where`` and the row are named).
+        MaterialError: not such a page, an unknown formula, a bad row (``where`` and the
+            row are named).
     """
     try:
         page = yaml.safe_load(text)
-    except (yaml.YAMLError, *DAMAGE) as error:  # nested too deep, endless integers and dates that are none as well
-        raise MaterialError(f"{where}: not YAML: {next(iter(str(error).splitlines()), 'no words')}") from None
+    except (
+        yaml.YAMLError,
+        *DAMAGE,
+    ) as error:  # nested too deep, endless integers and dates that are none as well
+        raise MaterialError(
+            f"{where}: not YAML: {next(iter(str(error).splitlines()), 'no words')}"
+        ) from None
     blocks = page.get("DATA") if isinstance(page, dict) else None
     if not isinstance(blocks, list):
-        raise MaterialError(f"{where}: no list DATA; need a page of refractiveindex.info")
+        raise MaterialError(
+            f"{where}: no list DATA; need a page of refractiveindex.info"
+        )
     n: Part | None = None
     k: Part | None = None
     for i, block in enumerate(blocks, 1):
         if not isinstance(block, dict):
-            raise MaterialError(f"{where}: entry {i} of DATA is no table; need type and data, or type and coefficients")
+            raise MaterialError(
+                f"{where}: entry {i} of DATA is no table; need type and data, or type and coefficients"
+            )
         real, absorbed = _parts(block, where)
         if (n and real) or (k and absorbed):
             raise MaterialError(
@@ -135,7 +182,9 @@ def read(text: str, where: str) -> tuple[Part, Part | None, str]:
             )
         n, k = n or real, k or absorbed
     if n is None:
-        raise MaterialError(f"{where}: neither a formula nor a table of n; need one of them")
+        raise MaterialError(
+            f"{where}: neither a formula nor a table of n; need one of them"
+        )
     return n, k, _source(page)
 
 
@@ -153,12 +202,18 @@ def _parts(block: dict[str, Any], where: str) -> tuple[Part | None, Part | None]
     if "n" in columns and table[1].min() <= 0:
         raise MaterialError(f"{where}, {kind}: n = {table[1].min():g}; need n above 0")
     if "k" in columns and table[-1].min() < -_NOISE:
-        raise MaterialError(f"{where}, {kind}: k = {table[-1].min():g}; need k of 0 or above (exp(-iwt))")
-    return Table(table[:2]) if "n" in columns else None, Table(table[[0, -1]]) if "k" in columns else None
+        raise MaterialError(
+            f"{where}, {kind}: k = {table[-1].min():g}; need k of 0 or above (exp(-iwt))"
+        )
+    return Table(table[:2]) if "n" in columns else None, Table(
+        table[[0, -1]]
+    ) if "k" in columns else None
 
 
 def _words(block: dict[str, Any], key: str) -> str:
-    """A text or number; '' for anything else, such as lists of lists by reference, whose text would have no end."""
+    """A text or number; '' for anything else, such as lists of lists by reference,
+    whose text would have no end.
+    """
     value = block.get(key, "")
     return str(value) if isinstance(value, str | int | float) else ""
 
@@ -167,9 +222,15 @@ def _formula(block: dict[str, Any], kind: str, where: str) -> Formula:
     numbers = _words(block, "coefficients").split()
     span = (_words(block, "wavelength_range") or _words(block, "range")).split()
     try:
-        number, values, ends = int(kind.split()[-1]), tuple(map(float, numbers)), tuple(map(float, span))
+        number, values, ends = (
+            int(kind.split()[-1]),
+            tuple(map(float, numbers)),
+            tuple(map(float, span)),
+        )
     except ValueError:
-        raise MaterialError(f"{where}, {kind}: coefficients or wavelength_range are not numbers") from None
+        raise MaterialError(
+            f"{where}, {kind}: coefficients or wavelength_range are not numbers"
+        ) from None
     if number not in LEAST or len(values) < LEAST[number] or len(ends) != 2:
         raise MaterialError(
             f"{where}, {kind}: {len(values)} coefficients, range {span}; need formula 1 to 9 with its coefficients and "
@@ -189,7 +250,9 @@ def _complete(number: int, count: int, where: str) -> None:
     if number == 4:
         whole = whole and count != 7  # its first two terms have four coefficients each
     if not whole:
-        raise MaterialError(f"{where}: {count} coefficients, the last of them of no whole term; need whole terms")
+        raise MaterialError(
+            f"{where}: {count} coefficients, the last of them of no whole term; need whole terms"
+        )
 
 
 def _rows(text: str, width: int, where: str) -> Array:
@@ -200,13 +263,17 @@ def _rows(text: str, width: int, where: str) -> Array:
         except ValueError:
             row = []
         if len(row) != width or not all(map(math.isfinite, row)) or row[0] <= 0:
-            raise MaterialError(f"{where}, row {i}: {line.strip()!r}; need {width} finite numbers, wavelength in um")
+            raise MaterialError(
+                f"{where}, row {i}: {line.strip()!r}; need {width} finite numbers, wavelength in um"
+            )
         rows.append(row)
     table = np.array(rows).reshape(-1, width).T
     if table.size:
         table = table[:, np.argsort(table[0], kind="stable")]
     if table.shape[1] < 2 or (np.diff(table[0]) <= 0).any():
-        raise MaterialError(f"{where}: {table.shape[1]} rows; need two or more at distinct wavelengths")
+        raise MaterialError(
+            f"{where}: {table.shape[1]} rows; need two or more at distinct wavelengths"
+        )
     return np.asarray(table)
 
 
@@ -228,4 +295,6 @@ def load(path: Path, where: str) -> tuple[Part, Part | None, str]:
     try:
         return read(path.read_text(encoding="utf-8-sig"), where)
     except (OSError, UnicodeDecodeError) as error:
-        raise MaterialError(f"{where}: not a readable text file ({error}); need a YAML page") from None
+        raise MaterialError(
+            f"{where}: not a readable text file ({error}); need a YAML page"
+        ) from None

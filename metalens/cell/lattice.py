@@ -11,7 +11,8 @@ from metalens.ground.errors import CellError
 class Lattice:
     """A lattice on the pitch of the cell, the period along x.
 
-    kind: square; rectangular, with ``ratio`` times the pitch along y; hexagonal, with rows sqrt(3)/2 pitches apart,
+    kind: square; rectangular, with ``ratio`` times the pitch along y; hexagonal, with
+    rows sqrt(3)/2 pitches apart,
         every other one shifted by half a pitch.
     ratio: period along y over the pitch, of a rectangular lattice.
     """
@@ -21,7 +22,9 @@ class Lattice:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.ratio) and 0.05 <= self.ratio <= 20):
-            raise CellError(f"lattice ratio = {self.ratio}: need the period along y over the pitch, 0.05 to 20")
+            raise CellError(
+                f"lattice ratio = {self.ratio}: need the period along y over the pitch, 0.05 to 20"
+            )
         if self.kind != "rectangular" and self.ratio != 1.0:
             raise CellError(
                 f"lattice ratio = {self.ratio} on a {self.kind} lattice: only rectangular ones take a ratio"
@@ -29,7 +32,9 @@ class Lattice:
 
     @property
     def centred(self) -> bool:
-        """Whether the rectangle of :meth:`periods_um` holds a second site at its middle."""
+        """Whether the rectangle of :meth:`periods_um` holds a second site at its
+        middle.
+        """
         return self.kind == "hexagonal"
 
     @property
@@ -53,6 +58,10 @@ class Lattice:
         x, y = self.periods_um(pitch_um)
         sites = [(i * x, j * y) for i in range(-2, 3) for j in range(-2, 3)]
         if self.centred:
-            sites += [((i + 0.5) * x, (j + 0.5) * y) for i in range(-2, 2) for j in range(-2, 2)]
+            sites += [
+                ((i + 0.5) * x, (j + 0.5) * y)
+                for i in range(-2, 2)
+                for j in range(-2, 2)
+            ]
         sites.sort(key=lambda site: math.hypot(*site))
         return tuple(sites[1:])

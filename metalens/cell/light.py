@@ -14,12 +14,15 @@ class Light:
     """One plane wave from the substrate.
 
     wavelength_um: in vacuum.
-    angle_rad: of the light outside, in vacuum: the tangential wave vector is k0 sin(angle_rad).
-    polarization: s or p, or x or y for the field along that axis of the plane of incidence.
+    angle_rad: of the light outside, in vacuum: the tangential wave vector is k0
+    sin(angle_rad).
+    polarization: s or p, or x or y for the field along that axis of the plane of
+    incidence.
     azimuth_rad: of the plane of incidence, from +x to +y.
 
     Raises:
-        CellError: a wavelength that is no length, what is no direction of light, an unknown polarisation.
+        CellError: a wavelength that is no length, what is no direction of light, an
+            unknown polarisation.
     """
 
     wavelength_um: float
@@ -29,9 +32,13 @@ class Light:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.wavelength_um) and self.wavelength_um > 0):
-            raise CellError(f"wavelength_um = {self.wavelength_um}: need a finite length above 0")
+            raise CellError(
+                f"wavelength_um = {self.wavelength_um}: need a finite length above 0"
+            )
         if self.polarization not in get_args(Polarization):
-            raise CellError(f"polarization = {self.polarization!r}: need 'x', 'y', 's' or 'p'")
+            raise CellError(
+                f"polarization = {self.polarization!r}: need 'x', 'y', 's' or 'p'"
+            )
         check_direction(self.angle_rad, self.azimuth_rad)
 
 
@@ -41,8 +48,14 @@ def check_direction(angle_rad: float, azimuth_rad: float) -> None:
     Raises:
         CellError: an angle that is not finite, or not below a right angle.
     """
-    if not (math.isfinite(angle_rad) and abs(angle_rad) < math.pi / 2 and math.isfinite(azimuth_rad)):
-        raise CellError(f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, |angle| < pi/2")
+    if not (
+        math.isfinite(angle_rad)
+        and abs(angle_rad) < math.pi / 2
+        and math.isfinite(azimuth_rad)
+    ):
+        raise CellError(
+            f"angle_rad = {angle_rad}, azimuth_rad = {azimuth_rad}: need finite angles, |angle| < pi/2"
+        )
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -1,4 +1,5 @@
-"""Refractive index of the materials of a cell: published ones with source and range, own CSV or YAML, plain numbers.
+"""Refractive index of the materials of a cell: published ones with source and range,
+own CSV or YAML, plain numbers.
 
 YAML files are pages of refractiveindex.info (:mod:`metalens.cell.database`).
 Time factor exp(-iwt): an absorbing material has k > 0. Nothing is extrapolated.
@@ -27,7 +28,8 @@ class Material:
     name, source: what it is, and where the numbers come from.
     range_um: shortest and longest vacuum wavelength for which they hold.
     table: (3, rows) wavelength_um, n, k; empty for a Sellmeier material.
-    sellmeier: ((B, resonance_um), ...) of n² = 1 + sum B l² / (l² - resonance²); empty for a table.
+    sellmeier: ((B, resonance_um), ...) of n² = 1 + sum B l² / (l² - resonance²); empty
+    for a table.
     page: n, and k where it is not 0, of a database page instead.
     """
 
@@ -54,7 +56,9 @@ _FORMULAS = {
         ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161)),
     ),
 }
-_PAGES = {  # deposited films where the database has them, bulk else; o and e: ordinary and extraordinary ray
+# deposited films where the database has them, bulk else; o and e: ordinary and
+# extraordinary ray
+_PAGES = {
     "TiO2": "TiO2_Siefke",
     "TiO2-sputtered": "TiO2_Sarkar",
     "TiO2-rutile-o": "TiO2_Devore-o",
@@ -104,22 +108,28 @@ gold=Au silver=Ag aluminium=Al aluminum=Al chromium=Cr chrome=Cr fused-quartz=Si
 su-8-2000=SU-8 ps=polystyrene gan-o=GaN sapphire-o=sapphire al2o3-o=sapphire al2o3-e=sapphire-e mgf2-o=MgF2
 rutile=TiO2-rutile-o zinc-sulfide=ZnS
 """
-SPOKEN = dict(pair.split("=") for pair in _WORDS.split())  # what people type and no spelling leads from: its name
+SPOKEN = dict(
+    pair.split("=") for pair in _WORDS.split()
+)  # what people type and no spelling leads from: its name
 
 
 def index(material: cell.Material | Material, wavelength_um: float) -> complex:
     """Refractive index n + ik at a vacuum wavelength.
 
     Args:
-        material: a name of ``NAMES``, the path of a CSV file (:func:`read_csv`) or of a YAML page of
-            refractiveindex.info, plain numbers (``cell.Index``), a ``cell.Blend``, or a ``Material``.
+        material: a name of ``NAMES``, the path of a CSV file (:func:`read_csv`) or of a
+            YAML page of
+            refractiveindex.info, plain numbers (``cell.Index``), a ``cell.Blend``, or a
+            ``Material``.
         wavelength_um: vacuum wavelength.
 
-    Accuracy: that of the source. Between the rows of a table n and k are straight lines in the wavelength (the
+    Accuracy: that of the source. Between the rows of a table n and k are straight lines
+    in the wavelength (the
         slope jumps at the rows).
 
     Raises:
-        MaterialError: unknown name, unreadable CSV, or a wavelength outside the range of the source.
+        MaterialError: unknown name, unreadable CSV, or a wavelength outside the range
+            of the source.
 
     >>> round(index("SiO2", 0.85).real, 4)
     1.4525
@@ -128,7 +138,9 @@ def index(material: cell.Material | Material, wavelength_um: float) -> complex:
 
 
 def slope(material: cell.Material | Material, wavelength_um: float) -> complex:
-    """Dispersion d(n + ik)/d(wavelength_um), with the arguments and errors of :func:`index`."""
+    """Dispersion d(n + ik)/d(wavelength_um), with the arguments and errors of
+    :func:`index`.
+    """
     return _index_and_slope(material, wavelength_um)[1]
 
 
@@ -147,7 +159,9 @@ def material(name: str) -> Material:
         return read_yaml(path)
     if path.suffix.lower() == ".csv" or len(path.parts) > 1:
         return read_csv(path)
-    raise MaterialError(f"unknown material {name!r}{_hint(name)}; or give the path of a CSV file or of a page (.yml)")
+    raise MaterialError(
+        f"unknown material {name!r}{_hint(name)}; or give the path of a CSV file or of a page (.yml)"
+    )
 
 
 def _hint(name: str) -> str:
@@ -159,15 +173,29 @@ def _hint(name: str) -> str:
 
 
 def _kin(name: str, wavelength_um: float) -> str:
-    """Shipped tables of the same substance that hold at a wavelength, in the words of a message."""
-    alike = [known for known in NAMES if known != name and _substance(known) == _substance(name)]
+    """Shipped tables of the same substance that hold at a wavelength, in the words of a
+    message.
+    """
+    alike = [
+        known
+        for known in NAMES
+        if known != name and _substance(known) == _substance(name)
+    ]
     ranges = {known: material(known).range_um for known in alike}
-    held = [repr(known) for known, (low, high) in ranges.items() if low <= wavelength_um <= high]
+    held = [
+        repr(known)
+        for known, (low, high) in ranges.items()
+        if low <= wavelength_um <= high
+    ]
     return f" ({' or '.join(held)} holds there)" if held else ""
 
 
 def _substance(name: str) -> list[str]:
-    return [word for word in name.split("-") if word not in ("a", "c", "o", "e", "rutile", "sputtered", "infrared")]
+    return [
+        word
+        for word in name.split("-")
+        if word not in ("a", "c", "o", "e", "rutile", "sputtered", "infrared")
+    ]
 
 
 def read_yaml(path: str | Path) -> Material:
@@ -178,7 +206,9 @@ def read_yaml(path: str | Path) -> Material:
     """
     path = Path(path)
     if not path.is_file():
-        raise MaterialError(f"{path}: no such file; need a YAML page of refractiveindex.info")
+        raise MaterialError(
+            f"{path}: no such file; need a YAML page of refractiveindex.info"
+        )
     stat = path.stat()
     return _read_yaml(path, (stat.st_mtime_ns, stat.st_size))
 
@@ -197,19 +227,24 @@ def _of_page(page: tuple[Part, Part | None, str], name: str) -> Material:
         raise MaterialError(
             f"{name}: n holds from {n.range_um[0]:g} to {n.range_um[1]:g} um, and k at no wavelength of these"
         )
-    return Material(name, source, (low, high), _NO_TABLE, (), (n,) if k is None else (n, k))
+    return Material(
+        name, source, (low, high), _NO_TABLE, (), (n,) if k is None else (n, k)
+    )
 
 
 def read_csv(path: str | Path) -> Material:
     """A material of a table wavelength_um, n, k (:mod:`metalens.cell.tables`).
 
     Raises:
-        MaterialError: no such file, a missing column, or a bad row; the message gives the line.
+        MaterialError: no such file, a missing column, or a bad row; the message gives
+            the line.
     """
     try:
         stat = Path(path).stat()
     except OSError:
-        raise MaterialError(f"{path}: no such file; need a CSV with columns {tables.COLUMNS}") from None
+        raise MaterialError(
+            f"{path}: no such file; need a CSV with columns {tables.COLUMNS}"
+        ) from None
     return _read_csv(Path(path), (stat.st_mtime_ns, stat.st_size))
 
 
@@ -218,27 +253,44 @@ def _read_csv(path: Path, stamp: tuple[int, int]) -> Material:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise MaterialError(f"{path}: not a readable text file ({error}); need a CSV table") from None
+        raise MaterialError(
+            f"{path}: not a readable text file ({error}); need a CSV table"
+        ) from None
     return _parse(text, name=str(path), where=str(path))
 
 
 @lru_cache(maxsize=64)
 def _shipped(name: str) -> Material:
     if name in _PAGES:
-        file = importlib.resources.files("metalens") / "data" / "materials" / f"{_PAGES[name]}.yml"
-        return _of_page(database.read(file.read_text(encoding="utf-8"), file.name), name)
-    text = (importlib.resources.files("metalens") / "data" / _TABLES[name]).read_text(encoding="utf-8")
+        file = (
+            importlib.resources.files("metalens")
+            / "data"
+            / "materials"
+            / f"{_PAGES[name]}.yml"
+        )
+        return _of_page(
+            database.read(file.read_text(encoding="utf-8"), file.name), name
+        )
+    text = (importlib.resources.files("metalens") / "data" / _TABLES[name]).read_text(
+        encoding="utf-8"
+    )
     return _parse(text, name=name, where=_TABLES[name])
 
 
 def _parse(text: str, *, name: str, where: str) -> Material:
     table, comments = tables.read(text, where)
-    return Material(name, comments or f"the file {where}", (table[0, 0], table[0, -1]), table)
+    return Material(
+        name, comments or f"the file {where}", (table[0, 0], table[0, -1]), table
+    )
 
 
-def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> tuple[complex, complex]:
+def _index_and_slope(
+    wanted: cell.Material | Material, wavelength_um: float
+) -> tuple[complex, complex]:
     if not (math.isfinite(wavelength_um) and wavelength_um > 0):
-        raise MaterialError(f"wavelength {wavelength_um:.7g} um: need a finite length above 0")
+        raise MaterialError(
+            f"wavelength {wavelength_um:.7g} um: need a finite length above 0"
+        )
     if isinstance(wanted, cell.Index):
         return complex(wanted.n, wanted.k), 0j
     if isinstance(wanted, cell.Blend):
@@ -251,7 +303,10 @@ def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> 
             f"choose a wavelength inside, another material{_kin(record.name, wavelength_um)}, or plain n and k"
         )
     if record.page:
-        n, k = (record.page[0].at(wavelength_um), record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0))
+        n, k = (
+            record.page[0].at(wavelength_um),
+            record.page[-1].at(wavelength_um) if len(record.page) > 1 else (0, 0),
+        )
         return complex(n[0].real, max(0.0, k[0].real)), complex(n[1].real, k[1].real)
     if record.table.size:
         return _from_table(record, wavelength_um)
@@ -259,8 +314,10 @@ def _index_and_slope(wanted: cell.Material | Material, wavelength_um: float) -> 
 
 
 def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex]:
-    """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) / (a + 2 e) + (1 - f) (b - e) /
-    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b, the root that absorbs (of two
+    """Bruggeman's mixture (D. A. G. Bruggeman, Ann. Phys. 416, 636 (1935)): f (a - e) /
+    (a + 2 e) + (1 - f) (b - e) /
+    (b + 2 e) = 0, so e = (h + sqrt(h² + 8 a b)) / 4 with h = (3 f - 1) a + (2 - 3 f) b,
+    the root that absorbs (of two
     media that emit no light one does, Im e >= 0); then the offsets."""
     base, base_rate = _index_and_slope(wanted.base, wavelength_um)
     n, rate = base, base_rate
@@ -276,7 +333,9 @@ def _blended(wanted: cell.Blend, wavelength_um: float) -> tuple[complex, complex
         rate = complex(de / (2 * n))
     n += complex(wanted.n_offset, wanted.k_offset)
     if n.real <= 0 or n.imag < 0:
-        raise MaterialError(f"blend of {wanted.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0")
+        raise MaterialError(
+            f"blend of {wanted.base} at {wavelength_um} um: n + ik = {n:.4g}; need n > 0 and k >= 0"
+        )
     return n, rate
 
 
@@ -284,7 +343,11 @@ def _from_sellmeier(record: Material, wavelength_um: float) -> tuple[complex, co
     """n² = 1 + sum B l² / (l² - c²), and d(n²)/dl = -2 l sum B c² / (l² - c²)²."""
     l2 = wavelength_um**2
     n = math.sqrt(1 + sum(b * l2 / (l2 - c * c) for b, c in record.sellmeier))
-    rate = -wavelength_um / n * sum(b * c * c / (l2 - c * c) ** 2 for b, c in record.sellmeier)
+    rate = (
+        -wavelength_um
+        / n
+        * sum(b * c * c / (l2 - c * c) ** 2 for b, c in record.sellmeier)
+    )
     return complex(n), complex(rate)
 
 
@@ -293,4 +356,6 @@ def _from_table(record: Material, wavelength_um: float) -> tuple[complex, comple
     i = min(max(bisect.bisect_right(x, wavelength_um) - 1, 0), len(x) - 2)
     rate = complex(n[i + 1] - n[i], k[i + 1] - k[i]) / (x[i + 1] - x[i])
     share = (wavelength_um - x[i]) / (x[i + 1] - x[i])
-    return complex(n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]), rate
+    return complex(
+        n[i] + share * (n[i + 1] - n[i]), (1 - share) * k[i] + share * k[i + 1]
+    ), rate

@@ -1,4 +1,6 @@
-"""The unit cell: one pillar of any shape on its lattice, between a substrate and a cover."""
+"""The unit cell: one pillar of any shape on its lattice, between a substrate and a
+cover.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -9,12 +11,14 @@ from metalens.cell.shapes.every import Shape
 from metalens.cell.shapes.round import Circle
 from metalens.ground.errors import CellError
 
-_APART = 0.02  # of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
+# of the pitch: neighbours that are closer, and what is thinner, no truncation resolves
+_APART = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Index:
-    """A refractive index given as plain numbers, the same at every wavelength (exp(-iwt): k >= 0 absorbs).
+    """A refractive index given as plain numbers, the same at every wavelength
+    (exp(-iwt): k >= 0 absorbs).
 
     n: real part, above 0. k: imaginary part, 0 or above.
     """
@@ -23,15 +27,24 @@ class Index:
     k: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.n > 0 and math.isfinite(self.n) and self.k >= 0 and math.isfinite(self.k)):
-            raise CellError(f"refractive index {self.n}+{self.k}i: need finite n > 0 and k >= 0")
+        if not (
+            self.n > 0
+            and math.isfinite(self.n)
+            and self.k >= 0
+            and math.isfinite(self.k)
+        ):
+            raise CellError(
+                f"refractive index {self.n}+{self.k}i: need finite n > 0 and k >= 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Blend:
-    """A deposited film: a material with offsets, or mixed with another (Bruggeman's effective medium).
+    """A deposited film: a material with offsets, or mixed with another (Bruggeman's
+    effective medium).
 
-    base, other: names or files of materials; share: volume of ``other``. n_offset, k_offset: added to the result.
+    base, other: names or files of materials; share: volume of ``other``. n_offset,
+    k_offset: added to the result.
     """
 
     base: str
@@ -42,12 +55,18 @@ class Blend:
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1 or (self.share > 0 and not self.other):
-            raise CellError(f"blend share = {self.share} of {self.other!r}: need 0 to 1, and the name of the other")
+            raise CellError(
+                f"blend share = {self.share} of {self.other!r}: need 0 to 1, and the name of the other"
+            )
         if not (math.isfinite(self.n_offset) and math.isfinite(self.k_offset)):
-            raise CellError(f"blend offsets {self.n_offset}, {self.k_offset}: need finite numbers")
+            raise CellError(
+                f"blend offsets {self.n_offset}, {self.k_offset}: need finite numbers"
+            )
 
 
-Material = str | Index | Blend  # a name known to metalens.materials, the path of a CSV or YAML file, numbers, a blend
+Material = (
+    str | Index | Blend
+)  # a name known to metalens.materials, the path of a CSV or YAML file, numbers, a blend
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +81,20 @@ class Film:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.thickness_um) and self.thickness_um >= 0):
-            raise CellError(f"film thickness {self.thickness_um} um: need a finite value >= 0")
+            raise CellError(
+                f"film thickness {self.thickness_um} um: need a finite value >= 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One section of a layered pillar: a pedestal, the pillar itself, the residual mask on it.
+    """One section of a layered pillar: a pedestal, the pillar itself, the residual mask
+    on it.
 
-    height_um: of the section. grow_um: its width less that of the mask, along every edge pair.
-    material: of the section; None for that of the cell's pillar. between: likewise, around it.
+    height_um: of the section. grow_um: its width less that of the mask, along every
+    edge pair.
+    material: of the section; None for that of the cell's pillar. between: likewise,
+    around it.
     coat_um, coat: a conformal film on its wall.
     """
 
@@ -83,11 +107,21 @@ class Layer:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.height_um) and self.height_um > 0):
-            raise CellError(f"layer height_um = {self.height_um}: need a finite length above 0")
-        if not (math.isfinite(self.grow_um) and math.isfinite(self.coat_um) and self.coat_um >= 0):
-            raise CellError(f"layer grow_um = {self.grow_um}, coat_um = {self.coat_um}: need finite lengths, coat >= 0")
+            raise CellError(
+                f"layer height_um = {self.height_um}: need a finite length above 0"
+            )
+        if not (
+            math.isfinite(self.grow_um)
+            and math.isfinite(self.coat_um)
+            and self.coat_um >= 0
+        ):
+            raise CellError(
+                f"layer grow_um = {self.grow_um}, coat_um = {self.coat_um}: need finite lengths, coat >= 0"
+            )
         if (self.coat_um > 0) != (self.coat is not None):
-            raise CellError(f"layer coat_um = {self.coat_um} with coat = {self.coat!r}: need both or neither")
+            raise CellError(
+                f"layer coat_um = {self.coat_um} with coat = {self.coat!r}: need both or neither"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +130,18 @@ class Cell:
 
     pitch_um: lattice constant (along x).
     height_um: of the pillar.
-    pillar, substrate, cover, between: materials (``between`` fills the space around the pillar).
-    sidewall_rad: tilt of the wall from the vertical, above 0 where the foot is wider than the top; the
+    pillar, substrate, cover, between: materials (``between`` fills the space around the
+    pillar).
+    sidewall_rad: tilt of the wall from the vertical, above 0 where the foot is wider
+    than the top; the
         diameter of a pillar is the one at half its height.
-    under, over: films between substrate and pillar, and between pillar and cover, in the order that the
+    under, over: films between substrate and pillar, and between pillar and cover, in
+    the order that the
         light meets them.
     shape: of the section; its size is what other stages call the diameter.
     lattice: how the pillar repeats.
-    layers: sections of the pillar, foot first, whose heights add up to ``height_um``; none: one section.
+    layers: sections of the pillar, foot first, whose heights add up to ``height_um``;
+    none: one section.
     """
 
     pitch_um: float
@@ -125,27 +163,40 @@ class Cell:
         if not (math.isfinite(self.height_um) and self.height_um >= 0):
             raise CellError(f"height_um = {self.height_um}: need a finite length >= 0")
         if not abs(self.sidewall_rad) < math.pi / 4:
-            raise CellError(f"sidewall_rad = {self.sidewall_rad}: need an angle within +-pi/4")
+            raise CellError(
+                f"sidewall_rad = {self.sidewall_rad}: need an angle within +-pi/4"
+            )
         total = sum(layer.height_um for layer in self.layers)
         if self.layers and abs(total - self.height_um) > 1e-9:
-            raise CellError(f"layers add up to {total:.6g} um, height_um is {self.height_um:.6g}: need the same height")
+            raise CellError(
+                f"layers add up to {total:.6g} um, height_um is {self.height_um:.6g}: need the same height"
+            )
 
     @property
     def round(self) -> bool:
-        """Whether it is a plain round pillar on a square lattice, tilted wall and films allowed."""
+        """Whether it is a plain round pillar on a square lattice, tilted wall and films
+        allowed.
+        """
         return (
-            isinstance(self.shape, Circle) and not self.shape.hole and self.lattice.kind == "square" and not self.layers
+            isinstance(self.shape, Circle)
+            and not self.shape.hole
+            and self.lattice.kind == "square"
+            and not self.layers
         )
 
     @property
     def alike(self) -> bool:
-        """Whether light along x and along y meets the same cell at normal incidence: a turn of less than half does."""
+        """Whether light along x and along y meets the same cell at normal incidence: a
+        turn of less than half does.
+        """
         turns = {"square": math.pi / 2, "hexagonal": math.pi / 3}
         if self.lattice.kind not in turns:
             return False
         outline = self.shape.outline(self.pitch_um / 2)
         step = turns[self.lattice.kind]
-        return outline.repeats(step) or (self.lattice.centred and outline.repeats(2 * step))
+        return outline.repeats(step) or (
+            self.lattice.centred and outline.repeats(2 * step)
+        )
 
     @property
     def described(self) -> str:
@@ -160,21 +211,28 @@ class Cell:
 
     @property
     def height_shares(self) -> tuple[float, ...]:
-        """Of a change of the height, by section: those of the pillar's own material share it in proportion. What lies
-        under, between and on them (a pedestal, a residual mask) is of other films; all share it where none is of it."""
+        """Of a change of the height, by section: those of the pillar's own material
+        share it in proportion. What lies
+        under, between and on them (a pedestal, a residual mask) is of other films; all
+        share it where none is of it."""
         own = [layer.height_um * (layer.material is None) for layer in self.sections]
         own = own if any(own) else [layer.height_um for layer in self.sections]
         return tuple(height / sum(own) for height in own)
 
     def at_height(self, height_um: float) -> "Cell":
-        """The same cell with pillars of another height; of layered ones by :attr:`height_shares`.
+        """The same cell with pillars of another height; of layered ones by
+        :attr:`height_shares`.
 
         Raises:
             CellError: so low that nothing is left of the pillar's own material.
         """
         if not self.layers:
             return replace(self, height_um=height_um)
-        own = sum(layer.height_um for layer, share in zip(self.layers, self.height_shares, strict=True) if share)
+        own = sum(
+            layer.height_um
+            for layer, share in zip(self.layers, self.height_shares, strict=True)
+            if share
+        )
         more = height_um - self.height_um
         if own + more <= 0:
             raise CellError(
@@ -193,20 +251,27 @@ class Cell:
 
     @property
     def widening_um(self) -> tuple[float, float]:
-        """(least, most) that a section is wider than the size says: ends of a tilted wall, layers, their coats."""
+        """(least, most) that a section is wider than the size says: ends of a tilted
+        wall, layers, their coats.
+        """
         slope, foot = -2 * math.tan(self.sidewall_rad), -self.height_um / 2
         bare, coated = [], []
         for layer in self.sections:
-            ends = [layer.grow_um + slope * height for height in (foot, foot + layer.height_um)]
+            ends = [
+                layer.grow_um + slope * height
+                for height in (foot, foot + layer.height_um)
+            ]
             foot += layer.height_um
             bare += ends
             coated += [wide + 2 * layer.coat_um for wide in ends]
         return min(bare), max(coated)
 
     def widest_um(self, gap_um: float) -> float:
-        """The size at which neighbours are this far apart (0 where even the thinnest are nearer).
+        """The size at which neighbours are this far apart (0 where even the thinnest
+        are nearer).
 
-        Where a foot, a pedestal or a coat is wider than the size, it is less where that comes within a fiftieth of the
+        Where a foot, a pedestal or a coat is wider than the size, it is less where that
+        comes within a fiftieth of the
         pitch of its neighbour.
         """
         _, most = self.widening_um
@@ -223,8 +288,10 @@ class Cell:
         return round(low, 4)
 
     def size_um(self, width_um: float, gap_um: float = 0.0) -> float:
-        """The least size of the shape that is nowhere narrower than this (a ring's wall, a cross's bar), and whose
-        holes and hollows are nowhere narrower than ``gap_um``. Of a top or a layer that is thinner than the size at
+        """The least size of the shape that is nowhere narrower than this (a ring's
+        wall, a cross's bar), and whose
+        holes and hollows are nowhere narrower than ``gap_um``. Of a top or a layer that
+        is thinner than the size at
         least a fiftieth of the pitch is left.
         """
         least, _ = self.widening_um
@@ -237,4 +304,6 @@ class Cell:
 
     def gap_um(self, size_um: float, *, grow_um: float = 0.0) -> float:
         """Least distance between neighbouring pillars of this size; 0 where they touch."""
-        return self.outline(size_um, grow_um=grow_um).gap_um(self.lattice.steps_um(self.pitch_um))
+        return self.outline(size_um, grow_um=grow_um).gap_um(
+            self.lattice.steps_um(self.pitch_um)
+        )

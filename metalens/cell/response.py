@@ -7,15 +7,19 @@ from dataclasses import dataclass
 class Response:
     """Zero-order response of one pillar cell, power-normalised: |t|² + |r|² = 1 when lossless and subwavelength.
 
-    The phase runs from the plane of the pillar's foot to the plane of its top; incidence from the substrate;
-    time factor exp(-iwt). For films under or over the pillar the planes are the outer faces of the films.
+    The phase runs from the plane of the pillar's foot to the plane of its top;
+    incidence from the substrate;
+    time factor exp(-iwt). For films under or over the pillar the planes are the outer
+    faces of the films.
 
     t, r: co-polarised transmission and reflection amplitudes.
     t_error: estimate of the larger of |t - exact| and |r - exact| (``anchored``: of the first), not below it.
     orders: harmonics (RCWA) or degrees of freedom (modal) of the finest solution used.
     energy: |t|² + |r|² summed over the propagating orders; 1 - energy is absorbed (or a defect if lossless). In a
-        substrate that absorbs, powers of light that comes and that is reflected do not add, and it may exceed 1.
-    engine: ``rcwa``, ``modal``, ``film``, or ``anchored`` (coupled waves put right by the modal method).
+        substrate that absorbs, powers of light that comes and that is reflected do not
+        add, and it may exceed 1.
+    engine: ``rcwa``, ``modal``, ``film``, or ``anchored`` (coupled waves put right by
+    the modal method).
     converged: whether ``t_error`` meets the tolerance that was asked for.
     reason: why the solver stopped, in words.
     """

@@ -1,7 +1,10 @@
-"""Own tables of n and k: CSV, or semicolons or tabs with decimal commas; # opens comments.
+"""Own tables of n and k: CSV, or semicolons or tabs with decimal commas; # opens
+comments.
 
-The wavelength is in um or nm, as its column says (``wavelength_um``, ``wavelength_nm``, ``Wavelength (nm)``; or ``wl``,
-um, as refractiveindex.info writes it); rows rise or fall with it. A table without k is of a transparent material.
+The wavelength is in um or nm, as its column says (``wavelength_um``, ``wavelength_nm``,
+``Wavelength (nm)``; or ``wl``,
+um, as refractiveindex.info writes it); rows rise or fall with it. A table without k is
+of a transparent material.
 """
 
 import csv
@@ -25,55 +28,94 @@ def read(text: str, where: str) -> tuple[Array, str]:
     """
     lines = text.splitlines()
     comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
-    body = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    body = [
+        (i, line)
+        for i, line in enumerate(lines, 1)
+        if line.strip() and not line.startswith("#")
+    ]
     if not body:
-        raise MaterialError(f"{where}: empty; need columns {COLUMNS}, and at least two rows")
+        raise MaterialError(
+            f"{where}: empty; need columns {COLUMNS}, and at least two rows"
+        )
     mark = next((m for m in ";\t" if m in body[0][1] and "," not in body[0][1]), ",")
-    plain = [(i, line if mark == "," else line.replace(",", ".").replace(mark, ",")) for i, line in body]
+    plain = [
+        (i, line if mark == "," else line.replace(",", ".").replace(mark, ","))
+        for i, line in body
+    ]
     body = _unstacked(plain, where)
     names = [_column(field) for field in next(csv.reader([body[0][1]]))]
     place = next((names.index(column) for column in _SCALES if column in names), -1)
     if place < 0 or "n" not in names:
-        raise MaterialError(f"{where}, line {body[0][0]}: columns {', '.join(names)}; need {COLUMNS}")
+        raise MaterialError(
+            f"{where}, line {body[0][0]}: columns {', '.join(names)}; need {COLUMNS}"
+        )
     order = [place, names.index("n"), names.index("k") if "k" in names else -1]
-    rows = [_row(line, order, len(names), f"{where}, line {i}", _SCALES[names[place]]) for i, line in body[1:]]
-    return np.array(_rising(rows, [i for i, _ in body[1:]], where)).T, " ".join(comments)
+    rows = [
+        _row(line, order, len(names), f"{where}, line {i}", _SCALES[names[place]])
+        for i, line in body[1:]
+    ]
+    return np.array(_rising(rows, [i for i, _ in body[1:]], where)).T, " ".join(
+        comments
+    )
 
 
 def _column(field: str) -> str:
-    """``Wavelength (nm)``, ``wavelength, nm`` and ``wavelength [nm]`` are ``wavelength_nm``."""
+    """``Wavelength (nm)``, ``wavelength, nm`` and ``wavelength [nm]`` are
+    ``wavelength_nm``.
+    """
     plain = field.strip().lower().replace("μ", "u").replace("µ", "u")
     return re.sub(r"[\s,()\[\]/]+", "_", plain).strip("_")
 
 
 def _unstacked(body: list[tuple[int, str]], where: str) -> list[tuple[int, str]]:
-    """The rows of a file whose k follows its n as a second table (as refractiveindex.info exports) in one table."""
-    heads = [i for i, (_, line) in enumerate(body) if line.replace(" ", "").lower().startswith("wl,")]
+    """The rows of a file whose k follows its n as a second table (as
+    refractiveindex.info exports) in one table.
+    """
+    heads = [
+        i
+        for i, (_, line) in enumerate(body)
+        if line.replace(" ", "").lower().startswith("wl,")
+    ]
     if len(heads) != 2:
         return body
     first, second = body[: heads[1]], body[heads[1] + 1 :]
     waves = [line.split(",")[0].strip() for _, line in first[1:]]
     if waves != [line.split(",")[0].strip() for _, line in second]:
-        raise MaterialError(f"{where}, line {body[heads[1]][0]}: n and k stand at different wavelengths; need the same")
-    rows = [(i, f"{line},{other.split(',')[1]}") for (i, line), (_, other) in zip(first[1:], second, strict=True)]
+        raise MaterialError(
+            f"{where}, line {body[heads[1]][0]}: n and k stand at different wavelengths; need the same"
+        )
+    rows = [
+        (i, f"{line},{other.split(',')[1]}")
+        for (i, line), (_, other) in zip(first[1:], second, strict=True)
+    ]
     return [(first[0][0], "wl,n,k"), *rows]
 
 
-def _row(line: str, order: list[int], width: int, where: str, scale: float) -> list[float]:
+def _row(
+    line: str, order: list[int], width: int, where: str, scale: float
+) -> list[float]:
     fields = next(csv.reader([line]))
     if len(fields) != width:
         raise MaterialError(f"{where}: {len(fields)} fields, the header has {width}")
     try:
         values = [float(fields[column]) if column >= 0 else 0.0 for column in order]
     except ValueError:
-        raise MaterialError(f"{where}: {line!r} is not numbers; need {COLUMNS}") from None
+        raise MaterialError(
+            f"{where}: {line!r} is not numbers; need {COLUMNS}"
+        ) from None
     wavelength_um, n, k = values = [values[0] * scale, *values[1:]]
-    if not (all(math.isfinite(v) for v in values) and wavelength_um > 0 and n > 0 and k >= 0):
-        raise MaterialError(f"{where}: {line!r}; need finite wavelengths > 0, n > 0 and k >= 0 (exp(-iwt))")
+    if not (
+        all(math.isfinite(v) for v in values) and wavelength_um > 0 and n > 0 and k >= 0
+    ):
+        raise MaterialError(
+            f"{where}: {line!r}; need finite wavelengths > 0, n > 0 and k >= 0 (exp(-iwt))"
+        )
     return values
 
 
-def _rising(rows: list[list[float]], numbers: list[int], where: str) -> list[list[float]]:
+def _rising(
+    rows: list[list[float]], numbers: list[int], where: str
+) -> list[list[float]]:
     """The rows as they are, or all of them turned round."""
     if len(rows) < 2:
         raise MaterialError(f"{where}: {len(rows)} rows of numbers; need at least two")

@@ -1,4 +1,6 @@
-"""The chain as a list of commands: the stages that a set of settings files asks for, and what each leaves."""
+"""The chain as a list of commands: the stages that a set of settings files asks for,
+and what each leaves.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -15,13 +17,18 @@ SHIPPED = ("cell", "design", "process", "run", "bench_truth", "bench_metrology")
 
 @dataclass(frozen=True, slots=True)
 class ChainFiles:
-    """CHAIN.toml: settings files, relative to it; a stage whose file is left out is not run.
+    """CHAIN.toml: settings files, relative to it; a stage whose file is left out is not
+    run.
 
-    cell, design, process: of library, lens and mask. psf: of the PSF stack; its defaults without it.
-    run: of a co-design run. bench_truth, bench_metrology: hidden errors and other measurements of a virtual bench; it
-        measures the lens of the run, which is then retrained for, or without a run the one of bench_design.
+    cell, design, process: of library, lens and mask. psf: of the PSF stack; its
+    defaults without it.
+    run: of a co-design run. bench_truth, bench_metrology: hidden errors and other
+    measurements of a virtual bench; it
+        measures the lens of the run, which is then retrained for, or without a run the
+        one of bench_design.
     budget: whether the error budget is computed.
-    bench_design: lens that the virtual bench measures, where it is not the run's or the design's.
+    bench_design: lens that the virtual bench measures, where it is not the run's or the
+    design's.
     """
 
     cell: Path
@@ -35,19 +42,28 @@ class ChainFiles:
     budget: bool = True
 
     def __post_init__(self) -> None:
-        if self.bench_design is not None and (self.bench_truth is None or self.run is not None):
+        if self.bench_design is not None and (
+            self.bench_truth is None or self.run is not None
+        ):
             raise ConfigError(
                 "bench_design belongs to a bench_truth without a run: a run's bench measures its own lens"
             )
-        if self.bench_truth is not None and self.bench_design is None and self.run is None:
-            raise ConfigError("bench_truth has no lens to measure: give a run or a bench_design")
+        if (
+            self.bench_truth is not None
+            and self.bench_design is None
+            and self.run is None
+        ):
+            raise ConfigError(
+                "bench_truth has no lens to measure: give a run or a bench_design"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
     """One verb of the chain.
 
-    words: of the command line, relative to the chain's folder. error: entry of the result that says how wrong it may
+    words: of the command line, relative to the chain's folder. error: entry of the
+    result that says how wrong it may
     be, and what it means. pictures: files that the verb leaves, with captions.
     """
 
@@ -62,7 +78,8 @@ class Stage:
 class Laid:
     """What a chain's folder holds before its first stage.
 
-    files: the settings, by name in the folder. contents: {path in the folder: bytes} of them and all that they name.
+    files: the settings, by name in the folder. contents: {path in the folder: bytes} of
+    them and all that they name.
     """
 
     files: ChainFiles
@@ -75,8 +92,12 @@ class Laid:
             store.write_bytes(folder / name, content)
 
     def stands_in(self, folder: Path) -> bool:
-        """Whether a folder holds these settings, no others, and the same tables and maps."""
-        settings = {name for name in self.contents if "/" not in name and name.endswith(".toml")}
+        """Whether a folder holds these settings, no others, and the same tables and
+        maps.
+        """
+        settings = {
+            name for name in self.contents if "/" not in name and name.endswith(".toml")
+        }
         paths = [(folder / name, content) for name, content in self.contents.items()]
         return settings == {path.name for path in folder.glob("*.toml")} and all(
             path.is_file() and path.read_bytes() == content for path, content in paths
@@ -85,19 +106,24 @@ class Laid:
 
 def shipped() -> ChainFiles:
     """The demo's own settings, as names of files that :func:`laid` gives."""
-    return _named(SHIPPED, budget=False)  # a minute more: asked for with a CHAIN.toml, or metalens budget
+    return _named(
+        SHIPPED, budget=False
+    )  # a minute more: asked for with a CHAIN.toml, or metalens budget
 
 
 def load(path: Path) -> ChainFiles:
     """Read CHAIN.toml.
 
     Raises:
-        ConfigError: see :func:`metalens.ground.config.load`; a settings file that is not there.
+        ConfigError: see :func:`metalens.ground.config.load`; a settings file that is
+            not there.
     """
     found = config.load(path, ChainFiles)
     for name, value in _given(found):
         if not (path.parent / value).is_file():
-            raise ConfigError(f"{path}: {name} = {str(value)!r}: no such file beside it")
+            raise ConfigError(
+                f"{path}: {name} = {str(value)!r}: no such file beside it"
+            )
     return found
 
 
@@ -109,40 +135,60 @@ def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -
         aperture_mm: put in place of the aperture of the design.
 
     Raises:
-        ConfigError: a file that is named lies above its settings file, or two files have one name.
+        ConfigError: a file that is named lies above its settings file, or two files
+            have one name.
     """
     contents: dict[str, bytes] = {}
     for name, value in _given(files):
         if source is None:
-            text = resources.files("metalens").joinpath("data", "demo", value.name).read_text(encoding="utf-8")
+            text = (
+                resources.files("metalens")
+                .joinpath("data", "demo", value.name)
+                .read_text(encoding="utf-8")
+            )
         else:
             _bring(contents, source / value)  # refuses what is no settings file
             text = (source / value).read_text(encoding="utf-8-sig")
         if name == "design" and aperture_mm is not None:
-            lines = [line for line in text.splitlines() if not line.startswith("aperture_mm")]
+            lines = [
+                line for line in text.splitlines() if not line.startswith("aperture_mm")
+            ]
             text = "\n".join([f"aperture_mm = {aperture_mm}", *lines]) + "\n"
         contents[f"{name}.toml"] = text.encode()
-    return Laid(_named(tuple(name for name, _ in _given(files)), budget=files.budget), contents)
+    return Laid(
+        _named(tuple(name for name, _ in _given(files)), budget=files.budget), contents
+    )
 
 
 def _bring(contents: dict[str, bytes], settings: Path) -> None:
-    """Take along what a settings file names beside or below it, or in the current folder.
+    """Take along what a settings file names beside or below it, or in the current
+    folder.
 
     Whole paths are left as they are, and files that the chain makes.
     """
     for word in sorted(set(_words(config.read(settings, ChainFiles)))):
-        found = [place / word for place in (settings.parent, Path()) if (place / word).is_file()]
+        found = [
+            place / word
+            for place in (settings.parent, Path())
+            if (place / word).is_file()
+        ]
         if Path(word).is_absolute() or word in MADE or not found:
             continue
         if ".." in Path(word).parts:
-            raise ConfigError(f"{settings}: {word!r} lies above it; put it beside it, or give its whole path")
+            raise ConfigError(
+                f"{settings}: {word!r} lies above it; put it beside it, or give its whole path"
+            )
         content = found[0].read_bytes()
         if contents.setdefault(Path(word).as_posix(), content) != content:
-            raise ConfigError(f"{settings}: {word!r} is not the file of that name beside other settings; rename it")
+            raise ConfigError(
+                f"{settings}: {word!r} is not the file of that name beside other settings; rename it"
+            )
 
 
 def _words(value: Any) -> Iterator[str]:
-    """Texts anywhere in a table that may be the name of a file: with an ending, of one line."""
+    """Texts anywhere in a table that may be the name of a file: with an ending, of one
+    line.
+    """
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from _words(part)
@@ -183,7 +229,12 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
         "every entry, and the polynomial proxy (paper Eq. 2) that every later stage uses.",
         ("library", "cell.toml", "-o", "library.h5"),
         ("max_error", "largest error bar of |t|"),
-        (("library.png", "Phase and transmission of the pillars with their error bars, and the proxy's residual."),),
+        (
+            (
+                "library.png",
+                "Phase and transmission of the pillars with their error bars, and the proxy's residual.",
+            ),
+        ),
     )
     yield Stage(
         "Lens",
@@ -191,17 +242,31 @@ def _making(files: ChainFiles) -> Iterator[Stage]:
         "over all pillars then shows where the light really meets.",
         ("design", "design.toml", "-o", "lens.h5"),
         ("max_phase_error_rad", "rad between wanted and made phase"),
-        (("lens.png", "Phase and diameter of the pillars across the lens, and a zoom to single pillars."),),
+        (
+            (
+                "lens.png",
+                "Phase and diameter of the pillars across the lens, and a zoom to single pillars.",
+            ),
+        ),
     )
     yield Stage(
         "Point spread functions",
         "Images of point sources over the depths of an eye, computed on the sensor window only, to a stated error.",
-        ("psf", "lens.h5", "-o", "psf.h5", *(("--config", "psf.toml") if files.psf else ())),
+        (
+            "psf",
+            "lens.h5",
+            "-o",
+            "psf.h5",
+            *(("--config", "psf.toml") if files.psf else ()),
+        ),
         ("error", "relative error of the PSFs"),
         (
             ("psf_xz.png", "Slice through the PSF along depth."),
             ("psf_montage.png", "PSFs over depth and field angle."),
-            ("psf_information.png", "Axial information of Eq. 11; the normalisation decides the ranking."),
+            (
+                "psf_information.png",
+                "Axial information of Eq. 11; the normalisation decides the ranking.",
+            ),
             ("psf_mtf.png", "Modulation transfer, and energy inside a circle."),
         ),
     )
@@ -213,7 +278,16 @@ def _mask() -> Stage:
         "Mask",
         "One cell per diameter, polygons of equal area on the mask grid, aperture, marks, label, dose test and "
         "witness cells; checked against the design rules, written, read back and compared.",
-        ("layout", "lens.h5", "--process", "process.toml", "-o", "mask", "--oasis", "--gds"),
+        (
+            "layout",
+            "lens.h5",
+            "--process",
+            "process.toml",
+            "-o",
+            "mask",
+            "--oasis",
+            "--gds",
+        ),
         ("differences", "differences between plan and written files"),
         (
             ("mask/die.png", "The whole die."),
@@ -225,7 +299,11 @@ def _mask() -> Stage:
 
 
 def _budget(files: ChainFiles) -> Stage:
-    lens = ("run/lens.h5", "--run", "run") if files.run else ("lens.h5", "--library", "library.h5")
+    lens = (
+        ("run/lens.h5", "--run", "run")
+        if files.run
+        else ("lens.h5", "--library", "library.h5")
+    )
     return Stage(
         "Error budget",
         "Every link from pillar to answered gaze, each changed or switched off alone on the frames of the virtual "
@@ -257,11 +335,30 @@ def _bench(files: ChainFiles) -> Iterator[Stage]:
     yield Stage(
         "The lens as built",
         "Captures to parameters with their intervals; what the frames cannot tell apart is said in words.",
-        ("fit", "captures", "--design", measured, "--truth", "bench_truth.toml", *metrology, "-o", "asbuilt.h5"),
-        ("chi2_per_dof", "chi² per degree of freedom, 1 where model and noise explain the frames"),
         (
-            ("asbuilt_frames.png", "As designed, measured, as built, and the residual in standard deviations."),
-            ("asbuilt_posterior.png", "Posterior of each parameter, its 95 % interval, and in red the hidden truth."),
+            "fit",
+            "captures",
+            "--design",
+            measured,
+            "--truth",
+            "bench_truth.toml",
+            *metrology,
+            "-o",
+            "asbuilt.h5",
+        ),
+        (
+            "chi2_per_dof",
+            "chi² per degree of freedom, 1 where model and noise explain the frames",
+        ),
+        (
+            (
+                "asbuilt_frames.png",
+                "As designed, measured, as built, and the residual in standard deviations.",
+            ),
+            (
+                "asbuilt_posterior.png",
+                "Posterior of each parameter, its 95 % interval, and in red the hidden truth.",
+            ),
             ("asbuilt_parameters.png", "Fitted parameters with their 95 % intervals."),
         ),
     )
@@ -279,7 +376,16 @@ def _codesign() -> Stage:
 
 
 def _retrain() -> Stage:
-    words = ("retrain", "run", "--optics", "asbuilt.h5", "--truth", "bench_truth.toml", "--process", "process.toml")
+    words = (
+        "retrain",
+        "run",
+        "--optics",
+        "asbuilt.h5",
+        "--truth",
+        "bench_truth.toml",
+        "--process",
+        "process.toml",
+    )
     return Stage(
         "Before and after retraining",
         "The network is trained on for lenses drawn from the fit's posterior, and judged on the lens that was really "
@@ -287,5 +393,10 @@ def _retrain() -> Stage:
         "rose from 0.44 mm to 0.59 mm in the median, and retraining won it back.",
         (*words, "--steps", "60", "--test-batches", "8", "-o", "retrained"),
         ("slip_mm", "mm of slippage error after retraining"),
-        (("retrained/cases.png", "Slippage error with the lens as designed, as made, and after retraining."),),
+        (
+            (
+                "retrained/cases.png",
+                "Slippage error with the lens as designed, as made, and after retraining.",
+            ),
+        ),
     )

@@ -1,4 +1,6 @@
-"""CELL.toml with two ranges of sizes to a library over both: what is swept, written and said."""
+"""CELL.toml with two ranges of sizes to a library over both: what is swept, written and
+said.
+"""
 
 import dataclasses
 import time
@@ -17,8 +19,16 @@ LEAST_USABLE = 0.5  # of the pairs of sizes, below which a library is no library
 NM = 1e3
 
 
-def run(options: Distributed, target: Path, cell: Cell, sweep: Sweep, about: store.Provenance) -> int:
-    """Sweep and write; exit 1 where most bars miss the tolerance, or a pair held out lies above its bar."""
+def run(
+    options: Distributed,
+    target: Path,
+    cell: Cell,
+    sweep: Sweep,
+    about: store.Provenance,
+) -> int:
+    """Sweep and write; exit 1 where most bars miss the tolerance, or a pair held out
+    lies above its bar.
+    """
     with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
@@ -27,7 +37,9 @@ def run(options: Distributed, target: Path, cell: Cell, sweep: Sweep, about: sto
         made = dataclasses.replace(made, provenance=about)
         axes.save(draft.path, made)
         axes.figure(draft.path.with_suffix(".png"), made)
-    return options.console.judged(_values(made, seconds), _text(target, made, seconds), failures(made))
+    return options.console.judged(
+        _values(made, seconds), _text(target, made, seconds), failures(made)
+    )
 
 
 def failures(made: AxesLibrary) -> list[str]:
@@ -39,7 +51,9 @@ def failures(made: AxesLibrary) -> list[str]:
             f"(median {np.median(made.t_error):.2g}): allow a larger tolerance or take narrower ranges"
         )
     if made.missed:
-        found.append(f"{made.missed} of {len(made.held_out)} pairs held out lie above their error bar")
+        found.append(
+            f"{made.missed} of {len(made.held_out)} pairs held out lie above their error bar"
+        )
     return found
 
 
@@ -63,7 +77,9 @@ def _values(made: AxesLibrary, seconds: float) -> dict[str, Any]:
 
 def _least(made: AxesLibrary) -> list[float]:
     """Least |t| of both polarisations among the usable pairs; 0 where there is none."""
-    return [float(np.abs(made.t[..., k, k])[made.usable].min(initial=1.0)) for k in (0, 1)]
+    return [
+        float(np.abs(made.t[..., k, k])[made.usable].min(initial=1.0)) for k in (0, 1)
+    ]
 
 
 def _text(target: Path, made: AxesLibrary, seconds: float) -> str:

@@ -14,7 +14,12 @@ from metalens.ground.console import Console
 from metalens.ground.transaction import Draft, Terms
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-MASKS = (".oas", ".oasis", ".gds", ".gdsii")  # endings of mask files, OASIS before GDSII
+MASKS = (
+    ".oas",
+    ".oasis",
+    ".gds",
+    ".gdsii",
+)  # endings of mask files, OASIS before GDSII
 MaybeOutput = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 
 
@@ -38,9 +43,15 @@ class Common:
         return Console(self.quiet, self.json)
 
     def claim(
-        self, target: Path, *, beside: Sequence[str] = (), inputs: Sequence[Path] = (), room: int = transaction.ROOM
+        self,
+        target: Path,
+        *,
+        beside: Sequence[str] = (),
+        inputs: Sequence[Path] = (),
+        room: int = transaction.ROOM,
     ) -> contextlib.AbstractContextManager[Draft]:
-        """Claim a file and its companions before the work; they appear together at the end of the block, or not at all.
+        """Claim a file and its companions before the work; they appear together at the
+        end of the block, or not at all.
 
         Args:
             beside: endings of the companions, as ``_xz.png``.
@@ -55,7 +66,8 @@ class Common:
     def claim_folder(
         self, target: Path, *, inputs: Sequence[Path] = (), room: int = transaction.ROOM
     ) -> contextlib.AbstractContextManager[Draft]:
-        """Claim a folder before the work; it appears whole with its manifest at the end of the block, or not at all.
+        """Claim a folder before the work; it appears whole with its manifest at the end
+        of the block, or not at all.
 
         Raises:
             OutputError: see :func:`metalens.ground.transaction.folder`.
@@ -63,7 +75,12 @@ class Common:
         return transaction.folder(target, terms=self._terms(inputs, room))
 
     def claim_work(
-        self, target: Path, *, keep: Sequence[str], resume: bool = False, grow: bool = False
+        self,
+        target: Path,
+        *,
+        keep: Sequence[str],
+        resume: bool = False,
+        grow: bool = False,
     ) -> contextlib.AbstractContextManager[Draft]:
         """Claim a folder for long work that an interruption leaves resumable.
 
@@ -71,7 +88,9 @@ class Common:
             OutputError: see :func:`metalens.ground.transaction.long_work`.
         """
         terms = dataclasses.replace(self._terms((), transaction.ROOM), parents=True)
-        return transaction.long_work(target, keep=keep, resume=resume, grow=grow, terms=terms)
+        return transaction.long_work(
+            target, keep=keep, resume=resume, grow=grow, terms=terms
+        )
 
     def _terms(self, inputs: Sequence[Path], room: int) -> Terms:
         return Terms(force=self.force, inputs=(*self._paths(), *inputs), room=room)
@@ -81,16 +100,23 @@ class Common:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name != "output":
-                yield from (v for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, Path))
+                yield from (
+                    v
+                    for v in (value if isinstance(value, tuple) else (value,))
+                    if isinstance(v, Path)
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Distributed(Common):
-    """Options of verbs whose work is spread over processes; the result is the same for any number of them.
+    """Options of verbs whose work is spread over processes; the result is the same for
+    any number of them.
 
     Attributes:
-        workers: processes of this machine that do the work; left out: as many as it has cores.
-        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the work in their place.
+        workers: processes of this machine that do the work; left out: as many as it has
+            cores.
+        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the
+            work in their place.
     """
 
     workers: int | None = None

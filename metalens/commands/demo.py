@@ -1,4 +1,6 @@
-"""The whole chain on a real lens: every stage is run as its command, and one report shows it all."""
+"""The whole chain on a real lens: every stage is run as its command, and one report
+shows it all.
+"""
 
 import contextlib
 import io
@@ -37,7 +39,8 @@ class Options(Common):
 
     Attributes:
         output: folder for everything that is made; report.html is the page to open.
-        config: CHAIN.toml of your own (cell, design, process; psf, bench_design, bench_truth, bench_metrology, run):
+        config: CHAIN.toml of your own (cell, design, process; psf, bench_design,
+            bench_truth, bench_metrology, run):
             the same chain unattended, at any size.
         resume: go on after the last stage that was finished.
         aperture_mm: diameter of the lens, in place of the one in the design.
@@ -50,39 +53,59 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Run the chain; exit 0 when every stage passed its own check, else the status of the first that did not."""
+    """Run the chain; exit 0 when every stage passed its own check, else the status of
+    the first that did not.
+    """
     if options.aperture_mm is not None and not 0.02 <= options.aperture_mm <= 10:
         raise ConfigError(f"aperture_mm = {options.aperture_mm}: need 0.02 to 10")
     wanted = chain.shipped() if options.config is None else chain.load(options.config)
     source = None if options.config is None else options.config.parent
     laid = chain.laid(wanted, source, aperture_mm=options.aperture_mm)
-    whole = options.output.absolute()  # stages run in another folder, also as an interrupt finds them
+    whole = (
+        options.output.absolute()
+    )  # stages run in another folder, also as an interrupt finds them
     with options.claim_work(whole, keep=(OUTCOMES,), resume=options.resume) as draft:
         folder = draft.path
         if not laid.stands_in(folder):  # of other settings nothing gets beside it
             if (folder / OUTCOMES).is_file():
-                raise ConfigError(f"{options.output} was begun with other settings; start over with --force")
+                raise ConfigError(
+                    f"{options.output} was begun with other settings; start over with --force"
+                )
             manifest.empty(folder)
             laid.write(folder)
         outcomes: list[Outcome] = []
         for outcome in _chain(folder, laid.files):
             outcomes.append(outcome)
-            words, verdict = " ".join(outcome.stage.words), "ok" if outcome.status == 0 else "FAILED"
-            options.console.say(f"{outcome.seconds:6.1f} s  metalens {words}  {verdict}")
+            words, verdict = (
+                " ".join(outcome.stage.words),
+                "ok" if outcome.status == 0 else "FAILED",
+            )
+            options.console.say(
+                f"{outcome.seconds:6.1f} s  metalens {words}  {verdict}"
+            )
         _write(folder, outcomes)
     page = options.output / "report.html"
-    values = {_name(o.stage): {"status": o.status, "seconds": o.seconds, **o.values} for o in outcomes}
+    values = {
+        _name(o.stage): {"status": o.status, "seconds": o.seconds, **o.values}
+        for o in outcomes
+    }
     options.console.result({"report": str(page), **values}, f"open {page}")
     return next((o.status for o in outcomes if o.status), 0)
 
 
 def _name(stage: Stage) -> str:
     """The verb, and what it works on where the chain has it twice."""
-    return "bench_design" if "bench_design.toml" in stage.words and stage.words[0] == "design" else stage.words[0]
+    return (
+        "bench_design"
+        if "bench_design.toml" in stage.words and stage.words[0] == "design"
+        else stage.words[0]
+    )
 
 
 def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
-    """Run the verbs in the chain's folder until one refuses its input; what an earlier run did is not done again."""
+    """Run the verbs in the chain's folder until one refuses its input; what an earlier
+    run did is not done again.
+    """
     done = dict(_done(folder / OUTCOMES))
     with contextlib.chdir(folder):
         for stage in chain.stages(files):
@@ -95,16 +118,24 @@ def _chain(folder: Path, files: ChainFiles) -> Iterator[Outcome]:
             values = json.loads(shown.getvalue()) if shown.getvalue().strip() else {}
             seconds = time.perf_counter() - start
             if status in (0, 1):
-                store.append_line(Path(OUTCOMES), json.dumps([stage.words, status, values, seconds]))
+                store.append_line(
+                    Path(OUTCOMES), json.dumps([stage.words, status, values, seconds])
+                )
             yield Outcome(stage, status, values, seconds)
             if status == 130:
                 raise KeyboardInterrupt
             if status not in (0, 1):
-                raise MetalensError(f"the chain stopped: `metalens {' '.join(stage.words)}` refused its input")
+                raise MetalensError(
+                    f"the chain stopped: `metalens {' '.join(stage.words)}` refused its input"
+                )
 
 
-def _done(path: Path) -> Iterator[tuple[tuple[str, ...], tuple[int, dict[str, Any], float]]]:
-    """Stages that an earlier run finished, by their words; one whose line is damaged is done again."""
+def _done(
+    path: Path,
+) -> Iterator[tuple[tuple[str, ...], tuple[int, dict[str, Any], float]]]:
+    """Stages that an earlier run finished, by their words; one whose line is damaged is
+    done again.
+    """
     for line in store.whole_lines(path):
         with contextlib.suppress(ValueError, TypeError, RecursionError):
             words, status, values, seconds = json.loads(line)
@@ -116,21 +147,46 @@ def _write(folder: Path, outcomes: list[Outcome]) -> None:
     made = {_name(o.stage): o.values for o in outcomes}
     keys = [
         report.KeyFigure("pillars", f"{made['design'].get('pillars', 0):,}"),
-        report.KeyFigure("numerical aperture", f"{made['design'].get('numerical_aperture', 0):.3f}"),
-        report.KeyFigure("focusing efficiency", f"{made['design'].get('efficiency', 0):.1%}"),
-        report.KeyFigure("every stage passed its check", _verdict(outcomes), good=not any(o.status for o in outcomes)),
+        report.KeyFigure(
+            "numerical aperture", f"{made['design'].get('numerical_aperture', 0):.3f}"
+        ),
+        report.KeyFigure(
+            "focusing efficiency", f"{made['design'].get('efficiency', 0):.1%}"
+        ),
+        report.KeyFigure(
+            "every stage passed its check",
+            _verdict(outcomes),
+            good=not any(o.status for o in outcomes),
+        ),
         report.KeyFigure("from first solve to this page", f"{total:.0f} s"),
     ]
     if "budget" in made:
-        keys.insert(3, report.KeyFigure("gaze error of all links", f"{made['budget']['gaze_error_deg']:.2g}°"))
+        keys.insert(
+            3,
+            report.KeyFigure(
+                "gaze error of all links", f"{made['budget']['gaze_error_deg']:.2g}°"
+            ),
+        )
     rows = [
-        (o.stage.title, f"{o.seconds:.1f}", _error(o), _verdict([o]), "metalens " + " ".join(o.stage.words))
+        (
+            o.stage.title,
+            f"{o.seconds:.1f}",
+            _error(o),
+            _verdict([o]),
+            "metalens " + " ".join(o.stage.words),
+        )
         for o in outcomes
     ]
     head = ("stage", "seconds", "how wrong it may be", "passed its check", "command")
-    timing = report.Table(head, rows, "Time beside error. Run any of these yourself in this folder.")
+    timing = report.Table(
+        head, rows, "Time beside error. Run any of these yourself in this folder."
+    )
     sections = [
-        report.Section("The chain", "Every stage is a command; every artefact is a file.", (timing,)),
+        report.Section(
+            "The chain",
+            "Every stage is a command; every artefact is a file.",
+            (timing,),
+        ),
         *(_section(folder, outcome) for outcome in outcomes),
         _module(folder),
     ]
@@ -166,15 +222,25 @@ def _section(folder: Path, outcome: Outcome) -> report.Section:
 
 
 def _tables(outcome: Outcome) -> Iterator[report.Table]:
-    """Rows and parameters of a result as tables of their own, its plain numbers as the last."""
+    """Rows and parameters of a result as tables of their own, its plain numbers as the
+    last.
+    """
     listed = outcome.values.get("rows")
     if isinstance(listed, list) and listed and isinstance(listed[0], dict):
         head = [k for k, v in listed[0].items() if not isinstance(v, dict | list)]
-        yield report.Table([report.in_words(h) for h in head], [[row[k] for k in head] for row in listed])
+        yield report.Table(
+            [report.in_words(h) for h in head],
+            [[row[k] for k in head] for row in listed],
+        )
     fitted = outcome.values.get("parameters")
     if isinstance(fitted, dict):
         rows = [
-            (report.in_words(name), value, sigma, f"{value - 1.96 * sigma:.4g} to {value + 1.96 * sigma:.4g}")
+            (
+                report.in_words(name),
+                value,
+                sigma,
+                f"{value - 1.96 * sigma:.4g} to {value + 1.96 * sigma:.4g}",
+            )
             for name, (value, sigma) in fitted.items()
         ]
         yield report.Table(("parameter", "value", "1 sigma", "95 % interval"), rows)
@@ -184,7 +250,9 @@ def _tables(outcome: Outcome) -> Iterator[report.Table]:
         if isinstance(value, bool | int | float | str)
     ]
     words = " ".join(outcome.stage.words)
-    yield report.Table(("result", "value"), plain, f"metalens {words}: {outcome.seconds:.1f} s")
+    yield report.Table(
+        ("result", "value"), plain, f"metalens {words}: {outcome.seconds:.1f} s"
+    )
 
 
 def _error(outcome: Outcome) -> str:
@@ -192,7 +260,11 @@ def _error(outcome: Outcome) -> str:
     found = outcome.values.get(key)
     if isinstance(found, dict):
         found = sum(len(differences) for differences in found.values())
-    return f"{report.in_figures(float(found), 2)} {meaning}" if isinstance(found, int | float) else meaning
+    return (
+        f"{report.in_figures(float(found), 2)} {meaning}"
+        if isinstance(found, int | float)
+        else meaning
+    )
 
 
 def _verdict(outcomes: list[Outcome]) -> str:

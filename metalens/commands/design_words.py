@@ -13,21 +13,33 @@ from metalens.lens import Layers, Lens
 from metalens.pillars import Proxy
 
 
-def meets(phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console) -> bool:
+def meets(
+    phase: PhaseOf, focus: Focus, radius_um: float, cell: Cell, console: Console
+) -> bool:
     """Whether a map focuses on the sensor; where it does elsewhere, it is said where."""
     if design.focuses(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um):
         return True
-    elsewhere = design.meeting_um(phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um)
+    elsewhere = design.meeting_um(
+        phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um
+    )
     if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
         told = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {focus.sensor_distance_um / 1e3:g} mm"
-        console.say(f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}")
+        console.say(
+            f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}"
+        )
     return False
 
 
 def neighbours(
-    made: Lens, quality: Quality, conversion: Conversion | None, radius_um: float, *, solve: bool
+    made: Lens,
+    quality: Quality,
+    conversion: Conversion | None,
+    radius_um: float,
+    *,
+    solve: bool,
 ) -> tuple[Lens, Unlike | None]:
-    """The lens, holding its rows where they are to be solved, and what unlike neighbours leave of the light in the
+    """The lens, holding its rows where they are to be solved, and what unlike
+    neighbours leave of the light in the
     focus, by those or rough; None where there is no such number.
 
     Raises:
@@ -35,8 +47,14 @@ def neighbours(
     """
     if conversion is not None or not quality.focuses:
         if solve:
-            why = "pillars that are turned" if conversion is not None else "a phase without a focus"
-            raise ConfigError(f"own_cell: {why}: no rows are solved for it; leave --own-cell out")
+            why = (
+                "pillars that are turned"
+                if conversion is not None
+                else "a phase without a focus"
+            )
+            raise ConfigError(
+                f"own_cell: {why}: no rows are solved for it; leave --own-cell out"
+            )
         return made, None
     if not solve:
         return made, design.rough_unlike(made, radius_um=radius_um)
@@ -44,8 +62,12 @@ def neighbours(
     return made, design.unlike(made, radius_um=radius_um)
 
 
-def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None) -> dict[str, object]:
-    """Numbers of a lens, of the check of its focus and of its neighbours; None for what JSON does not know."""
+def values(
+    quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None
+) -> dict[str, object]:
+    """Numbers of a lens, of the check of its focus and of its neighbours; None for what
+    JSON does not know.
+    """
     values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
     if quality.focuses:
         values |= {
@@ -66,7 +88,11 @@ def values(quality: Quality, check: FocusCheck | None, unlike: Unlike | None = N
     }
     if check is not None:
         along = None if math.isnan(check.z_um) else check.z_um  # JSON knows no nan
-        values |= {"focus_x_um": check.x_um, "focus_y_um": check.y_um, "focus_z_um": along}
+        values |= {
+            "focus_x_um": check.x_um,
+            "focus_y_um": check.y_um,
+            "focus_z_um": along,
+        }
         values |= {"exact_strehl": check.strehl, "focus_passed": check.passed}
     if unlike is not None:
         values["neighbours"] = asdict(unlike)
@@ -86,7 +112,9 @@ def unfocused(checks: Sequence[FocusCheck | None]) -> list[str]:
 def _cone(quality: Quality) -> list[str]:
     """Aperture and field of a lens that has a focus."""
     if not quality.focuses:
-        return ["  light of this phase meets in no one bright spot of the sensor: no focusing efficiency, NA or field"]
+        return [
+            "  light of this phase meets in no one bright spot of the sensor: no focusing efficiency, NA or field"
+        ]
     return [
         f"  NA {quality.numerical_aperture:.3f} towards the sensor; diffraction-limited field "
         f"{math.degrees(quality.field_of_view_rad):.1f} deg (Strehl ratio 0.8, hyperbolic lens of this focus)"
@@ -125,18 +153,26 @@ def _films(layers: Layers) -> list[str]:
     found = []
     for where, films in (("front", layers.front), ("behind", layers.behind)):
         if films:
-            named = ", ".join(f"{film.thickness_um:g} um {film.material}" for film in films)
+            named = ", ".join(
+                f"{film.thickness_um:g} um {film.material}" for film in films
+            )
             found.append(f"  phase corrected for layers {where}: {named}")
     if layers.stop is not None:
         found.append(
             f"  aperture stop of {2 * layers.stop.radius_um:g} um, {layers.stop.distance_um:g} um before the pillars"
-            + ("" if layers.stop.centred else f", its middle at {layers.stop.centre_um} um")
+            + (
+                ""
+                if layers.stop.centred
+                else f", its middle at {layers.stop.centre_um} um"
+            )
         )
     return found
 
 
 def curve(proxy: Proxy) -> dict[str, object]:
-    """How far the curve that stands for the pillars is from the solved ones, at the most."""
+    """How far the curve that stands for the pillars is from the solved ones, at the
+    most.
+    """
     return {
         "proxy_phase_error_rad": proxy.max_phase_error_rad,
         "proxy_transmission_error": proxy.max_transmission_error,
@@ -145,7 +181,8 @@ def curve(proxy: Proxy) -> dict[str, object]:
 
 
 def held(made: Lens) -> str:
-    """What is known of its pillars, in words: how close to solved ones; for which light, where pillars of one
+    """What is known of its pillars, in words: how close to solved ones; for which
+    light, where pillars of one
     size answer x and y apart."""
     phase, level = made.proxy.max_phase_error_rad, made.proxy.max_transmission_error
     known = (
@@ -169,7 +206,8 @@ def text(
     *,
     several: bool = False,
 ) -> str:
-    """Lines about a lens below a head; layers: films that its phase is corrected for; several: whether its pillars are
+    """Lines about a lens below a head; layers: films that its phase is corrected for;
+    several: whether its pillars are
     a compromise between wavelengths."""
     lines = [
         head,

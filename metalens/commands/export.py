@@ -1,4 +1,6 @@
-"""lens.h5 for other programs: arrays with axes (.npz, .mat), or the smooth phase of ray tracers (Zemax .dat)."""
+"""lens.h5 for other programs: arrays with axes (.npz, .mat), or the smooth phase of ray
+tracers (Zemax .dat).
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +20,10 @@ class Options(Common):
 
     Attributes:
         lens: the lens file.
-        output: file to write; its ending says the format: .npz, .mat (x, y, diameter, phase, transmission of every
-            pillar) or .dat (Zemax OpticStudio grid phase, unwrapped, in mm; other ray tracers read it too).
+        output: file to write; its ending says the format: .npz, .mat (x, y, diameter,
+            phase, transmission of every
+            pillar) or .dat (Zemax OpticStudio grid phase, unwrapped, in mm; other ray
+            tracers read it too).
         samples: points across the aperture of a .dat.
     """
 
@@ -31,17 +35,28 @@ class Options(Common):
 def run(options: Options) -> int:
     """Write the file; exit 0."""
     export.check(options.output)
-    if options.samples != Options.samples and options.output.suffix.lower() in export.ARRAYS:
-        raise LensError(f"--samples {options.samples}: counts the points of a .dat; arrays hold every pillar")
+    if (
+        options.samples != Options.samples
+        and options.output.suffix.lower() in export.ARRAYS
+    ):
+        raise LensError(
+            f"--samples {options.samples}: counts the points of a .dat; arrays hold every pillar"
+        )
     with options.claim(options.output) as draft:
         made = lens.load(options.lens)
         grid = options.output.suffix.lower() == export.GRID
         rows, columns = made.diameters.diameter_um.shape
-        transaction.check_room(options.output, 12 * options.samples**2 if grid else 4 * rows * columns)
+        transaction.check_room(
+            options.output, 12 * options.samples**2 if grid else 4 * rows * columns
+        )
         error = export.write(draft.path, made, samples=options.samples)
     how = ""
     if grid:
         how = f"; cubic interpolation between its points meets the pillars to {error:.2g} rad"
-    told = {"file": options.output.name, "bytes": options.output.stat().st_size, "interpolation_error_rad": error}
+    told = {
+        "file": options.output.name,
+        "bytes": options.output.stat().st_size,
+        "interpolation_error_rad": error,
+    }
     options.console.result(told, f"{options.output}: {told['bytes']:,} bytes{how}")
     return 0

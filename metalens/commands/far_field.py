@@ -1,4 +1,6 @@
-"""``metalens psf --far-field``: where the light of a lens goes over direction cosines, the share of every beam."""
+"""``metalens psf --far-field``: where the light of a lens goes over direction cosines,
+the share of every beam.
+"""
 
 import dataclasses
 import math
@@ -37,7 +39,8 @@ Directions = list[tuple[float, float]]
 class Asked:
     """What a far field is computed for, kept in the file.
 
-    angles_deg: (x, y) of every direction of incidence. source_mm: inf for plane waves. samples: across.
+    angles_deg: (x, y) of every direction of incidence. source_mm: inf for plane waves.
+    samples: across.
     """
 
     angles_deg: tuple[tuple[float, float], ...]
@@ -50,13 +53,24 @@ def asked(options: Any, made: lens.Lens) -> Asked:
     """Of the options of ``metalens psf``.
 
     Raises:
-        ConfigError: an option that says nothing of a far field, or more than one depth or wavelength.
+        ConfigError: an option that says nothing of a far field, or more than one depth
+            or wavelength.
     """
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if value not in (None, False) and field.name not in (*TAKES, "quiet", "json", "force"):
-            raise ConfigError(f"{field.name}: not for a far field, which takes {', '.join(TAKES[2:7])}")
-    sources, waves = options.sources_mm or (math.inf,), options.wavelengths_nm or (1e3 * made.wavelength_um,)
+        if value not in (None, False) and field.name not in (
+            *TAKES,
+            "quiet",
+            "json",
+            "force",
+        ):
+            raise ConfigError(
+                f"{field.name}: not for a far field, which takes {', '.join(TAKES[2:7])}"
+            )
+    sources, waves = (
+        options.sources_mm or (math.inf,),
+        options.wavelengths_nm or (1e3 * made.wavelength_um,),
+    )
     along_x = options.angles_deg or (0.0,)
     along_y = options.angles_y_deg or (0.0,) * len(along_x)
     if len(sources) != 1 or len(waves) != 1 or len(along_x) != len(along_y):
@@ -73,12 +87,18 @@ def asked(options: Any, made: lens.Lens) -> Asked:
     samples = SAMPLES if options.samples is None else options.samples
     if not 3 <= samples <= 4001:
         raise ConfigError(f"samples = {samples}: need 3 to 4001 across a far field")
-    return Asked(tuple(zip(along_x, along_y, strict=True)), sources[0], waves[0], samples)
+    return Asked(
+        tuple(zip(along_x, along_y, strict=True)), sources[0], waves[0], samples
+    )
 
 
 def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"]:
-    """One far field a direction of incidence; of pillars of two sizes the light along x that the lens is for."""
-    directions = console.track(wanted.angles_deg, total=len(wanted.angles_deg), label="directions")
+    """One far field a direction of incidence; of pillars of two sizes the light along x
+    that the lens is for.
+    """
+    directions = console.track(
+        wanted.angles_deg, total=len(wanted.angles_deg), label="directions"
+    )
     return [
         psf.far_field(
             made,
@@ -91,23 +111,46 @@ def compute(made: lens.Lens, wanted: Asked, console: Console) -> list["FarField"
     ]
 
 
-def save(path: Path, wanted: Asked, found: list["FarField"], *, inputs: dict[str, str], page: bool) -> None:
-    """The file of kind ``far-field``, its picture beside it, and with ``page`` its report."""
+def save(
+    path: Path,
+    wanted: Asked,
+    found: list["FarField"],
+    *,
+    inputs: dict[str, str],
+    page: bool,
+) -> None:
+    """The file of kind ``far-field``, its picture beside it, and with ``page`` its
+    report.
+    """
     arrays = {
         "share": np.stack([one.share for one in found]).astype(np.float32),
         "sine": found[0].sines,
         "rings": np.stack([one.rings for one in found]),
         "angles_deg": np.array(wanted.angles_deg),
         "beams": np.array(
-            [(i, b.sine_x, b.sine_y, b.share) for i, one in enumerate(found) for b in one.beams], float
+            [
+                (i, b.sine_x, b.sine_y, b.share)
+                for i, one in enumerate(found)
+                for b in one.beams
+            ],
+            float,
         ).reshape(-1, 4),
         "beyond": np.array([one.beyond for one in found]),
         "transmitted": np.array([one.transmitted for one in found]),
         "error": np.array([one.error for one in found]),
     }
-    about = {"wavelength_um": 1e-3 * wanted.wavelength_nm, "source_um": 1e3 * wanted.source_mm}
+    about = {
+        "wavelength_um": 1e-3 * wanted.wavelength_nm,
+        "source_um": 1e3 * wanted.source_mm,
+    }
     provenance = store.Provenance(config.dumps(wanted), inputs)
-    store.save(path, "far-field", arrays, attributes=about | {"beam_sine": found[0].beam_sine}, provenance=provenance)
+    store.save(
+        path,
+        "far-field",
+        arrays,
+        attributes=about | {"beam_sine": found[0].beam_sine},
+        provenance=provenance,
+    )
     image = picture(wanted, found)
     store.write_bytes(path.with_name(f"{path.stem}_far.png"), image)
     if page:
@@ -118,7 +161,11 @@ def values(wanted: Asked, found: list["FarField"]) -> dict[str, Any]:
     """Numbers for programs."""
     fields = []
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
-        beams = [dataclasses.asdict(b) | {"angle_deg": b.angle_deg, "azimuth_deg": b.azimuth_deg} for b in one.beams]
+        beams = [
+            dataclasses.asdict(b)
+            | {"angle_deg": b.angle_deg, "azimuth_deg": b.azimuth_deg}
+            for b in one.beams
+        ]
         fields.append(
             {
                 "angle_x_deg": x,
@@ -131,22 +178,43 @@ def values(wanted: Asked, found: list["FarField"]) -> dict[str, Any]:
             }
         )
     first = found[0]
-    return {"beam_sine": first.beam_sine, "beam_holds": first.beam_holds, "steepest": first.steepest, "fields": fields}
+    return {
+        "beam_sine": first.beam_sine,
+        "beam_holds": first.beam_holds,
+        "steepest": first.steepest,
+        "fields": fields,
+    }
 
 
 def text(target: Path, wanted: Asked, found: list["FarField"]) -> str:
     """Lines for people."""
-    source = "plane waves" if math.isinf(wanted.source_mm) else f"a source at {wanted.source_mm:g} mm"
-    lines = [f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {max(o.error for o in found):.1g}"]
+    source = (
+        "plane waves"
+        if math.isinf(wanted.source_mm)
+        else f"a source at {wanted.source_mm:g} mm"
+    )
+    lines = [
+        f"{target}: far field of {source}, {wanted.wavelength_nm:g} nm, error {max(o.error for o in found):.1g}"
+    ]
     for (x, y), one in zip(wanted.angles_deg, found, strict=True):
         cones = [(part, _cone(one, part)) for part in PARTS]
-        told = ", ".join(f"{part:.0%} within {angle:.3g}" for part, angle in cones if angle is not None)
+        told = ", ".join(
+            f"{part:.0%} within {angle:.3g}"
+            for part, angle in cones
+            if angle is not None
+        )
         lines.append(
             f"  from ({x:g}, {y:g}) deg: {one.transmitted:.3f} of the light on the pillars passes, of that {told} deg "
-            "of the axis" + (f", {one.beyond:.2g} does not leave into air" if one.beyond > 1e-4 else "")
+            "of the axis"
+            + (
+                f", {one.beyond:.2g} does not leave into air"
+                if one.beyond > 1e-4
+                else ""
+            )
         )
         lines += [
-            f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, {b.sine_y:+.5f})" for b in one.beams
+            f"    {b.share:.4f} at {b.angle_deg:.3f} deg, sines ({b.sine_x:+.5f}, {b.sine_y:+.5f})"
+            for b in one.beams
         ]
         if not one.beams:
             lines.append("    no direction holds 1 % of it")
@@ -154,7 +222,11 @@ def text(target: Path, wanted: Asked, found: list["FarField"]) -> str:
 
 
 def _counted(one: "FarField") -> str:
-    limit = "" if one.steepest >= 1 else f"; the lattice tells directions up to a sine of {one.steepest:.3f}"
+    limit = (
+        ""
+        if one.steepest >= 1
+        else f"; the lattice tells directions up to a sine of {one.steepest:.3f}"
+    )
     return (
         f"a beam is the light within a sine of {one.beam_sine:.2g} of its middle ({one.beam_holds:.0%} of an ideal "
         f"round one){limit}"
@@ -162,29 +234,54 @@ def _counted(one: "FarField") -> str:
 
 
 def _cone(one: "FarField", part: float) -> float | None:
-    """Angle about the axis in deg that holds a part of the transmitted light; None where none does."""
+    """Angle about the axis in deg that holds a part of the transmitted light; None
+    where none does.
+    """
     sine = one.within_sine(part)
     return None if math.isnan(sine) else math.degrees(math.asin(min(sine, 1.0)))
 
 
 def picture(wanted: Asked, found: list["FarField"]) -> bytes:
-    """Light over direction cosines on a logarithmic scale (above), and within cones about the axis (below)."""
+    """Light over direction cosines on a logarithmic scale (above), and within cones
+    about the axis (below).
+    """
     from matplotlib.colors import LogNorm
 
     width = max(4.6, 3.6 * len(found))
-    figure, panels = canvas(2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1))
+    figure, panels = canvas(
+        2, len(found), size=(width, 6.6), squeeze=False, height_ratios=(2, 1)
+    )
     for column, ((x, y), one) in enumerate(zip(wanted.angles_deg, found, strict=True)):
         edge = float(one.sines[-1] + (one.sines[1] - one.sines[0]) / 2)
         top = float(one.share.max())
         panel = panels[0, column]
         low = max(1e-6 * top, 1e-300)
-        shown = panel.imshow(np.maximum(one.share, low), norm=LogNorm(low, top), extent=(-edge, edge, edge, -edge))
+        shown = panel.imshow(
+            np.maximum(one.share, low),
+            norm=LogNorm(low, top),
+            extent=(-edge, edge, edge, -edge),
+        )
         panel.grid(False)
-        panel.set(title=f"from ({x:g}°, {y:g}°)", xlabel="sine along x", ylabel="sine along y")
-        figure.colorbar(shown, ax=panel, label="share of the light in a square", shrink=0.85)
-        angles = np.degrees(np.arcsin(np.minimum(np.arange(1, len(one.rings) + 1) * 2 * edge / len(one.sines), 1.0)))
+        panel.set(
+            title=f"from ({x:g}°, {y:g}°)", xlabel="sine along x", ylabel="sine along y"
+        )
+        figure.colorbar(
+            shown, ax=panel, label="share of the light in a square", shrink=0.85
+        )
+        angles = np.degrees(
+            np.arcsin(
+                np.minimum(
+                    np.arange(1, len(one.rings) + 1) * 2 * edge / len(one.sines), 1.0
+                )
+            )
+        )
         panels[1, column].plot(angles, np.cumsum(one.rings))
-        panels[1, column].set(xlabel="angle from the axis / deg", ylabel="share within", ylim=(0, 1.02), xlim=(0, None))
+        panels[1, column].set(
+            xlabel="angle from the axis / deg",
+            ylabel="share within",
+            ylim=(0, 1.02),
+            xlim=(0, None),
+        )
     return png(figure)
 
 
@@ -195,9 +292,17 @@ def _report(path: Path, wanted: Asked, found: list["FarField"], image: bytes) ->
         for b in one.beams
     ]
     words = "Light far behind the lens over direction cosines, +x right and +y down; below, what cones hold."
-    caption = f"Shares are of the light that the pillars let through; {_counted(found[0])}."
+    caption = (
+        f"Shares are of the light that the pillars let through; {_counted(found[0])}."
+    )
     keys = [KeyFigure("relative error", f"{max(one.error for one in found):.1g}", True)]
     keys += [KeyFigure("of the light passes", f"{found[0].transmitted:.3f}")]
     sections = [Section("Directions", items=[Figure(image, words, wide=True)])]
-    sections.append(Section("Beams", items=[Table(HEAD, rows, caption)] if rows else (), text="" if rows else caption))
+    sections.append(
+        Section(
+            "Beams",
+            items=[Table(HEAD, rows, caption)] if rows else (),
+            text="" if rows else caption,
+        )
+    )
     write(path, "Far field", sections, key_figures=keys)

@@ -1,4 +1,6 @@
-"""CELL.toml to field.h5: E and H in and around one pillar, on cuts along its axis and across it, with a picture."""
+"""CELL.toml to field.h5: E and H in and around one pillar, on cuts along its axis and
+across it, with a picture.
+"""
 
 import math
 from dataclasses import dataclass
@@ -30,18 +32,23 @@ class Options(Common):
     """Options of ``metalens field``.
 
     Attributes:
-        config: CELL.toml, of which [cell] and the first wavelength of [sweep] are taken.
+        config: CELL.toml, of which [cell] and the first wavelength of [sweep] are
+            taken.
         diameter_um: of the pillar (of other shapes their size).
         output: the file to write; NAME.png beside it.
         wavelength_nm: in vacuum; left out, the first of [sweep].
         angle_deg: of the light outside, in air.
         azimuth_deg: of the plane of incidence, from +x to +y.
-        polarization: x or y: E along that axis; p or s: in the plane of incidence, or across it.
-        heights_um: of the maps across the pillar, above its foot; left out, a quarter, half and three
+        polarization: x or y: E along that axis; p or s: in the plane of incidence, or
+            across it.
+        heights_um: of the maps across the pillar, above its foot; left out, a quarter,
+            half and three
             quarters of it.
-        around_um: how far the cuts reach below and above pillar and films; left out, half a wavelength.
+        around_um: how far the cuts reach below and above pillar and films; left out,
+            half a wavelength.
         samples: points along the pitch.
-        tolerance: of the relative root-mean-square error of E over the points of a cut, up to 0.5; left out, 0.1 is
+        tolerance: of the relative root-mean-square error of E over the points of a cut,
+            up to 0.5; left out, 0.1 is
             sought, and what is reached is told.
     """
 
@@ -85,15 +92,24 @@ class Asked:
         return self.cell.pitch_um / self.samples
 
     def grids(self) -> list[Grid]:
-        """Cuts along x and z, along y and z, and maps along x and y: middles of square pixels over a period."""
+        """Cuts along x and z, along y and z, and maps along x and y: middles of square
+        pixels over a period.
+        """
         x, y = (
             (np.arange(n) - (n - 1) / 2) * (edge / n)
             for edge in self.cell.lattice.periods_um(self.cell.pitch_um)
             for n in [max(2, round(edge / self.step_um))]
         )
         low = -sum(film.thickness_um for film in self.cell.under) - self.around_um
-        high = self.cell.height_um + sum(film.thickness_um for film in self.cell.over) + self.around_um
-        z = low + (np.arange(math.ceil((high - low) / self.step_um)) + 0.5) * self.step_um
+        high = (
+            self.cell.height_um
+            + sum(film.thickness_um for film in self.cell.over)
+            + self.around_um
+        )
+        z = (
+            low
+            + (np.arange(math.ceil((high - low) / self.step_um)) + 0.5) * self.step_um
+        )
         return [Grid(x, [0.0], z), Grid([0.0], y, z), Grid(x, y, self.heights_um)]
 
 
@@ -105,18 +121,30 @@ def asked(options: Options) -> Asked:
     """
     wanted = config.load(options.config, CellFile, empty=False)
     cell = wanted.cell
-    wavelength = wanted.sweep.wavelengths_um[0] if options.wavelength_nm is None else options.wavelength_nm / NM
+    wavelength = (
+        wanted.sweep.wavelengths_um[0]
+        if options.wavelength_nm is None
+        else options.wavelength_nm / NM
+    )
     around = wavelength / 2 if options.around_um is None else options.around_um
     parts = tuple(part * cell.height_um for part in (0.25, 0.5, 0.75))
     heights = parts if options.heights_um is None else options.heights_um
     if not 8 <= options.samples <= MOST_SAMPLES:
-        raise ConfigError(f"samples = {options.samples}: need 8 to {MOST_SAMPLES} points along the pitch")
-    if not (0 <= around < 1e3 and heights and all(math.isfinite(h) and abs(h) < 1e3 for h in heights)):
+        raise ConfigError(
+            f"samples = {options.samples}: need 8 to {MOST_SAMPLES} points along the pitch"
+        )
+    if not (
+        0 <= around < 1e3
+        and heights
+        and all(math.isfinite(h) and abs(h) < 1e3 for h in heights)
+    ):
         raise ConfigError(
             f"around_um = {around:g}, heights_um = {list(heights)}: need lengths below 1000 um, at least one height"
         )
     if options.tolerance is not None and not 0 < options.tolerance <= UNKNOWN:
-        raise ConfigError(f"tolerance = {options.tolerance:g}: need an error above 0 and up to {UNKNOWN:g}")
+        raise ConfigError(
+            f"tolerance = {options.tolerance:g}: need an error above 0 and up to {UNKNOWN:g}"
+        )
     return Asked(
         cell,
         options.diameter_um,
@@ -132,16 +160,30 @@ def asked(options: Options) -> Asked:
 
 
 def run(options: Options) -> int:
-    """Compute, write, draw; exit 1 where an error estimate stays above the tolerance that is stated, or above 0.5."""
+    """Compute, write, draw; exit 1 where an error estimate stays above the tolerance
+    that is stated, or above 0.5.
+    """
     wanted = asked(options)
     with options.claim(options.output, beside=(".png",)) as draft:
-        found = near_fields(wanted.cell, wanted.diameter_um, wanted.light, wanted.grids(), tolerance=wanted.tolerance)
+        found = near_fields(
+            wanted.cell,
+            wanted.diameter_um,
+            wanted.light,
+            wanted.grids(),
+            tolerance=wanted.tolerance,
+        )
         files = (options.config, *workers.material_files(wanted.cell))
-        save(draft.path, wanted, found, {file.name: reading.sha256(file) for file in files})
+        save(
+            draft.path,
+            wanted,
+            found,
+            {file.name: reading.sha256(file) for file in files},
+        )
         store.write_bytes(draft.path.with_suffix(".png"), picture(wanted, found))
     names = (*CUTS, "xy")
     values: dict[str, Any] = {
-        name: {"error": one.error, "largest_e": _largest(one)} for name, one in zip(names, found, strict=True)
+        name: {"error": one.error, "largest_e": _largest(one)}
+        for name, one in zip(names, found, strict=True)
     }
     failures: list[str] = []
     missed = [name for name, one in zip(names, found, strict=True) if not one.converged]
@@ -152,7 +194,11 @@ def run(options: Options) -> int:
     failed = any(one.error > (options.tolerance or UNKNOWN) for one in found)
     if missed:
         above = f"{', '.join(missed)} above the tolerance {wanted.tolerance:g} at {found[0].orders} orders: "
-        cure = "allow a larger one; " if failed and all(one.error <= UNKNOWN for one in found) else ""
+        cure = (
+            "allow a larger one; "
+            if failed and all(one.error <= UNKNOWN for one in found)
+            else ""
+        )
         told = f"{above}{cure}fields at edges converge slowly"
         if failed:
             failures.append(told)
@@ -172,22 +218,40 @@ def magnitude(field: Array) -> Array:
     return np.asarray(np.sqrt((np.abs(field) ** 2).sum(axis=0)))
 
 
-def save(path: Path, wanted: Asked, found: list[NearField], inputs: dict[str, str]) -> None:
-    """The file of kind ``near-field``: E and H (3, rows, columns) of the cuts, (3, height, y, x) of the maps."""
+def save(
+    path: Path, wanted: Asked, found: list[NearField], inputs: dict[str, str]
+) -> None:
+    """The file of kind ``near-field``: E and H (3, rows, columns) of the cuts, (3,
+    height, y, x) of the maps.
+    """
     xz, yz, xy = found
-    arrays: dict[str, Array] = {"x_um": xz.grid.x_um, "y_um": yz.grid.y_um, "z_um": xz.grid.z_um}  # type: ignore[dict-item]
+    arrays: dict[str, Array] = {
+        "x_um": np.asarray(xz.grid.x_um),
+        "y_um": np.asarray(yz.grid.y_um),
+        "z_um": np.asarray(xz.grid.z_um),
+    }
     arrays["heights_um"] = np.array(wanted.heights_um)
     for name, one, flat in (("xz", xz, -2), ("yz", yz, -1), ("xy", xy, None)):
         for part, field in (("e", one.e), ("h", one.h), ("index", one.index)):
-            arrays[f"{name}/{part}"] = field if flat is None else field.squeeze(axis=flat)
-    about: dict[str, store.Attribute] = {"wavelength_um": wanted.wavelength_um, "step_um": wanted.step_um}
-    about |= {f"error_{name}": one.error for name, one in zip((*CUTS, "xy"), found, strict=True)}
+            arrays[f"{name}/{part}"] = (
+                field if flat is None else field.squeeze(axis=flat)
+            )
+    about: dict[str, store.Attribute] = {
+        "wavelength_um": wanted.wavelength_um,
+        "step_um": wanted.step_um,
+    }
+    about |= {
+        f"error_{name}": one.error
+        for name, one in zip((*CUTS, "xy"), found, strict=True)
+    }
     provenance = store.Provenance(config.dumps(wanted), inputs)
     store.save(path, "near-field", arrays, attributes=about, provenance=provenance)
 
 
 def picture(wanted: Asked, found: list[NearField]) -> bytes:
-    """|E| on both cuts (light goes upwards) and on the maps, with the boundaries of the materials."""
+    """|E| on both cuts (light goes upwards) and on the maps, with the boundaries of the
+    materials.
+    """
     cuts, maps = found[:2], found[2]
     columns = max(2, len(wanted.heights_um))
     figure, panels = canvas(2, columns, size=(3.2 * columns, 7.2), squeeze=False)
@@ -197,12 +261,16 @@ def picture(wanted: Asked, found: list[NearField]) -> bytes:
         across = np.asarray(one.grid.x_um if name == "xz" else one.grid.y_um)
         e, index = magnitude(one.e).squeeze(), one.index.squeeze().real
         shown = _map(panel, across, np.asarray(one.grid.z_um), e, index, top)
-        panel.set(title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm")
+        panel.set(
+            title=f"|E| at {CUTS[name]}", xlabel=f"{name[0]} / µm", ylabel="z / µm"
+        )
     for i, height in enumerate(wanted.heights_um):
         x, y = np.asarray(maps.grid.x_um), np.asarray(maps.grid.y_um)
         shown = _map(panels[1, i], x, y, magnitude(maps.e)[i], maps.index[i].real, top)
         panels[1, i].invert_yaxis()
-        panels[1, i].set(title=f"|E| at z = {height:.4g} µm", xlabel="x / µm", ylabel="y / µm")
+        panels[1, i].set(
+            title=f"|E| at z = {height:.4g} µm", xlabel="x / µm", ylabel="y / µm"
+        )
     for panel in (*panels[0, 2:], *panels[1, len(wanted.heights_um) :]):
         panel.set_axis_off()
     figure.colorbar(shown, ax=panels, label="|E| of the light that comes", shrink=0.6)
@@ -210,10 +278,23 @@ def picture(wanted: Asked, found: list[NearField]) -> bytes:
 
 
 def _map(panel: Any, x: Array, y: Array, e: Array, index: Array, top: float) -> Any:
-    edges = [axis[k] + step * (axis[1] - axis[0]) / 2 for axis in (x, y) for k, step in ((0, -1), (-1, 1))]
-    image = panel.imshow(e, origin="lower", extent=edges, vmin=0, vmax=top, aspect="equal", cmap="magma")
+    edges = [
+        axis[k] + step * (axis[1] - axis[0]) / 2
+        for axis in (x, y)
+        for k, step in ((0, -1), (-1, 1))
+    ]
+    image = panel.imshow(
+        e, origin="lower", extent=edges, vmin=0, vmax=top, aspect="equal", cmap="magma"
+    )
     if np.ptp(index) > 0:
         levels = np.unique(index)
-        panel.contour(x, y, index, levels=(levels[1:] + levels[:-1]) / 2, colors="w", linewidths=0.7)
+        panel.contour(
+            x,
+            y,
+            index,
+            levels=(levels[1:] + levels[:-1]) / 2,
+            colors="w",
+            linewidths=0.7,
+        )
     panel.grid(False)
     return image

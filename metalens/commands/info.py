@@ -1,4 +1,6 @@
-"""What a file is: kind, version, provenance, arrays and a small picture of the largest; masks and networks as well."""
+"""What a file is: kind, version, provenance, arrays and a small picture of the largest;
+masks and networks as well.
+"""
 
 import importlib
 import json
@@ -17,7 +19,8 @@ from metalens.ground.errors import StoreError
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
 _HDF5 = b"\x89HDF"  # first bytes
-# kind of file: module of a package above with ``told`` and ``text``, filled by the command line
+# kind of file: module of a package above with ``told`` and ``text``, filled by the
+# command line
 TOLD: dict[str, str] = {}
 
 
@@ -26,7 +29,8 @@ class Options(Common):
     """Options of ``metalens info``.
 
     Attributes:
-        file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or checkpoint (safetensors), a
+        file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or
+            checkpoint (safetensors), a
             folder with a manifest, or any file of one.
     """
 
@@ -75,7 +79,8 @@ def _about(name: str, stored: store.Stored) -> dict[str, Any]:
 
 
 def member(path: Path) -> dict[str, Any] | None:
-    """A file that is no HDF5, as the manifest of its folder lists it: command and versions; None where none does.
+    """A file that is no HDF5, as the manifest of its folder lists it: command and
+    versions; None where none does.
 
     Raises:
         StoreError: it is not as it was written.
@@ -88,8 +93,15 @@ def member(path: Path) -> dict[str, Any] | None:
         if file.read(len(_HDF5)) == _HDF5:
             return None
     if store.sha256(path) != listed["sha256"]:
-        raise StoreError(f"{path}: not as `metalens {found['command']}` wrote it; make it again")
-    return {"file": path.name, "command": found["command"], "versions": found["versions"], **listed}
+        raise StoreError(
+            f"{path}: not as `metalens {found['command']}` wrote it; make it again"
+        )
+    return {
+        "file": path.name,
+        "command": found["command"],
+        "versions": found["versions"],
+        **listed,
+    }
 
 
 def _member_text(told: dict[str, Any]) -> str:
@@ -114,13 +126,25 @@ def folder(path: Path) -> dict[str, Any]:
 
 
 def _folder_text(told: dict[str, Any]) -> str:
-    lines = [f"{told['folder']}: {len(told['files'])} files, each as it was written", f"  metalens {told['command']}"]
-    lines += [f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…" for name, e in told["files"].items()]
-    return "\n".join([*lines, "made with " + ", ".join(f"{k} {v}" for k, v in told["versions"].items())])
+    lines = [
+        f"{told['folder']}: {len(told['files'])} files, each as it was written",
+        f"  metalens {told['command']}",
+    ]
+    lines += [
+        f"  {name}  {e['bytes']:,} bytes  SHA-256 {e['sha256'][:16]}…"
+        for name, e in told["files"].items()
+    ]
+    return "\n".join(
+        [
+            *lines,
+            "made with " + ", ".join(f"{k} {v}" for k, v in told["versions"].items()),
+        ]
+    )
 
 
 def network(path: Path) -> dict[str, Any]:
-    """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of its length, then JSON).
+    """Kind, version, settings and tensors in the head of a safetensors file (8 bytes of
+    its length, then JSON).
 
     Raises:
         StoreError: missing, cut short, or no such file.
@@ -130,18 +154,36 @@ def network(path: Path) -> dict[str, Any]:
             length = int.from_bytes(file.read(8), "little")
             size = path.stat().st_size
             head = json.loads(file.read(length) if length <= size else b"")
-        tensors = {name: entry for name, entry in head.items() if name != "__metadata__"}
+        tensors = {
+            name: entry for name, entry in head.items() if name != "__metadata__"
+        }
         about = dict(head.get("__metadata__", {}))
         if "about" in about:
-            about = {k: v for k, v in json.loads(about["about"]).items() if k != "state"}
+            about = {
+                k: v for k, v in json.loads(about["about"]).items() if k != "state"
+            }
         ends = [int(entry["data_offsets"][1]) for entry in tensors.values()]
-        arrays = {name: f"{entry['dtype']} {tuple(entry['shape'])}" for name, entry in sorted(tensors.items())}
+        arrays = {
+            name: f"{entry['dtype']} {tuple(entry['shape'])}"
+            for name, entry in sorted(tensors.items())
+        }
     except FileNotFoundError:
         raise StoreError(f"{path}: no such file") from None
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise StoreError(f"{path}: cut short or no safetensors file ({error}); make it again") from None
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
+        raise StoreError(
+            f"{path}: cut short or no safetensors file ({error}); make it again"
+        ) from None
     if 8 + length + max(ends, default=0) != size:
-        raise StoreError(f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again")
+        raise StoreError(
+            f"{path}: {size} bytes, need {8 + length + max(ends, default=0)}: cut short; make it again"
+        )
     kind, version = str(about.get("kind", "network")), str(about.get("version", "1"))
     return {
         "file": path.name,
@@ -155,34 +197,56 @@ def network(path: Path) -> dict[str, Any]:
 def _network_text(told: dict[str, Any]) -> str:
     lines = [f"{told['kind']} version {told['version']}"]
     lines += [f"  {name}: {shape}" for name, shape in told["arrays"].items()]
-    return "\n".join([*lines, *("  config: " + line for line in told["settings"].splitlines() if line)])
+    return "\n".join(
+        [
+            *lines,
+            *("  config: " + line for line in told["settings"].splitlines() if line),
+        ]
+    )
 
 
 def _text(stored: store.Stored, arrays: dict[str, str]) -> str:
     made = stored.provenance
     lines = [f"{stored.kind} version {stored.version}"]
-    lines += [f"  {name} = {_short(value)}" for name, value in stored.attributes.items()]
+    lines += [
+        f"  {name} = {_short(value)}" for name, value in stored.attributes.items()
+    ]
     lines += [f"  {name}: {shape}" for name, shape in arrays.items()]
     lines.append("made with " + ", ".join(f"{k} {v}" for k, v in made.versions.items()))
-    lines += [f"  from {name} (SHA-256 {digest[:16]}…)" for name, digest in made.inputs.items()]
+    lines += [
+        f"  from {name} (SHA-256 {digest[:16]}…)"
+        for name, digest in made.inputs.items()
+    ]
     lines += ["  config: " + line for line in made.config.splitlines() if line]
-    picture = max(stored.arrays.values(), key=lambda a: a.size if a.ndim >= 2 else 0, default=None)
+    picture = max(
+        stored.arrays.values(), key=lambda a: a.size if a.ndim >= 2 else 0, default=None
+    )
     if picture is not None and picture.ndim >= 2 and picture.dtype.kind in "fiu":
         lines += sketch(picture)
     return "\n".join(lines)
 
 
 def _short(value: object) -> str:
-    """One line; of a float the digits that arithmetic leaves right: 0.94 for 0.9400000000000001."""
-    text = repr(float(f"{value:.12g}")) if isinstance(value, float) else str(value).strip().replace("\n", "; ")
+    """One line; of a float the digits that arithmetic leaves right: 0.94 for
+    0.9400000000000001.
+    """
+    text = (
+        repr(float(f"{value:.12g}"))
+        if isinstance(value, float)
+        else str(value).strip().replace("\n", "; ")
+    )
     return text if len(text) <= 100 else text[:97] + "..."
 
 
 def sketch(array: Array, *, columns: int = 48) -> list[str]:
-    """Lines of characters that show a (…, y, x) array, its first image, darkest for the largest value."""
+    """Lines of characters that show a (…, y, x) array, its first image, darkest for the
+    largest value.
+    """
     image = np.asarray(array.reshape(-1, *array.shape[-2:])[0], float)
     rows = max(1, round(columns * image.shape[0] / image.shape[1] / 2))
-    picked = image[np.ix_(_spread(image.shape[0], rows), _spread(image.shape[1], columns))]
+    picked = image[
+        np.ix_(_spread(image.shape[0], rows), _spread(image.shape[1], columns))
+    ]
     low, high = float(np.nanmin(picked)), float(np.nanmax(picked))
     level = np.nan_to_num((picked - low) / (high - low or 1.0)) * (len(_SHADES) - 1)
     return ["".join(_SHADES[int(v)] for v in row) for row in level]

@@ -1,4 +1,6 @@
-"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy, and a figure beside it."""
+"""CELL.toml to library.h5: pillar sweep with an error bar on every entry, its proxy,
+and a figure beside it.
+"""
 
 import dataclasses
 import math
@@ -38,7 +40,8 @@ MOST_UNKNOWN = 0.5  # share of the entries whose bars may be above any tolerance
 class CellFile:
     """The content of CELL.toml.
 
-    cell: the pillar cell. sweep: what the library holds. proxy: what its polynomial must meet.
+    cell: the pillar cell. sweep: what the library holds. proxy: what its polynomial
+    must meet.
     """
 
     cell: Cell = DEFAULT_CELL
@@ -52,8 +55,10 @@ class Options(Distributed):
 
     Attributes:
         config: CELL.toml.
-        accept_partial_turn: a proxy of less than a turn is no failure (``metalens design`` has the same option).
-        output: the library file to write; NAME.resume beside it keeps finished curves until it is complete.
+        accept_partial_turn: a proxy of less than a turn is no failure (``metalens
+            design`` has the same option).
+        output: the library file to write; NAME.resume beside it keeps finished curves
+            until it is complete.
     """
 
     config: tyro.conf.Positional[Path]
@@ -62,41 +67,67 @@ class Options(Distributed):
 
 
 def run(options: Options) -> int:
-    """Sweep, fit, write; exit 1 where an error bar misses the tolerance that is stated or no full turn is covered."""
+    """Sweep, fit, write; exit 1 where an error bar misses the tolerance that is stated
+    or no full turn is covered.
+    """
     wanted = config.load(options.config, CellFile, empty=False)
     if wanted.sweep.lengths_um is not None:
         axes.check(wanted.cell, wanted.sweep)
-        about = store.Provenance(config.dumps(wanted), _inputs(options.config, wanted.cell))
-        return axes_library.run(options, options.output, wanted.cell, wanted.sweep, about)
+        about = store.Provenance(
+            config.dumps(wanted), _inputs(options.config, wanted.cell)
+        )
+        return axes_library.run(
+            options, options.output, wanted.cell, wanted.sweep, about
+        )
     library.check(wanted.cell, wanted.sweep)
     target, inputs = options.output, _inputs(options.config, wanted.cell)
     with options.claim(target, beside=(".png",)) as draft, options.shared():
         start = time.perf_counter()
         journal = target.with_name(target.name + ".resume")
-        made = library.sweep(wanted.cell, wanted.sweep, console=options.console, checkpoint=journal)
+        made = library.sweep(
+            wanted.cell, wanted.sweep, console=options.console, checkpoint=journal
+        )
         seconds = time.perf_counter() - start
         if wanted.sweep.light == "circular":
             made = converted.with_turns(made)
         fitted, refusal = _fit(made, wanted.proxy)
-        notes = (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
+        notes = (
+            (*fitted.notes, *filter(None, [fitted.shortfall])) if fitted else (refusal,)
+        )
         about = store.Provenance(config.dumps(wanted), inputs)
-        made = dataclasses.replace(made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about)
+        made = dataclasses.replace(
+            made, proxy=fitted.proxy if fitted else None, notes=notes, provenance=about
+        )
         library.save(draft.path, made)
         _draw(draft.path, made, fitted)
     stated = wanted.sweep.tolerance is not None
-    failures = _failures(made, fitted, refusal, stated=stated, accept_partial_turn=options.accept_partial_turn)
-    values, text = _values(made, fitted, seconds), _text(target, made, fitted, seconds, failures)
+    failures = _failures(
+        made,
+        fitted,
+        refusal,
+        stated=stated,
+        accept_partial_turn=options.accept_partial_turn,
+    )
+    values, text = (
+        _values(made, fitted, seconds),
+        _text(target, made, fitted, seconds, failures),
+    )
     return options.console.judged(values, text, failures)
 
 
 def _inputs(path: Path, cell: Cell) -> dict[str, str]:
     """Hashes of the config and of the material tables that the cell names."""
-    return {file.name: reading.sha256(file) for file in (path, *workers.material_files(cell))}
+    return {
+        file.name: reading.sha256(file)
+        for file in (path, *workers.material_files(cell))
+    }
 
 
 def _fit(made: PillarLibrary, wanted: Wanted) -> tuple[ProxyFit | None, str]:
     try:
-        return (converted.fit if made.sweep.light == "circular" else proxy_fit.fit)(made, wanted), ""
+        return (converted.fit if made.sweep.light == "circular" else proxy_fit.fit)(
+            made, wanted
+        ), ""
     except DomainError as refused:
         return None, str(refused)
 
@@ -108,11 +139,18 @@ def _draw(target: Path, made: PillarLibrary, fitted: ProxyFit | None) -> None:
 
 
 def _failures(
-    made: PillarLibrary, fitted: ProxyFit | None, refusal: str, *, stated: bool, accept_partial_turn: bool = False
+    made: PillarLibrary,
+    fitted: ProxyFit | None,
+    refusal: str,
+    *,
+    stated: bool,
+    accept_partial_turn: bool = False,
 ) -> list[str]:
     failures = []
     if stated and not made.converged:
-        failures.append(f"{_above(made)}: allow a larger tolerance or leave the resonances out of diameters_um")
+        failures.append(
+            f"{_above(made)}: allow a larger tolerance or leave the resonances out of diameters_um"
+        )
     if fitted is None:
         failures.append(f"no proxy: {refusal}")
     elif fitted.turns < 1 and not accept_partial_turn:
@@ -128,13 +166,22 @@ def _failures(
                 f"the pillars cover {fitted.smooth_turns:.2f}, but it cannot follow them so far within its tolerances: "
                 "sweep with more samples, or loosen phase_tolerance_rad and transmission_tolerance"
             )
-        failures.append(f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: {cure}")
+        failures.append(
+            f"the proxy covers {fitted.turns:.2f} of a turn, a lens needs 1: {cure}"
+        )
     if (hardly := float((made.t_error > MOST_ERROR).mean())) > MOST_UNKNOWN:
-        failures.append(f"error bars of {hardly:.0%} of the entries are above {MOST_ERROR:g}, whatever is asked for")
+        failures.append(
+            f"error bars of {hardly:.0%} of the entries are above {MOST_ERROR:g}, whatever is asked for"
+        )
     if fitted is not None:
         failures += filter(None, [fitted.shortfall, fitted.proxy.doubt])
-    if made.turned is not None and (bar := _circular(made.turned)["converted_error"]) > MOST_ERROR:
-        failures.append(f"the share that changes hand is known within {bar:.2g} alone, {MOST_ERROR:g} at the most")
+    if (
+        made.turned is not None
+        and (bar := _circular(made.turned)["converted_error"]) > MOST_ERROR
+    ):
+        failures.append(
+            f"the share that changes hand is known within {bar:.2g} alone, {MOST_ERROR:g} at the most"
+        )
     return failures
 
 
@@ -147,7 +194,9 @@ def _above(made: PillarLibrary) -> str:
     )
 
 
-def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float) -> dict[str, Any]:
+def _values(
+    made: PillarLibrary, fitted: ProxyFit | None, seconds: float
+) -> dict[str, Any]:
     values: dict[str, Any] = {
         "engine": made.engine,
         "entries": made.t.size,
@@ -164,18 +213,27 @@ def _values(made: PillarLibrary, fitted: ProxyFit | None, seconds: float) -> dic
         values |= {
             "domain_um": list(proxy.domain_um),
             "turns": None if math.isnan(fitted.turns) else fitted.turns,
-            "coefficients": proxy.phase_coefficients.size + proxy.transmission_coefficients.size,
+            "coefficients": proxy.phase_coefficients.size
+            + proxy.transmission_coefficients.size,
             "max_phase_error_rad": proxy.max_phase_error_rad,
             "max_transmission_error": proxy.max_transmission_error,
             "entry_error": proxy.entry_error,
             "polarization_spread": fitted.polarization_spread,
             "notes": list(fitted.notes),
-            "error_against_coefficients": [dataclasses.asdict(trial) for trial in fitted.table],
+            "error_against_coefficients": [
+                dataclasses.asdict(trial) for trial in fitted.table
+            ],
         }
     return values
 
 
-def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: float, failures: list[str]) -> str:
+def _text(
+    target: Path,
+    made: PillarLibrary,
+    fitted: ProxyFit | None,
+    seconds: float,
+    failures: list[str],
+) -> str:
     each = 1e3 * seconds / max(1, made.solves)
     lines = [
         f"{target}: {made.t.size} entries, {len(made.resonances)} poles near the real diameters",
@@ -194,7 +252,9 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
             "",
             *_proxy_lines(fitted),
         ]
-    if not (made.converged or any(failure.startswith(_above(made)) for failure in failures)):
+    if not (
+        made.converged or any(failure.startswith(_above(made)) for failure in failures)
+    ):
         lines.append(
             f"  {_above(made)}, which the file does not state: beside resonances as a rule, "
             "of narrow walls and shapes without mirrors in more places"
@@ -202,13 +262,17 @@ def _text(target: Path, made: PillarLibrary, fitted: ProxyFit | None, seconds: f
     if made.turned is not None:
         lines += _turned_lines(made.turned)
     elif made.polarization == ("x",) and not made.cell.alike:
-        lines.append("  all of it for light along x: these pillars answer light along y otherwise")
+        lines.append(
+            "  all of it for light along x: these pillars answer light along y otherwise"
+        )
         lines += _elsewhere(made)
     return "\n".join(lines)
 
 
 def _elsewhere(made: PillarLibrary) -> list[str]:
-    """What becomes of light along x in pillars that have no mirror along x or y: a part of it leaves along y."""
+    """What becomes of light along x in pillars that have no mirror along x or y: a part
+    of it leaves along y.
+    """
     outline = made.cell.outline(float(made.diameter_um[-1]))
     if outline.keeps(-1, 1) or outline.keeps(1, -1):
         return []
@@ -256,5 +320,7 @@ def _proxy_lines(fitted: ProxyFit) -> list[str]:
         f"  of entries whose own error bars are {proxy.entry_error:.1e} of |t| (root mean square)",
     ]
     if fitted.polarization_spread > 0:
-        lines.append(f"  s and p differ by up to {2 * fitted.polarization_spread:.1e}; the proxy holds their mean")
+        lines.append(
+            f"  s and p differ by up to {2 * fitted.polarization_spread:.1e}; the proxy holds their mean"
+        )
     return lines + [f"  {note}" for note in fitted.notes]

@@ -1,4 +1,6 @@
-"""``metalens design`` with a library over two sizes: the second target, what both lights see, and how it is said."""
+"""``metalens design`` with a library over two sizes: the second target, what both
+lights see, and how it is said.
+"""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -6,7 +8,15 @@ from typing import Literal
 
 from metalens import design
 from metalens.commands import design_words as words
-from metalens.design import Cubic, DoubleHelix, Focus, FocusCheck, PhaseMap, PhaseOf, Split
+from metalens.design import (
+    Cubic,
+    DoubleHelix,
+    Focus,
+    FocusCheck,
+    PhaseMap,
+    PhaseOf,
+    Split,
+)
 from metalens.ground import store
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens, check_gaps
@@ -20,20 +30,25 @@ BOTH: tuple[Literal["x", "y"], ...] = ("x", "y")
 class Target:
     """What light polarised along y is to see.
 
-    profile: which phase. sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a collimated beam).
+    profile: which phase. sensor_distance_mm, source_distance_mm: what is imaged onto
+    what (inf for a collimated beam).
     double_helix, cubic, map: of the profile of that name.
     """
 
     profile: Literal["hyperbolic", "double-helix", "cubic", "map"] = "hyperbolic"
     sensor_distance_mm: float = field(default=2.0, metadata={"above": 0})
-    source_distance_mm: float = field(default=20.0, metadata={"may_be_inf": True, "above": 0})
+    source_distance_mm: float = field(
+        default=20.0, metadata={"may_be_inf": True, "above": 0}
+    )
     double_helix: DoubleHelix = field(default_factory=DoubleHelix)
     cubic: Cubic = field(default_factory=Cubic)
     map: PhaseMap | None = None
 
     def __post_init__(self) -> None:
         if self.profile == "map" and self.map is None:
-            raise ConfigError("along_y: profile 'map' needs a table [along_y.map] with file and pitch_um")
+            raise ConfigError(
+                "along_y: profile 'map' needs a table [along_y.map] with file and pitch_um"
+            )
 
 
 def holds(path: Path) -> bool:
@@ -41,8 +56,12 @@ def holds(path: Path) -> bool:
     return path.is_file() and store.load(path).kind == axes.KIND
 
 
-def phase(wanted: Target, focus: Focus, where: Path, *, radius_um: float) -> tuple[PhaseOf, Focus]:
-    """The phase for light along y, and what it images onto what; where: the config that names the map."""
+def phase(
+    wanted: Target, focus: Focus, where: Path, *, radius_um: float
+) -> tuple[PhaseOf, Focus]:
+    """The phase for light along y, and what it images onto what; where: the config that
+    names the map.
+    """
     distances = wanted.sensor_distance_mm * 1e3, wanted.source_distance_mm * 1e3
     check_gaps(focus.layers, *distances)
     other = Focus(focus.wavelength_um, *distances, focus.layers)
@@ -51,14 +70,22 @@ def phase(wanted: Target, focus: Focus, where: Path, *, radius_um: float) -> tup
         "cubic": wanted.cubic,
         "map": wanted.map and replace(wanted.map, file=where.parent / wanted.map.file),
     }
-    return design.phase_of(shapes.get(wanted.profile), other, radius_um=radius_um), other
+    return design.phase_of(
+        shapes.get(wanted.profile), other, radius_um=radius_um
+    ), other
 
 
-def checks(made: Lens, profiles: tuple[str, str], *, skip: bool) -> list[FocusCheck | None]:
-    """The exact sum about the focus of either light; None where a profile has no focus, or it is not asked for."""
+def checks(
+    made: Lens, profiles: tuple[str, str], *, skip: bool
+) -> list[FocusCheck | None]:
+    """The exact sum about the focus of either light; None where a profile has no focus,
+    or it is not asked for.
+    """
     skip = skip or made.diameters.diameter_um.size > MOST_SUMMED
     return [
-        None if skip or profile != "hyperbolic" else design.check_focus(made.seen(light))
+        None
+        if skip or profile != "hyperbolic"
+        else design.check_focus(made.seen(light))
         for light, profile in zip(BOTH, profiles, strict=True)
     ]
 
@@ -71,23 +98,34 @@ def values(split: Split, found: list[FocusCheck | None]) -> dict[str, object]:
         "multiplexed": split.multiplexed,
         "covered": split.covered,
     }
-    for place, (light, quality) in enumerate(zip(BOTH, (split.x, split.y), strict=True)):
+    for place, (light, quality) in enumerate(
+        zip(BOTH, (split.x, split.y), strict=True)
+    ):
         own = words.values(quality, found[place])
-        own |= {"efficiency_error": split.efficiency_error[place], "leaked": split.leaked[place]}
+        own |= {
+            "efficiency_error": split.efficiency_error[place],
+            "leaked": split.leaked[place],
+        }
         del own["turns"]  # of a single diameter
         told[f"along_{light}"] = own
     return told
 
 
-def text(head: str, layers: Layers, split: Split, found: list[FocusCheck | None]) -> str:
+def text(
+    head: str, layers: Layers, split: Split, found: list[FocusCheck | None]
+) -> str:
     """Of both lights, for people."""
     what = "two phases" if split.multiplexed else "one phase for both polarisations"
     lines = [
         head,
         f"  pillars of {split.pairs:,} pairs of sizes make {what}; {split.covered:.0%} of the phases covered",
     ]
-    for place, (light, quality) in enumerate(zip(BOTH, (split.x, split.y), strict=True)):
-        lines += words.text(f"  light polarised along {light}:", layers, quality, found[place]).splitlines()
+    for place, (light, quality) in enumerate(
+        zip(BOTH, (split.x, split.y), strict=True)
+    ):
+        lines += words.text(
+            f"  light polarised along {light}:", layers, quality, found[place]
+        ).splitlines()
         lines.append(
             f"  efficiency within {split.efficiency_error[place]:.2g} (error bars of the pillars); phase error "
             f"{quality.rms_phase_error_rad:.2g} rad rms costs {1 - quality.strehl:.1%} of the peak; "

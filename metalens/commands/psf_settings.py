@@ -1,4 +1,6 @@
-"""Settings of ``metalens psf``: depths, angles, window, source and spectrum, from a file or from the command line."""
+"""Settings of ``metalens psf``: depths, angles, window, source and spectrum, from a
+file or from the command line.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -21,32 +23,46 @@ AIRY = 28.0  # width of a window in units of wavelength / NA
 class Settings:
     """What is computed; kept in the file.
 
-    depths_mm: nearest and farthest source, and the largest step between depths; left out: 21 depths over which the rim
-        of this lens goes from 1.75 waves out of focus on one side to as many on the other.
+    depths_mm: nearest and farthest source, and the largest step between depths; left
+    out: 21 depths over which the rim
+        of this lens goes from 1.75 waves out of focus on one side to as many on the
+        other.
     sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
-    angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the image of a positive angle lies
+    angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the
+    image of a positive angle lies
         at +x. angles_y_deg: along y (down), one for each or none for 0.
-    window_um, samples: full width along x of the window that follows the chief ray, and samples along it; without a
+    window_um, samples: full width along x of the window that follows the chief ray, and
+    samples along it; without a
         width 28 wavelength / NA, or 8 blur radii at the worst depth where that is more.
     height_um: its height, of samples as far apart; 0 for a square window.
     offset_um: [x, y] from the chief ray to the window's middle.
-    source_um: full size of an incoherent source: diameter of a disc, side of a square, full width at half maximum of a
-        gaussian; 0 for a point. source_deg: the same as an angle, for sources at infinity too.
+    source_um: full size of an incoherent source: diameter of a disc, side of a square,
+    full width at half maximum of a
+        gaussian; 0 for a point. source_deg: the same as an angle, for sources at
+        infinity too.
     source_shape: disc, square or gaussian.
     led_fwhm_nm: width of the diode about the design wavelength; 0 for one wavelength.
-    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose product is the spectrum (LED,
+    spectrum: in place of led_fwhm_nm, CSV files of wavelength in nm and value whose
+    product is the spectrum (LED,
         filter, sensor).
-    wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add. weights: of each; none for equal.
+    wavelengths_nm: in place of both, wavelengths in vacuum whose intensities add.
+    weights: of each; none for equal.
     tolerance: relative L2 error of the PSFs.
-    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in NA), ``flux`` (that of both
-        polarisations, which a pixel counts), ``vector`` (Ex, Ey, Ez of both, squares added), or ``auto``: the scalar
+    polarisation: ``scalar`` (the flux through the sensor's plane, to fourth order in
+    NA), ``flux`` (that of both
+        polarisations, which a pixel counts), ``vector`` (Ex, Ey, Ez of both, squares
+        added), or ``auto``: the scalar
         where its distance to the flux is below the tolerance, else the flux.
     layers: films in front and behind in place of the lens file's, as in DESIGN.toml.
-    light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean of the two, where they are
+    light: polarisation along x or y, for a lens of pillars of two sizes; both: the mean
+    of the two, where they are
         focused from and to the same distances (any light, for other lenses).
-    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell (seconds to minutes): the PSFs then
-        hold the factor of those neighbours, the error budget what is left. A lens of ``design --own-cell`` holds its
-        rows. Without either, pillars are taken one by one, and those terms are rough, of the default cell.
+    own_cell: solve rows of unlike pillars and tilted light for the lens's own cell
+    (seconds to minutes): the PSFs then
+        hold the factor of those neighbours, the error budget what is left. A lens of
+        ``design --own-cell`` holds its
+        rows. Without either, pillars are taken one by one, and those terms are rough,
+        of the default cell.
     """
 
     depths_mm: tuple[float, float, float] | None = None
@@ -83,17 +99,25 @@ class Settings:
                 f"depths_mm = {self.depths_mm}: need nearest, farthest and step with 0 < nearest <= farthest"
             )
         if not all(depth > 0 for depth in self.sources_mm):
-            raise ConfigError(f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave")
-        if (far - near) / step > MOST_DEPTHS or max(map(abs, (*self.angles_deg, *self.angles_y_deg, 0.0))) >= 90:
+            raise ConfigError(
+                f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave"
+            )
+        if (far - near) / step > MOST_DEPTHS or max(
+            map(abs, (*self.angles_deg, *self.angles_y_deg, 0.0))
+        ) >= 90:
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
                 "angles within 90 degrees"
             )
-        if not self.angles_deg or (self.angles_y_deg and len(self.angles_y_deg) != len(self.angles_deg)):
+        if not self.angles_deg or (
+            self.angles_y_deg and len(self.angles_y_deg) != len(self.angles_deg)
+        ):
             raise ConfigError(
                 f"{len(self.angles_deg)} angles along x, {len(self.angles_y_deg)} along y: need one for each"
             )
-        if (self.source_um and self.source_deg) or not (self.source_um >= 0 and 0 <= self.source_deg < 90):
+        if (self.source_um and self.source_deg) or not (
+            self.source_um >= 0 and 0 <= self.source_deg < 90
+        ):
             raise ConfigError(
                 f"source_um = {self.source_um}, source_deg = {self.source_deg}: need one of both, or 0 for a point"
             )
@@ -115,7 +139,9 @@ class Settings:
             return
         down = self.samples_y
         if not (self.height_um >= 0 and 1 <= down <= MOST_SAMPLES):
-            raise ConfigError(f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples")
+            raise ConfigError(
+                f"height_um = {self.height_um}: need 0, or a height of 1 to {MOST_SAMPLES} samples"
+            )
         step = self.window_um / self.samples
         if self.height_um and abs(self.height_um / step - down) > 1e-6 * down:
             raise ConfigError(
@@ -134,7 +160,9 @@ class Settings:
                 "two of spectrum, led_fwhm_nm and wavelengths_nm are given: each is the whole spectrum; give one"
             )
         if not all(0 < nm < np.inf for nm in self.wavelengths_nm):
-            raise ConfigError(f"wavelengths_nm = {self.wavelengths_nm}: need wavelengths above 0")
+            raise ConfigError(
+                f"wavelengths_nm = {self.wavelengths_nm}: need wavelengths above 0"
+            )
         good = len(self.weights) == len(self.wavelengths_nm) and sum(self.weights) > 0
         if self.weights and not (good and min(self.weights) >= 0):
             raise ConfigError(
@@ -144,7 +172,11 @@ class Settings:
     @property
     def samples_y(self) -> int:
         """Samples along y."""
-        return round(self.height_um / self.width_um * self.samples) if self.height_um else self.samples
+        return (
+            round(self.height_um / self.width_um * self.samples)
+            if self.height_um
+            else self.samples
+        )
 
     @property
     def width_um(self) -> float:
@@ -164,14 +196,19 @@ class Settings:
         if self.window_um is not None:
             return replace(self, depths_mm=depths_mm)
         ends = [z * 1e3 for z in self.sources_mm or depths_mm[:2]]
-        return replace(self, depths_mm=depths_mm, window_um=reach.window_um(made, tuple(ends), airy=AIRY))
+        return replace(
+            self,
+            depths_mm=depths_mm,
+            window_um=reach.window_um(made, tuple(ends), airy=AIRY),
+        )
 
     @property
     def view(self) -> "psf.View":
         """Depths, angles, window and source in um and rad.
 
         Raises:
-            ConfigError: depths or window are those of a lens, and no lens was named (:meth:`about`).
+            ConfigError: depths or window are those of a lens, and no lens was named
+                (:meth:`about`).
         """
         if self.sources_mm:
             depths = np.array(self.sources_mm) * 1e3
@@ -179,13 +216,24 @@ class Settings:
             raise ConfigError("depths_mm are left to the lens, and there is none")
         else:
             near, far, step = self.depths_mm
-            depths = np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1) * 1e3
+            depths = (
+                np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
+                * 1e3
+            )
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
-        pairs = [tuple(np.deg2rad([x, y]).tolist()) for x, y in zip(self.angles_deg, along_y, strict=True)]
+        pairs = [
+            tuple(np.deg2rad([x, y]).tolist())
+            for x, y in zip(self.angles_deg, along_y, strict=True)
+        ]
         angles = tuple(propagate.angles(pair) for pair in pairs)
         window = self.width_um, self.width_um / self.samples * self.samples_y
         return psf.View(
-            tuple(depths.tolist()), angles, window, (self.samples, self.samples_y), self.offset_um, self.source
+            tuple(depths.tolist()),
+            angles,
+            window,
+            (self.samples, self.samples_y),
+            self.offset_um,
+            self.source,
         )
 
     @property
@@ -193,25 +241,45 @@ class Settings:
         """Size and shape of the source, None for a point."""
         if not (self.source_um or self.source_deg):
             return None
-        return psf.Extent(self.source_shape, self.source_um, 2 * math.tan(math.radians(self.source_deg) / 2))
+        return psf.Extent(
+            self.source_shape,
+            self.source_um,
+            2 * math.tan(math.radians(self.source_deg) / 2),
+        )
 
-    def spectrum_of(self, made: lens.Lens) -> spectra.Nodes | spectra.Source | spectra.Measured | None:
-        """Wavelengths with weights, a diode or measured curves; None for the design wavelength alone."""
+    def spectrum_of(
+        self, made: lens.Lens
+    ) -> spectra.Nodes | spectra.Source | spectra.Measured | None:
+        """Wavelengths with weights, a diode or measured curves; None for the design
+        wavelength alone.
+        """
         if self.wavelengths_nm:
             share = np.array(self.weights or [1.0] * len(self.wavelengths_nm))
-            return spectra.Nodes(np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0)
+            return spectra.Nodes(
+                np.array(self.wavelengths_nm) * 1e-3, share / share.sum(), 0.0
+            )
         if self.spectrum:
             return spectra.measured(self.spectrum, within_um=made.proxy.wavelengths_um)
-        return spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm) if self.led_fwhm_nm else None
+        return (
+            spectra.Source(made.wavelength_um * 1e3, self.led_fwhm_nm)
+            if self.led_fwhm_nm
+            else None
+        )
 
 
 def read(path: Path | None, over: dict[str, Any]) -> Settings:
-    """Settings of a file (None: those of the record) with what was given on the command line in their place.
+    """Settings of a file (None: those of the record) with what was given on the command
+    line in their place.
 
     Raises:
         ConfigError: as :func:`metalens.ground.config.load`.
     """
     table = {} if path is None else config.read(path, Settings, empty=False)
     given = {name: value for name, value in over.items() if value is not None}
-    where = " and ".join([*([str(path)] if path is not None else []), *(["the command line"] if given else [])])
+    where = " and ".join(
+        [
+            *([str(path)] if path is not None else []),
+            *(["the command line"] if given else []),
+        ]
+    )
     return config.from_table(table | given, Settings, where=where or "metalens psf")

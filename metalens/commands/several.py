@@ -1,4 +1,6 @@
-"""``metalens design`` for several wavelengths: what the others are to see, what they get, and how it is said."""
+"""``metalens design`` for several wavelengths: what the others are to see, what they
+get, and how it is said.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,15 +18,19 @@ from metalens.pillars import PillarLibrary
 class Beside:
     """Light beside the design's own that the same pillars are to serve.
 
-    wavelength_nm: of that light. weight: of its squared errors, against 1 of the design's own wavelength.
-    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a collimated beam); left out, as at the
+    wavelength_nm: of that light. weight: of its squared errors, against 1 of the
+    design's own wavelength.
+    sensor_distance_mm, source_distance_mm: what is imaged onto what (inf for a
+    collimated beam); left out, as at the
         design's own wavelength.
     """
 
     wavelength_nm: float = field(metadata={"above": 0})
     weight: float = field(default=1.0, metadata={"above": 0})
     sensor_distance_mm: float | None = field(default=None, metadata={"above": 0})
-    source_distance_mm: float | None = field(default=None, metadata={"may_be_inf": True, "above": 0})
+    source_distance_mm: float | None = field(
+        default=None, metadata={"may_be_inf": True, "above": 0}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +45,14 @@ class Judged:
 def check(wavelengths: tuple[Beside, ...], profile: str) -> None:
     """Refuse profiles that are of one wavelength."""
     if wavelengths and profile in ("fisher", "map"):
-        raise ConfigError(f"wavelengths: profile '{profile}' is of one; need hyperbolic, double-helix or cubic")
+        raise ConfigError(
+            f"wavelengths: profile '{profile}' is of one; need hyperbolic, double-helix or cubic"
+        )
 
 
 def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
-    """The design (:class:`metalens.commands.design.Design`) as each wavelength is to see it, and its weight; its own
+    """The design (:class:`metalens.commands.design.Design`) as each wavelength is to
+    see it, and its weight; its own
     first. Nothing where there is no other.
 
     Raises:
@@ -52,19 +61,32 @@ def each(wanted: Any, made_of: PillarLibrary) -> Iterator[tuple[Any, float]]:
     if not wanted.wavelengths:
         return
     if made_of.turned is not None:
-        raise ConfigError("wavelengths: turned pillars make one phase at all of them; need a library for any light")
+        raise ConfigError(
+            "wavelengths: turned pillars make one phase at all of them; need a library for any light"
+        )
     yield wanted, 1.0
     for one in wanted.wavelengths:
         sensor = one.sensor_distance_mm or wanted.sensor_distance_mm
         source = one.source_distance_mm or wanted.source_distance_mm
-        told = {"wavelength_nm": one.wavelength_nm, "sensor_distance_mm": sensor, "source_distance_mm": source}
+        told = {
+            "wavelength_nm": one.wavelength_nm,
+            "sensor_distance_mm": sensor,
+            "source_distance_mm": source,
+        }
         yield replace(wanted, **told, wavelengths=()), one.weight
 
 
 def judged(
-    made: Lens, beside: Sequence[Beside], wanted: Sequence[Wanted], found: Sequence[Quality], *, check: bool
+    made: Lens,
+    beside: Sequence[Beside],
+    wanted: Sequence[Wanted],
+    found: Sequence[Quality],
+    *,
+    check: bool,
 ) -> tuple[Judged, ...]:
-    """Every other wavelength with its quality, and the exact sum about its focus if that is asked for."""
+    """Every other wavelength with its quality, and the exact sum about its focus if
+    that is asked for.
+    """
     out = []
     for light, one, quality in zip(beside, wanted, found, strict=True):
         seen = replace(
@@ -73,14 +95,24 @@ def judged(
             sensor_distance_um=one.focus.sensor_distance_um,
             source_distance_um=one.focus.source_distance_um,
         )
-        out.append(Judged(light, quality, design.check_focus(seen, expected=quality.strehl) if check else None))
+        out.append(
+            Judged(
+                light,
+                quality,
+                design.check_focus(seen, expected=quality.strehl) if check else None,
+            )
+        )
     return tuple(out)
 
 
 def numbers(beside: Sequence[Judged]) -> dict[str, object]:
     """Of the other wavelengths, for programs; nothing where there is none."""
     found = [
-        {"wavelength_nm": one.light.wavelength_nm, "weight": one.light.weight, **words.values(one.quality, one.check)}
+        {
+            "wavelength_nm": one.light.wavelength_nm,
+            "weight": one.light.weight,
+            **words.values(one.quality, one.check),
+        }
         for one in beside
     ]
     return {"wavelengths": found} if found else {}
@@ -88,6 +120,12 @@ def numbers(beside: Sequence[Judged]) -> dict[str, object]:
 
 def lines(beside: Sequence[Judged], layers: Layers) -> str:
     """Of the other wavelengths, for people."""
-    heads = [f"\n  light of {one.light.wavelength_nm:g} nm, weight {one.light.weight:g}:" for one in beside]
+    heads = [
+        f"\n  light of {one.light.wavelength_nm:g} nm, weight {one.light.weight:g}:"
+        for one in beside
+    ]
     found = zip(heads, beside, strict=True)
-    return "".join(words.text(head, layers, one.quality, one.check, several=True) for head, one in found)
+    return "".join(
+        words.text(head, layers, one.quality, one.check, several=True)
+        for head, one in found
+    )

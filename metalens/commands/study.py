@@ -1,6 +1,8 @@
-"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table, JSON and a figure.
+"""Cell study: which pitch and height cover a full turn of phase smoothly, as a table,
+JSON and a figure.
 
-Cells that are solved are kept beside the output (NAME.resume): after an interruption the same command goes on.
+Cells that are solved are kept beside the output (NAME.resume): after an interruption
+the same command goes on.
 """
 
 import importlib
@@ -24,10 +26,13 @@ class Options(Distributed):
     """Options of ``metalens study``.
 
     Attributes:
-        config: STUDY.toml with pitches, heights, wavelengths, material or cell, and limits; the project's own without.
-        process: PROCESS.toml whose printable pillars and gaps, the strictest of all pitches and heights, take the place
+        config: STUDY.toml with pitches, heights, wavelengths, material or cell, and
+            limits; the project's own without.
+        process: PROCESS.toml whose printable pillars and gaps, the strictest of all
+            pitches and heights, take the place
             of min_diameter_um and min_gap_um (worked out for round pillars).
-        output: folder for README.md, cell_study.json and cell_study.png; NAME.resume beside it keeps solved cells until
+        output: folder for README.md, cell_study.json and cell_study.png; NAME.resume
+            beside it keeps solved cells until
             it is complete.
     """
 
@@ -38,31 +43,48 @@ class Options(Distributed):
 
 def run(options: Options) -> int:
     """Compare the cells; exit 1 where none covers a full turn at all wavelengths."""
-    study = Study() if options.config is None else config.load(options.config, Study, empty=False)
+    study = (
+        Study()
+        if options.config is None
+        else config.load(options.config, Study, empty=False)
+    )
     given = "" if options.config is None else f" {options.config.name}"
     if options.process is not None:
         study = _printable(options.process, study)
         given += f" --process {options.process.name}"
     command = f"metalens study{given} -o {options.output.name}"
     with options.claim_folder(options.output) as draft, options.shared():
-        journal = Journal(options.output.with_name(options.output.name + ".resume"), study)
+        journal = Journal(
+            options.output.with_name(options.output.name + ".resume"), study
+        )
         verdicts = cell_study.run(study, options.console, journal=journal)
         study_plots.write_study(draft.path, study, verdicts, command=command)
     journal.finish()
     best = cell_study.choice(study, verdicts)
-    values = {"pitch_um": best and best[0], "height_um": best and best[1], "cells": len(verdicts)}
+    values = {
+        "pitch_um": best and best[0],
+        "height_um": best and best[1],
+        "cells": len(verdicts),
+    }
     text = f"{options.output}: {len(verdicts)} cells"
     if best is not None:
         text += f"; lowest with a full turn everywhere: pitch {best[0]:g} um, height {best[1]:g} um"
     missed = cell_study.unsure(study, verdicts)
     text += f"\n  {missed}" if missed else ""
-    return options.console.judged(values, text, [] if best else ["no cell covers a full turn at all wavelengths"])
+    return options.console.judged(
+        values, text, [] if best else ["no cell covers a full turn at all wavelengths"]
+    )
 
 
 def _printable(path: Path, study: Study) -> Study:
-    """The study with the limits of a process file, through a package above this one that the command line names."""
+    """The study with the limits of a process file, through a package above this one
+    that the command line names.
+    """
     module = importlib.import_module(OBJECTIVES["process"])
     shapes = itertools.product(study.pitches_um, study.heights_um)
-    found = [module.printable(path, pitch_um=pitch, height_um=height) for pitch, height in shapes]
+    found = [
+        module.printable(path, pitch_um=pitch, height_um=height)
+        for pitch, height in shapes
+    ]
     thinnest, gap = (max(values) for values in zip(*found, strict=True))
     return replace(study, min_diameter_um=thinnest * nm, min_gap_um=gap * nm)

@@ -1,4 +1,6 @@
-"""A page to explore any artefact: lens, library, PSF stack, as-built lens and more; opens without a server."""
+"""A page to explore any artefact: lens, library, PSF stack, as-built lens and more;
+opens without a server.
+"""
 
 import importlib
 from collections.abc import Callable
@@ -12,14 +14,19 @@ from metalens.ground import manifest, store
 from metalens.ground.errors import ConfigError
 from metalens.view import Panel, html, serve, write
 
-VIEWS: dict[str, str] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
+VIEWS: dict[
+    str, str
+] = {}  # kind of artefact: "module:function" of a package above, filled by the command line
 # what tells the kind of a folder: names of files in it, any of them
 FOLDERS = {
     "mask": tuple(f"*{end}" for end in MASKS),
     "run": ("log.jsonl", "checkpoint.safetensors"),
     "capture": ("stage.csv", "stage.json", "capture.toml", "capture.json"),
 }
-GENERATOR, _HEAD = 'content="metalens toolchain"', 400  # what tells these pages, and characters that hold it
+GENERATOR, _HEAD = (
+    'content="metalens toolchain"',
+    400,
+)  # what tells these pages, and characters that hold it
 OWN = {
     "library": "library_panels",
     "axes-library": "axes_panels",
@@ -36,11 +43,15 @@ class Options(Common):
     """Options of ``metalens view``.
 
     Attributes:
-        file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the toolchain; a mask (GDSII or OASIS);
-            or the folder of a mask, of captures, of a co-design run, or of PSFs alone (one lens in several lights).
-        output: the page to write; by default the file's name with .html, beside it, or with _view.html where a report
+        file: library.h5, lens.h5, psf.h5, asbuilt.h5 or another HDF5 file of the
+            toolchain; a mask (GDSII or OASIS);
+            or the folder of a mask, of captures, of a co-design run, or of PSFs alone
+            (one lens in several lights).
+        output: the page to write; by default the file's name with .html, beside it, or
+            with _view.html where a report
             of that name stands there.
-        serve: show the page in a browser on this machine and follow what grows, until Ctrl-C; nothing is written. A
+        serve: show the page in a browser on this machine and follow what grows, until
+            Ctrl-C; nothing is written. A
             folder of several artefacts begins with a list of them.
         port: of --serve on 127.0.0.1; 0: any that is free.
     """
@@ -71,7 +82,9 @@ def run(options: Options) -> int:
 
 
 def _beside(path: Path) -> Path:
-    """NAME.html beside it; NAME_view.html where the first is another page, as the report of ``psf`` or ``fit``."""
+    """NAME.html beside it; NAME_view.html where the first is another page, as the
+    report of ``psf`` or ``fit``.
+    """
     own = path.resolve() if not path.name else path
     target = own.with_name(own.name.removesuffix(".h5") + ".html")
     if not target.is_file():
@@ -90,10 +103,16 @@ def _served(options: Options) -> int:
         return html(title, panels, about=_about(path))
 
     def listed() -> list[Path]:
-        return [] if _folder_kind(options.file) or not options.file.is_dir() else _inside(options.file)
+        return (
+            []
+            if _folder_kind(options.file) or not options.file.is_dir()
+            else _inside(options.file)
+        )
 
     def ready(address: str) -> None:
-        options.console.result({"address": address}, f"{options.file} at {address} until Ctrl-C")
+        options.console.result(
+            {"address": address}, f"{options.file} at {address} until Ctrl-C"
+        )
 
     serve(options.file, made, listed, port=options.port, ready=ready)
     return 0
@@ -108,7 +127,8 @@ def kind_of(path: Path) -> str:
     """What an artefact is: a kind of HDF5 file, ``mask``, ``run`` or ``capture``.
 
     Raises:
-        ConfigError: a folder of none of these kinds; what can be shown of it is named. StoreError: no artefact.
+        ConfigError: a folder of none of these kinds; what can be shown of it is named.
+            StoreError: no artefact.
     """
     if path.is_dir():
         if kind := _folder_kind(path):
@@ -117,14 +137,27 @@ def kind_of(path: Path) -> str:
         pages = [str(p) for p in sorted(path.glob("*.html"))]
         raise ConfigError(
             f"{path} is no folder of a mask, of captures or of a run"
-            + (f"; give one of {', '.join(inside[:9])}" if inside else "; give a file" if not pages else "")
+            + (
+                f"; give one of {', '.join(inside[:9])}"
+                if inside
+                else "; give a file"
+                if not pages
+                else ""
+            )
             + (f"; its own page is {', '.join(pages[:3])}" if pages else "")
         )
     return "mask" if path.suffix.lower() in MASKS else store.load(path).kind
 
 
 def _folder_kind(path: Path) -> str | None:
-    kind = next((k for k, names in FOLDERS.items() if any(True for name in names for _ in path.glob(name))), None)
+    kind = next(
+        (
+            k
+            for k, names in FOLDERS.items()
+            if any(True for name in names for _ in path.glob(name))
+        ),
+        None,
+    )
     return kind or ("lights" if _of_lights(path) else None)
 
 
@@ -137,7 +170,9 @@ def _of_lights(path: Path) -> bool:
 def _inside(path: Path) -> list[Path]:
     """Artefacts below a folder: files, and folders of a kind."""
     return [
-        p for p in sorted(path.rglob("*")) if p.suffix.lower() in (".h5", *MASKS) or (p.is_dir() and _folder_kind(p))
+        p
+        for p in sorted(path.rglob("*"))
+        if p.suffix.lower() in (".h5", *MASKS) or (p.is_dir() and _folder_kind(p))
     ]
 
 
@@ -159,5 +194,7 @@ def panels_of(kind: str) -> Callable[[Path], list[Panel]]:
     module, _, function = VIEWS.get(kind, "").partition(":")
     if not module:
         module, function = "metalens.view.artefacts", OWN.get(kind, "plain_panels")
-    found: Callable[[Path], list[Panel]] = getattr(importlib.import_module(module), function)
+    found: Callable[[Path], list[Panel]] = getattr(
+        importlib.import_module(module), function
+    )
     return found

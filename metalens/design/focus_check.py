@@ -1,4 +1,6 @@
-"""Whether the pillars focus where they should, by the direct Rayleigh-Sommerfeld sum on a small window."""
+"""Whether the pillars focus where they should, by the direct Rayleigh-Sommerfeld sum on
+a small window.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,8 +14,12 @@ from metalens.ground.arrays import Array
 from metalens.lens import Lens
 from metalens.propagate import Case, field_at, kernel
 
-_ARM = np.linspace(-1.2, 1.2, 9)  # arms of the cross of points, in units of wavelength / (2 NA)
-_SHIFTS = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])  # sensor distances tried, in units of wavelength / NA²
+_ARM = np.linspace(
+    -1.2, 1.2, 9
+)  # arms of the cross of points, in units of wavelength / (2 NA)
+_SHIFTS = np.array(
+    [-0.5, -0.25, 0.0, 0.25, 0.5]
+)  # sensor distances tried, in units of wavelength / NA²
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,10 +27,12 @@ class FocusCheck:
     """Where the light of the design source meets.
 
     x_um, y_um: of the brightest point of the sensor plane (0, 0 is meant).
-    z_um: distance of the brightest point of the axis from the sensor plane (0 is meant); nan where not asked for.
+    z_um: distance of the brightest point of the axis from the sensor plane (0 is
+    meant); nan where not asked for.
     strehl: peak intensity against all pillars' magnitudes in step.
     resolution_um: wavelength / (2 NA); depth_um: wavelength / NA².
-    expected: Strehl ratio that the pillars' phase errors leave, where they are a compromise.
+    expected: Strehl ratio that the pillars' phase errors leave, where they are a
+    compromise.
     """
 
     x_um: float
@@ -38,7 +46,10 @@ class FocusCheck:
     @property
     def placed(self) -> bool:
         """Brightest within a quarter of the resolution and of the depth of focus."""
-        return max(abs(self.x_um), abs(self.y_um)) <= self.resolution_um / 4 and not abs(self.z_um) > self.depth_um / 4
+        return (
+            max(abs(self.x_um), abs(self.y_um)) <= self.resolution_um / 4
+            and not abs(self.z_um) > self.depth_um / 4
+        )
 
     @property
     def passed(self) -> bool:
@@ -48,10 +59,24 @@ class FocusCheck:
     @property
     def text(self) -> str:
         """One line for a person."""
-        beyond = " or farther" if abs(self.z_um) >= _SHIFTS[-1] * self.depth_um * (1 - 1e-9) else ""
-        axial = "" if math.isnan(self.z_um) else f", {self.z_um:+.2f} um{beyond} from the sensor plane"
+        beyond = (
+            " or farther"
+            if abs(self.z_um) >= _SHIFTS[-1] * self.depth_um * (1 - 1e-9)
+            else ""
+        )
+        axial = (
+            ""
+            if math.isnan(self.z_um)
+            else f", {self.z_um:+.2f} um{beyond} from the sensor plane"
+        )
         dim = f"FOCUS IN ITS PLACE BUT DIM (a Strehl ratio of {0.8 * self.expected:.3f} is asked for)"
-        verdict = "focus" if self.passed else dim if self.placed else "NO FOCUS WHERE IT SHOULD BE"
+        verdict = (
+            "focus"
+            if self.passed
+            else dim
+            if self.placed
+            else "NO FOCUS WHERE IT SHOULD BE"
+        )
         return (
             f"{verdict}: peak at ({self.x_um:+.3f}, {self.y_um:+.3f}) um"
             f"{axial}, Strehl ratio {self.strehl:.3f} (resolution {self.resolution_um:.2f} um, "
@@ -63,21 +88,35 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
     """Sum the light of every pillar on a cross of points around the axis, and along it.
 
     Args:
-        axial: also look before and behind the sensor plane; five more sums over the lens. Lenses of fewer than
-            five Fresnel zones (R² / (wavelength x distance)) have their brightest point far before the focus and
+        axial: also look before and behind the sensor plane; five more sums over the
+            lens. Lenses of fewer than
+            five Fresnel zones (R² / (wavelength x distance)) have their brightest point
+            far before the focus and
             are not judged by it.
         expected: Strehl ratio that the phase errors of the pillars leave.
 
     Accuracy:
-        the sum is exact to rounding; the peak is the vertex of a parabola through the three brightest points
+        the sum is exact to rounding; the peak is the vertex of a parabola through the
+        three brightest points
         of a line, within 2 % of the resolution.
     """
     d = lens.diameters
-    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+    focus = Focus(
+        lens.wavelength_um,
+        lens.sensor_distance_um,
+        lens.source_distance_um,
+        lens.layers,
+    )
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
-    radius = min(d.radius_um + d.pitch_um / 2, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um))
+    radius = min(
+        d.radius_um + d.pitch_um / 2,
+        lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um),
+    )
     aperture = focus.aperture(radius)
-    resolution, depth = lens.wavelength_um / (2 * aperture), after.index[0] * lens.wavelength_um / aperture**2
+    resolution, depth = (
+        lens.wavelength_um / (2 * aperture),
+        after.index[0] * lens.wavelength_um / aperture**2,
+    )
     zones = radius**2 / (lens.wavelength_um * after.reduced_um)
     phase, level = lens.phase_rad(), lens.transmission() * _lit(lens)
     case = _case(lens, resolution, 0.0)
@@ -89,7 +128,9 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
     return FocusCheck(
         x_um=_vertex(arm, along_x),
         y_um=_vertex(arm, along_y),
-        z_um=_axial_peak(lens, (phase, level), resolution, depth) if axial and zones >= 5 else math.nan,
+        z_um=_axial_peak(lens, (phase, level), resolution, depth)
+        if axial and zones >= 5
+        else math.nan,
         strehl=float(max(along_x.max(), along_y.max())) / _in_step(level, case) ** 2,
         resolution_um=resolution,
         depth_um=depth,
@@ -98,10 +139,14 @@ def check_focus(lens: Lens, *, axial: bool = True, expected: float = 1.0) -> Foc
 
 
 def _lit(lens: Lens) -> Any:
-    """(y, x) share of the design source's light that passes the stop in front of every pillar; 1 without one."""
+    """(y, x) share of the design source's light that passes the stop in front of every
+    pillar; 1 without one.
+    """
     d = lens.diameters
     places = d.x_um, d.y_um[:, None]
-    return lens.layers.lit((0.0, 0.0), lens.source_distance_um, lens.wavelength_um, places, d.pitch_um)
+    return lens.layers.lit(
+        (0.0, 0.0), lens.source_distance_um, lens.wavelength_um, places, d.pitch_um
+    )
 
 
 def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
@@ -118,9 +163,13 @@ def _case(lens: Lens, step_um: float, shift_um: float) -> Case:
     )
 
 
-def _axial_peak(lens: Lens, maps: tuple[Array, Array], step_um: float, depth_um: float) -> float:
+def _axial_peak(
+    lens: Lens, maps: tuple[Array, Array], step_um: float, depth_um: float
+) -> float:
     shifts = _SHIFTS * depth_um
-    fields = [field_at(*maps, _case(lens, step_um, float(s)), _AXIS)[0, 0] for s in shifts]
+    fields = [
+        field_at(*maps, _case(lens, step_um, float(s)), _AXIS)[0, 0] for s in shifts
+    ]
     return _vertex(shifts, np.abs(np.array(fields)) ** 2)
 
 
@@ -128,18 +177,28 @@ _AXIS = np.zeros((1, 2))
 
 
 def _in_step(level: Array, case: Case) -> float:
-    """Magnitude at the focus if all pillars were in step: sum of p² T d / (2 pi r²) |1/r - ik|."""
+    """Magnitude at the focus if all pillars were in step: sum of p² T d / (2 pi r²)
+    |1/r - ik|.
+    """
     y, x = case.pillars_um
     total = sum(
-        float((row * np.abs(kernel(case, x, at, 0.0, 0.0, 0.0))).sum()) for row, at in zip(level, y, strict=True)
+        float((row * np.abs(kernel(case, x, at, 0.0, 0.0, 0.0))).sum())
+        for row, at in zip(level, y, strict=True)
     )
     return total * case.area_um2
 
 
 def _vertex(position: Array, value: Array) -> float:
-    """Top of the parabola through the largest value and its neighbours; the end itself if it is the largest."""
+    """Top of the parabola through the largest value and its neighbours; the end itself
+    if it is the largest.
+    """
     i = int(value.argmax())
     if i in (0, len(value) - 1):
         return float(position[i])
     before, here, after = value[i - 1 : i + 2]
-    return float(position[i] + (position[1] - position[0]) * (before - after) / (2 * (before - 2 * here + after)))
+    return float(
+        position[i]
+        + (position[1] - position[0])
+        * (before - after)
+        / (2 * (before - 2 * here + after))
+    )

@@ -1,4 +1,6 @@
-"""Whether a phase brings light together at all: where the rays of the design source meet the sensor."""
+"""Whether a phase brings light together at all: where the rays of the design source
+meet the sensor.
+"""
 
 import numpy as np
 
@@ -8,15 +10,21 @@ from metalens.ground.arrays import Array
 from metalens.lens import Lens, media
 
 RAYS = 25  # along an axis
-_APART = 0.98764321  # of the even spacing of rays: never in step with the samples of a map
-SPREAD = 0.2  # rms distance of the rays on the sensor, of that on the lens, up to which they are said to meet
-DARK = 1e-3  # of the peak of a perfect lens, below which the place where they meet is dark: a vortex
+_APART = (
+    0.98764321  # of the even spacing of rays: never in step with the samples of a map
+)
+# rms distance of the rays on the sensor, of that on the lens, up to which they are said
+# to meet
+SPREAD = 0.2
+# of the peak of a perfect lens, below which the place where they meet is dark: a vortex
+DARK = 1e-3
 
 
 def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> bool:
     """Whether rays from the design source meet in one bright spot of the sensor.
 
-    An axicon, a hologram and a plain vortex scatter their rays, a vortex in a focus leaves the middle of its ring dark.
+    An axicon, a hologram and a plain vortex scatter their rays, a vortex in a focus
+    leaves the middle of its ring dark.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
     if inside.sum() < RAYS:
@@ -30,34 +38,58 @@ def focuses(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) 
     inside &= w < 0.999 * after.layers[0][0] ** 2
     bend = media.bend(after.layers, np.where(inside, w, 0.0))
     meets = [(a + bend * p)[inside] for a, p in ((x, px), (y, py))]
-    if np.hypot(*(m.std() for m in meets)) > SPREAD * np.hypot(x[inside].std(), y[inside].std()):
+    if np.hypot(*(m.std() for m in meets)) > SPREAD * np.hypot(
+        x[inside].std(), y[inside].std()
+    ):
         return False
-    lit = np.exp(1j * (phase(axis, axis) + k * focus.path_um(x**2 + y**2)))[np.hypot(x, y) <= radius_um]
-    centred = np.hypot(*(m.mean() for m in meets)) * radius_um * k / focus.sensor_distance_um < 1
+    lit = np.exp(1j * (phase(axis, axis) + k * focus.path_um(x**2 + y**2)))[
+        np.hypot(x, y) <= radius_um
+    ]
+    centred = (
+        np.hypot(*(m.mean() for m in meets)) * radius_um * k / focus.sensor_distance_um
+        < 1
+    )
     return bool(not centred or abs(lit.mean()) ** 2 > DARK)
 
 
 def focused(lens: Lens) -> bool:
-    """As :func:`focuses`, of the pillars of a lens: every place has the phase of the pillar next to it."""
+    """As :func:`focuses`, of the pillars of a lens: every place has the phase of the
+    pillar next to it.
+    """
     d, phase = lens.diameters, lens.phase_rad()
 
     def nearest(x_um: Array, y_um: Array) -> Array:
         rows, columns = (
             np.clip(np.rint(at / step + (n - 1) / 2).astype(int), 0, n - 1)
-            for at, step, n in zip((y_um, x_um), d.steps_um[::-1], phase.shape, strict=True)
+            for at, step, n in zip(
+                (y_um, x_um), d.steps_um[::-1], phase.shape, strict=True
+            )
         )
         return np.asarray(phase[np.ix_(rows, columns)])
 
-    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
-    return focuses(nearest, focus, radius_um=d.radius_um + d.pitch_um / 2, pitch_um=d.pitch_um)
+    focus = Focus(
+        lens.wavelength_um,
+        lens.sensor_distance_um,
+        lens.source_distance_um,
+        lens.layers,
+    )
+    return focuses(
+        nearest, focus, radius_um=d.radius_um + d.pitch_um / 2, pitch_um=d.pitch_um
+    )
 
 
-def meeting_um(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float) -> float | None:
-    """Distance behind the lens, through air, where rays from the design source pass closest to one another.
+def meeting_um(
+    phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float
+) -> float | None:
+    """Distance behind the lens, through air, where rays from the design source pass
+    closest to one another.
 
-    Rays go from (x, y) along (p, q, sqrt(1 - p² - q²)); the sum of squared distances from their middle is least at
-    z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v alike, all less their means. None where they
-    spread there as widely as on the lens (:data:`SPREAD`), never meet in front of the lens, or films stand behind it.
+    Rays go from (x, y) along (p, q, sqrt(1 - p² - q²)); the sum of squared distances
+    from their middle is least at
+    z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v alike, all less
+    their means. None where they
+    spread there as widely as on the lens (:data:`SPREAD`), never meet in front of the
+    lens, or films stand behind it.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
     if not focus.layers.plain or inside.sum() < RAYS:
@@ -67,7 +99,10 @@ def meeting_um(phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: floa
     if inside.sum() < RAYS:
         return None
     along = np.sqrt(1 - (px**2 + py**2)[inside])
-    places, slopes = np.stack([x[inside], y[inside]]), np.stack([px[inside], py[inside]]) / along
+    places, slopes = (
+        np.stack([x[inside], y[inside]]),
+        np.stack([px[inside], py[inside]]) / along,
+    )
     places, slopes = (a - a.mean(axis=1, keepdims=True) for a in (places, slopes))
     power = float((slopes**2).sum())
     if power < 1e-18 * slopes.size:  # parallel to rounding
@@ -84,11 +119,18 @@ def _grid(radius_um: float, pitch_um: float) -> tuple[Array, Array, Array, Array
     return axis, x, y, np.hypot(x, y) <= radius_um - pitch_um
 
 
-def _leaving(phase: PhaseOf, focus: Focus, pitch_um: float, at: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Direction cosines behind the lens, in air; the slope of the phase is its difference over one pitch, wrapped."""
+def _leaving(
+    phase: PhaseOf, focus: Focus, pitch_um: float, at: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    """Direction cosines behind the lens, in air; the slope of the phase is its
+    difference over one pitch, wrapped.
+    """
     axis, x, y = at
     half, k = pitch_um / 2, 2 * np.pi / focus.wavelength_um
-    steps = [phase(axis + half, axis) - phase(axis - half, axis), phase(axis, axis + half) - phase(axis, axis - half)]
+    steps = [
+        phase(axis + half, axis) - phase(axis - half, axis),
+        phase(axis, axis + half) - phase(axis, axis - half),
+    ]
     slope = [((s + np.pi) % (2 * np.pi) - np.pi) / pitch_um / k for s in steps]
     away = np.sqrt(x**2 + y**2 + focus.source_distance_um**2)
     return slope[0] + x / away, slope[1] + y / away

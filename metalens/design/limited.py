@@ -1,4 +1,6 @@
-"""Foreign files whose reader may crash or eat the memory are read by a child process that has little to lose."""
+"""Foreign files whose reader may crash or eat the memory are read by a child process
+that has little to lose.
+"""
 
 import io
 import os
@@ -12,7 +14,10 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import StoreError
 
-_MEMORY, _A_BYTE = 2 << 30, 40  # bytes of address space: numpy and scipy take one GB; more for every byte of the file
+_MEMORY, _A_BYTE = (
+    2 << 30,
+    40,
+)  # bytes of address space: numpy and scipy take one GB; more for every byte of the file
 _SECONDS = 120
 _A = {"MATLAB": "a MATLAB", "NPZ": "an NPZ"}
 _CHILD = """
@@ -53,15 +58,25 @@ def arrays(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Array]:
             words += [str(_MEMORY + _A_BYTE * path.stat().st_size), str(_SECONDS)]
             words += [entry for entry in sys.path if entry not in ("", os.getcwd())]
             done = subprocess.run(
-                words, stdin=file, capture_output=True, cwd="/", env=os.environ | threads, timeout=_SECONDS, check=False
+                words,
+                stdin=file,
+                capture_output=True,
+                cwd="/",
+                env=os.environ | threads,
+                timeout=_SECONDS,
+                check=False,
             )
         if done.returncode:
             told = done.stderr.decode("utf-8", "replace").rpartition("REFUSED ")
-            raise StoreError(f"{path}: not {_A[kind]} file: {told[2] if told[1] else _death(done.returncode)}")
+            raise StoreError(
+                f"{path}: not {_A[kind]} file: {told[2] if told[1] else _death(done.returncode)}"
+            )
         with np.load(io.BytesIO(done.stdout), allow_pickle=False) as held:
             return {name: held[name] for name in held.files}
     except subprocess.TimeoutExpired:
-        raise StoreError(f"{path}: not {_A[kind]} file: its reader took more than {_SECONDS} s") from None
+        raise StoreError(
+            f"{path}: not {_A[kind]} file: its reader took more than {_SECONDS} s"
+        ) from None
     except OSError as error:
         raise StoreError(f"{path}: cannot be read ({error.strerror})") from None
     except MemoryError:
@@ -69,4 +84,8 @@ def arrays(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Array]:
 
 
 def _death(status: int) -> str:
-    return f"its reader was ended by signal {-status}" if status < 0 else f"its reader ended with {status}"
+    return (
+        f"its reader was ended by signal {-status}"
+        if status < 0
+        else f"its reader ended with {status}"
+    )

@@ -1,4 +1,6 @@
-"""A phase profile made of pillars: every site takes the diameter whose proxy phase is the wanted one."""
+"""A phase profile made of pillars: every site takes the diameter whose proxy phase is
+the wanted one.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -16,7 +18,10 @@ from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Hand, Lens
 from metalens.pillars import Proxy, taller
 
-PLACES, SEARCHED = 61, 121  # across what is lit of a lens, and across all of it, where that is looked for
+PLACES, SEARCHED = (
+    61,
+    121,
+)  # across what is lit of a lens, and across all of it, where that is looked for
 EDGE_UM = 2e-3  # a curve that ends so near a printable end is ended by it
 LIT = 0.5  # of the light at angle 0, below which a stop's field ends
 
@@ -27,18 +32,26 @@ class Quality:
 
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
-    efficiency: |sum T exp(i error)|² / N²: power in the ideal spot, against a perfect lens without loss.
+    efficiency: |sum T exp(i error)|² / N²: power in the ideal spot, against a perfect
+    lens without loss.
     transmission: mean |T|², the light that passes.
-    strehl: |sum T exp(i error)|² / (sum T)²: what the phase errors of the pillars leave of the peak.
-    field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a Strehl ratio of 0.8 on its
+    strehl: |sum T exp(i error)|² / (sum T)²: what the phase errors of the pillars leave
+    of the peak.
+    field_of_view_rad: full angle over which the hyperbolic lens of this focus keeps a
+    Strehl ratio of 0.8 on its
         sensor, which is flat (Maréchal's criterion on the wave-front error).
     max_phase_error_rad: largest difference between wanted and made phase.
     rms_phase_error_rad: root mean square of it over the pillars.
-    turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the phases that none has.
-    focuses: whether rays of the design source meet in one spot (:func:`metalens.design.focuses`); where they do not,
-        aperture and field have no meaning, and the efficiency is that of the wanted wave front.
-    steepest: slope of the phase at the rim over the wave number, the bend in sines that it asks for (of the focus).
-    sampled_aperture: bend that the lattice carries without aliases, wavelength / (2 longest period); nan if not known.
+    turns: of phase that the pillars cover; below 1 the nearest pillar stands in for the
+    phases that none has.
+    focuses: whether rays of the design source meet in one spot
+    (:func:`metalens.design.focuses`); where they do not,
+        aperture and field have no meaning, and the efficiency is that of the wanted
+        wave front.
+    steepest: slope of the phase at the rim over the wave number, the bend in sines that
+    it asks for (of the focus).
+    sampled_aperture: bend that the lattice carries without aliases, wavelength / (2
+    longest period); nan if not known.
     """
 
     pillars: int
@@ -75,24 +88,36 @@ class Limits:
             )
 
 
-def phase_of(shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float) -> PhaseOf:
-    """The wanted phase as a function of position: ``shape`` on top of the focus, None for hyperbolic.
+def phase_of(
+    shape: DoubleHelix | Cubic | PhaseMap | None, focus: Focus, *, radius_um: float
+) -> PhaseOf:
+    """The wanted phase as a function of position: ``shape`` on top of the focus, None
+    for hyperbolic.
 
     Returns:
-        A function of the positions x (columns,) and y (rows,) in um to the phase (rows, columns) in rad.
+        A function of the positions x (columns,) and y (rows,) in um to the phase (rows,
+        columns) in rad.
     """
     if isinstance(shape, PhaseMap):
         samples = phase_map.read(shape)
 
         def mapped(x_um: Array, y_um: Array) -> Array:
             phase = phase_map.interpolate(samples, x_um, y_um, radius_um=radius_um)
-            return phase + profiles.hyperbolic(x_um, y_um[:, None], focus) if shape.add_focus else phase
+            return (
+                phase + profiles.hyperbolic(x_um, y_um[:, None], focus)
+                if shape.add_focus
+                else phase
+            )
 
         return mapped
     if isinstance(shape, DoubleHelix):
-        return lambda x, y: profiles.double_helix(x, y[:, None], focus, shape, radius_um=radius_um)
+        return lambda x, y: profiles.double_helix(
+            x, y[:, None], focus, shape, radius_um=radius_um
+        )
     if isinstance(shape, Cubic):
-        return lambda x, y: profiles.cubic(x, y[:, None], focus, shape, radius_um=radius_um)
+        return lambda x, y: profiles.cubic(
+            x, y[:, None], focus, shape, radius_um=radius_um
+        )
     return lambda x, y: profiles.hyperbolic(x, y[:, None], focus)
 
 
@@ -111,33 +136,50 @@ def make(
     """Fill a round aperture with pillars (paper Eq. 2 inverted).
 
     Args:
-        phase: function of the sites' positions x (columns,) and y (rows,) in um to the wanted phase (rows, columns) in
-            rad, of a block of rows at a time (:func:`phase_of`). On a hexagonal lattice the pillars stand on its sites.
-        aperture_um: diameter of the aperture; every pillar's centre lies half a pitch inside it.
+        phase: function of the sites' positions x (columns,) and y (rows,) in um to the
+            wanted phase (rows, columns) in
+            rad, of a block of rows at a time (:func:`phase_of`). On a hexagonal lattice
+            the pillars stand on its sites.
+        aperture_um: diameter of the aperture; every pillar's centre lies half a pitch
+            inside it.
         limits: of the process; the proxy's domain is narrowed to them.
         profile: name kept in the lens.
-        accept_partial_turn: where the pillars cover less than a turn, take the nearest phase that they have; the
+        accept_partial_turn: where the pillars cover less than a turn, take the nearest
+            phase that they have; the
             quality says what it costs.
 
     Returns:
         The lens (float32 diameters: 2e-8 um, below 1e-6 rad) and its quality.
 
     Raises:
-        LensError: the aperture holds no pillar, the printable diameters reach less than a full turn, or the phase has
+        LensError: the aperture holds no pillar, the printable diameters reach less than
+            a full turn, or the phase has
             another shape.
     """
-    within = printable(proxy, cell, limits or Limits(), focus.wavelength_um, accept_partial_turn=accept_partial_turn)
+    within = printable(
+        proxy,
+        cell,
+        limits or Limits(),
+        focus.wavelength_um,
+        accept_partial_turn=accept_partial_turn,
+    )
     gap: Literal["nearest", "refuse"] = "nearest" if accept_partial_turn else "refuse"
     place = sites(cell, aperture_um, grid_nm=(limits or Limits()).grid_nm)
     diameter, sums = np.zeros(place.shape, np.float32), Sums()
     for rows, inside, wanted in place.blocks(phase):
-        diameter[rows][inside] = proxy.diameter_um(wanted, focus.wavelength_um, within_um=within, gap=gap)
+        diameter[rows][inside] = proxy.diameter_um(
+            wanted, focus.wavelength_um, within_um=within, gap=gap
+        )
         made = diameter[rows][inside].astype(float)
         phase_made = proxy.phase_rad(made, focus.wavelength_um)
         sums.add(wanted, phase_made, proxy.transmission(made, focus.wavelength_um))
-    lens = lens_of(place.map(diameter), cell, proxy, focus, profile=profile, provenance=provenance)
+    lens = lens_of(
+        place.map(diameter), cell, proxy, focus, profile=profile, provenance=provenance
+    )
     turns = proxy.coverage_rad(focus.wavelength_um, within_um=within) / (2 * math.pi)
-    return lens, sums.quality(focus, aperture_um / 2, turns, period_um=least_period_um(cell))
+    return lens, sums.quality(
+        focus, aperture_um / 2, turns, period_um=least_period_um(cell)
+    )
 
 
 def lens_of(
@@ -166,12 +208,18 @@ def lens_of(
 
 
 def printable(
-    proxy: Proxy, cell: Cell, limits: Limits, wavelength_um: float, *, accept_partial_turn: bool = False
+    proxy: Proxy,
+    cell: Cell,
+    limits: Limits,
+    wavelength_um: float,
+    *,
+    accept_partial_turn: bool = False,
 ) -> tuple[float, float]:
     """(least, largest) diameter in um that both the proxy holds and the process prints.
 
     Raises:
-        LensError: they reach less than a full turn of phase, so some phases cannot be made, and that is not accepted.
+        LensError: they reach less than a full turn of phase, so some phases cannot be
+            made, and that is not accepted.
     """
     thinnest, widest = _printed(cell, limits)
     low, high = max(proxy.domain_um[0], thinnest), min(proxy.domain_um[1], widest)
@@ -193,11 +241,16 @@ def printable(
 def cure(proxy: Proxy, cell: Cell, limits: Limits, turns: float) -> str:
     """What would cover a turn where these pillars cover less (``turns``), for a person.
 
-    Phase grows with the height as long as no resonance ends it: where the process ends the pillars, a height over the
-    turns covers one. Where the library ends them sooner, taller pillars bring the resonance nearer.
+    Phase grows with the height as long as no resonance ends it: where the process ends
+    the pillars, a height over the
+    turns covers one. Where the library ends them sooner, taller pillars bring the
+    resonance nearer.
     """
     thinnest, widest = _printed(cell, limits)
-    if proxy.domain_um[0] <= thinnest + EDGE_UM and proxy.domain_um[1] >= widest - EDGE_UM:
+    if (
+        proxy.domain_um[0] <= thinnest + EDGE_UM
+        and proxy.domain_um[1] >= widest - EDGE_UM
+    ):
         return taller(cell.height_um, turns)
     return (
         f"the process prints {thinnest:.4f}-{widest:.4f} um, the library's curve holds {proxy.domain_um[0]:.4f}-"
@@ -217,7 +270,13 @@ class Sums:
     """Running sums over all pillars that :class:`Quality` is made of."""
 
     def __init__(self) -> None:
-        self.count, self.field, self.level, self.power, self.worst = 0, 0j, 0.0, 0.0, 0.0
+        self.count, self.field, self.level, self.power, self.worst = (
+            0,
+            0j,
+            0.0,
+            0.0,
+            0.0,
+        )
         self.square = 0.0
 
     def add(self, wanted: Array, made: Array, level: Array) -> None:
@@ -230,10 +289,17 @@ class Sums:
         self.square += float((error**2).sum())
         self.worst = max(self.worst, float(np.abs(error).max(initial=0)))
 
-    def quality(self, focus: Focus, radius_um: float, turns: float, *, period_um: float) -> Quality:
-        """Of all pillars that were added; period_um: see :func:`metalens.design.sites.least_period_um`."""
+    def quality(
+        self, focus: Focus, radius_um: float, turns: float, *, period_um: float
+    ) -> Quality:
+        """Of all pillars that were added; period_um: see
+        :func:`metalens.design.sites.least_period_um`.
+        """
         peak = abs(self.field) ** 2
-        lit_um = min(radius_um, focus.layers.footprint_um(focus.source_distance_um, focus.wavelength_um))
+        lit_um = min(
+            radius_um,
+            focus.layers.footprint_um(focus.source_distance_um, focus.wavelength_um),
+        )
         return Quality(
             pillars=self.count,
             numerical_aperture=focus.aperture(lit_um),
@@ -244,17 +310,21 @@ class Sums:
             max_phase_error_rad=self.worst,
             rms_phase_error_rad=math.sqrt(self.square / self.count),
             turns=turns,
-            steepest=focus.aperture(radius_um) + radius_um / math.hypot(radius_um, focus.source_distance_um),
+            steepest=focus.aperture(radius_um)
+            + radius_um / math.hypot(radius_um, focus.source_distance_um),
             sampled_aperture=focus.wavelength_um / (2 * period_um),
         )
 
 
 def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float:
-    """Half field in rad at which coma, astigmatism and curvature of the field of the hyperbolic lens leave
+    """Half field in rad at which coma, astigmatism and curvature of the field of the
+    hyperbolic lens leave
     exp(-sigma²) = ``strehl`` on its sensor, which is flat.
 
-    sigma is the wave-front error over the aperture (of the lens, what the stop lets light on), with piston and tilt
-    taken out: at most 60 degrees. Behind a stop it ends where the light of less than half the pillars of angle 0 is
+    sigma is the wave-front error over the aperture (of the lens, what the stop lets
+    light on), with piston and tilt
+    taken out: at most 60 degrees. Behind a stop it ends where the light of less than
+    half the pillars of angle 0 is
     left, whatever the rest does.
     """
     low, high = 0.0, np.pi / 3
@@ -268,10 +338,18 @@ def field_angle(focus: Focus, radius_um: float, *, strehl: float = 0.8) -> float
 
 
 def _wavefront_variance(focus: Focus, radius_um: float, angle_rad: float) -> float:
-    """The largest of light from four sides, by turns of a stop beside the axis; of one where all are alike."""
+    """The largest of light from four sides, by turns of a stop beside the axis; of one
+    where all are alike.
+    """
     stop, found = focus.layers.stop, []
     for _ in range(4 if stop is not None and not stop.centred else 1):
-        found.append(_from_the_side(replace(focus, layers=replace(focus.layers, stop=stop)), radius_um, angle_rad))
+        found.append(
+            _from_the_side(
+                replace(focus, layers=replace(focus.layers, stop=stop)),
+                radius_um,
+                angle_rad,
+            )
+        )
         stop = stop and replace(stop, centre_um=(-stop.centre_um[1], stop.centre_um[0]))
     return max(found)
 
@@ -290,7 +368,9 @@ def _from_the_side(focus: Focus, radius_um: float, angle_rad: float) -> float:
 
 
 def _lit(focus: Focus, radius_um: float, tangent: float) -> tuple[Array, Array, float]:
-    """Places (x,) and (y,) of the lens that an angle's light falls on, ``PLACES`` across, and their area in um²."""
+    """Places (x,) and (y,) of the lens that an angle's light falls on, ``PLACES``
+    across, and their area in um².
+    """
     middle, half = (0.0, 0.0), radius_um
     for look in (PLACES,) if focus.layers.stop is None else (SEARCHED, PLACES):
         unit, step = np.linspace(-half, half, look, retstep=True)

@@ -1,7 +1,10 @@
-"""What a lens's own pillars leave out of its PSF: unlike neighbours and the angle of the light, solved for its cell.
+"""What a lens's own pillars leave out of its PSF: unlike neighbours and the angle of
+the light, solved for its cell.
 
-A few rows of unlike pillars (:mod:`metalens.design.neighbours`) with the zones that the lens has at its rim and
-beyond, and some of its diameters at normal incidence and at an angle. Seconds to a minute.
+A few rows of unlike pillars (:mod:`metalens.design.neighbours`) with the zones that the
+lens has at its rim and
+beyond, and some of its diameters at normal incidence and at an angle. Seconds to a
+minute.
 """
 
 import math
@@ -19,7 +22,10 @@ from metalens.lens import CURVED, Lens, Neighbours
 from metalens.psf import NEIGHBOURS, LeftOut
 
 RINGS = 48  # of a lens, over which light is summed
-FEWEST, MOST = 2, 12  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
+FEWEST, MOST = (
+    2,
+    12,
+)  # pillars in a row: where a zone has fewer or more, a row of this length stands for it
 # (with two, light to both sides is told apart by rows whose phases begin elsewhere)
 DIAMETERS = 5
 TOLERANCE = 1e-2  # of t
@@ -35,17 +41,26 @@ def left_out(lens: Lens, *, aperture: float, incidence_rad: float) -> LeftOut:
     Raises:
         CellError: the cell has films or tilted walls, whose rows no solver here knows.
 
-    Accuracy: the factor c(s) = 1 + a s + b s² goes through the rows; a few 1e-2 of it are truncation.
+    Accuracy: the factor c(s) = 1 + a s + b s² goes through the rows; a few 1e-2 of it
+    are truncation.
     """
     if lens.pairs is not None:
-        raise CellError("own_cell: rows of pillars of two sizes are not solved here; leave own_cell out")
+        raise CellError(
+            "own_cell: rows of pillars of two sizes are not solved here; leave own_cell out"
+        )
     found = lens.neighbours or neighbours(lens, counts=_counts(lens, aperture))
-    angle = angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2 if incidence_rad else 0.0
+    angle = (
+        angle_change(lens, incidence_rad) / math.sin(incidence_rad) ** 2
+        if incidence_rad
+        else 0.0
+    )
     return LeftOut(found, angle, "the lens's own cell")
 
 
 def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
-    """Pillars in rows from the zone of the rim on, where light is turned by the sine ``aperture``."""
+    """Pillars in rows from the zone of the rim on, where light is turned by the sine
+    ``aperture``.
+    """
     rim = max(FEWEST, round(lens.wavelength_um / (lens.cell.pitch_um * aperture)))
     shortest = min(rim, MOST // 2)
     return shortest, math.ceil(1.5 * shortest), 2 * shortest
@@ -53,9 +68,11 @@ def _counts(lens: Lens, aperture: float) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Unlike:
-    """What unlike neighbours leave of the light that pillars, taken one by one, bring to the focus.
+    """What unlike neighbours leave of the light that pillars, taken one by one, bring
+    to the focus.
 
-    share: of that power. error: estimate of its error. pillars: in the rows along the lattice that were solved; none:
+    share: of that power. error: estimate of its error. pillars: in the rows along the
+    lattice that were solved; none:
     rough.
     """
 
@@ -65,18 +82,24 @@ class Unlike:
 
 
 def rows(lens: Lens, *, radius_um: float) -> Neighbours:
-    """Rows of the lens's own pillars with the zones of its rim and longer ones, for the lens to hold.
+    """Rows of the lens's own pillars with the zones of its rim and longer ones, for the
+    lens to hold.
 
     Raises:
-        CellError: the cell has films or tilted walls, or no round pillars on a square lattice.
+        CellError: the cell has films or tilted walls, or no round pillars on a square
+            lattice.
     """
-    return neighbours(lens, counts=_counts(lens, float(_rings(lens, radius_um)[0].max())))
+    return neighbours(
+        lens, counts=_counts(lens, float(_rings(lens, radius_um)[0].max()))
+    )
 
 
 def unlike(lens: Lens, *, radius_um: float) -> Unlike:
-    """Rows of the lens's own pillars (those that it holds, else solved here), summed over its aperture.
+    """Rows of the lens's own pillars (those that it holds, else solved here), summed
+    over its aperture.
 
-    Accuracy: the error is what another truncation, and leaving out any one row, change, and a fifth of the loss for
+    Accuracy: the error is what another truncation, and leaving out any one row, change,
+    and a fifth of the loss for
         zones that get shorter from one to the next, which no row has.
 
     Raises:
@@ -86,13 +109,20 @@ def unlike(lens: Lens, *, radius_um: float) -> Unlike:
     sine, weight = _rings(lens, radius_um)
     share = found.share(sine, weight)
     less = [other.share(sine, weight) for other in found.others]
-    error = abs(found.coarser.share(sine, weight) - share) + max((abs(one - share) for one in less), default=0.0)
+    error = abs(found.coarser.share(sine, weight) - share) + max(
+        (abs(one - share) for one in less), default=0.0
+    )
     pitches = lens.wavelength_um / (found.sine[~found.diagonal] * lens.cell.pitch_um)
-    return Unlike(share, error + CURVED * abs(1 - share), tuple(np.rint(pitches).astype(int).tolist()))
+    return Unlike(
+        share,
+        error + CURVED * abs(1 - share),
+        tuple(np.rint(pitches).astype(int).tolist()),
+    )
 
 
 def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
-    """The same with the factor of another cell (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
+    """The same with the factor of another cell
+    (:data:`metalens.psf.budget.NEIGHBOURS`): a size, no more.
 
     Where that cell gains a little, these pillars may lose as much.
     """
@@ -106,13 +136,24 @@ def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
     """(m,) sines by which rings of a lens turn light, and their shares of the area."""
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     radius = radius_um * np.sqrt((node + 1) / 2)
-    focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
-    sine = np.array([focus.aperture(r) + r / math.hypot(r, lens.source_distance_um) for r in radius.tolist()])
+    focus = Focus(
+        lens.wavelength_um,
+        lens.sensor_distance_um,
+        lens.source_distance_um,
+        lens.layers,
+    )
+    sine = np.array(
+        [
+            focus.aperture(r) + r / math.hypot(r, lens.source_distance_um)
+            for r in radius.tolist()
+        ]
+    )
     return sine, weight / 2
 
 
 def angle_change(lens: Lens, incidence_rad: float) -> float:
-    """Root mean square relative change of t at an angle over diameters and both polarisations.
+    """Root mean square relative change of t at an angle over diameters and both
+    polarisations.
 
     A factor that all pillars share is taken out: it changes no PSF of sum 1.
     """
@@ -121,13 +162,20 @@ def angle_change(lens: Lens, incidence_rad: float) -> float:
     changes = []
     both: tuple[Literal["s", "p"], ...] = ("s", "p")
     for polarization in both:
-        flat, tilted = (_answers(lens, diameters, angle, polarization) for angle in (0.0, incidence_rad))
+        flat, tilted = (
+            _answers(lens, diameters, angle, polarization)
+            for angle in (0.0, incidence_rad)
+        )
         common = np.vdot(flat, tilted) / np.vdot(flat, flat)
-        changes.append(np.linalg.norm(tilted - common * flat) ** 2 / np.linalg.norm(tilted) ** 2)
+        changes.append(
+            np.linalg.norm(tilted - common * flat) ** 2 / np.linalg.norm(tilted) ** 2
+        )
     return float(np.sqrt(np.mean(changes)))
 
 
-def _answers(lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]) -> Array:
+def _answers(
+    lens: Lens, diameters_um: Array, angle_rad: float, polarization: Literal["s", "p"]
+) -> Array:
     found = rcwa.solve_many(
         lens.cell,
         tuple(diameters_um.tolist()),

@@ -1,11 +1,15 @@
-"""Phases for light polarised along x and along y, made of pillars of two sizes: one lens, or two in one place.
+"""Phases for light polarised along x and along y, made of pillars of two sizes: one
+lens, or two in one place.
 
-At every site that pair of sizes of the library is taken whose t_x, t_y lie nearest to the wanted
+At every site that pair of sizes of the library is taken whose t_x, t_y lie nearest to
+the wanted
 
     |t_x - exp(i (φ_x + a))|² + |t_y - exp(i (φ_y + b))|²   least over the printable pairs within their bars,      (1)
 
-which for the peak of a focus, |sum t exp(-iφ)|², is the best choice site by site. The pistons a and b, which no focus
-knows, are those of the largest sum over a sample of sites; where both phases are one, a = b, so that any polarisation
+which for the peak of a focus, |sum t exp(-iφ)|², is the best choice site by site. The
+pistons a and b, which no focus
+knows, are those of the largest sum over a sample of sites; where both phases are one, a
+= b, so that any polarisation
 of the light stays as it is.
 """
 
@@ -26,7 +30,9 @@ from metalens.pillars.axes import AxesLibrary, sized
 
 _PISTONS = 24  # tried for each polarisation
 _SAMPLE = 1500  # sites that choose them
-_COVERED_RAD = 0.2  # a wanted pair of phases is covered where a pillar gives both within this, and
+_COVERED_RAD = (
+    0.2  # a wanted pair of phases is covered where a pillar gives both within this, and
+)
 _COVERED_LEVEL = 0.7  # with no less than this |t|
 _GAPS = 12  # sizes along each axis at which the gap to the neighbours is worked out
 
@@ -35,10 +41,14 @@ _GAPS = 12  # sizes along each axis at which the gap to the neighbours is worked
 class Split:
     """What a lens of two sizes makes of light along x and along y.
 
-    x, y: quality for either; their ``efficiency`` is the share of that light in its focus. efficiency_error: bar of
-    each, from the error bars of the pillars. leaked: mean power that leaves with the other polarisation, for x and y.
-    covered: share of pairs of phases (of single phases, where both are one) that a pillar gives within 0.2 rad and a
-    level of 0.7. multiplexed: whether the two phases differ. pairs: distinct pairs of sizes used.
+    x, y: quality for either; their ``efficiency`` is the share of that light in its
+    focus. efficiency_error: bar of
+    each, from the error bars of the pillars. leaked: mean power that leaves with the
+    other polarisation, for x and y.
+    covered: share of pairs of phases (of single phases, where both are one) that a
+    pillar gives within 0.2 rad and a
+    level of 0.7. multiplexed: whether the two phases differ. pairs: distinct pairs of
+    sizes used.
     """
 
     x: Quality
@@ -63,13 +73,16 @@ def make_paired(
     """Fill a round aperture with pillars of two sizes, entries of the library.
 
     Args:
-        phases: wanted for light along x and along y; None: one phase for both. focuses: what each images onto what.
+        phases: wanted for light along x and along y; None: one phase for both. focuses:
+            what each images onto what.
 
     Returns:
-        The lens (of light along x; ``lens.seen("y")`` is that of light along y), and what it makes of both.
+        The lens (of light along x; ``lens.seen("y")`` is that of light along y), and
+        what it makes of both.
 
     Raises:
-        LensError: no printable pair of sizes within its error bar. DomainError: a wavelength that the library lacks.
+        LensError: no printable pair of sizes within its error bar. DomainError: a
+            wavelength that the library lacks.
     """
     limits, at = limits or Limits(), library.at(focuses[0].wavelength_um)
     stock = _stock(library, at, limits)
@@ -78,7 +91,9 @@ def make_paired(
     pistons = stock.pistons(_sampled(place, wanted), alike=phases[1] is None)
     size, length = np.zeros(place.shape, np.float32), np.zeros(place.shape, np.float32)
     sums, chosen = (Sums(), Sums()), []
-    for (rows, inside, x), (_, _, y) in zip(place.blocks(wanted[0]), place.blocks(wanted[1]), strict=True):
+    for (rows, inside, x), (_, _, y) in zip(
+        place.blocks(wanted[0]), place.blocks(wanted[1]), strict=True
+    ):
         x, y = x + pistons[0], y + pistons[1]
         pick = stock.nearest(x, y)
         size[rows][inside], length[rows][inside] = stock.sizes[pick].T
@@ -98,12 +113,16 @@ def make_paired(
         focuses[0].layers,
         pairs=table,
     )
-    return made, _split(stock, sums, used, focuses, aperture_um, library, alike=phases[1] is None)
+    return made, _split(
+        stock, sums, used, focuses, aperture_um, library, alike=phases[1] is None
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Stock:
-    """Pairs of sizes to choose from: (n, 2) sizes in um, (n, 2) t_x and t_y, (n,) bars, (n, 2) power that leaks."""
+    """Pairs of sizes to choose from: (n, 2) sizes in um, (n, 2) t_x and t_y, (n,) bars,
+    (n, 2) power that leaks.
+    """
 
     sizes: Array
     t: Array
@@ -113,26 +132,40 @@ class _Stock:
 
     def nearest(self, x_rad: Array, y_rad: Array) -> Array:
         """Places of the pairs by (1)."""
-        wanted = np.stack([np.cos(x_rad), np.sin(x_rad), np.cos(y_rad), np.sin(y_rad)], axis=-1)
+        wanted = np.stack(
+            [np.cos(x_rad), np.sin(x_rad), np.cos(y_rad), np.sin(y_rad)], axis=-1
+        )
         return np.asarray(self.tree.query(wanted)[1])
 
     def entry_error(self, used: Array) -> float:
-        """Root mean square over the pillars of the bars relative to |t|, of the light that has the less; used: (n,) how
+        """Root mean square over the pillars of the bars relative to |t|, of the light
+        that has the less; used: (n,) how
         often each pair stands in the lens."""
         relative = self.error / np.abs(self.t).min(axis=1).clip(1e-6)
         return math.sqrt(float((used * relative**2).sum() / used.sum()))
 
-    def pistons(self, wanted: tuple[Array, Array], *, alike: bool) -> tuple[float, float]:
+    def pistons(
+        self, wanted: tuple[Array, Array], *, alike: bool
+    ) -> tuple[float, float]:
         """(a, b) of (1)."""
         tried = 2 * np.pi * np.arange(_PISTONS) / _PISTONS
-        pairs = [(a, a) for a in tried] if alike else [(a, b) for a in tried for b in tried]
-        best = max(pairs, key=lambda pair: self._peak(wanted[0] + pair[0], wanted[1] + pair[1]))
+        pairs = (
+            [(a, a) for a in tried] if alike else [(a, b) for a in tried for b in tried]
+        )
+        best = max(
+            pairs, key=lambda pair: self._peak(wanted[0] + pair[0], wanted[1] + pair[1])
+        )
         return float(best[0]), float(best[1])
 
     def _peak(self, x_rad: Array, y_rad: Array) -> float:
         """The sum of both peaks."""
         t = self.t[self.nearest(x_rad, y_rad)]
-        return float(sum(abs((t[:, k] * np.exp(-1j * phase)).mean()) ** 2 for k, phase in enumerate((x_rad, y_rad))))
+        return float(
+            sum(
+                abs((t[:, k] * np.exp(-1j * phase)).mean()) ** 2
+                for k, phase in enumerate((x_rad, y_rad))
+            )
+        )
 
 
 def _stock(library: AxesLibrary, at: int, limits: Limits) -> _Stock:
@@ -147,7 +180,9 @@ def _stock(library: AxesLibrary, at: int, limits: Limits) -> _Stock:
     jones = library.t[at, row, column]
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]], axis=1)
     leaked = np.abs(np.stack([jones[:, 1, 0], jones[:, 0, 1]], axis=1)) ** 2
-    tree = cKDTree(np.stack([t[:, 0].real, t[:, 0].imag, t[:, 1].real, t[:, 1].imag], axis=1))
+    tree = cKDTree(
+        np.stack([t[:, 0].real, t[:, 0].imag, t[:, 1].real, t[:, 1].imag], axis=1)
+    )
     sizes = np.stack([library.x_um[row], library.y_um[column]], axis=1)
     return _Stock(sizes, t, library.t_error[at, row, column], leaked, tree)
 
@@ -156,20 +191,34 @@ def _printable(library: AxesLibrary, limits: Limits) -> Array:
     """(m, n) whether the process prints a pillar, and the gap to neighbours like it."""
     x, y = library.x_um, library.y_um
     wide = np.minimum(x[:, None], y) >= limits.min_diameter_nm * 1e-3 - 1e-9
-    least, turn = limits.min_gap_nm * 1e-3, getattr(library.cell.shape, "angle_rad", 0.0)
+    least, turn = (
+        limits.min_gap_nm * 1e-3,
+        getattr(library.cell.shape, "angle_rad", 0.0),
+    )
     if library.cell.lattice.kind != "hexagonal" and turn % (math.pi / 2) == 0:
         px, py = library.cell.lattice.periods_um(library.cell.pitch_um)
         px, py = (py, px) if round(turn / (math.pi / 2)) % 2 else (px, py)
-        return np.asarray(wide & (px - x[:, None] >= least - 1e-9) & (py - y >= least - 1e-9))
+        return np.asarray(
+            wide & (px - x[:, None] >= least - 1e-9) & (py - y >= least - 1e-9)
+        )
     ends = [np.linspace(v[0], v[-1], _GAPS) for v in (x, y)]
-    gap = np.array([[sized(library.cell, a, b).gap_um(a) for b in ends[1]] for a in ends[0]])
-    row, column = (np.minimum(np.searchsorted(e, v), _GAPS - 1) for e, v in zip(ends, (x, y), strict=True))
-    return np.asarray(wide & (gap[row[:, None], column] >= least))  # of the next larger pair
+    gap = np.array(
+        [[sized(library.cell, a, b).gap_um(a) for b in ends[1]] for a in ends[0]]
+    )
+    row, column = (
+        np.minimum(np.searchsorted(e, v), _GAPS - 1)
+        for e, v in zip(ends, (x, y), strict=True)
+    )
+    return np.asarray(
+        wide & (gap[row[:, None], column] >= least)
+    )  # of the next larger pair
 
 
 def _sampled(place: Sites, wanted: tuple[PhaseOf, PhaseOf]) -> tuple[Array, Array]:
     """Both phases at some of the sites, evenly picked."""
-    x, y = (np.concatenate([phase for *_, phase in place.blocks(one)]) for one in wanted)
+    x, y = (
+        np.concatenate([phase for *_, phase in place.blocks(one)]) for one in wanted
+    )
     pick = np.unique(np.linspace(0, len(x) - 1, _SAMPLE).astype(int))
     return x[pick], y[pick]
 
@@ -177,7 +226,9 @@ def _sampled(place: Sites, wanted: tuple[PhaseOf, PhaseOf]) -> tuple[Array, Arra
 def _table(library: AxesLibrary, focus_y: Focus, entry_error: float) -> Pairs:
     t = np.stack([library.t[..., 0, 0], library.t[..., 1, 1]], axis=-1)
     distances = focus_y.sensor_distance_um, focus_y.source_distance_um
-    return Pairs(library.wavelength_um, library.x_um, library.y_um, t, distances, entry_error)
+    return Pairs(
+        library.wavelength_um, library.x_um, library.y_um, t, distances, entry_error
+    )
 
 
 def _split(
@@ -192,8 +243,13 @@ def _split(
 ) -> Split:
     covered = _covered(stock, alike)
     period = least_period_um(library.cell)
-    qualities = [one.quality(f, aperture_um / 2, 1.0, period_um=period) for one, f in zip(sums, focuses, strict=True)]
-    mean = float((used * stock.error).sum() / used.sum())  # of t: the peak's amplitude is off by no more
+    qualities = [
+        one.quality(f, aperture_um / 2, 1.0, period_um=period)
+        for one, f in zip(sums, focuses, strict=True)
+    ]
+    mean = float(
+        (used * stock.error).sum() / used.sum()
+    )  # of t: the peak's amplitude is off by no more
     errors = [2 * math.sqrt(q.efficiency) * mean + mean**2 for q in qualities]
     leaked = (used[:, None] * stock.leaked).sum(axis=0) / used.sum()
     return Split(
@@ -212,5 +268,12 @@ def _covered(stock: _Stock, alike: bool) -> float:
     turn = 2 * np.pi * np.arange(72 if alike else 36) / (72 if alike else 36)
     x, y = (turn, turn) if alike else (v.ravel() for v in np.meshgrid(turn, turn))
     pick = stock.nearest(x, y)
-    off = np.abs(np.angle(stock.t[pick] * np.exp(-1j * np.stack([x, y], axis=1)))).max(axis=1)
-    return float(((off <= _COVERED_RAD) & (np.abs(stock.t[pick]).min(axis=1) >= _COVERED_LEVEL)).mean())
+    off = np.abs(np.angle(stock.t[pick] * np.exp(-1j * np.stack([x, y], axis=1)))).max(
+        axis=1
+    )
+    return float(
+        (
+            (off <= _COVERED_RAD)
+            & (np.abs(stock.t[pick]).min(axis=1) >= _COVERED_LEVEL)
+        ).mean()
+    )

@@ -1,7 +1,9 @@
 """Phase profiles of lenses: hyperbolic, double helix, cubic, and a map from file.
 
-All focus a point source on the axis at ``source_distance_um`` before the lens onto the sensor at
-``sensor_distance_um`` behind it; the last three add their own term to that hyperbolic phase.
+All focus a point source on the axis at ``source_distance_um`` before the lens onto the
+sensor at
+``sensor_distance_um`` behind it; the last three add their own term to that hyperbolic
+phase.
 """
 
 import math
@@ -32,36 +34,51 @@ class Focus:
     def __post_init__(self) -> None:
         for name in ("wavelength_um", "sensor_distance_um", "source_distance_um"):
             if not getattr(self, name) > 0:
-                raise LensError(f"{name} = {getattr(self, name)}: need a length above 0")
+                raise LensError(
+                    f"{name} = {getattr(self, name)}: need a length above 0"
+                )
         check_gaps(self.layers, self.sensor_distance_um, self.source_distance_um)
 
     def path_um(self, radius2_um2: Array) -> Array:
-        """Optical path source - lens - sensor through a ring of squared radius r², less that along the axis, um.
+        """Optical path source - lens - sensor through a ring of squared radius r², less
+        that along the axis, um.
 
-        Paper Eq. 1 on both sides; through films that of the ray which reaches r, to rounding.
+        Paper Eq. 1 on both sides; through films that of the ray which reaches r, to
+        rounding.
         """
         if self.layers.plain:
             near, far = self.sensor_distance_um, self.source_distance_um
-            return np.asarray(path_difference(radius2_um2, near) + path_difference(radius2_um2, far))
+            return np.asarray(
+                path_difference(radius2_um2, near) + path_difference(radius2_um2, far)
+            )
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um).layers
         total = media.longer(after, 0.0, 0.0, radius2_um2)[1]
         if math.isfinite(self.source_distance_um):
-            before = self.layers.before(self.source_distance_um, self.wavelength_um).layers
+            before = self.layers.before(
+                self.source_distance_um, self.wavelength_um
+            ).layers
             total = total + media.longer(before, 0.0, 0.0, radius2_um2)[1]
         return np.asarray(total)
 
     def aperture(self, radius_um: float) -> float:
-        """Numerical aperture n sin θ of the cone that leaves a lens of this radius towards the sensor."""
+        """Numerical aperture n sin θ of the cone that leaves a lens of this radius
+        towards the sensor.
+        """
         after = self.layers.after(self.sensor_distance_um, self.wavelength_um)
         return float(media.direction(after, radius_um))
 
-    def paths_from(self, x_um: Array, y_um: Array, tangent: float) -> tuple[Array, Array]:
-        """Optical paths to (x, y) of the lens from the source and the sensor point of a field angle along x, less those
+    def paths_from(
+        self, x_um: Array, y_um: Array, tangent: float
+    ) -> tuple[Array, Array]:
+        """Optical paths to (x, y) of the lens from the source and the sensor point of a
+        field angle along x, less those
         to its middle, um."""
         near, far = self.sensor_distance_um, self.source_distance_um
         if self.layers.plain:
             sensor = source_path(x_um, y_um, (-tangent, 0.0), 1 / near)
-            return np.asarray(sensor), np.asarray(source_path(x_um, y_um, (tangent, 0.0), 1 / far))
+            return np.asarray(sensor), np.asarray(
+                source_path(x_um, y_um, (tangent, 0.0), 1 / far)
+            )
         sine = tangent / math.hypot(1.0, tangent)
         found = []
         for gap, side in ((self.layers.after(near, self.wavelength_um), 1), (None, -1)):
@@ -70,16 +87,24 @@ class Focus:
                 continue
             pairs = (gap or self.layers.before(far, self.wavelength_um)).layers
             reach = side * sine * media.bend(pairs, sine**2)
-            found.append(np.asarray(media.longer(pairs, sine**2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um)[1]))
+            found.append(
+                np.asarray(
+                    media.longer(
+                        pairs, sine**2, reach**2, x_um**2 + y_um**2 - 2 * reach * x_um
+                    )[1]
+                )
+            )
         return found[0], found[1]
 
 
 @dataclass(frozen=True, slots=True)
 class DoubleHelix:
-    """Annular vortices: ring l of ``zones`` carries the charge 2l - 1 (after Pavani et al. 2009, Prasad 2013).
+    """Annular vortices: ring l of ``zones`` carries the charge 2l - 1 (after Pavani et
+    al. 2009, Prasad 2013).
 
     zones: number of rings.
-    exponent: ring l ends at radius R (l / zones)**exponent; 1/2 gives rings of equal area.
+    exponent: ring l ends at radius R (l / zones)**exponent; 1/2 gives rings of equal
+    area.
     """
 
     zones: int = 4
@@ -87,12 +112,15 @@ class DoubleHelix:
 
     def __post_init__(self) -> None:
         if self.zones < 1 or not self.exponent > 0:
-            raise ConfigError(f"double helix of {self.zones} zones, exponent {self.exponent}: need both above 0")
+            raise ConfigError(
+                f"double helix of {self.zones} zones, exponent {self.exponent}: need both above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Cubic:
-    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey 1995).
+    """strength_rad ((x/R)³ + (y/R)³): extends the depth of field (Dowski and Cathey
+    1995).
 
     strength_rad: phase at the rim of either axis.
     """
@@ -102,10 +130,12 @@ class Cubic:
 
 @dataclass(frozen=True, slots=True)
 class PhaseMap:
-    """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see :mod:`metalens.design.phase_map`.
+    """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see
+    :mod:`metalens.design.phase_map`.
 
     file: its path (.npy, .npz, .mat, a Zemax grid phase .dat, else text).
-    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the phasor exp(i phase).
+    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the
+    phasor exp(i phase).
     add_focus: whether the hyperbolic focus is added to the map.
     variable: name of the matrix in a .mat or .npz file that holds several.
     conjugate: change the sign, for maps made with exp(+iwt).
@@ -119,11 +149,14 @@ class PhaseMap:
 
     def __post_init__(self) -> None:
         if self.pitch_um is not None and not self.pitch_um > 0:
-            raise ConfigError(f"pitch_um = {self.pitch_um} of the phase map: need a length above 0")
+            raise ConfigError(
+                f"pitch_um = {self.pitch_um} of the phase map: need a length above 0"
+            )
 
 
 def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
-    """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both sides).
+    """Phase that brings all paths source - lens - sensor into step (paper Eq. 1 on both
+    sides).
 
     Args:
         x_um, y_um: positions that broadcast to (y, x).
@@ -131,17 +164,31 @@ def hyperbolic(x_um: Array, y_um: Array, focus: Focus) -> Array:
     Returns:
         (y, x) phase in rad, 0 on the axis and negative outwards, float64.
     """
-    return np.asarray(-2 * np.pi / focus.wavelength_um * focus.path_um(x_um**2 + y_um**2))
+    return np.asarray(
+        -2 * np.pi / focus.wavelength_um * focus.path_um(x_um**2 + y_um**2)
+    )
 
 
-def double_helix(x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float) -> Array:
-    """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes that turn with depth."""
+def double_helix(
+    x_um: Array, y_um: Array, focus: Focus, shape: DoubleHelix, *, radius_um: float
+) -> Array:
+    """Hyperbolic phase plus the vortices of :class:`DoubleHelix`; the PSF is two lobes
+    that turn with depth.
+    """
     fraction = np.hypot(x_um, y_um) / radius_um
-    ring = np.clip(np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones)
-    return np.asarray(hyperbolic(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um))
+    ring = np.clip(
+        np.ceil(shape.zones * fraction ** (1 / shape.exponent)), 1, shape.zones
+    )
+    return np.asarray(
+        hyperbolic(x_um, y_um, focus) + (2 * ring - 1) * np.arctan2(y_um, x_um)
+    )
 
 
-def cubic(x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float) -> Array:
+def cubic(
+    x_um: Array, y_um: Array, focus: Focus, shape: Cubic, *, radius_um: float
+) -> Array:
     """Hyperbolic phase plus :class:`Cubic`."""
     x, y = x_um / radius_um, y_um / radius_um
-    return np.asarray(hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3))
+    return np.asarray(
+        hyperbolic(x_um, y_um, focus) + shape.strength_rad * (x**3 + y**3)
+    )

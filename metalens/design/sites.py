@@ -1,4 +1,6 @@
-"""The sites of a lattice inside a round aperture, and the map of pillars that stand on them."""
+"""The sites of a lattice inside a round aperture, and the map of pillars that stand on
+them.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,15 +13,20 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap
 
-PhaseOf = Callable[[Array, Array], Array]  # (x,) and (y,) positions in um to (y, x) phase in rad
-_BLOCK_SITES = 1 << 21  # sites worked on at a time, so that memory does not grow with the lens
+PhaseOf = Callable[
+    [Array, Array], Array
+]  # (x,) and (y,) positions in um to (y, x) phase in rad
+_BLOCK_SITES = (
+    1 << 21
+)  # sites worked on at a time, so that memory does not grow with the lens
 
 
 @dataclass(frozen=True, slots=True)
 class Sites:
     """Where pillars may stand: centres half a pitch inside a round aperture.
 
-    shape: (y, x) of the map. steps_um: (x, y) from site to site of the map; on a hexagonal lattice every other site of
+    shape: (y, x) of the map. steps_um: (x, y) from site to site of the map; on a
+    hexagonal lattice every other site of
     the map is one of the lattice, the middle one among them.
     """
 
@@ -30,19 +37,27 @@ class Sites:
     aperture_um: float
 
     def blocks(self, phase: PhaseOf) -> Iterator[tuple[slice, Array, Array]]:
-        """Blocks of rows: which of their sites hold a pillar, and the phase wanted there.
+        """Blocks of rows: which of their sites hold a pillar, and the phase wanted
+        there.
 
         Raises:
             LensError: a phase of another shape than (rows, columns).
         """
-        x, y = ((np.arange(n) - (n - 1) / 2) * s for n, s in zip(self.shape[::-1], self.steps_um, strict=True))
-        reach = self.aperture_um / 2 - self.pitch_um / 2 if self.shape != (1, 1) else 0.0
+        x, y = (
+            (np.arange(n) - (n - 1) / 2) * s
+            for n, s in zip(self.shape[::-1], self.steps_um, strict=True)
+        )
+        reach = (
+            self.aperture_um / 2 - self.pitch_um / 2 if self.shape != (1, 1) else 0.0
+        )
         size = max(1, _BLOCK_SITES // self.shape[1])
         for start in range(0, self.shape[0], size):
             rows = slice(start, start + size)
             inside = y[rows, None] ** 2 + x**2 <= reach**2 * (1 + 1e-12)
             if self.lattice.centred:
-                odd = (np.arange(self.shape[0])[rows, None] + np.arange(self.shape[1])) % 2
+                odd = (
+                    np.arange(self.shape[0])[rows, None] + np.arange(self.shape[1])
+                ) % 2
                 inside &= odd == 0
             wanted = phase(x, y[rows])
             if np.shape(wanted) != inside.shape:
@@ -52,36 +67,56 @@ class Sites:
                 )
             yield rows, inside, wanted[inside]
 
-    def map(self, diameter_um: Array, angle_rad: Array | None = None, length_um: Array | None = None) -> DiameterMap:
+    def map(
+        self,
+        diameter_um: Array,
+        angle_rad: Array | None = None,
+        length_um: Array | None = None,
+    ) -> DiameterMap:
         """The pillars on these sites."""
         row_um = 0.0 if self.lattice.kind == "square" else self.steps_um[1]
-        return DiameterMap(diameter_um, self.pitch_um, self.lattice, row_um, angle_rad, length_um)
+        return DiameterMap(
+            diameter_um, self.pitch_um, self.lattice, row_um, angle_rad, length_um
+        )
 
 
 def sites(cell: Cell, aperture_um: float, *, grid_nm: float) -> Sites:
     """The sites of the cell's lattice in an aperture.
 
-    grid_nm: of the mask: rows of a hexagonal lattice are sqrt(3)/2 pitches apart, rounded to it.
+    grid_nm: of the mask: rows of a hexagonal lattice are sqrt(3)/2 pitches apart,
+    rounded to it.
 
     Raises:
         LensError: the aperture holds no pillar.
     """
     if not (math.isfinite(aperture_um) and aperture_um >= cell.pitch_um):
-        raise LensError(f"empty aperture: {aperture_um} um holds no cell of pitch {cell.pitch_um} um")
+        raise LensError(
+            f"empty aperture: {aperture_um} um holds no cell of pitch {cell.pitch_um} um"
+        )
     period = cell.lattice.periods_um(cell.pitch_um)
     if not cell.lattice.centred:
         counts = tuple(max(1, int(aperture_um / step)) for step in period[::-1])
-        return Sites(cell.pitch_um, cell.lattice, (counts[0], counts[1]), period, aperture_um)
+        return Sites(
+            cell.pitch_um, cell.lattice, (counts[0], counts[1]), period, aperture_um
+        )
     grid = grid_nm * 1e-3
     steps = cell.pitch_um / 2, max(1, round(period[1] / 2 / grid)) * grid
     half_x, half_y = (int((aperture_um - cell.pitch_um) / 2 / step) for step in steps)
     half_x += (half_x + half_y) % 2  # the middle of the map is a site
-    return Sites(cell.pitch_um, cell.lattice, (2 * half_y + 1, 2 * half_x + 1), steps, aperture_um)
+    return Sites(
+        cell.pitch_um,
+        cell.lattice,
+        (2 * half_y + 1, 2 * half_x + 1),
+        steps,
+        aperture_um,
+    )
 
 
 def least_period_um(cell: Cell) -> float:
-    """Twice the Nyquist step of a phase on this lattice: it may turn half a turn over half of this, in any direction.
+    """Twice the Nyquist step of a phase on this lattice: it may turn half a turn over
+    half of this, in any direction.
 
-    The shortest reciprocal vector is 2 pi / this: the pitch on a square lattice, sqrt(3)/2 of it on a hexagonal one.
+    The shortest reciprocal vector is 2 pi / this: the pitch on a square lattice,
+    sqrt(3)/2 of it on a hexagonal one.
     """
     return cell.pitch_um / cell.lattice.least_order

@@ -1,4 +1,6 @@
-"""A phase made by the turn of pillars of one size, for circular light (geometric phase)."""
+"""A phase made by the turn of pillars of one size, for circular light (geometric
+phase).
+"""
 
 import dataclasses
 from typing import Literal
@@ -18,10 +20,13 @@ from metalens.pillars.circular import Turned
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Conversion:
-    """What becomes of circular light of the design's hand, from solved cells of the pillar at several turns.
+    """What becomes of circular light of the design's hand, from solved cells of the
+    pillar at several turns.
 
-    size_um: of all pillars. converted, unconverted: shares of the light that leave with the other hand and the wanted
-    phase, and with the same hand and no phase; their errors are those of the solver. isolated_error: of the amplitude
+    size_um: of all pillars. converted, unconverted: shares of the light that leave with
+    the other hand and the wanted
+    phase, and with the same hand and no phase; their errors are those of the solver.
+    isolated_error: of the amplitude
     of a pillar that is taken as turned alone.
     """
 
@@ -44,39 +49,56 @@ def make_turned(
     profile: str = "map",
     provenance: Provenance | None = None,
 ) -> tuple[Lens, Quality, Conversion]:
-    """Fill a round aperture with pillars of the library's best size, each turned by half of its phase.
+    """Fill a round aperture with pillars of the library's best size, each turned by
+    half of its phase.
 
     Args:
-        phase: wanted; :func:`metalens.design.phase_of`. library: for circular light, with its proxy.
+        phase: wanted; :func:`metalens.design.phase_of`. library: for circular light,
+            with its proxy.
         hand: of the light that comes: right is x + iy, left x - iy.
 
     Returns:
-        The lens (turns in [0, pi), float32), its quality (that of the converted light), and the conversion.
+        The lens (turns in [0, pi), float32), its quality (that of the converted light),
+        and the conversion.
 
     Raises:
-        LensError: a library that is not for circular light, or pillars that the process does not print or that may
+        LensError: a library that is not for circular light, or pillars that the process
+            does not print or that may
             meet their neighbours when turned; no pillar in the aperture.
     """
     turned, proxy = library.turned, library.proxy
     if turned is None or proxy is None:
-        raise LensError("hand: the library holds no turned pillars; sweep it with light = 'circular'")
+        raise LensError(
+            "hand: the library holds no turned pillars; sweep it with light = 'circular'"
+        )
     cell, limits = library.cell, limits or Limits()
     _check(cell, turned, limits)
     place, sums = sites(cell, aperture_um, grid_nm=limits.grid_nm), Sums()
     size, angle = np.zeros(place.shape, np.float32), np.zeros(place.shape, np.float32)
-    start, step = float(proxy.phase_rad(turned.size_um, focus.wavelength_um)), HANDS[hand]
+    start, step = (
+        float(proxy.phase_rad(turned.size_um, focus.wavelength_um)),
+        HANDS[hand],
+    )
     for rows, inside, wanted in place.blocks(phase):
         size[rows][inside] = turned.size_um
         angle[rows][inside] = np.mod((wanted - start) / step, np.pi)
         made = start + step * angle[rows][inside].astype(float)
         sums.add(wanted, made, _level(proxy, turned, focus, len(made)))
     made_map = place.map(size, angle)
-    lens = lens_of(made_map, cell, proxy, focus, profile=profile, provenance=provenance, hand=hand)
-    return lens, sums.quality(focus, aperture_um / 2, 1.0, period_um=least_period_um(cell)), _conversion(turned, hand)
+    lens = lens_of(
+        made_map, cell, proxy, focus, profile=profile, provenance=provenance, hand=hand
+    )
+    return (
+        lens,
+        sums.quality(focus, aperture_um / 2, 1.0, period_um=least_period_um(cell)),
+        _conversion(turned, hand),
+    )
 
 
 def _level(proxy: Proxy, turned: Turned, focus: Focus, count: int) -> np.ndarray:
-    return np.full(count, float(proxy.transmission(turned.size_um, focus.wavelength_um)))
+    return np.full(
+        count, float(proxy.transmission(turned.size_um, focus.wavelength_um))
+    )
 
 
 def _conversion(turned: Turned, hand: str) -> Conversion:
@@ -88,7 +110,10 @@ def _conversion(turned: Turned, hand: str) -> Conversion:
 def _check(cell: Cell, turned: Turned, limits: Limits) -> None:
     """Refuse what is not printed at any turn of it and its neighbours."""
     outline = cell.outline(turned.size_um)
-    gap = min(np.hypot(*step) for step in cell.lattice.steps_um(cell.pitch_um)) - 2 * outline.radius_um
+    gap = (
+        min(np.hypot(*step) for step in cell.lattice.steps_um(cell.pitch_um))
+        - 2 * outline.radius_um
+    )
     if gap < limits.min_gap_nm * 1e-3 - 1e-9:
         raise LensError(
             f"a {cell.shape.name} of {turned.size_um:.4g} um leaves {1e3 * gap:.4g} nm to a neighbour when both are "

@@ -1,4 +1,6 @@
-"""The true image: PSFs that vary over field, depth and spectrum, through the films around the lens."""
+"""The true image: PSFs that vary over field, depth and spectrum, through the films
+around the lens.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,5 @@
-"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth`` times the frames in one pass), the
+"""Compiled loops: sheets weighted for the kernels of a patch (``forming.at_depth``
+times the frames in one pass), the
 light on the nodes of a pupil, and pillars gathered over cells."""
 
 import numba
@@ -12,18 +13,25 @@ from metalens.image.scene import values as values
 from metalens.lens import answers
 from metalens.propagate import turns32
 
-PART, put = answers.PART, answers.answers  # compiled loops know names of their own module
+PART, put = (
+    answers.PART,
+    answers.answers,
+)  # compiled loops know names of their own module
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
 def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-untyped-def]
-    """Sheets weighted for kernels: ``patches.lagrange`` between the depths, one depth node after the other, so that all
+    """Sheets weighted for kernels: ``patches.lagrange`` between the depths, one depth
+    node after the other, so that all
     pixels of a patch are one loop.
 
     Args:
-        content, place: (frames, sheets, y, x) light or coverage, and depth in units of the depth nodes, float32.
-        held: (few, 2) frame and sheet that are wanted. lit: whether the relative illumination weighs too.
-        tables: (depths, rank, y * x) weights and (depths, y * x) illumination, float32. first: of the kernels.
+        content, place: (frames, sheets, y, x) light or coverage, and depth in units of
+            the depth nodes, float32.
+        held: (few, 2) frame and sheet that are wanted. lit: whether the relative
+            illumination weighs too.
+        tables: (depths, rank, y * x) weights and (depths, y * x) illumination, float32.
+            first: of the kernels.
         out: (y, kernels, few, x).
     """
     high, few, _, wide = out.shape
@@ -61,7 +69,9 @@ def weigh(content, place, held, tables, lit, first, out):  # type: ignore[no-unt
 
 @numba.njit(cache=True, fastmath=True, nogil=True, forceinline=True)
 def _reached(content, place, depths, value, between):  # type: ignore[no-untyped-def]
-    """Content of a sheet; of every pixel the depth, the first node that it reaches, and :func:`_taps` from there."""
+    """Content of a sheet; of every pixel the depth, the first node that it reaches, and
+    :func:`_taps` from there.
+    """
     at, start, a, b, c, d = between
     wide, n = content.shape[1], min(4, depths)
     for y in range(len(content)):
@@ -82,12 +92,19 @@ def _reached(content, place, depths, value, between):  # type: ignore[no-untyped
 
 @numba.njit(inline="always")
 def _taps(t, n):  # type: ignore[no-untyped-def]
-    """Weights of ``patches.lagrange`` at t from the first of n nodes; nodes that are not there have 0."""
+    """Weights of ``patches.lagrange`` at t from the first of n nodes; nodes that are
+    not there have 0.
+    """
     one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
     u, v, w = t - one, t - np.float32(2), t - np.float32(3)
     if n == 4:
         sixth = np.float32(1 / 6)
-        return -u * v * w * sixth, t * v * w * half, -t * u * w * half, t * u * v * sixth
+        return (
+            -u * v * w * sixth,
+            t * v * w * half,
+            -t * u * w * half,
+            t * u * v * sixth,
+        )
     if n == 3:
         return u * v * half, -t * v, t * u * half, none
     if n == 2:
@@ -99,17 +116,23 @@ def phasors(weight: Array, turns: Array, paths: Array, mix: Array) -> Array:
     """(depths, y, x) complex64 weight exp(2πi (turns + Σ mix paths)).
 
     Args:
-        weight, turns: (y, x) float64. paths: (few, y, x) float64 in turns; mix: (depths, few).
+        weight, turns: (y, x) float64. paths: (few, y, x) float64 in turns; mix:
+            (depths, few).
     """
     out = np.empty((len(mix), *turns.shape, 2), np.float32)
     light = weight.astype(np.float32)
-    split(turns.shape[0], lambda a, b: _phasors(light[a:b], turns[a:b], paths[:, a:b], mix, out[:, a:b]))
+    split(
+        turns.shape[0],
+        lambda a, b: _phasors(light[a:b], turns[a:b], paths[:, a:b], mix, out[:, a:b]),
+    )
     return out.view(np.complex64)[..., 0]
 
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
-    """Row by row, so that the sum of a depth stays in the nearest cache; of a row what the aperture lets through."""
+    """Row by row, so that the sum of a depth stays in the nearest cache; of a row what
+    the aperture lets through.
+    """
     depths, few = mix.shape
     line = np.empty(turns.shape[1])
     for y in range(turns.shape[0]):
@@ -119,10 +142,20 @@ def _phasors(weight, turns, paths, mix, out):  # type: ignore[no-untyped-def]
         out[:, y, stop:] = 0
         for d in range(depths):
             if few == 5:  # of many depths: one pass
-                m0, m1, m2, m3, m4 = mix[d, 0], mix[d, 1], mix[d, 2], mix[d, 3], mix[d, 4]
+                m0, m1, m2, m3, m4 = (
+                    mix[d, 0],
+                    mix[d, 1],
+                    mix[d, 2],
+                    mix[d, 3],
+                    mix[d, 4],
+                )
                 for x in range(start, stop):
-                    part = m0 * paths[0, y, x] + m1 * paths[1, y, x] + m2 * paths[2, y, x]
-                    line[x] = turns[y, x] + part + m3 * paths[3, y, x] + m4 * paths[4, y, x]
+                    part = (
+                        m0 * paths[0, y, x] + m1 * paths[1, y, x] + m2 * paths[2, y, x]
+                    )
+                    line[x] = (
+                        turns[y, x] + part + m3 * paths[3, y, x] + m4 * paths[4, y, x]
+                    )
             else:
                 line[start:stop] = turns[y, start:stop]
                 for v in range(few):
@@ -146,17 +179,29 @@ def _power(field, out):  # type: ignore[no-untyped-def]
         out[i] = field[i].real * field[i].real + field[i].imag * field[i].imag
 
 
-def cells(diameter_um: Array, ideal_rad: Array, polynomials: answers.Polynomials, block: tuple[int, int, int]) -> Array:
+def cells(
+    diameter_um: Array,
+    ideal_rad: Array,
+    polynomials: answers.Polynomials,
+    block: tuple[int, int, int],
+) -> Array:
     """(3, cells y, cells x) float32 means over square cells of |T| cos(φ - ideal), |T| sin(φ - ideal), and of pillars.
 
     Args:
-        ideal_rad: (y, x) float32. polynomials: of the diameters, by :func:`metalens.lens.answers.polynomials`.
-        block: pillars along a cell, and rows and columns of the first one that lie before the map.
+        ideal_rad: (y, x) float32. polynomials: of the diameters, by
+            :func:`metalens.lens.answers.polynomials`.
+        block: pillars along a cell, and rows and columns of the first one that lie
+            before the map.
     """
     side, *before = block
-    shape = [-(-(n + b) // side) for n, b in zip(diameter_um.shape, before, strict=True)]
+    shape = [
+        -(-(n + b) // side) for n, b in zip(diameter_um.shape, before, strict=True)
+    ]
     out = np.zeros((3, *shape), np.float32)
-    split(shape[0], lambda a, b: _cells(diameter_um, ideal_rad, polynomials, block, out[:, a:b], a))
+    split(
+        shape[0],
+        lambda a, b: _cells(diameter_um, ideal_rad, polynomials, block, out[:, a:b], a),
+    )
     return out
 
 
@@ -167,7 +212,10 @@ def _cells(d, ideal, polynomials, block, out, first):  # type: ignore[no-untyped
     x, phase, level = np.empty(PART), np.empty(PART), np.empty(PART)
     for row in range(out.shape[1]):
         sums = np.zeros((3, out.shape[2]))
-        for i in range(max((first + row) * side - top, 0), min((first + row + 1) * side - top, d.shape[0])):
+        for i in range(
+            max((first + row) * side - top, 0),
+            min((first + row + 1) * side - top, d.shape[0]),
+        ):
             for start in range(0, d.shape[1], PART):
                 some = d[i, start : start + PART]
                 n = some.size

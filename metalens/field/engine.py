@@ -34,16 +34,26 @@ from metalens.lens import Layers, Lens
 from metalens.psf import Nodes, Polarisation, Source, blur_um
 from metalens.psf import spectrum as spectra
 
-PATCH = 28  # samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
-# tolerances tried for the worst PSF of a patch; below 1 where what is returned is darker than the frame
+# samples of a patch along an axis, about: less than its PSFs, so that few kernels serve
+PATCH = 28
+# tolerances tried for the worst PSF of a patch; below 1 where what is returned is
+# darker than the frame
 LOOSER = (8.0, 6.0, 4.5, 3.5, 2.5, 1.8, 1.3, 1.0, 0.5, 0.25, 0.12)
 OVERLAP = 4  # samples that two patches share
-COARSE = 4.0  # tolerance of coverage per tolerance of light: it matters at the borders of sheets alone
-HELD_OUT = 16  # pixels of the frame at which the PSFs that are used are compared with true ones
-NEGLECTED = 5  # of them at which the transform and the components of the field are judged
+# tolerance of coverage per tolerance of light: it matters at the borders of sheets
+# alone
+COARSE = 4.0
+# pixels of the frame at which the PSFs that are used are compared with true ones
+HELD_OUT = 16
+NEGLECTED = (
+    5  # of them at which the transform and the components of the field are judged
+)
 ALL = 2  # of them at which pillars taken together are
-SHADED = 6  # field points along an axis that tell how deep an image lies in the shadow of a stop
-DEEPEST = 8.0  # by how much an image may be dimmer than its frame and still be prepared to its own light: what a
+# field points along an axis that tell how deep an image lies in the shadow of a stop
+SHADED = 6
+# by how much an image may be dimmer than its frame and still be prepared to its own
+# light: what a
+DEEPEST = 8.0
 # shadow's ripples leave out is more than the rest there
 
 
@@ -62,24 +72,34 @@ def imager(
     """Prepare a lens for frames of a grid.
 
     Args:
-        lens: a lens file's content, or a wave (:class:`SmoothWave`, :class:`PillarWave`).
-        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.measured`), wavelengths with weights, or
+        lens: a lens file's content, or a wave (:class:`SmoothWave`,
+            :class:`PillarWave`).
+        spectrum: a diode, curves as measured (:func:`metalens.psf.spectrum.measured`),
+            wavelengths with weights, or
             None for the design wavelength alone.
-        layers: films around the lens; by default those of the lens file with the cover of its cell (none for a wave).
+        layers: films around the lens; by default those of the lens file with the cover
+            of its cell (none for a wave).
         field: (x, y) angle in rad of the middle of the grid.
         tolerance: of the image of a 1/f texture, relative L2.
         distance_um: lens to sensor, by default the design's.
-        polarisation: ``flux`` (of unpolarised light through the sensor's plane, which a pixel counts), ``scalar``,
-            ``auto``: one scalar where its error, ``parts["polarisation"]``, is below the tolerance, else the flux, or
+        polarisation: ``flux`` (of unpolarised light through the sensor's plane, which a
+            pixel counts), ``scalar``,
+            ``auto``: one scalar where its error, ``parts["polarisation"]``, is below
+            the tolerance, else the flux, or
             ``vector``: |Ex|² + |Ey|² + |Ez|², which a thin film that absorbs on the sensor's plane sees.
-        device: where PSFs and patches are computed and frames will be; a few PSFs are judged on the processor.
+        device: where PSFs and patches are computed and frames will be; a few PSFs are
+            judged on the processor.
 
     Raises:
-        SceneError: a field that is not within 90 degrees, a polarisation that is none, wavelengths, depths or field
-            points that no number of meets the tolerance; PropagationError: films thicker than the gap, or a spectrum of
-            which a wavelength that stands for it lies beyond the library of the pillars.
+        SceneError: a field that is not within 90 degrees, a polarisation that is none,
+            wavelengths, depths or field
+            points that no number of meets the tolerance; PropagationError: films
+            thicker than the gap, or a spectrum of
+            which a wavelength that stands for it lies beyond the library of the
+            pillars.
 
-    Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may leave it above the
+    Accuracy: ``error`` of the result, by cause in ``parts``; what no setting lowers may
+    leave it above the
         tolerance (``edge``: light that a small aperture's rim bends beyond the window).
     """
     _check(field, polarisation)
@@ -87,11 +107,15 @@ def imager(
         layers = lens.layers if isinstance(lens, Lens) else Layers()
     wave = wave_of(lens, layers, scene_grid.window * scene_grid.step_um, distance_um)
     focus = wave.focus  # type: ignore[attr-defined]
-    optics = Optics(wave, layers, focus.sensor_distance_um if distance_um is None else distance_um)
+    optics = Optics(
+        wave, layers, focus.sensor_distance_um if distance_um is None else distance_um
+    )
     source = spectrum or Nodes(np.array([focus.wavelength_um]), np.ones(1), 0.0)
     reduced = layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     middle = reduced * math.tan(field[0]), reduced * math.tan(field[1])
-    round_ = isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
+    round_ = (
+        isinstance(wave, SmoothWave) and wave.added_rad is None and field == (0.0, 0.0)
+    )
     round_ = round_ and (layers.stop is None or layers.stop.centred)
     shaded = _shaded(optics, scene_grid, focus.wavelength_um, middle)
     given = optics, scene_grid, source, middle
@@ -102,16 +126,22 @@ def imager(
     parts = {**made.parts, **_held_out(optics, whole)}
     if isinstance(wave, PillarWave):
         parts["unknown"] = spectra.unknown(source, wave.lens.proxy.wavelengths_um)
-    stray = stray_of(optics, scene_grid, float(1 / (1 / found.plan.depths_um).mean()), middle)
+    stray = stray_of(
+        optics, scene_grid, float(1 / (1 / found.plan.depths_um).mean()), middle
+    )
     return replace(made, parts=parts, stray=None if stray is None else stray.to(device))
 
 
 def _check(field: tuple[float, float], polarisation: Polarisation) -> None:
     """Refuse a field beyond 90 degrees and a polarisation that is none."""
     if not all(abs(angle) < math.pi / 2 for angle in field):
-        raise SceneError(f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2")
+        raise SceneError(
+            f"field of {field} rad, need angles (x, y) of the middle of the grid within ±pi/2"
+        )
     if polarisation not in get_args(Polarisation):
-        raise SceneError(f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}")
+        raise SceneError(
+            f"polarisation = {polarisation!r}: need one of {', '.join(get_args(Polarisation))}"
+        )
 
 
 class _Planned(NamedTuple):
@@ -121,17 +151,27 @@ class _Planned(NamedTuple):
     tolerance: float
 
 
-def _planned(given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any) -> _Planned:
-    """To the light of an image that is so many times dimmer than the frame, or where no number of nodes meets that to
+def _planned(
+    given: tuple[Any, ...], tolerance: float, shaded: float, **about: Any
+) -> _Planned:
+    """To the light of an image that is so many times dimmer than the frame, or where no
+    number of nodes meets that to
     the frame's."""
     if shaded > 1 and tolerance < 1:
         with contextlib.suppress(SceneError):
-            return _Planned(planned(*given, tolerance=tolerance / shaded, **about), tolerance / shaded)
+            return _Planned(
+                planned(*given, tolerance=tolerance / shaded, **about),
+                tolerance / shaded,
+            )
     return _Planned(planned(*given, tolerance=tolerance, **about), tolerance)
 
 
-def _shaded(optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]) -> float:
-    """:func:`_dimmer` of the middle depth by a few field points, before there is a plan; 1 without a stop."""
+def _shaded(
+    optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[float, float]
+) -> float:
+    """:func:`_dimmer` of the middle depth by a few field points, before there is a
+    plan; 1 without a stop.
+    """
     if optics.layers.stop is None:
         return 1.0
     y, x = (
@@ -140,14 +180,27 @@ def _shaded(optics: Optics, grid: Grid, wavelength_um: float, middle_um: tuple[f
     )
     depth = 1 / (1 / depth_nodes(grid, 2)).mean(0, keepdim=True)
     window = Window(grid.window, grid.step_um, period=2 * SPARE)
-    coarse = Plan(y, x, depth, Nodes(np.array([wavelength_um]), np.ones(1), 0.0), window, folds=False)
+    coarse = Plan(
+        y,
+        x,
+        depth,
+        Nodes(np.array([wavelength_um]), np.ones(1), 0.0),
+        window,
+        folds=False,
+    )
     with torch.no_grad():
         stack, energy = node_psfs(optics, coarse)
-    return min(_dimmer(Imager(grid, coarse, stack.nan_to_num(), energy, [], [], {})), DEEPEST)
+    return min(
+        _dimmer(Imager(grid, coarse, stack.nan_to_num(), energy, [], [], {})), DEEPEST
+    )
 
 
-def node_psfs(optics: Optics, plan: Plan, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
-    """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in the wave's factor."""
+def node_psfs(
+    optics: Optics, plan: Plan, device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor]:
+    """PSFs of all nodes, of sum 1, and their relative illumination; differentiable in
+    the wave's factor.
+    """
     if plan.folds:
         light = _folded(optics, plan, device)
     else:
@@ -159,26 +212,42 @@ def node_psfs(optics: Optics, plan: Plan, device: torch.device | str = "cpu") ->
 
 
 def normalised(light: Tensor, optics: Optics, plan: Plan) -> tuple[Tensor, Tensor]:
-    """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes' windows."""
+    """(PSFs of sum 1, relative illumination) of the light on each sample of the nodes'
+    windows.
+    """
     total, wave = light.sum((-2, -1)), float(plan.waves.wavelengths_um.mean())
     y, x = torch.meshgrid(plan.y_um.to(plan.x_um), plan.x_um, indexing="ij")
     cosine4 = _cosine4(optics, torch.stack([x, y], -1), plan.depths_um, wave)
     return light / total[..., None, None], total * cosine4.to(total)
 
 
-def _cosine4(optics: Optics, at_um: Tensor, depths_um: Tensor, wavelength_um: float) -> Tensor:
-    """(…, depths) cos⁴ of the field angles of places (…, [x, y]), at the middle of the stop where there is one."""
-    tangents = at_um.numpy() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
-    rays = [optics.layers.through_middle(tangents, depth, wavelength_um) for depth in depths_um.tolist()]
+def _cosine4(
+    optics: Optics, at_um: Tensor, depths_um: Tensor, wavelength_um: float
+) -> Tensor:
+    """(…, depths) cos⁴ of the field angles of places (…, [x, y]), at the middle of the
+    stop where there is one.
+    """
+    tangents = (
+        at_um.numpy()
+        / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    )
+    rays = [
+        optics.layers.through_middle(tangents, depth, wavelength_um)
+        for depth in depths_um.tolist()
+    ]
     return torch.from_numpy(1 / (1 + (np.stack(rays, -2) ** 2).sum(-1)) ** 2)
 
 
 def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
-    """PSFs of a round lens on a square grid about its axis, from one eighth of the nodes."""
+    """PSFs of a round lens on a square grid about its axis, from one eighth of the
+    nodes.
+    """
     count = len(plan.x_um)
     half = (count + 1) // 2
     pairs = [(i, j) for i in range(half) for j in range(i, half)]
-    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs]).to(device)
+    at = torch.stack([torch.stack([plan.x_um[j], plan.y_um[i]]) for i, j in pairs]).to(
+        device
+    )
     few = spectral(optics, at, plan.depths_um, plan.waves, plan.window)
     out = few.new_zeros(count, count, *few.shape[1:])
     for (i, j), psf in zip(pairs, few, strict=True):
@@ -188,20 +257,31 @@ def _folded(optics: Optics, plan: Plan, device: torch.device | str) -> Tensor:
     return out
 
 
-def patched(grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float) -> Imager:
-    """Cut the field into patches with all their kernels; differentiable in the PSFs and their illumination."""
+def patched(
+    grid: Grid, plan: Plan, stack: Tensor, energy: Tensor, *, tolerance: float
+) -> Imager:
+    """Cut the field into patches with all their kernels; differentiable in the PSFs and
+    their illumination.
+    """
     count = max(1, round(min(grid.frame) / PATCH))
     between = between_nodes(grid, plan)
     most = tolerance * SHARES["kernels"] / 4
-    made = cutting.cut(stack, energy, between, patches=count, overlap=OVERLAP, tolerance=most)
-    return with_psfs(Imager(grid, plan, stack, energy, made, [], {"kernels": most}), stack, energy)
+    made = cutting.cut(
+        stack, energy, between, patches=count, overlap=OVERLAP, tolerance=most
+    )
+    return with_psfs(
+        Imager(grid, plan, stack, energy, made, [], {"kernels": most}), stack, energy
+    )
 
 
 def thinned(whole: Imager, *, tolerance: float) -> Imager:
-    """As few kernels as image a texture of two sheets (:func:`trial`) within their share of the tolerance.
+    """As few kernels as image a texture of two sheets (:func:`trial`) within their
+    share of the tolerance.
 
-    What a patch lacks differs from pixel to pixel, and adds up to less than the worst PSF says. The error is of the
-    kernels alone: that even light is put right afterwards is not counted, since points gain nothing by it; of the frame
+    What a patch lacks differs from pixel to pixel, and adds up to less than the worst
+    PSF says. The error is of the
+    kernels alone: that even light is put right afterwards is not counted, since points
+    gain nothing by it; of the frame
     or of what is returned of it, where that is the darker part.
     """
     share = tolerance * SHARES["kernels"]
@@ -211,8 +291,14 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
         for looser in LOOSER:
             few = trimmed(whole, share * looser)
             missed = blurred(seen, few) - want
-            pairs = (missed, want), (returned(missed, whole.grid), returned(want, whole.grid))
-            error = max(float(part.norm() / light.norm().clamp_min(1e-30)) for part, light in pairs)
+            pairs = (
+                (missed, want),
+                (returned(missed, whole.grid), returned(want, whole.grid)),
+            )
+            error = max(
+                float(part.norm() / light.norm().clamp_min(1e-30))
+                for part, light in pairs
+            )
             if error <= share * 0.97:
                 break
     few = trimmed(whole, share * looser)
@@ -220,50 +306,72 @@ def thinned(whole: Imager, *, tolerance: float) -> Imager:
 
 
 def trimmed(optics: Imager, tolerance: float) -> Imager:
-    """The first kernels of every patch, as many as its own account of the tolerance needs."""
+    """The first kernels of every patch, as many as its own account of the tolerance
+    needs.
+    """
     made = [patch.trimmed(tolerance, tolerance * COARSE) for patch in optics.patches]
     transfer = [t[: len(p.mix)] for t, p in zip(optics.transfer, made, strict=True)]
     return replace(optics, patches=made, transfer=transfer)
 
 
 def trial(grid: Grid) -> Frames:
-    """One frame of two sheets over all depths with 1/f texture of mean 1 and contrast about 0.3."""
+    """One frame of two sheets over all depths with 1/f texture of mean 1 and contrast
+    about 0.3.
+    """
     draw = torch.Generator().manual_seed(11)
     y, x = grid.frame
     fy, fx = torch.fft.fftfreq(y)[:, None], torch.fft.rfftfreq(x)
     white = torch.fft.rfft2(torch.randn(2, y, x, generator=draw))
-    rough = torch.fft.irfft2(white / torch.sqrt(fy**2 + fx**2 + (0.5 / max(x, y)) ** 2), s=(y, x))
+    rough = torch.fft.irfft2(
+        white / torch.sqrt(fy**2 + fx**2 + (0.5 / max(x, y)) ** 2), s=(y, x)
+    )
     texture = (1 + 0.3 * (rough - rough.mean()) / rough.std()).clamp_min(0)
     down = torch.linspace(-1, 1, y)[:, None].expand(y, x)
     across = torch.linspace(-1, 1, x).expand(y, x)
     near = torch.sigmoid((-down - 0.25 + 0.2 * across) * y / 4)
     cover = torch.stack([near, 1 - near])
     low, high = (1 / d for d in grid.depths_um)
-    depth = 1 / torch.stack([low + (high - low) * (0.2 + 0.2 * across), low + (high - low) * (0.6 + 0.35 * down)])
+    depth = 1 / torch.stack(
+        [
+            low + (high - low) * (0.2 + 0.2 * across),
+            low + (high - low) * (0.6 + 0.35 * down),
+        ]
+    )
     return Frames((cover * texture)[None], cover[None], depth[None])
 
 
 def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
-    """Errors at places, depths and wavelengths that no node holds: interpolation of PSFs and of their light,
-    transform, components of the field that are left out, pillars taken together; light left outside.
+    """Errors at places, depths and wavelengths that no node holds: interpolation of
+    PSFs and of their light,
+    transform, components of the field that are left out, pillars taken together; light
+    left outside.
 
-    Those that count by the light of a place are over the whole frame's light: more of an image that is dimmer than it.
+    Those that count by the light of a place are over the whole frame's light: more of
+    an image that is dimmer than it.
     """
     plan = made.plan
     draw = np.random.default_rng(7)
-    pixels = torch.from_numpy(np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)).long()
+    pixels = torch.from_numpy(
+        np.floor(draw.random((HELD_OUT, 2)) * made.grid.frame)
+    ).long()
     rows, columns = (
         torch.linspace(float(nodes[0]), float(nodes[-1]), n, dtype=torch.float64)
         for n, nodes in zip(made.grid.frame, (plan.y_um, plan.x_um), strict=True)
     )
     at = torch.stack([columns[pixels[:, 1]], rows[pixels[:, 0]]], -1)
     ends = 1 / plan.depths_um[[0, -1]]
-    depths = 1 / (ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64))
+    depths = 1 / (
+        ends[0] + (ends[1] - ends[0]) * torch.tensor([0.13, 0.58], dtype=torch.float64)
+    )
     true = spectral(optics, at, depths, plan.waves, plan.window).detach()
     wave = float(plan.waves.wavelengths_um[0])
-    whole = through(optics, at, depths_um=depths, wavelength_um=wave, window=plan.window)
+    whole = through(
+        optics, at, depths_um=depths, wavelength_um=wave, window=plan.window
+    )
     light = true.sum((-1, -2))
-    level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[..., None, None]
+    level = _cosine4(optics, at, depths, float(plan.waves.wavelengths_um.mean()))[
+        ..., None, None
+    ]
     with torch.no_grad():
         used, lit = psfs_used(made, pixels, depths), lights_used(made, pixels, depths)
         got = (used * lit[..., None, None]).cpu()
@@ -275,54 +383,93 @@ def _held_out(optics: Optics, made: Imager) -> dict[str, float]:
     seen = left_out.Judged(optics, plan.waves, plan.window, few)
     transform = left_out.neglected(seen) * share
     edge = sampling(optics, plan.window, float(plan.waves.wavelengths_um[0])).beyond / 2
-    found = {"nodes": nodes, "spectrum": max(plan.waves.error, 0.0), "transform": transform}
+    found = {
+        "nodes": nodes,
+        "spectrum": max(plan.waves.error, 0.0),
+        "transform": transform,
+    }
     found["folded"] = left_out.folded(seen) * share
     found["polarisation"] = left_out.unpolarised(seen) * share
-    found["pillars"] = left_out.missing(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
+    found["pillars"] = (
+        left_out.missing(optics, wave, plan.window, (at[:ALL], depths)) * dimmer
+    )
     if optics.layers.stop is not None:
-        shown = [part[:NEGLECTED] for part in (true / light[..., None, None], light / whole, light / light.amax(0))]
+        shown = [
+            part[:NEGLECTED]
+            for part in (
+                true / light[..., None, None],
+                light / whole,
+                light / light.amax(0),
+            )
+        ]
         found["stop"] = _ripples(optics, wave, few, shown, plan.window.step_um) * dimmer
     return {**found, "edge": edge, "outside": 1 - float(light.sum() / whole.sum())}
 
 
 def _dimmer(made: Imager) -> float:
-    """By how much an image of even light is dimmer than the whole frame's, 1 at least: margins may be in the light
+    """By how much an image of even light is dimmer than the whole frame's, 1 at least:
+    margins may be in the light
     where an image lies in the shadow of a stop."""
     with torch.no_grad():
         lit = even_light(made)
-        whole, image = (float(part.square().mean().sqrt()) for part in (lit, returned(lit, made.grid)))
+        whole, image = (
+            float(part.square().mean().sqrt())
+            for part in (lit, returned(lit, made.grid))
+        )
     return max(whole / max(image, 1e-12 * whole), 1.0)
 
 
 def _ripples(
-    optics: Optics, wavelength_um: float, seen: tuple[Tensor, Tensor], light: Sequence[Tensor], step_um: float
+    optics: Optics,
+    wavelength_um: float,
+    seen: tuple[Tensor, Tensor],
+    light: Sequence[Tensor],
+    step_um: float,
 ) -> float:
-    """Error of the stop's shadow, the worst of some places and depths; light: their PSFs, the share of their light that
+    """Error of the stop's shadow, the worst of some places and depths; light: their
+    PSFs, the share of their light that
     these hold, and their light over that of the brightest place."""
     places, depths_um = seen
     held = light[1].cpu().numpy().clip(1e-6, 1)
     blurs_um = blur_um(light[0].cpu().numpy(), step_um, held)
     reduced = optics.layers.after(optics.distance_um, wavelength_um).reduced_um
     found = []
-    for place, row, parts, lit in zip((places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=True):
+    for place, row, parts, lit in zip(
+        (places / reduced).tolist(), blurs_um / reduced, held, light[2], strict=True
+    ):
         rads = row / math.hypot(1, *place)
-        for z, rad, part, bright in zip(depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True):
-            error = optics.layers.shadow_error((place[0], place[1]), z, wavelength_um, rad, part)
+        for z, rad, part, bright in zip(
+            depths_um.tolist(), rads.tolist(), parts.tolist(), lit.tolist(), strict=True
+        ):
+            error = optics.layers.shadow_error(
+                (place[0], place[1]), z, wavelength_um, rad, part
+            )
             found.append(float(error * bright))
     return max(found)
 
 
 def psfs_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
-    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row, column]) of the frame."""
-    flat, position = optics.stack.flatten(0, 2), vergence(depths_um, optics.plan.depths_um)
-    deep = dense(position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)).to(flat)
+    """(n, depths, h, w) PSFs, of sum 1, that the patches give sources at (n, [row,
+    column]) of the frame.
+    """
+    flat, position = (
+        optics.stack.flatten(0, 2),
+        vergence(depths_um, optics.plan.depths_um),
+    )
+    deep = dense(
+        position, torch.arange(len(optics.plan.depths_um), dtype=position.dtype)
+    ).to(flat)
     out = flat.new_zeros(len(pixels), len(depths_um), *flat.shape[1:])
     for patch in optics.patches:
         (top, below), (left, right) = patch.rows, patch.columns
         for i, (row, column) in enumerate(pixels.tolist()):
             if top <= row < below and left <= column < right:
-                weights = deep @ patch.weights[(row - top) * (right - left) + column - left]
-                out[i] += (weights @ (patch.mix @ flat[patch.nodes].flatten(1))).view_as(out[i])
+                weights = (
+                    deep @ patch.weights[(row - top) * (right - left) + column - left]
+                )
+                out[i] += (
+                    weights @ (patch.mix @ flat[patch.nodes].flatten(1))
+                ).view_as(out[i])
     return out
 
 
@@ -331,6 +478,13 @@ def lights_used(optics: Imager, pixels: Tensor, depths_um: Tensor) -> Tensor:
     depths, energy = optics.plan.depths_um, optics.energy
     position = vergence(depths_um, depths)
     deep = dense(position, torch.arange(len(depths), dtype=position.dtype))
-    ends = [part[at] for part, at in zip(between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True)]
-    light: Tensor = torch.einsum("na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy)
+    ends = [
+        part[at]
+        for part, at in zip(
+            between_nodes(optics.grid, optics.plan), pixels.unbind(1), strict=True
+        )
+    ]
+    light: Tensor = torch.einsum(
+        "na,nb,cz,abz->nc", *(part.to(energy) for part in (*ends, deep)), energy
+    )
     return light

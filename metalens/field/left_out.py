@@ -1,6 +1,8 @@
-"""What PSFs of the field leave out: by the transform, by components of the field, by pillars taken together.
+"""What PSFs of the field leave out: by the transform, by components of the field, by
+pillars taken together.
 
-Errors are of the image: those of PSFs count by their light, so that places in the shadow of a stop count little.
+Errors are of the image: those of PSFs count by their light, so that places in the
+shadow of a stop count little.
 """
 
 import functools
@@ -23,7 +25,9 @@ MOST = 256  # of their samples along an axis; of a wider window the middle is lo
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """PSFs by which errors are judged: of the first wavelength, at (field points, depths)."""
+    """PSFs by which errors are judged: of the first wavelength, at (field points,
+    depths).
+    """
 
     optics: Optics
     waves: Nodes
@@ -32,73 +36,116 @@ class Judged:
 
     @functools.cached_property
     def shown(self) -> Tensor:
-        """(field points, depths, h, w) as the window shows them, with their light; computed once."""
+        """(field points, depths, h, w) as the window shows them, with their light;
+        computed once.
+        """
         return self.lit()
 
-    def lit(self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any) -> Tensor:
+    def lit(
+        self, *, shift_um: tuple[float, float] = (0.0, 0.0), **other: Any
+    ) -> Tensor:
         """The same through a window with other settings, its rays seen from beside."""
-        about: dict[str, Any] = {"wavelength_um": float(self.waves.wavelengths_um[0]), "shift_um": shift_um}
+        about: dict[str, Any] = {
+            "wavelength_um": float(self.waves.wavelengths_um[0]),
+            "shift_um": shift_um,
+        }
         with torch.no_grad():
-            return psfs(self.optics, self.at[0], depths_um=self.at[1], window=replace(self.window, **other), **about)
+            return psfs(
+                self.optics,
+                self.at[0],
+                depths_um=self.at[1],
+                window=replace(self.window, **other),
+                **about,
+            )
 
 
 def neglected(judged: Judged) -> float:
-    """What the transform neglects: PSFs with the rays seen from their own width beside the field point, against
+    """What the transform neglects: PSFs with the rays seen from their own width beside
+    the field point, against
     themselves."""
     light = judged.shown.sum((-1, -2))
     wide = width(judged.shown / light[..., None, None]) * judged.window.step_um
-    return in_light(relative(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown), light)
+    return in_light(
+        relative(judged.lit(shift_um=(wide * 0.6, wide * 0.8)), judged.shown), light
+    )
 
 
 def folded(judged: Judged) -> float:
-    """What the transform folds back from beyond the period of the nodes: PSFs, with their light, against those of twice
+    """What the transform folds back from beyond the period of the nodes: PSFs, with
+    their light, against those of twice
     the period."""
     want = judged.lit(period=2 * judged.window.period)
     return in_light(relative(judged.shown, want), want.sum((-1, -2)))
 
 
-def polarised(judged: Judged, polarisation: Polarisation, *, within: tuple[float, float]) -> Window:
-    """The window with one scalar where that images within the first tolerance (``auto``), else with as few components
+def polarised(
+    judged: Judged, polarisation: Polarisation, *, within: tuple[float, float]
+) -> Window:
+    """The window with one scalar where that images within the first tolerance
+    (``auto``), else with as few components
     of the fields of both polarisations as image within the second."""
-    judged = replace(judged, window=replace(judged.window, flux=polarisation != "vector"))
+    judged = replace(
+        judged, window=replace(judged.window, flux=polarisation != "vector")
+    )
     window = judged.window
-    if polarisation == "scalar" or (polarisation == "auto" and unpolarised(judged) <= within[0]):
+    if polarisation == "scalar" or (
+        polarisation == "auto" and unpolarised(judged) <= within[0]
+    ):
         return window
     whole = judged.lit(components=window.whole)
     tried = (replace(window, components=count) for count in range(1, window.whole + 1))
-    return next(one for one in tried if unpolarised(replace(judged, window=one), whole) <= within[1])
+    return next(
+        one
+        for one in tried
+        if unpolarised(replace(judged, window=one), whole) <= within[1]
+    )
 
 
 def unpolarised(judged: Judged, whole: Tensor | None = None) -> float:
-    """What the components of the field that a window leaves out change: PSFs of sum 1 against those of all components
+    """What the components of the field that a window leaves out change: PSFs of sum 1
+    against those of all components
     (``whole``, where they are known)."""
     window = judged.window
     if window.components == window.whole:
         return 0.0
     whole = judged.lit(components=window.whole) if whole is None else whole
     few, light = judged.shown, whole.sum((-1, -2))
-    return in_light(relative(few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]), light)
+    return in_light(
+        relative(few / few.sum((-1, -2), keepdim=True), whole / light[..., None, None]),
+        light,
+    )
 
 
 def width(psfs: Tensor) -> float:
-    """Root mean square distance of the light from its centroid, samples, mean over the PSFs."""
+    """Root mean square distance of the light from its centroid, samples, mean over the
+    PSFs.
+    """
     n = psfs.shape[-1]
     place = torch.arange(n, dtype=psfs.dtype) - (n - 1) / 2
     total = psfs.sum((-1, -2))
-    x, y = (psfs.sum(-2) * place).sum(-1) / total, (psfs.sum(-1) * place).sum(-1) / total
+    x, y = (
+        (psfs.sum(-2) * place).sum(-1) / total,
+        (psfs.sum(-1) * place).sum(-1) / total,
+    )
     square = ((psfs.sum(-2) + psfs.sum(-1)) * place**2).sum(-1) / total
     return float(torch.sqrt((square - x**2 - y**2).clamp_min(0.25)).mean())
 
 
-def missing(optics: Optics, wavelength_um: float, window: Window, at: tuple[Tensor, Tensor]) -> float:
-    """What gathering pillars over cells changes: PSFs of sum 1 at (field points, depths) against those of every pillar,
-    to the same samples; 0 of a wave that is no lens of pillars. Light of other orders in the window is in it."""
+def missing(
+    optics: Optics, wavelength_um: float, window: Window, at: tuple[Tensor, Tensor]
+) -> float:
+    """What gathering pillars over cells changes: PSFs of sum 1 at (field points,
+    depths) against those of every pillar,
+    to the same samples; 0 of a wave that is no lens of pillars. Light of other orders
+    in the window is in it."""
     wave = optics.wave
     if not isinstance(wave, Pillars):
         return 0.0
     grid = sampling(optics, window, wavelength_um)
-    # points of a sample, half of Nyquist's step apart: triangles of a sample are then summed to 2e-3 of fine detail. At
-    # Nyquist's step it is 5e-3 too much; what scatters to the rim of a window is more, so that no window is cut for it.
+    # points of a sample, half of Nyquist's step apart: triangles of a sample are then
+    # summed to 2e-3 of fine detail. At
+    # Nyquist's step it is 5e-3 too much; what scatters to the rim of a window is more,
+    # so that no window is cut for it.
     finer = math.ceil(2 * grid.nodes * grid.step * window.step_um / wavelength_um)
     finer *= 2 if (window.samples + 2) * 2 * finer <= MOST else 1
     count = min(window.samples, max(MOST // finer - 2, 3) | 1)
@@ -107,27 +154,54 @@ def missing(optics: Optics, wavelength_um: float, window: Window, at: tuple[Tens
     errors, lights = [], []
     with torch.no_grad():
         for place in at[0]:
-            light = _of_pillars(optics, wave, wavelength_um, (place, at[1]), (window.step_um, count + 1, finer))
+            light = _of_pillars(
+                optics,
+                wave,
+                wavelength_um,
+                (place, at[1]),
+                (window.step_um, count + 1, finer),
+            )
             want = share @ light @ share.T
-            got = psfs(optics, place[None], depths_um=at[1], wavelength_um=wavelength_um, window=window)[0, :, few, few]
-            errors.append(relative(got / got.sum((-1, -2), keepdim=True), want / want.sum((-1, -2), keepdim=True)))
+            got = psfs(
+                optics,
+                place[None],
+                depths_um=at[1],
+                wavelength_um=wavelength_um,
+                window=window,
+            )[0, :, few, few]
+            errors.append(
+                relative(
+                    got / got.sum((-1, -2), keepdim=True),
+                    want / want.sum((-1, -2), keepdim=True),
+                )
+            )
             lights.append(got.sum((-1, -2)))
     return in_light(torch.stack(errors), torch.stack(lights))
 
 
 def _triangles(count: int, finer: int) -> Tensor:
-    """(samples, points) share of the light at points of a window one sample wider: a square source over a square."""
+    """(samples, points) share of the light at points of a window one sample wider: a
+    square source over a square.
+    """
     points = (np.arange((count + 1) * finer) - ((count + 1) * finer - 1) / 2) / finer
     away = np.abs(points - (np.arange(count) - (count - 1) / 2)[:, None])
     return torch.from_numpy(np.maximum(1 - away, 0))
 
 
 def _of_pillars(
-    optics: Optics, wave: Pillars, wavelength_um: float, at: tuple[Tensor, Tensor], sampled: tuple[float, int, int]
+    optics: Optics,
+    wave: Pillars,
+    wavelength_um: float,
+    at: tuple[Tensor, Tensor],
+    sampled: tuple[float, int, int],
 ) -> Tensor:
-    """(depths, y, x) light of point sources, from every pillar; sampled: step of a sample, samples, points of each."""
+    """(depths, y, x) light of point sources, from every pillar; sampled: step of a
+    sample, samples, points of each.
+    """
     (place, depths_um), (step_um, count, finer) = at, sampled
-    tangents = place.cpu() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    tangents = (
+        place.cpu() / optics.layers.after(optics.distance_um, wavelength_um).reduced_um
+    )
     angle = torch.atan(tangents).tolist()
     t = wave.answer(wavelength_um, math.atan(math.hypot(*tangents.tolist()))).cpu()
     about: dict[str, Any] = {
@@ -140,7 +214,11 @@ def _of_pillars(
         "samples": count * finer,
         "layers": optics.layers,
     }
-    chief = propagate.case(tuple(t.shape), **about | {"layers": optics.layers.open}).centre_um
+    chief = propagate.case(
+        tuple(t.shape), **about | {"layers": optics.layers.open}
+    ).centre_um
     offset = [float(a) - b for a, b in zip(place, chief, strict=True)]
-    made = psf_stack(torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False)
+    made = psf_stack(
+        torch.angle(t), t.abs(), **about, offset_um=offset, integrate=False
+    )
     return torch.as_tensor(made.intensity).double()

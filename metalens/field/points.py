@@ -1,12 +1,17 @@
-"""PSFs of single field points: the pupil in the direction p that all media share, as the window's centre sees it.
+"""PSFs of single field points: the pupil in the direction p that all media share, as
+the window's centre sees it.
 
     x(p) = X - reach(p) p/|p|                 where the ray that arrives at X with direction p leaves the lens
     U(X + δ) = ∫ √spread(p) T(x) exp(ik [source path(x) + path(p)]) exp(ik p·δ) d²p
 
-The transform is exact to first order in δ, and √spread keeps ∫|U|². Second order, Q = δᵀH(p)δ/2 with H = ∂p/∂X, is put
-right on the samples: about the middle p0 of the pupil its slope s(δ) = ∇Q moves the light, and its curvature
-M(δ) = ∇∇Q, where asked for, adds ∇·(M S) with the flux S = Re(U* W), W the transform of (p - p0) T.
-The low frequencies of |U|² are the autocorrelation of the pupil; one padded transform gives all that squares of a
+The transform is exact to first order in δ, and √spread keeps ∫|U|². Second order, Q =
+δᵀH(p)δ/2 with H = ∂p/∂X, is put
+right on the samples: about the middle p0 of the pupil its slope s(δ) = ∇Q moves the
+light, and its curvature
+M(δ) = ∇∇Q, where asked for, adds ∇·(M S) with the flux S = Re(U* W), W the transform of
+(p - p0) T.
+The low frequencies of |U|² are the autocorrelation of the pupil; one padded transform
+gives all that squares of a
 sample's size can show.
 """
 
@@ -28,20 +33,24 @@ from metalens.lens import Layers, media
 from metalens.psf import Mixed, strongest
 
 SPARE = 1.06  # period of the nodes per width of the window
-CLEAR = 0.7  # of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
+# of the harmonics: what wraps onto the others is below 3e-4 of the sharpest image
+CLEAR = 0.7
 DARK = 1e-6  # of samples that no light reaches: a PSF of next to nothing keeps a shape
 LARGEST_P = 0.9  # of a ray, in units of the rarest index
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Square samples around a field point: an odd count along each axis, of width ``step_um``.
+    """Square samples around a field point: an odd count along each axis, of width
+    ``step_um``.
 
     curved: with the flux of the second order as well, three times the work.
     components: of the fields of both polarisations, so many of the strongest mixtures
-        (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one scalar.
+        (:mod:`metalens.field.polarised`), each as much work as a scalar; 0 for one
+        scalar.
     flux: whether those give the flux through the sensor's plane, which a pixel counts, or |Ex|² + |Ey|² + |Ez|².
-    period: of the nodes, in widths of the window. Light from beyond half of it is seen folded back.
+    period: of the nodes, in widths of the window. Light from beyond half of it is seen
+    folded back.
     """
 
     samples: int
@@ -53,11 +62,17 @@ class Window:
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.samples % 2 == 0 or not self.step_um > 0:
-            raise PropagationError(f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3")
+            raise PropagationError(
+                f"window of {self.samples} samples of {self.step_um} um: need an odd count >= 3"
+            )
         if not 0 <= self.components <= self.whole:
-            raise PropagationError(f"{self.components} components of the field: need 0 to {self.whole}")
+            raise PropagationError(
+                f"{self.components} components of the field: need 0 to {self.whole}"
+            )
         if not self.period >= SPARE:
-            raise PropagationError(f"nodes of a period of {self.period} windows: need {SPARE} or more")
+            raise PropagationError(
+                f"nodes of a period of {self.period} windows: need {SPARE} or more"
+            )
 
     @property
     def whole(self) -> int:
@@ -78,7 +93,8 @@ class Optics:
 class Pupil:
     """Weight and phase of the rays of a field point; (nodes, nodes) float64.
 
-    given: the light on the aperture. The squares of the weights are less: a node across the rim has the mean field.
+    given: the light on the aperture. The squares of the weights are less: a node across
+    the rim has the mean field.
     """
 
     weight: Tensor
@@ -88,8 +104,10 @@ class Pupil:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
-    """Along one axis: (2 samples, points) light of the points of a transform on each sample, and below it the
-    derivative of that by the sample's place in um; place_um: (samples,) from where the rays are seen."""
+    """Along one axis: (2 samples, points) light of the points of a transform on each
+    sample, and below it the
+    derivative of that by the sample's place in um; place_um: (samples,) from where the
+    rays are seen."""
 
     both: Tensor
     place_um: Tensor
@@ -97,13 +115,17 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """period_um of the nodes, their number along an axis and their step of p, size of the padded transform, harmonics
+    """period_um of the nodes, their number along an axis and their step of p, size of
+    the padded transform, harmonics
     that are kept.
 
-    beyond: share of the light that a sharp round rim at p bends beyond the period (half of it, less the spare, is h),
+    beyond: share of the light that a sharp round rim at p bends beyond the period (half
+    of it, less the spare, is h),
         4√2 / (π² k p h); the transform folds it back.
-    dimmed: share that a window lacks and is given back: nodes are the mean of their width at the rim, whose light at X
-        is so times sinc²(X / period): ∫ (1 - sinc²) d(4√2 / (π² k p X)) over the window, to second order.
+    dimmed: share that a window lacks and is given back: nodes are the mean of their
+    width at the rim, whose light at X
+        is so times sinc²(X / period): ∫ (1 - sinc²) d(4√2 / (π² k p X)) over the
+        window, to second order.
     """
 
     period_um: float
@@ -118,23 +140,42 @@ class Sampling:
     flux: bool
 
 
-def sampling(optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf) -> Sampling:
-    """Nodes that fill the aperture for a window on the axis, where it is widest in p; of the shorter wave."""
+def sampling(
+    optics: Optics, window: Window, wavelength_um: float, finest_um: float = math.inf
+) -> Sampling:
+    """Nodes that fill the aperture for a window on the axis, where it is widest in p;
+    of the shorter wave.
+    """
     after = optics.layers.after(optics.distance_um, wavelength_um)
-    edge = float(media.direction(after, torch.tensor(optics.wave.radius_um, dtype=torch.float64)))
+    edge = float(
+        media.direction(after, torch.tensor(optics.wave.radius_um, dtype=torch.float64))
+    )
     if edge > LARGEST_P * after.layers[0][0]:
-        raise PropagationError(f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}")
-    step = min(wavelength_um, finest_um) / (window.samples * window.step_um * window.period)
+        raise PropagationError(
+            f"aperture of NA {edge:.2f}: the image engine takes up to {LARGEST_P}"
+        )
+    step = min(wavelength_um, finest_um) / (
+        window.samples * window.step_um * window.period
+    )
     period = wavelength_um / step
     nodes = 2 * math.ceil(edge / step) + 2
     harmonics = math.floor(2 * period / window.step_um)
     half = window.samples * window.step_um / 2 * window.period / SPARE
     stop = optics.layers.stop
-    lit = edge if stop is None else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
-    beyond = min(4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5)
-    # the harmonics that are kept may not wrap round, and the autocorrelation only onto the last of them
+    lit = (
+        edge
+        if stop is None
+        else edge * min(1.0, stop.radius_um / optics.wave.radius_um)
+    )
+    beyond = min(
+        4 * math.sqrt(2) / (math.pi**2 * 2 * math.pi / wavelength_um * lit * half), 0.5
+    )
+    # the harmonics that are kept may not wrap round, and the autocorrelation only onto
+    # the last of them
     size = max(nodes + math.ceil(CLEAR * harmonics) + 1, 2 * harmonics + 2)
-    quick = 16 * scipy.fft.next_fast_len(-(-size // 16))  # a third quicker than sizes that just factorise
+    quick = 16 * scipy.fft.next_fast_len(
+        -(-size // 16)
+    )  # a third quicker than sizes that just factorise
     dimmed = beyond * math.pi**2 / (12 * SPARE * window.period)
     how = window.curved, window.components, window.flux
     return Sampling(period, nodes, step, quick, harmonics, beyond, dimmed, *how)
@@ -150,20 +191,28 @@ def psfs(
     shift_um: tuple[float, float] = (0.0, 0.0),
     finest_um: float = math.inf,
 ) -> Tensor:
-    """(points, depths, h, w) share of the light on the aperture that falls on each sample from a source of that size.
+    """(points, depths, h, w) share of the light on the aperture that falls on each
+    sample from a source of that size.
 
     The aperture is the stop where the layers have one.
 
-    Source and sample are squares of one step: the light of a point, twice averaged over a square (sinc² in frequency,
-    kept up to its second zero, 2 / step). Constant radiance is then kept to rounding, and nothing rings.
+    Source and sample are squares of one step: the light of a point, twice averaged over
+    a square (sinc² in frequency,
+    kept up to its second zero, 2 / step). Constant radiance is then kept to rounding,
+    and nothing rings.
 
     Args:
-        at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with tangents at_um / reduced
-            distance through the middle of the lens comes from. Without films that is the chief ray.
-        depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in vacuum.
-        shift_um: the window's rays are seen from a place (x, y) beside :func:`view_um`; the samples stay. A check of
+        at_um: (points, [x, y]) float64 on the sensor: the source lies where a ray with
+            tangents at_um / reduced
+            distance through the middle of the lens comes from. Without films that is
+            the chief ray.
+        depths_um: (depths,) of the sources, inf for collimated light. wavelength_um: in
+            vacuum.
+        shift_um: the window's rays are seen from a place (x, y) beside :func:`view_um`;
+            the samples stay. A check of
             what the transform neglects.
-        finest_um: shortest wavelength of a spectrum, whose nodes are then those of all its wavelengths.
+        finest_um: shortest wavelength of a spectrum, whose nodes are then those of all
+            its wavelengths.
 
     Returns:
         float32 on the device of ``at_um``; differentiable in what the wave's factor is.
@@ -172,34 +221,64 @@ def psfs(
         PropagationError: films thicker than the gaps, an aperture beyond ``LARGEST_P``.
     """
     grid = sampling(optics, window, wavelength_um, finest_um)
-    views = [view_um(optics, place, depths_um, min(wavelength_um, finest_um)) for place in at_um]
+    views = [
+        view_um(optics, place, depths_um, min(wavelength_um, finest_um))
+        for place in at_um
+    ]
     return torch.stack(
         [
-            _one(optics, grid, place, depths_um, wavelength_um, _view(grid, window, view, shift_um, at_um.device))
+            _one(
+                optics,
+                grid,
+                place,
+                depths_um,
+                wavelength_um,
+                _view(grid, window, view, shift_um, at_um.device),
+            )
             for place, view in zip(at_um, views, strict=True)
         ]
     )
 
 
-def view_um(optics: Optics, place: Tensor, depths_um: Tensor, wavelength_um: float) -> tuple[float, float]:
-    """(x, y) beside a field point from where its rays are seen: where the light lands that a stop lets through."""
+def view_um(
+    optics: Optics, place: Tensor, depths_um: Tensor, wavelength_um: float
+) -> tuple[float, float]:
+    """(x, y) beside a field point from where its rays are seen: where the light lands
+    that a stop lets through.
+    """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     x, y = place.tolist()
     wave = optics.wave
-    return landing(optics.layers, wave.carrier_rad, wave.radius_um, ((x, y), after), depths_um, wavelength_um)
+    return landing(
+        optics.layers,
+        wave.carrier_rad,
+        wave.radius_um,
+        ((x, y), after),
+        depths_um,
+        wavelength_um,
+    )
 
 
 class _View(NamedTuple):
-    """From where the rays of a field point are seen, (x, y) beside it, and the samples along x and y from there."""
+    """From where the rays of a field point are seen, (x, y) beside it, and the samples
+    along x and y from there.
+    """
 
     beside_um: tuple[float, float]
     ends: tuple[Samples, ...]
 
 
 def _view(
-    grid: Sampling, window: Window, view: tuple[float, float], shift_um: tuple[float, float], device: torch.device
+    grid: Sampling,
+    window: Window,
+    view: tuple[float, float],
+    shift_um: tuple[float, float],
+    device: torch.device,
 ) -> _View:
-    ends = tuple(_to_samples(grid, window, v, s, device) for v, s in zip(view, shift_um, strict=True))
+    ends = tuple(
+        _to_samples(grid, window, v, s, device)
+        for v, s in zip(view, shift_um, strict=True)
+    )
     return _View((view[0] + shift_um[0], view[1] + shift_um[1]), ends)
 
 
@@ -229,25 +308,50 @@ def _one(
     if grid.components:
         fields = polarised.factors(found, tangents, after.order, flux=grid.flux)
         mixed = strongest(fields, pupil.weight, grid.components)
-    few = 1 if light.device.type == "cpu" else len(light)  # one depth at a time stays in a processor's cache
-    moves = [_move(slope, ends) for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))]
+    few = (
+        1 if light.device.type == "cpu" else len(light)
+    )  # one depth at a time stays in a processor's cache
+    moves = [
+        _move(slope, ends)
+        for slope in (found.slope, *(found.curvature.unbind(1) if grid.curved else ()))
+    ]
     aside = (found.aside, found.aside[:, None]) if grid.curved else ()
     parts = torch.split(light, few)
-    return torch.cat([_shown(_fluxes(part, mixed, aside, grid.size), ends, moves) for part in parts]) / total
+    return (
+        torch.cat(
+            [
+                _shown(_fluxes(part, mixed, aside, grid.size), ends, moves)
+                for part in parts
+            ]
+        )
+        / total
+    )
 
 
 def stopped(
-    optics: Optics, tangents: Tensor, found: Rays, depths_um: Tensor, wavelength_um: float
+    optics: Optics,
+    tangents: Tensor,
+    found: Rays,
+    depths_um: Tensor,
+    wavelength_um: float,
 ) -> tuple[Tensor, Tensor]:
-    """Of each source, (depths, nodes, nodes) amplitude behind the stop over that without, and (depths, 1, 1) light on
+    """Of each source, (depths, nodes, nodes) amplitude behind the stop over that
+    without, and (depths, 1, 1) light on
     the stop over that on the whole lens, of sources on the axis."""
     depths, radius = tuple(depths_um.tolist()), optics.wave.radius_um
-    shade = through_stop(optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um)
-    each = [(optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2 for depth in depths]
+    shade = through_stop(
+        optics.layers, tuple(tangents.tolist()), found, depths, wavelength_um
+    )
+    each = [
+        (optics.layers.footprint_um(depth, wavelength_um) / radius) ** 2
+        for depth in depths
+    ]
     return shade, torch.tensor(each, device=shade.device)[:, None, None]
 
 
-def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]) -> Tensor:
+def _shown(
+    fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor]
+) -> Tensor:
     """(depths, h, w) light of the transforms, moved to second order, on the samples."""
     plain, change = _moved(fluxes[0], ends, moves[0])
     shown = plain + change
@@ -256,29 +360,48 @@ def _shown(fluxes: list[Tensor], ends: tuple[Samples, ...], moves: list[Tensor])
     return shown
 
 
-def _fluxes(light: Tensor, mixed: Mixed | None, aside: tuple[Tensor, ...], size: int) -> list[Tensor]:
-    """(depths, size, size) |U|² of the transforms of the light on the nodes, and with ``aside`` the flux along x and y.
+def _fluxes(
+    light: Tensor, mixed: Mixed | None, aside: tuple[Tensor, ...], size: int
+) -> list[Tensor]:
+    """(depths, size, size) |U|² of the transforms of the light on the nodes, and with
+    ``aside`` the flux along x and y.
 
     mixed: whose light adds up; None for the scalar.
     """
     total: list[Tensor] = []
-    pupils = [(1.0, None)] if mixed is None else zip(mixed.signs, mixed.pupils.to(torch.float32), strict=True)
+    pupils = (
+        [(1.0, None)]
+        if mixed is None
+        else zip(mixed.signs, mixed.pupils.to(torch.float32), strict=True)
+    )
     for sign, pupil in pupils:
         part = light if pupil is None else light * pupil
         spectrum = torch.fft.fft2(part, s=(size, size))
         if compiled.plain(spectrum):
             found = [torch.from_numpy(compiled.power(spectrum.numpy()))]
         else:
-            found = [torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)]
+            found = [
+                torch.addcmul(spectrum.real.square(), spectrum.imag, spectrum.imag)
+            ]
         for along in aside:
             other = torch.fft.fft2(part * along.to(part.real), s=(size, size))
-            found.append(torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag))
-        total = found if not total else [a + sign * b for a, b in zip(total, found, strict=True)]
+            found.append(
+                torch.addcmul(spectrum.real * other.real, spectrum.imag, other.imag)
+            )
+        total = (
+            found
+            if not total
+            else [a + sign * b for a, b in zip(total, found, strict=True)]
+        )
     return total
 
 
-def _on_samples(power: Tensor, ends: tuple[Samples, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """(…, h, w) light on the samples, and its derivatives by their places along x and y."""
+def _on_samples(
+    power: Tensor, ends: tuple[Samples, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(…, h, w) light on the samples, and its derivatives by their places along x and
+    y.
+    """
     along_x, along_y = ends
     height, width = len(along_y.place_um), len(along_x.place_um)
     rows = along_y.both @ power
@@ -301,26 +424,46 @@ def _move(slope: Tensor, ends: tuple[Samples, ...]) -> Tensor:
     return torch.cat([s, (turned[0, 0] + turned[1, 1])[None]])
 
 
-def _moved(power: Tensor, ends: tuple[Samples, ...], move: Tensor) -> tuple[Tensor, Tensor]:
-    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and ∇·(s P): how it changes where it is
+def _moved(
+    power: Tensor, ends: tuple[Samples, ...], move: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(depths, h, w) power P (|U|², or a component of the flux) on the samples, and
+    ∇·(s P): how it changes where it is
     moved by s (see :func:`_move`)."""
     plain, across, down = _on_samples(power, ends)
     return plain, plain * move[2] + move[0] * across + move[1] * down
 
 
 def seen(
-    optics: Optics, place: Tensor, grid: Sampling, wavelength_um: float, beside_um: tuple[float, float] = (0.0, 0.0)
+    optics: Optics,
+    place: Tensor,
+    grid: Sampling,
+    wavelength_um: float,
+    beside_um: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Rays, Pupil]:
-    """The rays of the nodes to a place beside the field point, and the lens' carrier with the path to there."""
+    """The rays of the nodes to a place beside the field point, and the lens' carrier
+    with the path to there.
+    """
     after = optics.layers.after(optics.distance_um, wavelength_um)
     at = float(place[0]) + beside_um[0], float(place[1]) + beside_um[1]
-    found = rays(after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device)
-    phase = optics.wave.carrier_rad(found.x_um, found.y_um) + 2 * math.pi / wavelength_um * found.away_um
-    return found, Pupil(found.whole * found.passed, phase, float((found.whole * found.width_um).sum()) / grid.step)
+    found = rays(
+        after, optics.wave.radius_um, at, (grid.nodes, grid.step), place.device
+    )
+    phase = (
+        optics.wave.carrier_rad(found.x_um, found.y_um)
+        + 2 * math.pi / wavelength_um * found.away_um
+    )
+    return found, Pupil(
+        found.whole * found.passed,
+        phase,
+        float((found.whole * found.width_um).sum()) / grid.step,
+    )
 
 
 def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
-    """(depths, *shape) complex64 light on the nodes, the factor of the wave left out; compiled on the processor."""
+    """(depths, *shape) complex64 light on the nodes, the factor of the wave left out;
+    compiled on the processor.
+    """
     turns = pupil.phase_rad / (2 * math.pi)
     if turns.device.type == "cpu":
         given = pupil.weight, turns, paths.few_um / wavelength_um, paths.mix
@@ -331,20 +474,40 @@ def leaving(pupil: Pupil, paths: Paths, wavelength_um: float) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
-def _to_samples(grid: Sampling, window: Window, view_um: float, shift_um: float, device: torch.device) -> Samples:
-    """From the points of the padded transform to the samples along an axis: sinc² up to its second zero.
+def _to_samples(
+    grid: Sampling,
+    window: Window,
+    view_um: float,
+    shift_um: float,
+    device: torch.device,
+) -> Samples:
+    """From the points of the padded transform to the samples along an axis: sinc² up to
+    its second zero.
 
-    Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics to harmonics, by a transform.
-    Samples more than half a period from where the light lands are dark (``DARK``): the transform has other light there.
+    Σ_h sinc²(h step / period) exp(2πi h (place / period + m / size)), h from -harmonics
+    to harmonics, by a transform.
+    Samples more than half a period from where the light lands are dark (``DARK``): the
+    transform has other light there.
     """
     harmonic = np.arange(grid.harmonics + 1)
     box = np.sinc(harmonic / grid.period_um * window.step_um) ** 2
-    place = (np.arange(window.samples) - (window.samples - 1) / 2) * window.step_um - view_um
+    place = (
+        np.arange(window.samples) - (window.samples - 1) / 2
+    ) * window.step_um - view_um
     seen_as = np.where(np.abs(place) <= grid.period_um / 2, 1.0, DARK)
     place = place - shift_um
-    wave = seen_as[:, None] * box * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
+    wave = (
+        seen_as[:, None]
+        * box
+        * np.exp(2j * np.pi * (place[:, None] / grid.period_um * harmonic % 1))
+    )
     scale = window.step_um / grid.period_um * grid.size
     light = scale * np.fft.irfft(wave, grid.size)
-    slope = scale * np.fft.irfft(wave * (2j * np.pi / grid.period_um * harmonic), grid.size)
-    found = [torch.from_numpy(a.astype(np.float32)).to(device) for a in (np.concatenate([light, slope]), place)]
+    slope = scale * np.fft.irfft(
+        wave * (2j * np.pi / grid.period_um * harmonic), grid.size
+    )
+    found = [
+        torch.from_numpy(a.astype(np.float32)).to(device)
+        for a in (np.concatenate([light, slope]), place)
+    ]
     return Samples(found[0], found[1])

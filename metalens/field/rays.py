@@ -1,6 +1,8 @@
-"""Rays of one field point: where they leave the lens, how the window bends them, and their paths from the sources.
+"""Rays of one field point: where they leave the lens, how the window bends them, and
+their paths from the sources.
 
-None of it depends on the wavelength but through the indices of films, so that all wavelengths of a spectrum whose nodes
+None of it depends on the wavelength but through the indices of films, so that all
+wavelengths of a spectrum whose nodes
 are the same directions share it: what was computed last is kept.
 """
 
@@ -23,11 +25,15 @@ KEPT = 4  # field points whose rays are kept: a few MB each
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rays:
-    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the lens.
+    """Rays of nodes at equal steps of the direction p, (nodes, nodes) float64 on the
+    lens.
 
-    width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed: root of the power that faces let
-    through; away_um: path to the window's centre less that along the normal. aside: (nodes,) p - p0 along x and along
-    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`bending` there.
+    width_um: of a node on the lens; whole: √spread of each, 0 beyond the rim; passed:
+    root of the power that faces let
+    through; away_um: path to the window's centre less that along the normal. aside:
+    (nodes,) p - p0 along x and along
+    y; middle: (x, y) of p0, the middle of the pupil. slope, curvature: :func:`bending`
+    there.
     """
 
     x_um: Tensor
@@ -44,7 +50,9 @@ class Rays:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Paths:
-    """Optical paths of many depths as mixtures of a few: mix (depths, few) times few_um (few, *shape), float64."""
+    """Optical paths of many depths as mixtures of a few: mix (depths, few) times few_um
+    (few, *shape), float64.
+    """
 
     few_um: Tensor
     mix: Tensor
@@ -57,12 +65,20 @@ class Paths:
 
 @functools.lru_cache(maxsize=KEPT)
 def rays(
-    after: Media, radius: float, at_um: tuple[float, float], nodes: tuple[int, float], device: torch.device
+    after: Media,
+    radius: float,
+    at_um: tuple[float, float],
+    nodes: tuple[int, float],
+    device: torch.device,
 ) -> Rays:
-    """Rays to a place (x, y) of the sensor from a lens of this radius; nodes: their number and their step of p."""
+    """Rays to a place (x, y) of the sensor from a lens of this radius; nodes: their
+    number and their step of p.
+    """
     count, width = nodes
     centre = torch.tensor(at_um, dtype=torch.float64, device=device)
-    axis = (torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2) * width
+    axis = (
+        torch.arange(count, dtype=torch.float64, device=device) - (count - 1) / 2
+    ) * width
     turn = torch.arange(256, dtype=torch.float64, device=device) * (2 * math.pi / 256)
     rim = centre - radius * torch.stack([torch.cos(turn), torch.sin(turn)], -1)
     far = torch.hypot(rim[:, 0], rim[:, 1]).clamp_min(1e-9)
@@ -74,19 +90,38 @@ def rays(
     x, y = centre[0] - out * px, centre[1] - out * py
     r = torch.hypot(x, y).clamp_min(1e-9)
     wide = torch.sqrt(media.spread(after, p))
-    inside = ((radius - r) / (wide * width) + 0.5).clamp(0, 1)  # of a node across the rim, as wide as r changes with p
+    inside = ((radius - r) / (wide * width) + 0.5).clamp(
+        0, 1
+    )  # of a node across the rim, as wide as r changes with p
     passed = torch.sqrt(media.passed(after.order, p))
-    return Rays(x, y, wide * width, inside * wide, passed, media.path(after, p), axis, middle, *bending(after, middle))
+    return Rays(
+        x,
+        y,
+        wide * width,
+        inside * wide,
+        passed,
+        media.path(after, p),
+        axis,
+        middle,
+        *bending(after, middle),
+    )
 
 
 @functools.lru_cache(maxsize=KEPT)
 def through_stop(
-    layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float
+    layers: Layers,
+    tangents: tuple[float, float],
+    seen: Rays,
+    depths_um: tuple[float, ...],
+    wavelength_um: float,
 ) -> Tensor:
-    """(depths, *shape) complex64 amplitude of each source's light behind the stop at (x, y), over that without; 0
+    """(depths, *shape) complex64 amplitude of each source's light behind the stop at
+    (x, y), over that without; 0
     beyond the rim of the lens."""
     lit = seen.whole.cpu().numpy() > 0
-    x, y, width = (part.cpu().numpy()[lit] for part in (seen.x_um, seen.y_um, seen.width_um))
+    x, y, width = (
+        part.cpu().numpy()[lit] for part in (seen.x_um, seen.y_um, seen.width_um)
+    )
     out = np.zeros((len(depths_um), *lit.shape), np.complex64)
     for one, depth in zip(out, depths_um, strict=True):
         one[lit] = layers.shadow(tangents, depth, wavelength_um, (x, y), width)
@@ -101,25 +136,42 @@ def landing(
     depths_um: Tensor,
     wavelength_um: float,
 ) -> tuple[float, float]:
-    """(x, y) um beside a field point at which its light lands, mean over its rays and depths; (0, 0) without a stop.
+    """(x, y) um beside a field point at which its light lands, mean over its rays and
+    depths; (0, 0) without a stop.
 
-    A ray of direction p lands at -(1/k) ∂(phase)/∂p. A stop before a lens lets light from the side through one part of
+    A ray of direction p lands at -(1/k) ∂(phase)/∂p. A stop before a lens lets light
+    from the side through one part of
     it alone, by which it lands beside the ray through the middle.
 
     Args:
-        carrier_rad: phase of the lens at places (x, y). seen_from: the field point, and the media behind the lens.
+        carrier_rad: phase of the lens at places (x, y). seen_from: the field point, and
+            the media behind the lens.
     """
     if layers.stop is None:
         return 0.0, 0.0
     place, after = seen_from
-    step = 2 * float(media.direction(after, torch.tensor(radius, dtype=torch.float64))) / FEW
+    step = (
+        2
+        * float(media.direction(after, torch.tensor(radius, dtype=torch.float64)))
+        / FEW
+    )
     found = rays(after, radius, place, (FEW, step), torch.device("cpu"))
     tangents = place[0] / after.reduced_um, place[1] / after.reduced_um
-    own = carrier_rad(found.x_um, found.y_um) * (wavelength_um / (2 * math.pi)) + found.away_um
-    paths = own + source_paths(layers, torch.tensor(tangents), found, depths_um, wavelength_um).um
+    own = (
+        carrier_rad(found.x_um, found.y_um) * (wavelength_um / (2 * math.pi))
+        + found.away_um
+    )
+    paths = (
+        own
+        + source_paths(
+            layers, torch.tensor(tangents), found, depths_um, wavelength_um
+        ).um
+    )
     sums = torch.zeros(3, dtype=torch.float64)
     for depth, path in zip(depths_um.tolist(), paths, strict=True):
-        light = found.whole**2 * layers.lit(tangents, depth, wavelength_um, (found.x_um, found.y_um), found.width_um)
+        light = found.whole**2 * layers.lit(
+            tangents, depth, wavelength_um, (found.x_um, found.y_um), found.width_um
+        )
         y, x = torch.gradient(path, spacing=step)
         sums += torch.stack([-(light * x).sum(), -(light * y).sum(), light.sum()])
     x_um, y_um, given = sums.tolist()
@@ -129,39 +181,66 @@ def landing(
 def bending(after: Media, middle: Tensor) -> tuple[Tensor, Tensor]:
     """(j, a, b) ∂H/∂p_j and (i, j, a, b) ∂²H/∂p_i∂p_j at a direction, 1/um.
 
-    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of 1e-3, exact to 1e-5 of them.
+    H = ∂p/∂X is 1/reach' along the ray's plane and p/reach across it; differences of
+    1e-3, exact to 1e-5 of them.
     """
     step = 1e-3
     unit = torch.eye(2, dtype=middle.dtype, device=middle.device) * step
     ends = torch.stack([unit, -unit])  # (sign, axis, 2)
     ahead, behind = _turning(after, middle + ends)
-    both = _turning(after, middle + ends[:, :, None, None] + ends)  # (sign, i, sign, j, a, b)
+    both = _turning(
+        after, middle + ends[:, :, None, None] + ends
+    )  # (sign, i, sign, j, a, b)
     slopes = (both[:, :, 0] - both[:, :, 1]) / (2 * step)
     return (ahead - behind) / (2 * step), (slopes[0] - slopes[1]) / (2 * step)
 
 
 def _turning(after: Media, p: Tensor) -> Tensor:
-    """(…, 2, 2) H of directions (…, 2): how the direction towards a window turns as the window moves."""
+    """(…, 2, 2) H of directions (…, 2): how the direction towards a window turns as the
+    window moves.
+    """
     size = torch.hypot(p[..., 0], p[..., 1]).clamp_min(1e-9)
     reach, unit = media.reach(after, size), p / size[..., None]
-    along, across = (part[..., None, None] for part in (reach / (size * media.spread(after, size)), size / reach))
-    turning: Tensor = across * torch.eye(2).to(p) + (along - across) * unit[..., :, None] * unit[..., None, :]
+    along, across = (
+        part[..., None, None]
+        for part in (reach / (size * media.spread(after, size)), size / reach)
+    )
+    turning: Tensor = (
+        across * torch.eye(2).to(p)
+        + (along - across) * unit[..., :, None] * unit[..., None, :]
+    )
     return turning
 
 
-def source_paths(layers: Layers, tangents: Tensor, seen: Rays, depths_um: Tensor, wavelength_um: float) -> Paths:
+def source_paths(
+    layers: Layers,
+    tangents: Tensor,
+    seen: Rays,
+    depths_um: Tensor,
+    wavelength_um: float,
+) -> Paths:
     """Optical path from each source to the lens at (x, y), less the path to its middle.
 
-    More depths than ``VERGENCES`` are interpolated between that many Chebyshev points of 1/z: the path is smooth there
-    (singular only where a source touches the lens), and the points cost what the sources would.
+    More depths than ``VERGENCES`` are interpolated between that many Chebyshev points
+    of 1/z: the path is smooth there
+    (singular only where a source touches the lens), and the points cost what the
+    sources would.
     """
-    wave = wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None
-    return _source_paths(layers, tuple(tangents.tolist()), seen, tuple(depths_um.tolist()), wave)
+    wave = (
+        wavelength_um if any(film.thickness_um > 0 for film in layers.front) else None
+    )
+    return _source_paths(
+        layers, tuple(tangents.tolist()), seen, tuple(depths_um.tolist()), wave
+    )
 
 
 @functools.lru_cache(maxsize=KEPT)
 def _source_paths(
-    layers: Layers, tangents: tuple[float, float], seen: Rays, depths_um: tuple[float, ...], wavelength_um: float | None
+    layers: Layers,
+    tangents: tuple[float, float],
+    seen: Rays,
+    depths_um: tuple[float, ...],
+    wavelength_um: float | None,
 ) -> Paths:
     """As :func:`source_paths`; without films in front no wavelength is needed."""
     given = layers, tangents, seen
@@ -174,7 +253,9 @@ def _source_paths(
     nodes = (low + high) / 2 + (high - low) / 2 * unit
     value = np.polynomial.chebyshev.chebvander(unit, VERGENCES - 1)
     wanted = (2 * inverse - low - high) / (high - low)
-    mix = np.polynomial.chebyshev.chebvander(wanted, VERGENCES - 1) @ np.linalg.inv(value)
+    mix = np.polynomial.chebyshev.chebvander(wanted, VERGENCES - 1) @ np.linalg.inv(
+        value
+    )
     few = _each(*given, tuple((1 / nodes).tolist()), wavelength_um)
     return Paths(few, torch.from_numpy(mix).to(few))
 
@@ -186,7 +267,9 @@ def _each(
     depths_um: tuple[float, ...],
     wavelength_um: float | None,
 ) -> Tensor:
-    """(depths, *shape) paths in um, one depth after the other; beyond the rim, behind films, those of places at it."""
+    """(depths, *shape) paths in um, one depth after the other; beyond the rim, behind
+    films, those of places at it.
+    """
     x, y = seen.x_um, seen.y_um
     slope = math.hypot(*tangents)
     p = torch.tensor(slope / math.hypot(1, slope), dtype=torch.float64, device=x.device)
@@ -195,13 +278,21 @@ def _each(
         if math.isinf(depth):
             out.append((tangents[0] * x + tangents[1] * y) / math.hypot(1, slope))
             continue
-        before = Media((1.0,), (depth,)) if wavelength_um is None else layers.before(depth, wavelength_um)
+        before = (
+            Media((1.0,), (depth,))
+            if wavelength_um is None
+            else layers.before(depth, wavelength_um)
+        )
         back = float(media.reach(before, p)) / slope if slope > 0 else before.reduced_um
         sx, sy = -back * tangents[0], -back * tangents[1]
-        if len(before.layers) == 1:  # √(z² + ρ²) less the same at the middle, without cancellation
+        if (
+            len(before.layers) == 1
+        ):  # √(z² + ρ²) less the same at the middle, without cancellation
             extra = x * x + y * y - 2 * (x * sx + y * sy)
             chief = math.sqrt(depth**2 + sx**2 + sy**2)
-            out.append(before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief))
+            out.append(
+                before.layers[0][0] * extra / (torch.sqrt(chief**2 + extra) + chief)
+            )
         else:
             chief = float(media.chord(before, np.float64(math.hypot(sx, sy))))
             away2 = (x - sx) ** 2 + (y - sy) ** 2

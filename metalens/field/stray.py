@@ -1,11 +1,16 @@
-"""Light of other diffraction orders of the zones: each a blurred disc on the sensor, weak and wide.
+"""Light of other diffraction orders of the zones: each a blurred disc on the sensor,
+weak and wide.
 
-A ray that leaves the lens at r is turned by order m as a lens of m times the power would: on the sensor it lands at
-r (1 + d/z - m (1 + d/s)) from its chief ray (source depth z, focus s, sensor distance d, each reduced: Σ t/n of the
+A ray that leaves the lens at r is turned by order m as a lens of m times the power
+would: on the sensor it lands at
+r (1 + d/z - m (1 + d/s)) from its chief ray (source depth z, focus s, sensor distance
+d, each reduced: Σ t/n of the
 media on the way). Order 1 is the image.
 
-Behind a stop a source lights a part of the lens about c, which moves with its direction: the disc is as large as that
-part, lies about c times the same factor, and is dim where the lens takes in little of what the stop lets through.
+Behind a stop a source lights a part of the lens about c, which moves with its
+direction: the disc is as large as that
+part, lies about c times the same factor, and is dim where the lens takes in little of
+what the stop lets through.
 """
 
 import math
@@ -28,7 +33,8 @@ PLACES = 64  # of the lens along an axis, of which each is lit or dark there
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Disc:
-    """Discs about places of the frame: their transfer, and matrices (rows, columns) that put light at those places;
+    """Discs about places of the frame: their transfer, and matrices (rows, columns)
+    that put light at those places;
     None where they lie about the sources' own."""
 
     transfer: Tensor
@@ -44,15 +50,21 @@ class Disc:
 
     def to(self, device: torch.device | str) -> "Disc":
         """The same on a device."""
-        places = None if self.places is None else (self.places[0].to(device), self.places[1].to(device))
+        places = (
+            None
+            if self.places is None
+            else (self.places[0].to(device), self.places[1].to(device))
+        )
         return Disc(self.transfer.to(device), places)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stray:
-    """shares: of the light on the aperture in each order. discs: weighted by them; shape of their transforms.
+    """shares: of the light on the aperture in each order. discs: weighted by them;
+    shape of their transforms.
 
-    illumination: (y, x) of the frame, cos⁴ of the field angle, times what the lens takes in of the light of the stop.
+    illumination: (y, x) of the frame, cos⁴ of the field angle, times what the lens
+    takes in of the light of the stop.
     """
 
     shares: dict[int, float]
@@ -68,7 +80,8 @@ class Stray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Lit:
-    """The part of the lens that sources light: its radius; its middle (rows, columns), um, for every row and column of
+    """The part of the lens that sources light: its radius; its middle (rows, columns),
+    um, for every row and column of
     the frame, None where that is the lens's; illumination as in :class:`Stray`."""
 
     radius_um: float
@@ -76,8 +89,12 @@ class _Lit:
     illumination: Tensor
 
 
-def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]) -> Stray | None:
-    """Discs of the orders beside the image; None for a smooth phase, which has one order alone."""
+def stray_of(
+    optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]
+) -> Stray | None:
+    """Discs of the orders beside the image; None for a smooth phase, which has one
+    order alone.
+    """
     wave = optics.wave
     if not isinstance(wave, PillarWave):
         return None
@@ -85,7 +102,10 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
     d = optics.layers.after(optics.distance_um, focus.wavelength_um).reduced_um
     depth, source = (_reduced(optics, z) for z in (depth_um, focus.source_distance_um))
     shares = wave.orders(focus.wavelength_um, ORDERS)
-    shape = (scipy.fft.next_fast_len(2 * frame[0], real=True), scipy.fft.next_fast_len(2 * frame[1], real=True))
+    shape = (
+        scipy.fft.next_fast_len(2 * frame[0], real=True),
+        scipy.fft.next_fast_len(2 * frame[1], real=True),
+    )
     if optics.layers.stop is None:
         lit = _all(wave.radius_um, grid, d, middle_um)
     else:
@@ -94,62 +114,97 @@ def stray_of(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float
     for m, share in shares.items():
         lands = 1 + d / depth - m * (1 + d / source)
         radius = max(lit.radius_um * abs(lands), grid.step_um)
-        transfer = torch.fft.rfft2(torch.from_numpy(share * _disc(radius, grid.step_um, shape)).float())
+        transfer = torch.fft.rfft2(
+            torch.from_numpy(share * _disc(radius, grid.step_um, shape)).float()
+        )
         if lit.aside_um is None:
             discs.append(Disc(transfer))
         else:
             down, across = lit.aside_um
             to_step = lands / grid.step_um
-            discs.append(Disc(transfer, (_moved(down * to_step), _moved(across * to_step))))
+            discs.append(
+                Disc(transfer, (_moved(down * to_step), _moved(across * to_step)))
+            )
     if lit.aside_um is None:
         discs = [Disc(torch.stack([disc.transfer for disc in discs]).sum(0))]
     return Stray(shares, discs, shape, lit.illumination)
 
 
 def _disc(radius_um: float, step_um: float, shape: tuple[int, int]) -> Array:
-    """(y, x) light of sum 1 (at radii above a step) on samples about the first, which wraps."""
+    """(y, x) light of sum 1 (at radii above a step) on samples about the first, which
+    wraps.
+    """
     y, x = (np.fft.fftfreq(n) * n * step_um for n in shape)
     inside = np.clip((radius_um - np.hypot(y[:, None], x)) / step_um + 0.5, 0, 1)
     return np.asarray(inside * step_um**2 / (math.pi * radius_um**2))
 
 
 def _moved(samples: Array) -> Tensor:
-    """(n, n) matrix that puts light of each sample so many samples on, shared by the two next to there."""
+    """(n, n) matrix that puts light of each sample so many samples on, shared by the
+    two next to there.
+    """
     place = np.arange(len(samples))
-    return torch.from_numpy(np.clip(1 - np.abs(place[:, None] - (place + samples)), 0, 1)).float()
+    return torch.from_numpy(
+        np.clip(1 - np.abs(place[:, None] - (place + samples)), 0, 1)
+    ).float()
 
 
-def _all(radius_um: float, grid: Grid, reduced_um: float, middle_um: tuple[float, float]) -> _Lit:
+def _all(
+    radius_um: float, grid: Grid, reduced_um: float, middle_um: tuple[float, float]
+) -> _Lit:
     """Of a lens without a stop."""
     rows, columns = ((np.arange(n) - (n - 1) / 2) * grid.step_um for n in grid.frame)
-    tangent2 = ((rows[:, None] + middle_um[1]) ** 2 + (columns + middle_um[0]) ** 2) / reduced_um**2
+    tangent2 = (
+        (rows[:, None] + middle_um[1]) ** 2 + (columns + middle_um[0]) ** 2
+    ) / reduced_um**2
     return _Lit(radius_um, None, torch.from_numpy(1 / (1 + tangent2) ** 2).float())
 
 
-def _behind_stop(optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]) -> _Lit:
-    """What rays of some directions light of a lens behind a stop, and for all of them between those."""
+def _behind_stop(
+    optics: Optics, grid: Grid, depth_um: float, middle_um: tuple[float, float]
+) -> _Lit:
+    """What rays of some directions light of a lens behind a stop, and for all of them
+    between those.
+    """
     layers, wave = optics.layers, optics.wave
     colour = wave.focus.wavelength_um  # type: ignore[attr-defined]
     reduced = layers.after(optics.distance_um, colour).reduced_um
-    ends = [(m + np.linspace(-h, h, NODES)) / reduced for m, h in zip(middle_um[::-1], grid.half_um, strict=True)]
+    ends = [
+        (m + np.linspace(-h, h, NODES)) / reduced
+        for m, h in zip(middle_um[::-1], grid.half_um, strict=True)
+    ]
     tangents = np.stack(np.meshgrid(*ends[::-1]), -1)
     place = (np.arange(PLACES) - (PLACES - 1) / 2) * (2 * wave.radius_um / PLACES)
     x, y = np.meshgrid(place, place)
     there = np.hypot(x, y) <= wave.radius_um
     cell = float(place[1] - place[0])
-    shown = [layers.lit((a, b), depth_um, colour, (x, y), cell) * there for a, b in tangents.reshape(-1, 2).tolist()]
+    shown = [
+        layers.lit((a, b), depth_um, colour, (x, y), cell) * there
+        for a, b in tangents.reshape(-1, 2).tolist()
+    ]
     light = np.stack(shown).reshape(NODES, NODES, -1)
     area = light.sum(-1) * cell**2
     row, column = light[:, NODES // 2], light[NODES // 2]
-    aside = _between(_middle(row, y), grid.frame[0]), _between(_middle(column, x), grid.frame[1])
-    cosine4 = 1 / (1 + (layers.through_middle(tangents, depth_um, colour) ** 2).sum(-1)) ** 2
-    taken = torch.from_numpy(cosine4 * area / (math.pi * layers.footprint_um(depth_um, colour) ** 2))
-    whole = torch.nn.functional.interpolate(taken[None, None], size=grid.frame, mode="bilinear", align_corners=True)
+    aside = (
+        _between(_middle(row, y), grid.frame[0]),
+        _between(_middle(column, x), grid.frame[1]),
+    )
+    cosine4 = (
+        1 / (1 + (layers.through_middle(tangents, depth_um, colour) ** 2).sum(-1)) ** 2
+    )
+    taken = torch.from_numpy(
+        cosine4 * area / (math.pi * layers.footprint_um(depth_um, colour) ** 2)
+    )
+    whole = torch.nn.functional.interpolate(
+        taken[None, None], size=grid.frame, mode="bilinear", align_corners=True
+    )
     return _Lit(math.sqrt(area.max() / math.pi), aside, whole[0, 0].float())
 
 
 def _middle(light: Array, place_um: Array) -> Array:
-    """(n,) middle of the light (n, places) of n directions; of dark ones that of the next that are lit."""
+    """(n,) middle of the light (n, places) of n directions; of dark ones that of the
+    next that are lit.
+    """
     given = light.sum(-1)
     lit = given > 0
     if not lit.any():
@@ -160,7 +215,11 @@ def _middle(light: Array, place_um: Array) -> Array:
 
 def _between(values: Array, count: int) -> Array:
     """(count,) values between those of directions at equal steps."""
-    return np.asarray(np.interp(np.linspace(0, len(values) - 1, count), np.arange(len(values)), values))
+    return np.asarray(
+        np.interp(
+            np.linspace(0, len(values) - 1, count), np.arange(len(values)), values
+        )
+    )
 
 
 def _reduced(optics: Optics, depth_um: float) -> float:
@@ -171,9 +230,13 @@ def _reduced(optics: Optics, depth_um: float) -> float:
 
 
 def add_stray(image: Tensor, light: Tensor, stray: Stray, grid: Grid) -> Tensor:
-    """The image with the discs of all sources added; ``light`` (frames, y, x) of all sheets."""
+    """The image with the discs of all sources added; ``light`` (frames, y, x) of all
+    sheets.
+    """
     light = light * stray.illumination.to(light)
-    spectrum = torch.stack([disc.spectrum(light, stray.shape) for disc in stray.discs]).sum(0)
+    spectrum = torch.stack(
+        [disc.spectrum(light, stray.shape) for disc in stray.discs]
+    ).sum(0)
     edge = grid.margin + grid.spare
     rows, columns = (slice(edge, edge + n) for n in grid.samples)
     haze: Tensor = torch.fft.irfft2(spectrum, s=stray.shape)[..., rows, columns]

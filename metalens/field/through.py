@@ -1,4 +1,6 @@
-"""Light of a field point that goes through a lens, wherever it then lands: what the light in a window is a share of."""
+"""Light of a field point that goes through a lens, wherever it then lands: what the
+light in a window is a share of.
+"""
 
 import math
 
@@ -10,12 +12,22 @@ from metalens.field.rays import Rays
 from metalens.field.waves import PillarWave
 
 
-def through(optics: Optics, at_um: Tensor, *, depths_um: Tensor, wavelength_um: float, window: Window) -> Tensor:
-    """(points, depths) light through stop, lens and faces behind it, over that on the aperture as
-    :func:`metalens.field.points.psfs` counts it: σ = Σ S |T|² spread / Σ spread on the nodes, S 1 for rays that pass
+def through(
+    optics: Optics,
+    at_um: Tensor,
+    *,
+    depths_um: Tensor,
+    wavelength_um: float,
+    window: Window,
+) -> Tensor:
+    """(points, depths) light through stop, lens and faces behind it, over that on the
+    aperture as
+    :func:`metalens.field.points.psfs` counts it: σ = Σ S |T|² spread / Σ spread on the
+    nodes, S 1 for rays that pass
     the stop.
 
-    Of pillars |T|² is the mean of all of them: what single ones scatter is in it, whether it lands in a window or not.
+    Of pillars |T|² is the mean of all of them: what single ones scatter is in it,
+    whether it lands in a window or not.
     """
     grid, wave = sampling(optics, window, wavelength_um), optics.wave
     reduced, out = optics.layers.after(optics.distance_um, wavelength_um).reduced_um, []
@@ -24,18 +36,35 @@ def through(optics: Optics, at_um: Tensor, *, depths_um: Tensor, wavelength_um: 
             rays, pupil = seen(optics, place, grid, wavelength_um)
             tangents = place / reduced
             tilt = math.atan(math.hypot(*tangents.tolist()))
-            light = (pupil.weight * rays.passed * rays.width_um / grid.step).expand(len(depths_um), -1, -1)
+            light = (pupil.weight * rays.passed * rays.width_um / grid.step).expand(
+                len(depths_um), -1, -1
+            )
             if isinstance(wave, PillarWave):
                 light = light * wave.transmittance(wavelength_um, tilt)
-            elif (factor := wave.factor(rays.x_um, rays.y_um, wavelength_um, tilt)) is not None:
+            elif (
+                factor := wave.factor(rays.x_um, rays.y_um, wavelength_um, tilt)
+            ) is not None:
                 light = light * factor.abs() ** 2
-            out.append((light * _passed(optics, tangents, rays, depths_um, wavelength_um)).sum((-1, -2)) / pupil.given)
+            out.append(
+                (light * _passed(optics, tangents, rays, depths_um, wavelength_um)).sum(
+                    (-1, -2)
+                )
+                / pupil.given
+            )
     return torch.stack(out)
 
 
-def _passed(optics: Optics, tangents: Tensor, found: Rays, depths_um: Tensor, wavelength_um: float) -> Tensor | float:
-    """(depths, nodes, nodes) of rays that pass the stop, over its light's share of the whole lens on the axis; 1
-    without one. Of rays, since what a node's mean of the edge's waves lacks goes through all the same."""
+def _passed(
+    optics: Optics,
+    tangents: Tensor,
+    found: Rays,
+    depths_um: Tensor,
+    wavelength_um: float,
+) -> Tensor | float:
+    """(depths, nodes, nodes) of rays that pass the stop, over its light's share of the
+    whole lens on the axis; 1
+    without one. Of rays, since what a node's mean of the edge's waves lacks goes
+    through all the same."""
     layers, radius = optics.layers, optics.wave.radius_um
     if layers.stop is None:
         return 1.0

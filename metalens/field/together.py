@@ -1,7 +1,10 @@
-"""Frames through many patches at once: what ``forming`` does patch by patch, for devices that each call costs dear.
+"""Frames through many patches at once: what ``forming`` does patch by patch, for
+devices that each call costs dear.
 
-A GPU is done with a patch of a few frames before it is told of the next. Patches of one size are therefore stacked,
-kernels that some of them lack being zeros, and go through every transform together, as many as the memory affords.
+A GPU is done with a patch of a few frames before it is told of the next. Patches of one
+size are therefore stacked,
+kernels that some of them lack being zeros, and go through every transform together, as
+many as the memory affords.
 """
 
 from collections import defaultdict
@@ -23,16 +26,21 @@ def through(
     out: Tensor,
     held_bytes: int = BYTES,
 ) -> None:
-    """Add the light (and coverage, where ``out`` has two kinds) of frames through every patch; differentiable.
+    """Add the light (and coverage, where ``out`` has two kinds) of frames through every
+    patch; differentiable.
 
     Args:
-        given: (frames, sheets, y, x) light, coverage, and depth in units of the depth nodes.
+        given: (frames, sheets, y, x) light, coverage, and depth in units of the depth
+            nodes.
         transfer: of each patch, (rank, Y, X // 2 + 1), with its (Y, X) in ``shapes``.
-        out: (frames, kinds, sheets, y, x), half a window larger at each side than the frames.
+        out: (frames, kinds, sheets, y, x), half a window larger at each side than the
+            frames.
         held_bytes: of spectra at once.
     """
     beyond = out.shape[-1] - given[0].shape[-1]
-    each = 8 * given[0].shape[0] * given[0].shape[1]  # bytes of a spectrum of all sheets, a point
+    each = (
+        8 * given[0].shape[0] * given[0].shape[1]
+    )  # bytes of a spectrum of all sheets, a point
     for some in _alike(patches, transfer, held_bytes // each):
         few = [patches[i] for i in some]
         kernels, shape = _stacked([transfer[i] for i in some]), shapes[some[0]]
@@ -47,13 +55,21 @@ def through(
                 place += one
 
 
-def _alike(patches: list[Patch], transfer: list[Tensor], points: int) -> Iterator[list[int]]:
-    """Numbers of patches of one size, as many together as have so many points of transforms, or one."""
+def _alike(
+    patches: list[Patch], transfer: list[Tensor], points: int
+) -> Iterator[list[int]]:
+    """Numbers of patches of one size, as many together as have so many points of
+    transforms, or one.
+    """
     sizes = defaultdict(list)
     for i, patch in enumerate(patches):
-        sizes[patch.rows[1] - patch.rows[0], patch.columns[1] - patch.columns[0]].append(i)
+        sizes[
+            patch.rows[1] - patch.rows[0], patch.columns[1] - patch.columns[0]
+        ].append(i)
     for same in sizes.values():
-        same.sort(key=lambda i: len(transfer[i]))  # kernels that are zeros cost as much as others
+        same.sort(
+            key=lambda i: len(transfer[i])
+        )  # kernels that are zeros cost as much as others
         count = max(1, points // max(transfer[i].numel() for i in same))
         yield from (same[k : k + count] for k in range(0, len(same), count))
 
@@ -65,10 +81,17 @@ def _stacked(parts: list[Tensor]) -> Tensor:
     return torch.stack([torch.cat(pair) for pair in zip(parts, spare, strict=True)])
 
 
-def _sources(few: list[Patch], given: tuple[Tensor, Tensor, Tensor], kinds: int) -> list[Tensor]:
-    """(patches, kernels, frames, sheets, y, x) light, and with two kinds coverage, weighted for their kernels."""
+def _sources(
+    few: list[Patch], given: tuple[Tensor, Tensor, Tensor], kinds: int
+) -> list[Tensor]:
+    """(patches, kernels, frames, sheets, y, x) light, and with two kinds coverage,
+    weighted for their kernels.
+    """
     light, cover, place = (
-        torch.stack([part[..., slice(*patch.rows), slice(*patch.columns)] for patch in few]) for part in given
+        torch.stack(
+            [part[..., slice(*patch.rows), slice(*patch.columns)] for patch in few]
+        )
+        for part in given
     )
     weights, level = _at_depth(few, place)
     out = [weights * (light * level)[:, None]]
@@ -84,13 +107,17 @@ def _covering(few: list[Patch], weights: Tensor) -> Tensor:
 
 
 def _at_depth(few: list[Patch], place: Tensor) -> tuple[Tensor, Tensor]:
-    """As ``forming.at_depth``: (patches, kernels, …) weights and (patches, …) E of sources at (patches, …) depths."""
+    """As ``forming.at_depth``: (patches, kernels, …) weights and (patches, …) E of
+    sources at (patches, …) depths.
+    """
     pixels, depths = few[0].energy.shape
     first, taps = lagrange(place, depths)
     pixel = torch.arange(pixels, device=place.device).reshape(place.shape[-2:])
     number = torch.arange(len(few), device=place.device).reshape(-1, 1, 1, 1, 1)
     index = (number * pixels + pixel) * depths + first
-    kernels = _stacked([patch.weights.permute(2, 0, 1) for patch in few])  # (patches, kernels, pixels, depths)
+    kernels = _stacked(
+        [patch.weights.permute(2, 0, 1) for patch in few]
+    )  # (patches, kernels, pixels, depths)
     table = kernels.to(place).movedim(1, 0).flatten(1)
     level = torch.stack([patch.energy for patch in few]).to(place).flatten()
     weights, light = taps[..., 0] * table[:, index], taps[..., 0] * level[index]

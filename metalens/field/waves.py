@@ -1,7 +1,10 @@
-"""What a lens does to light, as the pupil of a field point sees it: a known carrier and a slowly varying factor.
+"""What a lens does to light, as the pupil of a field point sees it: a known carrier and
+a slowly varying factor.
 
-The focusing phase runs through thousands of radians; it is formed in float64 at every ray and joined with the paths
-before anything is rounded. What is left (polynomials of a design, pillars less the ideal phase) fits single precision.
+The focusing phase runs through thousands of radians; it is formed in float64 at every
+ray and joined with the paths
+before anything is rounded. What is left (polynomials of a design, pillars less the
+ideal phase) fits single precision.
 """
 
 import functools
@@ -20,8 +23,11 @@ from metalens.ground.errors import SceneError
 from metalens.lens import Layers, Lens, Media, answers, media, smooth
 from metalens.psf import among
 
-CELL_UM = 2.5  # over which pillars are averaged at most: below a zone of the lens, far above the pitch
-CELLS = 3  # in λ z / window: mean and interpolation leave light at a window's rim sinc³(1/6) = 0.87 of its amplitude
+# over which pillars are averaged at most: below a zone of the lens, far above the pitch
+CELL_UM = 2.5
+# in λ z / window: mean and interpolation leave light at a window's rim sinc³(1/6) =
+# 0.87 of its amplitude
+CELLS = 3
 LOBES = 2.0  # of the mean of cells over the nodes that read them, in widths of a node
 
 
@@ -35,27 +41,34 @@ class Wave(Protocol):
     def carrier_rad(self, x_um: Tensor, y_um: Tensor) -> Tensor:
         """Phase in float64 that is known beforehand and carries no gradient."""
 
-    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+    def factor(
+        self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
+    ) -> Tensor | None:
         """Complex transmission less the carrier, differentiable; None where it is 1."""
 
 
 @runtime_checkable
 class Pillars(Protocol):
-    """A lens plane whose factor is gathered from pillars, which can be asked one by one."""
+    """A lens plane whose factor is gathered from pillars, which can be asked one by
+    one.
+    """
 
     @property
     def pitch_um(self) -> float:
         """Of their square lattice."""
 
     def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none, as the factor takes them."""
+        """(y, x) complex t of every pillar, 0 where there is none, as the factor takes
+        them.
+        """
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SmoothWave:
     """A hyperbolic focus and an added phase, the same at all wavelengths and angles.
 
-    added_rad: (x_um, y_um) to the added phase in rad, float64, differentiable; None for none.
+    added_rad: (x_um, y_um) to the added phase in rad, float64, differentiable; None for
+    none.
     """
 
     focus: Focus
@@ -66,7 +79,9 @@ class SmoothWave:
         """The hyperbolic phase of the focus."""
         return focusing(self.focus, x_um, y_um)
 
-    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
+    def factor(
+        self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
+    ) -> Tensor | None:
         """exp(i added)."""
         if self.added_rad is None:
             return None
@@ -77,21 +92,28 @@ class SmoothWave:
 
 
 class PillarWave:
-    """The pillars of a lens through its proxy: mean of t exp(-i carrier) over cells of a few micrometres.
+    """The pillars of a lens through its proxy: mean of t exp(-i carrier) over cells of
+    a few micrometres.
 
-    diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are differentiable in. cell_um: width of
+    diameter_um: in place of those of the lens, (y, x), a tensor that the PSFs are
+    differentiable in. cell_um: width of
     the cells, a whole number of pitches, one at least.
 
-    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`, the mean of both polarisations).
-    Light that single pillars scatter out of their cell's mean is lost to the image; what of it lands in the window is
+    Unlike neighbours count where the lens holds their rows (:mod:`metalens.psf.among`,
+    the mean of both polarisations).
+    Light that single pillars scatter out of their cell's mean is lost to the image;
+    what of it lands in the window is
     measured by :mod:`metalens.field.left_out`.
 
     Raises:
-        SceneError: another lattice than a square one, turned pillars, those of two sizes, or such that answer x and y
+        SceneError: another lattice than a square one, turned pillars, those of two
+            sizes, or such that answer x and y
             apart.
     """
 
-    def __init__(self, lens: Lens, *, diameter_um: Tensor | None = None, cell_um: float = CELL_UM) -> None:
+    def __init__(
+        self, lens: Lens, *, diameter_um: Tensor | None = None, cell_um: float = CELL_UM
+    ) -> None:
         if lens.pairs is not None:
             raise SceneError(
                 "pillars of two sizes answer x and y apart: the image of the whole field is of unpolarised light and "
@@ -109,10 +131,19 @@ class PillarWave:
                 "alone: the image is of unpolarised light (metalens psf says of which light it is)"
             )
         self.lens = lens
-        self.focus = Focus(lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um, lens.layers)
+        self.focus = Focus(
+            lens.wavelength_um,
+            lens.sensor_distance_um,
+            lens.source_distance_um,
+            lens.layers,
+        )
         d = lens.diameters
         self.radius_um = d.radius_um + d.pitch_um / 2
-        self.diameter_um = torch.as_tensor(np.ascontiguousarray(d.diameter_um)) if diameter_um is None else diameter_um
+        self.diameter_um = (
+            torch.as_tensor(np.ascontiguousarray(d.diameter_um))
+            if diameter_um is None
+            else diameter_um
+        )
         self._block = max(1, round(cell_um / d.pitch_um))
         self._cells: dict[tuple[float, float], Tensor] = {}
 
@@ -120,8 +151,12 @@ class PillarWave:
         """The hyperbolic phase that the design aims at."""
         return focusing(self.focus, x_um, y_um)
 
-    def factor(self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float) -> Tensor | None:
-        """Cells interpolated to the rays; the pillars answer at the angle of the light where the library has angles."""
+    def factor(
+        self, x_um: Tensor, y_um: Tensor, wavelength_um: float, angle_rad: float
+    ) -> Tensor | None:
+        """Cells interpolated to the rays; the pillars answer at the angle of the light
+        where the library has angles.
+        """
         tilt = angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
         key = (wavelength_um, tilt)
         cells = self._cells.get(key)
@@ -130,15 +165,32 @@ class PillarWave:
             if not cells.requires_grad:
                 self._cells = {**dict(list(self._cells.items())[-15:]), key: cells}
         pitch = self.lens.diameters.pitch_um
-        if cells.requires_grad:  # nodes read some of the cells; how the light changes, their means over a node tell
-            near = _over(cells, float(x_um.max() - x_um.min()) / (x_um.shape[-1] - 1) / (self._block * pitch))
+        # nodes read some of the cells; how the light changes, their means over a node
+        # tell
+        if cells.requires_grad:
+            near = _over(
+                cells,
+                float(x_um.max() - x_um.min())
+                / (x_um.shape[-1] - 1)
+                / (self._block * pitch),
+            )
             cells = near + (cells - near).detach()
         half = [n * self._block * pitch / 2 for n in cells.shape[-2:]]
-        # the cells are half a pitch past the lens's middle where one row or column more is added behind it
-        past = [(n - own) % 2 * pitch / 2 for n, own in zip(self._padded, self.diameter_um.shape, strict=True)]
-        place = torch.stack([(x_um - past[1]) / half[1], (y_um - past[0]) / half[0]], -1).to(cells)
+        # the cells are half a pitch past the lens's middle where one row or column more
+        # is added behind it
+        past = [
+            (n - own) % 2 * pitch / 2
+            for n, own in zip(self._padded, self.diameter_um.shape, strict=True)
+        ]
+        place = torch.stack(
+            [(x_um - past[1]) / half[1], (y_um - past[0]) / half[0]], -1
+        ).to(cells)
         found = torch.nn.functional.grid_sample(
-            cells[None], place.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="border", align_corners=False
+            cells[None],
+            place.reshape(1, 1, -1, 2),
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=False,
         )
         return torch.complex(*found.reshape(2, *x_um.shape).unbind(0))
 
@@ -154,13 +206,21 @@ class PillarWave:
         return y, x
 
     def answer(self, wavelength_um: float, angle_rad: float) -> Tensor:
-        """(y, x) complex t of every pillar, 0 where there is none, with the factor of its neighbours; as
+        """(y, x) complex t of every pillar, 0 where there is none, with the factor of
+        its neighbours; as
         :meth:`factor` asks for them."""
-        return self._among(self._pillars(wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0)[0])
+        return self._among(
+            self._pillars(
+                wavelength_um, angle_rad if self.lens.proxy.max_angle_rad > 0 else 0.0
+            )[0]
+        )
 
     def transmittance(self, wavelength_um: float, angle_rad: float) -> float:
         """Mean |t|² of the pillars."""
-        return float((self.answer(wavelength_um, angle_rad).abs() ** 2).sum() / (self.diameter_um > 0).sum())
+        return float(
+            (self.answer(wavelength_um, angle_rad).abs() ** 2).sum()
+            / (self.diameter_um > 0).sum()
+        )
 
     def _among(self, t: Tensor) -> Tensor:
         """With the factor of unlike neighbours where the lens holds their rows."""
@@ -169,39 +229,65 @@ class PillarWave:
         return t * among.mean(t, self.lens.neighbours, self.lens.diameters.pitch_um)
 
     def orders(self, wavelength_um: float, orders: tuple[int, ...]) -> dict[int, float]:
-        """Share of the light on the aperture that leaves in each diffraction order of the zones: 1 focuses."""
+        """Share of the light on the aperture that leaves in each diffraction order of
+        the zones: 1 focuses.
+        """
         t, ideal, open_ = self._pillars(wavelength_um, 0.0)
-        return {m: float((t * torch.polar(open_, -m * ideal)).sum().abs() / open_.sum()) ** 2 for m in orders}
+        return {
+            m: float((t * torch.polar(open_, -m * ideal)).sum().abs() / open_.sum())
+            ** 2
+            for m in orders
+        }
 
     @functools.cached_property
     def _ideal(self) -> Tensor:
         """(y, x) carrier of every pillar, whole turns off, in single precision."""
         d, device = self.lens.diameters, self.diameter_um.device
         x, y = (torch.as_tensor(a, device=device) for a in (d.x_um, d.y_um))
-        return torch.remainder(self.carrier_rad(x, y[:, None]), 2 * math.pi).to(torch.float32)
+        return torch.remainder(self.carrier_rad(x, y[:, None]), 2 * math.pi).to(
+            torch.float32
+        )
 
-    def _pillars(self, wavelength_um: float, tilt: float) -> tuple[Tensor, Tensor, Tensor]:
-        """(complex t, carrier, 1 where a pillar stands) of every pillar, in single precision."""
+    def _pillars(
+        self, wavelength_um: float, tilt: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(complex t, carrier, 1 where a pillar stands) of every pillar, in single
+        precision.
+        """
         d, proxy = self.diameter_um, self.lens.proxy
         open_ = (d > 0).to(torch.float32)
         if compiled.values(d):
             phases, levels = torch.empty(2, *d.shape)
-            answers.put_all(proxy, d.detach().numpy(), (wavelength_um, tilt), phases.numpy(), levels.numpy())
+            answers.put_all(
+                proxy,
+                d.detach().numpy(),
+                (wavelength_um, tilt),
+                phases.numpy(),
+                levels.numpy(),
+            )
             return torch.polar(levels, phases), self._ideal, open_
         inside = torch.where(d > 0, d, torch.full_like(d, proxy.domain_um[0]))
         phase: Any = proxy.phase_rad(inside, wavelength_um, tilt)
         level: Any = proxy.transmission(inside, wavelength_um, tilt)
-        return torch.polar(level.to(torch.float32) * open_, phase.to(torch.float32)), self._ideal, open_
+        return (
+            torch.polar(level.to(torch.float32) * open_, phase.to(torch.float32)),
+            self._ideal,
+            open_,
+        )
 
     def _gathered(self, wavelength_um: float, tilt: float) -> Tensor:
-        """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty cells as their neighbours."""
+        """(2, cells y, cells x) real and imaginary part of the mean of each cell; empty
+        cells as their neighbours.
+        """
         d = self.diameter_um
         spare = [padded - n for padded, n in zip(self._padded, d.shape, strict=True)]
         if self.lens.neighbours is None and compiled.values(d):
             sizes, at = d.detach().numpy(), (wavelength_um, tilt)
             block = self._block, spare[0] // 2, spare[1] // 2
             known = answers.polynomials(self.lens.proxy, sizes, at)
-            mean = torch.from_numpy(compiled.cells(sizes, self._ideal.numpy(), known, block))
+            mean = torch.from_numpy(
+                compiled.cells(sizes, self._ideal.numpy(), known, block)
+            )
         else:
             mean = self._means(wavelength_um, tilt, spare)
         near = torch.nn.functional.avg_pool2d(mean[None], 3, stride=1, padding=1)[0]
@@ -209,20 +295,36 @@ class PillarWave:
         return filled / torch.where(mean[2] > 0, mean[2], near[2]).clamp_min(1e-12)
 
     def _means(self, wavelength_um: float, tilt: float, spare: list[int]) -> Tensor:
-        """As :func:`metalens.field.compiled.cells`, with derivatives and the factor of neighbours."""
+        """As :func:`metalens.field.compiled.cells`, with derivatives and the factor of
+        neighbours.
+        """
         t, ideal, open_ = self._pillars(wavelength_um, tilt)
-        rest = torch.view_as_real(self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)).permute(2, 0, 1)
+        rest = torch.view_as_real(
+            self._among(t) * torch.polar(torch.ones_like(ideal), -ideal)
+        ).permute(2, 0, 1)
         layers = torch.cat([rest, open_[None]])
-        pad = (spare[1] // 2, spare[1] - spare[1] // 2, spare[0] // 2, spare[0] - spare[0] // 2)
-        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layers, pad)[None], self._block)[0]
+        pad = (
+            spare[1] // 2,
+            spare[1] - spare[1] // 2,
+            spare[0] // 2,
+            spare[0] - spare[0] // 2,
+        )
+        return torch.nn.functional.avg_pool2d(
+            torch.nn.functional.pad(layers, pad)[None], self._block
+        )[0]
 
 
 def _over(cells: Tensor, width: float) -> Tensor:
-    """(2, y, x) mean about each of the cells that hold pillars, of waves longer than twice so many cells (Lanczos)."""
+    """(2, y, x) mean about each of the cells that hold pillars, of waves longer than
+    twice so many cells (Lanczos).
+    """
     if width <= 1:
         return cells
     reach = math.ceil(LOBES * width) - 1
-    away = torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64) / width
+    away = (
+        torch.arange(-reach, reach + 1, device=cells.device, dtype=torch.float64)
+        / width
+    )
     row = (torch.sinc(away) * torch.sinc(away / LOBES) / width).to(cells)
     there = (cells.detach() != 0).any(0, keepdim=True).to(cells)
     both = torch.cat([cells, there])[:, None]
@@ -233,9 +335,11 @@ def _over(cells: Tensor, width: float) -> Tensor:
 
 
 def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
-    """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d (paper Eq. 1, exp(-iωt)).
+    """-k (√(r²+d²) - d + √(r²+s²) - s): source distance s imaged onto sensor distance d
+    (paper Eq. 1, exp(-iωt)).
 
-    Through the films of the focus the paths are those of :meth:`metalens.design.Focus.path_um`.
+    Through the films of the focus the paths are those of
+    :meth:`metalens.design.Focus.path_um`.
     """
     r2 = x_um * x_um + y_um * y_um
     d, s, films = focus.sensor_distance_um, focus.source_distance_um, focus.layers
@@ -248,24 +352,42 @@ def focusing(focus: Focus, x_um: Tensor, y_um: Tensor) -> Tensor:
 def _longer(between: Media, r2: Tensor) -> Tensor:
     """Optical path of the ray of squared reach r² less that along the normal, um."""
     if len(between.layers) > 1:
-        extra: Tensor = smooth.over(lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2)
+        extra: Tensor = smooth.over(
+            lambda u: media.longer(between.layers, 0.0, 0.0, u)[1], r2
+        )
         return extra
     n, d = between.layers[0]
     return n * r2 / (torch.sqrt(r2 + d * d) + d)
 
 
-def cell_um(layers: Layers, wavelength_um: float, window_um: float, distance_um: float) -> float:
-    """Width of the cells that leave a window of this width, so far behind the lens, what pillars scatter into it."""
-    node_um = wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
+def cell_um(
+    layers: Layers, wavelength_um: float, window_um: float, distance_um: float
+) -> float:
+    """Width of the cells that leave a window of this width, so far behind the lens,
+    what pillars scatter into it.
+    """
+    node_um = (
+        wavelength_um * layers.after(distance_um, wavelength_um).reduced_um / window_um
+    )
     return min(CELL_UM, node_um / CELLS)
 
 
-def wave_of(lens: Lens | Wave, layers: Layers, window_um: float, distance_um: float | None = None) -> Wave:
-    """The lens plane of a lens file, in cells that leave a window of this width what pillars scatter into it; or the
+def wave_of(
+    lens: Lens | Wave,
+    layers: Layers,
+    window_um: float,
+    distance_um: float | None = None,
+) -> Wave:
+    """The lens plane of a lens file, in cells that leave a window of this width what
+    pillars scatter into it; or the
     one that was given."""
     if isinstance(lens, Lens):
         distance = lens.sensor_distance_um if distance_um is None else distance_um
-        return PillarWave(lens, cell_um=cell_um(layers, lens.wavelength_um, window_um, distance))
+        return PillarWave(
+            lens, cell_um=cell_um(layers, lens.wavelength_um, window_um, distance)
+        )
     if not hasattr(lens, "carrier_rad"):
-        raise SceneError(f"{type(lens).__name__} is no lens: need a Lens, a SmoothWave or a PillarWave")
+        raise SceneError(
+            f"{type(lens).__name__} is no lens: need a Lens, a SmoothWave or a PillarWave"
+        )
     return lens

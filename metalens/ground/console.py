@@ -1,4 +1,6 @@
-"""What a command shows: results as lines or JSON, progress with rate and ETA on a terminal, plain lines otherwise."""
+"""What a command shows: results as lines or JSON, progress with rate and ETA on a
+terminal, plain lines otherwise.
+"""
 
 import contextlib
 import json
@@ -15,7 +17,8 @@ Item = TypeVar("Item")
 
 
 def flush(text: str = "") -> None:
-    """Write to standard output and flush it; a reader that went away (``| head``) is no failure of the work.
+    """Write to standard output and flush it; a reader that went away (``| head``) is no
+    failure of the work.
 
     Raises:
         OutputError: it cannot be written otherwise, as to a full disk.
@@ -62,10 +65,15 @@ class Console:
             self.say(text)
 
     def judged(self, values: dict[str, Any], text: str, failures: Iterable[str]) -> int:
-        """The outcome with the checks that it failed, in words (``failures`` of the values, a line each of the text);
-        the status that the command ends with: 1 where any is told, else 0. Empty words are no failure."""
+        """The outcome with the checks that it failed, in words (``failures`` of the
+        values, a line each of the text);
+        the status that the command ends with: 1 where any is told, else 0. Empty words
+        are no failure."""
         told = [failure for failure in failures if failure]
-        self.result(values | {"failures": told}, "\n".join([text, *(f"  FAILED: {failure}" for failure in told)]))
+        self.result(
+            values | {"failures": told},
+            "\n".join([text, *(f"  FAILED: {failure}" for failure in told)]),
+        )
         return 1 if told else 0
 
     def track(self, items: Iterable[Item], *, total: int, label: str) -> Iterator[Item]:
@@ -90,7 +98,13 @@ class Console:
 
 
 def _bar(items: Iterable[Item], total: int, label: str) -> Iterator[Item]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"),

@@ -1,13 +1,23 @@
 """Typed refusals. Each says what was found, what is needed, what to do, and where.
 
-All derive from ``ValueError``, so a caller may catch one type; commands turn them into exit code 2.
+All derive from ``ValueError``, so a caller may catch one type; commands turn them into
+exit code 2.
 """
 
 import difflib
 from collections.abc import Iterable, Mapping
 
 # what libraries raise on damaged files
-DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, AttributeError)
+DAMAGE = (
+    OSError,
+    KeyError,
+    RuntimeError,
+    ValueError,
+    TypeError,
+    OverflowError,
+    MemoryError,
+    AttributeError,
+)
 
 
 class MetalensError(ValueError):
@@ -23,7 +33,9 @@ class StoreError(MetalensError):
 
 
 class OutputError(MetalensError):
-    """An output cannot be written where it is asked for: taken, an input too, no room, or being written by another."""
+    """An output cannot be written where it is asked for: taken, an input too, no room,
+    or being written by another.
+    """
 
 
 class WorkerError(MetalensError):
@@ -51,7 +63,9 @@ class PropagationError(MetalensError):
 
 
 class ProcessError(MetalensError):
-    """A process file or a mask plan breaks the limits of the process or of the file format."""
+    """A process file or a mask plan breaks the limits of the process or of the file
+    format.
+    """
 
 
 class MaskFileError(MetalensError):
@@ -78,16 +92,22 @@ class TrainingError(MetalensError):
     """A co-design run cannot start, resume or go on."""
 
 
-def nearest(name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None) -> str:
-    """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known names.
+def nearest(
+    name: str, known: Iterable[str], elsewhere: Mapping[str, str] | None = None
+) -> str:
+    """A hint for a misspelt name: ``; did you mean 'pitch_um'?`` or the list of known
+    names.
 
-    elsewhere: what is said of names that belong to another place (of a record of settings its ``ELSEWHERE``).
+    elsewhere: what is said of names that belong to another place (of a record of
+    settings its ``ELSEWHERE``).
     """
     if elsewhere and name in elsewhere:
         return f"; {elsewhere[name]}"
     options = sorted(known)
     close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(options)}"
+    return (
+        f"; did you mean {close[0]!r}?" if close else f"; known: {', '.join(options)}"
+    )
 
 
 EXTRAS = {
@@ -104,7 +124,8 @@ EXTRAS = {
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str | None:
-    """What to install for a library that an extra brings; None where it is none of ours.
+    """What to install for a library that an extra brings; None where it is none of
+    ours.
 
     >>> missing_extra(ModuleNotFoundError("No module named 'torch'", name="torch"))
     "this needs torch, which is not installed: pip install 'metalens-toolchain[optics]'"

@@ -1,7 +1,10 @@
-"""Many tasks at once: on the cores of this machine (loky), or on a cluster named by its address (dask.distributed).
+"""Many tasks at once: on the cores of this machine (loky), or on a cluster named by its
+address (dask.distributed).
 
-loky, since its workers start without running the caller's script again; a process pool of the standard library does,
-and a script without a main guard would start itself over. The answers are the same for any number of workers: a task is
+loky, since its workers start without running the caller's script again; a process pool
+of the standard library does,
+and a script without a main guard would start itself over. The answers are the same for
+any number of workers: a task is
 done by one process with one BLAS thread, and knows nothing of the others.
 """
 
@@ -23,37 +26,59 @@ Common = TypeVar("Common")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 Done = Iterator[tuple[int, Any]]
-Place = Callable[[Callable[[Any, Any], Any], Any, Sequence[Any]], Done]  # (work, common, tasks): (index, result)
+Place = Callable[
+    [Callable[[Any, Any], Any], Any, Sequence[Any]], Done
+]  # (work, common, tasks): (index, result)
 _PLACE: ContextVar[Place | None] = ContextVar("_PLACE", default=None)
-_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 # safe path: what lies in the current folder is never imported, whatever its name
 _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
-_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = "1e15"  # what a large lens takes is no leak to end a worker for
+_ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = (
+    "1e15"  # what a large lens takes is no leak to end a worker for
+)
 _CONNECT_S, _MOST = 10, 1024  # seconds; processes of one machine
 
 
 def cores() -> int:
     """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
 
 
 @contextlib.contextmanager
 def on(scheduler: str | None = None, *, processes: int | None = None) -> Iterator[None]:
-    """Do the tasks of the block on the dask cluster of this address, or on so many processes of this machine.
+    """Do the tasks of the block on the dask cluster of this address, or on so many
+    processes of this machine.
 
-    With neither, each verb has its own way: :func:`run` a process a core, :func:`gather` threads of this process.
+    With neither, each verb has its own way: :func:`run` a process a core,
+    :func:`gather` threads of this process.
 
     Raises:
-        ConfigError: both are asked for, or no such number of processes. WorkerError: no cluster at the address.
+        ConfigError: both are asked for, or no such number of processes. WorkerError: no
+            cluster at the address.
     """
     if processes is not None and not 1 <= processes <= _MOST:
-        raise ConfigError(f"{processes} workers: need 1 to {_MOST}; more machines are reached by a scheduler")
+        raise ConfigError(
+            f"{processes} workers: need 1 to {_MOST}; more machines are reached by a scheduler"
+        )
     if processes is not None and scheduler is not None:
-        raise ConfigError("workers are processes of this machine, the cluster of a scheduler has its own: ask for one")
+        raise ConfigError(
+            "workers are processes of this machine, the cluster of a scheduler has its own: ask for one"
+        )
     with contextlib.ExitStack() as held:
         place: Place | None = None
         if scheduler is not None:
-            place = functools.partial(_cluster, held.enter_context(_client(scheduler)), scheduler)
+            place = functools.partial(
+                _cluster, held.enter_context(_client(scheduler)), scheduler
+            )
         elif processes is not None:
             place = functools.partial(_here, held.enter_context(_pool(processes)))
         token = _PLACE.set(place)
@@ -62,7 +87,10 @@ def on(scheduler: str | None = None, *, processes: int | None = None) -> Iterato
 
 
 def run(
-    work: Callable[[Task], Result], tasks: Sequence[Task], *, processes: int | None = None
+    work: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    *,
+    processes: int | None = None,
 ) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task as it is done.
 
@@ -84,14 +112,20 @@ def run(
 
 
 def gather(
-    work: Callable[[Common, Task], Result], common: Common, tasks: Sequence[Task], *, beside: bool = True
+    work: Callable[[Common, Task], Result],
+    common: Common,
+    tasks: Sequence[Task],
+    *,
+    beside: bool = True,
 ) -> list[Result]:
     """``work(common, task)`` of every task, in their order, each with one BLAS thread.
 
     Args:
         work: a function of a module. common: what all tasks need.
-        beside: where :func:`on` names no workers, side by side in threads of this process, for work that mostly
-            consists of calls which release the interpreter lock; else one after the other, each with all threads.
+        beside: where :func:`on` names no workers, side by side in threads of this
+            process, for work that mostly
+            consists of calls which release the interpreter lock; else one after the
+            other, each with all threads.
 
     Raises:
         WorkerError: as :func:`run`. Whatever ``work`` raises.
@@ -115,7 +149,9 @@ def _pool(count: int) -> Iterator[Any]:
     from loky import ProcessPoolExecutor
 
     with _environment():  # of loky's own helper too, which is started like a worker
-        pool = ProcessPoolExecutor(count, initializer=_settle, initargs=(os.getpid(),), env=_ENVIRONMENT)
+        pool = ProcessPoolExecutor(
+            count, initializer=_settle, initargs=(os.getpid(),), env=_ENVIRONMENT
+        )
     try:
         yield pool
     finally:
@@ -133,13 +169,17 @@ def _environment() -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _here(pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]) -> Done:
+def _here(
+    pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]
+) -> Done:
     from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
     try:
         with _environment():
-            waiting = {pool.submit(work, common, task): i for i, task in enumerate(tasks)}
+            waiting = {
+                pool.submit(work, common, task): i for i, task in enumerate(tasks)
+            }
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     except BrokenProcessPool as error:
@@ -150,7 +190,9 @@ def _here(pool: Any, work: Callable[[Any, Any], Any], common: Any, tasks: Sequen
 
 
 def _settle(parent: int) -> None:
-    """Begin a worker: what it prints is a message, not a result; it ends with whoever started it."""
+    """Begin a worker: what it prints is a message, not a result; it ends with whoever
+    started it.
+    """
     os.dup2(2, 1)
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
@@ -167,27 +209,46 @@ def _client(address: str) -> Iterator[Any]:
     try:
         distributed: Any = importlib.import_module("distributed")
     except ImportError:
-        raise WorkerError("--scheduler needs the extra [cluster]: pip install 'metalens-toolchain[cluster]'") from None
+        raise WorkerError(
+            "--scheduler needs the extra [cluster]: pip install 'metalens-toolchain[cluster]'"
+        ) from None
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise WorkerError(f"no dask scheduler at {address!r} ({error}); start one with `dask scheduler`") from None
+        raise WorkerError(
+            f"no dask scheduler at {address!r} ({error}); start one with `dask scheduler`"
+        ) from None
     with client:
         yield client
 
 
-def _cluster(client: Any, address: str, work: Callable[[Any, Any], Any], common: Any, tasks: Sequence[Any]) -> Done:
-    """A task of a lost worker is done again by another; so is the fetching of what all tasks need."""
+def _cluster(
+    client: Any,
+    address: str,
+    work: Callable[[Any, Any], Any],
+    common: Any,
+    tasks: Sequence[Any],
+) -> Done:
+    """A task of a lost worker is done again by another; so is the fetching of what all
+    tasks need.
+    """
     distributed: Any = importlib.import_module("distributed")
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sending large graph")  # it is sent once
+        warnings.filterwarnings(
+            "ignore", message="Sending large graph"
+        )  # it is sent once
         held = client.submit(_itself, common, pure=False)
-        waiting = {client.submit(_alone, work, held, task, pure=False): i for i, task in enumerate(tasks)}
+        waiting = {
+            client.submit(_alone, work, held, task, pure=False): i
+            for i, task in enumerate(tasks)
+        }
     try:
         for future in distributed.as_completed(waiting, loop=client.loop):
             yield waiting[future], future.result()
     except distributed.KilledWorker as error:
-        raise WorkerError(f"workers of the cluster died again and again on one task ({error})") from None
+        raise WorkerError(
+            f"workers of the cluster died again and again on one task ({error})"
+        ) from None
     except distributed.CancelledError as error:
         raise WorkerError(f"the cluster at {address} was lost ({error})") from None
     finally:

@@ -1,6 +1,7 @@
 """Faces of folders: public names that load when first used.
 
-A folder's ``__init__`` lists its public names twice: under ``TYPE_CHECKING``, where type checkers and editors read
+A folder's ``__init__`` lists its public names twice: under ``TYPE_CHECKING``, where
+type checkers and editors read
 them, and in the table that :func:`attach` takes. A test holds that the two agree.
 """
 
@@ -9,13 +10,18 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def attach(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names load when first used (PEP 562).
+def attach(
+    package: str, names: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names load when
+    first used (PEP 562).
 
     Args:
         package: its ``__name__``.
-        names: public name to the module that defines it, below the package (``"stack"``) or absolute where it has
-            a dot, with the name there after a colon where it is another (``"layout.oasis.write:write"``); ``""`` for
+        names: public name to the module that defines it, below the package
+            (``"stack"``) or absolute where it has
+            a dot, with the name there after a colon where it is another
+            (``"layout.oasis.write:write"``); ``""`` for
             a module of the package that is itself public.
 
     >>> load, listed, public = attach("metalens.ground", {"units": "", "Console": "console"})
@@ -30,6 +36,9 @@ def attach(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any]
         if not names[name]:
             return importlib.import_module(f"{package}.{name}")
         module, _, there = names[name].partition(":")
-        return getattr(importlib.import_module(module if "." in module else f"{package}.{module}"), there or name)
+        return getattr(
+            importlib.import_module(module if "." in module else f"{package}.{module}"),
+            there or name,
+        )
 
     return load, lambda: list(public), public

@@ -1,4 +1,6 @@
-"""Orthonormal Legendre polynomials: nodes, interpolation, and how many are needed for a given function."""
+"""Orthonormal Legendre polynomials: nodes, interpolation, and how many are needed for a
+given function.
+"""
 
 import functools
 
@@ -16,7 +18,9 @@ def nodes(count: int) -> tuple[Array, Array]:
 
 
 def values(count: int, t: Array) -> Array:
-    """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by the stable recurrence."""
+    """(*t, count) orthonormal polynomials P̂_0 … P̂_{count-1}, ∫P̂² = 1 on [-1, 1], by
+    the stable recurrence.
+    """
     t = np.asarray(t, float)
     out = np.empty((count, *t.shape))
     for m in range(count):
@@ -31,13 +35,17 @@ def values(count: int, t: Array) -> Array:
 
 
 def interpolation(count: int, t: Array) -> Array:
-    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`nodes`: L_a = w_a Σ_m P̂_m(t_a) P̂_m(t)."""
+    """(*t, count) values at ``t`` of the Lagrange polynomials on :func:`nodes`: L_a =
+    w_a Σ_m P̂_m(t_a) P̂_m(t).
+    """
     return np.asarray(values(count, t) @ to_nodes(count))
 
 
 @functools.lru_cache(maxsize=64)
 def to_nodes(count: int) -> Array:
-    """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in the modes."""
+    """(mode, node) matrix w_a P̂_m(t_a): coefficients of the Lagrange polynomials in
+    the modes.
+    """
     t, w = nodes(count)
     return values(count, t).T * w
 
@@ -51,11 +59,14 @@ def needed(samples: Array, tolerance: float) -> int:
     """Number of nodes that represent all lines to ``tolerance``.
 
     Args:
-        samples: (line, count) complex values on :func:`nodes` (count), count well above what is needed.
-        tolerance: of the root mean square over lines and position, relative to that of the samples.
+        samples: (line, count) complex values on :func:`nodes` (count), count well above
+            what is needed.
+        tolerance: of the root mean square over lines and position, relative to that of
+            the samples.
 
     Returns:
-        The least n with a tail of modes n, n+1, … below tolerance; ``count`` + 1 where the samples are too few to tell.
+        The least n with a tail of modes n, n+1, … below tolerance; ``count`` + 1 where
+        the samples are too few to tell.
     """
     count = samples.shape[-1]
     power = (np.abs(samples.reshape(-1, count) @ to_nodes(count).T) ** 2).sum(0)

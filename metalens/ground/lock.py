@@ -1,4 +1,6 @@
-"""One writer an output: a lock file beside it that names its owner; the lock of a dead owner is free."""
+"""One writer an output: a lock file beside it that names its owner; the lock of a dead
+owner is free.
+"""
 
 import contextlib
 import ctypes
@@ -20,15 +22,20 @@ from typing import Any
 
 from metalens.ground.errors import OutputError
 
-COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")  # words of the command line, for locks and manifests
+COMMAND: ContextVar[str] = ContextVar(
+    "COMMAND", default=""
+)  # words of the command line, for locks and manifests
 _open: set[int] = set()
 _EXCHANGE, _HERE = 2, -100  # of renameat2
-_SIGNALS = tuple(s for s in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM") if hasattr(signal, s))
+_SIGNALS = tuple(
+    s for s in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM") if hasattr(signal, s)
+)
 
 
 @contextlib.contextmanager
 def held(target: Path) -> Iterator[None]:
-    """Hold ``.NAME.lock`` beside ``target``; the kernel frees it when its owner dies, and the file goes at the end.
+    """Hold ``.NAME.lock`` beside ``target``; the kernel frees it when its owner dies,
+    and the file goes at the end.
 
     Raises:
         OutputError: another process writes this output; the message names it.
@@ -37,9 +44,15 @@ def held(target: Path) -> Iterator[None]:
     path = target.with_name(f".{target.name}.lock")
     handle = -1
     try:
-        with undisturbed():  # a signal that comes between making the file and knowing its handle is answered below
+        # a signal that comes between making the file and knowing its handle is answered
+        # below
+        with undisturbed():
             handle = _taken(path, target)
-        owner = {"process": os.getpid(), "host": socket.gethostname(), "command": COMMAND.get()}
+        owner = {
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "command": COMMAND.get(),
+        }
         os.ftruncate(handle, 0)
         os.pwrite(handle, json.dumps(owner).encode(), 0)
         _open.add(handle)
@@ -55,7 +68,9 @@ def held(target: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def parents(target: Path) -> Iterator[None]:
-    """Missing folders above an output; those that are made here and hold nothing go again where the block fails."""
+    """Missing folders above an output; those that are made here and hold nothing go
+    again where the block fails.
+    """
     missing = [folder for folder in target.parents if not folder.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +87,9 @@ def folder(path: Path) -> Iterator[None]:
     """Hold a folder for the moment of a renaming; waits for others."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        with contextlib.suppress(OSError):  # a file system without locks: the lock file alone must do
+        with contextlib.suppress(
+            OSError
+        ):  # a file system without locks: the lock file alone must do
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:
@@ -86,7 +103,13 @@ def exchange(one: Path, other: Path) -> bool:
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if call is None:
         return False
-    done: int = call(_HERE, os.fsencode(one.absolute()), _HERE, os.fsencode(other.absolute()), _EXCHANGE)
+    done: int = call(
+        _HERE,
+        os.fsencode(one.absolute()),
+        _HERE,
+        os.fsencode(other.absolute()),
+        _EXCHANGE,
+    )
     return done == 0
 
 
@@ -122,7 +145,11 @@ def undisturbed() -> Iterator[None]:
         yield
         return
     heard, numbers = _Heard(), [getattr(signal, name) for name in _SIGNALS]
-    before = {number: signal.signal(number, heard) for number in numbers if signal.getsignal(number) is not None}
+    before = {
+        number: signal.signal(number, heard)
+        for number in numbers
+        if signal.getsignal(number) is not None
+    }
     try:
         yield
     finally:
@@ -133,10 +160,14 @@ def undisturbed() -> Iterator[None]:
 
 
 def left(target: Path) -> Iterator[Path]:
-    """Scratch of dead owners of an output that is held; under whatever case, where the system tells none apart."""
+    """Scratch of dead owners of an output that is held; under whatever case, where the
+    system tells none apart.
+    """
     for path in sorted(target.parent.glob(".*.part-*")):
         name = path.name[1:].rpartition(".part-")[0]
-        if name == target.name or (name.lower() == target.name.lower() and _one(target.with_name(name), target)):
+        if name == target.name or (
+            name.lower() == target.name.lower() and _one(target.with_name(name), target)
+        ):
             yield path
 
 
@@ -147,7 +178,9 @@ def _one(one: Path, other: Path) -> bool:
 
 
 def _taken(path: Path, target: Path) -> int:
-    """An open handle of the lock file, locked; the file may have been removed by its last owner in between."""
+    """An open handle of the lock file, locked; the file may have been removed by its
+    last owner in between.
+    """
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
@@ -162,7 +195,9 @@ def _taken(path: Path, target: Path) -> int:
             told = _alive(handle, path)
         if told:
             os.close(handle)
-            raise OutputError(f"{target} is being written by {told}; wait for it or give another name")
+            raise OutputError(
+                f"{target} is being written by {told}; wait for it or give another name"
+            )
         with contextlib.suppress(FileNotFoundError):
             if os.stat(path).st_ino == os.fstat(handle).st_ino:
                 return handle
@@ -170,9 +205,11 @@ def _taken(path: Path, target: Path) -> int:
 
 
 def _far(handle: int, path: Path) -> str:
-    """Who else writes, where the lock of a file tells nothing of other machines and another one left its name; ''.
+    """Who else writes, where the lock of a file tells nothing of other machines and
+    another one left its name; ''.
 
-    Where it does (a file server that keeps the locks), a lock that was had is free, whoever left the file.
+    Where it does (a file server that keeps the locks), a lock that was had is free,
+    whoever left the file.
     """
     owner = _owner(handle)
     elsewhere = bool(owner) and owner["host"] != socket.gethostname()
@@ -180,12 +217,16 @@ def _far(handle: int, path: Path) -> str:
 
 
 def _alive(handle: int, path: Path) -> str:
-    """Who else writes, by the words in the lock file alone: a process that lives, or one of another machine; ''."""
+    """Who else writes, by the words in the lock file alone: a process that lives, or
+    one of another machine; ''.
+    """
     owner = _owner(handle)
     if not owner:
         return ""
     if owner["host"] != socket.gethostname():
-        return f"{_words(owner)}, as {path} says; if that one has ended, remove the file"
+        return (
+            f"{_words(owner)}, as {path} says; if that one has ended, remove the file"
+        )
     try:
         os.kill(owner["process"], 0)
     except ProcessLookupError:
@@ -195,11 +236,15 @@ def _alive(handle: int, path: Path) -> str:
     return _words(owner)
 
 
-_LOCAL = re.compile(r" - (fuse|9p)|\b(nolock|localflock|local_lock=(all|flock))\b")  # in the table of mounts
+_LOCAL = re.compile(
+    r" - (fuse|9p)|\b(nolock|localflock|local_lock=(all|flock))\b"
+)  # in the table of mounts
 
 
 def _locks_are_local(path: Path) -> bool:
-    """Whether another machine that uses the same file system does not hear of locks; by the table of mounts (Linux)."""
+    """Whether another machine that uses the same file system does not hear of locks; by
+    the table of mounts (Linux).
+    """
     try:
         lines = Path("/proc/self/mountinfo").read_text("utf-8", "replace").splitlines()
     except OSError:
@@ -213,14 +258,20 @@ def _owner(handle: int) -> dict[str, Any]:
     """What the lock file says of its owner; {} where it says nothing."""
     try:
         told = json.loads(os.pread(handle, 65536, 0))
-        return {"process": int(told["process"]), "host": str(told["host"]), "command": str(told["command"])}
+        return {
+            "process": int(told["process"]),
+            "host": str(told["host"]),
+            "command": str(told["command"]),
+        }
     except (ValueError, KeyError, TypeError, OverflowError):
         return {}
 
 
 def _words(owner: dict[str, Any]) -> str:
     return (
-        f"process {owner['process']} on {owner['host']} (metalens {owner['command']})" if owner else "another process"
+        f"process {owner['process']} on {owner['host']} (metalens {owner['command']})"
+        if owner
+        else "another process"
     )
 
 

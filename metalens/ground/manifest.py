@@ -1,4 +1,6 @@
-"""What a folder of ours holds: manifest.json with the SHA-256 of every file, the command and the versions."""
+"""What a folder of ours holds: manifest.json with the SHA-256 of every file, the
+command and the versions.
+"""
 
 import json
 import os
@@ -21,14 +23,23 @@ _MARKS = (
     (b"<!doctype html>", b'name="generator" content="metalens'),
     (b"MATLAB 5.0 MAT-file, metalens", b""),
     (b"file,depth_um,angle_deg,exposure_s", b""),
-    (b'<?xml version="1.0" encoding="utf-8"?>\n<report-database>', b"<generator>metalens"),
+    (
+        b'<?xml version="1.0" encoding="utf-8"?>\n<report-database>',
+        b"<generator>metalens",
+    ),
     (b"PK", b"metalens"),  # NumPy's archive, with a comment
-    (b"", b" 0 0 0\t \t\n"),  # Zemax grid phase: blanks at the end of its first line, for want of comments
+    (
+        b"",
+        b" 0 0 0\t \t\n",
+    ),  # Zemax grid phase: blanks at the end of its first line, for want of comments
 )
 
 
-def write(folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()) -> None:
-    """Write the manifest of everything in a folder but ``others``, which are not ours and are named as such.
+def write(
+    folder: Path, command: str, *, finished: bool = True, others: Collection[str] = ()
+) -> None:
+    """Write the manifest of everything in a folder but ``others``, which are not ours
+    and are named as such.
 
     Unfinished: of a folder that is still being made.
     """
@@ -60,17 +71,32 @@ def read(folder: Path) -> dict[str, Any] | None:
             raise ValueError("too large")
         found: dict[str, Any] = json.loads(path.read_bytes())
         if (found["kind"], found["version"]) != (KIND, VERSION):
-            raise ValueError(f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}")
-        entries = {str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])} for n, e in found["files"].items()}
+            raise ValueError(
+                f"kind {found['kind']!r} version {found['version']!r}, need {KIND!r} version {VERSION}"
+            )
+        entries = {
+            str(n): {"sha256": str(e["sha256"]), "bytes": int(e["bytes"])}
+            for n, e in found["files"].items()
+        }
         others = [str(name) for name in found.get("others", ())]
         plain = {"finished": bool(found["finished"]), "command": str(found["command"])}
         return found | plain | {"files": entries, "others": others}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise StoreError(f"{path}: damaged or no manifest of a metalens folder ({error}); make it again") from None
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise StoreError(
+            f"{path}: damaged or no manifest of a metalens folder ({error}); make it again"
+        ) from None
 
 
 def check(folder: Path) -> None:
-    """Refuse a folder of ours that is unfinished or no longer what was written; one without a manifest passes.
+    """Refuse a folder of ours that is unfinished or no longer what was written; one
+    without a manifest passes.
 
     Files that were added since are left alone.
 
@@ -81,12 +107,19 @@ def check(folder: Path) -> None:
     if found is None:
         return
     if not found["finished"]:
-        raise StoreError(f"{folder} is unfinished: go on with --resume, or make it again")
+        raise StoreError(
+            f"{folder} is unfinished: go on with --resume, or make it again"
+        )
     for name, entry in found["files"].items():
         path = folder / name
         if not path.is_file():
-            raise StoreError(f"{path} is missing; {NAME} lists it: make the folder again")
-        if path.stat().st_size != entry["bytes"] or store.sha256(path) != entry["sha256"]:
+            raise StoreError(
+                f"{path} is missing; {NAME} lists it: make the folder again"
+            )
+        if (
+            path.stat().st_size != entry["bytes"]
+            or store.sha256(path) != entry["sha256"]
+        ):
             raise StoreError(
                 f"{path} is not what was written (SHA-256 differs): make the folder again, or remove {NAME} to use it "
                 "as it stands"
@@ -106,11 +139,19 @@ def flush(folder: Path) -> None:
 
 
 def files(folder: Path) -> Iterator[str]:
-    """Names of all files below a folder, the manifest aside; folders that hold nothing end in a slash."""
+    """Names of all files below a folder, the manifest aside; folders that hold nothing
+    end in a slash.
+    """
     for place, folders, names in os.walk(folder):
         here = Path(place).relative_to(folder)
-        yield from ((here / n).as_posix() for n in names if (here / n).as_posix() != NAME)
-        yield from ((here / n).as_posix() for n in folders if os.path.islink(os.path.join(place, n)))
+        yield from (
+            (here / n).as_posix() for n in names if (here / n).as_posix() != NAME
+        )
+        yield from (
+            (here / n).as_posix()
+            for n in folders
+            if os.path.islink(os.path.join(place, n))
+        )
 
 
 def empty(folder: Path) -> None:
@@ -125,7 +166,8 @@ def empty(folder: Path) -> None:
 def foreign(path: Path) -> str:
     """Why a file or folder may not be replaced as one of ours; '' where it may.
 
-    A folder is ours with a manifest and no file beyond those that it lists; a file by its kind or mark.
+    A folder is ours with a manifest and no file beyond those that it lists; a file by
+    its kind or mark.
     """
     if path.is_dir():
         return _foreign_folder(path)
@@ -144,7 +186,8 @@ def foreign(path: Path) -> str:
 
 
 def journal(path: Path, title: str) -> list[str]:
-    """Whole lines of the journal of a piece of work after its title, its first; other work's is begun afresh.
+    """Whole lines of the journal of a piece of work after its title, its first; other
+    work's is begun afresh.
 
     title: one line of JSON, a text or a list, that begins with the version.
 
@@ -187,7 +230,11 @@ def strange(folder: Path) -> set[str]:
     present = set(files(folder))
     for place in (folder, *(path.parent for path in folder.rglob(NAME))):
         found, inside = read(place), place.relative_to(folder)
-        present -= {(inside / name).as_posix() for name in (*found["files"], NAME)} if found else set()
+        present -= (
+            {(inside / name).as_posix() for name in (*found["files"], NAME)}
+            if found
+            else set()
+        )
     return present
 
 

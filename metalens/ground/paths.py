@@ -1,7 +1,10 @@
-"""Differences of optical paths, without cancellation: numpy, torch and plain numbers alike.
+"""Differences of optical paths, without cancellation: numpy, torch and plain numbers
+alike.
 
-Every phase of a lens is k times the difference of two long lengths. Subtracting them loses what matters: at 26 mm
-float64 keeps 4e-12 um of a path, float32 no more than 2e-3 um. Written as a quotient, the difference keeps all digits.
+Every phase of a lens is k times the difference of two long lengths. Subtracting them
+loses what matters: at 26 mm
+float64 keeps 4e-12 um of a path, float32 no more than 2e-3 um. Written as a quotient,
+the difference keeps all digits.
 """
 
 import math
@@ -17,7 +20,8 @@ def longer(length: Any, more: Any) -> Any:
 
 
 def path_difference(radius2_um2: Any, distance_um: Any) -> Any:
-    """Extra path from an axial point out to radius r, sqrt(r² + z²) - z, from r² (paper Eq. 1).
+    """Extra path from an axial point out to radius r, sqrt(r² + z²) - z, from r² (paper
+    Eq. 1).
 
     Args:
         radius2_um2: (*shape) squared distance from the axis.
@@ -26,13 +30,19 @@ def path_difference(radius2_um2: Any, distance_um: Any) -> Any:
     >>> path_difference(9.0, 4.0)
     1.0
     """
-    return radius2_um2 * 0.0 if math.isinf(distance_um) else longer(distance_um, radius2_um2)
+    return (
+        radius2_um2 * 0.0
+        if math.isinf(distance_um)
+        else longer(distance_um, radius2_um2)
+    )
 
 
 def source_path(x: Any, y: Any, tangents: Any, inverse_depth: Any) -> Any:
-    """Path from a point source to (x, y), less its path to the lens centre, um; exact for a source at infinity.
+    """Path from a point source to (x, y), less its path to the lens centre, um; exact
+    for a source at infinity.
 
-    r - r0 = (ρ²/z + 2(x·tx + y·ty)) / (√(ρ²/z² + 2(x·tx + y·ty)/z + s²) + s) with s² = 1 + tx² + ty², the source at
+    r - r0 = (ρ²/z + 2(x·tx + y·ty)) / (√(ρ²/z² + 2(x·tx + y·ty)/z + s²) + s) with s² =
+    1 + tx² + ty², the source at
     (-z·tx, -z·ty, -z). Operands broadcast; no division by the depth.
     """
     tx, ty = tangents
@@ -43,7 +53,9 @@ def source_path(x: Any, y: Any, tangents: Any, inverse_depth: Any) -> Any:
 
 
 def sensor_path(x: Any, y: Any, centre: Any, distance: Any) -> Any:
-    """Path from a pillar at (x, y) to a point of the sensor, less the path from the lens centre, um."""
+    """Path from a pillar at (x, y) to a point of the sensor, less the path from the
+    lens centre, um.
+    """
     cx, cy = centre
     r0 = (cx * cx + cy * cy + distance * distance) ** 0.5
     return longer(r0, x * x + y * y - 2 * (x * cx + y * cy))

@@ -1,9 +1,12 @@
-"""Loaders that fail by type: whatever a damaged or edited file does, the answer is one error that names the file.
+"""Loaders that fail by type: whatever a damaged or edited file does, the answer is one
+error that names the file.
 
-The HDF5 library ends its process on some damaged files. So a forked child with little to lose reads a file first; and
+The HDF5 library ends its process on some damaged files. So a forked child with little
+to lose reads a file first; and
 it writes to a file that never refuses, since it may end its process on a full disk too.
 
-An input that is replaced or edited while it is read is refused. A stamp tells, which is the same or not: it is never
+An input that is replaced or edited while it is read is refused. A stamp tells, which is
+the same or not: it is never
 asked which of two is later, since clocks are set back.
 """
 
@@ -29,14 +32,25 @@ from metalens.ground import errors
 from metalens.ground.errors import DAMAGE, MetalensError, StoreError
 
 Made = TypeVar("Made")
-_ROOM, _SECONDS = 600 << 20, 60  # address space beyond what this process has, time of the processor, for a probe
-_DENSEST = 1100  # more of it for a byte of the file: what deflate can do at best, and copies
+_ROOM, _SECONDS = (
+    600 << 20,
+    60,
+)  # address space beyond what this process has, time of the processor, for a probe
+_DENSEST = (
+    1100  # more of it for a byte of the file: what deflate can do at best, and copies
+)
 _MOST_WORDS = 4000
 _WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
 _WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
-_PLAIN = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum: packing that the HDF5 library undoes without harm
+_PLAIN = {
+    1,
+    2,
+    3,
+}  # deflate, shuffle, Fletcher's checksum: packing that the HDF5 library undoes without harm
 Stamp = tuple[tuple[int, ...], ...]
-_noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar("_noted", default=None)  # of inputs, by path
+_noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar(
+    "_noted", default=None
+)  # of inputs, by path
 
 
 @contextlib.contextmanager
@@ -50,14 +64,17 @@ def remembered() -> Iterator[None]:
 
 
 def parting(line: str) -> tuple[str | None, bool]:
-    """What parts the columns of a line of a table (None for blanks and tabs), and whether its commas are decimal.
+    """What parts the columns of a line of a table (None for blanks and tabs), and
+    whether its commas are decimal.
 
     They are where something else parts the columns: "840,5;0,3", "840,5 0,3".
     """
     if ";" in line:
         return ";", True
     words = line.split()
-    apart = len(words) > 1 and not any(word[0] == "," or word[-1] == "," for word in words)
+    apart = len(words) > 1 and not any(
+        word[0] == "," or word[-1] == "," for word in words
+    )
     if apart and all(_WITH_COMMA.fullmatch(word) for word in words[:2]):
         return None, True
     return ("," if "," in line else None), False
@@ -71,16 +88,24 @@ def columns(line: str) -> list[str]:
 
 
 def stamp(path: str | Path) -> Stamp:
-    """Which file it is, its bytes and the time of its last change; of a folder, also of all that lies in it.
+    """Which file it is, its bytes and the time of its last change; of a folder, also of
+    all that lies in it.
 
     () where there is none.
     """
     try:
-        inside = sorted(os.scandir(path), key=lambda entry: entry.name) if os.path.isdir(path) else []
+        inside = (
+            sorted(os.scandir(path), key=lambda entry: entry.name)
+            if os.path.isdir(path)
+            else []
+        )
         about = [os.stat(one) for one in (path, *inside)]
     except OSError:
         return ()
-    return tuple((found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns) for found in about)
+    return tuple(
+        (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns)
+        for found in about
+    )
 
 
 def check_same(path: str | Path, before: Stamp) -> None:
@@ -90,7 +115,9 @@ def check_same(path: str | Path, before: Stamp) -> None:
         StoreError: naming it.
     """
     if stamp(path) != before:
-        raise StoreError(f"{path} was changed or replaced while it was being read: run again when it stands still")
+        raise StoreError(
+            f"{path} was changed or replaced while it was being read: run again when it stands still"
+        )
 
 
 @contextlib.contextmanager
@@ -98,7 +125,8 @@ def steady(path: str | Path) -> Iterator[None]:
     """Refuse an input that another program writes to while the block reads it.
 
     Raises:
-        StoreError: see :func:`check_same`, in place of what the block made of such an input.
+        StoreError: see :func:`check_same`, in place of what the block made of such an
+            input.
     """
     before = stamp(path)
     try:
@@ -111,9 +139,14 @@ def steady(path: str | Path) -> Iterator[None]:
 
 
 def note(path: str | Path, before: Stamp, content: bytes | None = None) -> None:
-    """Note what an input was when this command first read it; with its content, its hash too."""
+    """Note what an input was when this command first read it; with its content, its
+    hash too.
+    """
     if (noted := _noted.get()) is not None:
-        noted.setdefault(os.path.abspath(path), (before, hashlib.sha256(content).hexdigest() if content else ""))
+        noted.setdefault(
+            os.path.abspath(path),
+            (before, hashlib.sha256(content).hexdigest() if content else ""),
+        )
 
 
 def sha256(path: str | Path) -> str:
@@ -131,9 +164,11 @@ def sha256(path: str | Path) -> str:
 
 
 class Through(io.FileIO):
-    """A file for the HDF5 library, which may crash the process where a write fails, as on a full disk.
+    """A file for the HDF5 library, which may crash the process where a write fails, as
+    on a full disk.
 
-    So no write fails before its eyes: the first refusal is kept for :meth:`check`, nothing is written from then on.
+    So no write fails before its eyes: the first refusal is kept for :meth:`check`,
+    nothing is written from then on.
     """
 
     refused: OSError | None = None
@@ -159,19 +194,30 @@ class Through(io.FileIO):
 
 
 def reader(load: Callable[..., Made]) -> Callable[..., Made]:
-    """A ``load(path, ...)`` whose every failure on a damaged or edited file is a StoreError that names the file."""
+    """A ``load(path, ...)`` whose every failure on a damaged or edited file is a
+    StoreError that names the file.
+    """
 
     @functools.wraps(load)
     def checked(path: str | Path, *more: Any, **about: Any) -> Made:
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error", np.exceptions.ComplexWarning)  # complex numbers where real ones belong
+                warnings.simplefilter(
+                    "error", np.exceptions.ComplexWarning
+                )  # complex numbers where real ones belong
                 made = load(path, *more, **about)
             _check_types(made)
         except MetalensError:
             raise
-        except (*DAMAGE, IndexError, ArithmeticError, np.exceptions.ComplexWarning) as error:
-            raise StoreError(f"{path}: entries of the wrong kind ({error}); edited or damaged: make it again") from None
+        except (
+            *DAMAGE,
+            IndexError,
+            ArithmeticError,
+            np.exceptions.ComplexWarning,
+        ) as error:
+            raise StoreError(
+                f"{path}: entries of the wrong kind ({error}); edited or damaged: make it again"
+            ) from None
         return made
 
     return checked
@@ -186,25 +232,39 @@ def _check_types(record: Any) -> None:
     if not dataclasses.is_dataclass(record):
         return
     hints = typing.get_type_hints(type(record))
-    needed = {float: int | float | np.number, int: int | np.integer, str: str, bool: bool | np.bool_}
+    needed = {
+        float: int | float | np.number,
+        int: int | np.integer,
+        str: str,
+        bool: bool | np.bool_,
+    }
     for entry in dataclasses.fields(record):
         value, hint = getattr(record, entry.name), hints[entry.name]
-        if hint in needed and (not isinstance(value, needed[hint]) or (isinstance(value, bool) and hint is not bool)):
-            raise TypeError(f"{entry.name} is {type(value).__name__}, need {hint.__name__}")
+        if hint in needed and (
+            not isinstance(value, needed[hint])
+            or (isinstance(value, bool) and hint is not bool)
+        ):
+            raise TypeError(
+                f"{entry.name} is {type(value).__name__}, need {hint.__name__}"
+            )
         if isinstance(value, np.ndarray) and value.dtype.kind not in "biufcSU":
             raise TypeError(f"{entry.name} holds {value.dtype}, need numbers")
         _check_types(value)
 
 
 def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
-    """What ``read`` makes of an open HDF5 file, after a child process with limits has done the same and lived.
+    """What ``read`` makes of an open HDF5 file, after a child process with limits has
+    done the same and lived.
 
-    What the child raised is raised here, without reading: a damaged file takes the child's memory alone. Of a file
-    above 64 MB the child reads every header, where each block of the arrays lies, and their corners; all of them where
+    What the child raised is raised here, without reading: a damaged file takes the
+    child's memory alone. Of a file
+    above 64 MB the child reads every header, where each block of the arrays lies, and
+    their corners; all of them where
     they are packed otherwise than by gzip.
 
     Raises:
-        StoreError: the child died, as this process would have; the file was replaced meanwhile; or what ``read``
+        StoreError: the child died, as this process would have; the file was replaced
+            meanwhile; or what ``read``
             refuses (a MetalensError as it is, anything else as a RuntimeError).
     """
     import h5py
@@ -214,11 +274,17 @@ def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
             return work(file)
 
     plain = os.path.isfile(path)
-    if os.path.exists(path) and not (plain or os.path.isdir(path)):  # a pipe that nobody writes to would be waited for
+    if os.path.exists(path) and not (
+        plain or os.path.isdir(path)
+    ):  # a pipe that nobody writes to would be waited for
         raise StoreError(f"{path}: {absent(Path(path))}")
     size = os.path.getsize(path) if plain else 0
     with steady(path):
-        _probe(path, lambda: opened(read if size <= _WHOLE else read_through), _ROOM + _DENSEST * size)
+        _probe(
+            path,
+            lambda: opened(read if size <= _WHOLE else read_through),
+            _ROOM + _DENSEST * size,
+        )
         made: Made = opened(read)
     return made
 
@@ -246,7 +312,9 @@ def _probe(path: str | Path, read: Callable[[], object], room: int) -> None:
         told = pipe.read()
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status < 0:
-        raise StoreError(f"{path}: damaged: reading it ended the reader with signal {-status}; make it again")
+        raise StoreError(
+            f"{path}: damaged: reading it ended the reader with signal {-status}; make it again"
+        )
     if told:
         name, _, words = told.decode("utf-8", "replace").partition("\n")
         raise getattr(errors, name, RuntimeError)(words)
@@ -272,7 +340,9 @@ def shown(text: str) -> str:
     'grösse \\\\xff'
     """
     try:
-        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        return text.encode("utf-8", "surrogateescape").decode(
+            "utf-8", "backslashreplace"
+        )
     except UnicodeEncodeError:  # surrogates that stand for no byte
         return text.encode("utf-8", "backslashreplace").decode()
 
@@ -281,24 +351,41 @@ def _limit(room: int) -> None:
     """Of the child: memory, time, no core file, no words."""
     faulthandler.disable()
     told = Path("/proc/self/statm")  # of Linux
-    have = int(told.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE") if told.is_file() else room
+    have = (
+        int(told.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        if told.is_file()
+        else room
+    )
     used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-    limits = {resource.RLIMIT_AS: have + room, resource.RLIMIT_CPU: int(used) + _SECONDS, resource.RLIMIT_CORE: 0}
+    limits = {
+        resource.RLIMIT_AS: have + room,
+        resource.RLIMIT_CPU: int(used) + _SECONDS,
+        resource.RLIMIT_CORE: 0,
+    }
     for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
-        resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+        resource.setrlimit(
+            kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard)
+        )
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def read_through(file: Any) -> None:
-    """Every attribute of a file, the place of every block of its data sets, and their corners."""
+    """Every attribute of a file, the place of every block of its data sets, and their
+    corners.
+    """
     import h5py
 
     def visit(name: str, item: Any) -> None:
         for key in item.attrs:
             with contextlib.suppress(Exception):  # the next may yet end the reader
                 item.attrs[key]
-        if isinstance(item, h5py.Dataset) and item.ndim and item.size and not (item.is_virtual or item.external):
+        if (
+            isinstance(item, h5py.Dataset)
+            and item.ndim
+            and item.size
+            and not (item.is_virtual or item.external)
+        ):
             with contextlib.suppress(Exception):
                 item[(0,) * item.ndim], item[(-1,) * item.ndim]
             with contextlib.suppress(Exception):
@@ -309,7 +396,9 @@ def read_through(file: Any) -> None:
 
 
 def _blocks(item: Any) -> None:
-    """Go through the index of a data set's blocks; read them where a rare packing is to be undone."""
+    """Go through the index of a data set's blocks; read them where a rare packing is to
+    be undone.
+    """
     if item.chunks is None:
         return
     plan = item.id.get_create_plist()
@@ -345,4 +434,6 @@ def foreign(path: str | Path) -> str:
     start = b""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         start = file.read(8)
-    return next((words for first, words in _FOREIGN.items() if start.startswith(first)), "")
+    return next(
+        (words for first, words in _FOREIGN.items() if start.startswith(first)), ""
+    )

@@ -1,4 +1,6 @@
-"""One self-contained report.html with a shared look: sections of text, figures, tables and key figures."""
+"""One self-contained report.html with a shared look: sections of text, figures, tables
+and key figures.
+"""
 
 import base64
 import io
@@ -48,7 +50,8 @@ class Table:
 
     @property
     def text(self) -> str:
-        """Caption, head and rows as lines of text, each column as wide as its widest cell.
+        """Caption, head and rows as lines of text, each column as wide as its widest
+        cell.
 
         >>> print(Table(("lens", "axial / mm"), [("a long name", 0.41), ("b", None)], "Read.").text)
         Read.
@@ -58,7 +61,12 @@ class Table:
         """
         lines = [list(self.head), *self.cells]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        rows = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in lines]
+        rows = [
+            "  ".join(
+                cell.ljust(w) for cell, w in zip(row, widths, strict=True)
+            ).rstrip()
+            for row in lines
+        ]
         return "\n".join([self.caption, *rows] if self.caption else rows)
 
     def _text(self, value: Any) -> str:
@@ -74,7 +82,9 @@ class Markup:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A titled part of the report; ``text`` holds plain paragraphs separated by blank lines."""
+    """A titled part of the report; ``text`` holds plain paragraphs separated by blank
+    lines.
+    """
 
     title: str
     text: str = ""
@@ -96,9 +106,28 @@ class KeyFigure:
 
 
 PLAIN = 1e7  # up to here a number is written without a power of ten
-ROUNDING = 1e-12  # what is smaller in the units of this toolchain (um, rad, shares, electrons) is rounding
-UNITS = {"um": "µm", "nm": "nm", "mm": "mm", "rad": "rad", "deg": "deg", "s": "s", "seconds": "s", "e": "electrons"}
-UNITS |= {"px": "px", "mb": "MB", "waves": "waves", "um2": "µm²", "rad2": "rad²", "e2": "electrons²", "percent": "%"}
+# what is smaller in the units of this toolchain (um, rad, shares, electrons) is
+# rounding
+ROUNDING = 1e-12
+UNITS = {
+    "um": "µm",
+    "nm": "nm",
+    "mm": "mm",
+    "rad": "rad",
+    "deg": "deg",
+    "s": "s",
+    "seconds": "s",
+    "e": "electrons",
+}
+UNITS |= {
+    "px": "px",
+    "mb": "MB",
+    "waves": "waves",
+    "um2": "µm²",
+    "rad2": "rad²",
+    "e2": "electrons²",
+    "percent": "%",
+}
 UNITS |= {"mmacs": "million MACs"}
 WORDS = {
     "max": "largest",
@@ -110,8 +139,19 @@ WORDS = {
     "strehl": "Strehl ratio",
 }
 WORDS |= {"mmacs": "million MACs"}
-WORDS |= {"fwhm": "width at half maximum", "macs": "MACs", "chi2": "chi²", "dof": "degree of freedom", "t": "t"}
-WORDS |= {"std": "standard deviation of", "ee80": "radius of 80 % of the light", "mb": "size", "seconds": "time / s"}
+WORDS |= {
+    "fwhm": "width at half maximum",
+    "macs": "MACs",
+    "chi2": "chi²",
+    "dof": "degree of freedom",
+    "t": "t",
+}
+WORDS |= {
+    "std": "standard deviation of",
+    "ee80": "radius of 80 % of the light",
+    "mb": "size",
+    "seconds": "time / s",
+}
 
 
 def in_words(key: str) -> str:
@@ -126,13 +166,18 @@ def in_words(key: str) -> str:
     unit = UNITS.get(last, "") if parts else ""
     if unit and parts[-1] == "per":
         over = UNITS.get(parts[-2], "") if len(parts) > 2 else ""
-        unit, parts = (f"({over}/{unit})", parts[:-2]) if over else (f"(1/{unit})", parts[:-1])
-    said = " ".join(WORDS.get(part, part) for part in (parts if unit else [*parts, last]))
+        unit, parts = (
+            (f"({over}/{unit})", parts[:-2]) if over else (f"(1/{unit})", parts[:-1])
+        )
+    said = " ".join(
+        WORDS.get(part, part) for part in (parts if unit else [*parts, last])
+    )
     return f"{said} / {unit}" if unit else said
 
 
 def in_figures(value: Any, digits: int = 4) -> str:
-    """A value as a reader wants it: ``digits`` significant digits, yes and no, 0 for what rounding has left.
+    """A value as a reader wants it: ``digits`` significant digits, yes and no, 0 for
+    what rounding has left.
 
     >>> [in_figures(v) for v in (0.123456, 19553.2, 7.2e-15, True, None, "air", float("nan"))]
     ['0.1235', '19550', '0', 'yes', '–', 'air', 'nan']
@@ -150,19 +195,33 @@ def in_figures(value: Any, digits: int = 4) -> str:
 
 
 def png(figure: "Canvas", *, dpi: int = 220) -> bytes:
-    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the figure is closed.
+    """The bytes of a matplotlib figure as PNG, the same for the same drawing; the
+    figure is closed.
 
-    Two pixels of the file stand for one of the page: sharp on dense screens and on paper.
+    Two pixels of the file stand for one of the page: sharp on dense screens and on
+    paper.
     """
     from matplotlib import pyplot
 
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight", metadata={"Software": "metalens"})
+    figure.savefig(
+        buffer,
+        format="png",
+        dpi=dpi,
+        bbox_inches="tight",
+        metadata={"Software": "metalens"},
+    )
     pyplot.close(figure)
     return buffer.getvalue()
 
 
-def canvas(rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0, 3.4), **options: Any) -> Any:
+def canvas(
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    size: tuple[float, float] = (8.0, 3.4),
+    **options: Any,
+) -> Any:
     """(figure, axes) of matplotlib in the look of the reports, drawn without a display."""
     import matplotlib
 
@@ -180,10 +239,14 @@ def canvas(rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0,
         "axes.titleweight": "bold",
         "figure.facecolor": "white",
         "image.cmap": "magma",
-        "axes.prop_cycle": cycler(color=["#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#444"]),
+        "axes.prop_cycle": cycler(
+            color=["#1f6feb", "#d1495b", "#2a9d8f", "#e9a23b", "#6d597a", "#444"]
+        ),
     }
     with matplotlib.rc_context(style):
-        return pyplot.subplots(rows, columns, figsize=size, layout="constrained", **options)
+        return pyplot.subplots(
+            rows, columns, figsize=size, layout="constrained", **options
+        )
 
 
 def write(
@@ -194,15 +257,22 @@ def write(
     lead: str = "",
     key_figures: Sequence[KeyFigure] = (),
 ) -> None:
-    """Write the page: title, one lead paragraph, key figures, then the sections with a contents list.
+    """Write the page: title, one lead paragraph, key figures, then the sections with a
+    contents list.
 
     Raises:
         OSError: the target cannot be written.
     """
     from jinja2 import Environment
 
-    source = resources.files("metalens").joinpath("data/report.html").read_text(encoding="utf-8")
-    template = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+    source = (
+        resources.files("metalens")
+        .joinpath("data/report.html")
+        .read_text(encoding="utf-8")
+    )
+    template = Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True
+    ).from_string(source)
     kinds = {Figure: "figure", Table: "table", Markup: "markup"}
     page = template.render(
         title=title,

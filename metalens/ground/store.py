@@ -1,4 +1,6 @@
-"""Artefact files: one HDF5 header checked when opened, written whole or not at all, same input same bytes."""
+"""Artefact files: one HDF5 header checked when opened, written whole or not at all,
+same input same bytes.
+"""
 
 import contextlib
 import fcntl
@@ -21,11 +23,15 @@ from metalens.ground.errors import DAMAGE as DAMAGE
 from metalens.ground.errors import StoreError
 
 Attribute = str | int | float | bool
-_FORMAT = ("v110", "v110")  # of HDF5: every block of metadata carries a checksum, files can still be edited
+_FORMAT = (
+    "v110",
+    "v110",
+)  # of HDF5: every block of metadata carries a checksum, files can still be edited
 _UNITS = "um, rad"
 _MOST_BYTES = 1 << 36  # of all arrays of a file
 _DENSEST = 1040  # values' bytes for a byte in the file: what deflate can do at best
-_SMALL = 4096  # bytes of an array that is kept in its header, under the checksum of the header
+# bytes of an array that is kept in its header, under the checksum of the header
+_SMALL = 4096
 _RECORDED = ("numpy", "scipy", "torch", "h5py")
 
 
@@ -42,12 +48,16 @@ class Provenance:
     config: str = ""
     inputs: Mapping[str, str] = field(default_factory=dict)
     seed: int = -1
-    versions: Mapping[str, str] = field(default_factory=lambda: dict(package_versions()))
+    versions: Mapping[str, str] = field(
+        default_factory=lambda: dict(package_versions())
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stored:
-    """The content of an artefact file: ``arrays`` by name (``group/name``), ``attributes`` of the header."""
+    """The content of an artefact file: ``arrays`` by name (``group/name``),
+    ``attributes`` of the header.
+    """
 
     kind: str
     version: int
@@ -72,10 +82,13 @@ def sha256(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Give a scratch path beside ``path``; flush it and rename it over ``path`` only if the block succeeds.
+    """Give a scratch path beside ``path``; flush it and rename it over ``path`` only if
+    the block succeeds.
 
-    Whatever ends the block early (error, Ctrl-C, disk full), the old file stays and the scratch file goes; what a
-    killed process left goes with the next writing of the same file. Writers at the same time do not meet.
+    Whatever ends the block early (error, Ctrl-C, disk full), the old file stays and the
+    scratch file goes; what a
+    killed process left goes with the next writing of the same file. Writers at the same
+    time do not meet.
     """
     path = Path(path)
     clear(path)
@@ -95,7 +108,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def _part(path: Path) -> tuple[int, Path]:
     """A scratch file beside ``path``, locked so that nobody clears it away."""
     while True:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.name}.", suffix=".part", dir=path.parent
+        )
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(handle, fcntl.LOCK_SH)
         if os.path.exists(name):
@@ -107,7 +122,11 @@ def clear(path: Path) -> None:
     """Remove scratch files of writers that are gone."""
     start, end = f".{path.name}.", ".part"
     for entry in os.scandir(path.parent):
-        if entry.name.startswith(start) and entry.name.endswith(end) and lock.free(Path(entry.path)):
+        if (
+            entry.name.startswith(start)
+            and entry.name.endswith(end)
+            and lock.free(Path(entry.path))
+        ):
             os.unlink(entry.path)
 
 
@@ -130,9 +149,11 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a journal, on the disk when this returns; a line that was cut short before it is dropped.
+    """Add a line to a journal, on the disk when this returns; a line that was cut short
+    before it is dropped.
 
-    Writers at the same time wait for each other: what one of them has half written is no line that was cut short.
+    Writers at the same time wait for each other: what one of them has half written is
+    no line that was cut short.
     """
     with open(path, "ab+") as file:
         with contextlib.suppress(OSError):  # a file system without locks
@@ -146,7 +167,9 @@ def append_line(path: Path, line: str) -> None:
 
 
 def whole_lines(path: Path) -> list[str]:
-    """Lines of a journal; the last one is left out where it was cut short. None without a file."""
+    """Lines of a journal; the last one is left out where it was cut short. None without
+    a file.
+    """
     if not path.is_file():
         return []
     return path.read_text(encoding="utf-8", errors="replace").split("\n")[:-1]
@@ -162,7 +185,8 @@ def save(
     provenance: Provenance | None = None,
     compress: bool = True,
 ) -> None:
-    """Write an artefact: header (kind, version, units), arrays, provenance. Same input gives the same bytes.
+    """Write an artefact: header (kind, version, units), arrays, provenance. Same input
+    gives the same bytes.
 
     Args:
         path: target, replaced atomically.
@@ -173,54 +197,92 @@ def save(
         OSError: the target cannot be written (the old file stays).
     """
     with replacing(path) as part, reading.Through(part, "wb+") as file:
-        with lock.undisturbed():  # an interrupt inside the library is a failed write too
-            _write(file, kind, version, attributes or {}, arrays, provenance or Provenance(), compress)
+        with (
+            lock.undisturbed()
+        ):  # an interrupt inside the library is a failed write too
+            _write(
+                file,
+                kind,
+                version,
+                attributes or {},
+                arrays,
+                provenance or Provenance(),
+                compress,
+            )
         file.check()
 
 
-def load(path: str | Path, kind: str | None = None, *, version: int = 1, without: Collection[str] = ()) -> Stored:
+def load(
+    path: str | Path,
+    kind: str | None = None,
+    *,
+    version: int = 1,
+    without: Collection[str] = (),
+) -> Stored:
     """Read an artefact and check its header.
 
     Args:
         kind: the kind that is needed; None takes any (``metalens info``).
         without: arrays that are left in the file.
 
-    Arrays and header are under checksums of HDF5: a file that was cut or damaged is refused, not read wrongly, and one
+    Arrays and header are under checksums of HDF5: a file that was cut or damaged is
+    refused, not read wrongly, and one
     that was edited with an HDF5 library is read as it now stands.
 
     Raises:
-        StoreError: no such file, not HDF5, truncated, damaged, or of another kind or version; also where an entry
+        StoreError: no such file, not HDF5, truncated, damaged, or of another kind or
+            version; also where an entry
             that is asked for later is not in the file.
     """
     path = Path(path)
     if not path.is_file():
-        raise StoreError(f"{path}: {reading.absent(path)}; need a {kind or 'toolchain'} file")
+        raise StoreError(
+            f"{path}: {reading.absent(path)}; need a {kind or 'toolchain'} file"
+        )
     try:
-        return reading.survived(path, lambda file: _read(path, file, kind, version, without))
+        return reading.survived(
+            path, lambda file: _read(path, file, kind, version, without)
+        )
     except StoreError:
         raise
     except DAMAGE as error:
         if found := reading.foreign(path):
-            raise StoreError(f"{path}: {found}, need an HDF5 file of this toolchain") from error
-        raise StoreError(f"{path}: truncated or not an HDF5 file of this toolchain ({error})") from error
+            raise StoreError(
+                f"{path}: {found}, need an HDF5 file of this toolchain"
+            ) from error
+        raise StoreError(
+            f"{path}: truncated or not an HDF5 file of this toolchain ({error})"
+        ) from error
 
 
 def kind_of(path: str | Path) -> str:
     """The kind that an artefact file says it is; '' for any other file."""
     try:
-        found, units = reading.survived(path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")])
+        found, units = reading.survived(
+            path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")]
+        )
     except DAMAGE:
         return ""
     return found if isinstance(found, str) and units == _UNITS else ""
 
 
-def _read(path: Path, file: h5py.File, kind: str | None, version: int, without: Collection[str]) -> Stored:
+def _read(
+    path: Path,
+    file: h5py.File,
+    kind: str | None,
+    version: int,
+    without: Collection[str],
+) -> Stored:
     found = _plain(file.attrs.get("kind"))
     if found is None:
-        raise StoreError(f"{path}: an HDF5 file without 'kind', not made by this toolchain")
+        raise StoreError(
+            f"{path}: an HDF5 file without 'kind', not made by this toolchain"
+        )
     number = _plain(file.attrs["version"])
     if not isinstance(number, int):
-        raise StoreError(f"{path}: version is {number!r}, need a whole number; damaged: make it again")
+        raise StoreError(
+            f"{path}: version is {number!r}, need a whole number; damaged: make it again"
+        )
     if kind is not None and (found != kind or number != version):
         raise StoreError(
             f"{path} holds {found!r} version {number}, need {kind!r} version {version}; "
@@ -228,35 +290,54 @@ def _read(path: Path, file: h5py.File, kind: str | None, version: int, without: 
         )
     arrays: dict[str, Array] = _Held(path)
     wanted = ((name, item) for name, item in _listed(path, file) if name not in without)
-    arrays |= {name: item[...] for name, item in wanted if not name.startswith("provenance/")}
+    arrays |= {
+        name: item[...] for name, item in wanted if not name.startswith("provenance/")
+    }
     attributes: dict[str, Any] = _Held(path)
-    attributes |= {k: _plain(v) for k, v in file.attrs.items() if k not in ("kind", "version", "units")}
+    attributes |= {
+        k: _plain(v)
+        for k, v in file.attrs.items()
+        if k not in ("kind", "version", "units")
+    }
     return Stored(str(found), number, arrays, attributes, _read_provenance(file))
 
 
 def _listed(path: Path, file: h5py.File) -> list[tuple[str, h5py.Dataset]]:
-    """Data sets of a file, refused together before any is read where they claim more than the file can hold."""
+    """Data sets of a file, refused together before any is read where they claim more
+    than the file can hold.
+    """
     found: list[tuple[str, h5py.Dataset]] = []
-    file.visititems(lambda name, item: found.append((name, item)) if isinstance(item, h5py.Dataset) else None)
+    file.visititems(
+        lambda name, item: (
+            found.append((name, item)) if isinstance(item, h5py.Dataset) else None
+        )
+    )
     claimed = 0
     for name, item in found:
         check_claim(path, item, name)
         claimed += item.nbytes
     if claimed > _MOST_BYTES:
-        raise StoreError(f"{path}: its arrays take {claimed / 1e9:.3g} GB, more than {_MOST_BYTES / 1e9:.3g} GB")
+        raise StoreError(
+            f"{path}: its arrays take {claimed / 1e9:.3g} GB, more than {_MOST_BYTES / 1e9:.3g} GB"
+        )
     return found
 
 
 def check_claim(path: Path, item: h5py.Dataset, name: str) -> None:
-    """Refuse a data set of no values, of more than its bytes in the file can hold, or that lies in other files.
+    """Refuse a data set of no values, of more than its bytes in the file can hold, or
+    that lies in other files.
 
     Raises:
         StoreError: naming what it claims and what is there.
     """
     if item.shape is None:
-        raise StoreError(f"{path}: {name!r} is empty, without even a shape: damaged, or none of ours")
+        raise StoreError(
+            f"{path}: {name!r} is empty, without even a shape: damaged, or none of ours"
+        )
     if item.is_virtual or item.external:
-        raise StoreError(f"{path}: {name!r} lies in other files; need a file that holds all of its values")
+        raise StoreError(
+            f"{path}: {name!r} lies in other files; need a file that holds all of its values"
+        )
     if item.nbytes > _DENSEST * item.id.get_storage_size() + _SMALL:
         raise StoreError(
             f"{path}: {name!r} claims {item.nbytes:g} bytes of shape {item.shape}, the file holds "
@@ -272,7 +353,9 @@ class _Held(dict[str, Any]):
         self.path = path
 
     def __missing__(self, name: str) -> Any:
-        raise StoreError(f"{self.path}: holds no {name!r}; made by another release or damaged: make it again")
+        raise StoreError(
+            f"{self.path}: holds no {name!r}; made by another release or damaged: make it again"
+        )
 
 
 def _write(
@@ -285,7 +368,11 @@ def _write(
     compress: bool,
 ) -> None:
     with h5py.File(through, "w", track_order=False, libver=_FORMAT) as file:
-        header: dict[str, Attribute] = {"kind": kind, "version": version, "units": _UNITS}
+        header: dict[str, Attribute] = {
+            "kind": kind,
+            "version": version,
+            "units": _UNITS,
+        }
         for name, value in (header | dict(sorted(attributes.items()))).items():
             _write_attribute(file, name, value)
         for name in sorted(arrays):
@@ -296,24 +383,36 @@ def _write(
 
 def _write_array(file: h5py.File, name: str, array: Array, compress: bool) -> None:
     if array.dtype.kind == "U":
-        encoded = np.array([reading.shown(text).encode() for text in array.flat], "S").reshape(array.shape)
-        array = encoded.astype(h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1)))
+        encoded = np.array(
+            [reading.shown(text).encode() for text in array.flat], "S"
+        ).reshape(array.shape)
+        array = encoded.astype(
+            h5py.string_dtype("utf-8", max(encoded.dtype.itemsize, 1))
+        )
     if array.nbytes <= _SMALL:
         inside = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         inside.set_layout(h5py.h5d.COMPACT)
         file.create_dataset(name, data=array, track_times=False, dcpl=inside)
         return
     packing = (
-        {"compression": "gzip", "compression_opts": 1, "shuffle": True} if compress and array.nbytes > 65536 else {}
+        {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+        if compress and array.nbytes > 65536
+        else {}
     )
-    file.create_dataset(name, data=array, track_times=False, chunks=True, fletcher32=True, **packing)
+    file.create_dataset(
+        name, data=array, track_times=False, chunks=True, fletcher32=True, **packing
+    )
 
 
 def _write_attribute(item: h5py.Group, name: str, value: Attribute) -> None:
-    """Text goes in at its own length, inside the header; text of any length would lie apart, without a checksum."""
+    """Text goes in at its own length, inside the header; text of any length would lie
+    apart, without a checksum.
+    """
     if isinstance(value, str):
         encoded, name = reading.shown(value).encode(), reading.shown(name)
-        item.attrs.create(name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1)))
+        item.attrs.create(
+            name, encoded, dtype=h5py.string_dtype("utf-8", max(len(encoded), 1))
+        )
     else:
         item.attrs[name] = value
 
@@ -330,8 +429,13 @@ def _write_provenance(file: h5py.File, provenance: Provenance) -> None:
 
 def _read_provenance(file: h5py.File) -> Provenance:
     group = file["provenance"]
-    inputs, versions = ({k: str(_plain(v)) for k, v in group[p].attrs.items()} for p in ("inputs", "versions"))
-    return Provenance(str(_plain(group.attrs["config"])), inputs, int(group.attrs["seed"]), versions)
+    inputs, versions = (
+        {k: str(_plain(v)) for k, v in group[p].attrs.items()}
+        for p in ("inputs", "versions")
+    )
+    return Provenance(
+        str(_plain(group.attrs["config"])), inputs, int(group.attrs["seed"]), versions
+    )
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,5 @@
-"""Threads for compiled loops that release the interpreter lock: torch's number where it runs; safe after a fork.
+"""Threads for compiled loops that release the interpreter lock: torch's number where it
+runs; safe after a fork.
 
 And memory that a process keeps between the steps of a long run.
 """
@@ -28,10 +29,13 @@ class Stopped(Exception):  # no error: nobody waits for what is stopped any more
 
 
 def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """``work`` of every item, in their order: side by side, one thread each, :func:`split` within them included.
+    """``work`` of every item, in their order: side by side, one thread each,
+    :func:`split` within them included.
 
-    For work that consists of calls which release the interpreter lock, and that shares nothing it changes. An
-    interrupt or the first failure stops the others at their next :func:`split`, and is raised when they have ended.
+    For work that consists of calls which release the interpreter lock, and that shares
+    nothing it changes. An
+    interrupt or the first failure stops the others at their next :func:`split`, and is
+    raised when they have ended.
     """
     items = list(items)
     count = min(threads(), len(items), _MOST)
@@ -43,7 +47,10 @@ def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
         _BESIDE.stop = stop
         return work(item)
 
-    with ThreadPoolExecutor(count, thread_name_prefix="metalens-beside") as pool, one_blas_thread():
+    with (
+        ThreadPoolExecutor(count, thread_name_prefix="metalens-beside") as pool,
+        one_blas_thread(),
+    ):
         try:
             jobs = [pool.submit(alone, item) for item in items]
             return [job.result() for job in jobs]
@@ -54,7 +61,9 @@ def each(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
 
 
 def split(count: int, work: Callable[[int, int], object]) -> None:
-    """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads (see :func:`threads`)."""
+    """Call ``work(start, stop)`` over [0, count) in as many parts as there are threads
+    (see :func:`threads`).
+    """
     stop = getattr(_BESIDE, "stop", None)
     if stop is not None and stop.is_set():
         raise Stopped
@@ -62,7 +71,9 @@ def split(count: int, work: Callable[[int, int], object]) -> None:
 
 
 def beside(*works: Callable[[], Any]) -> list[Any]:
-    """Results of several calls, side by side where there are threads; see :func:`split`."""
+    """Results of several calls, side by side where there are threads; see
+    :func:`split`.
+    """
     out = dict[int, Any]()
 
     def some(start: int, stop: int) -> None:
@@ -74,9 +85,11 @@ def beside(*works: Callable[[], Any]) -> list[Any]:
 
 
 def apart(count: int, work: Callable[[int, int], object]) -> None:
-    """As :func:`split`, for work of many small calls of torch: each part has one of its threads to itself.
+    """As :func:`split`, for work of many small calls of torch: each part has one of its
+    threads to itself.
 
-    Together they would wait for each other at every call. ``work`` may carry no derivatives: what torch knows of them
+    Together they would wait for each other at every call. ``work`` may carry no
+    derivatives: what torch knows of them
     is of the calling thread.
     """
     torch = sys.modules["torch"]
@@ -98,14 +111,19 @@ def _shared(count: int, parts: int, work: Callable[[int, int], object]) -> None:
         work(0, count)
         return
     edges = [count * i // parts for i in range(parts + 1)]
-    jobs = [_pool(os.getpid(), parts).submit(work, a, b) for a, b in itertools.pairwise(edges[1:])]
+    jobs = [
+        _pool(os.getpid(), parts).submit(work, a, b)
+        for a, b in itertools.pairwise(edges[1:])
+    ]
     work(edges[0], edges[1])
     for job in jobs:
         job.result()
 
 
 def threads() -> int:
-    """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this process; one within `each`."""
+    """Threads of torch where it is loaded, else OMP_NUM_THREADS, else the cores of this
+    process; one within `each`.
+    """
     if getattr(_BESIDE, "stop", None) is not None:
         return 1
     torch = sys.modules.get("torch")
@@ -121,24 +139,38 @@ def _pool(process: int, parts: int) -> ThreadPoolExecutor:
 
 
 def one_blas_thread() -> contextlib.AbstractContextManager[object]:
-    """Run numpy's and scipy's BLAS on one thread: its idle threads spin for a while and take torch's cores."""
+    """Run numpy's and scipy's BLAS on one thread: its idle threads spin for a while and
+    take torch's cores.
+    """
     limit: contextlib.AbstractContextManager[object] = _blas().limit(limits=1)
     return limit
 
 
 @functools.lru_cache(maxsize=1)
 def keep_memory() -> bool:
-    """From here on what is freed stays with the process, for arrays to come; False where the C library is not glibc.
+    """From here on what is freed stays with the process, for arrays to come; False
+    where the C library is not glibc.
 
-    For runs whose steps all make arrays of the same sizes. Left to itself glibc gives blocks of over 32 MB, and the end
-    of its heap, back to the system after every step, and gets them as new pages, which the system clears one by one.
+    For runs whose steps all make arrays of the same sizes. Left to itself glibc gives
+    blocks of over 32 MB, and the end
+    of its heap, back to the system after every step, and gets them as new pages, which
+    the system clears one by one.
     """
-    tune = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    own_pages, trimmed = -3, -1  # M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h; either one alone makes it worse
-    return tune is not None and bool(tune(own_pages, 1 << 30) and tune(trimmed, (1 << 31) - 1))
+    tune = (
+        getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    )
+    own_pages, trimmed = (
+        -3,
+        -1,
+    )  # M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of malloc.h; either one alone makes it worse
+    return tune is not None and bool(
+        tune(own_pages, 1 << 30) and tune(trimmed, (1 << 31) - 1)
+    )
 
 
 @functools.lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
-    importlib.import_module("scipy.linalg")  # its BLAS is another one than numpy's, and must be there to be found
+    importlib.import_module(
+        "scipy.linalg"
+    )  # its BLAS is another one than numpy's, and must be there to be found
     return ThreadpoolController().select(user_api="blas")

@@ -20,7 +20,10 @@ from metalens.ground import lock, manifest, store
 from metalens.ground.errors import OutputError
 
 ROOM = 1 << 22  # bytes that every output may need
-UNFINISHED, JOURNAL = ".unfinished", ".resume"  # endings of what an interruption leaves for the next run
+UNFINISHED, JOURNAL = (
+    ".unfinished",
+    ".resume",
+)  # endings of what an interruption leaves for the next run
 IN_PLACE = "the new one is in place, but the disk did not confirm it"
 _READY = "ready"
 
@@ -29,8 +32,10 @@ _READY = "ready"
 class Draft:
     """A claimed output.
 
-    path: where to write it; companions of a file go beside this path under their own names.
-    target: where all appears at the end; where a link leads. resumed: whether ``path`` holds work of an earlier run.
+    path: where to write it; companions of a file go beside this path under their own
+    names.
+    target: where all appears at the end; where a link leads. resumed: whether ``path``
+    holds work of an earlier run.
     """
 
     path: Path
@@ -42,8 +47,10 @@ class Draft:
 class Terms:
     """What a claim allows.
 
-    force: whether what exists may be replaced, if it is ours. inputs: files and folders that are read.
-    room: bytes that the output needs. parents: whether missing folders above it are made.
+    force: whether what exists may be replaced, if it is ours. inputs: files and folders
+    that are read.
+    room: bytes that the output needs. parents: whether missing folders above it are
+    made.
     """
 
     force: bool = False
@@ -53,8 +60,11 @@ class Terms:
 
 
 @contextlib.contextmanager
-def file(target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()) -> Iterator[Draft]:
-    """Claim a file and its companions, give a scratch path, and put all in place if the block succeeds.
+def file(
+    target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()
+) -> Iterator[Draft]:
+    """Claim a file and its companions, give a scratch path, and put all in place if the
+    block succeeds.
 
     Args:
         beside: endings of the companions: ``_xz.png`` is NAME_xz.png for NAME.h5.
@@ -64,8 +74,12 @@ def file(target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()) ->
     """
     target = _real(target)
     names = [target.stem + end for end in beside]
-    if target.name.lower() in (name.lower() for name in names):  # one file where the system tells no case apart
-        raise OutputError(f"{target}: a file of that name is written beside the result; give another ending, as .h5")
+    if target.name.lower() in (
+        name.lower() for name in names
+    ):  # one file where the system tells no case apart
+        raise OutputError(
+            f"{target}: a file of that name is written beside the result; give another ending, as .h5"
+        )
     with _claimed(target, terms, is_folder=False):
         _refuse(target, names, terms, is_folder=False)
         with _scratch(target) as scratch:
@@ -76,7 +90,8 @@ def file(target: Path, *, beside: Sequence[str] = (), terms: Terms = Terms()) ->
 
 @contextlib.contextmanager
 def folder(target: Path, *, terms: Terms = Terms()) -> Iterator[Draft]:
-    """Claim a folder, give a scratch folder to fill, and put it in place with a manifest if the block succeeds.
+    """Claim a folder, give a scratch folder to fill, and put it in place with a
+    manifest if the block succeeds.
 
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
@@ -100,19 +115,24 @@ def long_work(
     grow: bool = False,
     terms: Terms = Terms(),
 ) -> Iterator[Draft]:
-    """As :func:`folder` for work of minutes to days: it is done in ``NAME.unfinished`` beside the target.
+    """As :func:`folder` for work of minutes to days: it is done in ``NAME.unfinished``
+    beside the target.
 
-    That folder survives an interruption if it holds a file that matches a pattern of ``keep``; with ``resume`` the next
-    run goes on in it, or in a copy of the finished folder. What stands at ``target`` stays until the end.
+    That folder survives an interruption if it holds a file that matches a pattern of
+    ``keep``; with ``resume`` the next
+    run goes on in it, or in a copy of the finished folder. What stands at ``target``
+    stays until the end.
 
     Args:
-        grow: always go on, from a copy of what stands at ``target``, and put the whole back; it must have a manifest,
+        grow: always go on, from a copy of what stands at ``target``, and put the whole
+            back; it must have a manifest,
             or hold nothing but folders that have one.
 
     What others put into a folder of ours goes with it, and does not become ours.
 
     Raises:
-        OutputError: nothing to resume, or unfinished work that would be lost; see :func:`_refuse`.
+        OutputError: nothing to resume, or unfinished work that would be lost; see
+            :func:`_refuse`.
     """
     target = _real(target)
     with _claimed(target, terms, is_folder=True), _scratch(target) as scratch:
@@ -140,54 +160,86 @@ def unfinished(target: Path) -> Path:
 
 
 def _real(target: Path) -> Path:
-    """What a link leads to, also where that does not stand yet: lock and scratch are beside it, as for who names it."""
+    """What a link leads to, also where that does not stand yet: lock and scratch are
+    beside it, as for who names it.
+    """
     try:
         return target.resolve() if os.path.islink(target) else target
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"{target}: a link that leads nowhere ({error}); give another name") from None
+        raise OutputError(
+            f"{target}: a link that leads nowhere ({error}); give another name"
+        ) from None
 
 
 @contextlib.contextmanager
 def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
     """The lock of an output, with leftovers of dead owners cleared."""
     if "\0" in str(target) or target.name in ("", ".", ".."):
-        raise OutputError(f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write")
+        raise OutputError(
+            f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write"
+        )
     if target.name.endswith((UNFINISHED, JOURNAL)):
-        raise OutputError(f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work")
+        raise OutputError(
+            f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work"
+        )
     with contextlib.ExitStack() as held:
         if terms.parents:
             held.enter_context(lock.parents(target))
         if not target.parent.is_dir():
-            how = "is a file: give" if target.parent.exists() else "does not exist; make it or give"
+            how = (
+                "is a file: give"
+                if target.parent.exists()
+                else "does not exist; make it or give"
+            )
             raise OutputError(f"{target}: folder {target.parent} {how} another name")
         try:
             held.enter_context(lock.held(target))
         except OSError as error:
-            raise OutputError(f"{target}: its folder cannot be written ({error.strerror}); give another") from error
+            raise OutputError(
+                f"{target}: its folder cannot be written ({error.strerror}); give another"
+            ) from error
         for left in lock.left(target):
             _recover(left, target)
-        store.clear(target.with_name(target.name + JOURNAL))  # scratch of a journal whose writer was killed
+        store.clear(
+            target.with_name(target.name + JOURNAL)
+        )  # scratch of a journal whose writer was killed
         try:
             yield
         except OSError as error:
             if error.filename is None:  # a full disk
-                error.add_note(f"{target} could not be made; what stood there is unchanged")
+                error.add_note(
+                    f"{target} could not be made; what stood there is unchanged"
+                )
             raise
 
 
-def _refuse(target: Path, beside: Iterable[str], terms: Terms, *, is_folder: bool) -> None:
-    """Refuse an output that is an input, exists without --force, is none of ours, or finds no room.
+def _refuse(
+    target: Path, beside: Iterable[str], terms: Terms, *, is_folder: bool
+) -> None:
+    """Refuse an output that is an input, exists without --force, is none of ours, or
+    finds no room.
 
     Raises:
         OutputError: naming what stands there and what to do.
     """
     for path in terms.inputs:
         if path.exists() and target.exists() and path.samefile(target):
-            raise OutputError(f"{target} is also an input ({path}): it would be replaced; give another name")
-        if is_folder and path.exists() and target.resolve() in path.resolve().parents and _something(target):
-            raise OutputError(f"{target} holds the input {path}: it would be replaced; give another name")
+            raise OutputError(
+                f"{target} is also an input ({path}): it would be replaced; give another name"
+            )
+        if (
+            is_folder
+            and path.exists()
+            and target.resolve() in path.resolve().parents
+            and _something(target)
+        ):
+            raise OutputError(
+                f"{target} holds the input {path}: it would be replaced; give another name"
+            )
     if os.path.ismount(target):
-        raise OutputError(f"{target} is a mount point, which cannot be replaced whole; give another name")
+        raise OutputError(
+            f"{target} is a mount point, which cannot be replaced whole; give another name"
+        )
     if target.exists() and target.is_dir() != is_folder:
         raise OutputError(f"{target} is a {'folder' if target.is_dir() else 'file'}; need the name of a "
                           f"{'folder' if is_folder else 'file'}")  # fmt: skip
@@ -198,19 +250,24 @@ def _refuse(target: Path, beside: Iterable[str], terms: Terms, *, is_folder: boo
             raise OutputError(f"{path} exists; give --force to overwrite it")
         why = manifest.foreign(path)
         if why:
-            raise OutputError(f"{path} {why}: not overwritten, not even with --force; move it or give another name")
+            raise OutputError(
+                f"{path} {why}: not overwritten, not even with --force; move it or give another name"
+            )
     check_room(target, terms.room)
 
 
 def check_room(target: Path, room: int) -> None:
-    """Refuse an output of ``room`` bytes that its disk has no room for; for sizes that are known after the claim.
+    """Refuse an output of ``room`` bytes that its disk has no room for; for sizes that
+    are known after the claim.
 
     Raises:
         OutputError: naming what is free and what is needed.
     """
     spare = shutil.disk_usage(target.parent).free
     if spare < room:
-        raise OutputError(f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first")
+        raise OutputError(
+            f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
+        )
 
 
 def _something(path: Path) -> bool:
@@ -224,8 +281,12 @@ def _something(path: Path) -> bool:
 def _scratch(target: Path) -> Iterator[Path]:
     scratch = None
     try:
-        with lock.undisturbed():  # a signal that comes here is answered inside the block that clears up
-            scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
+        with (
+            lock.undisturbed()
+        ):  # a signal that comes here is answered inside the block that clears up
+            scratch = Path(
+                tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent)
+            )
         yield scratch
     finally:
         with lock.undisturbed():
@@ -233,8 +294,11 @@ def _scratch(target: Path) -> Iterator[Path]:
                 _recover(scratch, target)
 
 
-def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Terms) -> None:
-    """Companions that stand are moved aside, then the file is replaced (from here on it is the new one), then theirs.
+def _commit_file(
+    scratch: Path, target: Path, beside: Sequence[str], terms: Terms
+) -> None:
+    """Companions that stand are moved aside, then the file is replaced (from here on it
+    is the new one), then theirs.
 
     So at no moment does a companion lie beside a file that it does not belong to.
     """
@@ -258,7 +322,9 @@ def _commit_file(scratch: Path, target: Path, beside: Sequence[str], terms: Term
             store.sync_folder(target.parent)
 
 
-def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False) -> None:
+def _commit_folder(
+    scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False
+) -> None:
     """Give the folder its manifest and exchange it with what stands."""
     begun = manifest.read(new)
     manifest.write(new, lock.COMMAND.get(), others=begun["others"] if begun else ())
@@ -267,8 +333,16 @@ def _commit_folder(scratch: Path, new: Path, target: Path, terms: Terms, *, whoe
         if not whoever:
             _refuse(target, (), terms, is_folder=True)
         number, ready, old = new.stat().st_ino, scratch / _READY, scratch / "old"
-        with _finished(target, lambda: old.exists() or (target.exists() and target.stat().st_ino == number), ready):
-            store.write_bytes(ready, b"%d" % number)  # whole or not at all: an empty one is a file's
+        with _finished(
+            target,
+            lambda: (
+                old.exists() or (target.exists() and target.stat().st_ino == number)
+            ),
+            ready,
+        ):
+            store.write_bytes(
+                ready, b"%d" % number
+            )  # whole or not at all: an empty one is a file's
             _put(scratch, new, target)
 
 
@@ -285,28 +359,42 @@ def _put(scratch: Path, new: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def _finished(target: Path, placed: Callable[[], bool], ready: Path | None = None) -> Iterator[None]:
-    """Where the disk refuses something: all is undone, or the new output is in place, and the error says so."""
+def _finished(
+    target: Path, placed: Callable[[], bool], ready: Path | None = None
+) -> Iterator[None]:
+    """Where the disk refuses something: all is undone, or the new output is in place,
+    and the error says so.
+    """
     try:
         yield
     except OSError as error:
         if placed():
-            raise OutputError(f"{target}: {IN_PLACE} ({error.strerror}); check it when the disk is well") from error
+            raise OutputError(
+                f"{target}: {IN_PLACE} ({error.strerror}); check it when the disk is well"
+            ) from error
         if ready is not None:
-            ready.unlink(missing_ok=True)  # or leaving would put the new one in place after all
+            ready.unlink(
+                missing_ok=True
+            )  # or leaving would put the new one in place after all
         raise
 
 
-def _open_work(scratch: Path, target: Path, terms: Terms, *, resume: bool, grow: bool) -> bool:
+def _open_work(
+    scratch: Path, target: Path, terms: Terms, *, resume: bool, grow: bool
+) -> bool:
     """Make or find the folder of unfinished work; whether it holds some already."""
     work = unfinished(target)
     found = manifest.read(work) if work.is_dir() else None
     if work.exists() and found is None:
-        raise OutputError(f"{work} is in the way and was not made by metalens; move it or give another name")
+        raise OutputError(
+            f"{work} is in the way and was not made by metalens; move it or give another name"
+        )
     if found is not None and resume:
         return True
     if found is not None and not terms.force:
-        raise OutputError(f"{work} holds an unfinished run; give --resume to go on, or --force to start over")
+        raise OutputError(
+            f"{work} holds an unfinished run; give --resume to go on, or --force to start over"
+        )
     if found is not None:
         work.rename(scratch / "given_up")
     fresh = scratch / "work"
@@ -314,7 +402,9 @@ def _open_work(scratch: Path, target: Path, terms: Terms, *, resume: bool, grow:
     if copied:
         others = manifest.strange(target)
         if others and manifest.read(target) is None:
-            raise OutputError(f"{target} holds {min(others)} and no {manifest.NAME}: not made by metalens")
+            raise OutputError(
+                f"{target} holds {min(others)} and no {manifest.NAME}: not made by metalens"
+            )
         if not grow:
             manifest.check(target)
         shutil.copytree(target, fresh, symlinks=True)
@@ -330,17 +420,23 @@ def _recover(scratch: Path, target: Path) -> None:
     new, old, ready = scratch / "new", scratch / "old", scratch / _READY
     if ready.is_file() and ready.stat().st_size:
         _recover_folder(scratch, target, int(ready.read_text(encoding="ascii")))
-    elif ready.is_file() and new.is_dir() and old.is_dir():  # of a file: both are made before
+    elif (
+        ready.is_file() and new.is_dir() and old.is_dir()
+    ):  # of a file: both are made before
         done = not (new / target.name).exists()
         for path in (new if done else old).iterdir():
             if not target.with_name(path.name).exists():
                 path.rename(target.with_name(path.name))
-    ready.unlink(missing_ok=True)  # first: what a kill leaves of the rest is scratch and nothing more
+    ready.unlink(
+        missing_ok=True
+    )  # first: what a kill leaves of the rest is scratch and nothing more
     shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _recover_folder(scratch: Path, target: Path, inode: int) -> None:
-    """Put a folder in place that was finished when its owner was killed, or clear what it had replaced."""
+    """Put a folder in place that was finished when its owner was killed, or clear what
+    it had replaced.
+    """
     for path in (scratch / "new", unfinished(target)):
         if path.is_dir() and path.stat().st_ino == inode:
             if not (target.exists() and manifest.foreign(target)):

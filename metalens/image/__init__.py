@@ -1,4 +1,6 @@
-"""Scene through PSFs onto the sensor, and what the image tells (quick pupil, Fisher information)."""
+"""Scene through PSFs onto the sensor, and what the image tells (quick pupil, Fisher
+information).
+"""
 
 from typing import TYPE_CHECKING
 

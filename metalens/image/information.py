@@ -1,4 +1,6 @@
-"""Fisher information of images and of PSFs: Eqs. 4-6 and 11 of the paper, bounds, and measures beyond them."""
+"""Fisher information of images and of PSFs: Eqs. 4-6 and 11 of the paper, bounds, and
+measures beyond them.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ Normalisation = Literal["sum", "l2", "none"]
 
 
 def information(jacobians: Tensor, variance: Tensor | None = None) -> Tensor:
-    """Fisher matrix F_ij = sum over pixels of J_i J_j (Eq. 4), or of J_i J_j / variance (Gaussian noise).
+    """Fisher matrix F_ij = sum over pixels of J_i J_j (Eq. 4), or of J_i J_j / variance
+    (Gaussian noise).
 
     Args:
         jacobians: (parameters, ...) derivative of the image in each parameter.
@@ -28,7 +31,8 @@ def information(jacobians: Tensor, variance: Tensor | None = None) -> Tensor:
 
 
 def span_angle(fisher: Tensor) -> Tensor:
-    """Angle between two sensitivity fields: cos phi = F12 / sqrt(F11 F22) (Eq. 5), in [0, pi].
+    """Angle between two sensitivity fields: cos phi = F12 / sqrt(F11 F22) (Eq. 5), in
+    [0, pi].
 
     From atan2, so that it is exact near 0 and pi; 0 where a field vanishes.
     """
@@ -43,7 +47,8 @@ class OpticsLoss:
     """Eq. 6 and its parts.
 
     value: sensitivity + orthogonality + compactness, each with its weight.
-    floored: parameters whose information is below the floor: their logarithm is held and has a bounded gradient.
+    floored: parameters whose information is below the floor: their logarithm is held
+    and has a bounded gradient.
     """
 
     value: Tensor
@@ -62,14 +67,18 @@ def optics_loss(
     floor: float = 1e-8,
     relative: bool = True,
 ) -> OpticsLoss:
-    """- sum log F_ii + orthogonality sum over i != j of F_ij² + compactness (1 - E) (Eq. 6).
+    """- sum log F_ii + orthogonality sum over i != j of F_ij² + compactness (1 - E)
+    (Eq. 6).
 
     Args:
         fisher: (n, n).
         encircled: encircled energy in [0, 1], any shape; its mean enters.
-        floor: least F_ii in the logarithm: below it the tangent of the logarithm at the floor is used (value and
-            slope are continuous, the gradient still points to more information), and ``floored`` tells.
-        relative: divide F_ij² by F_ii F_jj. The paper's plain form changes with the units of the parameters and
+        floor: least F_ii in the logarithm: below it the tangent of the logarithm at the
+            floor is used (value and
+            slope are continuous, the gradient still points to more information), and
+            ``floored`` tells.
+        relative: divide F_ij² by F_ii F_jj. The paper's plain form changes with the
+            units of the parameters and
             with the brightness: it can be made small by dimming the image.
     """
     diagonal = torch.diagonal(fisher)
@@ -79,16 +88,26 @@ def optics_loss(
     scale = torch.outer(safe, safe) if relative else torch.ones_like(fisher)
     off = (fisher**2 / scale).sum() - (torch.diagonal(fisher**2 / scale)).sum()
     parts = -logs.sum(), orthogonality * off, compactness * (1 - encircled).mean()
-    return OpticsLoss(sum(parts, fisher.new_zeros(())), *parts, tuple(torch.nonzero(held)[:, 0].tolist()))
+    return OpticsLoss(
+        sum(parts, fisher.new_zeros(())),
+        *parts,
+        tuple(torch.nonzero(held)[:, 0].tolist()),
+    )
 
 
-def encircled_energy(intensity: Tensor, sample_um: float, *, radius_um: float) -> Tensor:
-    """Light within ``radius_um`` of the window's centre, in the units of ``intensity`` (..., y, x).
+def encircled_energy(
+    intensity: Tensor, sample_um: float, *, radius_um: float
+) -> Tensor:
+    """Light within ``radius_um`` of the window's centre, in the units of ``intensity``
+    (..., y, x).
 
-    Samples cut by the circle count in part. Give intensities as shares of the light through the aperture to get
+    Samples cut by the circle count in part. Give intensities as shares of the light
+    through the aperture to get
     the absolute encircled energy; dividing by the window's own sum flatters a wide PSF.
     """
-    y, x = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in intensity.shape[-2:])
+    y, x = (
+        torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in intensity.shape[-2:]
+    )
     inside = (radius_um / sample_um + 0.5 - torch.hypot(y[:, None], x)).clamp(0, 1)
     return (intensity * inside.to(intensity)).sum((-2, -1))
 
@@ -103,16 +122,25 @@ def pixel_information(
     normalisation: Normalisation,
     shift_um: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:
-    """I(z) of Eq. 11 for one position of the pixel grid: sum over pixels of ((P(z + dz) - P(z)) / dz)², per mm².
+    """I(z) of Eq. 11 for one position of the pixel grid: sum over pixels of ((P(z + dz)
+    - P(z)) / dz)², per mm².
 
     Args:
-        near, far: (..., y, x) intensities at z and at z + ``step_um``, sampled every ``sample_um``.
-        normalisation: of every depth's pixels: by their sum, by their Euclidean norm, or as they are. It decides
+        near, far: (..., y, x) intensities at z and at z + ``step_um``, sampled every
+            ``sample_um``.
+        normalisation: of every depth's pixels: by their sum, by their Euclidean norm,
+            or as they are. It decides
             which lens wins; always name it.
     """
     shape = tuple(whole_pixels(n, sample_um, pixel_um) for n in near.shape[-2:])
     grid = dict(pitch_um=pixel_um, shape=(shape[0], shape[1]), shift_um=shift_um)
-    a, b = (_normalised(integrate(image, sample_um, **grid), normalisation) for image in (near, far))  # type: ignore[arg-type]
+    a, b = (
+        _normalised(
+            integrate(image, sample_um, **grid),  # type: ignore[arg-type]
+            normalisation,
+        )
+        for image in (near, far)
+    )
     return ((b - a) ** 2).sum((-2, -1)) / (step_um * 1e-3) ** 2
 
 
@@ -126,13 +154,17 @@ def axial_information(
     normalisation: Normalisation = "l2",
     positions: int = 3,
 ) -> Tensor:
-    """I(z) of Eq. 11, averaged over ``positions``² sub-pixel positions of the image on the pixels, per mm².
+    """I(z) of Eq. 11, averaged over ``positions``² sub-pixel positions of the image on
+    the pixels, per mm².
 
-    Read from one position, or from intensities sampled coarser than lambda d / 4R, the value misranks lenses and an
-    optimiser exploits it. The window must hold the PSF: light outside it does not count.
+    Read from one position, or from intensities sampled coarser than lambda d / 4R, the
+    value misranks lenses and an
+    optimiser exploits it. The window must hold the PSF: light outside it does not
+    count.
 
     Args:
-        near, far: (..., y, x) intensities at z and z + ``step_um``, sampled at least three times a pixel.
+        near, far: (..., y, x) intensities at z and z + ``step_um``, sampled at least
+            three times a pixel.
 
     Raises:
         SceneError: less than three samples a pixel, or no position asked for.
@@ -161,15 +193,21 @@ def axial_information(
     return torch.stack(values).mean(0)
 
 
-def texture_information(psf: Tensor, *, step_um: float, spectrum: Tensor, noise: float) -> Tensor:
-    """Information on depth from the blur of an unknown texture: 1/2 sum over frequencies of (d log S / dz)², per mm².
+def texture_information(
+    psf: Tensor, *, step_um: float, spectrum: Tensor, noise: float
+) -> Tensor:
+    """Information on depth from the blur of an unknown texture: 1/2 sum over
+    frequencies of (d log S / dz)², per mm².
 
-    The image of a Gaussian texture of power ``spectrum`` in white noise has the power S(f) = |H(f)|² spectrum + noise;
-    this is the Fisher information of its variance (Whittle). Phases, and so displacements of the PSF, carry nothing.
+    The image of a Gaussian texture of power ``spectrum`` in white noise has the power
+    S(f) = |H(f)|² spectrum + noise;
+    this is the Fisher information of its variance (Whittle). Phases, and so
+    displacements of the PSF, carry nothing.
 
     Args:
         psf: (depths, y, x) pixel PSFs at equal steps ``step_um``.
-        spectrum: (y, x // 2 + 1) power of the texture on the grid of ``torch.fft.rfft2``.
+        spectrum: (y, x // 2 + 1) power of the texture on the grid of
+            ``torch.fft.rfft2``.
         noise: power of the noise per frequency.
 
     Returns:
@@ -186,28 +224,40 @@ def texture_information(psf: Tensor, *, step_um: float, spectrum: Tensor, noise:
 
 
 def without_nuisance(fisher: Tensor, wanted: int) -> Tensor:
-    """Information on the first ``wanted`` parameters when the others are unknown too: the Schur complement.
+    """Information on the first ``wanted`` parameters when the others are unknown too:
+    the Schur complement.
 
-    Nuisance directions that the image does not show at all are left out (pseudo-inverse).
+    Nuisance directions that the image does not show at all are left out
+    (pseudo-inverse).
     """
-    a, b, c = fisher[:wanted, :wanted], fisher[:wanted, wanted:], fisher[wanted:, wanted:]
+    a, b, c = (
+        fisher[:wanted, :wanted],
+        fisher[:wanted, wanted:],
+        fisher[wanted:, wanted:],
+    )
     scale = torch.sqrt(torch.diagonal(c).clamp_min(torch.finfo(c.dtype).tiny))
-    inverse = torch.linalg.pinv(c / torch.outer(scale, scale), hermitian=True, rtol=1e-12)
+    inverse = torch.linalg.pinv(
+        c / torch.outer(scale, scale), hermitian=True, rtol=1e-12
+    )
     left: Tensor = a - (b / scale) @ inverse @ (b / scale).mT
     return left
 
 
 def cramer_rao(fisher: Tensor) -> Tensor:
-    """(n,) least standard deviation of an unbiased estimate of each parameter: sqrt of the diagonal of F^-1.
+    """(n,) least standard deviation of an unbiased estimate of each parameter: sqrt of
+    the diagonal of F^-1.
 
-    ``fisher`` must be noise-weighted. Infinite where a parameter cannot be told from the others (colinear
+    ``fisher`` must be noise-weighted. Infinite where a parameter cannot be told from
+    the others (colinear
     sensitivities), found from the eigenvalues of the matrix scaled to a unit diagonal.
     """
     diagonal = torch.diagonal(fisher)
     scale = torch.sqrt(diagonal.clamp_min(torch.finfo(fisher.dtype).tiny))
     values, vectors = torch.linalg.eigh(fisher / torch.outer(scale, scale))
     seen = values > 1e-12 * len(fisher)
-    spread = (vectors**2 * torch.where(seen, 1 / torch.where(seen, values, 1.0), 0.0)).sum(1)
+    spread = (
+        vectors**2 * torch.where(seen, 1 / torch.where(seen, values, 1.0), 0.0)
+    ).sum(1)
     blind = ((vectors**2)[:, ~seen].sum(1) > 1e-9) | (diagonal <= 0)
     return torch.where(blind, math.inf, torch.sqrt(spread) / scale)
 

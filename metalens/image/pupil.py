@@ -1,8 +1,12 @@
-"""Quick PSFs of smooth pupil phases: two matrix products an image, for design studies and first guesses.
+"""Quick PSFs of smooth pupil phases: two matrix products an image, for design studies
+and first guesses.
 
-The pupil is sampled in direction cosines q as seen from the window's centre, where the chief ray meets the sensor: in
-them the lens-to-window propagation is a Fourier transform to first order in the window's size. On the axis these are
-the nodes that carry the phase; off it, each of them takes the phase of the nearest node. Pillars are not resolved; the
+The pupil is sampled in direction cosines q as seen from the window's centre, where the
+chief ray meets the sensor: in
+them the lens-to-window propagation is a Fourier transform to first order in the
+window's size. On the axis these are
+the nodes that carry the phase; off it, each of them takes the phase of the nearest
+node. Pillars are not resolved; the
 full lens goes through :mod:`metalens.psf`.
 """
 
@@ -47,13 +51,17 @@ class Pupil:
 
     @property
     def field_step_um(self) -> float:
-        """Coarsest sampling of the field: lambda / (2 sin of the rim's angle); of the intensity, half of it."""
+        """Coarsest sampling of the field: lambda / (2 sin of the rim's angle); of the
+        intensity, half of it.
+        """
         return self.wavelength_um / (2 * self.edge)
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A place in the field: ``angle_rad`` from the axis, in the direction ``azimuth_rad`` from +x."""
+    """A place in the field: ``angle_rad`` from the axis, in the direction
+    ``azimuth_rad`` from +x.
+    """
 
     angle_rad: float = 0.0
     azimuth_rad: float = 0.0
@@ -67,11 +75,15 @@ class Field:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """The pupil as seen from the window's centre, on (nodes, nodes) direction cosines; float64.
+    """The pupil as seen from the window's centre, on (nodes, nodes) direction cosines;
+    float64.
 
-    x_um, y_um: where the rays leave the lens. weight: share of each cell inside the aperture, and the solid angle.
-    node: index of the nearest node of the pupil, row * nodes + column; None where they are the same, on the axis.
-    lens_rad: hyperbolic phase of the focus and path to the window's centre, less that of the lens' centre.
+    x_um, y_um: where the rays leave the lens. weight: share of each cell inside the
+    aperture, and the solid angle.
+    node: index of the nearest node of the pupil, row * nodes + column; None where they
+    are the same, on the axis.
+    lens_rad: hyperbolic phase of the focus and path to the window's centre, less that
+    of the lens' centre.
     """
 
     x_um: Tensor
@@ -83,13 +95,19 @@ class Seen:
 
 def axis(pupil: Pupil) -> Tensor:
     """(nodes,) direction cosines of the nodes from their middle."""
-    return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (2 * pupil.edge / pupil.nodes)
+    return (torch.arange(pupil.nodes, dtype=torch.float64) - (pupil.nodes - 1) / 2) * (
+        2 * pupil.edge / pupil.nodes
+    )
 
 
 @functools.lru_cache(maxsize=16)
 def kernel(pupil: Pupil, sample_um: float, samples: int) -> Tensor:
-    """(samples, nodes) Fourier transform from direction cosines to the samples of a window."""
-    position = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * sample_um
+    """(samples, nodes) Fourier transform from direction cosines to the samples of a
+    window.
+    """
+    position = (
+        torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
+    ) * sample_um
     k = 2 * math.pi / pupil.wavelength_um
     return torch.exp(-1j * k * position[:, None] * axis(pupil)).to(torch.complex64)
 
@@ -109,7 +127,9 @@ def radius(pupil: Pupil) -> Tensor:
 
 
 def amplitude(pupil: Pupil) -> Tensor:
-    """(nodes, nodes) weight of the nodes: the share of the rim cells inside the aperture, and the solid angle."""
+    """(nodes, nodes) weight of the nodes: the share of the rim cells inside the
+    aperture, and the solid angle.
+    """
     q = axis(pupil)
     q2 = q[:, None] ** 2 + q**2
     step = 2 * pupil.edge / pupil.nodes
@@ -118,11 +138,15 @@ def amplitude(pupil: Pupil) -> Tensor:
 
 
 def aperture_light(pupil: Pupil, window_um: float) -> float:
-    """What |U|² of all nodes is over, so that a window of this width holds the share that a sharp round rim sends it.
+    """What |U|² of all nodes is over, so that a window of this width holds the share
+    that a sharp round rim sends it.
 
-    The area of the aperture in nodes: the squares of the weights sum to less, as a node across the rim has the mean
-    field of its width. What such nodes send to X is dimmed by sinc²(X / period); so of a rim at p, which sends
-    4√2 / (π² k p X) of the light beyond ±X, the window lacks ∫ (1 - sinc²) of that, to second order.
+    The area of the aperture in nodes: the squares of the weights sum to less, as a node
+    across the rim has the mean
+    field of its width. What such nodes send to X is dimmed by sinc²(X / period); so of
+    a rim at p, which sends
+    4√2 / (π² k p X) of the light beyond ±X, the window lacks ∫ (1 - sinc²) of that, to
+    second order.
     """
     step, k = 2 * pupil.edge / pupil.nodes, 2 * math.pi / pupil.wavelength_um
     given = math.pi * (pupil.radius_um / pupil.sensor_distance_um / step) ** 2
@@ -140,17 +164,20 @@ def psf(
     sample_um: float = 0.75,
     samples: int = 192,
 ) -> Tensor:
-    """Intensity around the chief ray of point sources behind a lens that focuses ``focus_um`` and adds ``phase_rad``.
+    """Intensity around the chief ray of point sources behind a lens that focuses
+    ``focus_um`` and adds ``phase_rad``.
 
     Args:
         phase_rad: (nodes, nodes) on the pupil's nodes, differentiable.
         depths_um: (images,) of the sources in front of the lens, along the axis.
-        focus_um: source distance that the hyperbolic part of the lens images onto the sensor.
+        focus_um: source distance that the hyperbolic part of the lens images onto the
+            sensor.
         fields: (images,) directions of the sources; all on the axis without.
         sample_um: of the window, at most half of ``pupil.field_step_um``.
 
     Returns:
-        (images, samples, samples): share of the light through the aperture on each sample; float32.
+        (images, samples, samples): share of the light through the aperture on each
+        sample; float32.
 
     Raises:
         PropagationError: the window is wider than the period of the nodes.
@@ -163,14 +190,22 @@ def psf(
     to_window = kernel(pupil, sample_um, samples)
     k, added = 2 * math.pi / pupil.wavelength_um, wrapped(phase_rad).float()
     angles, weights = [], []
-    for depth, field in zip(depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True):
+    for depth, field in zip(
+        depths_um.tolist(), fields or [Field()] * len(depths_um), strict=True
+    ):
         seen = view(pupil, field, float(focus_um))
         path = source_path(seen.x_um, seen.y_um, field.tangents, 1 / depth)
         known = wrapped(seen.lens_rad + k * path).float()
-        angles.append(known + (added if seen.node is None else added.reshape(-1)[seen.node]))
+        angles.append(
+            known + (added if seen.node is None else added.reshape(-1)[seen.node])
+        )
         weights.append(seen.weight.float())
-    image = to_window @ (torch.polar(torch.stack(weights), torch.stack(angles)) @ to_window.mT)
-    share = (sample_um / pupil.period_um) ** 2 / aperture_light(pupil, samples * sample_um)  # Parseval over a period
+    image = to_window @ (
+        torch.polar(torch.stack(weights), torch.stack(angles)) @ to_window.mT
+    )
+    share = (sample_um / pupil.period_um) ** 2 / aperture_light(
+        pupil, samples * sample_um
+    )  # Parseval over a period
     return (image.real**2 + image.imag**2) * share
 
 
@@ -180,23 +215,36 @@ def view(pupil: Pupil, field: Field, focus_um: float) -> Seen:
     d, k = pupil.sensor_distance_um, 2 * math.pi / pupil.wavelength_um
     if not field.angle_rad:
         x, y = coordinates(pupil)
-        return Seen(x, y, amplitude(pupil), None, -k * path_difference(x**2 + y**2, focus_um))
+        return Seen(
+            x, y, amplitude(pupil), None, -k * path_difference(x**2 + y**2, focus_um)
+        )
     cx, cy = (d * t for t in field.tangents)
     mx, my = _middle(pupil.radius_um, cx, cy, d)
     qy, qx = torch.meshgrid(axis(pupil) + my, axis(pupil) + mx, indexing="ij")
     rest = (1 - qx**2 - qy**2).clamp_min(1e-3)
     x, y = cx + qx * d / torch.sqrt(rest), cy + qy * d / torch.sqrt(rest)
     r2, n = x**2 + y**2, pupil.nodes
-    step = 2 * pupil.edge / n * d / torch.sqrt(rest)  # of the nodes, on the lens, across the line of sight
+    step = (
+        2 * pupil.edge / n * d / torch.sqrt(rest)
+    )  # of the nodes, on the lens, across the line of sight
     weight = ((pupil.radius_um - torch.sqrt(r2)) / step + 0.5).clamp(0, 1) / rest
     path = torch.sqrt(r2 + d**2)
-    row, column = (torch.round(a / path * n / (2 * pupil.edge) + (n - 1) / 2).clamp(0, n - 1).long() for a in (y, x))
+    row, column = (
+        torch.round(a / path * n / (2 * pupil.edge) + (n - 1) / 2)
+        .clamp(0, n - 1)
+        .long()
+        for a in (y, x)
+    )
     focus = path_difference(r2, d) + path_difference(r2, focus_um)
-    return Seen(x, y, weight, row * n + column, k * (sensor_path(x, y, (cx, cy), d) - focus))
+    return Seen(
+        x, y, weight, row * n + column, k * (sensor_path(x, y, (cx, cy), d) - focus)
+    )
 
 
 def wrapped(phase_rad: Tensor) -> Tensor:
-    """The phase less whole turns, so that single precision holds it; the gradient is that of the phase."""
+    """The phase less whole turns, so that single precision holds it; the gradient is
+    that of the phase.
+    """
     return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))
 
 

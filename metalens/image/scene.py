@@ -1,8 +1,12 @@
-"""Image formation: a scene of depth layers through depth-dependent PSFs, with occlusion (paper Sec. 3.1).
+"""Image formation: a scene of depth layers through depth-dependent PSFs, with occlusion
+(paper Sec. 3.1).
 
-A scene is two opaque sheets, each a surface of varying depth: the near sheet (lids and skin) hides part of the far one
-(the eyeball). Slices of one sheet join without hiding each other; the near sheet hides the far one by its blurred
-coverage, and the far one is continued behind it. Weights are divided by their sum, so constant radiance stays constant.
+A scene is two opaque sheets, each a surface of varying depth: the near sheet (lids and
+skin) hides part of the far one
+(the eyeball). Slices of one sheet join without hiding each other; the near sheet hides
+the far one by its blurred
+coverage, and the far one is continued behind it. Weights are divided by their sum, so
+constant radiance stays constant.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +19,9 @@ from torch.autograd import forward_ad
 from metalens.ground.errors import SceneError
 
 CODES = 4096  # depths of the look-up table of kernel weights, at equal steps of 1/z
-FAINT = 0.01  # blurred coverage below which a far sheet fades behind the near one; rounding grows by its inverse
+# blurred coverage below which a far sheet fades behind the near one; rounding grows by
+# its inverse
+FAINT = 0.01
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,8 +29,10 @@ class Frames:
     """Rendered sheets, index 0 near and 1 far along the axis of sheets.
 
     radiance: (frames, 2, y, x), already multiplied by the coverage.
-    coverage: (frames, 2, y, x) in [0, 1]; the two add up to 1 where the scene is opaque.
-    depth_um: (frames, 2, y, x) distance from the lens plane; any value where the coverage is 0.
+    coverage: (frames, 2, y, x) in [0, 1]; the two add up to 1 where the scene is
+    opaque.
+    depth_um: (frames, 2, y, x) distance from the lens plane; any value where the
+    coverage is 0.
     """
 
     radiance: Tensor
@@ -33,9 +41,18 @@ class Frames:
 
     def __post_init__(self) -> None:
         shape = self.radiance.shape
-        if len(shape) != 4 or shape[1] != 2 or self.coverage.shape != shape or self.depth_um.shape != shape:
-            found = [tuple(a.shape) for a in (self.radiance, self.coverage, self.depth_um)]
-            raise SceneError(f"radiance, coverage, depth have shapes {found}, need the same (frames, 2, y, x)")
+        if (
+            len(shape) != 4
+            or shape[1] != 2
+            or self.coverage.shape != shape
+            or self.depth_um.shape != shape
+        ):
+            found = [
+                tuple(a.shape) for a in (self.radiance, self.coverage, self.depth_um)
+            ]
+            raise SceneError(
+                f"radiance, coverage, depth have shapes {found}, need the same (frames, 2, y, x)"
+            )
 
     def to(self, device: torch.device | str) -> "Frames":
         """The same on a device."""
@@ -59,14 +76,17 @@ class Layers:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PsfBasis:
-    """A PSF stack over depth (and field) as a few kernels: P(z) = sum over r of weights[z, r] kernels[r].
+    """A PSF stack over depth (and field) as a few kernels: P(z) = sum over r of
+    weights[z, r] kernels[r].
 
     kernels: (rank, h, w).
-    weights: (field rows, field columns, depths, rank); one field point where the PSF is the same over the image,
+    weights: (field rows, field columns, depths, rank); one field point where the PSF is
+    the same over the image,
         otherwise a regular grid from corner to corner of the image.
     depths_um: (depths,) ascending.
     error: relative error (L2) to expect of the image of a texture, at the worst depth.
-    bound: largest sum of |error| of a PSF, for PSFs of sum 1: no image of radiance 1 is wrong by more.
+    bound: largest sum of |error| of a PSF, for PSFs of sum 1: no image of radiance 1 is
+    wrong by more.
     """
 
     kernels: Tensor
@@ -77,35 +97,53 @@ class PsfBasis:
 
 
 def basis(
-    stack: Tensor, depths_um: Tensor, *, tolerance: float = 1e-3, occupied_um: tuple[float, float] | None = None
+    stack: Tensor,
+    depths_um: Tensor,
+    *,
+    tolerance: float = 1e-3,
+    occupied_um: tuple[float, float] | None = None,
 ) -> PsfBasis:
-    """Fewest kernels that keep the image of a texture within ``tolerance``; differentiable in the stack.
+    """Fewest kernels that keep the image of a texture within ``tolerance``;
+    differentiable in the stack.
 
-    The gradient is that of the stack projected on the kept weights: changes of the PSFs that vary with depth in a way
+    The gradient is that of the stack projected on the kept weights: changes of the PSFs
+    that vary with depth in a way
     that the stack does not show yet need a smaller tolerance.
 
-    A singular value decomposition of the transfer functions, weighted by the 1/f amplitude of natural textures:
+    A singular value decomposition of the transfer functions, weighted by the 1/f
+    amplitude of natural textures:
     what a PSF does at frequencies that scenes hardly hold costs no kernels.
 
     Args:
         stack: (depths, h, w), or (field rows, field columns, depths, h, w).
         depths_um: (depths,) ascending.
-        occupied_um: least and largest depth that the scene holds; depths further out are left out.
+        occupied_um: least and largest depth that the scene holds; depths further out
+            are left out.
 
     Raises:
         SceneError: the depths do not ascend or do not match the stack.
     """
     fields = stack if stack.ndim == 5 else stack[None, None]
-    if fields.shape[2] != len(depths_um) or bool((depths_um[1:] <= depths_um[:-1]).any()):
-        raise SceneError(f"{len(depths_um)} depths for a stack {tuple(stack.shape)}: need one ascending depth a PSF")
+    if fields.shape[2] != len(depths_um) or bool(
+        (depths_um[1:] <= depths_um[:-1]).any()
+    ):
+        raise SceneError(
+            f"{len(depths_um)} depths for a stack {tuple(stack.shape)}: need one ascending depth a PSF"
+        )
     if occupied_um is not None:
         low = max(int(torch.searchsorted(depths_um, occupied_um[0], right=True)) - 1, 0)
-        high = min(int(torch.searchsorted(depths_um, occupied_um[1])), len(depths_um) - 1)
+        high = min(
+            int(torch.searchsorted(depths_um, occupied_um[1])), len(depths_um) - 1
+        )
         fields, depths_um = fields[:, :, low : high + 1], depths_um[low : high + 1]
     flat = fields.flatten(3).flatten(0, 2)
-    left, size, _ = torch.linalg.svd(_seen(fields.detach().double()), full_matrices=False)
+    left, size, _ = torch.linalg.svd(
+        _seen(fields.detach().double()), full_matrices=False
+    )
     share = (left * size) ** 2
-    missing = torch.sqrt(share.flip(1).cumsum(1).flip(1) / share.sum(1, keepdim=True)).amax(0)
+    missing = torch.sqrt(
+        share.flip(1).cumsum(1).flip(1) / share.sum(1, keepdim=True)
+    ).amax(0)
     rank = max(int((missing > tolerance).sum()), 1)
     weights = left[:, :rank].to(flat)
     kernels = weights.mT @ flat
@@ -113,21 +151,33 @@ def basis(
     error = float(missing[rank]) if rank < len(missing) else 0.0
     bound = float((residual.abs().sum(1) / flat.detach().sum(1).abs()).max())
     shape = (*fields.shape[:3], rank)
-    return PsfBasis(kernels.reshape(rank, *fields.shape[3:]), weights.reshape(shape), depths_um, error, bound)
+    return PsfBasis(
+        kernels.reshape(rank, *fields.shape[3:]),
+        weights.reshape(shape),
+        depths_um,
+        error,
+        bound,
+    )
 
 
 def _seen(fields: Tensor) -> Tensor:
-    """(PSFs, frequencies) transfer functions as a 1/f texture shows them, real and imaginary parts side by side."""
+    """(PSFs, frequencies) transfer functions as a 1/f texture shows them, real and
+    imaginary parts side by side.
+    """
     h, w = fields.shape[-2:]
     transfer = torch.fft.rfft2(fields, s=(2 * h, 2 * w))
-    fy, fx = torch.fft.fftfreq(2 * h, dtype=torch.float64), torch.fft.rfftfreq(2 * w, dtype=torch.float64)
+    fy, fx = (
+        torch.fft.fftfreq(2 * h, dtype=torch.float64),
+        torch.fft.rfftfreq(2 * w, dtype=torch.float64),
+    )
     amplitude = 1 / torch.sqrt(fy[:, None] ** 2 + fx**2 + (1 / (8 * max(h, w))) ** 2)
     amplitude = amplitude * torch.where((fx == 0) | (fx == 0.5), 1.0, 2**0.5)
     return torch.view_as_real(transfer * amplitude).flatten(3).flatten(0, 2)
 
 
 def weight_maps(psf: PsfBasis, depth_um: Tensor) -> Tensor:
-    """(rank, ..., y, x) weights of the kernels for sources at these depths: linear in 1/z between the nodes.
+    """(rank, ..., y, x) weights of the kernels for sources at these depths: linear in
+    1/z between the nodes.
 
     Depths outside the nodes take the outermost one.
     """
@@ -142,13 +192,17 @@ def weight_maps(psf: PsfBasis, depth_um: Tensor) -> Tensor:
         r = (rows + down).clamp(max=table.shape[0] - 1)[:, None].expand(code.shape)
         c = (columns + right).clamp(max=table.shape[1] - 1).expand(code.shape)
         share = (y if down else 1 - y)[:, None] * (x if right else 1 - x)
-        total = total + torch.stack([table[r, c, k, code] for k in range(table.shape[2])]) * share.to(table)
+        total = total + torch.stack(
+            [table[r, c, k, code] for k in range(table.shape[2])]
+        ) * share.to(table)
     return total
 
 
 def _codes(depths_um: Tensor, depth_um: Tensor) -> Tensor:
     near, far = 1 / float(depths_um[0]), 1 / float(depths_um[-1])
-    unit = (near - 1 / depth_um.clamp(float(depths_um[0]), float(depths_um[-1]))) / max(near - far, 1e-30)
+    unit = (near - 1 / depth_um.clamp(float(depths_um[0]), float(depths_um[-1]))) / max(
+        near - far, 1e-30
+    )
     return (unit * (CODES - 1) + 0.5).long()
 
 
@@ -157,11 +211,19 @@ def _table(psf: PsfBasis) -> Tensor:
     if len(psf.depths_um) == 1:
         return psf.weights.mT.expand(-1, -1, -1, CODES)
     vergence = 1 / psf.depths_um.double()
-    wanted = torch.linspace(float(vergence[0]), float(vergence[-1]), CODES, dtype=torch.float64)
+    wanted = torch.linspace(
+        float(vergence[0]), float(vergence[-1]), CODES, dtype=torch.float64
+    )
     upper = torch.searchsorted(-vergence, -wanted).clamp(1, len(vergence) - 1)
-    part = ((wanted - vergence[upper - 1]) / (vergence[upper] - vergence[upper - 1])).clamp(0, 1).to(psf.weights)
+    part = (
+        ((wanted - vergence[upper - 1]) / (vergence[upper] - vergence[upper - 1]))
+        .clamp(0, 1)
+        .to(psf.weights)
+    )
     upper = upper.to(psf.weights.device)
-    return torch.lerp(psf.weights[:, :, upper - 1], psf.weights[:, :, upper], part[:, None]).mT
+    return torch.lerp(
+        psf.weights[:, :, upper - 1], psf.weights[:, :, upper], part[:, None]
+    ).mT
 
 
 def _span(pixels: int, points: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -175,7 +237,8 @@ class UniformImager:
     """Transfer functions of a basis, ready for frames of one size.
 
     psf: the basis. transfer: (rank, Y, X // 2 + 1). shape: (Y, X) of the transforms.
-    table: (field rows, field columns, rank, CODES) weights of the kernels at depths at equal steps of 1/z.
+    table: (field rows, field columns, rank, CODES) weights of the kernels at depths at
+    equal steps of 1/z.
     """
 
     psf: PsfBasis
@@ -185,20 +248,41 @@ class UniformImager:
 
     def to(self, device: torch.device | str) -> "UniformImager":
         """The same on a device, for frames there; differentiable."""
-        psf = replace(self.psf, kernels=self.psf.kernels.to(device), weights=self.psf.weights.to(device))
-        return replace(self, psf=psf, transfer=self.transfer.to(device), table=self.table.to(device))
+        psf = replace(
+            self.psf,
+            kernels=self.psf.kernels.to(device),
+            weights=self.psf.weights.to(device),
+        )
+        return replace(
+            self,
+            psf=psf,
+            transfer=self.transfer.to(device),
+            table=self.table.to(device),
+        )
 
 
-def uniform_imager(psf: PsfBasis, frame: tuple[int, int], *, margin: int = 0) -> UniformImager:
-    """Prepare a basis for frames of ``frame`` = (y, x) pixels that were rendered with ``margin`` pixels to spare."""
+def uniform_imager(
+    psf: PsfBasis, frame: tuple[int, int], *, margin: int = 0
+) -> UniformImager:
+    """Prepare a basis for frames of ``frame`` = (y, x) pixels that were rendered with
+    ``margin`` pixels to spare.
+    """
     reach = max(psf.kernels.shape[-2:]) // 2
     spare = 2 * max(reach - margin, 0)
     shape = tuple(scipy.fft.next_fast_len(n + spare, real=True) for n in frame)
-    return UniformImager(psf, _transfer(psf.kernels, (shape[0], shape[1])), (shape[0], shape[1]), _table(psf))
+    return UniformImager(
+        psf,
+        _transfer(psf.kernels, (shape[0], shape[1])),
+        (shape[0], shape[1]),
+        _table(psf),
+    )
 
 
-def image(frames: Frames, optics: UniformImager, *, margin: int = 0, chunk: int = 2) -> Tensor:
-    """(frames, y - 2 margin, x - 2 margin) irradiance on the sensor grid, upright, at unit transmission.
+def image(
+    frames: Frames, optics: UniformImager, *, margin: int = 0, chunk: int = 2
+) -> Tensor:
+    """(frames, y - 2 margin, x - 2 margin) irradiance on the sensor grid, upright, at
+    unit transmission.
 
     Args:
         margin: pixels around the frame that are blurred in but not returned.
@@ -209,8 +293,12 @@ def image(frames: Frames, optics: UniformImager, *, margin: int = 0, chunk: int 
         part = slice(start, start + chunk)
         few = Frames(*(getattr(frames, name)[part] for name in Frames.__slots__))
         mean = _mean(few)
-        source = _sources(replace(few, radiance=few.radiance - mean * few.coverage), optics)
-        blurred = torch.fft.irfft2(_mixed(torch.fft.rfft2(source), optics), s=optics.shape)
+        source = _sources(
+            replace(few, radiance=few.radiance - mean * few.coverage), optics
+        )
+        blurred = torch.fft.irfft2(
+            _mixed(torch.fft.rfft2(source), optics), s=optics.shape
+        )
         size = frames.radiance.shape[-2:]
         blurred = blurred[..., margin : size[0] - margin, margin : size[1] - margin]
         out.append(_over(blurred[:, 0], blurred[:, 1], mean[:, 0]))
@@ -218,15 +306,22 @@ def image(frames: Frames, optics: UniformImager, *, margin: int = 0, chunk: int 
 
 
 def _mean(frames: Frames) -> Tensor:
-    """(frames, 1, 1, 1) mean radiance: taken off before the transforms, whose rounding then grows with the contrast."""
-    light, cover = (part.detach().sum((1, 2, 3), keepdim=True) for part in (frames.radiance, frames.coverage))
+    """(frames, 1, 1, 1) mean radiance: taken off before the transforms, whose rounding
+    then grows with the contrast.
+    """
+    light, cover = (
+        part.detach().sum((1, 2, 3), keepdim=True)
+        for part in (frames.radiance, frames.coverage)
+    )
     return light / cover.clamp_min(1e-30)
 
 
 def spectra(frames: Frames, optics: UniformImager) -> Tensor:
-    """(rank, frames, light and coverage, sheets, Y, X // 2 + 1) spectra of the frames, weighted for every kernel.
+    """(rank, frames, light and coverage, sheets, Y, X // 2 + 1) spectra of the frames,
+    weighted for every kernel.
 
-    They do not change with the kernels: for many images of the same frames, as in a design, see :func:`with_kernels`.
+    They do not change with the kernels: for many images of the same frames, as in a
+    design, see :func:`with_kernels`.
     """
     spectrum: Tensor = torch.fft.rfft2(_sources(frames, optics))
     return spectrum
@@ -241,23 +336,33 @@ def _mixed(spectrum: Tensor, optics: UniformImager) -> Tensor:
 
 
 def _sources(frames: Frames, optics: UniformImager) -> Tensor:
-    """(rank, frames, 2 kinds, 2 sheets, y, x) light and coverage weighted for every kernel, ready to transform."""
+    """(rank, frames, 2 kinds, 2 sheets, y, x) light and coverage weighted for every
+    kernel, ready to transform.
+    """
     psf, given = optics.psf, (frames.radiance, frames.coverage, frames.depth_um)
     single = psf.weights.shape[:2] == (1, 1)
     if single and all(plain(a) for a in (*given, psf.weights)):
         from metalens.image.sources import weighted
 
         ends = float(psf.depths_um[0]), float(psf.depths_um[-1])
-        light, cover, depth, table = (a.numpy() for a in (*given, optics.table[0, 0].contiguous()))
-        return torch.from_numpy(weighted(light, cover, depth, table, ends_um=ends, shape=optics.shape))
+        light, cover, depth, table = (
+            a.numpy() for a in (*given, optics.table[0, 0].contiguous())
+        )
+        return torch.from_numpy(
+            weighted(light, cover, depth, table, ends_um=ends, shape=optics.shape)
+        )
     pair = torch.stack([frames.radiance, frames.coverage], 1)
     if single:  # weights of the depth alone: pad once, not once a kernel
-        return weight_maps(psf, padded(frames.depth_um, optics.shape))[:, :, None] * padded(pair, optics.shape)
+        return weight_maps(psf, padded(frames.depth_um, optics.shape))[
+            :, :, None
+        ] * padded(pair, optics.shape)
     return padded(weight_maps(psf, frames.depth_um)[:, :, None] * pair, optics.shape)
 
 
 def plain(a: Tensor) -> bool:
-    """Whether compiled code may read the values: single precision, in main memory, without derivatives."""
+    """Whether compiled code may read the values: single precision, in main memory,
+    without derivatives.
+    """
     return a.dtype in (torch.float32, torch.complex64) and values(a)
 
 
@@ -277,9 +382,15 @@ def with_kernels(optics: UniformImager, kernels: Tensor) -> UniformImager:
     return replace(optics, psf=replace(optics.psf, kernels=kernels), transfer=transfer)
 
 
-def image_spectra(source: Tensor, optics: UniformImager, size: tuple[int, int]) -> Tensor:
-    """(frames, y, x) the image that :func:`image` gives, from :func:`spectra` of frames of ``size`` = (y, x) pixels."""
-    blurred = torch.fft.irfft2(_mixed(source, optics), s=optics.shape)[..., : size[0], : size[1]]
+def image_spectra(
+    source: Tensor, optics: UniformImager, size: tuple[int, int]
+) -> Tensor:
+    """(frames, y, x) the image that :func:`image` gives, from :func:`spectra` of frames
+    of ``size`` = (y, x) pixels.
+    """
+    blurred = torch.fft.irfft2(_mixed(source, optics), s=optics.shape)[
+        ..., : size[0], : size[1]
+    ]
     return _over(blurred[:, 0], blurred[:, 1])
 
 
@@ -296,38 +407,56 @@ def cut(frames: Frames, depths_um: Tensor) -> Layers:
             below = vergence[max(k - 1, 0)] - node
             above = node - vergence[min(k + 1, len(vergence) - 1)]
             offset = position[:, sheet] - node
-            share = 1 - torch.where(offset > 0, offset / below.clamp_min(1e-12), -offset / above.clamp_min(1e-12))
+            share = 1 - torch.where(
+                offset > 0,
+                offset / below.clamp_min(1e-12),
+                -offset / above.clamp_min(1e-12),
+            )
             share = share.clamp(0, 1)
             if bool((share * frames.coverage[:, sheet] > 0).any()):
                 parts.append(share * frames.radiance[:, sheet])
                 cover.append(share * frames.coverage[:, sheet])
                 where.append(depths_um[k])
                 near.append(sheet == 0)
-    return Layers(torch.stack(parts, 1), torch.stack(cover, 1), torch.stack(where), torch.tensor(near))
+    return Layers(
+        torch.stack(parts, 1),
+        torch.stack(cover, 1),
+        torch.stack(where),
+        torch.tensor(near),
+    )
 
 
 def _over(light: Tensor, cover: Tensor, mean: Tensor | float = 0.0) -> Tensor:
-    """Near sheet over far sheet, (frames, 2, y, x) blurred light and coverage -> (frames, y, x).
+    """Near sheet over far sheet, (frames, 2, y, x) blurred light and coverage ->
+    (frames, y, x).
 
     ``mean``: (frames, 1, 1) radiance that was taken off the light.
     """
     free = (1 - cover[:, 0]).clamp(0, 1)
-    share = (cover[:, 1] / FAINT).clamp(0, 1)  # fades smoothly in below FAINT, exact above
+    share = (cover[:, 1] / FAINT).clamp(
+        0, 1
+    )  # fades smoothly in below FAINT, exact above
     behind = free * share * (3 - 2 * share) / cover[:, 1].clamp_min(FAINT)
     weight = cover[:, 0] + behind * cover[:, 1]
-    over: Tensor = (light[:, 0] + behind * light[:, 1] + mean * weight) / weight.clamp_min(FAINT)
+    over: Tensor = (
+        light[:, 0] + behind * light[:, 1] + mean * weight
+    ) / weight.clamp_min(FAINT)
     return over
 
 
 def _transfer(kernels: Tensor, shape: tuple[int, int]) -> Tensor:
     h, w = kernels.shape[-2:]
     padded = torch.nn.functional.pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
-    transfer: Tensor = torch.fft.rfft2(torch.roll(padded, (-(h // 2), -(w // 2)), (-2, -1)))
+    transfer: Tensor = torch.fft.rfft2(
+        torch.roll(padded, (-(h // 2), -(w // 2)), (-2, -1))
+    )
     return transfer
 
 
 def padded(sources: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Continue the border pixels into the spare columns and rows: half of them belong to the far border."""
+    """Continue the border pixels into the spare columns and rows: half of them belong
+    to the far border.
+    """
     for axis in (-1, -2):
         spare = shape[axis] - sources.shape[axis]
         if spare > 0:

@@ -1,4 +1,6 @@
-"""The sensor: continuous pixel pitch, photon and read noise, full well, quantisation (paper Sec. 3.1)."""
+"""The sensor: continuous pixel pitch, photon and read noise, full well, quantisation
+(paper Sec. 3.1).
+"""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +14,8 @@ from metalens.ground.errors import SceneError
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What turns irradiance into numbers. Defaults: a small global-shutter pixel of 3 um with 10 bits.
+    """What turns irradiance into numbers. Defaults: a small global-shutter pixel of 3
+    um with 10 bits.
 
     pitch_um: effective pixel pitch (the paper's p hat).
     base_pitch_um: pitch for which the electron counts below hold.
@@ -44,17 +47,23 @@ class Sensor:
 
 
 def kappa(pitch_um: float | Tensor, base_pitch_um: float) -> float | Tensor:
-    """Light of a pixel relative to a base pixel: (pitch / base pitch)², the paper's energy-preserving factor."""
+    """Light of a pixel relative to a base pixel: (pitch / base pitch)², the paper's
+    energy-preserving factor.
+    """
     return (pitch_um / base_pitch_um) ** 2
 
 
 def pixel_count(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that cover ``samples`` samples; one where the pixel is larger than the image."""
+    """Pixels of this pitch that cover ``samples`` samples; one where the pixel is
+    larger than the image.
+    """
     return max(1, math.ceil(samples * sample_um / pitch_um * (1 - 1e-12)))
 
 
 def whole_pixels(samples: int, sample_um: float, pitch_um: float) -> int:
-    """Pixels of this pitch that lie wholly inside ``samples`` samples, however the lengths are rounded."""
+    """Pixels of this pitch that lie wholly inside ``samples`` samples, however the
+    lengths are rounded.
+    """
     return math.floor(samples * sample_um / pitch_um * (1 + 1e-12))
 
 
@@ -67,32 +76,44 @@ def pixel_weights(
     shift_um: float = 0.0,
     grid_um: float | None = None,
 ) -> Tensor:
-    """(pixels, samples) share of each sample's light that falls on each pixel, in float64.
+    """(pixels, samples) share of each sample's light that falls on each pixel, in
+    float64.
 
-    The cumulative light at the sample edges is interpolated by a Catmull-Rom cubic and differenced at the pixel
-    edges: exact area overlap where the edges coincide, telescoping (so the energy is kept), and with a continuous
-    derivative in the pitch everywhere. Plain overlap has a kink wherever a pixel edge meets a sample edge.
+    The cumulative light at the sample edges is interpolated by a Catmull-Rom cubic and
+    differenced at the pixel
+    edges: exact area overlap where the edges coincide, telescoping (so the energy is
+    kept), and with a continuous
+    derivative in the pitch everywhere. Plain overlap has a kink wherever a pixel edge
+    meets a sample edge.
 
     Args:
         samples: of the image along this axis; the image is centred on the pixel row.
         pitch_um: float, or a tensor that the weights are differentiable in.
         count: of pixels; by default as many as cover the image.
         shift_um: of the pixel row towards + along the axis.
-        grid_um: distance of the pixels, the pitch by default. Where it is given the places stay and ``pitch_um`` is
-            the width of the box alone (the paper's learnable box filter), in the light of a box of ``grid_um``.
+        grid_um: distance of the pixels, the pitch by default. Where it is given the
+            places stay and ``pitch_um`` is
+            the width of the box alone (the paper's learnable box filter), in the light
+            of a box of ``grid_um``.
 
     Accuracy:
-        Column sums are 1 to rounding where the pixels reach one sample beyond the image. A pixel cut by an
-        isolated bright sample takes up to -0.075 of it: the overshoot of the cubic; none on sampled PSFs.
+        Column sums are 1 to rounding where the pixels reach one sample beyond the
+        image. A pixel cut by an
+        isolated bright sample takes up to -0.075 of it: the overshoot of the cubic;
+        none on sampled PSFs.
     """
     pitch = torch.as_tensor(pitch_um, dtype=torch.float64)
-    pixels = pixel_count(samples, sample_um, float(pitch.detach()) if grid_um is None else grid_um)
+    pixels = pixel_count(
+        samples, sample_um, float(pitch.detach()) if grid_um is None else grid_um
+    )
     pixels = pixels if count is None else count
     place = torch.arange(pixels + 1, dtype=torch.float64) - pixels / 2
 
     def light(edge_um: Tensor) -> Tensor:
         position = (edge_um + shift_um) / sample_um + samples / 2
-        return _smooth_step(position[:, None] - torch.arange(samples, dtype=torch.float64))
+        return _smooth_step(
+            position[:, None] - torch.arange(samples, dtype=torch.float64)
+        )
 
     if grid_um is None:
         step = light(place * pitch)
@@ -110,7 +131,8 @@ def integrate(
     shift_um: tuple[float, float] = (0.0, 0.0),
     grid_um: float | None = None,
 ) -> Tensor:
-    """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's area.
+    """Light on every pixel: the sum of ``image`` (light per sample) over the pixel's
+    area.
 
     Args:
         image: (..., y, x).
@@ -119,25 +141,53 @@ def integrate(
         grid_um: see :func:`pixel_weights`.
 
     Returns:
-        (..., rows, columns) in the dtype of ``image``; differentiable in image and pitch.
+        (..., rows, columns) in the dtype of ``image``; differentiable in image and
+        pitch.
     """
-    axes = list(zip(image.shape[-2:], (None, None) if shape is None else shape, shift_um, strict=True))
-    if not (isinstance(pitch_um, Tensor) and pitch_um.requires_grad and torch.is_grad_enabled()):
+    axes = list(
+        zip(
+            image.shape[-2:],
+            (None, None) if shape is None else shape,
+            shift_um,
+            strict=True,
+        )
+    )
+    if not (
+        isinstance(pitch_um, Tensor)
+        and pitch_um.requires_grad
+        and torch.is_grad_enabled()
+    ):
         width = float(pitch_um.detach()) if isinstance(pitch_um, Tensor) else pitch_um
-        lengths = [length / sample_um for length in (width, width if grid_um is None else grid_um)]
-        if all(_samples(n, count, shift / sample_um, lengths) for n, count, shift in axes):
+        lengths = [
+            length / sample_um
+            for length in (width, width if grid_um is None else grid_um)
+        ]
+        if all(
+            _samples(n, count, shift / sample_um, lengths) for n, count, shift in axes
+        ):
             return image
     rows, columns = (
-        pixel_weights(n, sample_um, pitch_um=pitch_um, count=count, shift_um=shift, grid_um=grid_um)
+        pixel_weights(
+            n,
+            sample_um,
+            pitch_um=pitch_um,
+            count=count,
+            shift_um=shift,
+            grid_um=grid_um,
+        )
         for n, count, shift in axes
     )
     return rows.to(image) @ image @ columns.to(image).mT
 
 
-def _samples(samples: int, count: int | None, shift: float, lengths: Sequence[float]) -> bool:
-    """Whether every pixel is one sample, to the rounding of its edges' places (double precision).
+def _samples(
+    samples: int, count: int | None, shift: float, lengths: Sequence[float]
+) -> bool:
+    """Whether every pixel is one sample, to the rounding of its edges' places (double
+    precision).
 
-    count: of pixels. shift: of the grid. lengths: width and distance of the pixels, all in samples.
+    count: of pixels. shift: of the grid. lengths: width and distance of the pixels, all
+    in samples.
     """
     if (pixel_count(samples, 1.0, lengths[1]) if count is None else count) != samples:
         return False
@@ -156,27 +206,41 @@ def mean_electrons(
     """Expected electrons of every pixel, before noise and saturation.
 
     Args:
-        irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e`` electrons.
+        irradiance: (..., y, x), 1 where a base pixel collects ``sensor.exposure_e``
+            electrons.
         pitch_um: tensor in place of ``sensor.pitch_um``, to differentiate in.
         count: pixels along each axis.
-        grid_um: see :func:`pixel_weights`; light and ambient are then those of a pixel of this size.
+        grid_um: see :func:`pixel_weights`; light and ambient are then those of a pixel
+            of this size.
 
     Returns:
-        (..., rows, columns): kappa times (exposure times mean irradiance plus ambient), at least 0.
+        (..., rows, columns): kappa times (exposure times mean irradiance plus ambient),
+        at least 0.
     """
-    pitch = torch.as_tensor(sensor.pitch_um, dtype=torch.float64) if pitch_um is None else pitch_um
+    pitch = (
+        torch.as_tensor(sensor.pitch_um, dtype=torch.float64)
+        if pitch_um is None
+        else pitch_um
+    )
     shape = None if count is None else (count, count)
-    light = integrate(irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um)
+    light = integrate(
+        irradiance, sample_um, pitch_um=pitch, shape=shape, grid_um=grid_um
+    )
     light = light * (sample_um / sensor.base_pitch_um) ** 2
-    scale = torch.as_tensor(kappa(pitch if grid_um is None else grid_um, sensor.base_pitch_um)).to(irradiance)
+    scale = torch.as_tensor(
+        kappa(pitch if grid_um is None else grid_um, sensor.base_pitch_um)
+    ).to(irradiance)
     return (sensor.exposure_e * light + sensor.ambient_e * scale).clamp_min(0)
 
 
 def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Poisson counts k of this mean m, with a gradient that has the right moments: dk/dm = (1 + k / m) / 2.
+    """Poisson counts k of this mean m, with a gradient that has the right moments:
+    dk/dm = (1 + k / m) / 2.
 
-    The expectation of the gradient of k is 1 and of k² is 2m + 1, those of the true distribution for every m > 0;
-    for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong skewness, and negative counts.
+    The expectation of the gradient of k is 1 and of k² is 2m + 1, those of the true
+    distribution for every m > 0;
+    for k³ it is high by 1/2 against 3m² + 6m + 1. A Gaussian in its place has a wrong
+    skewness, and negative counts.
     """
     where = mean.device if generator is None else generator.device
     count = torch.poisson(mean.detach().to(where), generator=generator).to(mean.device)
@@ -186,27 +250,42 @@ def photons(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
 
 
 def expose(
-    mean: Tensor, *, sensor: Sensor, generator: torch.Generator | None = None, reads: float | Tensor = 1.0
+    mean: Tensor,
+    *,
+    sensor: Sensor,
+    generator: torch.Generator | None = None,
+    reads: float | Tensor = 1.0,
 ) -> Tensor:
-    """Electrons read from pixels that expect ``mean``: photon noise, full well, read noise of ``reads`` reads each.
+    """Electrons read from pixels that expect ``mean``: photon noise, full well, read
+    noise of ``reads`` reads each.
 
     Saturated pixels have gradient 0.
     """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     collected = photons(mean, generator).clamp(max=well)
     noise = normal(tuple(mean.shape), mean, generator)
-    return collected + sensor.read_noise_e * torch.as_tensor(reads).to(noise).sqrt() * noise
+    return (
+        collected
+        + sensor.read_noise_e * torch.as_tensor(reads).to(noise).sqrt() * noise
+    )
 
 
-def normal(shape: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Standard normal numbers of the kind of ``like``, where it lies: drawn where the generator is, so that the same
+def normal(
+    shape: tuple[int, ...], like: Tensor, generator: torch.Generator | None
+) -> Tensor:
+    """Standard normal numbers of the kind of ``like``, where it lies: drawn where the
+    generator is, so that the same
     seed gives the same noise on every device."""
     where = like.device if generator is None else generator.device
-    return torch.randn(shape, generator=generator, dtype=like.dtype, device=where).to(like.device)
+    return torch.randn(shape, generator=generator, dtype=like.dtype, device=where).to(
+        like.device
+    )
 
 
 def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
-    """Numbers 0 .. 2^bits - 1, full scale at the full well; the gradient is that of the straight line."""
+    """Numbers 0 .. 2^bits - 1, full scale at the full well; the gradient is that of the
+    straight line.
+    """
     top = 2**sensor.bits - 1
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     level = (electrons * (top / well)).clamp(0, top)
@@ -215,17 +294,30 @@ def digitise(electrons: Tensor, *, sensor: Sensor) -> Tensor:
 
 
 def variance(mean: Tensor, *, sensor: Sensor) -> Tensor:
-    """Noise variance of a pixel that expects ``mean`` electrons: photon, read and rounding noise, electrons²."""
+    """Noise variance of a pixel that expects ``mean`` electrons: photon, read and
+    rounding noise, electrons².
+    """
     well = sensor.full_well_e * float(kappa(sensor.pitch_um, sensor.base_pitch_um))
-    total: Tensor = mean + sensor.read_noise_e**2 + (well / (2**sensor.bits - 1)) ** 2 / 12
+    total: Tensor = (
+        mean + sensor.read_noise_e**2 + (well / (2**sensor.bits - 1)) ** 2 / 12
+    )
     return total
 
 
-def low_snr(sensor: Sensor, mean_irradiance: float, *, snr_db: float = 15.0, ambient_ratio: float = 4.0) -> Sensor:
-    """The sensor with dimmed light under strong ambient light, so that a pixel has this signal-to-noise ratio.
+def low_snr(
+    sensor: Sensor,
+    mean_irradiance: float,
+    *,
+    snr_db: float = 15.0,
+    ambient_ratio: float = 4.0,
+) -> Sensor:
+    """The sensor with dimmed light under strong ambient light, so that a pixel has this
+    signal-to-noise ratio.
 
-    Signal-to-noise ratio: 20 log10(mean signal electrons / standard deviation), with the ambient light's shot noise
-    and the read noise, at the sensor's own pitch. The ambient light is ``ambient_ratio`` times the signal and, as
+    Signal-to-noise ratio: 20 log10(mean signal electrons / standard deviation), with
+    the ambient light's shot noise
+    and the read noise, at the sensor's own pitch. The ambient light is
+    ``ambient_ratio`` times the signal and, as
     the paper's low-light test has it, enters before the photon noise.
     """
     _check("mean_irradiance", mean_irradiance, above=True)
@@ -233,19 +325,27 @@ def low_snr(sensor: Sensor, mean_irradiance: float, *, snr_db: float = 15.0, amb
     q2, area = 10 ** (snr_db / 10), float(kappa(sensor.pitch_um, sensor.base_pitch_um))
     shot = q2 * (1 + ambient_ratio)
     signal = (shot + math.sqrt(shot**2 + 4 * q2 * sensor.read_noise_e**2)) / 2 / area
-    return replace(sensor, exposure_e=signal / mean_irradiance, ambient_e=signal * ambient_ratio)
+    return replace(
+        sensor, exposure_e=signal / mean_irradiance, ambient_e=signal * ambient_ratio
+    )
 
 
 def _smooth_step(t: Tensor) -> Tensor:
-    """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left of -1, 1 right of 2."""
+    """Response of the Catmull-Rom cumulative to one cell [0, 1] of unit light: 0 left
+    of -1, 1 right of 2.
+    """
     u, w = t + 1, t - 1
     before = 0.5 * u**2 * (u - 1)
     inside = t * (0.5 + t * (1.5 - t))
     after = 1 + 0.5 * w * (1 - w) ** 2
-    left = torch.where(t < 0, torch.where(t < -1, 0.0, before), inside)  # one piece each: its slope counts once
+    left = torch.where(
+        t < 0, torch.where(t < -1, 0.0, before), inside
+    )  # one piece each: its slope counts once
     return torch.where(t < 1, left, torch.where(t < 2, after, 1.0))
 
 
 def _check(name: str, value: float, *, above: bool) -> None:
     if not (math.isfinite(value) and (value > 0 if above else value >= 0)):
-        raise SceneError(f"{name} = {value}: need a finite value {'above 0' if above else '>= 0'}")
+        raise SceneError(
+            f"{name} = {value}: need a finite value {'above 0' if above else '>= 0'}"
+        )

@@ -1,4 +1,6 @@
-"""Sheets weighted for every kernel of a PSF basis, compiled: what image formation transforms."""
+"""Sheets weighted for every kernel of a PSF basis, compiled: what image formation
+transforms.
+"""
 
 from typing import Any
 
@@ -10,14 +12,23 @@ from metalens.ground.arrays import Array
 
 
 def weighted(
-    light: Array, cover: Array, depth_um: Array, table: Array, *, ends_um: tuple[float, float], shape: tuple[int, int]
+    light: Array,
+    cover: Array,
+    depth_um: Array,
+    table: Array,
+    *,
+    ends_um: tuple[float, float],
+    shape: tuple[int, int],
 ) -> Array:
-    """(rank, n, 2 kinds, 2 sheets, Y, X) light and coverage times the weight of every kernel at their depths.
+    """(rank, n, 2 kinds, 2 sheets, Y, X) light and coverage times the weight of every
+    kernel at their depths.
 
     Args:
         light, cover, depth_um: (n, 2, y, x) float32. What has no coverage has no light.
-        table: (rank, codes) weights at equal steps of 1/z from the first to the second of ``ends_um``.
-        shape: (Y, X); spare rows and columns continue the border, half of them the far one.
+        table: (rank, codes) weights at equal steps of 1/z from the first to the second
+            of ``ends_um``.
+        shape: (Y, X); spare rows and columns continue the border, half of them the far
+            one.
     """
     out = np.empty((len(table), len(light), 2, 2, *shape), np.float32)
     near, far = (np.float32(1 / end) for end in ends_um)
@@ -31,7 +42,15 @@ def weighted(
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _weigh(
-    light: Array, cover: Array, depth: Array, table: Array, near: Any, far: Any, start: int, stop: int, out: Array
+    light: Array,
+    cover: Array,
+    depth: Array,
+    table: Array,
+    near: Any,
+    far: Any,
+    start: int,
+    stop: int,
+    out: Array,
 ) -> None:
     rows, columns = out.shape[4], out.shape[5]
     height, width = light.shape[2], light.shape[3]
@@ -46,8 +65,16 @@ def _weigh(
             for column in range(columns):
                 x = _inside(column, width, columns)
                 vergence = np.float32(1) / max(depth[n, sheet, y, x], np.float32(1))
-                code[column] = np.int32(min(max((near - vergence) * unit + np.float32(0.5), np.float32(0)), top))
-                value[column], share[column] = light[n, sheet, y, x], cover[n, sheet, y, x]
+                code[column] = np.int32(
+                    min(
+                        max((near - vergence) * unit + np.float32(0.5), np.float32(0)),
+                        top,
+                    )
+                )
+                value[column], share[column] = (
+                    light[n, sheet, y, x],
+                    cover[n, sheet, y, x],
+                )
             for k in range(len(table)):
                 for column in range(columns):
                     weight = table[k, np.uint32(code[column])]

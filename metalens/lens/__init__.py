@@ -1,4 +1,6 @@
-"""A lens: pillar diameters on a lattice with their cell, their proxy, and the films around them."""
+"""A lens: pillar diameters on a lattice with their cell, their proxy, and the films
+around them.
+"""
 
 from typing import TYPE_CHECKING
 

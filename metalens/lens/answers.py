@@ -1,8 +1,10 @@
-"""Answers of all pillars to light of one wavelength and angle, by compiled loops that read each diameter once.
+"""Answers of all pillars to light of one wavelength and angle, by compiled loops that
+read each diameter once.
 
     φ(D) = φ_0 + x(φ_1 + x(φ_2 + …)),  |T|(D) alike,  x = scale D^power + shift        paper Eq. 2, at one (λ, θ)
 
-Polynomials are taken in float64 over a part of a row that stays in the nearest cache, and whole turns come off before
+Polynomials are taken in float64 over a part of a row that stays in the nearest cache,
+and whole turns come off before
 the cast to the dtype of the result.
 """
 
@@ -14,50 +16,78 @@ from metalens.ground.threads import split
 from metalens.lens.record import Lens
 from metalens.pillars import Proxy
 
-Polynomials = tuple[float, float, int, float, Array, Array]  # scale, shift, power, ceiling, monomials of φ and |T|
+Polynomials = tuple[
+    float, float, int, float, Array, Array
+]  # scale, shift, power, ceiling, monomials of φ and |T|
 PART = 512  # pillars of a row at a time
 FASTMATH = {"contract", "nsz", "reassoc"}
 
 
 def fill(lens: Lens, at: tuple[float, float], phase: Array, level: Array) -> None:
-    """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in their dtype; 0 where there is
+    """Phase wrapped to ±π and transmission of every pillar to these (y, x) arrays, in
+    their dtype; 0 where there is
     none.
 
     Args:
         at: wavelength in um, angle of incidence in rad.
 
     Raises:
-        DomainError: a diameter, the wavelength or the angle lies outside the proxy's domain.
+        DomainError: a diameter, the wavelength or the angle lies outside the proxy's
+            domain.
     """
     if lens.pairs is not None:
         turns = lens.phase_rad(at[0], at[1]) / (2 * np.pi)
-        phase[:], level[:] = (turns - np.rint(turns)) * 2 * np.pi, lens.transmission(at[0], at[1])
+        phase[:], level[:] = (
+            (turns - np.rint(turns)) * 2 * np.pi,
+            lens.transmission(at[0], at[1]),
+        )
         return
-    turned = None if lens.diameters.angle_rad is None else np.asarray(lens.geometric_rad(slice(None)))
-    put_all(lens.proxy, np.asarray(lens.diameters.diameter_um), at, phase, level, turned)
+    turned = (
+        None
+        if lens.diameters.angle_rad is None
+        else np.asarray(lens.geometric_rad(slice(None)))
+    )
+    put_all(
+        lens.proxy, np.asarray(lens.diameters.diameter_um), at, phase, level, turned
+    )
 
 
 def put_all(
-    proxy: Proxy, d: Array, at: tuple[float, float], phase: Array, level: Array, turned: Array | None = None
+    proxy: Proxy,
+    d: Array,
+    at: tuple[float, float],
+    phase: Array,
+    level: Array,
+    turned: Array | None = None,
 ) -> None:
-    """As :func:`fill`, of (y, x) diameters in um; turned: (y, x) phase in rad that is added."""
+    """As :func:`fill`, of (y, x) diameters in um; turned: (y, x) phase in rad that is
+    added.
+    """
     loop, numbers = _fill, polynomials(proxy, d, at)
     turn = np.zeros((len(d), 0)) if turned is None else turned
     split(len(d), lambda a, b: loop(d[a:b], turn[a:b], numbers, phase[a:b], level[a:b]))
 
 
-def polynomials(proxy: Proxy, diameter_um: Array, at: tuple[float, float]) -> Polynomials:
-    """What :func:`answers` takes of these diameters, for a wavelength in um and an angle in rad; raises as
+def polynomials(
+    proxy: Proxy, diameter_um: Array, at: tuple[float, float]
+) -> Polynomials:
+    """What :func:`answers` takes of these diameters, for a wavelength in um and an
+    angle in rad; raises as
     :func:`fill`."""
     phase, level = proxy.at(*at), proxy.level_at(*at)
     most = float(np.max(diameter_um, initial=0.0))
     if most > 0:
-        proxy.phase_rad(np.array([np.min(diameter_um, where=diameter_um > 0, initial=most), most]), *at)  # or refused
+        proxy.phase_rad(
+            np.array([np.min(diameter_um, where=diameter_um > 0, initial=most), most]),
+            *at,
+        )  # or refused
     inner = phase.scale, phase.shift, phase.power, level.ceiling
     return (*inner, np.array(phase.monomials), np.array(level.monomials))
 
 
-@numba.njit(fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True)
+@numba.njit(
+    fastmath=FASTMATH, nogil=True, error_model="numpy", cache=True, forceinline=True
+)
 def answers(d, numbers, x, phase, level):  # type: ignore[no-untyped-def]
     """Phase in rad and |T| of a part of a row; x: work."""
     scale, shift, power, ceiling, in_phase, in_level = numbers
@@ -93,5 +123,7 @@ def _fill(d, turned, numbers, out_phase, out_level):  # type: ignore[no-untyped-
                     phase[j] += turned[i, start + j]
             for j in range(n):
                 t = phase[j] / (2 * np.pi)
-                out_phase[i, start + j] = (t - np.rint(t)) * (2 * np.pi) if row[j] > 0 else 0.0
+                out_phase[i, start + j] = (
+                    (t - np.rint(t)) * (2 * np.pi) if row[j] > 0 else 0.0
+                )
                 out_level[i, start + j] = level[j]

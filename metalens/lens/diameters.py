@@ -14,7 +14,9 @@ _BLOCK_ROWS = 256
 
 
 class Grid(NamedTuple):
-    """Distances of columns and rows, and the area of a pillar's cell; 0: as on a square lattice."""
+    """Distances of columns and rows, and the area of a pillar's cell; 0: as on a square
+    lattice.
+    """
 
     pitch_um: float
     row_um: float = 0.0
@@ -25,19 +27,25 @@ class Grid(NamedTuple):
 class DiameterMap:
     """Pillar sizes on a lattice; the lens axis sits at index ((ny-1)/2, (nx-1)/2).
 
-    A hexagonal lattice is every other site of a grid of half a pitch along x and ``row_um`` along y: those with
+    A hexagonal lattice is every other site of a grid of half a pitch along x and
+    ``row_um`` along y: those with
     row + column odd hold no pillar.
 
-    diameter_um: (y, x) size of every pillar (its diameter where it is round), 0 where there is no pillar and no light
+    diameter_um: (y, x) size of every pillar (its diameter where it is round), 0 where
+    there is no pillar and no light
         passes; +x right, +y down.
     pitch_um: lattice constant.
     lattice: square, rectangular or hexagonal.
-    row_um: distance of the rows; 0 for that of the lattice (a mask on a grid may need another, by a fraction).
-    angle_rad: (y, x) turn of every pillar in the plane, from +x to +y, beside that of the shape; None for none.
-    length_um: (y, x) size along y where pillars have two; ``diameter_um`` is then that along x. None: by the shape.
+    row_um: distance of the rows; 0 for that of the lattice (a mask on a grid may need
+    another, by a fraction).
+    angle_rad: (y, x) turn of every pillar in the plane, from +x to +y, beside that of
+    the shape; None for none.
+    length_um: (y, x) size along y where pillars have two; ``diameter_um`` is then that
+    along x. None: by the shape.
 
     Raises:
-        LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and column named); no pillar; a pillar
+        LensError: not 2-D, non-finite, negative, or as wide as the pitch (row and
+            column named); no pillar; a pillar
             between the sites of the lattice; turns that do not fit the map.
     """
 
@@ -52,7 +60,11 @@ class DiameterMap:
         d = self.diameter_um
         if d.ndim != 2:
             raise LensError(f"diameter map has shape {d.shape}, need (y, x)")
-        if not 0.9 * self.lattice_row_um <= (self.row_um or self.lattice_row_um) <= 1.1 * self.lattice_row_um:
+        if (
+            not 0.9 * self.lattice_row_um
+            <= (self.row_um or self.lattice_row_um)
+            <= 1.1 * self.lattice_row_um
+        ):
             raise LensError(
                 f"row_um = {self.row_um}: rows of this {self.lattice.kind} lattice lie {self.lattice_row_um:.6g} um "
                 "apart; need 0, or that within 10 %"
@@ -65,33 +77,51 @@ class DiameterMap:
                 f"need 0 (no pillar) or 0 < diameter < pitch {self.pitch_um} um"
             )
         if widest == 0:
-            raise LensError("empty aperture: the map holds no pillar; check the aperture and the profile")
+            raise LensError(
+                "empty aperture: the map holds no pillar; check the aperture and the profile"
+            )
         turn = self.angle_rad
         if turn is not None and not (turn.shape == d.shape and np.isfinite(turn).all()):
-            raise LensError(f"angle_rad of shape {turn.shape}: need finite turns of the {d.shape} map of diameters")
+            raise LensError(
+                f"angle_rad of shape {turn.shape}: need finite turns of the {d.shape} map of diameters"
+            )
         length = self.length_um
-        if length is not None and not (length.shape == d.shape and np.isfinite(length).all() and length.min() >= 0):
-            raise LensError(f"length_um of shape {length.shape}: need lengths >= 0 of the {d.shape} map of diameters")
+        if length is not None and not (
+            length.shape == d.shape and np.isfinite(length).all() and length.min() >= 0
+        ):
+            raise LensError(
+                f"length_um of shape {length.shape}: need lengths >= 0 of the {d.shape} map of diameters"
+            )
         if self.lattice.centred:
             for row in range(min(2, len(d))):
                 if np.asarray(d[row::2])[:, 1 - row :: 2].any():
-                    raise LensError("a pillar between the sites of the hexagonal lattice: row + column is odd there")
+                    raise LensError(
+                        "a pillar between the sites of the hexagonal lattice: row + column is odd there"
+                    )
 
     @property
     def pillars(self) -> int:
         """How many sites hold a pillar."""
         held: object = self.diameter_um
-        return held.count if isinstance(held, RowsOnDisk) else int(np.count_nonzero(self.diameter_um))
+        return (
+            held.count
+            if isinstance(held, RowsOnDisk)
+            else int(np.count_nonzero(self.diameter_um))
+        )
 
     @property
     def lattice_row_um(self) -> float:
         """Distance of the rows of an exact lattice."""
-        return self.lattice.periods_um(self.pitch_um)[1] / (2 if self.lattice.centred else 1)
+        return self.lattice.periods_um(self.pitch_um)[1] / (
+            2 if self.lattice.centred else 1
+        )
 
     @property
     def steps_um(self) -> tuple[float, float]:
         """(x, y) distance of neighbouring columns and rows of the map."""
-        return self.pitch_um / (2 if self.lattice.centred else 1), self.row_um or self.lattice_row_um
+        return self.pitch_um / (
+            2 if self.lattice.centred else 1
+        ), self.row_um or self.lattice_row_um
 
     @property
     def site_um2(self) -> float:
@@ -101,7 +131,9 @@ class DiameterMap:
 
     @property
     def grid(self) -> "Grid":
-        """The map's sites as :func:`metalens.propagate.case` takes them; zeros on a square lattice."""
+        """The map's sites as :func:`metalens.propagate.case` takes them; zeros on a
+        square lattice.
+        """
         square = self.lattice.kind == "square" and not self.row_um
         column, row = self.steps_um
         return Grid(column) if square else Grid(column, row, self.site_um2)
@@ -109,7 +141,12 @@ class DiameterMap:
     @property
     def plain(self) -> bool:
         """Whether it is a square lattice of pillars of one size that are not turned."""
-        return self.lattice.kind == "square" and not self.row_um and self.angle_rad is None and self.length_um is None
+        return (
+            self.lattice.kind == "square"
+            and not self.row_um
+            and self.angle_rad is None
+            and self.length_um is None
+        )
 
     @property
     def x_um(self) -> Array:
@@ -130,9 +167,14 @@ class DiameterMap:
             there = self.diameter_um[rows] > 0
             held = there.any(axis=1)
             if held.any():
-                first, last = there.argmax(axis=1), there.shape[1] - 1 - there[:, ::-1].argmax(axis=1)
+                first, last = (
+                    there.argmax(axis=1),
+                    there.shape[1] - 1 - there[:, ::-1].argmax(axis=1),
+                )
                 outer = np.maximum(np.abs(self.x_um[first]), np.abs(self.x_um[last]))
-                farthest = max(farthest, float(np.hypot(outer, self.y_um[rows])[held].max()))
+                farthest = max(
+                    farthest, float(np.hypot(outer, self.y_um[rows])[held].max())
+                )
         return farthest
 
 

@@ -1,9 +1,11 @@
-"""Light behind the edge of a round hole, compiled: shares of places a few nanoseconds each.
+"""Light behind the edge of a round hole, compiled: shares of places a few nanoseconds
+each.
 
     E(w) = e^(-iπ/4) / √2 ∫_-∞^w e^(iπv²/2) dv = [w > 0] + e^(iπ(w²/2 - 1/4)) / √2 A(w),    w >= 0, E(-w) = 1 - E(w)
     A(w) = -e^(iπ/4) ∫_0^∞ e^(-πt²/2 + iπ e^(iπ/4) w t) dt,    A' = 1 - iπw A
 
-(Born and Wolf, Principles of Optics, 8.7.3, the contour turned by 45 degrees). A has no oscillation: a table of cubics
+(Born and Wolf, Principles of Optics, 8.7.3, the contour turned by 45 degrees). A has no
+oscillation: a table of cubics
 up to ``LONGEST``, 1e-7, and 1 / (iπw) Σ (2n - 1)!! / (iπw²)^n beyond, 1e-7.
 """
 
@@ -21,7 +23,11 @@ def _table() -> Array:
     node, weight = np.polynomial.legendre.leggauss(80)
     t, turn = 2.5 * (node + 1), np.exp(0.25j * np.pi)
     w = np.arange(LONGEST * STEPS + 2) / STEPS
-    value = -turn * np.exp(-np.pi / 2 * t * t + 1j * np.pi * turn * np.outer(w, t)) @ (2.5 * weight)
+    value = (
+        -turn
+        * np.exp(-np.pi / 2 * t * t + 1j * np.pi * turn * np.outer(w, t))
+        @ (2.5 * weight)
+    )
     slope = (1 - 1j * np.pi * w * value) / STEPS
     return np.stack([value.real, value.imag, slope.real, slope.imag], -1)
 
@@ -62,7 +68,9 @@ def _fill(x, y, width, ray, lengths, hole, table, out):  # type: ignore[no-untyp
         scale = np.sqrt(2 / (wavelength * normal))
         middle, half = (radius - far) * scale, width[i] * scale / 2
         one, other = _wave(middle + half, table), _wave(middle - half, table)
-        bent = complex(0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i]))
+        bent = complex(
+            0.0, wavelength * along * across / (normal * 4 * np.pi * radius * width[i])
+        )
         out[i] = (one[1] - other[1]) / (2 * half) - bent * (one[0] - other[0])
 
 
@@ -74,17 +82,31 @@ def behind(
     radius_um: float,
     wavelength_um: float,
 ) -> Array:
-    """Complex amplitude S of :mod:`metalens.lens.stop` where rays cross the stop at (x, y), mean over a width.
+    """Complex amplitude S of :mod:`metalens.lens.stop` where rays cross the stop at (x,
+    y), mean over a width.
 
     Args:
-        at_um: of one shape. ray: unit vector of the plane of incidence. lengths_um: Fresnel lengths in it, across it.
+        at_um: of one shape. ray: unit vector of the plane of incidence. lengths_um:
+            Fresnel lengths in it, across it.
     """
     shape = np.shape(at_um[0])
-    x, y, width = (np.ascontiguousarray(np.broadcast_to(a, shape), float).ravel() for a in (*at_um, width_um))
+    x, y, width = (
+        np.ascontiguousarray(np.broadcast_to(a, shape), float).ravel()
+        for a in (*at_um, width_um)
+    )
     out = np.empty(len(x), complex)
 
     def work(a: int, b: int) -> None:
-        _fill(x[a:b], y[a:b], width[a:b], ray, lengths_um, (radius_um, wavelength_um), TABLE, out[a:b])
+        _fill(
+            x[a:b],
+            y[a:b],
+            width[a:b],
+            ray,
+            lengths_um,
+            (radius_um, wavelength_um),
+            TABLE,
+            out[a:b],
+        )
 
     split(len(x), work)
     return out.reshape(shape)

@@ -1,4 +1,6 @@
-"""A lens for other programs: arrays with axes (NPZ, MATLAB), and a smooth phase for ray tracers (Zemax grid phase)."""
+"""A lens for other programs: arrays with axes (NPZ, MATLAB), and a smooth phase for ray
+tracers (Zemax grid phase).
+"""
 
 import io
 import math
@@ -15,7 +17,10 @@ from metalens.lens.record import Lens
 
 ARRAYS, GRID = (".npz", ".mat"), ".dat"
 SUFFIXES = (*ARRAYS, GRID)
-_MM, _NO_DATA = 1e-3, 1  # of a grid-phase file: lengths in mm (unit flag 0), flag of a point without data
+_MM, _NO_DATA = (
+    1e-3,
+    1,
+)  # of a grid-phase file: lengths in mm (unit flag 0), flag of a point without data
 _RIM = 4  # points: a cubic spline forgets an edge as 0.27^points
 
 
@@ -26,21 +31,28 @@ def check(path: str | Path) -> None:
         LensError: naming the formats there are.
     """
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise LensError(f"{path}: cannot write this format; name it {', '.join(SUFFIXES)}")
+        raise LensError(
+            f"{path}: cannot write this format; name it {', '.join(SUFFIXES)}"
+        )
 
 
 def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
     """Write a lens in the format that the name's ending says.
 
-    ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission, pitch_um, wavelength_um; where
-    pillars are turned angle_rad; where they have two sizes length_um, phase and transmission for light along x.
-    ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture, unwrapped, in mm.
+    ``.npz``, ``.mat``: x_um, y_um, diameter_um, phase_rad (wrapped), transmission,
+    pitch_um, wavelength_um; where
+    pillars are turned angle_rad; where they have two sizes length_um, phase and
+    transmission for light along x.
+    ``.dat``: Zemax grid phase of ``samples`` by ``samples`` points across the aperture,
+    unwrapped, in mm.
 
     Returns:
-        largest difference in phase (rad) between the pillars and what a program interpolates; 0 for the arrays.
+        largest difference in phase (rad) between the pillars and what a program
+        interpolates; 0 for the arrays.
 
     Raises:
-        LensError: another ending, or a phase that no smooth map has (see :func:`unwrapped`).
+        LensError: another ending, or a phase that no smooth map has (see
+            :func:`unwrapped`).
     """
     check(path)
     suffix = Path(path).suffix.lower()
@@ -59,7 +71,11 @@ def write(path: str | Path, lens: Lens, *, samples: int = 501) -> float:
         from scipy.io import savemat
 
         savemat(file, values, oned_as="column")
-        write_bytes(path, b"MATLAB 5.0 MAT-file, metalens lens, um and rad".ljust(116) + file.getvalue()[116:])
+        write_bytes(
+            path,
+            b"MATLAB 5.0 MAT-file, metalens lens, um and rad".ljust(116)
+            + file.getvalue()[116:],
+        )
     return 0.0
 
 
@@ -74,15 +90,21 @@ def arrays(lens: Lens) -> dict[str, Array]:
         "transmission": lens.transmission(),
         "pitch_um": np.array(d.pitch_um),
         "wavelength_um": np.array(lens.wavelength_um),
-    } | {name: np.asarray(v) for name, v in (("angle_rad", d.angle_rad), ("length_um", d.length_um)) if v is not None}
+    } | {
+        name: np.asarray(v)
+        for name, v in (("angle_rad", d.angle_rad), ("length_um", d.length_um))
+        if v is not None
+    }
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GridPhase:
     """Phase on a square grid, +y down as everywhere here.
 
-    phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be interpolated; nan further out.
-    step_um: of the points. error_rad: largest difference between the pillars and the cubic interpolation of the points,
+    phase_rad: (n, n), continued a few points beyond the lens, so that its rim can be
+    interpolated; nan further out.
+    step_um: of the points. error_rad: largest difference between the pillars and the
+    cubic interpolation of the points,
     a few points inside the rim, where a program has all it needs.
     """
 
@@ -91,9 +113,11 @@ class GridPhase:
     error_rad: float
 
     def text(self) -> str:
-        """The file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy nodata`` a point, largest y first.
+        """The file: ``nx ny delx dely unitflag xdec ydec``, then ``phase dx dy dxy
+        nodata`` a point, largest y first.
 
-        Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the program then takes differences. The
+        Format: OpticStudio help, Grid Phase. Derivatives are 0 at all points: the
+            program then takes differences. The
         blanks that end the first line say whose file it is.
         """
         n, step = len(self.phase_rad), repr(self.step_um * _MM)
@@ -106,15 +130,19 @@ class GridPhase:
 
 
 def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
-    """The unwrapped phase of a lens on ``samples`` by ``samples`` points across its aperture.
+    """The unwrapped phase of a lens on ``samples`` by ``samples`` points across its
+    aperture.
 
     Raises:
-        LensError: fewer than 5 samples, or another lattice than a square one; see :func:`unwrapped`.
+        LensError: fewer than 5 samples, or another lattice than a square one; see
+            :func:`unwrapped`.
     """
     from scipy.ndimage import binary_erosion, map_coordinates
 
     if lens.diameters.lattice.kind != "square":
-        raise LensError(f"grid phase of a {lens.diameters.lattice.kind} lattice: need a square one; write .npz or .mat")
+        raise LensError(
+            f"grid phase of a {lens.diameters.lattice.kind} lattice: need a square one; write .npz or .mat"
+        )
     if samples < 5:
         raise LensError(f"{samples} samples across the aperture: need 5 or more")
     phase, d = unwrapped(lens), lens.diameters
@@ -124,14 +152,18 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
     where = np.meshgrid(at + centre[0], at + centre[1], indexing="ij")
     grid = map_coordinates(phase, where, order=1, cval=np.nan)
     if np.isfinite(grid).sum() < samples:
-        raise LensError(f"{samples} samples find hardly a point with pillars all around; need a wider lens")
+        raise LensError(
+            f"{samples} samples find hardly a point with pillars all around; need a wider lens"
+        )
     there = np.isfinite(phase)
     rows, columns = np.nonzero(there)
     back = [(rows - centre[0]) * d.pitch_um / step + (samples - 1) / 2,
             (columns - centre[1]) * d.pitch_um / step + (samples - 1) / 2]  # fmt: skip
     inner = binary_erosion(np.isfinite(grid), iterations=_RIM).astype(float)
     whole = map_coordinates(inner, back, order=1) > 1 - 1e-9
-    read = map_coordinates(_filled(grid), [b[whole] for b in back], order=3, mode="nearest")
+    read = map_coordinates(
+        _filled(grid), [b[whole] for b in back], order=3, mode="nearest"
+    )
     beyond = _continued(phase, _RIM * step / d.pitch_um + 1)
     return GridPhase(
         map_coordinates(beyond, where, order=1, cval=np.nan),
@@ -141,7 +173,9 @@ def grid_phase(lens: Lens, samples: int = 501) -> GridPhase:
 
 
 def _continued(phase: Array, reach: float) -> Array:
-    """Sites up to ``reach`` beyond the data, by the parabola through the nearest that has some and two behind it."""
+    """Sites up to ``reach`` beyond the data, by the parabola through the nearest that
+    has some and two behind it.
+    """
     from scipy.ndimage import distance_transform_edt
 
     away, nearest = distance_transform_edt(np.isnan(phase), return_indices=True)
@@ -150,7 +184,9 @@ def _continued(phase: Array, reach: float) -> Array:
     first, second, third = (_at(phase, rim - k * (at - rim)) for k in range(3))
     straight = np.where(np.isnan(second), first, 2 * first - second)
     out = phase.copy()
-    out[at[:, 0], at[:, 1]] = np.where(np.isnan(second + third), straight, 3 * first - 3 * second + third)
+    out[at[:, 0], at[:, 1]] = np.where(
+        np.isnan(second + third), straight, 3 * first - 3 * second + third
+    )
     return out
 
 
@@ -165,18 +201,23 @@ def _filled(grid: Array) -> Array:
     """Points without data take the nearest that has some."""
     from scipy.ndimage import distance_transform_edt
 
-    nearest = distance_transform_edt(np.isnan(grid), return_distances=False, return_indices=True)
+    nearest = distance_transform_edt(
+        np.isnan(grid), return_distances=False, return_indices=True
+    )
     return np.asarray(grid[tuple(nearest)])
 
 
 def unwrapped(lens: Lens) -> Array:
-    """(y, x) phase that is continuous from pillar to pillar, nan where there is none; 0 at the middle.
+    """(y, x) phase that is continuous from pillar to pillar, nan where there is none; 0
+    at the middle.
 
-    Along the middle column first, then along every row to both sides: exact where neighbours differ by less than half
+    Along the middle column first, then along every row to both sides: exact where
+    neighbours differ by less than half
     a turn.
 
     Raises:
-        LensError: gaps along the way, or neighbours half a turn apart whichever way they are joined: a vortex, a
+        LensError: gaps along the way, or neighbours half a turn apart whichever way
+            they are joined: a vortex, a
             spiral or zones with steps have no smooth phase.
     """
     d = lens.diameters.diameter_um
@@ -184,15 +225,27 @@ def unwrapped(lens: Lens) -> Array:
     phase = np.where(there, lens.phase_rad(), np.nan)
     middle, column = len(phase) // 2, phase.shape[1] // 2
     spine = np.nonzero(there[:, column])[0]
-    if len(spine) == 0 or len(spine) != spine[-1] - spine[0] + 1 or spine[0] != np.nonzero(there.any(1))[0][0]:
-        raise LensError("the middle column of the lens has gaps; its phase cannot be followed from row to row")
+    if (
+        len(spine) == 0
+        or len(spine) != spine[-1] - spine[0] + 1
+        or spine[0] != np.nonzero(there.any(1))[0][0]
+    ):
+        raise LensError(
+            "the middle column of the lens has gaps; its phase cannot be followed from row to row"
+        )
     first, last = int(spine[0]), int(spine[-1]) + 1
     right = np.unwrap(phase[first:last, column:], axis=1)
     left = np.unwrap(phase[first:last, column::-1], axis=1)[:, ::-1]
     rows = np.concatenate([left[:, :-1], right], axis=1)
     found = np.full(phase.shape, np.nan)
-    found[first:last] = rows + (np.unwrap(phase[first:last, column]) - phase[first:last, column])[:, None]
-    jump = max(float(np.nanmax(np.abs(np.diff(found, axis=axis)), initial=0)) for axis in (0, 1))
+    found[first:last] = (
+        rows
+        + (np.unwrap(phase[first:last, column]) - phase[first:last, column])[:, None]
+    )
+    jump = max(
+        float(np.nanmax(np.abs(np.diff(found, axis=axis)), initial=0))
+        for axis in (0, 1)
+    )
     if jump > math.pi or (np.isnan(found) & there).any():
         raise LensError(
             f"neighbouring pillars differ by {jump:.3g} rad whichever way the phase is followed, need below pi: a "

@@ -1,4 +1,6 @@
-"""What stands before and behind the pillars: plane-parallel films, the medium that fills the rest, and a stop."""
+"""What stands before and behind the pillars: plane-parallel films, the medium that
+fills the rest, and a stop.
+"""
 
 import itertools
 import math
@@ -21,10 +23,14 @@ MOST_ABSORBED = 0.02
 class Layers:
     """Plane-parallel films around a lens; the light meets them in this order.
 
-    front: between the source and the pillars (a cover glass, the substrate); the rest of the depth is air.
-    behind: between the pillars and the sensor (filter, cover glass); the rest of the distance is ``cover``.
-    cover: fills the gap behind the pillars; None for the cover of the lens' cell (air where there is none).
-    stop: aperture stop in front, as on the other face of the substrate; None where the lens is its own.
+    front: between the source and the pillars (a cover glass, the substrate); the rest
+    of the depth is air.
+    behind: between the pillars and the sensor (filter, cover glass); the rest of the
+    distance is ``cover``.
+    cover: fills the gap behind the pillars; None for the cover of the lens' cell (air
+    where there is none).
+    stop: aperture stop in front, as on the other face of the substrate; None where the
+    lens is its own.
     """
 
     front: tuple[Film, ...] = ()
@@ -45,7 +51,9 @@ class Layers:
     @property
     def films(self) -> tuple[Film, ...]:
         """All films that have a thickness."""
-        return tuple(film for film in (*self.front, *self.behind) if film.thickness_um > 0)
+        return tuple(
+            film for film in (*self.front, *self.behind) if film.thickness_um > 0
+        )
 
     def covered_by(self, cover: Material) -> "Layers":
         """These films with the cover of a cell between them.
@@ -54,7 +62,9 @@ class Layers:
             ConfigError: they name another cover.
         """
         if self.cover not in (None, cover):
-            raise ConfigError(f"layers.cover = {self.cover!r}, but the cell has {cover!r}: leave layers.cover out")
+            raise ConfigError(
+                f"layers.cover = {self.cover!r}, but the cell has {cover!r}: leave layers.cover out"
+            )
         return replace(self, cover=cover)
 
     @property
@@ -66,16 +76,21 @@ class Layers:
         """Media from pillars to sensor, the cover first.
 
         Raises:
-            PropagationError: the films are thicker than the distance, or one of them is metal.
+            PropagationError: the films are thicker than the distance, or one of them is
+                metal.
         """
-        return _media(self.behind, self.filling, distance_um, wavelength_um, "lens to sensor")
+        return _media(
+            self.behind, self.filling, distance_um, wavelength_um, "lens to sensor"
+        )
 
     def before(self, depth_um: float, wavelength_um: float) -> Media:
         """Media from a source at this depth to the pillars, air first."""
         return _media(self.front, "air", depth_um, wavelength_um, "source to lens")
 
     def from_stop(self, wavelength_um: float) -> Media | None:
-        """Media from the stop to the pillars, the last film first; None where there is no way between them."""
+        """Media from the stop to the pillars, the last film first; None where there is
+        no way between them.
+        """
         left = 0.0 if self.stop is None else self.stop.distance_um
         found: list[Film] = []
         for film in reversed(self.front):
@@ -86,9 +101,13 @@ class Layers:
             return None
         return _media(tuple(found), "air", thick + left, wavelength_um, "stop to lens")
 
-    def through_middle(self, tangents: Array, depth_um: float, wavelength_um: float) -> Array:
-        """(…, 2) slopes in air of the rays through the middle of the stop from sources at this depth, whose rays to the
-        middle of the lens have these slopes; the same without a stop, and of collimated light."""
+    def through_middle(
+        self, tangents: Array, depth_um: float, wavelength_um: float
+    ) -> Array:
+        """(…, 2) slopes in air of the rays through the middle of the stop from sources
+        at this depth, whose rays to the
+        middle of the lens have these slopes; the same without a stop, and of collimated
+        light."""
         if self.stop is None or math.isinf(depth_um):
             return tangents
         before, between = self._around_stop(depth_um, wavelength_um)
@@ -99,7 +118,9 @@ class Layers:
         outer = [(n, t) for n, t in outer if t > 1e-9 * depth_um]
         sine2 = (tangents**2).sum(-1, keepdims=True)
         come = tangents / np.sqrt(1 + sine2)
-        away = media.bend(before.layers, sine2 / (1 + sine2)) * come + np.array(self.stop.centre_um)
+        away = media.bend(before.layers, sine2 / (1 + sine2)) * come + np.array(
+            self.stop.centre_um
+        )
         w = media.square(outer, (away**2).sum(-1, keepdims=True))
         return np.asarray(away / media.bend(outer, w) / np.sqrt(1 - w))
 
@@ -111,11 +132,14 @@ class Layers:
         at_um: tuple[Any, Any],
         width_um: Any,
     ) -> Any:
-        """Share of a source's rays that pass the stop on their way to places (x, y) of the pillars, 0 to 1.
+        """Share of a source's rays that pass the stop on their way to places (x, y) of
+        the pillars, 0 to 1.
 
         Args:
-            tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of the source, inf for collimated
-                light. at_um: x and y, broadcast. width_um: of a place, over which the edge is shared out.
+            tangents: (x, y) of its ray to the middle of the lens, in air. depth_um: of
+                the source, inf for collimated
+                light. at_um: x and y, broadcast. width_um: of a place, over which the
+                edge is shared out.
 
         Raises:
             PropagationError: the source lies behind the stop.
@@ -133,8 +157,10 @@ class Layers:
         at_um: tuple[Any, Any],
         width_um: Any,
     ) -> Array:
-        """Complex amplitude of a source's light behind the stop over that without it, at places of the pillars: as
-        :meth:`lit` with the ripples of the edge (:mod:`metalens.lens.stop`); numpy arrays.
+        """Complex amplitude of a source's light behind the stop over that without it,
+        at places of the pillars: as
+        :meth:`lit` with the ripples of the edge (:mod:`metalens.lens.stop`); numpy
+        arrays.
         """
         if self.stop is None:
             return np.ones(np.broadcast_shapes(np.shape(at_um[0]), np.shape(at_um[1])))
@@ -149,22 +175,39 @@ class Layers:
         blur_rad: float = 0.0,
         held: float = 1.0,
     ) -> float:
-        """Relative L2 error of a PSF by what :meth:`shadow` leaves out; 0 without a stop.
+        """Relative L2 error of a PSF by what :meth:`shadow` leaves out; 0 without a
+        stop.
 
-        blur_rad: radius of the PSF over its distance from the lens. held: share of its light in the window that is
-            looked at. Waves that gather about the middle of a blur fall as 1 / √r, so that their share of the light
+        blur_rad: radius of the PSF over its distance from the lens. held: share of its
+            light in the window that is
+            looked at. Waves that gather about the middle of a blur fall as 1 / √r, so
+            that their share of the light
             grows as held^-½, and the error as held^-¼.
         """
         if self.stop is None:
             return 0.0
         zones = self.stop.radius_um * blur_rad / wavelength_um / held**0.25
-        return left_out(self.stop, self._around_stop(depth_um, wavelength_um), tangents, wavelength_um, zones)
+        return left_out(
+            self.stop,
+            self._around_stop(depth_um, wavelength_um),
+            tangents,
+            wavelength_um,
+            zones,
+        )
 
     def footprint_um(self, depth_um: float, wavelength_um: float) -> float:
-        """Radius of what a source on the axis lights of the pillars' plane; inf without a stop."""
-        return math.inf if self.stop is None else lit_um(self.stop, *self._around_stop(depth_um, wavelength_um))
+        """Radius of what a source on the axis lights of the pillars' plane; inf without
+        a stop.
+        """
+        return (
+            math.inf
+            if self.stop is None
+            else lit_um(self.stop, *self._around_stop(depth_um, wavelength_um))
+        )
 
-    def _around_stop(self, depth_um: float, wavelength_um: float) -> tuple[Media | None, Media | None]:
+    def _around_stop(
+        self, depth_um: float, wavelength_um: float
+    ) -> tuple[Media | None, Media | None]:
         if self.stop is not None and depth_um <= self.stop.distance_um:
             raise PropagationError(
                 f"layers: a source {depth_um:g} um before the pillars lies behind the stop, {self.stop.distance_um:g} "
@@ -174,16 +217,26 @@ class Layers:
         return before, self.from_stop(wavelength_um)
 
     def ghost(self, wavelength_um: float) -> float:
-        """Share of the light that goes twice between the two faces that reflect most: the largest ghost image."""
+        """Share of the light that goes twice between the two faces that reflect most:
+        the largest ghost image.
+        """
         worst = 0.0
         for films, first in ((self.front, "air"), (self.behind, self.filling)):
-            order = [float(index(m, wavelength_um).real) for m in (first, *(f.material for f in films))]
-            faces = sorted((((a - b) / (a + b)) ** 2 for a, b in itertools.pairwise(order)), reverse=True)
+            order = [
+                float(index(m, wavelength_um).real)
+                for m in (first, *(f.material for f in films))
+            ]
+            faces = sorted(
+                (((a - b) / (a + b)) ** 2 for a, b in itertools.pairwise(order)),
+                reverse=True,
+            )
             worst = max(worst, math.prod(faces[:2]) if len(faces) > 1 else 0.0)
         return worst
 
 
-def check_gaps(layers: Layers, sensor_distance_um: float, source_distance_um: float = math.inf) -> None:
+def check_gaps(
+    layers: Layers, sensor_distance_um: float, source_distance_um: float = math.inf
+) -> None:
     """Refuse films that do not fit between source, pillars and sensor.
 
     Raises:
@@ -202,12 +255,21 @@ def _too_thick(thick_um: float, gap_um: float, where: str) -> str:
     return f"layers: films of {thick_um:g} um in the {gap_um:g} um from {where}; need films no thicker than the gap"
 
 
-def _media(films: tuple[Film, ...], rest: Material, distance_um: float, wavelength_um: float, where: str) -> Media:
+def _media(
+    films: tuple[Film, ...],
+    rest: Material,
+    distance_um: float,
+    wavelength_um: float,
+    where: str,
+) -> Media:
     thick = sum(film.thickness_um for film in films)
     if thick > distance_um:
         raise PropagationError(_too_thick(thick, distance_um, where))
     thicknesses = (distance_um - thick, *(film.thickness_um for film in films))
-    indices = [index(name, wavelength_um) for name in (rest, *(film.material for film in films))]
+    indices = [
+        index(name, wavelength_um)
+        for name in (rest, *(film.material for film in films))
+    ]
     for n, t in zip(indices, thicknesses, strict=True):
         lost = -math.expm1(-4 * math.pi * n.imag * t / wavelength_um)
         if lost > MOST_ABSORBED:

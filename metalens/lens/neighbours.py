@@ -1,13 +1,20 @@
-"""What unlike neighbours do to the light of a lens: a factor by the angle that it is turned by.
+"""What unlike neighbours do to the light of a lens: a factor by the angle that it is
+turned by.
 
     C(s, α) = 1 + a s + b s²        on amplitudes whose squares are power; s: sine by which light is turned
 
-The first term is that of the zone borders, whose number grows with s; the second that of the slope between them. a and
-b go through solved rows (:mod:`metalens.design.neighbours`), apart for fields along the slope and across it, and for
-slopes along the lattice and along its diagonal; between these they go as sin² 2α, the least that a square lattice has.
-Beyond the steepest row along the lattice C stays as it is; beyond that along the diagonal, what sets it apart does.
-Rows are solved at one wavelength and at normal incidence. Light of another wavelength or from the side is given the
-same factor where the zones are as wide: s is that of the rows' wavelength. What that leaves out is for who uses it to
+The first term is that of the zone borders, whose number grows with s; the second that
+of the slope between them. a and
+b go through solved rows (:mod:`metalens.design.neighbours`), apart for fields along the
+slope and across it, and for
+slopes along the lattice and along its diagonal; between these they go as sin² 2α, the
+least that a square lattice has.
+Beyond the steepest row along the lattice C stays as it is; beyond that along the
+diagonal, what sets it apart does.
+Rows are solved at one wavelength and at normal incidence. Light of another wavelength
+or from the side is given the
+same factor where the zones are as wide: s is that of the rows' wavelength. What that
+leaves out is for who uses it to
 count (:mod:`metalens.psf.budget`).
 """
 
@@ -21,9 +28,9 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 
-CURVED = (
-    0.2  # of the change: a cut through a lens solved whole changes that much less (python -m benchmarks neighbours)
-)
+# of the change: a cut through a lens solved whole changes that much less (python -m
+# benchmarks neighbours)
+CURVED = 0.2
 _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 
 
@@ -31,14 +38,19 @@ _ARRAYS = ("sine", "diagonal", "factor", "coarse", "scatter")
 class Neighbours:
     """Rows of a lens's own unlike pillars, each solved as one cell.
 
-    sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the diagonal of the lattice.
-    factor: (2, n) complex tangential amplitude where the light should go, over that of pillars one by one; of light
-        whose field lies along the row, and across it. coarse: (2, n) the same at a coarser truncation.
-    scatter: (n,) share of the transmitted power that goes elsewhere, beyond what pillars one by one would send there.
+    sine: (n,) by which a row turns light. diagonal: (n,) whether it runs along the
+    diagonal of the lattice.
+    factor: (2, n) complex tangential amplitude where the light should go, over that of
+    pillars one by one; of light
+        whose field lies along the row, and across it. coarse: (2, n) the same at a
+        coarser truncation.
+    scatter: (n,) share of the transmitted power that goes elsewhere, beyond what
+    pillars one by one would send there.
     wavelength_um: of the rows. cover: index of the medium behind the pillars.
 
     Raises:
-        LensError: arrays that do not belong together, no row along the lattice, a sine not above 0.
+        LensError: arrays that do not belong together, no row along the lattice, a sine
+            not above 0.
     """
 
     sine: Array
@@ -52,14 +64,26 @@ class Neighbours:
     def __post_init__(self) -> None:
         n = len(self.sine)
         shapes = {name: np.shape(getattr(self, name)) for name in _ARRAYS}
-        if shapes != {"sine": (n,), "diagonal": (n,), "factor": (2, n), "coarse": (2, n), "scatter": (n,)}:
-            raise LensError(f"rows of unlike pillars: arrays of shapes {shapes}, need one entry a row")
+        if shapes != {
+            "sine": (n,),
+            "diagonal": (n,),
+            "factor": (2, n),
+            "coarse": (2, n),
+            "scatter": (n,),
+        }:
+            raise LensError(
+                f"rows of unlike pillars: arrays of shapes {shapes}, need one entry a row"
+            )
         if not (n and not np.all(self.diagonal) and np.all(np.asarray(self.sine) > 0)):
-            raise LensError("rows of unlike pillars: need one along the lattice, and sines above 0")
+            raise LensError(
+                "rows of unlike pillars: need one along the lattice, and sines above 0"
+            )
 
     @property
     def coefficients(self) -> Array:
-        """(2: along the lattice and its diagonal, 2: field along the slope and across, 2: a and b) complex."""
+        """(2: along the lattice and its diagonal, 2: field along the slope and across,
+        2: a and b) complex.
+        """
         cosine = np.sqrt(np.maximum(1 - (self.sine / self.cover) ** 2, 1e-9))
         power = self.factor * np.stack([cosine**-0.5, cosine**0.5])
         found: list[Array] = []
@@ -72,15 +96,22 @@ class Neighbours:
 
     @property
     def steepest(self) -> tuple[float, float]:
-        """Largest sines that were solved, along the lattice and along its diagonal (0 where none was)."""
-        straight, aside = (float(self.sine[rows].max(initial=0.0)) for rows in (~self.diagonal, self.diagonal))
+        """Largest sines that were solved, along the lattice and along its diagonal (0
+        where none was).
+        """
+        straight, aside = (
+            float(self.sine[rows].max(initial=0.0))
+            for rows in (~self.diagonal, self.diagonal)
+        )
         return straight, min(straight, aside)
 
     def of_field(self, field: int, sine: Any, aside: Any) -> Any:
-        """(…) complex C of fields along the slope (0) or across it (1); NumPy or torch, differentiable.
+        """(…) complex C of fields along the slope (0) or across it (1); NumPy or torch,
+        differentiable.
 
         Args:
-            sine: (…) by which the slope turns light of the rows' wavelength. aside: sin² 2α of its azimuth α.
+            sine: (…) by which the slope turns light of the rows' wavelength. aside:
+                sin² 2α of its azimuth α.
         """
         return self._factor(self.coefficients[:, field], sine, aside)
 
@@ -95,16 +126,21 @@ class Neighbours:
         return 1 + s * (a + b * s) + aside * (turned * (a2 + b2 * turned))
 
     def at(self, sine: Array, azimuth_rad: Array | float = 0.0) -> Array:
-        """(2, …) complex C of fields along the slope and across it, of slopes in this azimuth of the lattice."""
+        """(2, …) complex C of fields along the slope and across it, of slopes in this
+        azimuth of the lattice.
+        """
         aside = np.sin(2 * np.asarray(azimuth_rad)) ** 2
-        return np.stack([self.of_field(field, np.asarray(sine), aside) for field in (0, 1)])
+        return np.stack(
+            [self.of_field(field, np.asarray(sine), aside) for field in (0, 1)]
+        )
 
     def mean(self, sine: Array) -> Array:
         """(…) complex: mean of both polarisations and of all azimuths."""
         return np.asarray(self.at(sine, math.pi / 8).mean(0))  # where sin² 2α is 1/2
 
     def share(self, sine: Array, weight: Array) -> float:
-        """Share of the power in the focus of pillars taken one by one that unlike neighbours leave there.
+        """Share of the power in the focus of pillars taken one by one that unlike
+        neighbours leave there.
 
         Args:
             sine, weight: (m,) turned by, and share of the lens, of sum 1.
@@ -113,7 +149,10 @@ class Neighbours:
 
     def without(self, row: int) -> "Neighbours":
         """The same without a row."""
-        return replace(self, **{name: np.delete(getattr(self, name), row, axis=-1) for name in _ARRAYS})
+        return replace(
+            self,
+            **{name: np.delete(getattr(self, name), row, axis=-1) for name in _ARRAYS},
+        )
 
     @property
     def coarser(self) -> "Neighbours":
@@ -122,12 +161,19 @@ class Neighbours:
 
     @property
     def others(self) -> list["Neighbours"]:
-        """The same without any one of the rows, as long as one along the lattice is left."""
-        kept = [k for k in range(len(self.sine)) if self.diagonal[k] or np.count_nonzero(~self.diagonal) > 1]
+        """The same without any one of the rows, as long as one along the lattice is
+        left.
+        """
+        kept = [
+            k
+            for k in range(len(self.sine))
+            if self.diagonal[k] or np.count_nonzero(~self.diagonal) > 1
+        ]
         return [self.without(k) for k in kept]
 
     def doubted(self, sine: Array) -> list["Neighbours"]:
-        """What it may be as well: at the coarser truncation, without the row that changes most at these sines, and with
+        """What it may be as well: at the coarser truncation, without the row that
+        changes most at these sines, and with
         what zones that get shorter from one to the next change."""
         mine = self.mean(sine)
         apart = [float(np.abs(other.mean(sine) - mine).max()) for other in self.others]
@@ -137,10 +183,14 @@ class Neighbours:
     def to_arrays(self) -> dict[str, Array]:
         """For a file."""
         about = np.array([self.wavelength_um, self.cover])
-        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS} | {"wavelength_um_cover": about}
+        return {name: np.asarray(getattr(self, name)) for name in _ARRAYS} | {
+            "wavelength_um_cover": about
+        }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> "Neighbours":
         """Inverse of :meth:`to_arrays`."""
         wave, cover = arrays["wavelength_um_cover"].tolist()
-        return cls(**{name: arrays[name] for name in _ARRAYS}, wavelength_um=wave, cover=cover)
+        return cls(
+            **{name: arrays[name] for name in _ARRAYS}, wavelength_um=wave, cover=cover
+        )

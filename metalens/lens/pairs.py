@@ -1,4 +1,6 @@
-"""Pillars of two sizes in a lens: a table of t in place of a proxy, and the distances of light polarised along y."""
+"""Pillars of two sizes in a lens: a table of t in place of a proxy, and the distances
+of light polarised along y.
+"""
 
 import math
 from collections.abc import Mapping
@@ -16,12 +18,16 @@ NAMES = ("wavelength_um", "x_um", "y_um", "t")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pairs:
-    """Transmission of pillars over the size along x and that along y, for light polarised along x and along y.
+    """Transmission of pillars over the size along x and that along y, for light
+    polarised along x and along y.
 
-    wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2) power-normalised amplitudes that
+    wavelength_um: (w,). x_um: (m,), y_um: (n,) evenly spaced sizes. t: (w, m, n, 2)
+    power-normalised amplitudes that
         keep the polarisation, exp(-iwt).
-    focus_y_um: (sensor, source) distance of the light polarised along y; that of the lens is of light along x.
-    entry_error: root mean square of the error bars of the pillars that stand in the lens, relative to |t|; nan where
+    focus_y_um: (sensor, source) distance of the light polarised along y; that of the
+    lens is of light along x.
+    entry_error: root mean square of the error bars of the pillars that stand in the
+    lens, relative to |t|; nan where
         it is not known (older files).
     """
 
@@ -35,10 +41,15 @@ class Pairs:
     def __post_init__(self) -> None:
         shape = (len(self.wavelength_um), len(self.x_um), len(self.y_um), 2)
         if self.t.shape != shape or min(shape) < 1 or not np.isfinite(self.t).all():
-            raise LensError(f"table of pillars of two sizes has shape {self.t.shape}, need finite values of {shape}")
+            raise LensError(
+                f"table of pillars of two sizes has shape {self.t.shape}, need finite values of {shape}"
+            )
 
-    def amplitude(self, x_um: Array, y_um: Array, wavelength_um: float, light: str) -> Array:
-        """(...) t of pillars that stand in the table; sizes of 0 are no pillar and give 0.
+    def amplitude(
+        self, x_um: Array, y_um: Array, wavelength_um: float, light: str
+    ) -> Array:
+        """(...) t of pillars that stand in the table; sizes of 0 are no pillar and give
+        0.
 
         Raises:
             DomainError: a wavelength or a size that the table does not hold.
@@ -46,22 +57,42 @@ class Pairs:
         found = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
         if not len(found):
             held = ", ".join(f"{w:g}" for w in self.wavelength_um)
-            raise DomainError(f"wavelength {wavelength_um:g} um: pillars of two sizes are known at {held} um alone")
+            raise DomainError(
+                f"wavelength {wavelength_um:g} um: pillars of two sizes are known at {held} um alone"
+            )
         there = np.asarray(x_um) > 0
-        row, column = (_place(axis, np.where(there, v, axis[0])) for axis, v in ((self.x_um, x_um), (self.y_um, y_um)))
-        return np.asarray(np.where(there, self.t[found[0], row, column, "xy".index(light)], 0))
+        row, column = (
+            _place(axis, np.where(there, v, axis[0]))
+            for axis, v in ((self.x_um, x_um), (self.y_um, y_um))
+        )
+        return np.asarray(
+            np.where(there, self.t[found[0], row, column, "xy".index(light)], 0)
+        )
 
     @property
     def proxy(self) -> "NoProxy":
-        """What stands where a lens has a proxy: its domain and wavelengths, and a refusal of the rest."""
+        """What stands where a lens has a proxy: its domain and wavelengths, and a
+        refusal of the rest.
+        """
         domain = float(self.x_um[0]), float(self.x_um[-1]) + 1e-9
         ends = float(self.wavelength_um[0]), float(self.wavelength_um[-1])
         known = 0.0 if math.isnan(self.entry_error) else self.entry_error
-        return NoProxy(np.zeros((1, 1)), np.zeros((1, 1)), domain, ends, 0.0, 0.0, entry_error=known)
+        return NoProxy(
+            np.zeros((1, 1)),
+            np.zeros((1, 1)),
+            domain,
+            ends,
+            0.0,
+            0.0,
+            entry_error=known,
+        )
 
     def to_arrays(self) -> dict[str, Array]:
         """Everything as arrays, for a store file."""
-        alone = {name: np.array(getattr(self, name)) for name in ("focus_y_um", "entry_error")}
+        alone = {
+            name: np.array(getattr(self, name))
+            for name in ("focus_y_um", "entry_error")
+        }
         return {name: getattr(self, name) for name in NAMES} | alone
 
     @classmethod
@@ -69,11 +100,20 @@ class Pairs:
         """Inverse of :meth:`to_arrays`."""
         sensor, source = arrays["focus_y_um"].tolist()
         wavelength, x, y, t = (arrays[name] for name in NAMES)
-        return cls(wavelength, x, y, t, (sensor, source), float(arrays.get("entry_error", math.nan)))
+        return cls(
+            wavelength,
+            x,
+            y,
+            t,
+            (sensor, source),
+            float(arrays.get("entry_error", math.nan)),
+        )
 
 
 class NoProxy(Proxy):
-    """Pillars of two sizes are no function of one: whatever asks for phase or level over a diameter is refused."""
+    """Pillars of two sizes are no function of one: whatever asks for phase or level
+    over a diameter is refused.
+    """
 
     __slots__ = ()
 
@@ -88,7 +128,9 @@ class NoProxy(Proxy):
             "export (arrays) and view take such lenses"
         )
 
-    phase_rad = transmission = dphase_ddiameter = dtransmission_ddiameter = diameter_um = coverage_rad = monotone = at
+    phase_rad = transmission = dphase_ddiameter = dtransmission_ddiameter = (
+        diameter_um
+    ) = coverage_rad = monotone = at
 
 
 def _place(axis: Array, size_um: Array) -> Array:
@@ -102,5 +144,7 @@ def _place(axis: Array, size_um: Array) -> Array:
     place = np.clip(np.rint(exact), 0, len(axis) - 1)
     if np.abs(exact - place).max(initial=0.0) > 0.05:
         wrong = float(np.asarray(size_um).ravel()[np.abs(exact - place).argmax()])
-        raise DomainError(f"a pillar of {wrong:.6g} um: the table of this lens does not hold that size")
+        raise DomainError(
+            f"a pillar of {wrong:.6g} um: the table of this lens does not hold that size"
+        )
     return np.asarray(place.astype(int))

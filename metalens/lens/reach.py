@@ -1,4 +1,6 @@
-"""How far a lens reaches: the range of depths over which its image blurs, and how wide it does, from its own focus."""
+"""How far a lens reaches: the range of depths over which its image blurs, and how wide
+it does, from its own focus.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -6,9 +8,11 @@ from dataclasses import dataclass, field
 from metalens.lens.layers import Layers
 from metalens.lens.record import Lens
 
-DEFOCUS_WAVES = 1.75  # at the rim, at both ends of the range: the blur is then 3.5 wavelength / NA in radius
+# at the rim, at both ends of the range: the blur is then 3.5 wavelength / NA in radius
+DEFOCUS_WAVES = 1.75
 STEP_WAVES = 0.115  # at the rim, between two depths whose images are told apart
-ENCIRCLED = 5.3  # radius of the disc that holds a spot whose depth can be told, in wavelength / NA
+# radius of the disc that holds a spot whose depth can be told, in wavelength / NA
+ENCIRCLED = 5.3
 SAMPLE = 0.86  # of the coarsest sampling of the intensity
 PIXEL = 0.88  # of a pixel that shows most of what a spot tells, in wavelength / NA
 BLURS = 8.0  # width of a window, in radii of the blur
@@ -26,17 +30,27 @@ class Aperture:
 
 
 def defocus_per_um(lens: Lens | Aperture, depth_um: float) -> float:
-    """1 / z of a source less that of best focus, 1/um, films in front taken as the air that bends light as much."""
+    """1 / z of a source less that of best focus, 1/um, films in front taken as the air
+    that bends light as much.
+    """
     return 1 / _reduced(lens, depth_um) - 1 / _reduced(lens, lens.source_distance_um)
 
 
 def blur_um(lens: Lens | Aperture, depth_um: float) -> float:
-    """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z - 1/z0|."""
-    return _lit(lens, _aperture(lens).radius_um) * sensor_reach_um(lens) * abs(defocus_per_um(lens, depth_um))
+    """Radius of the paraxial blur on the sensor of a source on the axis: R d |1/z -
+    1/z0|.
+    """
+    return (
+        _lit(lens, _aperture(lens).radius_um)
+        * sensor_reach_um(lens)
+        * abs(defocus_per_um(lens, depth_um))
+    )
 
 
 def sensor_reach_um(lens: Lens | Aperture) -> float:
-    """Distance in air that bends paraxial light as much as the media between pillars and sensor."""
+    """Distance in air that bends paraxial light as much as the media between pillars
+    and sensor.
+    """
     return lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).reduced_um
 
 
@@ -45,14 +59,20 @@ def diffraction_um(lens: Lens | Aperture) -> float:
     return lens.wavelength_um * sensor_reach_um(lens) / _widest(lens)
 
 
-def window_um(lens: Lens | Aperture, depths_um: tuple[float, ...], *, airy: float) -> float:
-    """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst of these depths; 3 digits."""
+def window_um(
+    lens: Lens | Aperture, depths_um: tuple[float, ...], *, airy: float
+) -> float:
+    """Width of a window: ``airy`` wavelength / NA, or 8 radii of the blur at the worst
+    of these depths; 3 digits.
+    """
     blur = max(blur_um(lens, depth) for depth in depths_um)
     return _rounded(max(airy * diffraction_um(lens), BLURS * blur), 3)
 
 
 def disc_um(lens: Lens | Aperture) -> float:
-    """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2 digits."""
+    """Radius that holds most of a spot whose depth can be told: 5.3 wavelength / NA, 2
+    digits.
+    """
     return _rounded(ENCIRCLED * diffraction_um(lens), 2)
 
 
@@ -62,24 +82,35 @@ def pixel_um(lens: Lens | Aperture) -> float:
 
 
 def depth_step_um(lens: Lens | Aperture, depth_um: float) -> float:
-    """Step of depth that moves the rim by 0.115 waves against the middle: 0.23 wavelength z² / R², 2 digits.
+    """Step of depth that moves the rim by 0.115 waves against the middle: 0.23
+    wavelength z² / R², 2 digits.
 
-    Short enough that the image's change over it is a derivative; never above a fiftieth of the depth.
+    Short enough that the image's change over it is a derivative; never above a fiftieth
+    of the depth.
     """
-    step = 2 * STEP_WAVES * lens.wavelength_um * (_reduced(lens, depth_um) / _widest(lens)) ** 2
+    step = (
+        2
+        * STEP_WAVES
+        * lens.wavelength_um
+        * (_reduced(lens, depth_um) / _widest(lens)) ** 2
+    )
     return _rounded(min(step, 0.02 * depth_um), 2)
 
 
 def sample_um(lens: Lens | Aperture, pixel_um: float) -> float:
-    """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a pixel; 2 digits."""
+    """Sampling of intensities: 0.86 of wavelength / 4 sin(rim), at most a quarter of a
+    pixel; 2 digits.
+    """
     sine = math.sin(math.atan(_widest(lens) / sensor_reach_um(lens)))
     return _rounded(min(SAMPLE * lens.wavelength_um / (4 * sine), pixel_um / 4), 2)
 
 
 def depth_range_um(lens: Lens | Aperture, *, digits: int = 2) -> tuple[float, float]:
-    """(near, far) depths at which the rim is 1.75 waves out of focus, R² |1/z - 1/z0| / (2 wavelength).
+    """(near, far) depths at which the rim is 1.75 waves out of focus, R² |1/z - 1/z0| /
+    (2 wavelength).
 
-    Where no depth is that far out of focus, far is ten times near; near is at least the lens's diameter, or the
+    Where no depth is that far out of focus, far is ten times near; near is at least the
+    lens's diameter, or the
     depth of focus itself. Rounded to ``digits`` digits, and beyond the films in front.
 
     A lens of 1 mm and 850 nm that is made for 20 mm: 16 and 26 mm.
@@ -97,17 +128,25 @@ def _aperture(lens: Lens | Aperture) -> Aperture:
     if isinstance(lens, Aperture):
         return lens
     distances = lens.sensor_distance_um, lens.source_distance_um
-    return Aperture(lens.diameters.radius_um, lens.wavelength_um, *distances, lens.layers)
+    return Aperture(
+        lens.diameters.radius_um, lens.wavelength_um, *distances, lens.layers
+    )
 
 
 def _widest(lens: Lens | Aperture) -> float:
     """Radius, at least one pitch, of what is lit."""
-    radius = lens.radius_um if isinstance(lens, Aperture) else max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    radius = (
+        lens.radius_um
+        if isinstance(lens, Aperture)
+        else max(lens.diameters.radius_um, lens.diameters.pitch_um)
+    )
     return _lit(lens, radius)
 
 
 def _lit(lens: Lens | Aperture, radius_um: float) -> float:
-    return min(radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um))
+    return min(
+        radius_um, lens.layers.footprint_um(lens.source_distance_um, lens.wavelength_um)
+    )
 
 
 def _reduced(lens: Lens | Aperture, depth_um: float) -> float:
@@ -117,7 +156,10 @@ def _reduced(lens: Lens | Aperture, depth_um: float) -> float:
 def _thinner(lens: Lens | Aperture) -> float:
     """What films in front take off the depth: sum of t (1 - 1/n)."""
     before = lens.layers.before(math.inf, lens.wavelength_um)
-    return sum(t * (1 - 1 / n) for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True))
+    return sum(
+        t * (1 - 1 / n)
+        for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True)
+    )
 
 
 def _rounded(value: float, digits: int) -> float:

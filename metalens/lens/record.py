@@ -1,4 +1,6 @@
-"""The lens that is handed on: a diameter map, and what is needed to know its phase at any wavelength."""
+"""The lens that is handed on: a diameter map, and what is needed to know its phase at
+any wavelength.
+"""
 
 import contextlib
 from collections.abc import Mapping
@@ -23,8 +25,14 @@ from metalens.pillars import Proxy
 
 _NAME = "diameter_um"
 Hand = Literal["", "left", "right"]
-HANDS: dict[str, float] = {"": 0.0, "left": -2.0, "right": 2.0}  # phase in turns of the pillar, by incoming hand
-MOST_HELD_BYTES = 1 << 26  # of diameters, beyond which the mask reads them from the file row by row
+HANDS: dict[str, float] = {
+    "": 0.0,
+    "left": -2.0,
+    "right": 2.0,
+}  # phase in turns of the pillar, by incoming hand
+MOST_HELD_BYTES = (
+    1 << 26
+)  # of diameters, beyond which the mask reads them from the file row by row
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,18 +45,25 @@ class Lens:
     wavelength_um: of the design.
     sensor_distance_um: lens to sensor, in the cover medium.
     source_distance_um: object distance of best focus (inf for a collimated beam).
-    profile: name of the design (hyperbolic, double-helix, cubic, fisher, map, as-built).
+    profile: name of the design (hyperbolic, double-helix, cubic, fisher, map,
+    as-built).
     provenance: config and inputs that made it.
     layers: films in front and behind; their cover is that of the cell.
-    hand: circular light that the lens is made for: "right" (field x + iy, the phase grows by twice the turn of a
-        pillar) or "left"; the proxy is then that of the light that leaves with the other hand. Empty: any light.
-    pairs: table of pillars of two sizes in place of the proxy; None where they have one. light: polarisation, "x" or
-        "y", that phase, transmission and distances are for where they have two (:meth:`seen`).
-    neighbours: rows of its own unlike pillars (:func:`metalens.design.neighbours`), whose factor PSFs and images then
+    hand: circular light that the lens is made for: "right" (field x + iy, the phase
+    grows by twice the turn of a
+        pillar) or "left"; the proxy is then that of the light that leaves with the
+        other hand. Empty: any light.
+    pairs: table of pillars of two sizes in place of the proxy; None where they have
+    one. light: polarisation, "x" or
+        "y", that phase, transmission and distances are for where they have two
+        (:meth:`seen`).
+    neighbours: rows of its own unlike pillars (:func:`metalens.design.neighbours`),
+    whose factor PSFs and images then
         hold; None where none was solved.
 
     Raises:
-        LensError: layers with another cover than the cell's; turned pillars without a hand, or the other way round;
+        LensError: layers with another cover than the cell's; turned pillars without a
+            hand, or the other way round;
             PropagationError: films thicker than their gap.
     """
 
@@ -67,10 +82,19 @@ class Lens:
     neighbours: Neighbours | None = None
 
     def __post_init__(self) -> None:
-        if (self.pairs is None) != (self.diameters.length_um is None) or (self.pairs is None and self.light != "x"):
-            raise LensError("pairs: need the table of pillars where they have two sizes, and there alone")
-        if bool(self.hand) != (self.diameters.angle_rad is not None) or self.hand not in HANDS:
-            raise LensError(f"hand = {self.hand!r}: need left or right where pillars are turned one by one, else none")
+        if (self.pairs is None) != (self.diameters.length_um is None) or (
+            self.pairs is None and self.light != "x"
+        ):
+            raise LensError(
+                "pairs: need the table of pillars where they have two sizes, and there alone"
+            )
+        if (
+            bool(self.hand) != (self.diameters.angle_rad is not None)
+            or self.hand not in HANDS
+        ):
+            raise LensError(
+                f"hand = {self.hand!r}: need left or right where pillars are turned one by one, else none"
+            )
         cover = self.cell.cover
         if self.layers.cover not in (None, cover):
             raise LensError(
@@ -81,16 +105,24 @@ class Lens:
 
     @property
     def reduced_um(self) -> float:
-        """Σ thickness / index from the pillars to the sensor: samples at x um show directions of tangent x over it."""
+        """Σ thickness / index from the pillars to the sensor: samples at x um show
+        directions of tangent x over it.
+        """
         return self.layers.after(self.sensor_distance_um, self.wavelength_um).reduced_um
 
     @property
     def one_light(self) -> str:
-        """Which light the proxy is of, in words, where pillars of one size answer x and y apart; empty for others."""
+        """Which light the proxy is of, in words, where pillars of one size answer x and
+        y apart; empty for others.
+        """
         if self.hand or self.pairs is not None or self.cell.alike:
             return ""
         angled = self.proxy.max_angle_rad > 0
-        return "the mean of both polarisations, tilted along x" if angled else "light along x"
+        return (
+            "the mean of both polarisations, tilted along x"
+            if angled
+            else "light along x"
+        )
 
     def seen(self, light: Literal["x", "y"]) -> "Lens":
         """The lens for light polarised along x or y, where it focuses that."""
@@ -99,34 +131,58 @@ class Lens:
         mine = self.sensor_distance_um, self.source_distance_um
         sensor, source = self.pairs.focus_y_um  # of the other light, whichever that is
         other = replace(self.pairs, focus_y_um=mine)
-        return replace(self, light=light, pairs=other, sensor_distance_um=sensor, source_distance_um=source)
+        return replace(
+            self,
+            light=light,
+            pairs=other,
+            sensor_distance_um=sensor,
+            source_distance_um=source,
+        )
 
-    def phase_rad(self, wavelength_um: float | None = None, angle_rad: float = 0.0) -> Array:
-        """(y, x) phase of every pillar through the proxy or the table, and of its turn; 0 where there is none."""
+    def phase_rad(
+        self, wavelength_um: float | None = None, angle_rad: float = 0.0
+    ) -> Array:
+        """(y, x) phase of every pillar through the proxy or the table, and of its turn;
+        0 where there is none.
+        """
         return self.rows_phase_rad(slice(None), wavelength_um, angle_rad)
 
-    def rows_phase_rad(self, rows: slice, wavelength_um: float | None = None, angle_rad: float = 0.0) -> Array:
+    def rows_phase_rad(
+        self, rows: slice, wavelength_um: float | None = None, angle_rad: float = 0.0
+    ) -> Array:
         """As :meth:`phase_rad`, of some rows."""
         d = np.asarray(self.diameters.diameter_um[rows])
         if self.pairs is not None:
-            return np.asarray(np.angle(self._amplitude(rows, self.pairs, wavelength_um)))
+            return np.asarray(
+                np.angle(self._amplitude(rows, self.pairs, wavelength_um))
+            )
         inside = np.where(d > 0, d, self.proxy.domain_um[0])
         phase = self.proxy.phase_rad(inside, self._at(wavelength_um), angle_rad)
         return np.where(d > 0, phase + self.geometric_rad(rows), 0)
 
-    def _amplitude(self, rows: slice, pairs: Pairs, wavelength_um: float | None) -> Array:
+    def _amplitude(
+        self, rows: slice, pairs: Pairs, wavelength_um: float | None
+    ) -> Array:
         x, y = self.diameters.diameter_um[rows], self.diameters.length_um
-        return pairs.amplitude(x, x if y is None else y[rows], self._at(wavelength_um), self.light)
+        return pairs.amplitude(
+            x, x if y is None else y[rows], self._at(wavelength_um), self.light
+        )
 
     def geometric_rad(self, rows: slice) -> Array | float:
-        """Phase that turned pillars give circular light, plus or minus twice the turn; 0 where none is turned."""
+        """Phase that turned pillars give circular light, plus or minus twice the turn;
+        0 where none is turned.
+        """
         turn = self.diameters.angle_rad
         return 0.0 if turn is None else np.asarray(HANDS[self.hand] * turn[rows], float)
 
-    def transmission(self, wavelength_um: float | None = None, angle_rad: float = 0.0) -> Array:
+    def transmission(
+        self, wavelength_um: float | None = None, angle_rad: float = 0.0
+    ) -> Array:
         """(y, x) magnitude |T| <= 1 of every pillar; 0 where there is none."""
         if self.pairs is not None:
-            return np.minimum(np.abs(self._amplitude(slice(None), self.pairs, wavelength_um)), 1.0)
+            return np.minimum(
+                np.abs(self._amplitude(slice(None), self.pairs, wavelength_um)), 1.0
+            )
         d = self.diameters.diameter_um
         inside = np.where(d > 0, d, self.proxy.domain_um[0])
         level = self.proxy.transmission(inside, self._at(wavelength_um), angle_rad)
@@ -163,7 +219,13 @@ def load_plain(path: str | Path) -> Lens:
     """
     made = load(path)
     if not made.diameters.plain:
-        turned = ", turned one by one" if made.hand else ", of two sizes" if made.pairs else ""
+        turned = (
+            ", turned one by one"
+            if made.hand
+            else ", of two sizes"
+            if made.pairs
+            else ""
+        )
         raise LensError(
             f"{path}: pillars on a {made.diameters.lattice.kind} lattice{turned}; this command takes a square lattice "
             "of pillars of one size that are not turned (psf, layout and view take any)"
@@ -173,9 +235,11 @@ def load_plain(path: str | Path) -> Lens:
 
 @reader
 def streamed(path: str | Path) -> Lens:
-    """As :func:`load`; diameters that would take much memory stay in the file, as :class:`RowsOnDisk`.
+    """As :func:`load`; diameters that would take much memory stay in the file, as
+    :class:`RowsOnDisk`.
 
-    What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray`` gives all of them.
+    What looks at them in blocks of rows (the mask) needs no more; ``numpy.asarray``
+    gives all of them.
     """
     large = False
     if Path(path).is_file():  # what else it is tells the loader, and what is damaged
@@ -185,7 +249,10 @@ def streamed(path: str | Path) -> Lens:
         return load(path)
     stored = store.load(path, "lens", without=(_NAME,))
     held = {**stored.arrays, _NAME: cast(Array, RowsOnDisk(path, _NAME))}
-    return replace(from_parts(held, stored.attributes, where=str(path)), provenance=stored.provenance)
+    return replace(
+        from_parts(held, stored.attributes, where=str(path)),
+        provenance=stored.provenance,
+    )
 
 
 def _claimed(file: Any) -> int:
@@ -195,9 +262,15 @@ def _claimed(file: Any) -> int:
 
 
 def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, Any]]:
-    """(arrays, attributes) of a lens for a store file; ``group`` stands before the names of the arrays."""
+    """(arrays, attributes) of a lens for a store file; ``group`` stands before the
+    names of the arrays.
+    """
     arrays: dict[str, Array] = {f"{group}diameter_um": lens.diameters.diameter_um}
-    about = ("proxy", lens.proxy.to_arrays()) if lens.pairs is None else ("pairs", lens.pairs.to_arrays())
+    about = (
+        ("proxy", lens.proxy.to_arrays())
+        if lens.pairs is None
+        else ("pairs", lens.pairs.to_arrays())
+    )
     arrays |= {f"{group}{about[0]}/{name}": array for name, array in about[1].items()}
     attributes = {
         "pitch_um": lens.diameters.pitch_um,
@@ -209,10 +282,17 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
     }
     d = lens.diameters
     if not d.plain:
-        attributes |= {"lattice": config.dumps(d.lattice), "row_um": d.steps_um[1], "shape": lens.cell.shape.name}
+        attributes |= {
+            "lattice": config.dumps(d.lattice),
+            "row_um": d.steps_um[1],
+            "shape": lens.cell.shape.name,
+        }
         attributes |= {"hand": lens.hand, "light": lens.light}
     if lens.neighbours is not None:
-        arrays |= {f"{group}neighbours/{name}": array for name, array in lens.neighbours.to_arrays().items()}
+        arrays |= {
+            f"{group}neighbours/{name}": array
+            for name, array in lens.neighbours.to_arrays().items()
+        }
     if d.angle_rad is not None:
         arrays |= {f"{group}angle_rad": d.angle_rad}
     if d.length_um is not None:
@@ -222,10 +302,20 @@ def parts(lens: Lens, *, group: str = "") -> tuple[dict[str, Array], dict[str, A
     return arrays, attributes
 
 
-def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, where: str, group: str = "") -> Lens:
+def from_parts(
+    arrays: Mapping[str, Array],
+    attributes: Mapping[str, Any],
+    *,
+    where: str,
+    group: str = "",
+) -> Lens:
     """Inverse of :func:`parts`; ``where`` names the file in errors."""
     proxy, held, rows = (
-        {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+        {
+            name.removeprefix(start): array
+            for name, array in arrays.items()
+            if name.startswith(start)
+        }
         for start in (f"{group}proxy/", f"{group}pairs/", f"{group}neighbours/")
     )
     pairs = Pairs.from_arrays(held) if held else None
@@ -245,7 +335,9 @@ def from_parts(arrays: Mapping[str, Array], attributes: Mapping[str, Any], *, wh
     )
 
 
-def _diameters(arrays: Mapping[str, Array], attributes: Mapping[str, Any], where: str, group: str) -> DiameterMap:
+def _diameters(
+    arrays: Mapping[str, Array], attributes: Mapping[str, Any], where: str, group: str
+) -> DiameterMap:
     """The map of a file; on a square lattice in files that name none."""
     plain = DiameterMap(arrays[f"{group}diameter_um"], attributes["pitch_um"])
     if "lattice" not in attributes:
@@ -253,10 +345,16 @@ def _diameters(arrays: Mapping[str, Array], attributes: Mapping[str, Any], where
     lattice = config.loads(attributes["lattice"], Lattice, where=f"{where}: lattice")
     row_um = 0.0 if lattice.kind == "square" else attributes["row_um"]
     turn, length = (arrays.get(f"{group}{name}") for name in ("angle_rad", "length_um"))
-    return replace(plain, lattice=lattice, row_um=row_um, angle_rad=turn, length_um=length)
+    return replace(
+        plain, lattice=lattice, row_um=row_um, angle_rad=turn, length_um=length
+    )
 
 
 def _layers(attributes: Mapping[str, Any], where: str) -> Layers:
     """The films of a file; none in files that name none."""
     text = attributes.get("layers")
-    return Layers() if text is None else config.loads(text, Layers, where=f"{where}: layers")
+    return (
+        Layers()
+        if text is None
+        else config.loads(text, Layers, where=f"{where}: layers")
+    )

@@ -13,11 +13,15 @@ _BAND = 256  # rows, where the file is not cut into chunks
 
 
 class RowsOnDisk:
-    """Stands for an array (y, x) where blocks of rows are all that is needed; ``numpy.asarray`` reads all of it.
+    """Stands for an array (y, x) where blocks of rows are all that is needed;
+    ``numpy.asarray`` reads all of it.
 
-    A slice of rows (and columns), a row number, least and most: anything else needs ``numpy.asarray`` first. The band
-    of rows read last is kept, whole chunks of the file. The file is to have been read with
-    :func:`metalens.ground.reading.survived` before; reading rows of one that was written to since is a StoreError.
+    A slice of rows (and columns), a row number, least and most: anything else needs
+    ``numpy.asarray`` first. The band
+    of rows read last is kept, whole chunks of the file. The file is to have been read
+    with
+    :func:`metalens.ground.reading.survived` before; reading rows of one that was
+    written to since is a StoreError.
     """
 
     def __init__(self, path: str | Path, name: str) -> None:
@@ -25,7 +29,11 @@ class RowsOnDisk:
         self._file = h5py.File(path, "r")
         self._data: h5py.Dataset = self._file[name]
         self.shape: tuple[int, int] = self._data.shape
-        self.dtype, self.ndim, self.nbytes = self._data.dtype, self._data.ndim, self._data.nbytes
+        self.dtype, self.ndim, self.nbytes = (
+            self._data.dtype,
+            self._data.ndim,
+            self._data.nbytes,
+        )
         self._height = int(self._data.chunks[0]) if self._data.chunks else _BAND
         self._first, self._kept = 0, np.empty((0, self.shape[1]), self.dtype)
         self._ends: tuple[float, float, int] | None = None
@@ -84,4 +92,8 @@ class RowsOnDisk:
             first = stop
         if len(pieces) == 1:
             return pieces[0]
-        return np.concatenate(pieces) if pieces else np.empty((0, self.shape[1]), self.dtype)
+        return (
+            np.concatenate(pieces)
+            if pieces
+            else np.empty((0, self.shape[1]), self.dtype)
+        )

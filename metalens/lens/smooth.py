@@ -1,6 +1,8 @@
-"""Functions of rays over many places: polynomials where those reach rounding, so that Newton's method runs a few times.
+"""Functions of rays over many places: polynomials where those reach rounding, so that
+Newton's method runs a few times.
 
-What media make of a ray is analytic in its squared reach u, away from -(Σ t / n)²: Chebyshev coefficients fall as a
+What media make of a ray is analytic in its squared reach u, away from -(Σ t / n)²:
+Chebyshev coefficients fall as a
 power.
 """
 
@@ -16,12 +18,16 @@ FEW = 1000  # places below which the function itself is quicker
 
 
 def over(function: Callable[[Any], Any], u: Any) -> Any:
-    """function(u), elementwise, of a float64 array or tensor; to 1e-14 of its largest value."""
+    """function(u), elementwise, of a float64 array or tensor; to 1e-14 of its largest
+    value.
+    """
     count = u.size if isinstance(u, np.ndarray) else u.numel()
     low, high = (float(u.min()), float(u.max())) if count >= FEW else (0.0, 0.0)
     middle, reach = (low + high) / 2, (high - low) / 2
     for degree in DEGREES if reach > 0 else ():
-        found = chebyshev.chebinterpolate(lambda unit: function(middle + reach * unit), degree)
+        found = chebyshev.chebinterpolate(
+            lambda unit: function(middle + reach * unit), degree
+        )
         if np.abs(found[-2:]).max() <= LEFT * np.abs(found).max():
             return _horner(chebyshev.cheb2poly(found), (u - middle) / reach)
     return function(u)

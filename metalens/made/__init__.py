@@ -1,4 +1,6 @@
-"""The made lens: one table of causes with their derivatives, states of them, their spread, and the bias of a mask."""
+"""The made lens: one table of causes with their derivatives, states of them, their
+spread, and the bias of a mask.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,6 @@
-"""Etch and exposure bias: what is drawn is not what is made; draw so that the designed pillar is made."""
+"""Etch and exposure bias: what is drawn is not what is made; draw so that the designed
+pillar is made.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,22 +11,27 @@ from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-STEEPEST = 0.5  # |d bias / d diameter| above this is refused: the inverse would not be a contraction
+# |d bias / d diameter| above this is refused: the inverse would not be a contraction
+STEEPEST = 0.5
 _PROBES_NM = np.linspace(10, 2000, 1991)
 
 
 @dataclass(frozen=True, slots=True)
 class Bias:
-    """Bias = made diameter - drawn diameter, both at half the height of the pillar, for the drawn diameter.
+    """Bias = made diameter - drawn diameter, both at half the height of the pillar, for
+    the drawn diameter.
 
-    table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond the ends.
+    table_nm: (drawn diameter, bias) pairs, rising; linear between them, constant beyond
+    the ends.
     curve_nm: or coefficients c_k of bias = sum c_k (drawn diameter / 100 nm)^k.
-    csv: or a file of two columns, drawn diameter and bias in nm, with or without a head.
+    csv: or a file of two columns, drawn diameter and bias in nm, with or without a
+    head.
     isolated_nm: what a pillar without neighbours gains beyond one in a full lattice.
     range_um: distance (Gaussian 1/e radius) over which neighbours count for that.
 
     Raises:
-        ProcessError: more than one source of the bias, a table that does not rise, a slope beyond +-0.5.
+        ProcessError: more than one source of the bias, a table that does not rise, a
+            slope beyond +-0.5.
     """
 
     table_nm: tuple[tuple[float, float], ...] = ()
@@ -35,19 +42,32 @@ class Bias:
 
     def __post_init__(self) -> None:
         if sum((bool(self.table_nm), bool(self.curve_nm), self.csv is not None)) > 1:
-            raise ProcessError("bias is given more than once; keep one of table_nm, curve_nm and csv")
-        numbers = np.array([*np.ravel(self.table_nm), *self.curve_nm, self.isolated_nm, self.range_um], float)
+            raise ProcessError(
+                "bias is given more than once; keep one of table_nm, curve_nm and csv"
+            )
+        numbers = np.array(
+            [*np.ravel(self.table_nm), *self.curve_nm, self.isolated_nm, self.range_um],
+            float,
+        )
         if not np.isfinite(numbers).all():
-            raise ProcessError("bias holds a value that is not finite; need numbers in nm")
+            raise ProcessError(
+                "bias holds a value that is not finite; need numbers in nm"
+            )
         if self.range_um <= 0:
             raise ProcessError(f"range_um = {self.range_um}: need a distance above 0")
         drawn = np.array([pair[0] for pair in self.table_nm])
         if (np.diff(drawn) <= 0).any() or (drawn <= 0).any():
-            raise ProcessError(f"diameters of the bias table must rise and be above 0, found {drawn.tolist()}")
+            raise ProcessError(
+                f"diameters of the bias table must rise and be above 0, found {drawn.tolist()}"
+            )
         self._check_slope()
 
     def _check_slope(self) -> None:
-        probes = np.array([pair[0] for pair in self.table_nm]) if self.table_nm else _PROBES_NM
+        probes = (
+            np.array([pair[0] for pair in self.table_nm])
+            if self.table_nm
+            else _PROBES_NM
+        )
         slope = np.diff(self.at(probes)) / np.diff(probes)
         if slope.size and abs(slope).max() > STEEPEST:
             at = int(abs(slope).argmax())
@@ -64,18 +84,24 @@ class Bias:
             return np.asarray(np.interp(drawn, knots, values))
         if self.curve_nm:
             clipped = np.clip(drawn, _PROBES_NM[0], _PROBES_NM[-1])
-            return np.asarray(np.polynomial.polynomial.polyval(clipped / 100, self.curve_nm))
+            return np.asarray(
+                np.polynomial.polynomial.polyval(clipped / 100, self.curve_nm)
+            )
         return np.zeros_like(drawn)
 
     def made_nm(self, drawn_nm: Array | float, isolation: Array | float = 0.0) -> Array:
         """Diameter that comes out; ``isolation``: 0 in a full lattice, 1 alone."""
         drawn = np.asarray(drawn_nm, float)
-        return np.asarray(drawn + self.at(drawn) + self.isolated_nm * np.asarray(isolation))
+        return np.asarray(
+            drawn + self.at(drawn) + self.isolated_nm * np.asarray(isolation)
+        )
 
     def drawn_nm(self, made_nm: Array | float, isolation: Array | float = 0.0) -> Array:
-        """Inverse of :meth:`made_nm`: what to draw so that ``made_nm`` comes out, to 1e-9 nm.
+        """Inverse of :meth:`made_nm`: what to draw so that ``made_nm`` comes out, to
+        1e-9 nm.
 
-        The fixed point of drawn = made - bias(drawn): each round halves the error at least.
+        The fixed point of drawn = made - bias(drawn): each round halves the error at
+        least.
         """
         goal = np.asarray(made_nm, float) - self.isolated_nm * np.asarray(isolation)
         drawn = goal.copy()
@@ -87,19 +113,25 @@ class Bias:
 
 
 def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
-    """(drawn diameter, bias) pairs in nm from a file of two columns, below a line of words or not.
+    """(drawn diameter, bias) pairs in nm from a file of two columns, below a line of
+    words or not.
 
     Columns are parted by commas, or by semicolons, tabs or blanks with decimal commas.
 
     Raises:
-        ProcessError: missing file, a line that is not two numbers (line named), or no line at all.
+        ProcessError: missing file, a line that is not two numbers (line named), or no
+            line at all.
     """
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ProcessError(f"{path}: cannot be read as a table ({error})") from None
-    rows = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    rows = [
+        (n, line)
+        for n, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if rows and rows[0][1].lstrip()[0] not in "+-.0123456789":
         del rows[0]  # names of the columns
     pairs = []
@@ -107,7 +139,9 @@ def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
         try:
             first, second = (float(cell) for cell in reading.columns(line))
         except ValueError:
-            raise ProcessError(f"{path}, line {number}: {line[:60]!r}, need two numbers") from None
+            raise ProcessError(
+                f"{path}, line {number}: {line[:60]!r}, need two numbers"
+            ) from None
         pairs.append((first, second))
     if not pairs:
         raise ProcessError(f"{path}: holds no numbers; need lines of two columns")

@@ -1,6 +1,8 @@
-"""What can be wrong with a made lens: one table of causes, each with its unit, prior, bounds and derivative.
+"""What can be wrong with a made lens: one table of causes, each with its unit, prior,
+bounds and derivative.
 
-Fit, tolerance study, error budget, training spread and mask correction read this table and nothing else: a new cause is
+Fit, tolerance study, error budget, training spread and mask correction read this table
+and nothing else: a new cause is
 a new row. Three kinds of derivative hold all of them:
 
     Widens    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
@@ -26,10 +28,13 @@ Terms = tuple[tuple[float, int, int], ...]  # (c, i, j): c u^i v^j
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """Pillars as guides of one mode, over their diameters; what the quick derivatives are made of.
+    """Pillars as guides of one mode, over their diameters; what the quick derivatives
+    are made of.
 
-    k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,) effective index and its derivatives
-    by the diameter. index, around: of pillar and surroundings. height_um, sidewall_rad: of the design.
+    k: wavenumber in vacuum, rad/um. diameter_um, effective, slope, curvature: (n,)
+    effective index and its derivatives
+    by the diameter. index, around: of pillar and surroundings. height_um, sidewall_rad:
+    of the design.
     """
 
     k: float
@@ -54,11 +59,15 @@ class Widens:
 class Answers:
     """Derivative of ln t of every pillar alike, by ``unit`` of the row.
 
-    quick: from the effective index, (n,) complex for the diameters of a guide. changed: the cell with so much more of
-    the cause; None where a pillar of the same size has no more of it. step: of differences through a solver. exact:
+    quick: from the effective index, (n,) complex for the diameters of a guide. changed:
+    the cell with so much more of
+    the cause; None where a pillar of the same size has no more of it. step: of
+    differences through a solver. exact:
     where :class:`metalens.modal.Gradient` has dt/d(cause).
-    numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives` names them, by cell and size of
-    the pillar; {} where such a pillar cannot have the cause. None: by differences, step by step.
+    numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives`
+    names them, by cell and size of
+    the pillar; {} where such a pillar cannot have the cause. None: by differences, step
+    by step.
     """
 
     quick: Callable[[Guide], Array]
@@ -70,7 +79,9 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Bends:
-    """Derivative of the wave front's phase: rad a unit of the cause, a polynomial in (u, v)."""
+    """Derivative of the wave front's phase: rad a unit of the cause, a polynomial in
+    (u, v).
+    """
 
     terms: Terms
 
@@ -79,7 +90,8 @@ class Bends:
 class Drawn:
     """How a process spreads a cause, in PROCESS.toml's table ``spread``.
 
-    name, sigma: entry there and its default. share: of the entry's amount that the cause gets; two causes of one entry
+    name, sigma: entry there and its default. share: of the entry's amount that the
+    cause gets; two causes of one entry
     are the x and y of a direction that every lens draws anew.
     """
 
@@ -90,11 +102,15 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One row: a number that says how a made lens differs from its design; 0 is the design.
+    """One row: a number that says how a made lens differs from its design; 0 is the
+    design.
 
-    meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma: prior knowledge without metrology.
-    low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name. free: fitted unless told
-    otherwise. drawn: how the process spreads it, where it does. plausible: standard deviation that is reckoned with
+    meaning: for reports. scale: a typical uncertainty, for steps and plots. sigma:
+    prior knowledge without metrology.
+    low, high: bounds. acts: its derivative. unit: um, rad or 1 in one unit of the name.
+    free: fitted unless told
+    otherwise. drawn: how the process spreads it, where it does. plausible: standard
+    deviation that is reckoned with
     where it is neither fitted nor stated; sigma where 0.
     """
 
@@ -116,25 +132,39 @@ def _by_height(g: Guide) -> Array:
 
 
 def _by_index(g: Guide) -> Array:
-    """With b = (n_eff² - 1) / (n² - 1) a function of D sqrt(n² - 1): d n_eff / dn = (b n + n D b' / 2) / n_eff."""
+    """With b = (n_eff² - 1) / (n² - 1) a function of D sqrt(n² - 1): d n_eff / dn = (b
+    n + n D b' / 2) / n_eff.
+    """
     contrast = g.index**2 - g.around**2
     b = (g.effective**2 - g.around**2) / contrast
     by_diameter = 2 * g.effective * g.slope / contrast
-    return 1j * g.k * g.height_um * (b * g.index + g.index * g.diameter_um * by_diameter / 2) / g.effective
+    return (
+        1j
+        * g.k
+        * g.height_um
+        * (b * g.index + g.index * g.diameter_um * by_diameter / 2)
+        / g.effective
+    )
 
 
 def _by_sidewall(g: Guide) -> Array:
-    """Pillars are measured at half height: the wall acts in second order, k n_eff'' s h³ / 3."""
+    """Pillars are measured at half height: the wall acts in second order, k n_eff'' s
+    h³ / 3.
+    """
     return 1j * g.k * g.curvature * g.sidewall_rad * g.height_um**3 / 3
 
 
 def _by_side(g: Guide) -> Array:
-    """A round pillar that is wider along one axis: the mean over both polarisations is half of the diameter's."""
+    """A round pillar that is wider along one axis: the mean over both polarisations is
+    half of the diameter's.
+    """
     return 0.5j * g.k * g.height_um * g.slope
 
 
 def _by_none(g: Guide) -> Array:
-    """A plain round pillar is the same at any turn, and has no other films under or on it."""
+    """A plain round pillar is the same at any turn, and has no other films under or on
+    it.
+    """
     return np.zeros_like(g.effective, complex)
 
 
@@ -144,7 +174,9 @@ def _number(name: str) -> Callable[[Cell, float], dict[str, float]]:
 
 
 def _width(cell: Cell, size_um: float) -> dict[str, float]:
-    """Along the shape's own x at the length that it has, where it has two sides: L = ratio times the size."""
+    """Along the shape's own x at the length that it has, where it has two sides: L =
+    ratio times the size.
+    """
     ratio = _ratio(cell)
     return {"size_um": 1.0, "shape.ratio": -ratio / size_um} if ratio else {}
 
@@ -160,18 +192,26 @@ def _turn(cell: Cell, size_um: float) -> dict[str, float]:
 
 def _ratio(cell: Cell) -> float:
     """Of the second side of a rectangle or an ellipse to its size; 0 for other shapes."""
-    return float(cell.shape.ratio) if isinstance(cell.shape, Rectangle | Ellipse) else 0.0
+    return (
+        float(cell.shape.ratio) if isinstance(cell.shape, Rectangle | Ellipse) else 0.0
+    )
 
 
 def _heights(cell: Cell, size_um: float) -> dict[str, float]:
     """Of the pillar, or of its sections."""
     if not cell.layers:
         return {"height_um": 1.0}
-    return {f"layers.{i}.height_um": share for i, share in enumerate(cell.height_shares) if share}
+    return {
+        f"layers.{i}.height_um": share
+        for i, share in enumerate(cell.height_shares)
+        if share
+    }
 
 
 def _films(cell: Cell, *, under: bool) -> dict[str, float]:
-    """Of the films under all sections of the pillar's own material, or on them, in proportion to their heights."""
+    """Of the films under all sections of the pillar's own material, or on them, in
+    proportion to their heights.
+    """
     own = [i for i, layer in enumerate(cell.layers) if layer.material is None]
     if not own:
         return {}
@@ -193,7 +233,9 @@ def _leaning(cell: Cell, amount: float, wavelength_um: float) -> Cell:
     return dataclasses.replace(cell, sidewall_rad=cell.sidewall_rad + amount)
 
 
-def _widens(name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: object) -> Cause:
+def _widens(
+    name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: object
+) -> Cause:
     nm = tuple((c * 1e-3, i, j) for c, i, j in terms)
     return Cause(name, meaning, 1.0, sigma, -bound, bound, Widens(nm), 1e-3, **more)  # type: ignore[arg-type]
 
@@ -201,17 +243,51 @@ def _widens(name: str, meaning: str, sigma: float, bound: float, terms: Terms, *
 def _bends(name: str, norm: float, terms: Terms) -> Cause:
     """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
     rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
-    return Cause(f"{name}_rad", f"Zernike {name} of the wave front, rms", 0.05, 1.0, -6.0, 6.0, Bends(rad))
+    return Cause(
+        f"{name}_rad",
+        f"Zernike {name} of the wave front, rms",
+        0.05,
+        1.0,
+        -6.0,
+        6.0,
+        Bends(rad),
+    )
 
 
-def _side(name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]) -> Cause:
+def _side(
+    name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
+) -> Cause:
     acts = Answers(_by_side, None, 2e-3, numbers=numbers)
-    return Cause(name, meaning, 1.0, 2.0, -12.0, 12.0, acts, 1e-3, free=False, drawn=Drawn(name, 0.0))
+    return Cause(
+        name,
+        meaning,
+        1.0,
+        2.0,
+        -12.0,
+        12.0,
+        acts,
+        1e-3,
+        free=False,
+        drawn=Drawn(name, 0.0),
+    )
 
 
 def _film(name: str, meaning: str, *, under: bool) -> Cause:
-    acts = Answers(_by_none, None, 1e-2, numbers=lambda cell, size_um: _films(cell, under=under))
-    return Cause(name, meaning, 2.0, 5.0, -30.0, 30.0, acts, 1e-3, free=False, drawn=Drawn(name, 0.0))
+    acts = Answers(
+        _by_none, None, 1e-2, numbers=lambda cell, size_um: _films(cell, under=under)
+    )
+    return Cause(
+        name,
+        meaning,
+        2.0,
+        5.0,
+        -30.0,
+        30.0,
+        acts,
+        1e-3,
+        free=False,
+        drawn=Drawn(name, 0.0),
+    )
 
 
 DEG = math.pi / 180
@@ -268,20 +344,27 @@ CAUSES: tuple[Cause, ...] = (
 
 
 def coarser(wavelength_um: float) -> float:
-    """How much larger what the table gives in nm is for a lens of this wavelength: wavelength / 0.85 um, 1 at least.
+    """How much larger what the table gives in nm is for a lens of this wavelength:
+    wavelength / 0.85 um, 1 at least.
 
-    Pillars, their height and what their tools are asked to hold grow with the wavelength, so that errors of one kind
-    turn the phase alike; lenses of shorter waves come from the same writers and etchers, with their nanometres.
+    Pillars, their height and what their tools are asked to hold grow with the
+    wavelength, so that errors of one kind
+    turn the phase alike; lenses of shorter waves come from the same writers and
+    etchers, with their nanometres.
     """
     return max(1.0, wavelength_um / USUAL_UM)
 
 
 def larger(name: str, wavelength_um: float) -> float:
-    """By which prior and bounds of a row are multiplied for a wavelength: :func:`coarser` of what is given in nm."""
+    """By which prior and bounds of a row are multiplied for a wavelength:
+    :func:`coarser` of what is given in nm.
+    """
     return coarser(wavelength_um) if name.endswith("_nm") else 1.0
 
 
-def of_kind(kind: type[Widens] | type[Answers] | type[Bends]) -> Iterator[tuple[int, Cause]]:
+def of_kind(
+    kind: type[Widens] | type[Answers] | type[Bends],
+) -> Iterator[tuple[int, Cause]]:
     """(place in the table, row) of the causes that act in one way, in order."""
     return ((n, row) for n, row in enumerate(CAUSES) if isinstance(row.acts, kind))
 
@@ -292,15 +375,24 @@ def named(kind: type[Widens] | type[Answers] | type[Bends]) -> tuple[str, ...]:
 
 
 def with_missing(rows: Sequence[Array]) -> Array:
-    """(answering causes, *shape) of the first rows of the table: those that are not there are 0."""
-    return np.stack([*rows, *[np.zeros_like(rows[0])] * (len(named(Answers)) - len(rows))])
+    """(answering causes, *shape) of the first rows of the table: those that are not
+    there are 0.
+    """
+    return np.stack(
+        [*rows, *[np.zeros_like(rows[0])] * (len(named(Answers)) - len(rows))]
+    )
 
 
 def lacking(cell: Cell) -> tuple[str, ...]:
-    """Names of the causes that pillars of this kind cannot have: a round one has no length and no turn, one
+    """Names of the causes that pillars of this kind cannot have: a round one has no
+    length and no turn, one
     without layers no pedestal."""
     size = cell.pitch_um / 2
-    rows = [row for _, row in of_kind(Answers) if isinstance(row.acts, Answers) and row.acts.numbers]
+    rows = [
+        row
+        for _, row in of_kind(Answers)
+        if isinstance(row.acts, Answers) and row.acts.numbers
+    ]
     return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]
 
 
@@ -311,7 +403,11 @@ def polynomials(kind: type[Widens] | type[Bends]) -> Array:
 
 @functools.cache
 def _polynomials(kind: str) -> Array:
-    found = [row.acts.terms for row in CAUSES if type(row.acts).__name__ == kind and not isinstance(row.acts, Answers)]
+    found = [
+        row.acts.terms
+        for row in CAUSES
+        if type(row.acts).__name__ == kind and not isinstance(row.acts, Answers)
+    ]
     size = 1 + max((max(i, j) for terms in found for _, i, j in terms), default=0)
     out = np.zeros((len(found), size, size))
     for n, terms in enumerate(found):
@@ -322,4 +418,6 @@ def _polynomials(kind: str) -> Array:
 
 def maps(kind: type[Widens] | type[Bends], u: Array, v: Array) -> Array:
     """(rows of the kind, *shape) derivative maps at lens places (u, v) over the radius."""
-    return np.stack([np.polynomial.polynomial.polyval2d(u, v, each) for each in polynomials(kind)])
+    return np.stack(
+        [np.polynomial.polynomial.polyval2d(u, v, each) for each in polynomials(kind)]
+    )

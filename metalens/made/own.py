@@ -1,4 +1,6 @@
-"""Pillars by their own shape: exact derivatives of their Jones matrices by the answering causes, and by their edges."""
+"""Pillars by their own shape: exact derivatives of their Jones matrices by the
+answering causes, and by their edges.
+"""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -25,10 +27,13 @@ _ALONG_X, _ALONG_Y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
 class OwnRates:
     """Logarithmic derivatives of t at some sizes.
 
-    rates: (answering causes, n) complex, by the base unit of each (um, rad, 1); 0 of what such pillars cannot have.
-    edges: (n,) by a bias of all edges, less that by the size, which is what a proxy knows: 0 where a shape keeps its
+    rates: (answering causes, n) complex, by the base unit of each (um, rad, 1); 0 of
+    what such pillars cannot have.
+    edges: (n,) by a bias of all edges, less that by the size, which is what a proxy
+    knows: 0 where a shape keeps its
     form as its edges move (circles, squares), per um.
-    error: largest relative change (rms over the sizes) of one of them from a coarser truncation.
+    error: largest relative change (rms over the sizes) of one of them from a coarser
+    truncation.
     """
 
     rates: Array
@@ -37,48 +42,73 @@ class OwnRates:
 
 
 def own_rates(lens: "Lens", size_um: Array) -> OwnRates:
-    """Exact derivatives of RCWA at a fixed truncation, for the light that the lens's proxy is of.
+    """Exact derivatives of RCWA at a fixed truncation, for the light that the lens's
+    proxy is of.
 
     Accuracy: ``error``, the change from a coarser truncation: a few percent.
 
     Raises:
-        CellError, MaterialError: from the solver. LensError: pillars of two sizes (:func:`pair_rates`).
+        CellError, MaterialError: from the solver. LensError: pillars of two sizes
+            (:func:`pair_rates`).
     """
     if lens.pairs is not None:
-        raise LensError("pillars of two sizes: their derivatives are no function of one size")
-    edges = {} if lens.cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
-    (found,) = _rates(lens, [(lens.cell, float(d)) for d in size_um], edges, (seen(lens),))
+        raise LensError(
+            "pillars of two sizes: their derivatives are no function of one size"
+        )
+    edges = (
+        {} if lens.cell.shape.kind == "circle" else {"grow_um": 1.0, "size_um": -1.0}
+    )
+    (found,) = _rates(
+        lens, [(lens.cell, float(d)) for d in size_um], edges, (seen(lens),)
+    )
     return found
 
 
 def pair_rates(lens: "Lens", width_um: Array, length_um: Array) -> dict[str, OwnRates]:
     """As :func:`own_rates`, of pillars of two sizes, for light along "x" and along "y".
 
-    Their table knows both sizes, so that nothing is left of a bias of all edges: ``edges`` are 0.
+    Their table knows both sizes, so that nothing is left of a bias of all edges:
+    ``edges`` are 0.
     """
-    cells = [(sized(lens.cell, float(w), float(d)), float(w)) for w, d in zip(width_um, length_um, strict=True)]
+    cells = [
+        (sized(lens.cell, float(w), float(d)), float(w))
+        for w, d in zip(width_um, length_um, strict=True)
+    ]
     return dict(zip("xy", _rates(lens, cells, {}, (_ALONG_X, _ALONG_Y)), strict=True))
 
 
 def _rates(
-    lens: "Lens", cells: list[tuple[Cell, float]], edges: dict[str, float], weights: tuple[Array, ...]
+    lens: "Lens",
+    cells: list[tuple[Cell, float]],
+    edges: dict[str, float],
+    weights: tuple[Array, ...],
 ) -> list[OwnRates]:
     """Of pillars of these cells and sizes, for each weighting of the Jones matrix."""
     reach = _TILTED if lens.cell.sidewall_rad else _UPRIGHT
     tasks = [(cell, size, harmonics) for harmonics in reach for cell, size in cells]
     some = list(executor.gather(_derived, (lens.wavelength_um, edges, weights), tasks))
-    every = np.array(some).reshape(len(reach), len(cells), len(weights), -1).transpose(2, 0, 3, 1)
+    every = (
+        np.array(some)
+        .reshape(len(reach), len(cells), len(weights), -1)
+        .transpose(2, 0, 3, 1)
+    )
     return [_judged(coarse, fine) for coarse, fine in every]
 
 
 def _judged(coarse: Array, fine: Array) -> OwnRates:
-    off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(np.linalg.norm(fine, axis=1), 1e-9)
-    known = np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()  # a turn that a mirror of the cell forbids is rounding
+    off = np.linalg.norm(fine - coarse, axis=1) / np.maximum(
+        np.linalg.norm(fine, axis=1), 1e-9
+    )
+    known = (
+        np.abs(fine).max(1) > 1e-6 * np.abs(fine).max()
+    )  # a turn that a mirror of the cell forbids is rounding
     return OwnRates(fine[:-1], fine[-1], float((off * known).max()))
 
 
 def seen(lens: "Lens") -> Array:
-    """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of, its geometric phase aside."""
+    """(2, 2) weights of the Jones matrix that add up to the t that the proxy is of, its
+    geometric phase aside.
+    """
     if lens.hand:
         come = np.array([1.0, 1j * _HANDS[lens.hand]]) / np.sqrt(2)
         return np.outer(come, come)
@@ -87,22 +117,31 @@ def seen(lens: "Lens") -> Array:
 
 
 def _derived(
-    about: tuple[float, dict[str, float], tuple[Array, ...]], task: tuple[Cell, float, int]
+    about: tuple[float, dict[str, float], tuple[Array, ...]],
+    task: tuple[Cell, float, int],
 ) -> list[list[complex]]:
-    """For each weighting: derivatives of ln t by every answering cause, and by the edges less by the size."""
+    """For each weighting: derivatives of ln t by every answering cause, and by the
+    edges less by the size.
+    """
     from metalens.rcwa import jones_derivatives
 
     (wavelength_um, edges, weights), (cell, size_um, harmonics) = about, task
     causes = [row for _, row in of_kind(Answers)]
     wanted = [_numbers(row, cell, size_um) for row in causes]
     names = dict.fromkeys(name for some in (*wanted, edges) for name in some or {})
-    found = jones_derivatives(cell, size_um, wavelength_um, harmonics=harmonics, by=names)
+    found = jones_derivatives(
+        cell, size_um, wavelength_um, harmonics=harmonics, by=names
+    )
 
     def by(numbers: dict[str, float], weight: Array) -> complex:
-        return sum((share * _of(found, name, weight) for name, share in numbers.items()), 0j)
+        return sum(
+            (share * _of(found, name, weight) for name, share in numbers.items()), 0j
+        )
 
     differ = [
-        [by(some, weight) for weight in weights] if some is not None else _difference(row, wavelength_um, weights, task)
+        [by(some, weight) for weight in weights]
+        if some is not None
+        else _difference(row, wavelength_um, weights, task)
         for row, some in zip(causes, wanted, strict=True)
     ]
     differ.append([by(edges, weight) for weight in weights])
@@ -111,7 +150,11 @@ def _derived(
 
 def _numbers(row: Cause, cell: Cell, size_um: float) -> dict[str, float] | None:
     acts = row.acts
-    return acts.numbers(cell, size_um) if isinstance(acts, Answers) and acts.numbers else None
+    return (
+        acts.numbers(cell, size_um)
+        if isinstance(acts, Answers) and acts.numbers
+        else None
+    )
 
 
 def _of(found: "JonesDerivatives", name: str, weight: Array) -> complex:
@@ -119,14 +162,24 @@ def _of(found: "JonesDerivatives", name: str, weight: Array) -> complex:
 
 
 def _difference(
-    row: Cause, wavelength_um: float, weights: tuple[Array, ...], task: tuple[Cell, float, int]
+    row: Cause,
+    wavelength_um: float,
+    weights: tuple[Array, ...],
+    task: tuple[Cell, float, int],
 ) -> list[complex]:
-    """Central differences of ln t by a cause of which no number of the cell tells, for each weighting."""
+    """Central differences of ln t by a cause of which no number of the cell tells, for
+    each weighting.
+    """
     from metalens.rcwa import jones
 
     (cell, size_um, harmonics), acts = task, row.acts
     if not isinstance(acts, Answers) or acts.changed is None:
         return [0j] * len(weights)
     ends = (acts.changed(cell, sign * acts.step, wavelength_um) for sign in (-1, 1))
-    less, more = (jones(end, size_um, wavelength_um, harmonics=harmonics).t for end in ends)
-    return [complex(np.log((w * more).sum() / (w * less).sum()) / (2 * acts.step)) for w in weights]
+    less, more = (
+        jones(end, size_um, wavelength_um, harmonics=harmonics).t for end in ends
+    )
+    return [
+        complex(np.log((w * more).sum() / (w * less).sum()) / (2 * acts.step))
+        for w in weights
+    ]

@@ -1,4 +1,6 @@
-"""What the answering causes do to every pillar: derivatives of ln t over the diameter, and t itself under a change."""
+"""What the answering causes do to every pillar: derivatives of ln t over the diameter,
+and t itself under a change.
+"""
 
 import math
 from dataclasses import dataclass
@@ -17,22 +19,36 @@ from metalens.made.solved import Solved
 from metalens.made.two_sizes import PairSensitivities
 from metalens.pillars import Proxy
 
-_END = 64  # steps in the wavelengths of a proxy, of which the last one gives the tangent at its end
-_DARKEST = 1e-3  # |T| that a tangent beyond a proxy falls to at most: what a solver has there is a multiple of it
-_NODES, _DEGREE = 9, 5  # sizes that own shapes are solved at, and of the polynomials through them
+# steps in the wavelengths of a proxy, of which the last one gives the tangent at its
+# end
+_END = 64
+# |T| that a tangent beyond a proxy falls to at most: what a solver has there is a
+# multiple of it
+_DARKEST = 1e-3
+_NODES, _DEGREE = (
+    9,
+    5,
+)  # sizes that own shapes are solved at, and of the polynomials through them
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivity:
-    """First-order change of ln t with the answering causes, as polynomials of the diameter.
+    """First-order change of ln t with the answering causes, as polynomials of the
+    diameter.
 
-    coefficients: (answering causes, degree + 1) complex power series in (D - center_um) of d ln t by the base unit
-        (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row that is not there.
+    coefficients: (answering causes, degree + 1) complex power series in (D - center_um)
+    of d ln t by the base unit
+        (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row
+        that is not there.
     error: of the slopes, relative to their change across the lens; nan where not known.
-    low_um, high_um: diameters that the polynomials were made for; beyond them they go on along their tangents.
-    solved: t itself under large changes, where a solver was asked; it stands for the proxy then.
-    edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size, per um: a proxy knows pillars
-        that keep their form as they grow, which a biased rectangle does not; None for those that do.
+    low_um, high_um: diameters that the polynomials were made for; beyond them they go
+    on along their tangents.
+    solved: t itself under large changes, where a solver was asked; it stands for the
+    proxy then.
+    edges: (1, degree + 1) alike of d ln t by a bias of all edges less that by the size,
+    per um: a proxy knows pillars
+        that keep their form as they grow, which a biased rectangle does not; None for
+        those that do.
     pairs: of pillars of two sizes, in place of all polynomials; None of those of one.
     """
 
@@ -57,11 +73,15 @@ class Sensitivity:
             LensError: of pillars of two sizes.
         """
         if self.pairs is not None:
-            raise LensError("pillars of two sizes: their derivatives are no function of one size")
+            raise LensError(
+                "pillars of two sizes: their derivatives are no function of one size"
+            )
         return with_missing(self._series(self.coefficients, diameter_um))
 
     def by_edges(self, diameter_um: Array) -> Array | None:
-        """(*shape) what a bias of all edges changes ln t by beyond the same change of the size; None for nothing."""
+        """(*shape) what a bias of all edges changes ln t by beyond the same change of
+        the size; None for nothing.
+        """
         return None if self.edges is None else self._series(self.edges, diameter_um)[0]
 
     def _series(self, coefficients: Array, diameter_um: Array) -> list[Array]:
@@ -69,17 +89,26 @@ class Sensitivity:
         offset, beyond = inside - self.center_um, np.asarray(diameter_um - inside)
         values = [polynomial.polyval(offset, row) for row in coefficients]
         if beyond.any():
-            slopes = [polynomial.polyval(offset, polynomial.polyder(row)) for row in coefficients]
-            values = [value + beyond * slope for value, slope in zip(values, slopes, strict=True)]
+            slopes = [
+                polynomial.polyval(offset, polynomial.polyder(row))
+                for row in coefficients
+            ]
+            values = [
+                value + beyond * slope
+                for value, slope in zip(values, slopes, strict=True)
+            ]
         return values
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """Pillars of given diameters under the answering causes: t over that of the proxy at the design's wavelength.
+    """Pillars of given diameters under the answering causes: t over that of the proxy
+    at the design's wavelength.
 
-    slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes, orders, *shape) of t in powers of
-    the others, the designed t first; None where all are linear. proxy: (*shape) t of the proxy.
+    slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
+    orders, *shape) of t in powers of
+    the others, the designed t first; None where all are linear. proxy: (*shape) t of
+    the proxy.
     """
 
     slopes: Array
@@ -87,7 +116,9 @@ class Answer:
     proxy: Array
 
     def factor(self, amounts: Array) -> Array:
-        """(*shape) t under the change over the proxy's: prod_c t(a_c) / t(0) times exp(sum_c a_c s_c)."""
+        """(*shape) t under the change over the proxy's: prod_c t(a_c) / t(0) times
+        exp(sum_c a_c s_c).
+        """
         change = np.exp(np.tensordot(amounts, self.slopes, 1))
         if self.series is None:
             return np.asarray(change)
@@ -103,7 +134,9 @@ class Answer:
         if self.series is not None:
             for n, (amount, row) in enumerate(zip(amounts, self.series, strict=False)):
                 if row[1:].any():
-                    out[n] = polynomial.polyval(amount, polynomial.polyder(row)) / polynomial.polyval(amount, row)
+                    out[n] = polynomial.polyval(
+                        amount, polynomial.polyder(row)
+                    ) / polynomial.polyval(amount, row)
         return out
 
 
@@ -120,20 +153,34 @@ class Slopes(Protocol):
 
 
 def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
-    """Derivatives from the effective index of the pillars that the proxy's phase implies; of pillars that are not
-    round on a square lattice those of their own shape, by exact derivatives of a solver (seconds a lens).
+    """Derivatives from the effective index of the pillars that the proxy's phase
+    implies; of pillars that are not
+    round on a square lattice those of their own shape, by exact derivatives of a solver
+    (seconds a lens).
 
-    Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by index; interference between
-    foot and top is left out. The cell solvers say it better, at seconds a lens. Of others: ``error`` of the result.
+    Accuracy: of an effective index, 10 % of the slopes by height, 50 % of those by
+    index; interference between
+    foot and top is left out. The cell solvers say it better, at seconds a lens. Of
+    others: ``error`` of the result.
 
     Raises:
-        CellError, MaterialError, LensError: pillars that are not round and that the solver does not take.
+        CellError, MaterialError, LensError: pillars that are not round and that the
+            solver does not take.
     """
     if not lens.cell.round:
         return _of_its_own(lens)
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
-    low, high = max(float(d.min()), lens.proxy.domain_um[0]), min(float(d.max()), lens.proxy.domain_um[1])
-    seen = guide(lens.cell, lens.proxy, lens.wavelength_um, np.linspace(low, high, 61), degree=degree)
+    low, high = (
+        max(float(d.min()), lens.proxy.domain_um[0]),
+        min(float(d.max()), lens.proxy.domain_um[1]),
+    )
+    seen = guide(
+        lens.cell,
+        lens.proxy,
+        lens.wavelength_um,
+        np.linspace(low, high, 61),
+        degree=degree,
+    )
     center = float(seen.diameter_um.mean())
     rows = [
         polynomial.polyfit(seen.diameter_um - center, row.acts.quick(seen), degree)
@@ -144,7 +191,9 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
 
 
 def _of_its_own(lens: Lens) -> Sensitivity:
-    """From :func:`metalens.made.own.own_rates` at Chebyshev sizes, as polynomials of degree 5."""
+    """From :func:`metalens.made.own.own_rates` at Chebyshev sizes, as polynomials of
+    degree 5.
+    """
     low, high = lens.proxy.domain_um
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     found = own_rates(lens, (low + high) / 2 + (high - low) / 2 * unit)
@@ -155,39 +204,82 @@ def _of_its_own(lens: Lens) -> Sensitivity:
     )
     known = np.abs(rows).max(1) > 1e-6 * np.abs(rows).max()
     scale = (2 / (high - low)) ** np.arange(_DEGREE + 1)
-    made = np.array([np.pad(c, (0, _DEGREE + 1 - len(c))) for c in map(chebyshev.cheb2poly, series.T)]) * scale
+    made = (
+        np.array(
+            [
+                np.pad(c, (0, _DEGREE + 1 - len(c)))
+                for c in map(chebyshev.cheb2poly, series.T)
+            ]
+        )
+        * scale
+    )
     error = found.error + float((off * known).max())
-    return Sensitivity(made[:-1], (low + high) / 2, error, low, high, None, made[-1:] if known[-1] else None)
+    return Sensitivity(
+        made[:-1],
+        (low + high) / 2,
+        error,
+        low,
+        high,
+        None,
+        made[-1:] if known[-1] else None,
+    )
 
 
-def guide(cell: Cell, proxy: Proxy, wavelength_um: float, diameter_um: Array, *, degree: int = 5) -> Guide:
+def guide(
+    cell: Cell,
+    proxy: Proxy,
+    wavelength_um: float,
+    diameter_um: Array,
+    *,
+    degree: int = 5,
+) -> Guide:
     """Effective indices of pillars: phase(D) = k n_eff(D) h, smoothed by a polynomial.
 
-    Anchored at the thinnest pillar by the effective medium of thin cylinders across the field (Rayleigh 1892, two
+    Anchored at the thinnest pillar by the effective medium of thin cylinders across the
+    field (Rayleigh 1892, two
     dimensions).
     """
     from metalens.cell import materials
 
     index, outer = (
-        m.n if isinstance(m, Index) else materials.index(m, wavelength_um).real for m in (cell.pillar, cell.between)
+        m.n if isinstance(m, Index) else materials.index(m, wavelength_um).real
+        for m in (cell.pillar, cell.between)
     )
     k, h = 2 * math.pi / wavelength_um, cell.height_um
     fill = math.pi * diameter_um[0] ** 2 / 4 / cell.pitch_um**2
     inside, around = index**2, outer**2
-    thin = around * (inside * (1 + fill) + around * (1 - fill)) / (inside * (1 - fill) + around * (1 + fill))
+    thin = (
+        around
+        * (inside * (1 + fill) + around * (1 - fill))
+        / (inside * (1 - fill) + around * (1 + fill))
+    )
     phase = proxy.phase_rad(diameter_um, wavelength_um)
     offset = diameter_um - diameter_um.mean()
-    fit = np.polynomial.Polynomial.fit(offset, math.sqrt(thin) + (phase - phase[0]) / (k * h), degree)
+    fit = np.polynomial.Polynomial.fit(
+        offset, math.sqrt(thin) + (phase - phase[0]) / (k * h), degree
+    )
     return Guide(
-        k, diameter_um, fit(offset), fit.deriv()(offset), fit.deriv(2)(offset), index, outer, h, cell.sidewall_rad
+        k,
+        diameter_um,
+        fit(offset),
+        fit.deriv()(offset),
+        fit.deriv(2)(offset),
+        index,
+        outer,
+        h,
+        cell.sidewall_rad,
     )
 
 
-def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0) -> Array:
-    """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at an angle of incidence.
+def designed(
+    proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: float = 0.0
+) -> Array:
+    """Complex t of pillars of diameter ``d_um`` (any shape) as the proxy has them, at
+    an angle of incidence.
 
     Beyond the ends of the proxy's domain phase and |T| go on along their tangents (|T| held within 1e-3 to 1): by
-    diameter, and by wavelength as far again as the proxy reaches, then held; of one wavelength they hold at all.
+    diameter, and by wavelength as far again as the proxy reaches, then held; of one
+    wavelength they hold at all.
     """
     low, high = proxy.wavelengths_um
     inside = min(max(wavelength_um, low), high)
@@ -201,20 +293,28 @@ def designed(proxy: Proxy, d_um: Array, wavelength_um: float, *, angle_rad: floa
     return np.asarray(np.clip(level, _DARKEST, 1) * np.exp(1j * phase))
 
 
-def _levels(proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float) -> tuple[Array, Array]:
-    """Phase and |T| at a wavelength that the proxy knows, along their tangents beyond its diameters."""
+def _levels(
+    proxy: Proxy, d_um: Array, wavelength_um: float, angle_rad: float
+) -> tuple[Array, Array]:
+    """Phase and |T| at a wavelength that the proxy knows, along their tangents beyond
+    its diameters.
+    """
     at = wavelength_um, angle_rad
     inside = np.clip(d_um, *proxy.domain_um)
     beyond = d_um - inside
     phase = proxy.phase_rad(inside, *at) + beyond * proxy.dphase_ddiameter(inside, *at)
-    level = proxy.transmission(inside, *at) + beyond * proxy.dtransmission_ddiameter(inside, *at)
+    level = proxy.transmission(inside, *at) + beyond * proxy.dtransmission_ddiameter(
+        inside, *at
+    )
     return np.asarray(phase), np.asarray(level)
 
 
 def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
-    """What pillars of these diameters (any shape) do under any change of the process, made ready once for many.
+    """What pillars of these diameters (any shape) do under any change of the process,
+    made ready once for many.
 
-    Beyond the diameters that a solver was asked for, its last word goes on with the proxy.
+    Beyond the diameters that a solver was asked for, its last word goes on with the
+    proxy.
     """
     slopes = np.asarray(response.at(diameter_um))
     solved = response.solved if isinstance(response, Sensitivity) else None
@@ -227,9 +327,11 @@ def answer(proxy: Proxy, response: Slopes, diameter_um: Array) -> Answer:
 
 
 def biased(response: Slopes, d_um: Array, bias_um: Array | float) -> Array | float:
-    """t of pillars whose edges have moved by a bias to sizes ``d_um``, over that of pillars designed so.
+    """t of pillars whose edges have moved by a bias to sizes ``d_um``, over that of
+    pillars designed so.
 
-    Of second order: the derivative is taken half-way. 1 for shapes that keep their form.
+    Of second order: the derivative is taken half-way. 1 for shapes that keep their
+    form.
     """
     rate = response.by_edges(np.asarray(d_um - np.asarray(bias_um) / 2))
     return 1.0 if rate is None else np.exp(bias_um * rate)
@@ -245,11 +347,17 @@ def transmission(
     bias_um: Array | float = 0.0,
     angle_rad: float = 0.0,
 ) -> Array:
-    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc), or as the solver has it.
+    """:func:`designed` under a change of the process: t exp(sum_c a_c d ln t / dc), or
+    as the solver has it.
 
     Args:
-        answers: (answering causes,) amounts in base units: :meth:`State.answers`. bias_um: what of the diameters is
+        answers: (answering causes,) amounts in base units: :meth:`State.answers`.
+            bias_um: what of the diameters is
             bias, of all edges alike, and no size of the design (:func:`biased`).
     """
-    changed = answer(proxy, response, d_um).factor(answers) * biased(response, d_um, bias_um)
-    return np.asarray(designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed)
+    changed = answer(proxy, response, d_um).factor(answers) * biased(
+        response, d_um, bias_um
+    )
+    return np.asarray(
+        designed(proxy, d_um, wavelength_um, angle_rad=angle_rad) * changed
+    )

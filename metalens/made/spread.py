@@ -1,4 +1,6 @@
-"""What a process leaves uncertain: standard deviations by name, and lenses drawn from them."""
+"""What a process leaves uncertain: standard deviations by name, and lenses drawn from
+them.
+"""
 
 import dataclasses
 import math
@@ -12,20 +14,28 @@ from metalens.ground.errors import ProcessError
 from metalens.made.causes import CAUSES, Drawn, lacking
 from metalens.made.state import State
 
-DRAWN: dict[str, Drawn] = {row.drawn.name: row.drawn for row in CAUSES if row.drawn}  # by entry, in the table's order
+DRAWN: dict[str, Drawn] = {
+    row.drawn.name: row.drawn for row in CAUSES if row.drawn
+}  # by entry, in the table's order
 _Entries: Any = dataclasses.make_dataclass(
-    "_Entries", [(name, float, entry.sigma) for name, entry in DRAWN.items()], frozen=True
+    "_Entries",
+    [(name, float, entry.sigma) for name, entry in DRAWN.items()],
+    frozen=True,
 )
 
 
 @dataclass(frozen=True)
 class Spread(_Entries):  # type: ignore[misc]
-    """Standard deviations of what the process leaves uncertain, one of every entry of :data:`DRAWN`.
+    """Standard deviations of what the process leaves uncertain, one of every entry of
+    :data:`DRAWN`.
 
-    bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the other, in a random direction.
+    bias_nm: of all pillars together. gradient_nm: bias from one edge of the lens to the
+    other, in a random direction.
     bow_nm: bias from centre to edge. height_nm, index, sidewall_deg: of the whole lens.
-    width_nm, length_nm, turn_deg: of the sides of all rectangles or ellipses and of their turn; none unless stated.
-    pedestal_nm, cap_nm: of the heights of films under and on a layered pillar's own material; none unless stated.
+    width_nm, length_nm, turn_deg: of the sides of all rectangles or ellipses and of
+    their turn; none unless stated.
+    pedestal_nm, cap_nm: of the heights of films under and on a layered pillar's own
+    material; none unless stated.
     """
 
     def __post_init__(self) -> None:
@@ -40,7 +50,11 @@ class Spread(_Entries):  # type: ignore[misc]
     @property
     def stated(self) -> dict[str, float]:
         """The same without entries that no process has unless it says so."""
-        return {name: value for name, value in self.values().items() if value or DRAWN[name].sigma}
+        return {
+            name: value
+            for name, value in self.values().items()
+            if value or DRAWN[name].sigma
+        }
 
     def check(self, cell: Cell) -> None:
         """Refuse what pillars of this cell cannot have.
@@ -51,7 +65,9 @@ class Spread(_Entries):  # type: ignore[misc]
         apart = {row.drawn.name: row.name for row in CAUSES if row.drawn}
         for name, value in self.stated.items():
             if value and apart[name] in lacking(cell):
-                raise ProcessError(f"spread.{name} = {value:g}: {cell.described} has none; need 0")
+                raise ProcessError(
+                    f"spread.{name} = {value:g}: {cell.described} has none; need 0"
+                )
 
     @classmethod
     def only(cls, **values: float) -> "Spread":
@@ -61,7 +77,9 @@ class Spread(_Entries):  # type: ignore[misc]
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One lens of a process: amounts by entry of the spread, and the direction that the lens drew for its gradients."""
+    """One lens of a process: amounts by entry of the spread, and the direction that the
+    lens drew for its gradients.
+    """
 
     amounts: dict[str, float]
     turn_rad: float = 0.0
@@ -71,21 +89,37 @@ class Draw:
         found: dict[str, float] = {}
         for row in CAUSES:
             if row.drawn and row.drawn.name in self.amounts:
-                found[row.name] = self.amounts[row.drawn.name] * row.drawn.share * self._direction(row.name)
+                found[row.name] = (
+                    self.amounts[row.drawn.name]
+                    * row.drawn.share
+                    * self._direction(row.name)
+                )
         return State.of(found)
 
     def _direction(self, cause: str) -> float:
-        """1, or cosine and sine of the direction for the first and second cause of one entry."""
-        entry = next(row.drawn.name for row in CAUSES if row.name == cause and row.drawn)
+        """1, or cosine and sine of the direction for the first and second cause of one
+        entry.
+        """
+        entry = next(
+            row.drawn.name for row in CAUSES if row.name == cause and row.drawn
+        )
         together = [row.name for row in CAUSES if row.drawn and row.drawn.name == entry]
-        return 1.0 if len(together) == 1 else (math.cos, math.sin)[together.index(cause)](self.turn_rad)
+        return (
+            1.0
+            if len(together) == 1
+            else (math.cos, math.sin)[together.index(cause)](self.turn_rad)
+        )
 
 
 def draws(spread: Spread, count: int, *, seed: int) -> list[Draw]:
     """``count`` lenses of a process: normal amounts, gradients in any direction."""
     random, stated = np.random.default_rng(seed), spread.stated
     sigma = np.array(list(stated.values()))
-    normal, turns = random.standard_normal((count, len(sigma))) * sigma, random.uniform(0, 2 * np.pi, count)
+    normal, turns = (
+        random.standard_normal((count, len(sigma))) * sigma,
+        random.uniform(0, 2 * np.pi, count),
+    )
     return [
-        Draw(dict(zip(stated, row.tolist(), strict=True)), float(turn)) for row, turn in zip(normal, turns, strict=True)
+        Draw(dict(zip(stated, row.tolist(), strict=True)), float(turn))
+        for row, turn in zip(normal, turns, strict=True)
     ]

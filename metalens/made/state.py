@@ -13,7 +13,9 @@ from metalens.made.causes import CAUSES, Answers, Bends, Widens, of_kind, polyno
 
 @dataclass(frozen=True, eq=False, slots=True)
 class State:
-    """How much of each cause a lens has: (causes,) in the order and units of :data:`metalens.made.CAUSES`."""
+    """How much of each cause a lens has: (causes,) in the order and units of
+    :data:`metalens.made.CAUSES`.
+    """
 
     amounts: Array
 
@@ -40,19 +42,27 @@ class State:
     def bias_um(self, u: Array, v: Array) -> Array:
         """Change of the diameters at lens places over the radius; shapes broadcast."""
         u, v = np.broadcast_arrays(u, v)
-        return np.asarray(np.polynomial.polynomial.polyval2d(u, v, self.bias_polynomial_um()))
+        return np.asarray(
+            np.polynomial.polynomial.polyval2d(u, v, self.bias_polynomial_um())
+        )
 
     def phase_rad(self, u: Array, v: Array) -> Array:
-        """Phase added to the wave front at lens places over the radius; shapes broadcast."""
+        """Phase added to the wave front at lens places over the radius; shapes
+        broadcast.
+        """
         u, v = np.broadcast_arrays(u, v)
-        return np.asarray(np.polynomial.polynomial.polyval2d(u, v, self._polynomial(Bends)))
+        return np.asarray(
+            np.polynomial.polynomial.polyval2d(u, v, self._polynomial(Bends))
+        )
 
     def bends(self) -> bool:
         """Whether the wave front has any phase of its own."""
         return bool(self._of(Bends).any())
 
     def answers(self) -> Array:
-        """(answering causes,) amounts in um, rad and 1, as the pillars' derivatives take them."""
+        """(answering causes,) amounts in um, rad and 1, as the pillars' derivatives
+        take them.
+        """
         return self._of(Answers) * [row.unit for _, row in of_kind(Answers)]
 
     def _of(self, kind: type[Widens] | type[Answers] | type[Bends]) -> Array:

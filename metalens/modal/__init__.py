@@ -1,6 +1,8 @@
-"""A modal method for round pillars: exact along z, elements that follow the disc across.
+"""A modal method for round pillars: exact along z, elements that follow the disc
+across.
 
-``solve`` gives one response with its error estimate, ``gradient`` the exact derivatives of t.
+``solve`` gives one response with its error estimate, ``gradient`` the exact derivatives
+of t.
 """
 
 from typing import TYPE_CHECKING

@@ -1,10 +1,13 @@
-"""Matrices of the quarter cell with every wall natural: what a geometry costs once, for all wavelengths.
+"""Matrices of the quarter cell with every wall natural: what a geometry costs once, for
+all wavelengths.
 
-With edge-element functions N_i and scalar functions z_i of the quarter cell (lengths in half pitches):
+With edge-element functions N_i and scalar functions z_i of the quarter cell (lengths in
+half pitches):
 
     mass_ij = ∫ N_i·N_j,   curl_ij = ∫ rot N_i rot N_j,   scalar_ij = ∫ z_i z_j,   grad z_j = sum_i gradient_ij N_i
 
-over the whole cell and over the disc alone. Heights, wavelengths, indices, angles and polarisations come later.
+over the whole cell and over the disc alone. Heights, wavelengths, indices, angles and
+polarisations come later.
 """
 
 import math
@@ -28,9 +31,11 @@ class Part:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
-    """One disc in its cell, assembled: reused for every wavelength, height, index, angle and polarisation.
+    """One disc in its cell, assembled: reused for every wavelength, height, index,
+    angle and polarisation.
 
-    rho: diameter over pitch. cell, disc: matrices of the whole quarter cell and of its part inside the disc, in
+    rho: diameter over pitch. cell, disc: matrices of the whole quarter cell and of its
+    part inside the disc, in
     half pitches. gradient: (vectors, scalars).
     """
 
@@ -43,7 +48,9 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Metric:
-    """Products of the Jacobian at the points of a patch: contravariant metric times area, 1 / area, area."""
+    """Products of the Jacobian at the points of a patch: contravariant metric times
+    area, 1 / area, area.
+    """
 
     xi_xi: np.ndarray
     eta_eta: np.ndarray
@@ -53,7 +60,9 @@ class Metric:
 
 
 def metric(patch: Patch, rho: float) -> Metric:
-    """(elements, points) each; N_i·N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j) + eta_eta b_i b_j."""
+    """(elements, points) each; N_i·N_j dA = xi_xi a_i a_j + xi_eta (a_i b_j + b_i a_j)
+    + eta_eta b_i b_j.
+    """
     xi = rho * patch.rho_xi + patch.rest_xi
     eta = rho * patch.rho_eta + patch.rest_eta
     g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
@@ -84,8 +93,12 @@ def metric_rate(patch: Patch, rho: float) -> Metric:
     )
 
 
-def element_matrices(patch: Patch, m: Metric) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass, curl-curl and scalar mass of each element of a patch: (elements, functions, functions)."""
+def element_matrices(
+    patch: Patch, m: Metric
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass, curl-curl and scalar mass of each element of a patch: (elements, functions,
+    functions).
+    """
     b = patch.basis
     w = b.weight
 
@@ -97,7 +110,9 @@ def element_matrices(patch: Patch, m: Metric) -> tuple[np.ndarray, np.ndarray, n
     mass = np.concatenate(
         [
             np.concatenate([gram(b.along_xi, m.xi_xi, b.along_xi), cross], 2),
-            np.concatenate([cross.transpose(0, 2, 1), gram(b.along_eta, m.eta_eta, b.along_eta)], 2),
+            np.concatenate(
+                [cross.transpose(0, 2, 1), gram(b.along_eta, m.eta_eta, b.along_eta)], 2
+            ),
         ],
         1,
     )
@@ -106,7 +121,9 @@ def element_matrices(patch: Patch, m: Metric) -> tuple[np.ndarray, np.ndarray, n
 
 
 def scatter(numbers: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
-    """Sum element blocks into an (n, n) matrix; numbers is (copies, elements, functions), blocks shared by copies."""
+    """Sum element blocks into an (n, n) matrix; numbers is (copies, elements,
+    functions), blocks shared by copies.
+    """
     index = (numbers[..., :, None] * n + numbers[..., None, :]).ravel()
     weights = np.broadcast_to(blocks, (len(numbers), *blocks.shape)).ravel()
     return np.bincount(index, weights, n * n).reshape(n, n)
@@ -119,16 +136,23 @@ def gradient(plan: MeshPlan) -> np.ndarray:
     out = np.zeros((len(mesh.vector_wall), len(mesh.scalar_wall)))
     for patch in mesh.patches:
         rows, columns = np.nonzero(patch.basis.gradient)
-        out[patch.vector[..., rows], patch.scalar[..., columns]] = patch.basis.gradient[rows, columns]
+        out[patch.vector[..., rows], patch.scalar[..., columns]] = patch.basis.gradient[
+            rows, columns
+        ]
     return out
 
 
 def integrate(mesh: Mesh, rho: float, *, rate: bool = False) -> tuple[Part, Part]:
     """Matrices of the cell and of the disc, or (``rate``) their derivatives in rho."""
     nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
-    sums = {inside: [np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns))] for inside in (True, False)}
+    sums = {
+        inside: [np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns))]
+        for inside in (True, False)
+    }
     for patch in mesh.patches:
-        mass, curl, scalar = element_matrices(patch, (metric_rate if rate else metric)(patch, rho))
+        mass, curl, scalar = element_matrices(
+            patch, (metric_rate if rate else metric)(patch, rho)
+        )
         total = sums[patch.inside]
         total[0] += scatter(patch.vector, mass, nv)
         total[1] += scatter(patch.vector, curl, nv)
@@ -142,7 +166,8 @@ def assemble(rho: float, plan: MeshPlan) -> Geometry:
     """Integrate the matrices of a disc of radius ``rho`` half pitches.
 
     Raises:
-        CellError: the disc is not strictly inside the cell: elements between it and the wall would vanish.
+        CellError: the disc is not strictly inside the cell: elements between it and the
+            wall would vanish.
     """
     if not (math.isfinite(rho) and 0 < rho < 1):
         raise CellError(

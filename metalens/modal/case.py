@@ -1,4 +1,5 @@
-"""From a cell, a size and a plane wave to the numbers of one modal case, and those of its solution; refuses what the
+"""From a cell, a size and a plane wave to the numbers of one modal case, and those of
+its solution; refuses what the
 elements cannot follow."""
 
 import math
@@ -9,21 +10,27 @@ import numpy as np
 from metalens.cell import Cell, Light, index
 from metalens.ground.errors import CellError
 
-LEAST_CONTRAST = 2.0  # of permittivities, of a pillar that is told from its surroundings
+LEAST_CONTRAST = (
+    2.0  # of permittivities, of a pillar that is told from its surroundings
+)
 LOW, TALL = 0.5, 16.0  # heights in half pitches
 DENSE, ORDERS = 2.0, 1.05  # waves in a pitch, in the layer and in the half-spaces
 STEEP_RAD = 1.0  # half Bloch phase
 GUIDING = 1.2  # permittivity between pillars over that of the denser half-space
 RARER = 3.0
-NORMAL_RAD = 1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
+NORMAL_RAD = (
+    1e-6  # of Bloch phase: below, t differs from normal incidence by less than 1e-12
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """One problem in half pitches: what the linear algebra needs.
 
-    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above: permittivities of the
-    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the electric field.
+    rho: diameter over pitch. k0, height: vacuum wavenumber and height. below, above:
+    permittivities of the
+    half-spaces. disc, around: of the layer. bloch: kx. p: plane of incidence holds the
+    electric field.
     """
 
     rho: float
@@ -45,12 +52,16 @@ class Case:
     def strange(self) -> float:
         """How unlike the cells of lenses it is.
 
-        0 for a pillar of the denser medium, lower than eight pitches and higher than a quarter of one, at most two
-        waves in a pitch, no order but zero at normal incidence, moderate angles, between media hardly denser than
+        0 for a pillar of the denser medium, lower than eight pitches and higher than a
+        quarter of one, at most two
+        waves in a pitch, no order but zero at normal incidence, moderate angles,
+        between media hardly denser than
         either half-space; ``RARER`` for a disc of the rarer medium; else 1.
 
-        Forms on a coarse mesh err more alike there. A layer that guides beside the pillars has resonances as sharp as
-        the pillars are thin: bars of three of 30 such cells were down to 0.45 of the error, of 150 others none.
+        Forms on a coarse mesh err more alike there. A layer that guides beside the
+        pillars has resonances as sharp as
+        the pillars are thin: bars of three of 30 such cells were down to 0.45 of the
+        error, of 150 others none.
         """
         disc, around = abs(self.disc), abs(self.around)
         outside = self.k0 * math.sqrt(max(self.below, self.above)) / math.pi
@@ -71,11 +82,16 @@ class Case:
 class Solution:
     """One rung's answer.
 
-    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of how far the forms are apart,
-    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per relative error of the transverse
-    wavenumbers squared of the layer modes, which both forms share. grazing: change of the matrix for what the mesh
-    misplaces cutoffs. beside: how near an order is to its cutoff, see ``match.nearness``. bloch: half the Bloch phase.
-    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where it is, damping of round trips
+    matrix: (2, 2) zero-order scattering matrix, mean of both forms. waves, rim: half of
+    how far the forms are apart,
+    for the wavenumbers of the layer modes and beyond. drift: change of the matrix per
+    relative error of the transverse
+    wavenumbers squared of the layer modes, which both forms share. grazing: change of
+    the matrix for what the mesh
+    misplaces cutoffs. beside: how near an order is to its cutoff, see
+    ``match.nearness``. bloch: half the Bloch phase.
+    size: wavelengths in a pitch, in the densest medium. strange: as in ``Case``; where
+    it is, damping of round trips
     in the layer. energy: mean of both forms. unknowns: of both forms.
     """
 
@@ -100,7 +116,9 @@ class Solution:
 
 def film(case: Case) -> np.ndarray:
     """Zero-order scattering matrix of two half-spaces without a layer (Fresnel)."""
-    kz1, kz2 = (math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above))
+    kz1, kz2 = (
+        math.sqrt(case.k0**2 * e - case.bloch**2) for e in (case.below, case.above)
+    )
     y1, y2 = (case.below / kz1, case.above / kz2) if case.p else (kz1, kz2)
     r, t = (y1 - y2) / (y1 + y2), 2 * math.sqrt(y1 * y2) / (y1 + y2)
     return np.array([[r, t], [t, -r]], complex)
@@ -110,7 +128,8 @@ def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
     """Check a case, and put it into half pitches.
 
     Raises:
-        CellError: films or a tilted sidewall (``solve`` takes them), a plane of incidence off the lattice axes, an
+        CellError: films or a tilted sidewall (``solve`` takes them), a plane of
+            incidence off the lattice axes, an
             absorbing half-space, or a diameter out of range.
     """
     diameter_um = float(diameter_um)
@@ -118,7 +137,11 @@ def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
     along = plane_of_incidence(light)
     below, above = half_spaces(cell, light)
     disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.between))
-    k0, half, sine = 2 * math.pi / light.wavelength_um, cell.pitch_um / 2, abs(math.sin(light.angle_rad))
+    k0, half, sine = (
+        2 * math.pi / light.wavelength_um,
+        cell.pitch_um / 2,
+        abs(math.sin(light.angle_rad)),
+    )
     bloch = k0 * sine * half
     return Case(
         rho=diameter_um / cell.pitch_um,

@@ -1,6 +1,8 @@
-"""Dense symmetric linear algebra without the cost of general-purpose checks: matrices here have a hundred rows.
+"""Dense symmetric linear algebra without the cost of general-purpose checks: matrices
+here have a hundred rows.
 
-Matrices are real, rows contiguous, and of symmetric ones the lower triangle counts. LAPACK sees the transposes, so
+Matrices are real, rows contiguous, and of symmetric ones the lower triangle counts.
+LAPACK sees the transposes, so
 nothing is copied but what is overwritten.
 """
 
@@ -29,9 +31,15 @@ def cholesky(definite: np.ndarray) -> np.ndarray:
     return lower
 
 
-def below(lower: np.ndarray, right: np.ndarray, *, transposed: bool = False) -> np.ndarray:
-    """lower⁻¹ right, or lower⁻ᵀ right if ``transposed``; lower triangular with zeros above."""
-    solved: np.ndarray = lapack.dtrtrs(lower.T, right, lower=UPPER, trans=0 if transposed else TRANSPOSED)[0]
+def below(
+    lower: np.ndarray, right: np.ndarray, *, transposed: bool = False
+) -> np.ndarray:
+    """lower⁻¹ right, or lower⁻ᵀ right if ``transposed``; lower triangular with zeros
+    above.
+    """
+    solved: np.ndarray = lapack.dtrtrs(
+        lower.T, right, lower=UPPER, trans=0 if transposed else TRANSPOSED
+    )[0]
     return solved
 
 
@@ -41,7 +49,9 @@ def definite_inverse(definite: np.ndarray) -> np.ndarray:
     Raises:
         LinAlgError: it is not definite.
     """
-    inverse: np.ndarray = lapack.dpotri(cholesky(definite).T, lower=UPPER, overwrite_c=1)[0].T
+    inverse: np.ndarray = lapack.dpotri(
+        cholesky(definite).T, lower=UPPER, overwrite_c=1
+    )[0].T
     return inverse
 
 
@@ -52,7 +62,9 @@ def gram(matrix: np.ndarray) -> np.ndarray:
 
 
 def congruent(inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which have no diagonal, are left out."""
+    """outerᵀ inner outer of a semidefinite matrix; rows and columns of zeros, which
+    have no diagonal, are left out.
+    """
     rows = np.flatnonzero(inner.diagonal())
     few = outer[rows]
     product: np.ndarray = few.T @ (inner.take(rows, 0).take(rows, 1) @ few)
@@ -71,23 +83,31 @@ def eigenvectors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return value, vectors
 
 
-def eigen_pairs(matrix: np.ndarray, definite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values, rising, and vectors of matrix x = value definite x, with xᵀ definite x = 1.
+def eigen_pairs(
+    matrix: np.ndarray, definite: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values, rising, and vectors of matrix x = value definite x, with xᵀ definite x =
+    1.
 
     Raises:
         LinAlgError: ``definite`` is not positive definite.
     """
     lower = cholesky(definite)
-    value, vectors = eigenvectors(lapack.dsygst(matrix.T, lower.T, itype=1, lower=UPPER)[0].T)
+    value, vectors = eigenvectors(
+        lapack.dsygst(matrix.T, lower.T, itype=1, lower=UPPER)[0].T
+    )
     return value, below(lower, vectors, transposed=True)
 
 
 def whitened(definite: np.ndarray, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Levels of lowerᵀ inner lower with lower lowerᵀ = definite, and lower⁻ᵀ vectors sqrt(|level|).
+    """Levels of lowerᵀ inner lower with lower lowerᵀ = definite, and lower⁻ᵀ vectors
+    sqrt(|level|).
 
     Raises:
         LinAlgError: ``definite`` is not positive definite.
     """
     lower = cholesky(definite)
-    level, vectors = eigenvectors(lapack.dsygst(inner.T, lower.T, itype=2, lower=UPPER)[0].T)
+    level, vectors = eigenvectors(
+        lapack.dsygst(inner.T, lower.T, itype=2, lower=UPPER)[0].T
+    )
     return level, below(lower, vectors, transposed=True) * np.sqrt(np.abs(level))

@@ -17,7 +17,16 @@ from metalens.modal.few_modes import few_modes
 from metalens.modal.homogeneous import Basis, modes
 from metalens.modal.ladder import COMPARED, RUNGS, Rung, first_rung
 from metalens.modal.layer import Medium, electric_modes, magnetic_modes
-from metalens.modal.match import CARRY, HalfSpace, Match, few_scattering, half_space, nearness, scattering, zero_order
+from metalens.modal.match import (
+    CARRY,
+    HalfSpace,
+    Match,
+    few_scattering,
+    half_space,
+    nearness,
+    scattering,
+    zero_order,
+)
 from metalens.modal.mesh import MeshPlan
 from metalens.modal.pencil import electric_pencil, lossless, magnetic_pencil
 from metalens.modal.spaces import space, topology
@@ -25,9 +34,13 @@ from metalens.rcwa import anchored
 
 QUICK = 1e-9  # accuracies above it allow the quick way to the homogeneous modes
 QUICK_CAREFUL_RAD = 0.02
-CAREFUL_RAD = 0.1  # of Bloch phase: below, digits of the nearly uniform gradient are worth a singular value problem
+# of Bloch phase: below, digits of the nearly uniform gradient are worth a singular
+# value problem
+CAREFUL_RAD = 0.1
 SMALL = 500  # unknowns of a symmetry class: bases of no more are kept for longer
-MOST = 8  # layer modes, the least decaying, whose wavenumbers the error estimate follows: the next move it by 1e-4
+# layer modes, the least decaying, whose wavenumbers the error estimate follows: the
+# next move it by 1e-4
+MOST = 8
 
 
 @lru_cache(maxsize=4)
@@ -36,8 +49,11 @@ def geometry(rho: float, plan: MeshPlan) -> Geometry:
     return assemble(rho, plan)
 
 
-def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False) -> Basis:
-    """Homogeneous modes of one symmetry class; reused while only wavelength, height and indices change.
+def basis(
+    rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool = False
+) -> Basis:
+    """Homogeneous modes of one symmetry class; reused while only wavelength, height and
+    indices change.
 
     quick: as in ``modes``; nearly uniform gradients then need no care until later.
     """
@@ -45,21 +61,31 @@ def basis(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool 
     return (kept_long if small else kept)(rho, plan, electric, bloch, quick)
 
 
-@lru_cache(maxsize=6)  # both classes of three diameters: the probes of a curve, for either polarisation
-def kept(rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool) -> Basis:
+@lru_cache(
+    maxsize=6
+)  # both classes of three diameters: the probes of a curve, for either polarisation
+def kept(
+    rho: float, plan: MeshPlan, electric: bool, bloch: float, quick: bool
+) -> Basis:
     """See ``basis``."""
-    symmetry_class = space(geometry(rho, plan), electric=electric, half_phase_rad=bloch or None)
+    symmetry_class = space(
+        geometry(rho, plan), electric=electric, half_phase_rad=bloch or None
+    )
     careful = 0 < bloch < (QUICK_CAREFUL_RAD if quick else CAREFUL_RAD)
     return modes(symmetry_class, careful=careful, quick=quick)
 
 
-kept_long = lru_cache(maxsize=24)(kept.__wrapped__)  # what one polarisation adds to a curve, 5 MB each
+kept_long = lru_cache(maxsize=24)(
+    kept.__wrapped__
+)  # what one polarisation adds to a curve, 5 MB each
 
 
 def geometric_mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """first (first⁻¹ second)^(1/2) of two 2 x 2 matrices: unitary and symmetric where both are.
+    """first (first⁻¹ second)^(1/2) of two 2 x 2 matrices: unitary and symmetric where
+    both are.
 
-    The arithmetic mean, from which it differs in second order, where ``first`` is nearly singular (a black layer)
+    The arithmetic mean, from which it differs in second order, where ``first`` is
+    nearly singular (a black layer)
     or the ratio has no principal root.
     """
     if abs(determinant(first)) > 1e-3 * np.linalg.norm(first, 2) ** 2:
@@ -81,9 +107,12 @@ def determinant(matrix: np.ndarray) -> complex:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Form:
-    """What one form gives: zero-order matrix (2, 2), power out per unit power in, size; and of the layer modes that
-    travel, by falling axial wavenumber, q (m,) and, for the electric form, the derivative of the matrix in each
-    (m, 2, 2). grazing: change of the matrix when orders near their cutoff take the wavenumbers of the mesh.
+    """What one form gives: zero-order matrix (2, 2), power out per unit power in, size;
+    and of the layer modes that
+    travel, by falling axial wavenumber, q (m,) and, for the electric form, the
+    derivative of the matrix in each
+    (m, 2, 2). grazing: change of the matrix when orders near their cutoff take the
+    wavenumbers of the mesh.
     damping: see ``Match``; 1 in cells of lenses, which are not judged by it."""
 
     matrix: np.ndarray
@@ -98,7 +127,8 @@ class Form:
 def layer_between(
     b: Basis, case: Case, *, magnetic: bool, weak: float
 ) -> tuple[np.ndarray, Callable[[HalfSpace, HalfSpace], Match], bool]:
-    """Axial wavenumbers of the carrying modes, the match between half-spaces, and whether it is of the dual unknown.
+    """Axial wavenumbers of the carrying modes, the match between half-spaces, and
+    whether it is of the dual unknown.
 
     Few modes where the layer is without loss and thick enough that few carry, else all.
     """
@@ -108,22 +138,48 @@ def layer_between(
         modes = few_modes(pencil, case.height, weak=weak)
         if modes is not None:
             few = modes
-            return few.q, lambda foot, top: few_scattering(pencil, few, case.height, foot, top), magnetic
+            return (
+                few.q,
+                lambda foot, top: few_scattering(pencil, few, case.height, foot, top),
+                magnetic,
+            )
     layer = (magnetic_modes if magnetic else electric_modes)(b, medium)
     carry = np.flatnonzero(np.abs(np.exp(1j * layer.q * case.height)) > CARRY)
-    return layer.q[carry], lambda foot, top: scattering(layer, case.height, foot, top), False
+    return (
+        layer.q[carry],
+        lambda foot, top: scattering(layer, case.height, foot, top),
+        False,
+    )
 
 
-def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY) -> Form:
+def solve_form(
+    case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARRY
+) -> Form:
     """One form on one mesh; ``weak`` as in ``evaluate``."""
-    # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the electric space
-    b = basis(case.rho, plan, case.p == magnetic if case.bloch else False, case.bloch, weak > QUICK)
+    # at normal incidence the magnetic form lives in the mirror image (x <-> y) of the
+    # electric space
+    b = basis(
+        case.rho,
+        plan,
+        case.p == magnetic if case.bloch else False,
+        case.bloch,
+        weak > QUICK,
+    )
     te = case.p == magnetic if case.bloch else True
     q, between, dual = layer_between(b, case, magnetic=magnetic, weak=weak)
-    sign = np.array([[-1.0, 1.0], [1.0, -1.0]]) if magnetic and not dual else np.ones((2, 2))
+    sign = (
+        np.array([[-1.0, 1.0], [1.0, -1.0]])
+        if magnetic and not dual
+        else np.ones((2, 2))
+    )
 
-    def matched(bloch: float | None) -> tuple[Match, int, list[int], tuple[HalfSpace, HalfSpace]]:
-        below, above = (half_space(b, case.k0, e, magnetic=magnetic, bloch=bloch) for e in (case.below, case.above))
+    def matched(
+        bloch: float | None,
+    ) -> tuple[Match, int, list[int], tuple[HalfSpace, HalfSpace]]:
+        below, above = (
+            half_space(b, case.k0, e, magnetic=magnetic, bloch=bloch)
+            for e in (case.below, case.above)
+        )
         foot = zero_order(b, below, case.bloch, te=te)
         return (
             between(below, above),
@@ -134,14 +190,22 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
 
     match, foot, pair, halves = matched(case.bloch)
     matrix = match.matrix[pair][:, pair] * sign
-    plain = [half_space(b, case.k0, e, magnetic=magnetic).admittance for e in (case.below, case.above)]
+    plain = [
+        half_space(b, case.k0, e, magnetic=magnetic).admittance
+        for e in (case.below, case.above)
+    ]
     grazing = 0.0
-    if any((half.admittance != other).any() for half, other in zip(halves, plain, strict=True)):
+    if any(
+        (half.admittance != other).any()
+        for half, other in zip(halves, plain, strict=True)
+    ):
         other, _, ports, _ = matched(None)
         grazing = float(np.abs(matrix - other.matrix[ports][:, ports] * sign).max())
     travelling = np.argsort(-(q**2).real, kind="stable")[:MOST]
     moved = np.zeros((len(travelling), len(q)), complex)
-    moved[np.arange(len(travelling)), travelling] = 1j * case.height * match.travel[travelling]
+    moved[np.arange(len(travelling)), travelling] = (
+        1j * case.height * match.travel[travelling]
+    )
     moved = moved[:0] if magnetic else moved
     return Form(
         matrix=matrix,
@@ -157,24 +221,37 @@ def solve_form(case: Case, plan: MeshPlan, *, magnetic: bool, weak: float = CARR
 def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
     """Both forms on one mesh.
 
-    weak: modes weaker than this over the height end at the interface they start from, and the matrix root of the
+    weak: modes weaker than this over the height end at the interface they start from,
+    and the matrix root of the
     others is this accurate.
-    Their difference is split into what the axial wavenumbers explain and the rest, so that the two cannot cancel.
+    Their difference is split into what the axial wavenumbers explain and the rest, so
+    that the two cannot cancel.
 
     Raises:
-        CellError: a disc so thin or so wide that the matrices of its elements are singular.
+        CellError: a disc so thin or so wide that the matrices of its elements are
+            singular.
     """
     try:
-        # matrices of a few hundred rows: on two threads of BLAS a solve takes three to six times as long
-        with one_blas_thread(), np.errstate(invalid="ignore"):  # of degenerate elements: refused below
-            first, second = (solve_form(case, plan, magnetic=magnetic, weak=weak) for magnetic in (False, True))
+        # matrices of a few hundred rows: on two threads of BLAS a solve takes three to
+        # six times as long
+        with (
+            one_blas_thread(),
+            np.errstate(invalid="ignore"),
+        ):  # of degenerate elements: refused below
+            first, second = (
+                solve_form(case, plan, magnetic=magnetic, weak=weak)
+                for magnetic in (False, True)
+            )
     except np.linalg.LinAlgError as singular:
         raise CellError(
             f"a diameter of {case.rho:.3g} pitches: the elements that follow the disc degenerate ({singular}); "
             "use metalens.rcwa for this pillar"
         ) from singular
     pairs = nearest_pairs(first.q, second.q)
-    explained = first.by_q[pairs[:, 0]] * (first.q[pairs[:, 0]] - second.q[pairs[:, 1]])[:, None, None]
+    explained = (
+        first.by_q[pairs[:, 0]]
+        * (first.q[pairs[:, 0]] - second.q[pairs[:, 1]])[:, None, None]
+    )
     rest = first.matrix - second.matrix - explained.sum(0)
     dense = case.k0**2 * max(case.disc, case.around, key=lambda e: e.real)
     slack = np.abs(dense - first.q**2) / (2 * np.abs(first.q))
@@ -182,11 +259,15 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
         matrix=geometric_mean(first.matrix, second.matrix),
         waves=float(np.abs(explained).sum(0).max()) / 2,
         rim=float(np.abs(rest).max()) / 2,
-        drift=float((np.abs(first.by_q) * slack[:, None, None]).sum(0).max(initial=0.0)),
+        drift=float(
+            (np.abs(first.by_q) * slack[:, None, None]).sum(0).max(initial=0.0)
+        ),
         energy=(first.energy + second.energy) / 2,
         unknowns=first.unknowns + second.unknowns,
         grazing=max(first.grazing, second.grazing),
-        beside=max(nearness(case.k0**2 * e, case.bloch) for e in (case.below, case.above)),
+        beside=max(
+            nearness(case.k0**2 * e, case.bloch) for e in (case.below, case.above)
+        ),
         bloch=case.bloch,
         size=math.sqrt(abs(dense)) / math.pi,
         strange=case.strange,
@@ -195,7 +276,8 @@ def evaluate(case: Case, plan: MeshPlan, *, weak: float = CARRY) -> Solution:
 
 
 def nearest_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(m, 2) places of values that belong together, nearest pairs first, until one side has none left.
+    """(m, 2) places of values that belong together, nearest pairs first, until one side
+    has none left.
 
     Two layer modes that lie close may come in another order in the other form.
     """
@@ -221,13 +303,20 @@ class Climb:
 def climb(case: Case, tolerance: float) -> Climb:
     """The cheapest rung of the ladder that meets the tolerance, by its own estimate.
 
-    At sharp resonances both forms may lie together by accident, far from the truth: guided modes of a thin layer of low
-    contrast, pillars that carry many waves, discs of the rarer medium. So cells unlike those of lenses begin two rungs
-    lower, and how the answer settles from mesh to mesh counts (see ``ladder``); two meshes alone tell nothing of them.
+    At sharp resonances both forms may lie together by accident, far from the truth:
+    guided modes of a thin layer of low
+    contrast, pillars that carry many waves, discs of the rarer medium. So cells unlike
+    those of lenses begin two rungs
+    lower, and how the answer settles from mesh to mesh counts (see ``ladder``); two
+    meshes alone tell nothing of them.
     """
     best: Climb | None = None
     solved: list[Solution] = []
-    begin = first_rung(tolerance, case.rho) - COMPARED if case.strange else first_rung(tolerance, case.rho, case.size)
+    begin = (
+        first_rung(tolerance, case.rho) - COMPARED
+        if case.strange
+        else first_rung(tolerance, case.rho, case.size)
+    )
     last: MeshPlan | None = None
     for rung in RUNGS[max(begin, 0) :]:
         plan = rung.choice(case.rho).plan
@@ -258,37 +347,58 @@ def solve(
     polarization: Polarization = "x",
     tolerance: float = 1e-3,
 ) -> Response:
-    """Zero-order response of a round pillar by the modal method, exact along z where the wall is upright.
+    """Zero-order response of a round pillar by the modal method, exact along z where
+    the wall is upright.
 
-    A tilted wall and films: coupled waves put right by the modal method, see :mod:`metalens.rcwa.anchored`.
+    A tilted wall and films: coupled waves put right by the modal method, see
+    :mod:`metalens.rcwa.anchored`.
 
-    diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx = k0 sin angle), the same in
-    every layer by Snell's law. azimuth_rad: of the plane of incidence, a multiple of pi/2. polarization: "s" or
+    diameter_um: above 0 and below the pitch. angle_rad: of incidence, in vacuum (kx =
+    k0 sin angle), the same in
+    every layer by Snell's law. azimuth_rad: of the plane of incidence, a multiple of
+    pi/2. polarization: "s" or
     "p", or "x" or "y" for the field along that axis of the plane of incidence.
-    tolerance: of t and r; the mesh is chosen from it and refined until the estimate meets it.
+    tolerance: of t and r; the mesh is chosen from it and refined until the estimate
+    meets it.
 
-    Accuracy: ``t_error`` holds for r as well where the wall is upright and without films; it comes from the
+    Accuracy: ``t_error`` holds for r as well where the wall is upright and without
+    films; it comes from the
         difference of the electric and magnetic forms.
 
     Raises:
         CellError, MaterialError: see ``case_of``.
     """
     check_tolerance(tolerance)
-    light = Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad))
+    light = Light(
+        float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
+    )
     if cell.round and (cell.sidewall_rad or cell.under or cell.over):
         return _as_built(cell, float(diameter_um), light, tolerance)
     case = case_of(cell, diameter_um, light)
     if case.height == 0:
         matrix = film(case)
         energy = float((np.abs(matrix[:, 0]) ** 2).sum())
-        return Response(complex(matrix[1, 0]), complex(matrix[0, 0]), 1e-15, 1, energy, "film", True, "closed form")
+        return Response(
+            complex(matrix[1, 0]),
+            complex(matrix[0, 0]),
+            1e-15,
+            1,
+            energy,
+            "film",
+            True,
+            "closed form",
+        )
     end = climb(case, tolerance)
     t, r = complex(end.solution.matrix[1, 0]), complex(end.solution.matrix[0, 0])
     unknowns, energy = end.solution.unknowns, end.solution.energy
-    return Response(t, r, end.error, unknowns, energy, "modal", end.converged, end.reason)
+    return Response(
+        t, r, end.error, unknowns, energy, "modal", end.converged, end.reason
+    )
 
 
-def _as_built(cell: Cell, diameter_um: float, light: Light, tolerance: float) -> Response:
+def _as_built(
+    cell: Cell, diameter_um: float, light: Light, tolerance: float
+) -> Response:
     """A pillar with a tilted wall or films, from upright ones without."""
     plain = anchored.plain(cell)
     upright = [
@@ -303,4 +413,6 @@ def _as_built(cell: Cell, diameter_um: float, light: Light, tolerance: float) ->
         )
         for node in anchored.node_diameters(cell, diameter_um)
     ]
-    return anchored.solve_anchored(cell, diameter_um, light, upright, tolerance=tolerance)
+    return anchored.solve_anchored(
+        cell, diameter_um, light, upright, tolerance=tolerance
+    )

@@ -1,13 +1,21 @@
-"""Only the modes that carry: a few eigenvectors, and everything else in one matrix root.
+"""Only the modes that carry: a few eigenvectors, and everything else in one matrix
+root.
 
-Between the ends of a layer travel the modes with |exp(i q h)| above a threshold, a dozen of hundreds. They are found
-by Rayleigh-Ritz in the low levels of the pencil, enlarged by residuals divided by the distance of the levels
-(Davidson 1975): the Ritz values of a symmetric pencil have the square of the error of the vectors.
+Between the ends of a layer travel the modes with |exp(i q h)| above a threshold, a
+dozen of hundreds. They are found
+by Rayleigh-Ritz in the low levels of the pencil, enlarged by residuals divided by the
+distance of the levels
+(Davidson 1975): the Ritz values of a symmetric pencil have the square of the error of
+the vectors.
 
-All others matter at the ends alone, by the admittance of a layer without end, Y = growth sqrt(growth⁻¹ stiffness).
-The modes that carry are first moved to a common level (deflated), which leaves a matrix X² = D² + R with D diagonal
-and R small beside it, so X = D + E by the fixed point E_ij = (R - E²)_ij / (D_i + D_j): products of matrices instead
-of a nonsymmetric eigenproblem, and no denominator near zero. Every iterate is symmetric with respect to growth: the
+All others matter at the ends alone, by the admittance of a layer without end, Y =
+growth sqrt(growth⁻¹ stiffness).
+The modes that carry are first moved to a common level (deflated), which leaves a matrix
+X² = D² + R with D diagonal
+and R small beside it, so X = D + E by the fixed point E_ij = (R - E²)_ij / (D_i + D_j):
+products of matrices instead
+of a nonsymmetric eigenproblem, and no denominator near zero. Every iterate is symmetric
+with respect to growth: the
 scattering matrix is symmetric and unitary whatever the number of iterations.
 """
 
@@ -19,16 +27,23 @@ import numpy as np
 from metalens.modal.layer import axial
 from metalens.modal.pencil import Pencil
 
-SPARE = 3.0  # low levels reach this many times the level of the weakest mode that carries
+SPARE = (
+    3.0  # low levels reach this many times the level of the weakest mode that carries
+)
 EXTRA = 60.0  # and this much further
 ROUNDS = 6  # of enlarging the low levels, at most
 STEPS = 80  # of the fixed point, at most
 WHOLE = 1  # of them on all rows, before
 ROUNDING = 1e-14  # of the largest element
-SETTLED = 0.03  # change of the slow rows, in that of the last whole step, at which all rows move again
+# change of the slow rows, in that of the last whole step, at which all rows move again
+SETTLED = 0.03
 SLOW = 8  # the rows of the lowest eighth of the levels go on alone
-ROUGH = 3e-7  # of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of it
-SINGLE = 3e-8  # accuracies from it on are met by that: answers move by 7e-8 on coarse meshes, 4e-3 of a bar on good
+# of the lowest level: what single precision is asked for, where rounding leaves 1e-7 of
+# it
+ROUGH = 3e-7
+# accuracies from it on are met by that: answers move by 7e-8 on coarse meshes, 4e-3 of
+# a bar on good
+SINGLE = 3e-8
 STRIPS = 4  # of rows of a product whose other half is a mirror image
 
 
@@ -36,7 +51,8 @@ STRIPS = 4  # of rows of a product whose other half is a mirror image
 class FewModes:
     """Modes that carry, in the coordinates y of the pencil, and the rest.
 
-    q: (c,) axial wavenumbers. field, partner: (n, c), partner = growth field. near: (n, n) real admittance of the
+    q: (c,) axial wavenumbers. field, partner: (n, c), partner = growth field. near: (n,
+    n) real admittance of the
     layer without end, with ``near_rate`` in place of i q for the modes that carry.
     """
 
@@ -49,7 +65,9 @@ class FewModes:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Ritz:
-    """Orthonormal trial vectors (levels, vectors) of both blocks, and the signs of growth on them."""
+    """Orthonormal trial vectors (levels, vectors) of both blocks, and the signs of
+    growth on them.
+    """
 
     te: np.ndarray
     tm: np.ndarray
@@ -57,13 +75,21 @@ class Ritz:
     tm_sign: np.ndarray
 
 
-def solve_ritz(pencil: Pencil, trial: Ritz, height: float, weak: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Levels (-q²) and vectors (a, c), (b, c) of the modes stronger than ``weak`` over the height."""
+def solve_ritz(
+    pencil: Pencil, trial: Ritz, height: float, weak: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels (-q²) and vectors (a, c), (b, c) of the modes stronger than ``weak`` over
+    the height.
+    """
     k = trial.te.shape[1]
     sign = np.concatenate([trial.te_sign, trial.tm_sign])
     matrix = np.zeros((len(sign), len(sign)))
-    matrix[:k, :k] = trial.te.T @ (pencil.te_sign[:, None] * beside(pencil.te, pencil.te_rest, trial.te))
-    matrix[k:, k:] = trial.tm.T @ (pencil.tm_sign[:, None] * beside(pencil.tm, pencil.tm_rest, trial.tm))
+    matrix[:k, :k] = trial.te.T @ (
+        pencil.te_sign[:, None] * beside(pencil.te, pencil.te_rest, trial.te)
+    )
+    matrix[k:, k:] = trial.tm.T @ (
+        pencil.tm_sign[:, None] * beside(pencil.tm, pencil.tm_rest, trial.tm)
+    )
     matrix[:k, k:] = trial.te.T @ (pencil.coupling @ trial.tm)
     matrix[k:, :k] = matrix[:k, k:].T
     level, vectors = np.linalg.eig(sign[:, None] * matrix)
@@ -71,7 +97,9 @@ def solve_ritz(pencil: Pencil, trial: Ritz, height: float, weak: float) -> tuple
     return level[carry], trial.te @ vectors[:k, carry], trial.tm @ vectors[k:, carry]
 
 
-def beside(level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray) -> np.ndarray:
+def beside(
+    level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray
+) -> np.ndarray:
     """(diag(level) + rest) vectors."""
     out: np.ndarray = level[:, None] * vectors
     if rest is not None:
@@ -80,22 +108,38 @@ def beside(level: np.ndarray, rest: np.ndarray | None, vectors: np.ndarray) -> n
 
 
 def enlarge(
-    trial: np.ndarray, sign: np.ndarray, low: np.ndarray, residual: np.ndarray, high: float
+    trial: np.ndarray,
+    sign: np.ndarray,
+    low: np.ndarray,
+    residual: np.ndarray,
+    high: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Trial vectors and signs of one block with the directions of ``residual`` outside the low levels added.
+    """Trial vectors and signs of one block with the directions of ``residual`` outside
+    the low levels added.
 
     high: sign of growth there.
     """
-    real = np.concatenate([residual.real, residual.imag], 1) if np.iscomplexobj(residual) else residual.copy()
+    real = (
+        np.concatenate([residual.real, residual.imag], 1)
+        if np.iscomplexobj(residual)
+        else residual.copy()
+    )
     real[low] = 0.0
     real -= trial @ (trial.T @ real)
     left, value, _ = np.linalg.svd(real, full_matrices=False)
-    more = left[:, value > 1e-3 * value[0]] if value.size and value[0] > 0 else left[:, :0]
-    return np.concatenate([trial, more], 1), np.concatenate([sign, np.full(more.shape[1], high)])
+    more = (
+        left[:, value > 1e-3 * value[0]] if value.size and value[0] > 0 else left[:, :0]
+    )
+    return np.concatenate([trial, more], 1), np.concatenate(
+        [sign, np.full(more.shape[1], high)]
+    )
 
 
-def carrying(pencil: Pencil, height: float, weak: float, accuracy: float) -> tuple[np.ndarray, ...] | None:
-    """Levels and vectors of the modes that carry, or None where they are too many to be few.
+def carrying(
+    pencil: Pencil, height: float, weak: float, accuracy: float
+) -> tuple[np.ndarray, ...] | None:
+    """Levels and vectors of the modes that carry, or None where they are too many to be
+    few.
 
     accuracy: of the vectors, relative.
     """
@@ -103,7 +147,10 @@ def carrying(pencil: Pencil, height: float, weak: float, accuracy: float) -> tup
     low_te, low_tm = pencil.te < reach, pencil.tm < reach
     high_te, high_tm = ~low_te, ~low_tm
     few = np.count_nonzero(low_te) + np.count_nonzero(low_tm)
-    if few > 0.5 * (len(pencil.te) + len(pencil.tm)) or (pencil.te_sign[~low_te] < 0).any():
+    if (
+        few > 0.5 * (len(pencil.te) + len(pencil.tm))
+        or (pencil.te_sign[~low_te] < 0).any()
+    ):
         return None
     trial = Ritz(
         np.eye(len(pencil.te))[:, low_te],
@@ -122,21 +169,31 @@ def carrying(pencil: Pencil, height: float, weak: float, accuracy: float) -> tup
         if pencil.tm_rest is not None:
             pull += pencil.tm_rest[high_tm] @ tm
         off_tm[high_tm] = tm[high_tm] + pull / (pencil.tm[high_tm, None] - level)
-        if max(np.abs(off_te).max(initial=0.0), np.abs(off_tm).max(initial=0.0)) < accuracy:
+        if (
+            max(np.abs(off_te).max(initial=0.0), np.abs(off_tm).max(initial=0.0))
+            < accuracy
+        ):
             return level, te, tm
         te_block = enlarge(trial.te, trial.te_sign, low_te, off_te, 1.0)
         tm_block = enlarge(trial.tm, trial.tm_sign, low_tm, off_tm, -1.0)
         trial = Ritz(te_block[0], tm_block[0], te_block[1], tm_block[1])
-        if len(trial.te_sign) + len(trial.tm_sign) > 0.8 * (len(pencil.te) + len(pencil.tm)):
+        if len(trial.te_sign) + len(trial.tm_sign) > 0.8 * (
+            len(pencil.te) + len(pencil.tm)
+        ):
             return None
     return None
 
 
-def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -> np.ndarray | None:
-    """X with X² = square and eigenvalues in the right half plane, near the root of its diagonal; None if it is not.
+def root(
+    square: np.ndarray, signs: np.ndarray, least: float, accuracy: float
+) -> np.ndarray | None:
+    """X with X² = square and eigenvalues in the right half plane, near the root of its
+    diagonal; None if it is not.
 
-    signs: of growth, with respect to which the square is symmetric. least: levels of the diagonal below it are
-    lifted to it. In single precision as far as it goes, half the time of double, which ends it where more is asked.
+    signs: of growth, with respect to which the square is symmetric. least: levels of
+    the diagonal below it are
+    lifted to it. In single precision as far as it goes, half the time of double, which
+    ends it where more is asked.
     """
     n = len(square)
     diagonal = np.sqrt(np.maximum(np.diag(square), least))
@@ -159,11 +216,18 @@ def root(square: np.ndarray, signs: np.ndarray, least: float, accuracy: float) -
 
 
 def settled(
-    e: np.ndarray, fixed: tuple[np.ndarray, np.ndarray], signs: np.ndarray, aim: float, *, whole: int
+    e: np.ndarray,
+    fixed: tuple[np.ndarray, np.ndarray],
+    signs: np.ndarray,
+    aim: float,
+    *,
+    whole: int,
 ) -> np.ndarray | None:
-    """E = rest - weight E² from a start, for ``fixed`` = (rest, weight); None where the steps do not shrink.
+    """E = rest - weight E² from a start, for ``fixed`` = (rest, weight); None where the
+    steps do not shrink.
 
-    The rows of the lowest levels converge last: they are watched until they move by less than ``aim``, and after
+    The rows of the lowest levels converge last: they are watched until they move by
+    less than ``aim``, and after
     ``whole`` steps go on alone until all rows are worth another.
     """
     rest, weight = fixed
@@ -192,25 +256,33 @@ def settled(
 
 
 def even(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """A matrix made symmetric with respect to the signs to the last bit: products of some processors are not, and what
+    """A matrix made symmetric with respect to the signs to the last bit: products of
+    some processors are not, and what
     is left of the difference is light that is lost."""
     mirror = (signs[:, None] * signs).astype(e.dtype) * e.T
     return np.asarray((e + mirror) / 2)
 
 
 def squared(e: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """e @ e of a matrix that is symmetric with respect to the signs: strips of rows from the diagonal on, and their
+    """e @ e of a matrix that is symmetric with respect to the signs: strips of rows
+    from the diagonal on, and their
     mirror images."""
     n, found = len(e), np.empty_like(e)
     for start in range(0, n, -(-n // STRIPS)):
-        rows, beyond = slice(start, start - (-n // STRIPS)), slice(start - (-n // STRIPS), n)
+        rows, beyond = (
+            slice(start, start - (-n // STRIPS)),
+            slice(start - (-n // STRIPS), n),
+        )
         found[rows, start:] = e[rows] @ e[:, start:]
-        found[beyond, rows] = (signs[beyond, None] * signs[rows]).astype(e.dtype) * found[rows, beyond].T
+        found[beyond, rows] = (signs[beyond, None] * signs[rows]).astype(
+            e.dtype
+        ) * found[rows, beyond].T
     return found
 
 
 def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
-    """Modes stronger than ``weak`` over the height, and the admittance of the rest; None where they are not few.
+    """Modes stronger than ``weak`` over the height, and the admittance of the rest;
+    None where they are not few.
 
     weak: the accuracy asked for, relative.
     """
@@ -236,4 +308,6 @@ def few_modes(pencil: Pencil, height: float, *, weak: float) -> FewModes | None:
     near = root(square, sign, common, weak)
     if near is None:
         return None
-    return FewModes(axial(-level), field, partner, -sign[:, None] * near, -np.sqrt(common))
+    return FewModes(
+        axial(-level), field, partner, -sign[:, None] * near, -np.sqrt(common)
+    )

@@ -1,9 +1,13 @@
 """Modes of a homogeneous layer in the element space: the basis of everything else.
 
-The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu = kx² + ky²) and the rest
-(TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as exp(i kz z) with
-kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by construction.
-In the half-spaces the zero order is given its exact wavenumber, so that it propagates up to grazing incidence.
+The element space splits, orthogonally in the mass matrix, into gradients (TM waves; mu
+= kx² + ky²) and the rest
+(TE waves; lam = kx² + ky², 0 for a uniform field). In a medium of index n both go as
+exp(i kz z) with
+kz² = (k0 n)² - mu or lam: the discrete Rayleigh orders, energy-conserving by
+construction.
+In the half-spaces the zero order is given its exact wavenumber, so that it propagates
+up to grazing incidence.
 """
 
 from collections.abc import Callable
@@ -20,11 +24,14 @@ from metalens.modal.spaces import Space
 class Basis:
     """Mass-orthonormal modes of the empty cell, lengths in half pitches.
 
-    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise. te_exact, tm_exact: the same with that of the
+    te: (a,) transverse wavenumbers squared, rising; tm: (b,) likewise. te_exact,
+    tm_exact: the same with that of the
     zero order exact.
-    vector: (unknowns, a + b) fields, TE first (made on demand). scalar: (scalars, b) longitudinal fields of the TM
+    vector: (unknowns, a + b) fields, TE first (made on demand). scalar: (scalars, b)
+    longitudinal fields of the TM
     modes.
-    disc_mass: (a + b, a + b) mass inside the disc; disc_curl: (a, a); disc_scalar: (b, b).
+    disc_mass: (a + b, a + b) mass inside the disc; disc_curl: (a, a); disc_scalar: (b,
+    b).
     """
 
     te: np.ndarray
@@ -49,7 +56,9 @@ class Basis:
 
 
 def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
-    """Discrete wavenumbers squared with the zero order's, where this family has it, set to its exact value."""
+    """Discrete wavenumbers squared with the zero order's, where this family has it, set
+    to its exact value.
+    """
     exact = (half_phase_rad or 0.0) ** 2
     out: np.ndarray = np.maximum(discrete, 0.0)
     if abs(out[0] - exact) <= 0.05 * exact + 1e-9:
@@ -57,23 +66,34 @@ def corrected(discrete: np.ndarray, half_phase_rad: float | None) -> np.ndarray:
     return out
 
 
-def gradients(space: Space, lower: np.ndarray, *, careful: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transverse wavenumbers squared and scalar fields of the gradients, and a full orthogonal basis, gradients first.
+def gradients(
+    space: Space, lower: np.ndarray, *, careful: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transverse wavenumbers squared and scalar fields of the gradients, and a full
+    orthogonal basis, gradients first.
 
-    The basis is in coordinates ``lower.T @ field``, in which the mass matrix is the identity. ``careful`` takes
-    singular values instead of eigenvalues of the squared problem: nearly uniform gradients (grazing the normal)
+    The basis is in coordinates ``lower.T @ field``, in which the mass matrix is the
+    identity. ``careful`` takes
+    singular values instead of eigenvalues of the squared problem: nearly uniform
+    gradients (grazing the normal)
     keep all digits, at twice the cost.
     """
     g = space.gradient
     if careful:
         scalar_lower = np.linalg.cholesky(space.cell.scalar)
-        factor = sl.solve_triangular(scalar_lower, (lower.T @ g).T, lower=True, check_finite=False).T
+        factor = sl.solve_triangular(
+            scalar_lower, (lower.T @ g).T, lower=True, check_finite=False
+        ).T
         left, value, right = np.linalg.svd(factor, full_matrices=True)
         order = np.argsort(value)
         left[:, : len(value)] = left[:, order]
-        scalar = sl.solve_triangular(scalar_lower, right[order].T, trans="T", lower=True, check_finite=False)
+        scalar = sl.solve_triangular(
+            scalar_lower, right[order].T, trans="T", lower=True, check_finite=False
+        )
         return value[order] ** 2, scalar, left
-    tm, scalar = sl.eigh(g.T @ space.cell.mass @ g, space.cell.scalar, check_finite=False)
+    tm, scalar = sl.eigh(
+        g.T @ space.cell.mass @ g, space.cell.scalar, check_finite=False
+    )
     normal = lower.T @ ((g @ scalar) / np.sqrt(tm))
     q = sl.qr(normal, check_finite=False)[0]
     q[:, : len(tm)] = normal
@@ -81,13 +101,16 @@ def gradients(space: Space, lower: np.ndarray, *, careful: bool) -> tuple[np.nda
 
 
 def modes(space: Space, *, careful: bool = False, quick: bool = False) -> Basis:
-    """TM modes from the gradients, TE modes from their complement; ``careful`` as in ``gradients``, quick as in
+    """TM modes from the gradients, TE modes from their complement; ``careful`` as in
+    ``gradients``, quick as in
     ``quick_modes``."""
     if quick and not careful:
         return quick_modes(space)
     lower = np.linalg.cholesky(space.cell.mass)
     tm, scalar, orthogonal = gradients(space, lower, careful=careful)
-    vector = sl.solve_triangular(lower, orthogonal, trans="T", lower=True, check_finite=False)
+    vector = sl.solve_triangular(
+        lower, orthogonal, trans="T", lower=True, check_finite=False
+    )
     rest = vector[:, len(tm) :]
     te, mix = np.linalg.eigh(rest.T @ space.cell.curl @ rest)
     rest = rest @ mix
@@ -97,11 +120,15 @@ def modes(space: Space, *, careful: bool = False, quick: bool = False) -> Basis:
 
 
 def quick_modes(space: Space) -> Basis:
-    """In the basis of cotree unknowns and gradients, where the curl knows the first alone: problems of half the size.
+    """In the basis of cotree unknowns and gradients, where the curl knows the first
+    alone: problems of half the size.
 
-    With G the gradients, K = Gᵀ mass G, the TM modes solve K f = tm scalar f, and the TE modes are x on the cotree
-    less its projection on the gradients: curl_cc x = te (mass_cc - mass_cG K⁻¹ mass_Gc) x. Half the time; the
-    difference loses digits (1e-8 of t at worst). Of the disc's matrices the rows that are not zero alone are taken.
+    With G the gradients, K = Gᵀ mass G, the TM modes solve K f = tm scalar f, and the
+    TE modes are x on the cotree
+    less its projection on the gradients: curl_cc x = te (mass_cc - mass_cG K⁻¹ mass_Gc)
+    x. Half the time; the
+    difference loses digits (1e-8 of t at worst). Of the disc's matrices the rows that
+    are not zero alone are taken.
     """
     c, down_to = space.cotree, space.transposed
     corner = c[:, None], c
@@ -121,7 +148,12 @@ def quick_modes(space: Space) -> Basis:
     across -= drawn
     a, gradient = len(te), space.gradient
     disc_mass = np.empty((a + len(tm), a + len(tm)))
-    disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = high, across, across.T, low
+    disc_mass[:a, :a], disc_mass[:a, a:], disc_mass[a:, :a], disc_mass[a:, a:] = (
+        high,
+        across,
+        across.T,
+        low,
+    )
 
     def vector() -> np.ndarray:
         gradients = gradient @ unit
@@ -129,7 +161,14 @@ def quick_modes(space: Space) -> Basis:
         rest[c] += x
         return np.concatenate([rest, gradients], 1)
 
-    return made(space, te, tm, vector, scalar, (disc_mass, congruent(space.disc.curl[corner], x)))
+    return made(
+        space,
+        te,
+        tm,
+        vector,
+        scalar,
+        (disc_mass, congruent(space.disc.curl[corner], x)),
+    )
 
 
 def made(

@@ -1,52 +1,83 @@
-"""The ladder of meshes: which one to try first for a tolerance, and how its error is estimated.
+"""The ladder of meshes: which one to try first for a tolerance, and how its error is
+estimated.
 
-To first order the error of a scattering matrix S is that of the wavenumbers q_j of the layer's modes and that of the
+To first order the error of a scattering matrix S is that of the wavenumbers q_j of the
+layer's modes and that of the
 fields at both ends; g_j is the transverse wavenumber:
 
     dS = sum_j (dS/dq_j) dq_j + (fields at the ends),        dq_j = -(relative error of g_j²) g_j² / (2 q_j).
 
-The electric and the magnetic form are dual: where one overestimates, the other underestimates, save for what both
-share. Two real numbers fitted to each of 51 cells, a share of half the difference and a common relative error of all
-g_j², leave a tenth of the error of the mean (median). So a solution tells (``engine.evaluate``):
+The electric and the magnetic form are dual: where one overestimates, the other
+underestimates, save for what both
+share. Two real numbers fitted to each of 51 cells, a share of half the difference and a
+common relative error of all
+g_j², leave a tenth of the error of the mean (median). So a solution tells
+(``engine.evaluate``):
 
     rim      half the difference beyond wavenumbers: fields singular at the rim, where the forms err apart
     waves    half the difference for wavenumbers, mode by mode: the forms may place a guided wave alike
     drift    what a relative error of one of all g_j² does: waves on polynomials of degree p err, in both forms, as the
              2p-th power of the waves in a pitch
 
-The factors are those of a mesh and of the width of a disc, the least that hold (linear programmes over 290 cells of
-every kind of ``engines``, seeds 4417 and 5531, against finer meshes) times 1.9. With the same rim, waves and
+The factors are those of a mesh and of the width of a disc, the least that hold (linear
+programmes over 290 cells of
+every kind of ``engines``, seeds 4417 and 5531, against finer meshes) times 1.9. With
+the same rim, waves and
 drift, errors still differ by a factor of three, of which a bar has to tell the largest.
 
-At a sharp resonance first order fails: dS goes as one over what waves in the layer lose in a round trip, the least
-singular value of 1 - R exp(iqh) R exp(iqh) (``damping``), and forms may lie together by accident, far from the truth.
-Estimates of some hundredths reckon with it (``beyond``). So cells unlike those of lenses (``Case.strange``) are judged
-by how the answer moved since two meshes before, in as far as the forms have drawn together since (the root of it:
+At a sharp resonance first order fails: dS goes as one over what waves in the layer lose
+in a round trip, the least
+singular value of 1 - R exp(iqh) R exp(iqh) (``damping``), and forms may lie together by
+accident, far from the truth.
+Estimates of some hundredths reckon with it (``beyond``). So cells unlike those of
+lenses (``Case.strange``) are judged
+by how the answer moved since two meshes before, in as far as the forms have drawn
+together since (the root of it:
 errors decay no slower), over the damping.
 
-At normal incidence, where every wave loses a tenth and more in a round trip on all three meshes, no resonance is
-sharp, and the change needs no damping: it shows how much less the error of the mean is than the difference of the
-forms, and what is left in both forms alike is a share of the drift (``Settling``). The lesser of both estimates counts.
-On the mesh "even" the factors are three times the least that hold for 257 cells (of many waves in a pitch, at cutoffs,
-of low contrast, very tall, low and of other media, seeds 77123, 77124, 551 and 40961, against the mesh "finer"). Two
-thirds of them held for 300 others (68117, 90721), the nearest, of more than ``MOST_WAVES`` or very tall, at 0.97 of the
-bar; as they are the nearest takes half of it. The mesh "good" would gain little. Beside a cutoff both forms err alike,
-however near they are, so that the estimate does not apply there (``NEAREST``); discs of the rarer medium move there as
-much again as since the last mesh (1 of 317 bars, drawn with seed 514229, was 0.70 of the error), which counts in full.
+At normal incidence, where every wave loses a tenth and more in a round trip on all
+three meshes, no resonance is
+sharp, and the change needs no damping: it shows how much less the error of the mean is
+than the difference of the
+forms, and what is left in both forms alike is a share of the drift (``Settling``). The
+lesser of both estimates counts.
+On the mesh "even" the factors are three times the least that hold for 257 cells (of
+many waves in a pitch, at cutoffs,
+of low contrast, very tall, low and of other media, seeds 77123, 77124, 551 and 40961,
+against the mesh "finer"). Two
+thirds of them held for 300 others (68117, 90721), the nearest, of more than
+``MOST_WAVES`` or very tall, at 0.97 of the
+bar; as they are the nearest takes half of it. The mesh "good" would gain little. Beside
+a cutoff both forms err alike,
+however near they are, so that the estimate does not apply there (``NEAREST``); discs of
+the rarer medium move there as
+much again as since the last mesh (1 of 317 bars, drawn with seed 514229, was 0.70 of
+the error), which counts in full.
 
-On three other seeds 1157 of 1163 bars of four meshes held at first; with factors widened for four (a thin disc in
-steep light, ``slanted``; one of 0.9 pitches; two of many waves in a pitch) all do, the nearest at 0.82 of its bar.
-Factors at cutoffs are those of cells drawn there, of meshes finer than "good" the worst of 60 cells.
+On three other seeds 1157 of 1163 bars of four meshes held at first; with factors
+widened for four (a thin disc in
+steep light, ``slanted``; one of 0.9 pitches; two of many waves in a pitch) all do, the
+nearest at 0.82 of its bar.
+Factors at cutoffs are those of cells drawn there, of meshes finer than "good" the worst
+of 60 cells.
 
-Discs of 0.03 to 0.2 pitches err by 0.45 to 0.54 of ``rim`` and little else, at normal incidence: their factors are
-twice those of a linear programme over 130 of them, and held for 59 others drawn more widely (0.6 of the bar).
+Discs of 0.03 to 0.2 pitches err by 0.45 to 0.54 of ``rim`` and little else, at normal
+incidence: their factors are
+twice those of a linear programme over 130 of them, and held for 59 others drawn more
+widely (0.6 of the bar).
 
-Later draws found bars of the mesh "good" below the error, down to 0.38 of it. The cause is its angular degree: of 5, it
-misplaces the first order of an empty cell by 2e-5 of g², both forms alike, where degree 6 does by 8e-7; discs of more
-than 0.6 pitches (``GOOD_WIDE``), and cells beside a cutoff, answer to it. Discs of 0.3 to 0.6 pitches leave a wide gap
-besides: an outer degree of 6 (``GOOD_MIDDLE``) takes the error there from 1e-6 to 1e-7. An order counts as near its
-cutoff up to two fifths of it, less and less (``match.nearness``): beyond a tenth three meshes had bars of 0.82 to
-1.02 of the error. Discs of 0.7 to 0.8 pitches and an index near 2 in such cells set what both forms of "fair" share.
+Later draws found bars of the mesh "good" below the error, down to 0.38 of it. The cause
+is its angular degree: of 5, it
+misplaces the first order of an empty cell by 2e-5 of g², both forms alike, where degree
+6 does by 8e-7; discs of more
+than 0.6 pitches (``GOOD_WIDE``), and cells beside a cutoff, answer to it. Discs of 0.3
+to 0.6 pitches leave a wide gap
+besides: an outer degree of 6 (``GOOD_MIDDLE``) takes the error there from 1e-6 to 1e-7.
+An order counts as near its
+cutoff up to two fifths of it, less and less (``match.nearness``): beyond a tenth three
+meshes had bars of 0.82 to
+1.02 of the error. Discs of 0.7 to 0.8 pitches and an index near 2 in such cells set
+what both forms of "fair" share.
 """
 
 import math
@@ -63,10 +94,14 @@ from metalens.modal.mesh import MeshPlan
 class Factors:
     """Of the parts of an error estimate, see the module; zeros are left out.
 
-    rim, waves: of both halves of the forms' difference. flat, steep, oblique: relative error of transverse wavenumbers
-    squared that both forms share, ``flat + steep (waves in a pitch / SIZE)⁶``, ``oblique`` more off normal incidence.
-    moved: of the change from meshes before. slanted: least value of waves off normal incidence; at_cutoff: of rim and
-    waves where an order is at its cutoff, where the forms err alike, and less beside it. grazing: of the change that
+    rim, waves: of both halves of the forms' difference. flat, steep, oblique: relative
+    error of transverse wavenumbers
+    squared that both forms share, ``flat + steep (waves in a pitch / SIZE)⁶``,
+    ``oblique`` more off normal incidence.
+    moved: of the change from meshes before. slanted: least value of waves off normal
+    incidence; at_cutoff: of rim and
+    waves where an order is at its cutoff, where the forms err alike, and less beside
+    it. grazing: of the change that
     exact cutoffs make.
     """
 
@@ -86,8 +121,12 @@ class Factors:
         waves = max(self.waves, near, self.slanted if found.bloch > 0 else 0.0)
         shared = self.flat + self.oblique * (found.bloch > 0)
         shared += self.steep * (found.size / SIZE) ** STEEP
-        parts = max(self.rim, near) * found.rim + waves * found.waves + shared * found.drift
-        change = self.moved * max((settled(found, one) for one in before[-COMPARED:]), default=0.0)
+        parts = (
+            max(self.rim, near) * found.rim + waves * found.waves + shared * found.drift
+        )
+        change = self.moved * max(
+            (settled(found, one) for one in before[-COMPARED:]), default=0.0
+        )
         if before and found.strange >= RARER:
             change = max(change, ALIKE * found.beside * moved(found, before[-1]))
         return parts + self.grazing * found.grazing + change
@@ -95,9 +134,11 @@ class Factors:
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """Of the estimate after two meshes for cells unlike those of lenses whose waves are all damped.
+    """Of the estimate after two meshes for cells unlike those of lenses whose waves are
+    all damped.
 
-    moved: of the farthest change since them, each as far as the forms have drawn together. forms: of half their
+    moved: of the farthest change since them, each as far as the forms have drawn
+    together. forms: of half their
     difference. shared: relative error of transverse wavenumbers squared in both forms.
     """
 
@@ -113,13 +154,17 @@ class Settling:
         if len(meshes) <= COMPARED or not damped or beyond_it or found.beside > NEAREST:
             return math.inf
         change = max(drawn(found, one) for one in meshes[:-1])
-        return self.moved * change + self.forms * found.spread + self.shared * found.drift
+        return (
+            self.moved * change + self.forms * found.spread + self.shared * found.drift
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A mesh for discs up to ``up_to`` pitches wide, and the factors of its estimate; after: in place of them with the
-    change from meshes before, for cells unlike those of lenses. usual: in place of that of the rung."""
+    """A mesh for discs up to ``up_to`` pitches wide, and the factors of its estimate;
+    after: in place of them with the
+    change from meshes before, for cells unlike those of lenses. usual: in place of that
+    of the rung."""
 
     plan: MeshPlan
     up_to: float
@@ -132,8 +177,10 @@ class Choice:
 class Rung:
     """Meshes of one accuracy, thinnest disc first.
 
-    usual: the estimate that most pillars of many waves in a pitch end with. alone: factors for cells unlike those of
-    lenses, by this mesh alone, times how unlike they are. settling: of these cells after two meshes.
+    usual: the estimate that most pillars of many waves in a pitch end with. alone:
+    factors for cells unlike those of
+    lenses, by this mesh alone, times how unlike they are. settling: of these cells
+    after two meshes.
     """
 
     name: str
@@ -144,7 +191,9 @@ class Rung:
 
     @property
     def weak(self) -> float:
-        """Modes that carry less than this may be left out: far below the error of the mesh."""
+        """Modes that carry less than this may be left out: far below the error of the
+        mesh.
+        """
         return float(max(1e-13, 1e-3 * self.usual**1.1))
 
     def choice(self, rho: float) -> Choice:
@@ -152,12 +201,19 @@ class Rung:
         return next(c for c in self.choices if rho <= c.up_to)
 
     def error(
-        self, found: Solution, rho: float, before: Sequence[Solution] = (), *, mesh: Choice | None = None
+        self,
+        found: Solution,
+        rho: float,
+        before: Sequence[Solution] = (),
+        *,
+        mesh: Choice | None = None,
     ) -> float:
         """Error estimate of the mean of both forms.
 
-        before: solutions on coarser meshes, which cells unlike those of lenses are judged by where there are any.
-        mesh: what was solved on; where that is not the rung's own for the diameter, the wider of both estimates counts.
+        before: solutions on coarser meshes, which cells unlike those of lenses are
+            judged by where there are any.
+        mesh: what was solved on; where that is not the rung's own for the diameter, the
+            wider of both estimates counts.
         """
         if found.strange and before:
             bound = self.choice(rho).after.bound(found, before)
@@ -174,10 +230,13 @@ class Rung:
 
 
 def beyond(first: float) -> float:
-    """An estimate of first order with the orders beyond it: at most twice as much, or twice ``RESONANT``.
+    """An estimate of first order with the orders beyond it: at most twice as much, or
+    twice ``RESONANT``.
 
-    Beside a resonance of amplitude a, S changes by a / (1 - x) - a = first / (1 - first / a) for a shift of x of the
-    way to it, with first = a x. Of silicon discs in oblique light one error of 0.052 had an estimate of 0.038.
+    Beside a resonance of amplitude a, S changes by a / (1 - x) - a = first / (1 - first
+    / a) for a shift of x of the
+    way to it, with first = a x. Of silicon discs in oblique light one error of 0.052
+    had an estimate of 0.038.
     """
     whole = first / max(0.5, 1 - first / RESONANT)
     return max(first, min(whole, 2 * RESONANT))
@@ -190,7 +249,9 @@ def settled(found: Solution, before: Solution) -> float:
 
 
 def drawn(found: Solution, before: Solution) -> float:
-    """Change since a mesh before, times the root of how far the forms have drawn together since."""
+    """Change since a mesh before, times the root of how far the forms have drawn
+    together since.
+    """
     together = min(1.0, found.spread / before.spread) if before.spread > 0 else 1.0
     return moved(found, before) * math.sqrt(together)
 
@@ -200,43 +261,94 @@ def moved(found: Solution, before: Solution) -> float:
     return float(np.abs(found.matrix - before.matrix).max())
 
 
-SIZE, STEEP = 2.0, 6  # what polynomials of degree p get wrong of a wave goes as the 2 p-th power of its elements, and 3
+SIZE, STEEP = (
+    2.0,
+    6,
+)  # what polynomials of degree p get wrong of a wave goes as the 2 p-th power of its elements, and 3
 # is the least degree
-LARGE, FALL = 1.4, 3  # waves in a pitch from which on meshes have their usual estimates, and how these fall below
+LARGE, FALL = (
+    1.4,
+    3,
+)  # waves in a pitch from which on meshes have their usual estimates, and how these fall below
 AMPLIFIED = 6.0  # with a factor of a third, twice the change is the most that is told
-RESONANT = 0.1  # amplitude of a resonance, of those that move an answer by a hundredth and more
-MOST_WAVES = 2.5  # in a pitch: beyond, degree four errs alike in both forms by up to all that the change tells
+# amplitude of a resonance, of those that move an answer by a hundredth and more
+RESONANT = 0.1
+# in a pitch: beyond, degree four errs alike in both forms by up to all that the change
+# tells
+MOST_WAVES = 2.5
 DAMPED = 0.1  # of a wave in a round trip: where each loses more, no resonance is sharp
-NEAREST = 0.5  # of ``beside``: nearer to a cutoff both forms err alike, by up to nine times half their difference
+# of ``beside``: nearer to a cutoff both forms err alike, by up to nine times half their
+# difference
+NEAREST = 0.5
 ALIKE = 1.5  # of the last change, of discs of the rarer medium at a cutoff
 COMPARED = 2  # meshes before, the last, that cells unlike those of lenses are judged by
-UNSEEN = 0.02  # of the usual estimate: oblique waves in a layer without contrast err a little that nothing shows
-TINY, SLIM, THIN, NARROW = 0.03, 0.2, 0.3, 0.8  # diameters in pitches: too thin to be told apart; whose forms err by
-# what is singular at the rim alone; around which they err apart; whose gap is resolved late, in both forms alike
+# of the usual estimate: oblique waves in a layer without contrast err a little that
+# nothing shows
+UNSEEN = 0.02
+TINY, SLIM, THIN, NARROW = (
+    0.03,
+    0.2,
+    0.3,
+    0.8,
+)  # diameters in pitches: too thin to be told apart; whose forms err by
+# what is singular at the rim alone; around which they err apart; whose gap is resolved
+# late, in both forms alike
 BOTH = (0.7, 1.3)
-STEEPER = (0.7, 1.45)  # few functions resolve the rim better with a second exponent between that of theory and 1.7
+STEEPER = (
+    0.7,
+    1.45,
+)  # few functions resolve the rim better with a second exponent between that of theory and 1.7
 GOOD = MeshPlan(5, 5, 5, BOTH)
-GOOD_MIDDLE = MeshPlan(4, 6, 6, BOTH, core=0.6)  # angular degree 5 misplaces the first order by 2e-5, 6 by 8e-7
-GOOD_WIDE = MeshPlan(4, 6, 5, BOTH, core=0.6)  # the gap of a wide disc varies along the rim: its angular degree counts
+GOOD_MIDDLE = MeshPlan(
+    4, 6, 6, BOTH, core=0.6
+)  # angular degree 5 misplaces the first order by 2e-5, 6 by 8e-7
+GOOD_WIDE = MeshPlan(
+    4, 6, 5, BOTH, core=0.6
+)  # the gap of a wide disc varies along the rim: its angular degree counts
 FINE = MeshPlan(5, 5, 5, (0.7,), (0.85, 1.0), (0.15, 1.0), core=0.55)
 FINER = MeshPlan(5, 6, 5, BOTH, (0.85, 1.0), (0.15, 1.0))
 FINEST = MeshPlan(6, 7, 6, BOTH, (0.85, 1.0), (0.15, 1.0), core=0.55)
 REFERENCE = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
-COARSE, COARSE_WIDE = MeshPlan(3, 3, 2, STEEPER, core=0.45), MeshPlan(3, 4, 2, STEEPER, core=0.55)
-FAIR, FAIR_WIDE = MeshPlan(3, 4, 3, STEEPER, core=0.6), MeshPlan(4, 4, 3, STEEPER, core=0.55)
+COARSE, COARSE_WIDE = (
+    MeshPlan(3, 3, 2, STEEPER, core=0.45),
+    MeshPlan(3, 4, 2, STEEPER, core=0.55),
+)
+FAIR, FAIR_WIDE = (
+    MeshPlan(3, 4, 3, STEEPER, core=0.6),
+    MeshPlan(4, 4, 3, STEEPER, core=0.55),
+)
 EVEN = MeshPlan(4, 4, 4, BOTH)
-SETTLED, WIDE = Factors(0.6, 2.0, moved=0.31, at_cutoff=1.0), Factors(2.5, 1.8, moved=0.33)
+SETTLED, WIDE = (
+    Factors(0.6, 2.0, moved=0.31, at_cutoff=1.0),
+    Factors(2.5, 1.8, moved=0.33),
+)
 UNSETTLED = Factors(9.0, 9.0, moved=0.33)  # of elements of degree three and four
-SLIM_FACTORS = Factors(0.9, 0.08, 4e-9, 4e-8, oblique=1.5e-7, slanted=1.7, at_cutoff=1.0)
+SLIM_FACTORS = Factors(
+    0.9, 0.08, 4e-9, 4e-8, oblique=1.5e-7, slanted=1.7, at_cutoff=1.0
+)
 SLIM_GOOD = Choice(GOOD, SLIM, SLIM_FACTORS, SETTLED, usual=1.2e-5)
 ON_GOOD = (  # discs that leave a wide or a narrow gap
-    Choice(GOOD_WIDE, NARROW, Factors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0), WIDE),
-    Choice(GOOD_WIDE, 1.0, Factors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0), WIDE),
+    Choice(
+        GOOD_WIDE,
+        NARROW,
+        Factors(0.4, 1.0, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
+        WIDE,
+    ),
+    Choice(
+        GOOD_WIDE,
+        1.0,
+        Factors(0.6, 2.5, 2e-7, 6e-7, oblique=1.2e-7, at_cutoff=1.0),
+        WIDE,
+    ),
 )
 
 
-def _finer(plan: MeshPlan, safety: float, flat: float, oblique: float = 0.0) -> tuple[Choice, ...]:
-    """One mesh for all discs, with factors of the worst cells: too few were solved on finer ones to tell them apart."""
+def _finer(
+    plan: MeshPlan, safety: float, flat: float, oblique: float = 0.0
+) -> tuple[Choice, ...]:
+    """One mesh for all discs, with factors of the worst cells: too few were solved on
+    finer ones to tell them apart.
+    """
     usually = Factors(1.2 * safety, 1.2 * safety, flat, flat, oblique=oblique)
     wide = Factors(2 * safety, 2 * safety, flat, flat, oblique=oblique)
     narrow = Factors(4 * safety, 3 * safety, 2 * flat, flat, oblique=oblique)
@@ -254,20 +366,41 @@ ON_FINER = _finer(FINER, 0.5, 4e-8, 1e-7)
 
 def _rough(*choices: Choice) -> tuple[Choice, ...]:
     """Near a cutoff both forms err alike, and the more the fewer elements there are."""
-    return tuple(replace(one, factors=replace(one.factors, at_cutoff=4.6)) for one in choices)
+    return tuple(
+        replace(one, factors=replace(one.factors, at_cutoff=4.6)) for one in choices
+    )
 
 
 RUNGS = (
     Rung(
         "coarse",
         _rough(
-            Choice(COARSE, TINY, Factors(1.2, 1.2, 1e-5, 1e-5, oblique=2e-4), UNSETTLED),
-            Choice(COARSE, SLIM, Factors(1.05, 0.12, 6.3e-7, 2.5e-6, oblique=4.4e-5, slanted=1.7), UNSETTLED, 3e-4),
             Choice(
-                COARSE, THIN, Factors(0.5, 0.62, 6.3e-6, 2.5e-5, oblique=3.8e-5, slanted=1.7), UNSETTLED, usual=1e-3
+                COARSE, TINY, Factors(1.2, 1.2, 1e-5, 1e-5, oblique=2e-4), UNSETTLED
             ),
-            Choice(COARSE, 0.6, Factors(0.5, 3.1, 3.8e-6, 5e-4, oblique=3.8e-5), UNSETTLED),
-            Choice(COARSE, 0.7, Factors(3.8, 1.2, 3.8e-5, 1.9e-4, oblique=3.8e-5), UNSETTLED),
+            Choice(
+                COARSE,
+                SLIM,
+                Factors(1.05, 0.12, 6.3e-7, 2.5e-6, oblique=4.4e-5, slanted=1.7),
+                UNSETTLED,
+                3e-4,
+            ),
+            Choice(
+                COARSE,
+                THIN,
+                Factors(0.5, 0.62, 6.3e-6, 2.5e-5, oblique=3.8e-5, slanted=1.7),
+                UNSETTLED,
+                usual=1e-3,
+            ),
+            Choice(
+                COARSE, 0.6, Factors(0.5, 3.1, 3.8e-6, 5e-4, oblique=3.8e-5), UNSETTLED
+            ),
+            Choice(
+                COARSE,
+                0.7,
+                Factors(3.8, 1.2, 3.8e-5, 1.9e-4, oblique=3.8e-5),
+                UNSETTLED,
+            ),
             Choice(COARSE_WIDE, NARROW, Factors(0.5, 1.0, 4.4e-5, 3.8e-5), UNSETTLED),
             Choice(COARSE_WIDE, 1.0, Factors(0.62, 5.6, 4.4e-5, 3.8e-5), UNSETTLED),
         ),
@@ -278,12 +411,36 @@ RUNGS = (
         "fair",
         _rough(
             Choice(FAIR, TINY, Factors(1.2, 1.2, 3e-6, 8e-6, oblique=1e-5), UNSETTLED),
-            Choice(FAIR, SLIM, Factors(0.95, 0.09, 1e-7, 1e-6, oblique=1e-6, slanted=1.7), UNSETTLED, 8e-5),
-            Choice(FAIR, THIN, Factors(0.81, 0.62, 1e-6, 1e-5, slanted=1.7), UNSETTLED, usual=2e-4),
+            Choice(
+                FAIR,
+                SLIM,
+                Factors(0.95, 0.09, 1e-7, 1e-6, oblique=1e-6, slanted=1.7),
+                UNSETTLED,
+                8e-5,
+            ),
+            Choice(
+                FAIR,
+                THIN,
+                Factors(0.81, 0.62, 1e-6, 1e-5, slanted=1.7),
+                UNSETTLED,
+                usual=2e-4,
+            ),
             Choice(FAIR, 0.6, Factors(0.44, 1.0, 1.2e-6, 1.3e-4), UNSETTLED),
-            Choice(FAIR, 0.7, Factors(0.8, 1.3, 1.3e-5, 3.2e-5, oblique=1.4e-5), UNSETTLED),
-            Choice(FAIR_WIDE, NARROW, Factors(1.1, 1.0, 1.8e-5, 1.3e-5, oblique=1.1e-5), UNSETTLED),
-            Choice(FAIR_WIDE, 1.0, Factors(5.6, 3.8, 3.8e-5, 1.3e-5, oblique=1.1e-5), UNSETTLED),
+            Choice(
+                FAIR, 0.7, Factors(0.8, 1.3, 1.3e-5, 3.2e-5, oblique=1.4e-5), UNSETTLED
+            ),
+            Choice(
+                FAIR_WIDE,
+                NARROW,
+                Factors(1.1, 1.0, 1.8e-5, 1.3e-5, oblique=1.1e-5),
+                UNSETTLED,
+            ),
+            Choice(
+                FAIR_WIDE,
+                1.0,
+                Factors(5.6, 3.8, 3.8e-5, 1.3e-5, oblique=1.1e-5),
+                UNSETTLED,
+            ),
         ),
         4e-4,
         alone=Factors(7.0, 7.0, 1e-4, 1e-4, oblique=5e-5),
@@ -292,8 +449,20 @@ RUNGS = (
         "even",
         (
             Choice(EVEN, TINY, Factors(0.6, 0.6, 1e-6, 2e-6, oblique=4e-6), UNSETTLED),
-            Choice(EVEN, SLIM, Factors(0.95, 0.13, 2.5e-8, 2.5e-7, oblique=2.3e-7, slanted=1.7), UNSETTLED, 2.5e-5),
-            Choice(EVEN, THIN, Factors(0.69, 0.62, 2.5e-7, 2.5e-6, slanted=1.7), UNSETTLED, usual=5e-5),
+            Choice(
+                EVEN,
+                SLIM,
+                Factors(0.95, 0.13, 2.5e-8, 2.5e-7, oblique=2.3e-7, slanted=1.7),
+                UNSETTLED,
+                2.5e-5,
+            ),
+            Choice(
+                EVEN,
+                THIN,
+                Factors(0.69, 0.62, 2.5e-7, 2.5e-6, slanted=1.7),
+                UNSETTLED,
+                usual=5e-5,
+            ),
             Choice(EVEN, 0.6, Factors(0.5, 3.2, 1.6e-6, 1e-5), UNSETTLED),
             Choice(EVEN, 0.7, Factors(0.62, 5.4, 6.3e-6, 5e-6), UNSETTLED),
             *ON_GOOD,
@@ -305,24 +474,53 @@ RUNGS = (
     Rung(
         "good",
         (
-            Choice(GOOD, TINY, Factors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7, at_cutoff=1.0), SETTLED),
+            Choice(
+                GOOD,
+                TINY,
+                Factors(0.6, 0.6, 1.5e-7, 3e-7, oblique=3e-7, at_cutoff=1.0),
+                SETTLED,
+            ),
             SLIM_GOOD,
             Choice(
                 GOOD,
                 THIN,
-                Factors(0.69, 0.62, 3.7e-8, 3.8e-7, oblique=1.2e-7, slanted=1.7, at_cutoff=1.0),
+                Factors(
+                    0.69,
+                    0.62,
+                    3.7e-8,
+                    3.8e-7,
+                    oblique=1.2e-7,
+                    slanted=1.7,
+                    at_cutoff=1.0,
+                ),
                 SETTLED,
                 usual=2.5e-5,
             ),
-            Choice(GOOD_MIDDLE, 0.6, Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0), SETTLED),
-            Choice(GOOD_WIDE, 0.7, Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0), SETTLED),
+            Choice(
+                GOOD_MIDDLE,
+                0.6,
+                Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
+                SETTLED,
+            ),
+            Choice(
+                GOOD_WIDE,
+                0.7,
+                Factors(0.44, 1.2, 6.2e-8, 3.8e-7, oblique=1.2e-7, at_cutoff=1.0),
+                SETTLED,
+            ),
             *ON_GOOD,
         ),
         1e-4,
         alone=Factors(3.0, 3.0, 1e-6, 1e-6, oblique=1.5e-6),
     ),
-    # what "fine" adds to "good" is lost on wide discs, whose gap it does not divide: they go on to "finer"
-    Rung("fine", (*_finer(FINE, 1.0, 3e-7, 3e-7)[:1], *ON_FINER[1:]), 2.5e-5, _alone(1.0, 3e-7, 3e-7)),
+    # what "fine" adds to "good" is lost on wide discs, whose gap it does not divide:
+    # they go on to "finer"
+    Rung(
+        "fine",
+        (*_finer(FINE, 1.0, 3e-7, 3e-7)[:1], *ON_FINER[1:]),
+        2.5e-5,
+        _alone(1.0, 3e-7, 3e-7),
+    ),
     Rung("finer", ON_FINER, 8e-6, _alone(0.5, 4e-8, 1e-7)),
     Rung("finest", _finer(FINEST, 0.35, 2e-8, 5e-8), 3e-6, _alone(0.35, 2e-8, 5e-8)),
     Rung("reference", _finer(REFERENCE, 0.3, 1e-8), 1e-6, _alone(0.3, 1e-8)),
@@ -330,9 +528,11 @@ RUNGS = (
 
 
 def first_rung(tolerance: float, rho: float | None = None, size: float = LARGE) -> int:
-    """Index of the coarsest mesh that usually meets the tolerance: for discs of ``rho`` pitches, or for most.
+    """Index of the coarsest mesh that usually meets the tolerance: for discs of ``rho``
+    pitches, or for most.
 
-    size: waves in a pitch, of cells like those of lenses. Of 70 at normal incidence estimates fell as the third power
+    size: waves in a pitch, of cells like those of lenses. Of 70 at normal incidence
+    estimates fell as the third power
     of it on the coarse meshes, and faster on the mesh "good".
     """
     fewer = min(1.0, size / LARGE) ** FALL
@@ -340,4 +540,6 @@ def first_rung(tolerance: float, rho: float | None = None, size: float = LARGE) 
     def usual(rung: Rung) -> float:
         return fewer * ((None if rho is None else rung.choice(rho).usual) or rung.usual)
 
-    return next((i for i, rung in enumerate(RUNGS) if usual(rung) <= tolerance), len(RUNGS) - 1)
+    return next(
+        (i for i, rung in enumerate(RUNGS) if usual(rung) <= tolerance), len(RUNGS) - 1
+    )

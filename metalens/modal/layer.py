@@ -1,15 +1,21 @@
 """Modes of the patterned layer, in the basis of the homogeneous modes.
 
-Curl-curl equation in the layer, longitudinal field eliminated (u transverse field, p its continuous partner):
+Curl-curl equation in the layer, longitudinal field eliminated (u transverse field, p
+its continuous partner):
 
     growth u'' = stiffness u,    p = growth u',    u = w exp(i q z):  -q² growth w = stiffness w
 
-``electric`` form, u = E_t: stiffness = curl - k0² mass_eps, 1/growth = 1/mass - grad (k0² scalar_eps)⁻¹ gradᵀ.
-``magnetic`` form, u = H_t: stiffness = curl_(1/eps) - k0² mass, 1/growth = 1/mass_(1/eps) - grad (k0² scalar)⁻¹ gradᵀ.
-Both are Galerkin forms of the same Maxwell problem with errors of opposite tendency: their mean is better than
-either, their difference measures the error. All matrices are symmetric, and real without absorption.
+``electric`` form, u = E_t: stiffness = curl - k0² mass_eps, 1/growth = 1/mass - grad
+(k0² scalar_eps)⁻¹ gradᵀ.
+``magnetic`` form, u = H_t: stiffness = curl_(1/eps) - k0² mass, 1/growth =
+1/mass_(1/eps) - grad (k0² scalar)⁻¹ gradᵀ.
+Both are Galerkin forms of the same Maxwell problem with errors of opposite tendency:
+their mean is better than
+either, their difference measures the error. All matrices are symmetric, and real
+without absorption.
 
-TM unknowns are scaled by k0 / sqrt(tm), the size of their growth, which keeps rim-graded bases accurate.
+TM unknowns are scaled by k0 / sqrt(tm), the size of their growth, which keeps
+rim-graded bases accurate.
 """
 
 from dataclasses import dataclass
@@ -21,7 +27,9 @@ from metalens.modal.homogeneous import Basis
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Medium:
-    """Numbers of one case in half pitches: k0 and the permittivities of disc and surroundings."""
+    """Numbers of one case in half pitches: k0 and the permittivities of disc and
+    surroundings.
+    """
 
     k0: float
     disc: complex
@@ -38,7 +46,8 @@ class Medium:
 class LayerModes:
     """Fields and partners of the layer modes, columns scaled alike.
 
-    q: (n,) axial wavenumbers, decaying or going up. field: (n, n) w. partner: (n, n) growth w.
+    q: (n,) axial wavenumbers, decaying or going up. field: (n, n) w. partner: (n, n)
+    growth w.
     """
 
     q: np.ndarray
@@ -74,7 +83,9 @@ def electric_modes(basis: Basis, medium: Medium) -> LayerModes:
     value, vectors = np.linalg.eig(problem)
     partner = vectors.copy()
     partner[a:] = -shrink @ vectors[a:]
-    return LayerModes(axial(-1 / value), vectors / both[:, None], partner * both[:, None])
+    return LayerModes(
+        axial(-1 / value), vectors / both[:, None], partner * both[:, None]
+    )
 
 
 def magnetic_modes(basis: Basis, medium: Medium) -> LayerModes:
@@ -92,7 +103,11 @@ def magnetic_modes(basis: Basis, medium: Medium) -> LayerModes:
     stiffness = (disc - around) * basis.disc_curl + np.diag(around * basis.te - k0**2)
     level = 1 / np.sqrt(basis.te + k0**2)
     problem = np.empty_like(growth)
-    problem[:a] = level[:, None] * np.linalg.solve(level[:, None] * stiffness * level, level[:, None] * growth[:a])
+    problem[:a] = level[:, None] * np.linalg.solve(
+        level[:, None] * stiffness * level, level[:, None] * growth[:a]
+    )
     problem[a:] = -((scale / k0) ** 2)[:, None] * growth[a:]
     value, vectors = np.linalg.eig(problem)
-    return LayerModes(axial(-1 / value), vectors / both[:, None], both[:, None] * (growth @ vectors))
+    return LayerModes(
+        axial(-1 / value), vectors / both[:, None], both[:, None] * (growth @ vectors)
+    )

@@ -1,8 +1,12 @@
-"""Two interfaces: from the modes of a layer between half-spaces to the scattering matrix of its orders.
+"""Two interfaces: from the modes of a layer between half-spaces to the scattering
+matrix of its orders.
 
-Semi-infinite layer and half-space meet in the symmetric operator G = (Y_layer + Y_half)⁻¹. Only layer modes that
-survive the height (|exp(i q h)| above a threshold) travel between the interfaces; everything else is local to G.
-So each interface is one linear solve with a few right-hand sides, kept real where the case is lossless: what
+Semi-infinite layer and half-space meet in the symmetric operator G = (Y_layer +
+Y_half)⁻¹. Only layer modes that
+survive the height (|exp(i q h)| above a threshold) travel between the interfaces;
+everything else is local to G.
+So each interface is one linear solve with a few right-hand sides, kept real where the
+case is lossless: what
 propagates enters through a small complex correction (Woodbury).
 """
 
@@ -17,27 +21,40 @@ from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import LayerModes, axial
 from metalens.modal.pencil import Pencil
 
-NEAR = 0.4  # relative distance of k² from its cutoff within which an order takes its exact wavenumber
+# relative distance of k² from its cutoff within which an order takes its exact
+# wavenumber
+NEAR = 0.4
 AT = 0.1  # and within which it counts as at its cutoff
 KNOWN = 0.02  # relative error of k² up to which a mode of the mesh is that order
-CARRY = 1e-13  # modes that decay below this over the height cannot change a result of double precision
+# modes that decay below this over the height cannot change a result of double precision
+CARRY = 1e-13
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfSpace:
-    """Admittances (n,) of the homogeneous modes (p = Y u going away), and which of them propagate."""
+    """Admittances (n,) of the homogeneous modes (p = Y u going away), and which of them
+    propagate.
+    """
 
     admittance: np.ndarray
     ports: np.ndarray
 
 
 def half_space(
-    basis: Basis, k0: float, permittivity: float, *, magnetic: bool, bloch: float | None = None
+    basis: Basis,
+    k0: float,
+    permittivity: float,
+    *,
+    magnetic: bool,
+    bloch: float | None = None,
 ) -> HalfSpace:
-    """Admittances p / u: electric form i kz (TE), i k0² eps / kz (TM); magnetic form i kz / eps, i k0² / kz.
+    """Admittances p / u: electric form i kz (TE), i k0² eps / kz (TM); magnetic form i
+    kz / eps, i k0² / kz.
 
-    A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance stays finite.
-    bloch: if given, orders near their cut-off get the wavenumbers of the lattice with this kx, see ``near_cutoff``.
+    A wavenumber exactly at cut-off is moved off it by 1e-8 k0, so that the admittance
+    stays finite.
+    bloch: if given, orders near their cut-off get the wavenumbers of the lattice with
+    this kx, see ``near_cutoff``.
     """
     square = np.concatenate([basis.te_exact, basis.tm_exact])
     if bloch is not None:
@@ -51,12 +68,17 @@ def half_space(
 
 
 def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
-    """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the lattice has them.
+    """Transverse wavenumbers squared (n,), those within ``NEAR`` of the cutoff as the
+    lattice has them.
 
-    Near its cutoff an order's admittance is the root of a small difference, in which the error of the mesh weighs as
-    one over the axial wavenumber. The exact values are (bloch + pi m)² + (pi n)²; each takes the nearest.
+    Near its cutoff an order's admittance is the root of a small difference, in which
+    the error of the mesh weighs as
+    one over the axial wavenumber. The exact values are (bloch + pi m)² + (pi n)²; each
+    takes the nearest.
     """
-    close = np.flatnonzero((np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9)))
+    close = np.flatnonzero(
+        (np.abs(square - cutoff) < NEAR * cutoff) & (square > bloch**2 * (1 + 1e-9))
+    )
     if not len(close):
         return square
     exact = lattice(cutoff, bloch)
@@ -68,9 +90,11 @@ def near_cutoff(square: np.ndarray, cutoff: float, bloch: float) -> np.ndarray:
 
 
 def nearness(cutoff: float, bloch: float) -> float:
-    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over the distance, to 0 at ``NEAR``.
+    """1 where an order but zero lies within ``AT`` of its cutoff; beyond, as one over
+    the distance, to 0 at ``NEAR``.
 
-    An admittance answers to the error of a wavenumber squared as one over its distance from the cutoff.
+    An admittance answers to the error of a wavenumber squared as one over its distance
+    from the cutoff.
     """
     exact = lattice(cutoff, bloch)
     apart = float(np.abs(exact[exact > bloch**2 * (1 + 1e-9)] / cutoff - 1).min())
@@ -80,17 +104,23 @@ def nearness(cutoff: float, bloch: float) -> float:
 def lattice(cutoff: float, bloch: float) -> np.ndarray:
     """(bloch + pi m)² + (pi n)², at least up to twice the cutoff."""
     reach = math.ceil((math.sqrt(2 * cutoff) + abs(bloch)) / math.pi) + 1
-    along, across = bloch + np.pi * np.arange(-reach, reach + 1), np.pi * np.arange(reach + 1)
+    along, across = (
+        bloch + np.pi * np.arange(-reach, reach + 1),
+        np.pi * np.arange(reach + 1),
+    )
     wavenumbers: np.ndarray = (along[:, None] ** 2 + across**2).ravel()
     return wavenumbers
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Interface:
-    """One end of the layer, seen by its carrying modes and by the propagating orders (power-normalised).
+    """One end of the layer, seen by its carrying modes and by the propagating orders
+    (power-normalised).
 
-    reflect: (carry, carry) of layer modes; enter: (carry, ports); leave: (ports, carry); back: (ports, ports).
-    inward: (n, carry + ports) amplitudes of all layer modes going in, per carrying mode that arrives (its own
+    reflect: (carry, carry) of layer modes; enter: (carry, ports); leave: (ports,
+    carry); back: (ports, ports).
+    inward: (n, carry + ports) amplitudes of all layer modes going in, per carrying mode
+    that arrives (its own
     incoming amplitude left out) and per order that arrives.
     """
 
@@ -105,11 +135,15 @@ def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interfac
     """Blocks at a half-space, from all modes of the layer."""
     admittance, ports = half.admittance, half.ports
     rate, c = 1j * layer.q, len(carry)
-    columns = np.concatenate([layer.partner[:, carry], np.eye(len(admittance))[:, ports]], 1)
+    columns = np.concatenate(
+        [layer.partner[:, carry], np.eye(len(admittance))[:, ports]], 1
+    )
     real = np.isrealobj(layer.field)
     near_rate = -np.abs(rate) if real else rate
     near = decaying(admittance) if real else admittance
-    inward = np.linalg.solve(layer.partner * near_rate + near[:, None] * layer.field, columns)
+    inward = np.linalg.solve(
+        layer.partner * near_rate + near[:, None] * layer.field, columns
+    )
     return mended(
         columns.T @ (layer.field @ inward),
         inward,
@@ -119,7 +153,9 @@ def interface(layer: LayerModes, carry: np.ndarray, half: HalfSpace) -> Interfac
 
 
 def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface:
-    """Blocks at a half-space, from the modes that carry and the real admittance of all others."""
+    """Blocks at a half-space, from the modes that carry and the real admittance of all
+    others.
+    """
     admittance = 1 / half.admittance if pencil.dual else half.admittance
     near, ports = decaying(admittance, dual=pencil.dual), half.ports
     a, c = len(pencil.te), len(modes.q)
@@ -128,7 +164,10 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
     pencil.tm_turn.onto(operator[a:, a:], near[a:])
     fed = np.zeros((len(operator), len(ports)))
     te = ports < a
-    fed[:a, te], fed[a:, ~te] = pencil.te_turn.rows(ports[te]).T, pencil.tm_turn.rows(ports[~te] - a).T
+    fed[:a, te], fed[a:, ~te] = (
+        pencil.te_turn.rows(ports[te]).T,
+        pencil.tm_turn.rows(ports[~te] - a).T,
+    )
     partner = modes.partner
     parts = [partner.real, partner.imag] if np.iscomplexobj(partner) else [partner]
     columns = np.concatenate([*parts, fed], 1)
@@ -136,20 +175,30 @@ def few_interface(pencil: Pencil, modes: FewModes, half: HalfSpace) -> Interface
     green = columns.T @ found
     if len(parts) == 2:
         whole = np.zeros((2 * c + len(ports), c + len(ports)), complex)
-        whole[:c, :c], whole[c : 2 * c, :c], whole[2 * c :, c:] = np.eye(c), 1j * np.eye(c), np.eye(len(ports))
+        whole[:c, :c], whole[c : 2 * c, :c], whole[2 * c :, c:] = (
+            np.eye(c),
+            1j * np.eye(c),
+            np.eye(len(ports)),
+        )
         green, found = whole.T @ green @ whole, found @ whole
     return mended(
         green,
         found,
         partner.T @ modes.field,
-        Rates(1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]),
+        Rates(
+            1j * modes.q, np.full(c, modes.near_rate), admittance[ports], near[ports]
+        ),
     )
 
 
-def eliminated(operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool) -> np.ndarray:
-    """operator⁻¹ columns, symmetric: the definite block goes first, in three quarters of the time of a plain solve.
+def eliminated(
+    operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool
+) -> np.ndarray:
+    """operator⁻¹ columns, symmetric: the definite block goes first, in three quarters
+    of the time of a plain solve.
 
-    The first ``a`` unknowns are negative definite (``first``), or the others positive definite; if not, the plain way.
+    The first ``a`` unknowns are negative definite (``first``), or the others positive
+    definite; if not, the plain way.
     """
     if not first:
         swapped, fed = np.roll(-operator, (-a, -a), (0, 1)), np.roll(-columns, -a, 0)
@@ -159,19 +208,27 @@ def eliminated(operator: np.ndarray, a: int, columns: np.ndarray, *, first: bool
     except np.linalg.LinAlgError:
         return np.linalg.solve(operator, columns)
     across, fed = below(lower, operator[:a, a:]), below(lower, columns[:a])
-    rest = np.linalg.solve(operator[a:, a:] + across.T @ across, columns[a:] + across.T @ fed)
+    rest = np.linalg.solve(
+        operator[a:, a:] + across.T @ across, columns[a:] + across.T @ fed
+    )
     return np.concatenate([below(lower, across @ rest - fed, transposed=True), rest])
 
 
 def decaying(admittance: np.ndarray, *, dual: bool = False) -> np.ndarray:
-    """Real stand-in: the admittances that decay, and for those that propagate their size with the sign that the
-    stand-in of a travelling layer mode has, so that the two cannot cancel: plus in the dual unknown, else minus."""
-    return np.where(admittance.real == 0, np.abs(admittance) * (1 if dual else -1), admittance.real)
+    """Real stand-in: the admittances that decay, and for those that propagate their
+    size with the sign that the
+    stand-in of a travelling layer mode has, so that the two cannot cancel: plus in the
+    dual unknown, else minus."""
+    return np.where(
+        admittance.real == 0, np.abs(admittance) * (1 if dual else -1), admittance.real
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rates:
-    """i q of the carrying modes and the admittances of the ports: true, and as the operator holds them."""
+    """i q of the carrying modes and the admittances of the ports: true, and as the
+    operator holds them.
+    """
 
     mode: np.ndarray
     near_mode: np.ndarray
@@ -179,15 +236,21 @@ class Rates:
     near_port: np.ndarray
 
 
-def mended(green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: Rates) -> Interface:
-    """Blocks from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports, its stand-ins put right.
+def mended(
+    green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: Rates
+) -> Interface:
+    """Blocks from (Y_layer + Y_half)⁻¹ applied to the carrying partners and the ports,
+    its stand-ins put right.
 
-    green: of partners and ports with the solution; inward: the solution; norm: partners with fields.
+    green: of partners and ports with the solution; inward: the solution; norm: partners
+    with fields.
     """
     c, m = len(rates.mode), len(green)
     if (rates.mode != rates.near_mode).any() or (rates.port != rates.near_port).any():
         correction = np.zeros((m, m), complex)
-        correction[:c, :c] = np.linalg.solve(norm.T, np.diag(rates.mode - rates.near_mode)).T
+        correction[:c, :c] = np.linalg.solve(
+            norm.T, np.diag(rates.mode - rates.near_mode)
+        ).T
         correction[c:, c:] = np.diag(rates.port - rates.near_port)
         mend = np.linalg.inv(np.eye(m) + correction @ green)
         green, inward = green @ mend, inward @ mend
@@ -205,10 +268,13 @@ def mended(green: np.ndarray, inward: np.ndarray, norm: np.ndarray, rates: Rates
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Match:
-    """Scattering matrix over the ports of both sides, below first, and what it was made from.
+    """Scattering matrix over the ports of both sides, below first, and what it was made
+    from.
 
-    carry: the modes that travel; round_trip: (2 carry, 2 carry) system of their amplitudes, waves up at the foot
-    first, then waves down at the top; amplitude: (2 carry, ports) its solution for unit power into each port.
+    carry: the modes that travel; round_trip: (2 carry, 2 carry) system of their
+    amplitudes, waves up at the foot
+    first, then waves down at the top; amplitude: (2 carry, ports) its solution for unit
+    power into each port.
     travel: (carry,) their factors exp(i q h).
     """
 
@@ -222,18 +288,26 @@ class Match:
 
     @property
     def damping(self) -> float:
-        """Least singular value of the round trip: what the waves least damped lose, or come back out of step by."""
+        """Least singular value of the round trip: what the waves least damped lose, or
+        come back out of step by.
+        """
         return float(np.linalg.svd(self.round_trip, compute_uv=False).min(initial=1.0))
 
     def rate(self, moved: np.ndarray) -> np.ndarray:
-        """Derivatives (..., ports, ports) of the scattering matrix, given those (..., carry) of the factors exp(i q h)
+        """Derivatives (..., ports, ports) of the scattering matrix, given those (...,
+        carry) of the factors exp(i q h)
         of the carrying modes."""
         c, x = len(self.carry), self.travel[:, None]
-        down, up = moved[..., None] * self.amplitude[c:], moved[..., None] * self.amplitude[:c]
+        down, up = (
+            moved[..., None] * self.amplitude[c:],
+            moved[..., None] * self.amplitude[:c],
+        )
         push = np.concatenate([self.foot.reflect @ down, self.top.reflect @ up], -2)
         echo = np.linalg.solve(self.round_trip, push)
         down, up = down + x * echo[..., c:, :], up + x * echo[..., :c, :]
-        out: np.ndarray = np.concatenate([self.foot.leave @ down, self.top.leave @ up], -2)
+        out: np.ndarray = np.concatenate(
+            [self.foot.leave @ down, self.top.leave @ up], -2
+        )
         return out
 
 
@@ -245,16 +319,29 @@ def swap(foot: np.ndarray, top: np.ndarray, x: np.ndarray) -> np.ndarray:
     return out
 
 
-def scattering(layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace) -> Match:
-    """Match both ends of all modes: the matrix is symmetric, and unitary where lossless."""
+def scattering(
+    layer: LayerModes, height: float, below: HalfSpace, above: HalfSpace
+) -> Match:
+    """Match both ends of all modes: the matrix is symmetric, and unitary where
+    lossless.
+    """
     travel = np.exp(1j * layer.q * height)
     carry = np.flatnonzero(np.abs(travel) > CARRY)
-    return joined(interface(layer, carry, below), interface(layer, carry, above), carry, travel[carry])
+    return joined(
+        interface(layer, carry, below),
+        interface(layer, carry, above),
+        carry,
+        travel[carry],
+    )
 
 
-def few_scattering(pencil: Pencil, modes: FewModes, height: float, below: HalfSpace, above: HalfSpace) -> Match:
-    """As ``scattering``, from few modes; ``carry`` counts them, and ``inward`` is in the pencil's coordinates.
-    A dual unknown inverts the admittances of the half-spaces, and the reflection changes its sign.
+def few_scattering(
+    pencil: Pencil, modes: FewModes, height: float, below: HalfSpace, above: HalfSpace
+) -> Match:
+    """As ``scattering``, from few modes; ``carry`` counts them, and ``inward`` is in
+    the pencil's coordinates.
+    A dual unknown inverts the admittances of the half-spaces, and the reflection
+    changes its sign.
     """
     foot, top = few_interface(pencil, modes, below), few_interface(pencil, modes, above)
     return joined(foot, top, np.arange(len(modes.q)), np.exp(1j * modes.q * height))

@@ -1,12 +1,18 @@
 """The quarter cell as curvilinear quadrilaterals that follow the disc.
 
-Lengths are in half pitches: the quarter cell is [0, 1]², the disc has radius rho = diameter / pitch. A core
-quadrilateral fills the middle of the disc, rings of quadrilaterals lead from it to the circle and from the circle
-to the edge of the cell (transfinite blending, Gordon and Hall 1973). Each ring has ``sectors`` elements from the x
-axis to the diagonal (side A), and as many from the y axis to the diagonal (side B, the mirror image of A), so the
-mesh has the symmetry of the square, and the two parameters of neighbours run the same way along a shared edge.
+Lengths are in half pitches: the quarter cell is [0, 1]², the disc has radius rho =
+diameter / pitch. A core
+quadrilateral fills the middle of the disc, rings of quadrilaterals lead from it to the
+circle and from the circle
+to the edge of the cell (transfinite blending, Gordon and Hall 1973). Each ring has
+``sectors`` elements from the x
+axis to the diagonal (side A), and as many from the y axis to the diagonal (side B, the
+mirror image of A), so the
+mesh has the symmetry of the square, and the two parameters of neighbours run the same
+way along a shared edge.
 
-Every point is linear in rho: position = rho * P + Q, so the Jacobians and their derivatives in rho are exact.
+Every point is linear in rho: position = rho * P + Q, so the Jacobians and their
+derivatives in rho are exact.
 """
 
 import math
@@ -17,16 +23,24 @@ import numpy as np
 
 from metalens.modal.shapes import Interval, Square, plain, rim, square
 
-X0, X1, Y0, Y1 = 1, 2, 4, 8  # walls of the quarter cell, as bits: x = 0, x = 1, y = 0, y = 1
+X0, X1, Y0, Y1 = (
+    1,
+    2,
+    4,
+    8,
+)  # walls of the quarter cell, as bits: x = 0, x = 1, y = 0, y = 1
 
 
 @dataclass(frozen=True, slots=True)
 class MeshPlan:
     """What fixes the topology and the basis of a mesh (everything but the diameter).
 
-    radial, angular: polynomial degree across and along the rim; outside: radial degree outside the disc.
-    exponents: of the rim bubbles. inner, outer: outer ends of the rings, as fractions of the way from the core to
-    the circle, and from the circle to the edge of the cell. sectors: ends of the sectors, as fractions of 45
+    radial, angular: polynomial degree across and along the rim; outside: radial degree
+    outside the disc.
+    exponents: of the rim bubbles. inner, outer: outer ends of the rings, as fractions
+    of the way from the core to
+    the circle, and from the circle to the edge of the cell. sectors: ends of the
+    sectors, as fractions of 45
     degrees. core: half width of the core over the radius of the disc.
     """
 
@@ -42,9 +56,11 @@ class MeshPlan:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Patch:
-    """Elements that share one reference basis. Jacobians are (elements, points, 2) arrays of (x, y).
+    """Elements that share one reference basis. Jacobians are (elements, points, 2)
+    arrays of (x, y).
 
-    inside: whether the elements belong to the disc. copies: 2 where each stands for itself and its mirror image.
+    inside: whether the elements belong to the disc. copies: 2 where each stands for
+    itself and its mirror image.
     rho_xi, rho_eta, rest_xi, rest_eta: derivatives of P and Q along xi and eta.
     vector, scalar: (copies, elements, functions) global numbers of the functions.
     """
@@ -61,7 +77,9 @@ class Patch:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Mesh:
-    """Patches and the global numbering; ``vector_wall`` and ``scalar_wall`` hold the wall bits of each function."""
+    """Patches and the global numbering; ``vector_wall`` and ``scalar_wall`` hold the
+    wall bits of each function.
+    """
 
     plan: MeshPlan
     patches: tuple[Patch, ...]
@@ -73,7 +91,9 @@ Vertex = tuple[str, int, int]
 
 
 class Numbering:
-    """Hands out global numbers for functions on vertices, edges and interiors; records the walls they lie on."""
+    """Hands out global numbers for functions on vertices, edges and interiors; records
+    the walls they lie on.
+    """
 
     def __init__(self, rings: int, sectors: int) -> None:
         self.rings, self.sectors = rings, sectors
@@ -94,33 +114,51 @@ class Numbering:
         return (start if j == 0 else 0) | (end if last else 0)
 
     def vector(self, wall: int, *key: object) -> int:
-        """Number of the vector function ``key``; a key seen for the first time takes the next one."""
+        """Number of the vector function ``key``; a key seen for the first time takes
+        the next one.
+        """
         if key not in self.vectors:
             self.vectors[key] = len(self.vectors)
             self.vector_wall.append(wall)
         return self.vectors[key]
 
     def scalar(self, wall: int, *key: object) -> int:
-        """Number of the scalar function ``key``; a key seen for the first time takes the next one."""
+        """Number of the scalar function ``key``; a key seen for the first time takes
+        the next one.
+        """
         if key not in self.scalars:
             self.scalars[key] = len(self.scalars)
             self.scalar_wall.append(wall)
         return self.scalars[key]
 
-    def element(self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int) -> tuple[list[int], list[int]]:
-        """Numbers of the vector and scalar functions of the element with corners v00, v10, v01, v11."""
+    def element(
+        self, v: tuple[Vertex, Vertex, Vertex, Vertex], px: int, py: int
+    ) -> tuple[list[int], list[int]]:
+        """Numbers of the vector and scalar functions of the element with corners v00,
+        v10, v01, v11.
+        """
         walls = [self.wall(vertex) for vertex in v]
         x_ends, y_ends = ((0, 1), (2, 3)), ((0, 2), (1, 3))
 
         def on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.vector(walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i)
+            return self.vector(
+                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
+            )
 
         def scalar_on_edge(ends: tuple[int, int], i: int) -> int:
-            return self.scalar(walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i)
+            return self.scalar(
+                walls[ends[0]] & walls[ends[1]], v[ends[0]], v[ends[1]], i
+            )
 
         vectors = [
-            on_edge(x_ends[j], i) if j < 2 else self.vector(0, "x", v, i, j) for i in range(px) for j in range(py + 1)
-        ] + [on_edge(y_ends[i], j) if i < 2 else self.vector(0, "y", v, i, j) for i in range(px + 1) for j in range(py)]
+            on_edge(x_ends[j], i) if j < 2 else self.vector(0, "x", v, i, j)
+            for i in range(px)
+            for j in range(py + 1)
+        ] + [
+            on_edge(y_ends[i], j) if i < 2 else self.vector(0, "y", v, i, j)
+            for i in range(px + 1)
+            for j in range(py)
+        ]
         scalars = []
         for i in range(px + 1):
             for j in range(py + 1):
@@ -136,7 +174,9 @@ class Numbering:
 
 
 def core_vertex(i: int, j: int, n: int) -> Vertex:
-    """Name of the corner (i, j) of a core of n by n elements; those on its rim are named as the rings name them."""
+    """Name of the corner (i, j) of a core of n by n elements; those on its rim are
+    named as the rings name them.
+    """
     if i == n and j == n:
         return ("diagonal", 0, 0)
     if i == n:
@@ -145,12 +185,16 @@ def core_vertex(i: int, j: int, n: int) -> Vertex:
 
 
 def ring_vertex(side: str, ring: int, j: int, n: int) -> Vertex:
-    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above); both sides share the diagonal."""
+    """Name of corner j of a ring on one side ("A" below the diagonal, "B" above); both
+    sides share the diagonal.
+    """
     return ("diagonal", ring, 0) if j == n else (side, ring, j)
 
 
 def core_patch(plan: MeshPlan, numbers: Numbering) -> Patch:
-    """Bilinear quadrilateral with corners (0, 0), (a, 0), (c, c), (0, a), cut along both parameters."""
+    """Bilinear quadrilateral with corners (0, 0), (a, 0), (c, c), (0, a), cut along
+    both parameters.
+    """
     a = plan.core
     excess = 0.8 * a - a
     cuts = np.concatenate([[0.0], plan.sectors])
@@ -162,19 +206,36 @@ def core_patch(plan: MeshPlan, numbers: Numbering) -> Patch:
         for j in range(n):
             du, dv = cuts[i + 1] - cuts[i], cuts[j + 1] - cuts[j]
             u, v = np.meshgrid(cuts[i] + du * s, cuts[j] + dv * s, indexing="ij")
-            along_u.append(du * np.stack([a + excess * v, excess * v], -1).reshape(-1, 2))
-            along_v.append(dv * np.stack([excess * u, a + excess * u], -1).reshape(-1, 2))
-            corners = tuple(core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1))
+            along_u.append(
+                du * np.stack([a + excess * v, excess * v], -1).reshape(-1, 2)
+            )
+            along_v.append(
+                dv * np.stack([excess * u, a + excess * u], -1).reshape(-1, 2)
+            )
+            corners = tuple(
+                core_vertex(i + k, j + m, n) for m in (0, 1) for k in (0, 1)
+            )
             numbered = numbers.element(corners, plan.angular, plan.angular)  # type: ignore[arg-type]
             vectors.append(numbered[0])
             scalars.append(numbered[1])
     xi, eta = np.array(along_u), np.array(along_v)
     zero = np.zeros_like(xi)
-    return Patch(square(line, line), True, xi, eta, zero, zero, np.array([vectors]), np.array([scalars]))
+    return Patch(
+        square(line, line),
+        True,
+        xi,
+        eta,
+        zero,
+        zero,
+        np.array([vectors]),
+        np.array([scalars]),
+    )
 
 
 def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Start and end curve of a ring stack at fraction v of 45 degrees, as P and Q parts, each with its derivative."""
+    """Start and end curve of a ring stack at fraction v of 45 degrees, as P and Q
+    parts, each with its derivative.
+    """
     phi, rate = v * math.pi / 4, math.pi / 4
     circle = np.stack([np.cos(phi), np.sin(phi)], -1)
     d_circle = rate * np.stack([-np.sin(phi), np.cos(phi)], -1)
@@ -188,8 +249,12 @@ def ring_curves(plan: MeshPlan, inside: bool, v: np.ndarray) -> tuple[np.ndarray
     return circle, d_circle, edge, d_edge
 
 
-def ring_patch(plan: MeshPlan, numbers: Numbering, rings: range, *, inside: bool, radial: Interval) -> Patch:
-    """Elements of the given rings (counted from the core), both sides; the Jacobians are those of side A."""
+def ring_patch(
+    plan: MeshPlan, numbers: Numbering, rings: range, *, inside: bool, radial: Interval
+) -> Patch:
+    """Elements of the given rings (counted from the core), both sides; the Jacobians
+    are those of side A.
+    """
     ends = np.concatenate([[0.0], plan.inner if inside else plan.outer])
     first = 0 if inside else len(plan.inner)
     cuts = np.concatenate([[0.0], plan.sectors])
@@ -202,23 +267,46 @@ def ring_patch(plan: MeshPlan, numbers: Numbering, rings: range, *, inside: bool
         g0, dg = ends[ring - first], ends[ring - first + 1] - ends[ring - first]
         for j in range(n):
             dv = cuts[j + 1] - cuts[j]
-            g, v = np.meshgrid(g0 + dg * radial.point, cuts[j] + dv * angular.point, indexing="ij")
+            g, v = np.meshgrid(
+                g0 + dg * radial.point, cuts[j] + dv * angular.point, indexing="ij"
+            )
             start, d_start, end, d_end = ring_curves(plan, inside, v.ravel())
             g = g.reshape(-1, 1)
-            from_start, from_end = (-dg * start, dv * (1 - g) * d_start), (dg * end, dv * g * d_end)
+            from_start, from_end = (
+                (-dg * start, dv * (1 - g) * d_start),
+                (dg * end, dv * g * d_end),
+            )
             zero = np.zeros_like(start)
             if inside:
-                jacobians.append((from_start[0] + from_end[0], from_start[1] + from_end[1], zero, zero))
+                jacobians.append(
+                    (
+                        from_start[0] + from_end[0],
+                        from_start[1] + from_end[1],
+                        zero,
+                        zero,
+                    )
+                )
             else:
                 jacobians.append((*from_start, *from_end))
             for copy, side in enumerate("AB"):
-                corners = tuple(ring_vertex(side, ring + k, j + m, n) for m in (0, 1) for k in (0, 1))
+                corners = tuple(
+                    ring_vertex(side, ring + k, j + m, n)
+                    for m in (0, 1)
+                    for k in (0, 1)
+                )
                 numbered = numbers.element(corners, radial.degree, plan.angular)  # type: ignore[arg-type]
                 vectors[copy].append(numbered[0])
                 scalars[copy].append(numbered[1])
     parts = [np.array(part) for part in zip(*jacobians, strict=True)]
     return Patch(
-        square(radial, angular), inside, parts[0], parts[1], parts[2], parts[3], np.array(vectors), np.array(scalars)
+        square(radial, angular),
+        inside,
+        parts[0],
+        parts[1],
+        parts[2],
+        parts[3],
+        np.array(vectors),
+        np.array(scalars),
     )
 
 
@@ -231,12 +319,27 @@ def build(plan: MeshPlan) -> Mesh:
     smooth = plain(plan.radial, plan.radial + 5)
     patches = [core_patch(plan, numbers)]
     if inner > 1:
-        patches.append(ring_patch(plan, numbers, range(inner - 1), inside=True, radial=smooth))
+        patches.append(
+            ring_patch(plan, numbers, range(inner - 1), inside=True, radial=smooth)
+        )
     towards = rim(plan.radial, points, plan.exponents, True)
-    patches.append(ring_patch(plan, numbers, range(inner - 1, inner), inside=True, radial=towards))
+    patches.append(
+        ring_patch(plan, numbers, range(inner - 1, inner), inside=True, radial=towards)
+    )
     away = rim(plan.outside, points, plan.exponents, False)
-    patches.append(ring_patch(plan, numbers, range(inner, inner + 1), inside=False, radial=away))
+    patches.append(
+        ring_patch(plan, numbers, range(inner, inner + 1), inside=False, radial=away)
+    )
     if outer > 1:
         far = plain(plan.outside, plan.outside + 5)
-        patches.append(ring_patch(plan, numbers, range(inner + 1, inner + outer), inside=False, radial=far))
-    return Mesh(plan, tuple(patches), np.array(numbers.vector_wall), np.array(numbers.scalar_wall))
+        patches.append(
+            ring_patch(
+                plan, numbers, range(inner + 1, inner + outer), inside=False, radial=far
+            )
+        )
+    return Mesh(
+        plan,
+        tuple(patches),
+        np.array(numbers.vector_wall),
+        np.array(numbers.scalar_wall),
+    )

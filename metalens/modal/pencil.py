@@ -1,33 +1,51 @@
-"""The layer's equation with its diagonal blocks diagonalised: what finding few modes, and a root, start from.
+"""The layer's equation with its diagonal blocks diagonalised: what finding few modes,
+and a root, start from.
 
-In the homogeneous basis the layer without absorption couples TE and TM unknowns by one block only, and each diagonal
+In the homogeneous basis the layer without absorption couples TE and TM unknowns by one
+block only, and each diagonal
 block is a symmetric definite problem of half the size. In their eigenvectors y,
 
     growth = diag(sign),   stiffness = diag(sign * level) + [[0, coupling], [couplingᵀ, 0]],   sign = +-1,
 
-so that growth⁻¹ stiffness (whose eigenvalues are -q²) is diagonal but for the coupling, which is weak beside all
-levels but the lowest. The magnetic form is taken in its dual unknown, the partner p (tangential E): there
-stiffness⁻¹ plays the part of growth and growth⁻¹ that of stiffness, half-space admittances are inverted, and the
+so that growth⁻¹ stiffness (whose eigenvalues are -q²) is diagonal but for the coupling,
+which is weak beside all
+levels but the lowest. The magnetic form is taken in its dual unknown, the partner p
+(tangential E): there
+stiffness⁻¹ plays the part of growth and growth⁻¹ that of stiffness, half-space
+admittances are inverted, and the
 reflection changes its sign. It needs no inverse of an indefinite matrix.
 
-One block of each form, the TE of the electric and the TM of the magnetic, is a diagonal plus k0² times permittivities:
-only its low levels are diagonalised, and what is left beside the others (``rest``) is as weak as the coupling.
+One block of each form, the TE of the electric and the TM of the magnetic, is a diagonal
+plus k0² times permittivities:
+only its low levels are diagonalised, and what is left beside the others (``rest``) is
+as weak as the coupling.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from metalens.modal.dense import added, below, cholesky, definite_inverse, eigenvectors, gram, whitened
+from metalens.modal.dense import (
+    added,
+    below,
+    cholesky,
+    definite_inverse,
+    eigenvectors,
+    gram,
+    whitened,
+)
 from metalens.modal.homogeneous import Basis
 from metalens.modal.layer import Medium
 
-LOW = 32.0  # levels up to this many times the most that permittivities add to a diagonal are diagonalised
+# levels up to this many times the most that permittivities add to a diagonal are
+# diagonalised
+LOW = 32.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Turn:
-    """Fields of y in the homogeneous basis, square: of the first alone ``low`` (m, m), of each other ``beyond`` times
+    """Fields of y in the homogeneous basis, square: of the first alone ``low`` (m, m),
+    of each other ``beyond`` times
     itself; size: of all."""
 
     low: np.ndarray
@@ -67,8 +85,10 @@ class Pencil:
     """Real and symmetric; see the module.
 
     te (a,), tm (b,): levels. te_sign, tm_sign: of growth. coupling: (a, b).
-    te_turn, tm_turn: fields of the y in the homogeneous basis. dual: the unknown is the partner.
-    te_rest (a, a) or tm_rest (b, b): of growth⁻¹ stiffness beside the levels, zero among the low ones; the other None.
+    te_turn, tm_turn: fields of the y in the homogeneous basis. dual: the unknown is the
+    partner.
+    te_rest (a, a) or tm_rest (b, b): of growth⁻¹ stiffness beside the levels, zero
+    among the low ones; the other None.
     """
 
     te: np.ndarray
@@ -84,12 +104,19 @@ class Pencil:
 
 
 def lossless(medium: Medium) -> bool:
-    """Whether the layer is one of positive real permittivities, as the definite blocks need."""
-    return all(e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around)))
+    """Whether the layer is one of positive real permittivities, as the definite blocks
+    need.
+    """
+    return all(
+        e.imag == 0 and e.real > 0 for e in map(complex, (medium.disc, medium.around))
+    )
 
 
-def low_levels(matrix: np.ndarray, square: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Levels (n,), vectors (m, m) of the low ones, and what is left, of diag(square) and as much as ``most`` beside it.
+def low_levels(
+    matrix: np.ndarray, square: np.ndarray, most: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels (n,), vectors (m, m) of the low ones, and what is left, of diag(square)
+    and as much as ``most`` beside it.
 
     square: rising. Of the matrix the lower triangle counts.
     """
@@ -103,9 +130,16 @@ def low_levels(matrix: np.ndarray, square: np.ndarray, most: float) -> tuple[np.
 
 
 def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
-    """u = E_t: growth = diag(1, (scalar_eps⁻¹ tm / k0² - 1)⁻¹ negative), stiffness = curl - k0² mass_eps."""
+    """u = E_t: growth = diag(1, (scalar_eps⁻¹ tm / k0² - 1)⁻¹ negative), stiffness =
+    curl - k0² mass_eps.
+    """
     around = float(medium.around.real)
-    a, b, k2, step = len(basis.te), len(basis.tm), medium.k0**2, float((medium.disc - medium.around).real)
+    a, b, k2, step = (
+        len(basis.te),
+        len(basis.tm),
+        medium.k0**2,
+        float((medium.disc - medium.around).real),
+    )
     first = added(-k2 * step * basis.disc_mass[:a, :a], basis.te - k2 * around)
     te, te_low, rest = low_levels(first, basis.te, k2 * abs(step))
     second = added(k2 * step * basis.disc_mass[a:, a:], k2 * around)
@@ -114,11 +148,24 @@ def electric_pencil(basis: Basis, medium: Medium) -> Pencil:
     tm, tm_turn = whitened(second, added(gram(rise), -1.0))
     turn = Turn(te_low, a)
     coupling = turn.down(-k2 * step * basis.disc_mass[:a, a:] @ tm_turn)
-    return Pencil(te, tm, np.ones(a), -np.sign(tm), coupling, turn, Turn(tm_turn, b), rest, None, dual=False)
+    return Pencil(
+        te,
+        tm,
+        np.ones(a),
+        -np.sign(tm),
+        coupling,
+        turn,
+        Turn(tm_turn, b),
+        rest,
+        None,
+        dual=False,
+    )
 
 
 def magnetic_pencil(basis: Basis, medium: Medium) -> Pencil:
-    """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ - diag(0, tm / k0²)."""
+    """The dual unknown of u = H_t: growth = stiffness⁻¹, stiffness = mass_(1/eps)⁻¹ -
+    diag(0, tm / k0²).
+    """
     disc, around = (1 / float(e.real) for e in (medium.disc, medium.around))
     a, b, k2 = len(basis.te), len(basis.tm), medium.k0**2
     weighted = definite_inverse(added((disc - around) * basis.disc_mass, around))
@@ -128,4 +175,15 @@ def magnetic_pencil(basis: Basis, medium: Medium) -> Pencil:
     tm, tm_low, rest = low_levels(second, basis.tm, k2 * abs(1 / disc - 1 / around))
     turn = Turn(tm_low * medium.k0, b, medium.k0)
     coupling = turn.down(weighted[a:, :a] @ te_turn).T
-    return Pencil(te, tm, np.sign(te), -np.ones(b), coupling, Turn(te_turn, a), turn, None, rest, dual=True)
+    return Pencil(
+        te,
+        tm,
+        np.sign(te),
+        -np.ones(b),
+        coupling,
+        Turn(te_turn, a),
+        turn,
+        None,
+        rest,
+        dual=True,
+    )

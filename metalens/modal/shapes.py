@@ -1,12 +1,19 @@
-"""One-dimensional shape functions of the curl-conforming elements, and the rules that integrate them.
+"""One-dimensional shape functions of the curl-conforming elements, and the rules that
+integrate them.
 
-On the unit interval ``value[0] = 1 - s``, ``value[1] = s`` and every further value is a bubble, the integral of
-``slope[k - 1]``; ``slope[0] = 1`` and the others are orthonormal with zero mean. Products of a slope along one axis
-and a value along the other span the Nedelec space, products of two values its scalar space, and the gradient of
-the second lies in the first exactly (Demkowicz, Computing with hp-adaptive finite elements, 2007, ch. 11-14).
+On the unit interval ``value[0] = 1 - s``, ``value[1] = s`` and every further value is a
+bubble, the integral of
+``slope[k - 1]``; ``slope[0] = 1`` and the others are orthonormal with zero mean.
+Products of a slope along one axis
+and a value along the other span the Nedelec space, products of two values its scalar
+space, and the gradient of
+the second lies in the first exactly (Demkowicz, Computing with hp-adaptive finite
+elements, 2007, ch. 11-14).
 
-Where an element touches the rim of the disc, bubbles ``d**tau - d`` of the distance d from the rim are added: the
-field at the upper and lower edge of a pillar behaves as d**tau with tau near 0.7 for a dielectric corner of high
+Where an element touches the rim of the disc, bubbles ``d**tau - d`` of the distance d
+from the rim are added: the
+field at the upper and lower edge of a pillar behaves as d**tau with tau near 0.7 for a
+dielectric corner of high
 contrast (Meixner 1972), which no polynomial follows.
 """
 
@@ -15,7 +22,8 @@ from functools import lru_cache
 
 import numpy as np
 
-RIM_POWER = 10  # s = t**10 makes s**0.7 and s**1.3, their slopes and their products polynomials of t
+# s = t**10 makes s**0.7 and s**1.3, their slopes and their products polynomials of t
+RIM_POWER = 10
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,7 +31,8 @@ class Interval:
     """Functions of one element axis at quadrature points.
 
     point, weight: (n,) of the rule on [0, 1].
-    value: (degree + 1, n) nodal functions and bubbles; slope: (degree, n) their derivatives, see the module.
+    value: (degree + 1, n) nodal functions and bubbles; slope: (degree, n) their
+    derivatives, see the module.
     """
 
     point: np.ndarray
@@ -44,13 +53,17 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def graded(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rule on [0, 1] for integrands that are polynomials of ``s**(1 / RIM_POWER)`` and vary smoothly in s."""
+    """A rule on [0, 1] for integrands that are polynomials of ``s**(1 / RIM_POWER)``
+    and vary smoothly in s.
+    """
     t, w = gauss(n)
     return t**RIM_POWER, w * RIM_POWER * t ** (RIM_POWER - 1)
 
 
 def polynomials(degree: int, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (degree + 1, n) and slopes (degree, n) of the polynomial basis at points s."""
+    """Values (degree + 1, n) and slopes (degree, n) of the polynomial basis at points
+    s.
+    """
     legendre = np.polynomial.legendre.legvander(2 * s - 1, degree + 1).T
     norm = np.sqrt(2 * np.arange(degree) + 1)[:, None]
     value = np.empty((degree + 1, len(s)))
@@ -67,10 +80,14 @@ def plain(degree: int, points: int) -> Interval:
 
 
 @lru_cache(maxsize=64)
-def rim(degree: int, points: int, exponents: tuple[float, ...], at_end: bool) -> Interval:
-    """Polynomials and rim bubbles ``d**tau - d``, d the distance to s = 0, or to s = 1 if ``at_end``.
+def rim(
+    degree: int, points: int, exponents: tuple[float, ...], at_end: bool
+) -> Interval:
+    """Polynomials and rim bubbles ``d**tau - d``, d the distance to s = 0, or to s = 1
+    if ``at_end``.
 
-    The slope of each bubble is made orthonormal to the slopes before it, which keeps the matrices well conditioned.
+    The slope of each bubble is made orthonormal to the slopes before it, which keeps
+    the matrices well conditioned.
     """
     d, w = graded(points)
     value, slope = polynomials(degree, 1 - d if at_end else d)
@@ -88,18 +105,24 @@ def rim(degree: int, points: int, exponents: tuple[float, ...], at_end: bool) ->
                 fine_rate - part @ fine_slope[1:],
             )
         norm = np.sqrt(fine_weight @ fine_rate**2)
-        value, slope = np.vstack([value, bubble / norm]), np.vstack([slope, rate / norm])
+        value, slope = (
+            np.vstack([value, bubble / norm]),
+            np.vstack([slope, rate / norm]),
+        )
         fine_slope = np.vstack([fine_slope, fine_rate / norm])
     return Interval(1 - d if at_end else d, w, value, slope)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Square:
-    """Tensor products on the unit square, flattened: functions first, then quadrature points (xi slow, eta fast).
+    """Tensor products on the unit square, flattened: functions first, then quadrature
+    points (xi slow, eta fast).
 
-    along_xi, along_eta: covariant components of the vector functions; scalar: of the scalar ones.
+    along_xi, along_eta: covariant components of the vector functions; scalar: of the
+    scalar ones.
     turn: the functions that span the curls. weight: of the points.
-    curl: (turns, vectors), gradient: (vectors, scalars): exact relations between the coefficients.
+    curl: (turns, vectors), gradient: (vectors, scalars): exact relations between the
+    coefficients.
     """
 
     weight: np.ndarray
@@ -121,7 +144,9 @@ def difference(degree: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def square(xi: Interval, eta: Interval) -> Square:
-    """The element basis made of two interval bases; vector functions along xi come first."""
+    """The element basis made of two interval bases; vector functions along xi come
+    first.
+    """
 
     def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         flat: np.ndarray = np.einsum("ia,jb->ijab", a, b).reshape(len(a) * len(b), -1)

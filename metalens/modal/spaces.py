@@ -1,10 +1,15 @@
 """Symmetry: the field of the whole cell from the matrices of its quarter, always real.
 
-Across the y walls the field is even or odd, so one kind of wall suffices (``natural``, or ``electric``: no
-tangential component). Across the x walls a Bloch wave exp(i kx x) is neither; but mirroring x and conjugating
-leaves the problem unchanged. Fields with that symmetry are complex on the quarter cell, real along x = 0, and
-real times exp(i kx pitch / 2) along x = pitch / 2. Their real and imaginary parts are the unknowns: real matrices
-of twice the size, also with absorption. At kx = 0 the two parts decouple; the imaginary one has electric x walls,
+Across the y walls the field is even or odd, so one kind of wall suffices (``natural``,
+or ``electric``: no
+tangential component). Across the x walls a Bloch wave exp(i kx x) is neither; but
+mirroring x and conjugating
+leaves the problem unchanged. Fields with that symmetry are complex on the quarter cell,
+real along x = 0, and
+real times exp(i kx pitch / 2) along x = pitch / 2. Their real and imaginary parts are
+the unknowns: real matrices
+of twice the size, also with absorption. At kx = 0 the two parts decouple; the imaginary
+one has electric x walls,
 which is the case of light polarised along x at normal incidence.
 """
 
@@ -25,11 +30,15 @@ TYPICAL = 0.5  # pitches: disc whose mass weighs the choice
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Selection:
-    """Which quarter-cell functions carry the unknowns, for the real and the imaginary part.
+    """Which quarter-cell functions carry the unknowns, for the real and the imaginary
+    part.
 
-    order: quarter-cell numbers of the functions inside, at x = 0, and at x = pitch / 2, one after the other; inside,
-    start, end: how many of each. The unknowns are the real parts inside and at x = 0, the imaginary parts inside, and
-    the moduli at the end, where the real part is ``real`` times the modulus and the imaginary part ``imaginary`` times.
+    order: quarter-cell numbers of the functions inside, at x = 0, and at x = pitch / 2,
+    one after the other; inside,
+    start, end: how many of each. The unknowns are the real parts inside and at x = 0,
+    the imaginary parts inside, and
+    the moduli at the end, where the real part is ``real`` times the modulus and the
+    imaginary part ``imaginary`` times.
     Without Bloch phase (``real`` = 0): the functions inside alone.
     """
 
@@ -58,8 +67,12 @@ class Selection:
         return np.concatenate([picked[:first], second, picked[first:]])
 
 
-def select(wall: np.ndarray, *, electric: bool, half_phase_rad: float | None) -> Selection:
-    """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with electric x walls for None."""
+def select(
+    wall: np.ndarray, *, electric: bool, half_phase_rad: float | None
+) -> Selection:
+    """Unknowns of a Bloch wave with phase ``2 half_phase_rad`` over a pitch, or with
+    electric x walls for None.
+    """
     free = (wall & (Y0 | Y1)) == 0 if electric else np.ones(len(wall), bool)
     at_start, at_end = (wall & X0) != 0, (wall & X1) != 0
     inside = np.flatnonzero(free & ~at_start & ~at_end)
@@ -68,14 +81,22 @@ def select(wall: np.ndarray, *, electric: bool, half_phase_rad: float | None) ->
     start, end = np.flatnonzero(free & at_start), np.flatnonzero(free & at_end)
     order = np.concatenate([inside, start, end])
     return Selection(
-        order, len(inside), len(start), len(end), float(np.cos(half_phase_rad)), float(np.sin(half_phase_rad))
+        order,
+        len(inside),
+        len(start),
+        len(end),
+        float(np.cos(half_phase_rad)),
+        float(np.sin(half_phase_rad)),
     )
 
 
-def restrict(matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: bool = False) -> np.ndarray:
+def restrict(
+    matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: bool = False
+) -> np.ndarray:
     """The quarter-cell matrix acting on the real and imaginary parts of the unknowns.
 
-    rate: its derivative in the half phase, which enters by the weights at x = pitch / 2.
+    rate: its derivative in the half phase, which enters by the weights at x = pitch /
+    2.
     """
     picked = matrix.take(rows.order, 0).take(columns.order, 1)
     if not rows.periodic:
@@ -83,7 +104,11 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: b
     out = np.zeros((rows.size, columns.size))
     r, c = rows.inside, columns.inside
     first, second = r + rows.start, c + columns.start
-    cos, sin = (-columns.imaginary, columns.real) if rate else (columns.real, columns.imaginary)
+    cos, sin = (
+        (-columns.imaginary, columns.real)
+        if rate
+        else (columns.real, columns.imaginary)
+    )
     if not rate:
         out[:first, :second] = picked[:first, :second]
         out[first : first + r, second : second + c] = picked[:r, :c]
@@ -97,10 +122,13 @@ def restrict(matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: b
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Space:
-    """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase over half a pitch.
+    """Matrices of one symmetry class, in half pitches; its y walls and its Bloch phase
+    over half a pitch.
 
-    cotree: unknowns that with all gradients make a well-conditioned basis (those of the edges off a spanning tree).
-    transposed: of the gradient, sparse. within: scalars that reach into the disc; of no others the gradient does.
+    cotree: unknowns that with all gradients make a well-conditioned basis (those of the
+    edges off a spanning tree).
+    transposed: of the gradient, sparse. within: scalars that reach into the disc; of no
+    others the gradient does.
     within_transposed: their rows of ``transposed``.
     """
 
@@ -117,7 +145,9 @@ class Space:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Topology:
-    """What a symmetry class has for all diameters: its unknowns, and the rest as in ``Space``."""
+    """What a symmetry class has for all diameters: its unknowns, and the rest as in
+    ``Space``.
+    """
 
     vectors: Selection
     scalars: Selection
@@ -144,25 +174,39 @@ def topology(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> To
 
 @lru_cache(maxsize=32)
 def cotree(plan: MeshPlan, electric: bool, half_phase_rad: float | None) -> np.ndarray:
-    """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a phase."""
+    """See ``Space``; by pivoted elimination of the gradients, once for a mesh and a
+    phase.
+    """
     known = topology(plan, electric, half_phase_rad)
-    size = np.sqrt(np.diag(restrict(assemble(TYPICAL, plan).cell.mass, known.vectors, known.vectors)))
+    size = np.sqrt(
+        np.diag(
+            restrict(assemble(TYPICAL, plan).cell.mass, known.vectors, known.vectors)
+        )
+    )
     pivots = sl.qr((size[:, None] * known.gradient).T, mode="r", pivoting=True)[1]
     return np.sort(pivots[known.scalars.size :])
 
 
 def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> Space:
-    """The symmetry class with electric or natural y walls, and the given Bloch phase over half a pitch."""
+    """The symmetry class with electric or natural y walls, and the given Bloch phase
+    over half a pitch.
+    """
     plan = geometry.mesh.plan
     known = topology(plan, electric, half_phase_rad)
     vectors, scalars = known.vectors, known.scalars
 
     def part(p: Part) -> Part:
         return Part(
-            restrict(p.mass, vectors, vectors), restrict(p.curl, vectors, vectors), restrict(p.scalar, scalars, scalars)
+            restrict(p.mass, vectors, vectors),
+            restrict(p.curl, vectors, vectors),
+            restrict(p.scalar, scalars, scalars),
         )
 
-    step = None if half_phase_rad is None else (math.floor(half_phase_rad / PHASE_STEP) + 0.5) * PHASE_STEP
+    step = (
+        None
+        if half_phase_rad is None
+        else (math.floor(half_phase_rad / PHASE_STEP) + 0.5) * PHASE_STEP
+    )
     return Space(
         part(geometry.cell),
         part(geometry.disc),
@@ -176,14 +220,20 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
     )
 
 
-def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -> tuple[Space, Space]:
-    """Derivatives of ``space`` in the radius rho and in the half phase (zero without one)."""
+def space_rates(
+    geometry: Geometry, *, electric: bool, half_phase_rad: float | None
+) -> tuple[Space, Space]:
+    """Derivatives of ``space`` in the radius rho and in the half phase (zero without
+    one).
+    """
     known = topology(geometry.mesh.plan, electric, half_phase_rad)
     vectors, scalars = known.vectors, known.scalars
 
     def by_radius(p: Part) -> Part:
         return Part(
-            restrict(p.mass, vectors, vectors), restrict(p.curl, vectors, vectors), restrict(p.scalar, scalars, scalars)
+            restrict(p.mass, vectors, vectors),
+            restrict(p.curl, vectors, vectors),
+            restrict(p.scalar, scalars, scalars),
         )
 
     def by_phase(p: Part) -> Part:
@@ -199,5 +249,12 @@ def space_rates(geometry: Geometry, *, electric: bool, half_phase_rad: float | N
     rest = np.zeros(0, int), known.transposed, known.within, known.within_transposed
     return (
         Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, *rest),
-        Space(by_phase(geometry.cell), by_phase(geometry.disc), turned, electric, half_phase_rad, *rest),
+        Space(
+            by_phase(geometry.cell),
+            by_phase(geometry.disc),
+            turned,
+            electric,
+            half_phase_rad,
+            *rest,
+        ),
     )

@@ -1,13 +1,17 @@
 """First-order change of the scattering matrix when the matrices of the problem change.
 
-With u_i the field for unit power into port i, and K the symmetric operator of layer and half-spaces on the two
-interfaces, the scattering matrix is s_i·u_j - 1, u_j = 2 K⁻¹ s_j, so (fields held fixed: K is variational)
+With u_i the field for unit power into port i, and K the symmetric operator of layer and
+half-spaces on the two
+interfaces, the scattering matrix is s_i·u_j - 1, u_j = 2 K⁻¹ s_j, so (fields held
+fixed: K is variational)
 
     d S_ij = ds_i·u_j + u_i·ds_j - 1/2 u_i·dK u_j,
     u_i·dK u_j = ∫ (p_i·dN p_j - u_i·dS u_j) dz + u_i·dY u_j on both interfaces,   N = 1 / growth, S = stiffness.
 
-The integrals of products of modes are closed forms without a pole at equal wavenumbers, so degenerate modes need no
-care. All matrices are in the coordinates of the homogeneous modes; lengths are in half pitches.
+The integrals of products of modes are closed forms without a pole at equal wavenumbers,
+so degenerate modes need no
+care. All matrices are in the coordinates of the homogeneous modes; lengths are in half
+pitches.
 """
 
 from dataclasses import dataclass, replace
@@ -23,8 +27,10 @@ from metalens.modal.match import HalfSpace, Match
 class Change:
     """Rates of everything in one parameter.
 
-    k0, disc, around: of the wavenumber and the permittivities of the layer. bloch: of kx. mass, curl (n, n) and scalar
-    (b, b): of the cell; disc_mass, disc_curl, disc_scalar: of the disc; gradient: (n, b).
+    k0, disc, around: of the wavenumber and the permittivities of the layer. bloch: of
+    kx. mass, curl (n, n) and scalar
+    (b, b): of the cell; disc_mass, disc_curl, disc_scalar: of the disc; gradient: (n,
+    b).
     """
 
     k0: float
@@ -55,15 +61,27 @@ def electric_rates(
     step = disc - around
     mass = step * basis.disc_mass + around * np.eye(n)
     d_step = change.disc - change.around
-    d_mass = step * change.disc_mass + around * change.mass + d_step * basis.disc_mass + change.around * np.eye(n)
+    d_mass = (
+        step * change.disc_mass
+        + around * change.mass
+        + d_step * basis.disc_mass
+        + change.around * np.eye(n)
+    )
     stiffness = change.curl - k0**2 * d_mass - 2 * k0 * change.k0 * mass
     scalar = step * basis.disc_scalar + around * np.eye(b)
-    d_scalar = step * change.disc_scalar + around * change.scalar + d_step * basis.disc_scalar
+    d_scalar = (
+        step * change.disc_scalar + around * change.scalar + d_step * basis.disc_scalar
+    )
     d_scalar = d_scalar + change.around * np.eye(b)
     raised = raise_gradient(basis)
     lower = np.linalg.solve(k0**2 * scalar, raised.T)
     turn = change.gradient @ lower
-    inverse = -change.mass + lower.T @ (k0**2 * d_scalar + 2 * k0 * change.k0 * scalar) @ lower - turn - turn.T
+    inverse = (
+        -change.mass
+        + lower.T @ (k0**2 * d_scalar + 2 * k0 * change.k0 * scalar) @ lower
+        - turn
+        - turn.T
+    )
     return stiffness, inverse
 
 
@@ -75,47 +93,84 @@ def magnetic_rates(
     outer, step = 1 / around, 1 / disc - 1 / around
     d_outer = -change.around / around**2
     d_step = -change.disc / disc**2 - d_outer
-    stiffness = step * change.disc_curl + outer * change.curl - k0**2 * change.mass - 2 * k0 * change.k0 * np.eye(n)
+    stiffness = (
+        step * change.disc_curl
+        + outer * change.curl
+        - k0**2 * change.mass
+        - 2 * k0 * change.k0 * np.eye(n)
+    )
     a = len(basis.te)
-    stiffness[:a, :a] = stiffness[:a, :a] + d_step * basis.disc_curl + d_outer * np.diag(basis.te)
+    stiffness[:a, :a] = (
+        stiffness[:a, :a] + d_step * basis.disc_curl + d_outer * np.diag(basis.te)
+    )
     weighted = np.linalg.inv(step * basis.disc_mass + outer * np.eye(n))
-    d_weighted = step * change.disc_mass + outer * change.mass + d_step * basis.disc_mass + d_outer * np.eye(n)
+    d_weighted = (
+        step * change.disc_mass
+        + outer * change.mass
+        + d_step * basis.disc_mass
+        + d_outer * np.eye(n)
+    )
     raised = raise_gradient(basis)
     lower = raised.T / k0**2
     turn = change.gradient @ lower
-    inverse = lower.T @ (k0**2 * change.scalar + 2 * k0 * change.k0 * np.eye(b)) @ lower - turn - turn.T
+    inverse = (
+        lower.T @ (k0**2 * change.scalar + 2 * k0 * change.k0 * np.eye(b)) @ lower
+        - turn
+        - turn.T
+    )
     return stiffness, inverse - weighted @ d_weighted @ weighted
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HalfRate:
-    """Rates of the admittance operator (n, n) of a half-space and of its source vector (n,) of the zero order."""
+    """Rates of the admittance operator (n, n) of a half-space and of its source vector
+    (n,) of the zero order.
+    """
 
     admittance: np.ndarray
     source: np.ndarray
 
 
 def half_space_rate(
-    basis: Basis, half: HalfSpace, zero: int, k0: float, permittivity: float, change: Change, *, magnetic: bool
+    basis: Basis,
+    half: HalfSpace,
+    zero: int,
+    k0: float,
+    permittivity: float,
+    change: Change,
+    *,
+    magnetic: bool,
 ) -> HalfRate:
-    """A half-space is a layer of infinite height with the homogeneous modes; its zero order has its own wavenumber."""
+    """A half-space is a layer of infinite height with the homogeneous modes; its zero
+    order has its own wavenumber.
+    """
     a, change = len(basis.te), replace(change, disc=0.0, around=0.0)
     discrete = axial(k0**2 * permittivity - np.concatenate([basis.te, basis.tm]))
     factor = np.ones(basis.size, complex)
     factor[a:] = k0**2 * permittivity / discrete[a:] ** 2
     if magnetic:
         factor /= permittivity
-    stiffness, inverse = (magnetic_rates if magnetic else electric_rates)(basis, k0, permittivity, permittivity, change)
+    stiffness, inverse = (magnetic_rates if magnetic else electric_rates)(
+        basis, k0, permittivity, permittivity, change
+    )
     y = 1j * discrete * factor
-    operator = (y[:, None] * y * inverse - stiffness) * 1j / (discrete[:, None] + discrete)
-    # the zero order turns within the basis, and its exact wavenumber replaces the discrete one
-    column = stiffness[:, zero] - discrete[zero] ** 2 * factor * factor[zero] * inverse[:, zero]
+    operator = (
+        (y[:, None] * y * inverse - stiffness) * 1j / (discrete[:, None] + discrete)
+    )
+    # the zero order turns within the basis, and its exact wavenumber replaces the
+    # discrete one
+    column = (
+        stiffness[:, zero]
+        - discrete[zero] ** 2 * factor * factor[zero] * inverse[:, zero]
+    )
     gap = factor * (discrete[zero] ** 2 - discrete**2)
     gap[zero] = 1.0
     dual = change.mass[:, zero] - column / gap
     dual[zero] = change.mass[zero, zero] / 2
     y_exact = half.admittance[zero]
-    kz = axial(k0**2 * permittivity - np.concatenate([basis.te_exact, basis.tm_exact])[zero])
+    kz = axial(
+        k0**2 * permittivity - np.concatenate([basis.te_exact, basis.tm_exact])[zero]
+    )
     bloch = np.sqrt(np.concatenate([basis.te_exact, basis.tm_exact])[zero])
     d_kz = (k0 * permittivity * change.k0 - bloch * change.bloch) / kz
     d_exact = y_exact * (d_kz / kz if zero < a else 2 * change.k0 / k0 - d_kz / kz)
@@ -129,14 +184,26 @@ def half_space_rate(
 
 
 def half_space_by_permittivity(
-    basis: Basis, half: HalfSpace, zero: int, k0: float, permittivity: float, *, magnetic: bool
+    basis: Basis,
+    half: HalfSpace,
+    zero: int,
+    k0: float,
+    permittivity: float,
+    *,
+    magnetic: bool,
 ) -> HalfRate:
-    """Derivative of ``match.half_space`` in its permittivity, at fixed kx: closed forms, mode by mode."""
+    """Derivative of ``match.half_space`` in its permittivity, at fixed kx: closed
+    forms, mode by mode.
+    """
     a, e = len(basis.te), permittivity
     kz = axial(k0**2 * e - np.concatenate([basis.te_exact, basis.tm_exact]))
     by_kz = k0**2 / (2 * kz)
     te = by_kz[:a] / e - kz[:a] / e**2 if magnetic else by_kz[:a]
-    tm = -by_kz[a:] / kz[a:] ** 2 if magnetic else 1 / kz[a:] - e * by_kz[a:] / kz[a:] ** 2
+    tm = (
+        -by_kz[a:] / kz[a:] ** 2
+        if magnetic
+        else 1 / kz[a:] - e * by_kz[a:] / kz[a:] ** 2
+    )
     rate = 1j * np.concatenate([te, k0**2 * tm])
     source = np.zeros(basis.size, complex)
     source[zero] = rate[zero] / (2 * np.sqrt(half.admittance[zero]))
@@ -145,14 +212,20 @@ def half_space_by_permittivity(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Waves:
-    """Amplitudes of all layer modes, up from the foot and down from the top: (n, 2), a column per zero-order port."""
+    """Amplitudes of all layer modes, up from the foot and down from the top: (n, 2), a
+    column per zero-order port.
+    """
 
     up: np.ndarray
     down: np.ndarray
 
 
-def waves(match: Match, layer: LayerModes, height: float, foot_port: int, top_port: int) -> Waves:
-    """All amplitudes for unit power into the zero order from below and from above; ports counted on each side."""
+def waves(
+    match: Match, layer: LayerModes, height: float, foot_port: int, top_port: int
+) -> Waves:
+    """All amplitudes for unit power into the zero order from below and from above;
+    ports counted on each side.
+    """
     c, below = len(match.carry), match.foot.back.shape[0]
     x = np.exp(1j * layer.q[match.carry] * height)[:, None]
     amplitude = match.amplitude[:, [foot_port, below + top_port]]
@@ -167,7 +240,9 @@ def waves(match: Match, layer: LayerModes, height: float, foot_port: int, top_po
 
 
 def overlaps(q: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """∫ exp(i (qm + qn) z) dz and ∫ exp(i qm z + i qn (h - z)) dz over the height, (n, n) each."""
+    """∫ exp(i (qm + qn) z) dz and ∫ exp(i qm z + i qn (h - z)) dz over the height, (n,
+    n) each.
+    """
 
     def mean_exponential(z: np.ndarray) -> np.ndarray:
         small = np.abs(z) < 1e-5
@@ -180,11 +255,17 @@ def overlaps(q: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
         np.where(q.imag[:, None] >= q.imag, q, q[:, None]),
     )
     along = height * mean_exponential(1j * height * (q[:, None] + q))
-    against = height * np.exp(1j * second * height) * mean_exponential(1j * height * (first - second))
+    against = (
+        height
+        * np.exp(1j * second * height)
+        * mean_exponential(1j * height * (first - second))
+    )
     return along, against
 
 
-def layer_rate(layer: LayerModes, w: Waves, height: float, rates: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def layer_rate(
+    layer: LayerModes, w: Waves, height: float, rates: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
     """(2, 2) of ∫ (p_i·dN p_j - u_i·dS u_j) dz."""
     along, against = overlaps(layer.q, height)
     stiffness = layer.field.T @ rates[0] @ layer.field
@@ -193,10 +274,17 @@ def layer_rate(layer: LayerModes, w: Waves, height: float, rates: tuple[np.ndarr
 
     def total(matrix: np.ndarray, up: np.ndarray, down: np.ndarray) -> np.ndarray:
         same, other = matrix * along, matrix * against
-        sum_: np.ndarray = up.T @ same @ up + down.T @ same @ down + up.T @ other @ down + down.T @ other @ up
+        sum_: np.ndarray = (
+            up.T @ same @ up
+            + down.T @ same @ down
+            + up.T @ other @ down
+            + down.T @ other @ up
+        )
         return sum_
 
-    out: np.ndarray = total(inverse, rate * w.up, -rate * w.down) - total(stiffness, w.up, w.down)
+    out: np.ndarray = total(inverse, rate * w.up, -rate * w.down) - total(
+        stiffness, w.up, w.down
+    )
     return out
 
 

@@ -1,7 +1,10 @@
-"""Reduced order in the diameter: t(D) and r(D) of one wavelength and angle from a few dozen exact solves.
+"""Reduced order in the diameter: t(D) and r(D) of one wavelength and angle from a few
+dozen exact solves.
 
-The response of a pillar is a meromorphic function of its diameter, so a rational function that shares its poles
-between t and r converges geometrically through every resonance. Nodes are added where two rational fits of the
+The response of a pillar is a meromorphic function of its diameter, so a rational
+function that shares its poles
+between t and r converges geometrically through every resonance. Nodes are added where
+two rational fits of the
 same data disagree; the disagreement that is left is the error estimate.
 """
 
@@ -24,15 +27,19 @@ CHEAP_SHARE = 0.5  # of the largest disagreement: what a cheaper diameter has to
 CALM = 2  # new nodes in a row that the fit must predict within the tolerance
 SCAN = 1200  # places where the fits are compared
 FIRST = 13  # Chebyshev points that a search begins with
-FINEST_UM = 2e-5  # no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles no better
+# no two nodes are closer: no lithography resolves 20 pm, and solvers place sharp poles
+# no better
+FINEST_UM = 2e-5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nodes:
     """Exact solves of one curve, in the order they were made.
 
-    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver. energy: (n,).
-    converged: whether the last nodes were predicted within the tolerance; reason: why the search stopped.
+    diameter_um: (n,). response: (n, 2) t and r. error: (n,) of the solver. energy:
+    (n,).
+    converged: whether the last nodes were predicted within the tolerance; reason: why
+    the search stopped.
     """
 
     diameter_um: Array
@@ -60,9 +67,12 @@ class Curve:
     def __call__(self, diameter_um: Array) -> tuple[Array, Array]:
         """(..., 2) t and r, and (...) error estimate of t, not below the true error.
 
-        The estimate adds the largest disagreement with a rival fit, the residual of the fit, a tenth of the
-        tolerance, and the solver's error: mostly a small shift of the diameter, it is carried from the neighbouring
-        nodes in proportion to the slope of t, no farther than any passive pillar can be. At a node the estimate is the
+        The estimate adds the largest disagreement with a rival fit, the residual of the
+        fit, a tenth of the
+        tolerance, and the solver's error: mostly a small shift of the diameter, it is
+        carried from the neighbouring
+        nodes in proportion to the slope of t, no farther than any passive pillar can
+        be. At a node the estimate is the
         solver's own.
 
         Raises:
@@ -72,14 +82,21 @@ class Curve:
         order, right = self._around(d)
         x = self.nodes.diameter_um[order]
         if d.size and not (d.min() >= x[0] - 1e-12 and d.max() <= x[-1] + 1e-12):
-            raise DomainError(f"diameters {d.min():.6g} to {d.max():.6g} um, the curve holds {x[0]:.6g} to {x[-1]:.6g}")
+            raise DomainError(
+                f"diameters {d.min():.6g} to {d.max():.6g} um, the curve holds {x[0]:.6g} to {x[-1]:.6g}"
+            )
         solver = self.nodes.error[order]
         shift = solver / self._steepness(x)
         value = self.best(d)
-        error = self._doubt(d) + np.maximum(shift[right - 1], shift[right]) * self._steepness(d)
+        error = self._doubt(d) + np.maximum(
+            shift[right - 1], shift[right]
+        ) * self._steepness(d)
         for side in (right - 1, right):
             hit = x[side] == d
-            value[hit], error[hit] = self.nodes.response[order[side[hit]]], solver[side[hit]]
+            value[hit], error[hit] = (
+                self.nodes.response[order[side[hit]]],
+                solver[side[hit]],
+            )
         return value, np.minimum(error, 1 + np.maximum(1.0, np.abs(value[..., 0])))
 
     def solver_error(self, diameter_um: Array) -> Array:
@@ -89,31 +106,43 @@ class Curve:
         return np.asarray(np.minimum(error[right - 1], error[right]))
 
     def _around(self, diameter_um: Array) -> tuple[Array, Array]:
-        """The nodes from thin to thick, and the place among them of the thicker of the two around each diameter."""
+        """The nodes from thin to thick, and the place among them of the thicker of the
+        two around each diameter.
+        """
         order = np.argsort(self.nodes.diameter_um)
         right = np.searchsorted(self.nodes.diameter_um[order], diameter_um)
         return order, np.clip(right, 1, len(order) - 1)
 
     def _doubt(self, d: Array) -> Array:
         value = self.best(d)
-        doubt = np.max([np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0)
+        doubt = np.max(
+            [np.abs(rival(d) - value)[..., 0] for rival in self.rivals], axis=0
+        )
         return np.asarray(doubt + self.best.residual + FLOOR_SHARE * self.tolerance)
 
     def _steepness(self, d: Array) -> Array:
         """|dt/dD| and what a curve without features would have, 1/um."""
         low, high = self.nodes.diameter_um.min(), self.nodes.diameter_um.max()
         step = FINEST_UM / 100
-        rise = np.abs(self.best(d + step)[..., 0] - self.best(d - step)[..., 0]) / (2 * step)
+        rise = np.abs(self.best(d + step)[..., 0] - self.best(d - step)[..., 0]) / (
+            2 * step
+        )
         return np.asarray(rise + 2 / (high - low))
 
     def resonances(self, half_width_um: float = 0.02) -> Array:
-        """(k, 2) diameter and half-width of the poles nearer to the real axis than ``half_width_um``, um.
+        """(k, 2) diameter and half-width of the poles nearer to the real axis than
+        ``half_width_um``, um.
 
-        Poles that a rival fit does not share (within a fifth of their width) carry no meaning and are left out.
+        Poles that a rival fit does not share (within a fifth of their width) carry no
+        meaning and are left out.
         """
         low, high = self.nodes.diameter_um.min(), self.nodes.diameter_um.max()
         poles = self.best.poles()
-        poles = poles[(poles.real > low) & (poles.real < high) & (np.abs(poles.imag) < half_width_um)]
+        poles = poles[
+            (poles.real > low)
+            & (poles.real < high)
+            & (np.abs(poles.imag) < half_width_um)
+        ]
         for rival in self.rivals:
             others = rival.poles()
             if len(poles) and len(others):
@@ -141,13 +170,16 @@ def explore(
     most: int = 80,
     cheaper_um: Array | None = None,
 ) -> Nodes:
-    """Choose diameters one by one and solve them, until the rational fit predicts what comes.
+    """Choose diameters one by one and solve them, until the rational fit predicts what
+    comes.
 
     Args:
-        solve: exact response at a diameter, on one discretisation (jumps look like resonances).
+        solve: exact response at a diameter, on one discretisation (jumps look like
+            resonances).
         first: Chebyshev points to begin with.
         most: solves at most; where they do not suffice ``converged`` is False.
-        cheaper_um: (any,) diameters that cost less, taken where they tell half as much as the best, or more.
+        cheaper_um: (any,) diameters that cost less, taken where they tell half as much
+            as the best, or more.
     """
     cheaper = np.array([] if cheaper_um is None else cheaper_um, float)
     cheaper = cheaper[(cheaper > low_um) & (cheaper < high_um)]
@@ -158,7 +190,9 @@ def explore(
     while calm < CALM and len(x) < most:
         fit, simpler = _fits(np.array(x), _responses(made), tolerance)
         where, doubt = _suspect(fit, [simpler, *past[-2:]], np.array(x), cheaper)
-        enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(simpler.support)
+        enough = simpler.residual <= FIT_SHARE * tolerance and len(fit.support) > len(
+            simpler.support
+        )
         still = enough and doubt < DOUBT_SHARE * tolerance
         where = _widest_gap(x, cheaper) if still and calm == 0 else where
         response = solve(where)
@@ -172,7 +206,10 @@ def explore(
         if calm == CALM
         else f"{most} solves do not meet {tolerance:g}"
     )
-    errors, energies = np.array([m.t_error for m in made]), np.array([m.energy for m in made])
+    errors, energies = (
+        np.array([m.t_error for m in made]),
+        np.array([m.energy for m in made]),
+    )
     return Nodes(np.array(x), _responses(made), errors, energies, calm == CALM, reason)
 
 
@@ -180,32 +217,50 @@ def curve(nodes: Nodes, *, tolerance: float) -> Curve:
     """The rational curve through exact solves, and the rivals that judge it."""
     x, y = nodes.diameter_um, nodes.response
     best, simpler = _fits(x, y, tolerance)
-    shorter = tuple(rational.fit(x[:-k], y[:-k], tolerance=FIT_SHARE * tolerance) for k in (1, 2))
+    shorter = tuple(
+        rational.fit(x[:-k], y[:-k], tolerance=FIT_SHARE * tolerance) for k in (1, 2)
+    )
     return Curve(nodes, best, (simpler, *shorter), tolerance)
 
 
 def _fits(x: Array, y: Array, tolerance: float) -> tuple[Rational, Rational]:
-    """A fit with a pole more than the data ask for, and the fit of least degree that meets them."""
+    """A fit with a pole more than the data ask for, and the fit of least degree that
+    meets them.
+    """
     simpler = rational.fit(x, y, tolerance=FIT_SHARE * tolerance)
-    best = rational.fit(x, y, tolerance=0.0, terms=len(simpler.support) + 1, start=simpler.support)
+    best = rational.fit(
+        x, y, tolerance=0.0, terms=len(simpler.support) + 1, start=simpler.support
+    )
     return best, simpler
 
 
-def _suspect(fit: Rational, rivals: list[Rational], x: Array, cheaper: Array) -> tuple[float, float]:
-    """Where the fits disagree most, or nearly so at a cheaper place, and by how much at most; narrow resonances are
+def _suspect(
+    fit: Rational, rivals: list[Rational], x: Array, cheaper: Array
+) -> tuple[float, float]:
+    """Where the fits disagree most, or nearly so at a cheaper place, and by how much at
+    most; narrow resonances are
     looked at on their own scale."""
     low, high = x.min(), x.max()
     poles = fit.poles()
-    poles = poles[(poles.real > low) & (poles.real < high) & (np.abs(poles.imag) < 0.1 * (high - low))]
+    poles = poles[
+        (poles.real > low)
+        & (poles.real < high)
+        & (np.abs(poles.imag) < 0.1 * (high - low))
+    ]
     around = [poles.real + side * np.abs(poles.imag) for side in (-3, -1, 0, 1, 3)]
-    even, near = np.concatenate([np.linspace(low, high, SCAN + 1), cheaper]), np.concatenate(around)
+    even, near = (
+        np.concatenate([np.linspace(low, high, SCAN + 1), cheaper]),
+        np.concatenate(around),
+    )
     even = even[_distance(even, x) > (high - low) / (5 * len(x))]
     near = near[(near > low) & (near < high) & (_distance(near, x) > FINEST_UM)]
     places = np.concatenate([even, near])
     value = fit(places)[:, 0]
     doubt = np.max([np.abs(rival(places)[:, 0] - value) for rival in rivals], axis=0)
     worst = int(np.argmax(doubt))
-    cheap = np.flatnonzero(np.isin(places, cheaper) & (doubt >= CHEAP_SHARE * doubt[worst]))
+    cheap = np.flatnonzero(
+        np.isin(places, cheaper) & (doubt >= CHEAP_SHARE * doubt[worst])
+    )
     chosen = cheap[np.argmax(doubt[cheap])] if len(cheap) else worst
     return float(places[chosen]), float(doubt[worst])
 
@@ -215,12 +270,19 @@ def _distance(places: Array, x: Array) -> Array:
 
 
 def _widest_gap(x: list[float], cheaper: Array) -> float:
-    """The middle of the widest gap, or the cheaper place nearest to it in the middle half."""
+    """The middle of the widest gap, or the cheaper place nearest to it in the middle
+    half.
+    """
     ordered = np.sort(x)
     widest = int(np.argmax(np.diff(ordered)))
-    middle, quarter = (ordered[widest] + ordered[widest + 1]) / 2, (ordered[widest + 1] - ordered[widest]) / 4
+    middle, quarter = (
+        (ordered[widest] + ordered[widest + 1]) / 2,
+        (ordered[widest + 1] - ordered[widest]) / 4,
+    )
     away = np.abs(cheaper - middle)
-    return float(cheaper[np.argmin(away)] if away.min(initial=np.inf) < quarter else middle)
+    return float(
+        cheaper[np.argmin(away)] if away.min(initial=np.inf) < quarter else middle
+    )
 
 
 def _responses(made: list[Response]) -> Array:

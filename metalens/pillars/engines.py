@@ -1,4 +1,6 @@
-"""Which solver takes a pillar cell, and one whose error changes smoothly with the diameter."""
+"""Which solver takes a pillar cell, and one whose error changes smoothly with the
+diameter.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -11,25 +13,38 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.pillars.curve import FIRST, starts
 
-PROBES = [4, 7, FIRST - 1]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
-MESHES = 3  # that a curve takes: the one that serves most diameters, and what follows it beside a resonance
-ENOUGH = 1.2  # of the tolerance, half of an entry's: with the share of the fit the entry is still within its own
+PROBES = [
+    4,
+    7,
+    FIRST - 1,
+]  # of the diameters that a curve begins with: 0.25, 0.63 and 1 of the span
+# that a curve takes: the one that serves most diameters, and what follows it beside a
+# resonance
+MESHES = 3
+# of the tolerance, half of an entry's: with the share of the fit the entry is still
+# within its own
+ENOUGH = 1.2
 Engine = Literal["auto", "rcwa", "modal"]
 
 
 def choose(cell: Cell, engine: Engine = "auto") -> str:
-    """``modal`` for round pillars on a square lattice (more precise, and faster where upright), ``rcwa`` for others.
+    """``modal`` for round pillars on a square lattice (more precise, and faster where
+    upright), ``rcwa`` for others.
 
     Tilted walls and films need real half-spaces beyond them, as the sweep does anyhow.
     """
     if engine == "modal" and not cell.round:
-        raise CellError(f"the modal engine takes round pillars on a square lattice, not {cell.described}: use 'rcwa'")
+        raise CellError(
+            f"the modal engine takes round pillars on a square lattice, not {cell.described}: use 'rcwa'"
+        )
     if engine == "auto":
         return "modal" if cell.round else "rcwa"
     return engine
 
 
-def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Callable[[float], Response]:
+def precise(
+    cell: Cell, light: Light, *, tolerance: float, engine: str
+) -> Callable[[float], Response]:
     """Response at a diameter, refined until its own error estimate meets the tolerance."""
     if engine == "modal":
         return functools.partial(_modal, cell, light, tolerance)
@@ -37,50 +52,81 @@ def precise(cell: Cell, light: Light, *, tolerance: float, engine: str) -> Calla
 
 
 def smooth(
-    cell: Cell, light: Light, span_um: tuple[float, float], *, tolerance: float, engine: str
+    cell: Cell,
+    light: Light,
+    span_um: tuple[float, float],
+    *,
+    tolerance: float,
+    engine: str,
 ) -> Callable[[float], Response]:
-    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so far as it goes."""
+    """As :func:`precise`, on one discretisation for all diameters of ``span_um``, so
+    far as it goes.
+    """
     return smooth_all(cell, [light], span_um, tolerance=tolerance, engine=engine)[0]
 
 
 def smooth_all(
-    cell: Cell, lights: Sequence[Light], span_um: tuple[float, float], *, tolerance: float, engine: str
+    cell: Cell,
+    lights: Sequence[Light],
+    span_um: tuple[float, float],
+    *,
+    tolerance: float,
+    engine: str,
 ) -> list[Callable[[float], Response]]:
     """:func:`smooth` for several lights, on the discretisation that all of them need.
 
-    It is the least that meets the tolerance at three probes, which a curve over the span solves anyhow: answers are
-    remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is reported), but it has no jumps that
-    a rational fit would take for resonances. Meshes of the modal method need meet it at two of the probes: beside a
-    resonance, where the error is many times that elsewhere, the next mesh takes over. The jump there is the true error
+    It is the least that meets the tolerance at three probes, which a curve over the
+    span solves anyhow: answers are
+    remembered. Elsewhere the error of coupled waves may exceed the tolerance (it is
+    reported), but it has no jumps that
+    a rational fit would take for resonances. Meshes of the modal method need meet it at
+    two of the probes: beside a
+    resonance, where the error is many times that elsewhere, the next mesh takes over.
+    The jump there is the true error
     of the coarser mesh, some tenth of its bar.
     """
     if cell.height_um == 0 or (engine == "modal" and not upright(cell, engine)):
-        return [functools.cache(precise(cell, light, tolerance=tolerance, engine=engine)) for light in lights]
+        return [
+            functools.cache(precise(cell, light, tolerance=tolerance, engine=engine))
+            for light in lights
+        ]
     make = _modal_levels if engine == "modal" else _rcwa_levels
-    of_lights = [[functools.cache(level) for level in make(cell, light, span_um[1], tolerance)] for light in lights]
+    of_lights = [
+        [functools.cache(level) for level in make(cell, light, span_um[1], tolerance)]
+        for light in lights
+    ]
     levels = list(zip(*of_lights, strict=True))
     probes = np.array(starts(*span_um))[PROBES].tolist()
     allowed = 1 if engine == "modal" else 0
     for place, level in enumerate(levels[:-1]):
         if all(_failing(at, probes, allowed) <= allowed for at in level):
             taken = levels[place : place + MESHES] if engine == "modal" else [level]
-            return [_stepped(meshes, ENOUGH * tolerance) for meshes in zip(*taken, strict=True)]
+            return [
+                _stepped(meshes, ENOUGH * tolerance)
+                for meshes in zip(*taken, strict=True)
+            ]
     return list(levels[-1])
 
 
 def upright(cell: Cell, engine: str) -> bool:
-    """Whether the modal engine solves the pillar by itself: its lights of one direction then share modes and a mesh."""
+    """Whether the modal engine solves the pillar by itself: its lights of one direction
+    then share modes and a mesh.
+    """
     return engine == "modal" and not (cell.under or cell.over or cell.sidewall_rad)
 
 
 def at_the_finest(cell: Cell, errors: Array, tolerance: float) -> bool:
-    """Whether :func:`smooth` took the finest discretisation there is, by the errors of the nodes that came of it (the
-    first ones as a curve begins with): a pillar solved by itself has no less error then."""
+    """Whether :func:`smooth` took the finest discretisation there is, by the errors of
+    the nodes that came of it (the
+    first ones as a curve begins with): a pillar solved by itself has no less error
+    then."""
     return not cell.round and bool(errors[PROBES].max() > tolerance)
 
 
 def _failing(at: Callable[[float], Response], probes: list[float], allowed: int) -> int:
-    """How many probes miss the tolerance, counted no further than one more than are allowed."""
+    """How many probes miss the tolerance, counted no further than one more than are
+    allowed.
+    """
     failing = 0
     for diameter_um in probes:
         failing += not at(diameter_um).converged
@@ -89,15 +135,21 @@ def _failing(at: Callable[[float], Response], probes: list[float], allowed: int)
     return failing
 
 
-def _stepped(meshes: Sequence[Callable[[float], Response]], enough: float) -> Callable[[float], Response]:
-    """:func:`_met`, remembered; between two diameters that needed a finer mesh, beside a resonance, that one begins."""
+def _stepped(
+    meshes: Sequence[Callable[[float], Response]], enough: float
+) -> Callable[[float], Response]:
+    """:func:`_met`, remembered; between two diameters that needed a finer mesh, beside
+    a resonance, that one begins.
+    """
     needed: dict[float, int] = {}
 
     @functools.cache
     def at(diameter_um: float) -> Response:
         below = max((known for known in needed if known < diameter_um), default=None)
         above = min((known for known in needed if known > diameter_um), default=None)
-        begin = 0 if below is None or above is None else min(needed[below], needed[above])
+        begin = (
+            0 if below is None or above is None else min(needed[below], needed[above])
+        )
         needed[diameter_um], found = _met(meshes, diameter_um, enough, begin)
         return found
 
@@ -105,11 +157,16 @@ def _stepped(meshes: Sequence[Callable[[float], Response]], enough: float) -> Ca
 
 
 def _met(
-    meshes: Sequence[Callable[[float], Response]], diameter_um: float, enough: float, begin: int = 0
+    meshes: Sequence[Callable[[float], Response]],
+    diameter_um: float,
+    enough: float,
+    begin: int = 0,
 ) -> tuple[int, Response]:
-    """Of the first mesh from ``begin`` on that meets the tolerance at this diameter, else of the best; its place first.
+    """Of the first mesh from ``begin`` on that meets the tolerance at this diameter,
+    else of the best; its place first.
 
-    The third costs several times as much as both before, and is asked where neither has an error of ``enough`` or less.
+    The third costs several times as much as both before, and is asked where neither has
+    an error of ``enough`` or less.
     """
     tried: list[tuple[int, Response]] = []
     for place in range(begin, len(meshes)):
@@ -121,7 +178,9 @@ def _met(
     return min(tried, key=lambda made: made[1].t_error)
 
 
-def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
+def _modal_levels(
+    cell: Cell, light: Light, largest_um: float, tolerance: float
+) -> list[Callable[[float], Response]]:
     """One mesh a level: the one that the ladder takes for the largest diameter."""
     from metalens.modal import RUNGS, Rung, case_of, evaluate, first_rung
 
@@ -133,21 +192,36 @@ def _modal_levels(cell: Cell, light: Light, largest_um: float, tolerance: float)
             made = evaluate(case, mesh.plan, weak=rung.weak)
             error = rung.error(made, case.rho, mesh=mesh)
             t, r = complex(made.matrix[1, 0]), complex(made.matrix[0, 0])
-            return Response(t, r, error, made.unknowns, made.energy, "modal", error <= tolerance, f"mesh {rung.name}")
+            return Response(
+                t,
+                r,
+                error,
+                made.unknowns,
+                made.energy,
+                "modal",
+                error <= tolerance,
+                f"mesh {rung.name}",
+            )
 
         return at
 
     return [level(rung) for rung in RUNGS[max(0, first_rung(tolerance) - 1) :]]
 
 
-def _rcwa_levels(cell: Cell, light: Light, largest_um: float, tolerance: float) -> list[Callable[[float], Response]]:
+def _rcwa_levels(
+    cell: Cell, light: Light, largest_um: float, tolerance: float
+) -> list[Callable[[float], Response]]:
     reaches: tuple[int, ...] = (6, 8, 10, 12, 14)
     if not cell.round:
         from metalens.rcwa import most_harmonics
 
-        most = most_harmonics(cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad)
+        most = most_harmonics(
+            cell, largest_um, angle_rad=light.angle_rad, azimuth_rad=light.azimuth_rad
+        )
         reaches = (*range(6, most - 1, 2), most) if most > 6 else (most - 1, most)
-    return [functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches]
+    return [
+        functools.partial(_rcwa, cell, light, tolerance, reach) for reach in reaches
+    ]
 
 
 def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Response:
@@ -164,7 +238,13 @@ def _modal(cell: Cell, light: Light, tolerance: float, diameter_um: float) -> Re
     )
 
 
-def _rcwa(cell: Cell, light: Light, tolerance: float, harmonics: int | None, diameter_um: float) -> Response:
+def _rcwa(
+    cell: Cell,
+    light: Light,
+    tolerance: float,
+    harmonics: int | None,
+    diameter_um: float,
+) -> Response:
     from metalens import rcwa
 
     return rcwa.solve(

@@ -1,4 +1,6 @@
-"""Few nodes in wavelength and angle: the other curves of a sweep by polynomials between them, with error estimates."""
+"""Few nodes in wavelength and angle: the other curves of a sweep by polynomials between
+them, with error estimates.
+"""
 
 import math
 
@@ -12,7 +14,8 @@ from metalens.pillars.record import Sweep
 Normal = dict[str, Polarization]
 Rows = dict[Light, Array]  # (3, diameter) complex: t, r, error estimate
 ALL_UP_TO = 6  # values of an axis that are all solved
-NARROW_UM = 0.005  # half-width of a resonance that may lie between two nodes and show at neither
+# half-width of a resonance that may lie between two nodes and show at neither
+NARROW_UM = 0.005
 MOVES_UM = 0.02  # how far it may move between two nodes
 FIRST = 5  # nodes to begin with where there are more
 NEIGHBOURS = 4  # diameters on either side whose changes count
@@ -22,7 +25,8 @@ SAFETY = 3.0  # on the extrapolated error of a polynomial
 def picks(values: tuple[float, ...]) -> tuple[float, ...]:
     """The values to solve first: all of a few, else five Leja points.
 
-    Each is where the product of the distances to those before it is largest, which keeps that product, the factor of
+    Each is where the product of the distances to those before it is largest, which
+    keeps that product, the factor of
     the error of the polynomial through them, small everywhere.
     """
     if len(values) <= ALL_UP_TO:
@@ -34,66 +38,125 @@ def picks(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(values[i] for i in sorted(chosen))
 
 
-ALIKE: dict[str, Polarization] = {"s": "x", "p": "x", "x": "x", "y": "y"}  # light along x and y meets the same cell
-UNLIKE: dict[str, Polarization] = {**ALIKE, "s": "y"}  # planes of incidence along x: s is the light along y
+ALIKE: dict[str, Polarization] = {
+    "s": "x",
+    "p": "x",
+    "x": "x",
+    "y": "y",
+}  # light along x and y meets the same cell
+UNLIKE: dict[str, Polarization] = {
+    **ALIKE,
+    "s": "y",
+}  # planes of incidence along x: s is the light along y
 
 
 def lights(
-    sweep: Sweep, wavelengths_um: tuple[float, ...], angles_deg: tuple[float, ...], normal: Normal = ALIKE
+    sweep: Sweep,
+    wavelengths_um: tuple[float, ...],
+    angles_deg: tuple[float, ...],
+    normal: Normal = ALIKE,
 ) -> list[Light]:
-    """Every distinct plane wave; ``normal``: what the polarisations are at normal incidence."""
-    found = [light(w, a, p, normal) for a in angles_deg for p in sweep.polarizations for w in wavelengths_um]
+    """Every distinct plane wave; ``normal``: what the polarisations are at normal
+    incidence.
+    """
+    found = [
+        light(w, a, p, normal)
+        for a in angles_deg
+        for p in sweep.polarizations
+        for w in wavelengths_um
+    ]
     return list(dict.fromkeys(found))
 
 
-def light(wavelength_um: float, angle_deg: float, polarization: Polarization, normal: Normal = ALIKE) -> Light:
+def light(
+    wavelength_um: float,
+    angle_deg: float,
+    polarization: Polarization,
+    normal: Normal = ALIKE,
+) -> Light:
     """The plane wave of an entry."""
-    return Light(wavelength_um, math.radians(angle_deg), polarization if angle_deg else normal[polarization])
+    return Light(
+        wavelength_um,
+        math.radians(angle_deg),
+        polarization if angle_deg else normal[polarization],
+    )
 
 
-def complete(sweep: Sweep, solved: Rows, poles: dict[Light, Array], diameters: Array, normal: Normal = ALIKE) -> Rows:
-    """All rows of the sweep: the solved ones, then between wavelengths, then between angles.
+def complete(
+    sweep: Sweep,
+    solved: Rows,
+    poles: dict[Light, Array],
+    diameters: Array,
+    normal: Normal = ALIKE,
+) -> Rows:
+    """All rows of the sweep: the solved ones, then between wavelengths, then between
+    angles.
 
-    poles: (k, 2) diameter and half-width of the resonances of every solved curve. Where a narrow one moves from one
+    poles: (k, 2) diameter and half-width of the resonances of every solved curve. Where
+    a narrow one moves from one
     node to the next, the diameters it passes have an error of 1: they must be solved.
     """
     rows = dict(solved)
     sharp = {light: found[found[:, 1] < NARROW_UM] for light, found in poles.items()}
     for polarization in sweep.polarizations:
         for angle in sweep.angles_deg:
-            family = {w: light(w, angle, polarization, normal) for w in sweep.wavelengths_um}
+            family = {
+                w: light(w, angle, polarization, normal) for w in sweep.wavelengths_um
+            }
             _fill(rows, family, sharp, diameters)
         for wavelength in sweep.wavelengths_um:
             at = {math.sin(math.radians(a)) ** 2: a for a in sweep.angles_deg}
-            family = {x: light(wavelength, a, polarization, normal) for x, a in at.items()}
+            family = {
+                x: light(wavelength, a, polarization, normal) for x, a in at.items()
+            }
             _fill(rows, family, sharp, diameters)
     return rows
 
 
-def _fill(rows: Rows, family: dict[float, Light], sharp: dict[Light, Array], diameters: Array) -> None:
-    """Add the rows of a family (position: light) that are missing, where at least five are there."""
+def _fill(
+    rows: Rows, family: dict[float, Light], sharp: dict[Light, Array], diameters: Array
+) -> None:
+    """Add the rows of a family (position: light) that are missing, where at least five
+    are there.
+    """
     have = {x: wave for x, wave in family.items() if wave in rows}
     if len(have) < FIRST:
         return
-    nodes, table = np.array(list(have)), np.stack([rows[wave] for wave in have.values()])
+    nodes, table = (
+        np.array(list(have)),
+        np.stack([rows[wave] for wave in have.values()]),
+    )
     for x, wave in family.items():
         if wave not in rows:
             row = between(nodes, table, x)
             right = int(np.searchsorted(nodes, x))
-            first, second = (sharp.get(have[float(nodes[i])], np.empty((0, 2))) for i in (right - 1, right))
+            first, second = (
+                sharp.get(have[float(nodes[i])], np.empty((0, 2)))
+                for i in (right - 1, right)
+            )
             passed = _passed(first, second, diameters)
             row[2] = np.where(passed, 1.0, row[2])
             rows[wave] = row
 
 
 def _passed(first: Array, second: Array, diameters: Array) -> Array:
-    """Mask of the diameters that narrow resonances may pass between two neighbouring nodes."""
+    """Mask of the diameters that narrow resonances may pass between two neighbouring
+    nodes.
+    """
     mask = np.zeros(len(diameters), bool)
     for here, there in ((first, second), (second, first)):
         for centre, width in here:
             gap = np.abs(there[:, 0] - centre)
-            end = float(there[np.argmin(gap), 0]) if gap.size and gap.min() < MOVES_UM else None
-            low, high = (centre - MOVES_UM, centre + MOVES_UM) if end is None else sorted((centre, end))
+            end = (
+                float(there[np.argmin(gap), 0])
+                if gap.size and gap.min() < MOVES_UM
+                else None
+            )
+            low, high = (
+                (centre - MOVES_UM, centre + MOVES_UM)
+                if end is None
+                else sorted((centre, end))
+            )
             mask |= (diameters >= low - 4 * width) & (diameters <= high + 4 * width)
     return mask
 
@@ -101,10 +164,14 @@ def _passed(first: Array, second: Array, diameters: Array) -> Array:
 def between(nodes: Array, table: Array, x: float) -> Array:
     """(3, diameter) row at ``x`` by the polynomial through all nodes.
 
-    The error is extrapolated. Leaving out one node changes the row by the error of the next lower degree, leaving out
-    two by that of the degree below; where the second is less than the first by some factor, the polynomial through
-    all nodes is better by that factor again. Changes are taken as the largest of neighbouring diameters, as any one
-    may vanish by chance; the result is trebled, and the errors of the nodes are added as they enter.
+    The error is extrapolated. Leaving out one node changes the row by the error of the
+    next lower degree, leaving out
+    two by that of the degree below; where the second is less than the first by some
+    factor, the polynomial through
+    all nodes is better by that factor again. Changes are taken as the largest of
+    neighbouring diameters, as any one
+    may vanish by chance; the result is trebled, and the errors of the nodes are added
+    as they enter.
 
     nodes: (m,). table: (m, 3, diameter).
     """
@@ -117,7 +184,13 @@ def between(nodes: Array, table: Array, x: float) -> Array:
         one = np.maximum(one, np.abs(without - row[0]))
         for j in range(k):
             fewer = keep & (np.arange(len(nodes)) != j)
-            two = np.maximum(two, np.abs(np.tensordot(lagrange(nodes[fewer], x), table[fewer, 0], 1) - without))
+            two = np.maximum(
+                two,
+                np.abs(
+                    np.tensordot(lagrange(nodes[fewer], x), table[fewer, 0], 1)
+                    - without
+                ),
+            )
     one, two = (maximum_filter1d(change, 2 * NEIGHBOURS + 1) for change in (one, two))
     gain = np.minimum(1.0, one / np.maximum(two, 1e-300))
     row[2] = SAFETY * gain * one + np.abs(weights) @ table[:, 2].real
@@ -126,5 +199,9 @@ def between(nodes: Array, table: Array, x: float) -> Array:
 
 def lagrange(nodes: Array, x: float) -> Array:
     """(m,) weights of the values at the nodes in the polynomial through them at ``x``."""
-    ratio = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
-    return np.asarray(np.prod(np.where(np.eye(len(nodes), dtype=bool), 1.0, ratio), axis=1))
+    ratio = (x - nodes[None, :]) / (
+        nodes[:, None] - nodes[None, :] + np.eye(len(nodes))
+    )
+    return np.asarray(
+        np.prod(np.where(np.eye(len(nodes), dtype=bool), 1.0, ratio), axis=1)
+    )

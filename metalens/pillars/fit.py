@@ -1,4 +1,6 @@
-"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least coefficients in tolerance."""
+"""Fit the proxy of Eq. 2 to a library: the longest domain without resonances, the least
+coefficients in tolerance.
+"""
 
 import contextlib
 import dataclasses
@@ -16,8 +18,13 @@ from metalens.pillars.record import PillarLibrary
 from metalens.pillars.stretch import LEAST_ENTRIES, Stretch, stretch
 
 TURN = 2 * math.pi
-FOLLOWED, KNOWN_SHARE = 1e-3, 0.5  # deviation from entries where none is stated, and that of the entries' own bars
-EXCLUDED = 0.1  # of the phase that a domain may lose beside a resonance for its tolerances
+FOLLOWED, KNOWN_SHARE = (
+    1e-3,
+    0.5,
+)  # deviation from entries where none is stated, and that of the entries' own bars
+EXCLUDED = (
+    0.1  # of the phase that a domain may lose beside a resonance for its tolerances
+)
 POWERS = (3, 2, 1)
 HEADROOM = 2e-6  # |T| stays this far below 1: a few roundings of float32
 MOST_TERMS = 24  # coefficients in the diameter of one curve
@@ -29,12 +36,15 @@ MOST_NODES = 5  # coefficients in the wavelength, and in the angle
 class Wanted:
     """What a proxy must meet.
 
-    phase_tolerance_rad, transmission_tolerance: largest deviation from the library entries; left out, 1e-3, or half
+    phase_tolerance_rad, transmission_tolerance: largest deviation from the library
+    entries; left out, 1e-3, or half
         of what the entries' own error bars say on the domain where that is more.
-    coefficients: real ones, of phase and |T| together at one wavelength and angle; more are taken only where
+    coefficients: real ones, of phase and |T| together at one wavelength and angle; more
+    are taken only where
         fewer would leave less than a full turn.
     least_transmission: a domain ends where |t| falls below.
-    least_half_width_um: a domain ends at resonances narrower than this: a pillar so little off would jump.
+    least_half_width_um: a domain ends at resonances narrower than this: a pillar so
+    little off would jump.
     within_um: (least, largest) diameter to consider; all entries without it.
     """
 
@@ -48,13 +58,23 @@ class Wanted:
     @property
     def tolerances(self) -> tuple[float, float]:
         """Of phase (rad) and |T|."""
-        return self.phase_tolerance_rad or FOLLOWED, self.transmission_tolerance or FOLLOWED
+        return (
+            self.phase_tolerance_rad or FOLLOWED,
+            self.transmission_tolerance or FOLLOWED,
+        )
 
     def settled(self, entry_error: float) -> "Wanted":
-        """What is left out, by the errors of the entries themselves: no curve need follow what is not known."""
+        """What is left out, by the errors of the entries themselves: no curve need
+        follow what is not known.
+        """
         usual = max(FOLLOWED, KNOWN_SHARE * entry_error)
-        phase, level = self.phase_tolerance_rad or usual, self.transmission_tolerance or usual
-        return dataclasses.replace(self, phase_tolerance_rad=phase, transmission_tolerance=level)
+        phase, level = (
+            self.phase_tolerance_rad or usual,
+            self.transmission_tolerance or usual,
+        )
+        return dataclasses.replace(
+            self, phase_tolerance_rad=phase, transmission_tolerance=level
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +91,15 @@ class Trial:
 class ProxyFit:
     """A proxy and why it is as it is.
 
-    notes: where its domain was cut, and why. table: error against the number of coefficients on that domain.
+    notes: where its domain was cut, and why. table: error against the number of
+    coefficients on that domain.
     turns: covered by the domain, the least over wavelengths and angles.
-    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their mean.
-    shortfall: by how much the proxy misses the tolerances that were wanted, for a person; empty where it meets them.
-    smooth_turns: covered by the diameters without resonance, as far as the proxy or not.
+    polarization_spread: largest |t_s - t_p| / 2 on the domain; the proxy holds their
+    mean.
+    shortfall: by how much the proxy misses the tolerances that were wanted, for a
+    person; empty where it meets them.
+    smooth_turns: covered by the diameters without resonance, as far as the proxy or
+    not.
     """
 
     proxy: Proxy
@@ -101,9 +125,12 @@ class Data:
 def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
     """The proxy of a library.
 
-    Every other diameter is fitted (least largest deviation, by Lawson's weights), all are judged: half of them
-    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have their own polynomials in
-    diameter^power; |T| is scaled until its certified bound lies below 1. Where so few entries allow only a
+    Every other diameter is fitted (least largest deviation, by Lawson's weights), all
+    are judged: half of them
+    the fit never saw. The phase is monotone, as the library's is. Phase and |T| have
+    their own polynomials in
+    diameter^power; |T| is scaled until its certified bound lies below 1. Where so few
+    entries allow only a
     domain that misses the tolerances, ``shortfall`` says so.
 
     Raises:
@@ -117,31 +144,56 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         within_um=wanted.within_um,
     )
     wanted = wanted.settled(entry_error(library, smooth.diameter_um))
-    data = Data(smooth.phase, smooth.level, smooth.diameter_um, library.wavelength_um, library.angle_rad)
+    data = Data(
+        smooth.phase,
+        smooth.level,
+        smooth.diameter_um,
+        library.wavelength_um,
+        library.angle_rad,
+    )
     kept, proxy, terms = _followed(data, wanted)
     proxy = dataclasses.replace(proxy, entry_error=entry_error(library, kept.diameter))
     counts = range(4, max(18, 2 * terms + 5), 2)
-    trials = (_trial(kept, proxy.power, count) for count in counts if count // 2 < len(kept.diameter) // 3)
+    trials = (
+        _trial(kept, proxy.power, count)
+        for count in counts
+        if count // 2 < len(kept.diameter) // 3
+    )
     table = tuple(trial for trial in trials if trial is not None)
     notes = _notes(smooth, data, kept, terms)
     short = TURNS_BACK if math.isinf(_cost(proxy, wanted)) else shortfall(proxy, wanted)
-    return ProxyFit(proxy, notes, table, _turns(kept), smooth.polarization_spread, short, _turns(data))
+    return ProxyFit(
+        proxy,
+        notes,
+        table,
+        _turns(kept),
+        smooth.polarization_spread,
+        short,
+        _turns(data),
+    )
 
 
 def entry_error(library: PillarLibrary, diameter_um: Array) -> float:
-    """Root mean square of the error bars of t, relative to |t|, of the entries at some of a library's diameters."""
+    """Root mean square of the error bars of t, relative to |t|, of the entries at some
+    of a library's diameters.
+    """
     some = np.isin(library.diameter_um, diameter_um)
-    return float(np.sqrt(np.mean((library.t_error / np.abs(library.t))[..., some] ** 2)))
+    return float(
+        np.sqrt(np.mean((library.t_error / np.abs(library.t))[..., some] ** 2))
+    )
 
 
 def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
-    """The domain that a proxy follows, and its number of coefficients: those wanted; more where a full turn takes them;
+    """The domain that a proxy follows, and its number of coefficients: those wanted;
+    more where a full turn takes them;
     fewer where so few entries let those wanted swing between them."""
     terms = more = min(max(2, wanted.coefficients // 2), len(data.diameter) // 3)
     kept, proxy = _longest(data, wanted, terms)
     while more < MOST_TERMS and _turns(kept) < 1 <= _turns(data):
         more += 2
-        with contextlib.suppress(DomainError):  # more coefficients than so few entries bear: those before stand
+        with contextlib.suppress(
+            DomainError
+        ):  # more coefficients than so few entries bear: those before stand
             longer, better = _longest(data, wanted, more)
             if _cost(better, wanted) <= 1 and len(longer.diameter) > len(kept.diameter):
                 kept, proxy, terms = longer, better, more
@@ -154,7 +206,8 @@ def _followed(data: Data, wanted: Wanted) -> tuple[Data, Proxy, int]:
 
 
 def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] | None:
-    """Without the last diameters, beside what bounds the domain, where the tolerances are met so; they are excluded as
+    """Without the last diameters, beside what bounds the domain, where the tolerances
+    are met so; they are excluded as
     the resonance is, up to a tenth of the phase. None where that is not enough."""
     for count in range(len(data.diameter) - 1, LEAST_ENTRIES - 1, -1):
         some = _head(data, count)
@@ -168,7 +221,9 @@ def _shorter(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy, int] 
 
 
 def fit_proxy(library: PillarLibrary, wanted: Wanted | None = None) -> Proxy:
-    """The proxy of a library alone; :func:`fit` gives its table of error against coefficients too."""
+    """The proxy of a library alone; :func:`fit` gives its table of error against
+    coefficients too.
+    """
     return fit(library, wanted).proxy
 
 
@@ -176,15 +231,20 @@ def proxy_of(library: PillarLibrary) -> Proxy:
     """The proxy that a library holds, fitted now where it holds none.
 
     Raises:
-        DomainError: no proxy fits; a library for circular light holds none (it is fitted where that is swept).
+        DomainError: no proxy fits; a library for circular light holds none (it is
+            fitted where that is swept).
     """
     if library.proxy is None and library.sweep.light == "circular":
-        raise DomainError("a library for circular light without a proxy: make it with 'metalens library'")
+        raise DomainError(
+            "a library for circular light without a proxy: make it with 'metalens library'"
+        )
     return library.proxy if library.proxy is not None else fit_proxy(library)
 
 
 def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
-    """The longest sub-domain from the thin end on which ``terms`` coefficients meet the tolerances."""
+    """The longest sub-domain from the thin end on which ``terms`` coefficients meet the
+    tolerances.
+    """
     good, bad = min(len(data.diameter), 3 * terms), len(data.diameter) + 1
     best = _best(_head(data, good), wanted, terms)
     if best is None:
@@ -193,7 +253,9 @@ def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
             f"{data.diameter[good - 1]:.4g} um: sweep with more samples, or fewer wavelengths and angles"
         )
     while bad - good > 1:
-        middle = (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
+        middle = (
+            (good + bad + 1) // 2 if bad > len(data.diameter) else (good + bad) // 2
+        )
         trial = _best(_head(data, middle), wanted, terms)
         if trial is not None and _cost(trial, wanted) <= 1:
             good, best = middle, trial
@@ -203,7 +265,9 @@ def _longest(data: Data, wanted: Wanted, terms: int) -> tuple[Data, Proxy]:
 
 
 def shortfall(proxy: Proxy, wanted: Wanted) -> str:
-    """By how much a proxy misses its tolerances, for a person; empty where it meets them."""
+    """By how much a proxy misses its tolerances, for a person; empty where it meets
+    them.
+    """
     if missed(proxy, wanted) <= 1:
         return ""
     phase, level = wanted.tolerances
@@ -221,7 +285,8 @@ def missed(proxy: Proxy, wanted: Wanted) -> float:
 
 
 def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
-    """Of the powers of the diameter, the one with the least error in units of the tolerances; None where each takes
+    """Of the powers of the diameter, the one with the least error in units of the
+    tolerances; None where each takes
     |T| below 0 between the entries."""
     found = []
     for power in POWERS:
@@ -233,12 +298,16 @@ def _best(data: Data, wanted: Wanted, terms: int) -> Proxy | None:
 def _cost(proxy: Proxy, wanted: Wanted) -> float:
     """As :func:`missed`; infinite where the phase turns back (the library's does not)."""
     middles = [sum(proxy.wavelengths_um) / 2, *proxy.wavelengths_um]
-    monotone = all(proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad})
+    monotone = all(
+        proxy.monotone(w, a) for w in middles for a in {0.0, proxy.max_angle_rad}
+    )
     return missed(proxy, wanted) if monotone else math.inf
 
 
 def fit_terms(data: Data, power: int, terms: int) -> Proxy:
-    """The proxy with ``terms`` coefficients in diameter^power for the phase, and as many for |T|."""
+    """The proxy with ``terms`` coefficients in diameter^power for the phase, and as
+    many for |T|.
+    """
     axes = _axes(data, power)
     phase = _minimax(axes, data.phase, terms)
     level = _minimax(axes, data.level, terms)
@@ -246,7 +315,8 @@ def fit_terms(data: Data, power: int, terms: int) -> Proxy:
     if high > 1 - HEADROOM:
         level = level * ((1 - HEADROOM) / high)
     errors = [
-        float(np.abs(_evaluate(axes, c) - values).max()) for c, values in ((phase, data.phase), (level, data.level))
+        float(np.abs(_evaluate(axes, c) - values).max())
+        for c, values in ((phase, data.phase), (level, data.level))
     ]
     flat = len(data.angle) == 1
     return Proxy(
@@ -276,31 +346,46 @@ def _unit(values: Array) -> Array:
 
 
 def _evaluate(axes: tuple[Array, Array, Array], coefficients: Array) -> Array:
-    a, w, d = (chebyshev.chebvander(x, n - 1) for x, n in zip(axes, coefficients.shape, strict=True))
-    return np.asarray(np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True))
+    a, w, d = (
+        chebyshev.chebvander(x, n - 1)
+        for x, n in zip(axes, coefficients.shape, strict=True)
+    )
+    return np.asarray(
+        np.einsum("ai,wj,dk,ijk->awd", a, w, d, coefficients, optimize=True)
+    )
 
 
 def _minimax(axes: tuple[Array, Array, Array], values: Array, terms: int) -> Array:
-    """Tensor coefficients: every curve by itself in the diameter, then its coefficients in wavelength and angle.
+    """Tensor coefficients: every curve by itself in the diameter, then its coefficients
+    in wavelength and angle.
 
-    Up to five wavelengths or angles are met exactly by polynomials of them, more by least squares.
+    Up to five wavelengths or angles are met exactly by polynomials of them, more by
+    least squares.
     """
     curves = _lawson(chebyshev.chebvander(axes[2][::2], terms - 1), values[:, :, ::2])
     for axis in (0, 1):
         basis = chebyshev.chebvander(axes[axis], min(len(axes[axis]), MOST_NODES) - 1)
-        curves = np.moveaxis(np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis)
+        curves = np.moveaxis(
+            np.tensordot(np.linalg.pinv(basis), curves, (1, axis)), 0, axis
+        )
     return curves
 
 
 def _lawson(basis: Array, values: Array, *, rounds: int = 40) -> Array:
-    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson 1961: weights times
+    """(..., terms) coefficients of least largest deviation from (..., n) values (Lawson
+    1961: weights times
     deviation)."""
     weight = np.ones(values.shape)
-    best, least = np.zeros((*values.shape[:-1], basis.shape[1])), np.full(values.shape[:-1], np.inf)
+    best, least = (
+        np.zeros((*values.shape[:-1], basis.shape[1])),
+        np.full(values.shape[:-1], np.inf),
+    )
     for _ in range(rounds):
         root = np.sqrt(weight)[..., None]
         q, r = np.linalg.qr(basis * root)
-        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[..., 0]
+        c = np.linalg.solve(r, np.swapaxes(q, -1, -2) @ (values[..., None] * root))[
+            ..., 0
+        ]
         off = np.abs(np.einsum("nk,...k->...n", basis, c) - values)
         worst = off.max(axis=-1)
         better = worst < least
@@ -316,11 +401,19 @@ def _trial(data: Data, power: int, coefficients: int) -> Trial | None:
         proxy = fit_terms(data, power, coefficients // 2)
     except DomainError:
         return None
-    return Trial(coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error)
+    return Trial(
+        coefficients, power, proxy.max_phase_error_rad, proxy.max_transmission_error
+    )
 
 
 def _head(data: Data, count: int) -> Data:
-    return Data(data.phase[..., :count], data.level[..., :count], data.diameter[:count], data.wavelength, data.angle)
+    return Data(
+        data.phase[..., :count],
+        data.level[..., :count],
+        data.diameter[:count],
+        data.wavelength,
+        data.angle,
+    )
 
 
 def _turns(data: Data) -> float:

@@ -1,4 +1,6 @@
-"""Phase to pillar diameter through a proxy: a table of the inverse, then Newton's steps, for millions of pillars."""
+"""Phase to pillar diameter through a proxy: a table of the inverse, then Newton's
+steps, for millions of pillars.
+"""
 
 import math
 from typing import Any, TypeVar, cast
@@ -13,16 +15,24 @@ from metalens.pillars.polynomial import Curve
 Values = TypeVar("Values")  # numpy array, torch tensor or number: leaves as it came
 
 TABLE = 4096
-SOLVED_RAD = 1e-12  # what is left of the phase: far below the 1e-10 that is promised, above rounding of 100 rad
-HALVINGS = 54  # leave nothing of a double; so does as many of Newton's steps, where a curve is flat at one end
+# what is left of the phase: far below the 1e-10 that is promised, above rounding of 100
+# rad
+SOLVED_RAD = 1e-12
+# leave nothing of a double; so does as many of Newton's steps, where a curve is flat at
+# one end
+HALVINGS = 54
 TURN = 2 * math.pi
 
 
-def diameter(p: Curve, phase_rad: Values, *, within_um: tuple[float, float] | None, gap: str) -> Values:
+def diameter(
+    p: Curve, phase_rad: Values, *, within_um: tuple[float, float] | None, gap: str
+) -> Values:
     """Diameters on a curve of the phase; see :meth:`metalens.proxy.Proxy.diameter_um`."""
     low, high = within_um or (p.low, p.high)
     if not p.low - 1e-9 <= low < high <= p.high + 1e-9:
-        raise DomainError(f"within_um = ({low}, {high}), need a range inside the curve's domain ({p.low}, {p.high}) um")
+        raise DomainError(
+            f"within_um = ({low}, {high}), need a range inside the curve's domain ({p.low}, {p.high}) um"
+        )
     if not polynomial.monotone(p, (low, high)):
         raise DomainError(
             f"the phase is not monotone between {low} and {high} um: no unique diameter; give a narrower within_um"
@@ -53,16 +63,20 @@ def _solve(p: Curve, phase: Array, within: tuple[float, float], gap: str) -> Arr
         target = (chunk.astype(np.float64) - start) % TURN
         if cover < TURN:
             beyond = target > cover
-            target[beyond] = np.where(target[beyond] - cover <= TURN - target[beyond], cover, 0.0)
+            target[beyond] = np.where(
+                target[beyond] - cover <= TURN - target[beyond], cover, 0.0
+            )
         return _newton(p, target, start, cover, table).astype(chunk.dtype)
 
     return polynomial.over_chunks(work, phase)
 
 
 def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -> Array:
-    """Diameters whose phase is start + target: linear in the table, then steps of Newton, one as a rule.
+    """Diameters whose phase is start + target: linear in the table, then steps of
+    Newton, one as a rule.
 
-    Each squares what is left, but where the slope ends in 0: there it halves it, and leaves what has no slope.
+    Each squares what is left, but where the slope ends in 0: there it halves it, and
+    leaves what has no slope.
     """
     place = target * ((TABLE - 1) / cover)
     index = np.minimum(place.astype(np.int64), TABLE - 2)
@@ -80,7 +94,9 @@ def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -
 
 
 def _table(p: Curve, within: tuple[float, float]) -> Array:
-    """(TABLE,) diameters at even steps of the phase, from the end of least phase, by bisection."""
+    """(TABLE,) diameters at even steps of the phase, from the end of least phase, by
+    bisection.
+    """
     ends = polynomial.value(p, np.array(within))
     target = np.linspace(ends.min(), ends.max(), TABLE)
     left, right = (np.full(TABLE, within[i]) for i in np.argsort(ends))
@@ -92,7 +108,9 @@ def _table(p: Curve, within: tuple[float, float]) -> Array:
 
 
 def _torch(p: Curve, phase: Any, within: tuple[float, float], gap: str) -> Any:
-    """One differentiable Newton step on the detached answer: its derivative is exactly 1 / (dphase/dD)."""
+    """One differentiable Newton step on the detached answer: its derivative is exactly
+    1 / (dphase/dD).
+    """
     import torch
 
     values = phase.detach().cpu().numpy()

@@ -1,4 +1,6 @@
-"""Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope and certified bounds."""
+"""Chebyshev polynomials of a pillar's diameter over millions of pillars: value, slope
+and certified bounds.
+"""
 
 import functools
 import math
@@ -20,12 +22,16 @@ EDGE_UM = 1e-6  # a diameter this far outside the domain is rounding
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """p(x) with x = (2 D^power - low^power - high^power) / (high^power - low^power), x in [-1, 1] on the domain.
+    """p(x) with x = (2 D^power - low^power - high^power) / (high^power - low^power), x
+    in [-1, 1] on the domain.
 
-    monomials: coefficients of 1, x, x², ... (Python floats, so that they never raise the dtype of an array).
+    monomials: coefficients of 1, x, x², ... (Python floats, so that they never raise
+    the dtype of an array).
     low, high: ends of the domain.
-    power: of the diameter; the phase of a pillar follows its area or a higher power better than its diameter.
-    ceiling: above which the exact polynomial never is: what rounding adds there is taken off.
+    power: of the diameter; the phase of a pillar follows its area or a higher power
+    better than its diameter.
+    ceiling: above which the exact polynomial never is: what rounding adds there is
+    taken off.
     """
 
     monomials: tuple[float, ...]
@@ -56,27 +62,37 @@ class Curve:
         return self.scale * self.power
 
 
-def curve(coefficients: Array, domain: tuple[float, float], power: int, ceiling: float = math.inf) -> Curve:
+def curve(
+    coefficients: Array,
+    domain: tuple[float, float],
+    power: int,
+    ceiling: float = math.inf,
+) -> Curve:
     """The curve of 1-D Chebyshev ``coefficients`` on ``domain``."""
     return Curve(_monomials(tuple(coefficients.tolist())), *domain, power, ceiling)
 
 
 @functools.lru_cache(maxsize=256)
 def _monomials(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """Of 1, x, x², ...: those of Chebyshev polynomials; value and slope at a wavelength ask for the same."""
+    """Of 1, x, x², ...: those of Chebyshev polynomials; value and slope at a wavelength
+    ask for the same.
+    """
     return tuple(float(c) for c in chebyshev.cheb2poly(coefficients))
 
 
 def value(p: Curve, diameter: Array) -> Array:
     """p(D), shape and dtype of ``diameter``.
 
-    Accuracy: of Horner's rule, a few times the rounding of the dtype times the sum of |monomials|.
+    Accuracy: of Horner's rule, a few times the rounding of the dtype times the sum of
+    |monomials|.
 
     Raises:
         DomainError: a diameter lies outside the domain, or is not a number.
     """
     check(p, diameter)
-    return over_chunks(lambda d: np.minimum(horner(p.monomials, unit(p, d)), p.ceiling), diameter)
+    return over_chunks(
+        lambda d: np.minimum(horner(p.monomials, unit(p, d)), p.ceiling), diameter
+    )
 
 
 def slope(p: Curve, diameter: Array) -> Array:
@@ -86,7 +102,9 @@ def slope(p: Curve, diameter: Array) -> Array:
 
 
 def pulled_back(p: Curve, diameter: Array, weight: Array) -> Array:
-    """``weight`` times dp/dD in one pass; the diameters were checked before, the weight may be broadcast."""
+    """``weight`` times dp/dD in one pass; the diameters were checked before, the weight
+    may be broadcast.
+    """
 
     def part(start: int, d: Array) -> Array:
         rise = slope_of(p, d)
@@ -131,10 +149,20 @@ def unit(p: Curve, diameter: Array) -> Array:
 
 
 def monotone(p: Curve, within: tuple[float, float]) -> bool:
-    """Whether the curve rises or falls throughout: no root of its slope lies inside (certified, not sampled)."""
+    """Whether the curve rises or falls throughout: no root of its slope lies inside
+    (certified, not sampled).
+    """
     low, high = unit(p, np.array(within, float))
-    roots = np.polynomial.Polynomial(p.slope.monomials).roots() if len(p.monomials) > 2 else np.array([])
-    inside = (np.abs(roots.imag) < 1e-9) & (roots.real > low + 1e-9) & (roots.real < high - 1e-9)
+    roots = (
+        np.polynomial.Polynomial(p.slope.monomials).roots()
+        if len(p.monomials) > 2
+        else np.array([])
+    )
+    inside = (
+        (np.abs(roots.imag) < 1e-9)
+        & (roots.real > low + 1e-9)
+        & (roots.real < high - 1e-9)
+    )
     return bool(np.any(p.slope.monomials) and not inside.any())
 
 
@@ -147,8 +175,11 @@ def horner(monomials: tuple[float, ...], x: Array) -> Array:
     return total
 
 
-def over_chunks(work: Callable[..., Array], values: Array, *, places: bool = False) -> Array:
-    """``work`` elementwise over an array in cache-sized chunks, on all cores that the process may use.
+def over_chunks(
+    work: Callable[..., Array], values: Array, *, places: bool = False
+) -> Array:
+    """``work`` elementwise over an array in cache-sized chunks, on all cores that the
+    process may use.
 
     places: ``work`` also takes, first, where the chunk starts.
     """
@@ -165,7 +196,9 @@ def over_chunks(work: Callable[..., Array], values: Array, *, places: bool = Fal
     def run(start: int) -> None:
         out[start : start + CHUNK] = made(start)
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+    with ThreadPoolExecutor(
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    ) as pool:
         list(pool.map(run, range(0, flat.size, CHUNK)))
     return out.reshape(values.shape)
 
@@ -173,17 +206,25 @@ def over_chunks(work: Callable[..., Array], values: Array, *, places: bool = Fal
 def bounds(coefficients: Array, *, points: int = 64) -> tuple[float, float]:
     """Certified (lower, upper) bound of a tensor Chebyshev sum on [-1, 1]^n.
 
-    With N >= points * degree Chebyshev nodes on the last axis (24 * degree on the others), a polynomial q of degree d
+    With N >= points * degree Chebyshev nodes on the last axis (24 * degree on the
+    others), a polynomial q of degree d
     has max|q| <= max over the nodes |q| / cos(pi d / 2N) an axis (Ehlich and Zeller 1964); applied to q = p - middle.
 
-    Accuracy: the bound is too wide by at most 3e-4 (points = 64) of the polynomial's half-range for the last axis and
+    Accuracy: the bound is too wide by at most 3e-4 (points = 64) of the polynomial's
+    half-range for the last axis and
     2e-3 for each other.
     """
     values, slack = np.asarray(coefficients, float), 1.0
     for axis, count in enumerate(values.shape):
         degree = count - 1
-        nodes = chebyshev.chebpts1(max(1, (points if axis == values.ndim - 1 else 24) * degree))
-        values = np.moveaxis(np.tensordot(chebyshev.chebvander(nodes, degree), values, (1, axis)), 0, axis)
+        nodes = chebyshev.chebpts1(
+            max(1, (points if axis == values.ndim - 1 else 24) * degree)
+        )
+        values = np.moveaxis(
+            np.tensordot(chebyshev.chebvander(nodes, degree), values, (1, axis)),
+            0,
+            axis,
+        )
         slack /= math.cos(math.pi * degree / (2 * len(nodes))) if degree else 1.0
     middle, half = (values.max() + values.min()) / 2, (values.max() - values.min()) / 2
     return float(middle - half * slack), float(middle + half * slack)

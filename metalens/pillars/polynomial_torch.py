@@ -1,4 +1,6 @@
-"""The polynomials of :mod:`metalens.pillars.polynomial` for torch tensors, with exact derivatives of every order."""
+"""The polynomials of :mod:`metalens.pillars.polynomial` for torch tensors, with exact
+derivatives of every order.
+"""
 
 from typing import Any, cast
 
@@ -9,7 +11,9 @@ from metalens.pillars.polynomial import Curve
 
 
 def value(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
-    """p(D) on the device and in the dtype of ``diameter``; differentiable by backward, forward and vmap."""
+    """p(D) on the device and in the dtype of ``diameter``; differentiable by backward,
+    forward and vmap.
+    """
     return cast(torch.Tensor, _Polynomial.apply(diameter, p, 0))  # type: ignore[no-untyped-call]
 
 
@@ -22,11 +26,17 @@ def _bend(p: Curve, diameter: torch.Tensor) -> torch.Tensor:
     """d²p/dD², in differentiable operations: x' = a D^m gives p'' x'² + p' x''."""
     m = p.power - 1
     bend = value(p.slope.slope, diameter) * (p.inner_slope * diameter**m) ** 2
-    return bend + value(p.slope, diameter) * (p.inner_slope * m * diameter ** (m - 1)) if m else bend
+    return (
+        bend + value(p.slope, diameter) * (p.inner_slope * m * diameter ** (m - 1))
+        if m
+        else bend
+    )
 
 
 class _Polynomial(torch.autograd.Function):
-    """Elementwise p(D) (order 0) or dp/dD (order 1) that keeps only its input for the backward pass."""
+    """Elementwise p(D) (order 0) or dp/dD (order 1) that keeps only its input for the
+    backward pass.
+    """
 
     @staticmethod
     def forward(diameter: torch.Tensor, p: Curve, order: int) -> torch.Tensor:
@@ -45,9 +55,15 @@ class _Polynomial(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Any) -> Any:
         (diameter,) = ctx.saved_tensors
         weight = gradients[0]
-        plain = not (ctx.order or torch.is_grad_enabled() or torch._C._functorch.maybe_current_level())
+        plain = not (
+            ctx.order
+            or torch.is_grad_enabled()
+            or torch._C._functorch.maybe_current_level()
+        )
         if plain and diameter.device.type == "cpu" and weight.dtype == diameter.dtype:
-            fused = polynomial.pulled_back(ctx.curve, diameter.detach().numpy(), weight.detach().numpy())
+            fused = polynomial.pulled_back(
+                ctx.curve, diameter.detach().numpy(), weight.detach().numpy()
+            )
             return torch.from_numpy(fused), None, None
         return weight * (_bend if ctx.order else slope)(ctx.curve, diameter), None, None
 
@@ -57,7 +73,13 @@ class _Polynomial(torch.autograd.Function):
         return tangents[0] * (_bend if ctx.order else slope)(ctx.curve, diameter)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], diameter: torch.Tensor, p: Curve, order: int) -> tuple[Any, Any]:
+    def vmap(
+        info: Any,
+        in_dims: tuple[Any, ...],
+        diameter: torch.Tensor,
+        p: Curve,
+        order: int,
+    ) -> tuple[Any, Any]:
         return (slope if order else value)(p, diameter), in_dims[0]
 
 

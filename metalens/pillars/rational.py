@@ -1,4 +1,6 @@
-"""Rational interpolation in barycentric form: adaptive choice of support points (AAA), values and poles."""
+"""Rational interpolation in barycentric form: adaptive choice of support points (AAA),
+values and poles.
+"""
 
 from dataclasses import dataclass
 
@@ -10,7 +12,8 @@ from metalens.ground.arrays import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rational:
-    """r(x) = sum_j w_j f_j / (x - z_j) over sum_j w_j / (x - z_j); all components share their poles.
+    """r(x) = sum_j w_j f_j / (x - z_j) over sum_j w_j / (x - z_j); all components share
+    their poles.
 
     support: (m,) real points z.
     values: (m, components) f at the support.
@@ -24,7 +27,9 @@ class Rational:
     residual: float
 
     def __call__(self, x: Array) -> Array:
-        """(*shape of x, components); the support values where ``x`` meets a support point."""
+        """(*shape of x, components); the support values where ``x`` meets a support
+        point.
+        """
         flat = np.asarray(x, float).reshape(-1)
         gap = flat[:, None] - self.support
         row, column = np.nonzero(gap == 0)
@@ -36,7 +41,9 @@ class Rational:
         return np.asarray(out.reshape(*np.shape(x), self.values.shape[1]))
 
     def poles(self) -> Array:
-        """(m - 1,) complex poles at most: finite eigenvalues of the arrow pencil of the denominator."""
+        """(m - 1,) complex poles at most: finite eigenvalues of the arrow pencil of the
+        denominator.
+        """
         m = len(self.support)
         if m < 2:
             return np.empty(0, complex)
@@ -44,27 +51,44 @@ class Rational:
         left[0, 1:], left[1:, 0], left[1:, 1:] = self.weights, 1, np.diag(self.support)
         right = np.eye(m + 1)
         right[0, 0] = 0
-        top, bottom = scipy.linalg.eig(left, right, right=False, homogeneous_eigvals=True)
+        top, bottom = scipy.linalg.eig(
+            left, right, right=False, homogeneous_eigvals=True
+        )
         finite = np.abs(bottom) > 1e-10 * np.abs(top)
         return np.asarray(top[finite] / bottom[finite])
 
 
-def fit(x: Array, y: Array, *, tolerance: float, terms: int | None = None, start: Array | None = None) -> Rational:
+def fit(
+    x: Array,
+    y: Array,
+    *,
+    tolerance: float,
+    terms: int | None = None,
+    start: Array | None = None,
+) -> Rational:
     """The rational function of least degree that meets the data within ``tolerance``.
 
-    Nakatsukasa, Sète and Trefethen, "The AAA algorithm for rational approximation", SIAM J. Sci. Comput. 40,
-    A1494 (2018): support points are taken where the fit is worst, weights from the last right singular vector
+    Nakatsukasa, Sète and Trefethen, "The AAA algorithm for rational approximation",
+    SIAM J. Sci. Comput. 40,
+    A1494 (2018): support points are taken where the fit is worst, weights from the last
+    right singular vector
     of the Loewner matrix.
 
     Args:
         x: (n,) distinct real points.
         y: (n, components).
-        tolerance: largest deviation that is accepted; below the noise of the data poles without meaning appear.
+        tolerance: largest deviation that is accepted; below the noise of the data poles
+            without meaning appear.
         terms: most support points; n // 2 + 1 without it, where all data can be met.
-        start: support points to begin with (of an earlier fit), taken where they are among ``x``.
+        start: support points to begin with (of an earlier fit), taken where they are
+            among ``x``.
     """
     limit = min(terms or len(x), len(x) // 2 + 1)
-    support = [int(i) for i in np.flatnonzero(np.isin(x, start))[:limit]] if start is not None else []
+    support = (
+        [int(i) for i in np.flatnonzero(np.isin(x, start))[:limit]]
+        if start is not None
+        else []
+    )
     if not support:
         support = [int(np.argmax(np.abs(y - y.mean(0)).max(1)))]
     while True:
@@ -76,7 +100,9 @@ def fit(x: Array, y: Array, *, tolerance: float, terms: int | None = None, start
 
 
 def _weights(x: Array, y: Array, support: list[int]) -> tuple[Array, Array]:
-    """Barycentric weights on the support, and the deviation at every data point (0 on the support)."""
+    """Barycentric weights on the support, and the deviation at every data point (0 on
+    the support).
+    """
     rest = np.ones(len(x), bool)
     rest[support] = False
     error = np.zeros(len(x))
@@ -89,6 +115,8 @@ def _weights(x: Array, y: Array, support: list[int]) -> tuple[Array, Array]:
     weights = np.linalg.svd(loewner, full_matrices=wide)[2][-1].conj()
     bottom = cauchy @ weights
     with np.errstate(divide="ignore", invalid="ignore"):
-        deviation = np.abs((cauchy @ (weights[:, None] * y[support])) / bottom[:, None] - y[rest]).max(1)
+        deviation = np.abs(
+            (cauchy @ (weights[:, None] * y[support])) / bottom[:, None] - y[rest]
+        ).max(1)
     error[rest] = np.where(np.isfinite(deviation), deviation, np.inf)
     return weights, error

@@ -1,4 +1,6 @@
-"""The stretch of a library's diameters without resonances: where the phase goes one way and the light passes."""
+"""The stretch of a library's diameters without resonances: where the phase goes one way
+and the light passes.
+"""
 
 from dataclasses import dataclass
 
@@ -17,8 +19,10 @@ UNKNOWN = 0.5  # of |t|: an entry whose error bar is larger is not known
 class Stretch:
     """Consecutive diameters without resonance.
 
-    diameter_um: (d,). phase: (angle, wavelength, d) rad, unwrapped along every axis. level: |t|, as phase.
-    notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is their mean.
+    diameter_um: (d,). phase: (angle, wavelength, d) rad, unwrapped along every axis.
+    level: |t|, as phase.
+    notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
+    their mean.
     """
 
     diameter_um: Array
@@ -35,12 +39,16 @@ def stretch(
     least_half_width_um: float,
     within_um: tuple[float, float] | None = None,
 ) -> Stretch:
-    """The stretch of most phase over which, at all wavelengths, angles and polarisations, |t| stays above
-    ``least_transmission``, the phase rises (of openings, which leave less film the wider they are, falls), and no
-    resonance is narrower than ``least_half_width_um`` and no error bar above half of |t|.
+    """The stretch of most phase over which, at all wavelengths, angles and
+    polarisations, |t| stays above
+    ``least_transmission``, the phase rises (of openings, which leave less film the
+    wider they are, falls), and no
+    resonance is narrower than ``least_half_width_um`` and no error bar above half of
+    |t|.
 
     Raises:
-        DomainError: fewer than 12 entries in any such stretch; the message says what is in the way.
+        DomainError: fewer than 12 entries in any such stretch; the message says what is
+            in the way.
     """
     low, high = within_um or (0.0, np.inf)
     inside = (library.diameter_um >= low - 1e-9) & (library.diameter_um <= high + 1e-9)
@@ -56,14 +64,30 @@ def stretch(
             f"no {LEAST_ENTRIES} diameters in a row are free of resonances ({reasons}): choose another pitch, height "
             "or material, fewer wavelengths or angles, or sweep with more samples"
         )
-    best = max(runs, key=lambda run: float(abs(phase[..., run.stop - 1] - phase[..., run.start]).min()))
+    best = max(
+        runs,
+        key=lambda run: float(
+            abs(phase[..., run.stop - 1] - phase[..., run.start]).min()
+        ),
+    )
     mean = t.mean(axis=0)[..., best]
     spread = float(np.abs(t[0] - t[-1])[..., best].max()) / 2
-    return Stretch(d[best], _unwrapped(np.angle(mean)), np.abs(mean), _notes(best, d, faults), spread)
+    return Stretch(
+        d[best],
+        _unwrapped(np.angle(mean)),
+        np.abs(mean),
+        _notes(best, d, faults),
+        spread,
+    )
 
 
 def _faults(
-    library: PillarLibrary, d: Array, t: Array, phase: Array, least: float, half_width: float
+    library: PillarLibrary,
+    d: Array,
+    t: Array,
+    phase: Array,
+    least: float,
+    half_width: float,
 ) -> list[tuple[Array, str]]:
     """(mask over the diameters, what is wrong there)."""
     faults: list[tuple[Array, str]] = []
@@ -79,7 +103,12 @@ def _faults(
     back[1:] |= turns
     back[:-1] |= turns
     faults.append(
-        (back, "the phase rises with the size of the opening" if hole else "the phase falls with the diameter")
+        (
+            back,
+            "the phase rises with the size of the opening"
+            if hole
+            else "the phase falls with the diameter",
+        )
     )
     for _, angle, wavelength, centre, width in library.resonances:
         if width < half_width and len(d) and d[0] <= centre <= d[-1]:
@@ -87,13 +116,17 @@ def _faults(
             after = int(np.searchsorted(d, centre))
             near[[max(0, after - 1), after]] = True
             text = f"resonance at {centre:.4f} um, half-width {1e3 * width:.2g} nm ({wavelength:g} um"
-            faults.append((near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")")))
+            faults.append(
+                (near, text + (f", {np.degrees(angle):.3g} deg)" if angle else ")"))
+            )
     return faults
 
 
 def _runs(good: Array) -> list[slice]:
     """Runs of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(int)))
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[False], good, [False]]).astype(int))
+    )
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
@@ -107,7 +140,9 @@ def _notes(run: slice, d: Array, faults: list[tuple[Array, str]]) -> tuple[str, 
 
 
 def _unwrapped(phase: Array) -> Array:
-    """Unwrapped along the diameter, then neighbouring wavelengths and angles at the thinnest pillar."""
+    """Unwrapped along the diameter, then neighbouring wavelengths and angles at the
+    thinnest pillar.
+    """
     phase = np.unwrap(phase, axis=-1)
     for axis in (1, 0):
         start = phase[..., :1]

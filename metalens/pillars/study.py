@@ -1,4 +1,6 @@
-"""Which pillar cell to take: over pitch, height and wavelength, how much phase do printable pillars cover smoothly?"""
+"""Which pillar cell to take: over pitch, height and wavelength, how much phase do
+printable pillars cover smoothly?
+"""
 
 import itertools
 import math
@@ -27,18 +29,36 @@ class Study:
     """What is compared.
 
     pitches_um, heights_um, wavelengths_um: every combination.
-    pillar: material of the pillars, on the substrate and under the cover of :class:`metalens.cell.Cell`.
-    cell: any cell in its place: substrate, cover, shape, lattice, films, wall and material of every pillar; its pitch
-        and height are those compared, and "diameter" is the size of its shape. Light is along x, at normal incidence.
-    min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and between two.
+    pillar: material of the pillars, on the substrate and under the cover of
+    :class:`metalens.cell.Cell`.
+    cell: any cell in its place: substrate, cover, shape, lattice, films, wall and
+    material of every pillar; its pitch
+        and height are those compared, and "diameter" is the size of its shape. Light is
+        along x, at normal incidence.
+    min_diameter_um, min_gap_um: what can be printed: the least width of a shape, and
+    between two.
     least_transmission: |t| below this ends a smooth stretch.
     least_half_width_um: so does a resonance narrower than this.
-    tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end a stretch.
-    others: materials that the chosen cell is tried with as well, where their sources hold all the wavelengths; [] for
+    tolerance: error of t, up to 0.1; diameters whose error bar is above half of |t| end
+    a stretch.
+    others: materials that the chosen cell is tried with as well, where their sources
+    hold all the wavelengths; [] for
         none.
     """
 
-    pitches_um: tuple[float, ...] = (0.28, 0.29, 0.30, 0.31, 0.32, 0.34, 0.36, 0.38, 0.40, 0.42, 0.45)
+    pitches_um: tuple[float, ...] = (
+        0.28,
+        0.29,
+        0.30,
+        0.31,
+        0.32,
+        0.34,
+        0.36,
+        0.38,
+        0.40,
+        0.42,
+        0.45,
+    )
     heights_um: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
     wavelengths_um: tuple[float, ...] = (0.85, 0.94)
     pillar: Material = PLAIN
@@ -52,9 +72,13 @@ class Study:
 
     def __post_init__(self) -> None:
         if self.cell is not None and self.pillar != PLAIN:
-            raise ConfigError("pillar and cell are both given: a cell has its own material; give pillar inside cell")
+            raise ConfigError(
+                "pillar and cell are both given: a cell has its own material; give pillar inside cell"
+            )
         if self.tolerance > MOST_ERROR:
-            raise ConfigError(f"tolerance = {self.tolerance}: need an error of t above 0 and up to {MOST_ERROR:g}")
+            raise ConfigError(
+                f"tolerance = {self.tolerance}: need an error of t above 0 and up to {MOST_ERROR:g}"
+            )
         if min(self.pitches_um) <= self.min_diameter_um + self.min_gap_um:
             raise ConfigError(
                 f"pitches_um holds {min(self.pitches_um)}: no pillar of {self.min_diameter_um} um fits beside a gap of "
@@ -66,8 +90,11 @@ class Study:
         """Of the pillars."""
         return self.pillar if self.cell is None else self.cell.pillar
 
-    def made(self, pitch_um: float, height_um: float, pillar: Material | None = None) -> Cell:
-        """One cell of the study, or the same of another material; of layers those of the pillar's own take the height.
+    def made(
+        self, pitch_um: float, height_um: float, pillar: Material | None = None
+    ) -> Cell:
+        """One cell of the study, or the same of another material; of layers those of
+        the pillar's own take the height.
 
         Raises:
             CellError: a height that the films of other materials fill.
@@ -80,7 +107,8 @@ class Study:
 class Verdict:
     """One cell at one wavelength.
 
-    turns: of phase that the longest smooth stretch covers; from_um, to_um: its diameters.
+    turns: of phase that the longest smooth stretch covers; from_um, to_um: its
+    diameters.
     least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
     ends: what bounds it above.
     max_angle_deg: of incidence in air up to which no diffraction order propagates.
@@ -102,52 +130,80 @@ class Verdict:
     pillar: str
 
 
-def run(study: Study, console: Console | None = None, *, journal: Journal | None = None) -> list[Verdict]:
-    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell with other materials.
+def run(
+    study: Study, console: Console | None = None, *, journal: Journal | None = None
+) -> list[Verdict]:
+    """Verdicts on every combination, wavelength by wavelength, then on the chosen cell
+    with other materials.
 
     Args:
-        journal: of the curves that an interrupted run has solved; the verdicts are the same.
+        journal: of the curves that an interrupted run has solved; the verdicts are the
+            same.
 
     Raises:
-        CellError: a pitch at which diffraction orders propagate; it is named, with the largest that has none. Sizes
+        CellError: a pitch at which diffraction orders propagate; it is named, with the
+            largest that has none. Sizes
             that do not fit.
-        MaterialError: unknown, or a wavelength outside the range of a material of the cell.
+        MaterialError: unknown, or a wavelength outside the range of a material of the
+            cell.
     """
     for wavelength, pitch in itertools.product(study.wavelengths_um, study.pitches_um):
-        check_light(study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,)))
+        check_light(
+            study.made(pitch, study.heights_um[0]), Sweep(wavelengths_um=(wavelength,))
+        )
     tried, _ = others(study)
     shapes = itertools.product(study.wavelengths_um, study.heights_um, study.pitches_um)
-    cases = [(study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes]
+    cases = [
+        (study.made(pitch, height), wavelength) for wavelength, height, pitch in shapes
+    ]
     journal = journal or Journal(None)
     verdicts = _judged(study, cases, journal, console or Console(quiet=True))
     best = choice(study, verdicts)
     if best is None:
         return verdicts
     cells = [study.made(*best, other) for other in tried]
-    again = [(cell, wavelength) for cell in cells for wavelength in study.wavelengths_um]
+    again = [
+        (cell, wavelength) for cell in cells for wavelength in study.wavelengths_um
+    ]
     return verdicts + _judged(study, again, journal, Console(quiet=True))
 
 
 def others(study: Study) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Other materials that are tried, without the study's own; and those whose sources lack a wavelength.
+    """Other materials that are tried, without the study's own; and those whose sources
+    lack a wavelength.
 
     Raises:
         MaterialError: an unknown name or a file that cannot be read.
     """
-    named_else = [name for name in dict.fromkeys(study.others) if name != study.material]
+    named_else = [
+        name for name in dict.fromkeys(study.others) if name != study.material
+    ]
     ranges = {name: materials.material(name).range_um for name in named_else}
-    held = [all(low <= w <= high for w in study.wavelengths_um) for low, high in ranges.values()]
+    held = [
+        all(low <= w <= high for w in study.wavelengths_um)
+        for low, high in ranges.values()
+    ]
     tried = tuple(name for name, holds in zip(named_else, held, strict=True) if holds)
     return tried, tuple(name for name in named_else if name not in tried)
 
 
-def _judged(study: Study, cases: list[tuple[Cell, float]], journal: Journal, console: Console) -> list[Verdict]:
+def _judged(
+    study: Study, cases: list[tuple[Cell, float]], journal: Journal, console: Console
+) -> list[Verdict]:
     """One rational curve t(D) a case, on all cores."""
     tasks = []
     for cell, wavelength in cases:
         span = _span(study, cell)
         engine = engines.choose(cell)
-        tasks.append(workers.curves_task(cell, [Light(wavelength)], span, tolerance=study.tolerance, engine=engine))
+        tasks.append(
+            workers.curves_task(
+                cell,
+                [Light(wavelength)],
+                span,
+                tolerance=study.tolerance,
+                engine=engine,
+            )
+        )
     found = journal.run(tasks, console, "cells")
     made = [workers.curves(one, tolerance=study.tolerance)[0] for one in found]
     return [judge(study, *case, curve) for case, curve in zip(cases, made, strict=True)]
@@ -159,7 +215,10 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
     Raises:
         CellError: there is none.
     """
-    low, high = cell.size_um(study.min_diameter_um, study.min_gap_um), cell.widest_um(study.min_gap_um)
+    low, high = (
+        cell.size_um(study.min_diameter_um, study.min_gap_um),
+        cell.widest_um(study.min_gap_um),
+    )
     if low >= high:
         raise CellError(
             f"pitch {cell.pitch_um:g} um, {cell.described}: a gap of {study.min_gap_um:g} um leaves sizes up to "
@@ -170,19 +229,31 @@ def _span(study: Study, cell: Cell) -> tuple[float, float]:
 
 def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdict:
     """The smooth stretch that covers most phase on one curve."""
-    d = np.linspace(curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES)
+    d = np.linspace(
+        curve.nodes.diameter_um.min(), curve.nodes.diameter_um.max(), SAMPLES
+    )
     value, error = curve(d)
-    hole = cell.shape.hole  # the wider an opening, the less phase: taken with the other sign
-    level, phase = np.abs(value[:, 0]), np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1)
+    hole = (
+        cell.shape.hole
+    )  # the wider an opening, the less phase: taken with the other sign
+    level, phase = (
+        np.abs(value[:, 0]),
+        np.unwrap(np.angle(value[:, 0])) * (-1 if hole else 1),
+    )
     back = "the phase rises" if hole else "the phase falls"
-    faults = {"|t| falls": level < study.least_transmission, back: np.diff(phase, append=np.inf) < 0}
+    faults = {
+        "|t| falls": level < study.least_transmission,
+        back: np.diff(phase, append=np.inf) < 0,
+    }
     faults["an error bar above half of |t|"] = error > UNKNOWN * level
     sharp = np.zeros(SAMPLES, bool)
     for centre, width in curve.resonances(study.least_half_width_um):
         sharp |= np.abs(d - centre) <= max(REACH * width, d[1] - d[0])
     faults["a narrow resonance"] = sharp
     start, stop = _most_phase(phase, ~np.any(list(faults.values()), axis=0))
-    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or ["the printable range"]
+    why = [name for name, mask in faults.items() if stop < SAMPLES and mask[stop]] or [
+        "the printable range"
+    ]
     run = slice(start, stop)
     return Verdict(
         cell.pitch_um,
@@ -201,16 +272,30 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
 
 
 def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
-    """Angle of incidence in air up to which no order propagates: sin = wavelength / spacing of rows - largest n."""
-    n = max(index(material, wavelength_um).real for material in (cell.substrate, cell.cover))
+    """Angle of incidence in air up to which no order propagates: sin = wavelength /
+    spacing of rows - largest n.
+    """
+    n = max(
+        index(material, wavelength_um).real for material in (cell.substrate, cell.cover)
+    )
     sine = cell.lattice.least_order * wavelength_um / cell.pitch_um - n
     return math.degrees(math.asin(min(1.0, max(0.0, sine))))
 
 
 def _most_phase(phase: Array, good: Array) -> tuple[int, int]:
-    """(start, stop) of the run of good samples that covers most phase; (0, 0) where there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2).tolist()
-    return max(((a, b) for a, b in edges), key=lambda run: phase[run[1] - 1] - phase[run[0]], default=(0, 0))
+    """(start, stop) of the run of good samples that covers most phase; (0, 0) where
+    there is none.
+    """
+    edges = (
+        np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+        .reshape(-1, 2)
+        .tolist()
+    )
+    return max(
+        ((a, b) for a, b in edges),
+        key=lambda run: phase[run[1] - 1] - phase[run[0]],
+        default=(0, 0),
+    )
 
 
 def _mean_over_phase(phase: Array, power: Array) -> float:
@@ -220,7 +305,9 @@ def _mean_over_phase(phase: Array, power: Array) -> float:
 
 
 def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
-    """The study as a page with one table a wavelength: turns covered (least |t|), pitch across, height down."""
+    """The study as a page with one table a wavelength: turns covered (least |t|), pitch
+    across, height down.
+    """
     lines = [
         "# Cell study",
         "",
@@ -238,7 +325,10 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
             "",
             f"## {1e3 * wavelength:g} nm",
             "",
-            *_table(study, [v for v in _own(study, verdicts) if v.wavelength_um == wavelength]),
+            *_table(
+                study,
+                [v for v in _own(study, verdicts) if v.wavelength_um == wavelength],
+            ),
         ]
     missed = unsure(study, verdicts)
     lines += ["", missed[0].upper() + missed[1:] + "."] if missed else []
@@ -246,7 +336,9 @@ def markdown(study: Study, verdicts: list[Verdict], *, command: str) -> str:
 
 
 def unsure(study: Study, verdicts: Iterable[Verdict]) -> str:
-    """On how many stretches an error bar of t lies above the tolerance, in words; empty where on none."""
+    """On how many stretches an error bar of t lies above the tolerance, in words; empty
+    where on none.
+    """
     every = [v for v in verdicts if v.turns > 0]
     missed = [v for v in every if v.error > study.tolerance]
     if not missed:
@@ -269,7 +361,10 @@ def _subject(study: Study) -> str:
 
 def _limits(study: Study) -> str:
     """What is printed, in words."""
-    least, gap = f"{1e3 * study.min_diameter_um:.4g} nm", f"{1e3 * study.min_gap_um:.4g} nm"
+    least, gap = (
+        f"{1e3 * study.min_diameter_um:.4g} nm",
+        f"{1e3 * study.min_gap_um:.4g} nm",
+    )
     if study.made(study.pitches_um[0], study.heights_um[0]).round:
         return f"diameter from {least} to the pitch less {gap}"
     return f"nothing solid narrower than {least}, no gap, hole or hollow narrower than {gap}"
@@ -280,7 +375,11 @@ def named(material: Material) -> str:
     if isinstance(material, Blend):
         mixed = f" with {material.share:.0%} {material.other}" if material.other else ""
         return f"{material.base}{mixed} {material.n_offset:+g} {material.k_offset:+g}i"
-    return material if isinstance(material, str) else f"n = {material.n:g} + {material.k:g}i"
+    return (
+        material
+        if isinstance(material, str)
+        else f"n = {material.n:g} + {material.k:g}i"
+    )
 
 
 def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
@@ -289,12 +388,18 @@ def _own(study: Study, verdicts: Iterable[Verdict]) -> list[Verdict]:
 
 def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
     found = {(v.height_um, v.pitch_um): v for v in verdicts}
-    head = "| height \\ pitch (nm) | " + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um) + " |"
+    head = (
+        "| height \\ pitch (nm) | "
+        + " | ".join(f"{1e3 * p:g}" for p in study.pitches_um)
+        + " |"
+    )
     lines = [head, "|" + "---|" * (len(study.pitches_um) + 1)]
     for height in study.heights_um:
         cells = [found[height, pitch] for pitch in study.pitches_um]
         texts = [
-            f"**{v.turns:.2f}** ({v.mean_power:.2f})" if v.turns >= 1 else f"{v.turns:.2f} ({v.mean_power:.2f})"
+            f"**{v.turns:.2f}** ({v.mean_power:.2f})"
+            if v.turns >= 1
+            else f"{v.turns:.2f} ({v.mean_power:.2f})"
             for v in cells
         ]
         lines.append(f"| {1e3 * height:g} | " + " | ".join(texts) + " |")
@@ -302,7 +407,8 @@ def _table(study: Study, verdicts: Iterable[Verdict]) -> list[str]:
 
 
 def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
-    """(pitch, height) in um that covers a full turn at every wavelength with most turns at the worst of them, at the
+    """(pitch, height) in um that covers a full turn at every wavelength with most turns
+    at the worst of them, at the
     least height; None where no cell does."""
     by_cell: dict[tuple[float, float], list[float]] = {}
     for v in _own(study, verdicts):
@@ -311,7 +417,9 @@ def choice(study: Study, verdicts: list[Verdict]) -> tuple[float, float] | None:
     if not good:
         return None
     height = min(cell[0] for cell in good)
-    best = max((cell for cell in good if cell[0] == height), key=lambda cell: good[cell])
+    best = max(
+        (cell for cell in good if cell[0] == height), key=lambda cell: good[cell]
+    )
     return best[1], best[0]
 
 
@@ -336,11 +444,16 @@ def _choice(study: Study, verdicts: list[Verdict]) -> list[str]:
             f"order up to {v.max_angle_deg:.0f} deg"
         )
     _, outside = others(study)
-    return lines + [f"- {name} was not tried: its source does not hold {waves} nm" for name in outside]
+    return lines + [
+        f"- {name} was not tried: its source does not hold {waves} nm"
+        for name in outside
+    ]
 
 
 def rounded(value: object) -> object:
-    """Six significant digits: what the tolerance carries, and the same text on any machine."""
+    """Six significant digits: what the tolerance carries, and the same text on any
+    machine.
+    """
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, dict):

@@ -1,4 +1,6 @@
-"""Tasks of sweeps, solves of curves or of some diameters, as JSON types alone; the journal that keeps those done."""
+"""Tasks of sweeps, solves of curves or of some diameters, as JSON types alone; the
+journal that keeps those done.
+"""
 
 import dataclasses
 import json
@@ -16,31 +18,57 @@ from metalens.pillars import curve as reduced
 from metalens.pillars.curve import Curve, Nodes
 from metalens.pillars.engines import precise, smooth_all
 
-SOLVE_SHARE, FIT_SHARE = 0.5, 0.4  # of an entry's tolerance: for the solver, and for the rational fit
+SOLVE_SHARE, FIT_SHARE = (
+    0.5,
+    0.4,
+)  # of an entry's tolerance: for the solver, and for the rational fit
 Task = dict[str, Any]
 Result = dict[str, Any]
 
 
 def curves_task(
-    cell: Cell, lights: Sequence[Light], span_um: tuple[float, float], *, tolerance: float, engine: str
+    cell: Cell,
+    lights: Sequence[Light],
+    span_um: tuple[float, float],
+    *,
+    tolerance: float,
+    engine: str,
 ) -> Task:
-    """Exact solves of one curve t(D) a light, chosen adaptively (:func:`metalens.pillars.curve.explore`).
+    """Exact solves of one curve t(D) a light, chosen adaptively
+    (:func:`metalens.pillars.curve.explore`).
 
-    Lights of one wavelength and direction share the mesh, and the homogeneous modes at the diameters that every curve
+    Lights of one wavelength and direction share the mesh, and the homogeneous modes at
+    the diameters that every curve
     begins with.
     """
     return _task("curves", cell, lights, tolerance, engine) | {"span_um": list(span_um)}
 
 
-def points_task(cell: Cell, light: Light, diameters_um: list[float], *, tolerance: float, engine: str) -> Task:
+def points_task(
+    cell: Cell,
+    light: Light,
+    diameters_um: list[float],
+    *,
+    tolerance: float,
+    engine: str,
+) -> Task:
     """Exact solves at given diameters, each refined to the tolerance."""
-    return _task("points", cell, [light], tolerance, engine) | {"diameters_um": diameters_um}
+    return _task("points", cell, [light], tolerance, engine) | {
+        "diameters_um": diameters_um
+    }
 
 
-def jones_task(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float, reach: int) -> Task:
-    """Both polarisations of one pillar at normal incidence, at a fixed truncation; the result has a row an element."""
+def jones_task(
+    cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float, reach: int
+) -> Task:
+    """Both polarisations of one pillar at normal incidence, at a fixed truncation; the
+    result has a row an element.
+    """
     light = Light(wavelength_um)
-    return _task("jones", cell, [light], tolerance, "rcwa") | {"size_um": size_um, "harmonics": reach}
+    return _task("jones", cell, [light], tolerance, "rcwa") | {
+        "size_um": size_um,
+        "harmonics": reach,
+    }
 
 
 def work(task: Task) -> Result:
@@ -56,22 +84,36 @@ def work(task: Task) -> Result:
     low, high = task["span_um"]
     about["tolerance"] *= SOLVE_SHARE
     solves = smooth_all(cell, lights, (low, high), **about)
-    for diameter in reduced.starts(low, high):  # every curve begins with them: one after the other they share modes
+    for diameter in reduced.starts(
+        low, high
+    ):  # every curve begins with them: one after the other they share modes
         for solve in solves:
             solve(diameter)
     parts: list[Result] = []
-    for solve in solves:  # and later ones take diameters of those before, where these serve
+    for (
+        solve
+    ) in solves:  # and later ones take diameters of those before, where these serve
         known = [d for part in parts for d in part["diameter_um"]]
-        parts.append(_explored(solve, (low, high), FIT_SHARE * task["tolerance"], known))
+        parts.append(
+            _explored(solve, (low, high), FIT_SHARE * task["tolerance"], known)
+        )
     return _joined(parts)
 
 
 def _explored(
-    solve: Callable[[float], Response], span_um: tuple[float, float], tolerance: float, known_um: list[float]
+    solve: Callable[[float], Response],
+    span_um: tuple[float, float],
+    tolerance: float,
+    known_um: list[float],
 ) -> Result:
-    nodes = reduced.explore(solve, *span_um, tolerance=tolerance, cheaper_um=np.array(known_um))
+    nodes = reduced.explore(
+        solve, *span_um, tolerance=tolerance, cheaper_um=np.array(known_um)
+    )
     order = nodes.diameter_um.tolist()
-    return _listed(order, [solve(d) for d in order]) | {"converged": [nodes.converged], "reason": [nodes.reason]}
+    return _listed(order, [solve(d) for d in order]) | {
+        "converged": [nodes.converged],
+        "reason": [nodes.reason],
+    }
 
 
 def _joined(parts: list[Result]) -> Result:
@@ -82,11 +124,16 @@ def _joined(parts: list[Result]) -> Result:
 
 def curves(result: Result, *, tolerance: float) -> list[Curve]:
     """The curves of a task of curves, of this tolerance, one a light."""
-    columns = [np.array(result["diameter_um"]), *(np.array(result[name]) @ (1, 1j) for name in ("t", "r"))]
+    columns = [
+        np.array(result["diameter_um"]),
+        *(np.array(result[name]) @ (1, 1j) for name in ("t", "r")),
+    ]
     columns += [np.array(result[name]) for name in ("error", "energy")]
     made = []
     for place, stop in enumerate(np.cumsum(result["counts"]).tolist()):
-        diameter, t, r, error, energy = (one[stop - result["counts"][place] : stop] for one in columns)
+        diameter, t, r, error, energy = (
+            one[stop - result["counts"][place] : stop] for one in columns
+        )
         end = result["converged"][place], result["reason"][place]
         nodes = Nodes(diameter, np.stack([t, r], 1), error, energy, *end)
         made.append(reduced.curve(nodes, tolerance=FIT_SHARE * tolerance))
@@ -98,23 +145,44 @@ def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) ->
     from metalens.rcwa import jones
 
     found = jones(cell, size_um, light.wavelength_um, harmonics=reach)
-    rows = zip(found.t.ravel().tolist(), found.r.ravel().tolist(), [0, 1, 0, 1], strict=True)
-    made = [Response(t, r, found.t_error, found.orders, float(found.energy[k]), "rcwa", True, "") for t, r, k in rows]
+    rows = zip(
+        found.t.ravel().tolist(), found.r.ravel().tolist(), [0, 1, 0, 1], strict=True
+    )
+    made = [
+        Response(
+            t, r, found.t_error, found.orders, float(found.energy[k]), "rcwa", True, ""
+        )
+        for t, r, k in rows
+    ]
     return _listed([size_um] * 4, made)
 
 
-def run(tasks: list[Task], *, processes: int | None = None) -> Iterator[tuple[int, Result]]:
+def run(
+    tasks: list[Task], *, processes: int | None = None
+) -> Iterator[tuple[int, Result]]:
     """(index, result) of every task as it is done, on all cores or a cluster.
 
     Raises:
-        MetalensError: what a task raised, of the same class; WorkerError: a worker died.
+        MetalensError: what a task raised, of the same class; WorkerError: a worker
+            died.
     """
     return executor.run(work, tasks, processes=processes)
 
 
-def _task(kind: str, cell: Cell, lights: Sequence[Light], tolerance: float, engine: str) -> Task:
-    waves = [[one.wavelength_um, one.angle_rad, one.polarization, one.azimuth_rad] for one in lights]
-    return {"kind": kind, "cell": config.dumps(cell), "lights": waves, "tolerance": tolerance, "engine": engine}
+def _task(
+    kind: str, cell: Cell, lights: Sequence[Light], tolerance: float, engine: str
+) -> Task:
+    waves = [
+        [one.wavelength_um, one.angle_rad, one.polarization, one.azimuth_rad]
+        for one in lights
+    ]
+    return {
+        "kind": kind,
+        "cell": config.dumps(cell),
+        "lights": waves,
+        "tolerance": tolerance,
+        "engine": engine,
+    }
 
 
 def _listed(diameters_um: Iterable[float], made: list[Response]) -> Result:
@@ -128,7 +196,9 @@ def _listed(diameters_um: Iterable[float], made: list[Response]) -> Result:
 
 
 def material_files(of: object) -> Iterator[Path]:
-    """Files that the materials anywhere in a record (a cell, a film, a tuple of names) are read from."""
+    """Files that the materials anywhere in a record (a cell, a film, a tuple of names)
+    are read from.
+    """
     if isinstance(of, str):
         if of not in materials.NAMES and Path(of).is_file():
             yield Path(of)
@@ -141,26 +211,38 @@ def material_files(of: object) -> Iterator[Path]:
 
 
 def _entry(line: str) -> tuple[str, Result] | None:
-    """(task, result) of a line of a journal; None for one that is damaged: its task is done again."""
+    """(task, result) of a line of a journal; None for one that is damaged: its task is
+    done again.
+    """
     try:
         task, result = json.loads(line)
-        listed = [np.array(result[name]) for name in ("diameter_um", "t", "r", "error", "energy")]
+        listed = [
+            np.array(result[name])
+            for name in ("diameter_um", "t", "r", "error", "energy")
+        ]
     except (ValueError, TypeError, KeyError, RecursionError):
         return None
-    return (str(task), result) if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,) else None
+    return (
+        (str(task), result)
+        if len({len(a) for a in listed}) == 1 and listed[1].shape[1:] == (2,)
+        else None
+    )
 
 
 class Journal:
-    """Finished tasks as JSON lines beside the output, so that interrupted work goes on where it stopped.
+    """Finished tasks as JSON lines beside the output, so that interrupted work goes on
+    where it stopped.
 
-    The first line names the work: its settings and what the files of its materials hold. The journal of other work is
+    The first line names the work: its settings and what the files of its materials
+    hold. The journal of other work is
     begun afresh, a line that is damaged or cut short is dropped.
 
     Args:
         path: None keeps nothing. about: records of settings that the tasks follow from.
 
     Raises:
-        StoreError: a file that is no journal stands there; later, that a file of a material was replaced.
+        StoreError: a file that is no journal stands there; later, that a file of a
+            material was replaced.
     """
 
     def __init__(self, path: Path | None, *about: Any) -> None:
@@ -177,7 +259,9 @@ class Journal:
         keys = [json.dumps(task, sort_keys=True) for task in tasks]
         left = [i for i, key in enumerate(keys) if key not in self._known]
         if left and len(left) < len(tasks):
-            console.say(f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before")
+            console.say(
+                f"{label}: {len(tasks) - len(left)} of {len(tasks)} were done before"
+            )
         stream = run([tasks[i] for i in left])
         for i, result in console.track(stream, total=len(left), label=label):
             self._keep(keys[left[i]], result)

@@ -1,6 +1,8 @@
-"""Light from a point source through the pillars to the sensor window: the exact sum, and faster ways to the same field.
+"""Light from a point source through the pillars to the sensor window: the exact sum,
+and faster ways to the same field.
 
-``exact`` is the referee, ``angular_spectrum`` the textbook, ``windowed`` the fast way; ``choose`` picks by error.
+``exact`` is the referee, ``angular_spectrum`` the textbook, ``windowed`` the fast way;
+``choose`` picks by error.
 """
 
 from typing import TYPE_CHECKING

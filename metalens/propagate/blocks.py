@@ -1,7 +1,10 @@
-"""Blocks of neighbouring pillars: a few nodes stand for each, and a polynomial carries the known phase across it.
+"""Blocks of neighbouring pillars: a few nodes stand for each, and a polynomial carries
+the known phase across it.
 
-The kernel from a block to the window, its carrier removed, is smooth over some dozens of pillars, so that its values
-at ``nodes`` points inside the block give it at every pillar by interpolation. Read the other way round, the pillars'
+The kernel from a block to the window, its carrier removed, is smooth over some dozens
+of pillars, so that its values
+at ``nodes`` points inside the block give it at every pillar by interpolation. Read the
+other way round, the pillars'
 light may be moved to those points with the same weights.
 """
 
@@ -18,12 +21,22 @@ from metalens.ground.arrays import Array
 from metalens.propagate.geometry import Case
 from metalens.propagate.paths import from_source, to_sensor
 
-LENGTHS = ((64, 32, 16, 8, 4, 2, 1), (512, 256, 128, 64, 32, 16, 8, 4, 2, 1))  # of rows, of columns
+LENGTHS = (
+    (64, 32, 16, 8, 4, 2, 1),
+    (512, 256, 128, 64, 32, 16, 8, 4, 2, 1),
+)  # of rows, of columns
 ORDER = {4: 5, 8: 9}  # of the carrier polynomials, by bytes of a number
-ACCURACY = {4: 2e-8, 8: 1e-11}  # of the carrier in turns, beside the rounding of the path itself
-ROUNDED = 5e-15  # of the longest path: what path and polynomial round to in float64 (up to 3.5e-15 was found)
+ACCURACY = {
+    4: 2e-8,
+    8: 1e-11,
+}  # of the carrier in turns, beside the rounding of the path itself
+# of the longest path: what path and polynomial round to in float64 (up to 3.5e-15 was
+# found)
+ROUNDED = 5e-15
 SHARE = 40  # of the tolerance that interpolation inside blocks may take
-PROBES = 48  # positions in a block where the kernel is looked at; blocks that need more keep their pillars
+# positions in a block where the kernel is looked at; blocks that need more keep their
+# pillars
+PROBES = 48
 TABLE_ROWS = 8  # block rows whose carrier is formed at once, in float64
 NODES = 60  # of a lens along an axis, about, where nothing else is said
 CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
@@ -33,8 +46,10 @@ CHUNK = 512  # columns handled at once: their sums stay in the nearest cache
 class Blocks:
     """Pillars along one axis in blocks of ``length``, ``nodes`` points in each.
 
-    The last block is as long as the others and overlaps the one before it; every pillar belongs to the first block
-    that holds it. Where a block would need as many nodes as pillars, the nodes are the pillars.
+    The last block is as long as the others and overlaps the one before it; every pillar
+    belongs to the first block
+    that holds it. Where a block would need as many nodes as pillars, the nodes are the
+    pillars.
     """
 
     pillars: int
@@ -49,12 +64,16 @@ class Blocks:
     @property
     def bases(self) -> Array:
         """(block,) index of the first pillar."""
-        return np.minimum(np.arange(self.count) * self.length, self.pillars - self.length)
+        return np.minimum(
+            np.arange(self.count) * self.length, self.pillars - self.length
+        )
 
     @property
     def places(self) -> Array:
         """(nodes,) positions of the nodes from the block's middle, in half-lengths."""
-        return np.asarray(legendre.nodes(self.nodes)[0] if self.nodes < self.length else self.along)
+        return np.asarray(
+            legendre.nodes(self.nodes)[0] if self.nodes < self.length else self.along
+        )
 
     @property
     def along(self) -> Array:
@@ -75,7 +94,9 @@ class Blocks:
     def nodes_um(self, pitch_um: float) -> Array:
         """(block · nodes,) positions of all nodes from the lens axis."""
         half = (self.length - 1) / 2 * pitch_um
-        return np.asarray((self.middles_um(pitch_um)[:, None] + half * self.places).ravel())
+        return np.asarray(
+            (self.middles_um(pitch_um)[:, None] + half * self.places).ravel()
+        )
 
 
 Kernel = Callable[[Any, Any], Array]
@@ -94,12 +115,18 @@ def choose(
     """(rows, columns) blocks that cost least.
 
     Args:
-        kernel: (y, x) in um to (line, …) values whose variation over a block must be met, broadcasting.
+        kernel: (y, x) in um to (line, …) values whose variation over a block must be
+            met, broadcasting.
         tolerance: root mean square error of the interpolation, relative.
-        nodes: of the lens along an axis, to which the light of every block's goes on, about.
+        nodes: of the lens along an axis, to which the light of every block's goes on,
+            about.
         more: nodes of a block beyond those that the kernel needs.
     """
-    height = next(n for n in LENGTHS[0] if n <= case.shape[0] and _carried(case, reference, n, itemsize))
+    height = next(
+        n
+        for n in LENGTHS[0]
+        if n <= case.shape[0] and _carried(case, reference, n, itemsize)
+    )
     found = []
     for axis, longest in ((0, height), (1, LENGTHS[1][0])):
         options = [n for n in LENGTHS[axis] if n <= min(longest, case.shape[axis])]
@@ -108,8 +135,12 @@ def choose(
     return found[0], found[1]
 
 
-def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float, more: int) -> Blocks:
-    """Blocks of a length along an axis with as few nodes as the kernel needs at its ends and its middle."""
+def _needed(
+    case: Case, axis: int, length: int, kernel: Kernel, tolerance: float, more: int
+) -> Blocks:
+    """Blocks of a length along an axis with as few nodes as the kernel needs at its
+    ends and its middle.
+    """
     if length < 4:
         return Blocks(case.shape[axis], length, length)
     step_um = case.steps_um[axis]
@@ -119,12 +150,18 @@ def _needed(case: Case, axis: int, length: int, kernel: Kernel, tolerance: float
     line = middles + legendre.nodes(PROBES)[0] * (length - 1) / 2 * step_um
     values = kernel(line, across) if axis == 0 else kernel(across, line)
     count = max(legendre.needed(values, tolerance), 2) + more
-    return Blocks(case.shape[axis], length, length if count > PROBES else min(count, length))
+    return Blocks(
+        case.shape[axis], length, length if count > PROBES else min(count, length)
+    )
 
 
 def carrier_turns(case: Case, reference: float, x: Any, y: Any) -> Any:
-    """Source path (of the reference depth) plus sensor path (to the window centre), in wavelengths."""
-    return (from_source(case, x, y, case.tangents, reference) + to_sensor(case, x, y)) / case.wavelength_um
+    """Source path (of the reference depth) plus sensor path (to the window centre), in
+    wavelengths.
+    """
+    return (
+        from_source(case, x, y, case.tangents, reference) + to_sensor(case, x, y)
+    ) / case.wavelength_um
 
 
 def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
@@ -140,10 +177,14 @@ def _carried(case: Case, reference: float, length: int, itemsize: int) -> bool:
     return bool(error <= ACCURACY[itemsize] + ROUNDED * np.abs(want).max())
 
 
-def _powers(case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int) -> Array:
-    """(block, order, x) power coefficients of the carrier in turns along the rows of blocks at ``rows`` middles.
+def _powers(
+    case: Case, reference: float, rows: tuple[Any, float], x: Array, order: int
+) -> Array:
+    """(block, order, x) power coefficients of the carrier in turns along the rows of
+    blocks at ``rows`` middles.
 
-    Of the differences to the middle node, u = 0: the transform would round thousands of turns that all nodes share, by
+    Of the differences to the middle node, u = 0: the transform would round thousands of
+    turns that all nodes share, by
     its large entries.
     """
     u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
@@ -156,16 +197,22 @@ def _powers(case: Case, reference: float, rows: tuple[Any, float], x: Array, ord
 
 @functools.cache
 def _to_powers(order: int) -> Array:
-    """(power, node): power coefficients of the polynomial through values at the Chebyshev nodes."""
+    """(power, node): power coefficients of the polynomial through values at the
+    Chebyshev nodes.
+    """
     u = np.cos(np.pi * (np.arange(order) + 0.5) / order)
     coefficients = np.linalg.inv(chebyshev.chebvander(u, order - 1))
-    columns = [np.pad(chebyshev.cheb2poly(c), (0, order))[:order] for c in coefficients.T]
+    columns = [
+        np.pad(chebyshev.cheb2poly(c), (0, order))[:order] for c in coefficients.T
+    ]
     return np.array(columns).T
 
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """The known phase in turns, c(u) = Σ_n coefficients[n] uⁿ for u in [-1, 1] along the rows of a block."""
+    """The known phase in turns, c(u) = Σ_n coefficients[n] uⁿ for u in [-1, 1] along
+    the rows of a block.
+    """
 
     case: Case
     reference: float
@@ -174,13 +221,17 @@ class Carrier:
 
     @property
     def rounding_rad(self) -> float:
-        """Standard deviation of the phase from what its polynomials round, a tenth of the largest."""
+        """Standard deviation of the phase from what its polynomials round, a tenth of
+        the largest.
+        """
         y, x = (half * np.array([-1.0, 0.0, 1.0]) for half in self.case.half_size_um)
         longest = np.abs(carrier_turns(self.case, self.reference, x, y[:, None])).max()
         return float(2 * np.pi * ROUNDED / 10 * longest)
 
     def table(self, start: int, stop: int, dtype: Any) -> Array:
-        """(block, chunk, order, column) coefficients of block rows start to stop; whole turns are left out."""
+        """(block, chunk, order, column) coefficients of block rows start to stop; whole
+        turns are left out.
+        """
         order, columns = ORDER[np.dtype(dtype).itemsize], self.case.shape[1]
         chunks = -(-columns // self.chunk)
         out = np.zeros((stop - start, chunks, order, self.chunk), dtype)
@@ -197,6 +248,8 @@ class Carrier:
         """(block, order, column) float64 of some block rows."""
         middles = self.rows.middles_um(self.case.steps_um[0])[some, None, None]
         half = (self.rows.length - 1) / 2 * self.case.steps_um[0]
-        found = _powers(self.case, self.reference, (middles, half), self.case.pillars_um[1], order)
+        found = _powers(
+            self.case, self.reference, (middles, half), self.case.pillars_um[1], order
+        )
         found[:, 0] -= np.rint(found[:, 0])
         return found

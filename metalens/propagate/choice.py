@@ -9,7 +9,8 @@ from metalens.propagate import grids
 from metalens.propagate.geometry import Case, windows
 from metalens.propagate.nodes import MOST_NODES, Layout, layout
 
-# seconds on one core: per pillar and point, and per pillar, point and depth of the exact sum; per pillar of the
+# seconds on one core: per pillar and point, and per pillar, point and depth of the
+# exact sum; per pillar of the
 # windowed method, and for the plan of a tile
 _EXACT = (4e-9, 1.5e-9)
 _RAY = 5e-7  # beside the first where every ray is refracted by films
@@ -19,7 +20,8 @@ _PLAN_SECONDS = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """method: ``exact``, ``windowed``, ``tiled`` or ``wide``; tiles: windows that are computed apart; seconds:
+    """method: ``exact``, ``windowed``, ``tiled`` or ``wide``; tiles: windows that are
+    computed apart; seconds:
     expected, one core, planning included."""
 
     method: str
@@ -29,14 +31,17 @@ class Choice:
 
 
 @functools.lru_cache(maxsize=1024)
-def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving: bool = False) -> Choice:
+def choose(
+    case: Case, tolerance: float, *, differentiable: bool = False, moving: bool = False
+) -> Choice:
     """The cheapest method that meets the tolerance.
 
     Args:
         differentiable: leave out the exact sum, which has no derivatives.
         moving: leave out the transforms too, which have none in the geometry.
 
-    The angular spectrum is never chosen: its error (lattice, padding) has no bound. Radial lenses known by their
+    The angular spectrum is never chosen: its error (lattice, padding) has no bound.
+    Radial lenses known by their
     radial profile have a faster way of their own, :mod:`benchmarks.rivals.radial`.
     """
     pillars = case.shape[0] * case.shape[1]
@@ -48,18 +53,28 @@ def choose(case: Case, tolerance: float, *, differentiable: bool = False, moving
     with one_blas_thread():
         cut = _windows(case, tolerance)
         found = [_layout(window, tolerance) for row in cut for window in row]
-    plans = [(one.seconds + one.parts**2 * _PLAN_SECONDS, one.nodes) for one in found if one is not None]
+    plans = [
+        (one.seconds + one.parts**2 * _PLAN_SECONDS, one.nodes)
+        for one in found
+        if one is not None
+    ]
     windowed = sum(seconds + pillars * _PILLAR for seconds, _ in plans)
     if exact < windowed and not differentiable:
         size = f"{pillars:,} pillars at {_points(case)} points"
-        reason = f"exact sum: {size} take {_told(exact)} s, windowed {_told(windowed)} s"
+        reason = (
+            f"exact sum: {size} take {_told(exact)} s, windowed {_told(windowed)} s"
+        )
         return Choice("exact", reason, ((case,),), exact)
     times = f"{_told(windowed)} s, exact sum {_told(exact)} s"
     if len(found) > 1:
         why = f"the whole window would need over {MOST_NODES} nodes or a large table"
-        return Choice("tiled", f"windowed in {len(found)} tiles: {why}; {times}", cut, windowed)
+        return Choice(
+            "tiled", f"windowed in {len(found)} tiles: {why}; {times}", cut, windowed
+        )
     rows, columns = plans[0][1]
-    return Choice("windowed", f"windowed: {rows} x {columns} nodes, {times}", cut, windowed)
+    return Choice(
+        "windowed", f"windowed: {rows} x {columns} nodes, {times}", cut, windowed
+    )
 
 
 def _told(seconds: float) -> str:
@@ -72,7 +87,10 @@ def exact_seconds(case: Case) -> float:
     each, depth = _EXACT
     pillars = case.shape[0] * case.shape[1]
     each = each if case.behind is None else each + _RAY
-    return pillars * _points(case) * (each + depth * len(case.inverse_depths_per_um)) + 1e-4
+    return (
+        pillars * _points(case) * (each + depth * len(case.inverse_depths_per_um))
+        + 1e-4
+    )
 
 
 def _points(case: Case) -> int:
@@ -80,11 +98,16 @@ def _points(case: Case) -> int:
 
 
 def _windows(case: Case, tolerance: float) -> tuple[tuple[Case, ...], ...]:
-    """The window, cut into equal parts until each can be planned with a useful number of nodes."""
+    """The window, cut into equal parts until each can be planned with a useful number
+    of nodes.
+    """
     parts = 1
     while True:
         rows = windows(case, parts)
-        if all(_layout(window, tolerance) is not None for window in (rows[0][0], rows[-1][-1])):
+        if all(
+            _layout(window, tolerance) is not None
+            for window in (rows[0][0], rows[-1][-1])
+        ):
             return rows
         if parts >= max(case.samples):
             raise PropagationError(

@@ -1,7 +1,10 @@
-"""Compiled loops over pillars: light gathered at the nodes of blocks, and gradients given back to every pillar.
+"""Compiled loops over pillars: light gathered at the nodes of blocks, and gradients
+given back to every pillar.
 
-Pillars are taken in tiles of one block of rows and some hundred columns, whose phasors never leave the nearest cache:
-a few rows of phasors are formed, added to the row nodes of the tile, and at the tile's end to its column nodes.
+Pillars are taken in tiles of one block of rows and some hundred columns, whose phasors
+never leave the nearest cache:
+a few rows of phasors are formed, added to the row nodes of the tile, and at the tile's
+end to its column nodes.
 """
 
 from typing import Any
@@ -12,14 +15,24 @@ from numba.extending import overload
 
 from metalens.propagate.sincos import turns
 
-EXACT = {"contract", "arcp", "nsz", "afn"}  # order of sums is kept: the phase is reduced in two steps
+EXACT = {
+    "contract",
+    "arcp",
+    "nsz",
+    "afn",
+}  # order of sums is kept: the phase is reduced in two steps
 _PER_RAD = 1 / (2 * np.pi)
-_SCALE, _FIRST = np.float32(_PER_RAD), np.float32(6.28125)  # few bits, so that its multiples are exact
+_SCALE, _FIRST = (
+    np.float32(_PER_RAD),
+    np.float32(6.28125),
+)  # few bits, so that its multiples are exact
 _SECOND = np.float32(2 * np.pi - 6.28125)
 
 
 def whole_turns_off(phase: Any, like: Any) -> Any:
-    """Phase in turns less its whole turns, in the precision of ``like``; compiled loops choose while compiled."""
+    """Phase in turns less its whole turns, in the precision of ``like``; compiled loops
+    choose while compiled.
+    """
     return (_single if like.dtype == np.float32 else _double)(phase, like)  # type: ignore[no-untyped-call]
 
 
@@ -39,17 +52,25 @@ def _whole_turns_off(phase, like):  # type: ignore[no-untyped-def]
 
 
 def carried(table: Any, u: Any, j: Any, like: Any) -> Any:
-    """Carrier of column j at row position u of a block; compiled loops choose while compiled."""
+    """Carrier of column j at row position u of a block; compiled loops choose while
+    compiled.
+    """
     return (_short if like.dtype == np.float32 else _long)(table, u, j, like)  # type: ignore[no-untyped-call]
 
 
 def _short(table, u, j, like):  # type: ignore[no-untyped-def]
-    return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * table[4, j])))
+    return table[0, j] + u * (
+        table[1, j] + u * (table[2, j] + u * (table[3, j] + u * table[4, j]))
+    )
 
 
 def _long(table, u, j, like):  # type: ignore[no-untyped-def]
-    t = table[4, j] + u * (table[5, j] + u * (table[6, j] + u * (table[7, j] + u * table[8, j])))
-    return table[0, j] + u * (table[1, j] + u * (table[2, j] + u * (table[3, j] + u * t)))
+    t = table[4, j] + u * (
+        table[5, j] + u * (table[6, j] + u * (table[7, j] + u * table[8, j]))
+    )
+    return table[0, j] + u * (
+        table[1, j] + u * (table[2, j] + u * (table[3, j] + u * t))
+    )
 
 
 @overload(carried, inline="always")
@@ -74,7 +95,9 @@ def _light(phase, level, table, u, re, im):  # type: ignore[no-untyped-def]
         re[j], im[j] = level[j] * c, level[j] * s
 
 
-@numba.njit(fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True)
+@numba.njit(
+    fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
+)
 def _power(level, first, last, start, stop):  # type: ignore[no-untyped-def]
     """(sum of squares, sum of magnitudes) of a tile, kept open to NaN."""
     total, size = 0.0, 0.0
@@ -89,7 +112,9 @@ def _power(level, first, last, start, stop):  # type: ignore[no-untyped-def]
     return total, size
 
 
-@numba.njit(fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True)
+@numba.njit(
+    fastmath={"reassoc", "contract", "nsz"}, nogil=True, error_model="numpy", cache=True
+)
 def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
     """0, or NaN where a phase of a tile is not finite."""
     total = phase.dtype.type(0)
@@ -104,15 +129,27 @@ def _taint(phase, first, last, start, stop):  # type: ignore[no-untyped-def]
 def _add_rows(rows, shares, first, sums):  # type: ignore[no-untyped-def]
     """Add four rows (row, re/im, column) to the row nodes: sums (node, re/im, column)."""
     for a in range(sums.shape[0]):
-        s0, s1, s2, s3 = shares[a, first], shares[a, first + 1], shares[a, first + 2], shares[a, first + 3]
+        s0, s1, s2, s3 = (
+            shares[a, first],
+            shares[a, first + 1],
+            shares[a, first + 2],
+            shares[a, first + 3],
+        )
         for k in range(2):
             for j in range(sums.shape[2]):
-                sums[a, k, j] += s0 * rows[0, k, j] + s1 * rows[1, k, j] + s2 * rows[2, k, j] + s3 * rows[3, k, j]
+                sums[a, k, j] += (
+                    s0 * rows[0, k, j]
+                    + s1 * rows[1, k, j]
+                    + s2 * rows[2, k, j]
+                    + s3 * rows[3, k, j]
+                )
 
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def]
-    """Add the columns span[0] to span[1] of a tile to the column nodes: out (node, re/im, column node)."""
+    """Add the columns span[0] to span[1] of a tile to the column nodes: out (node,
+    re/im, column node).
+    """
     nodes, length = shares.shape
     for block in range(span[0] // length, (span[1] - 1) // length + 1):
         low, high = max(block * length, span[0]), min((block + 1) * length, span[1])
@@ -129,12 +166,15 @@ def _add_columns(sums, span, shares, bases, out):  # type: ignore[no-untyped-def
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
 def gather(phase, level, table, u, shares, bases, first, out):  # type: ignore[no-untyped-def]
-    """Light of some block rows at their nodes, added to ``out`` (block row · node, re/im, column node).
+    """Light of some block rows at their nodes, added to ``out`` (block row · node,
+    re/im, column node).
 
-    phase, level: (y, x). table: (block row, chunk, order, column) of those block rows, the first being ``first``.
+    phase, level: (y, x). table: (block row, chunk, order, column) of those block rows,
+    the first being ``first``.
     u: (length,) row positions. shares, bases: a pair each, for rows and columns.
 
-    Returns the sum of squares of the transmission, NaN where a phase of a closed tile is not finite.
+    Returns the sum of squares of the transmission, NaN where a phase of a closed tile
+    is not finite.
     """
     (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
     rows = np.zeros((4, 2, chunk), out.dtype)
@@ -157,11 +197,24 @@ def gather(phase, level, table, u, shares, bases, first, out):  # type: ignore[n
                 for q in range(4):
                     if i + q < stop:
                         p, t = phase[i + q, x0:x1], level[i + q, x0:x1]
-                        _light(p, t, table[block, c], u[i + q - base], rows[q, 0], rows[q, 1])
+                        _light(
+                            p,
+                            t,
+                            table[block, c],
+                            u[i + q - base],
+                            rows[q, 0],
+                            rows[q, 1],
+                        )
                     else:
                         rows[q] = 0
                 _add_rows(rows, padded, i - base, sums)
-            _add_columns(sums, (x0, x1), shares[1], bases[1], out[block * nodes : (block + 1) * nodes])
+            _add_columns(
+                sums,
+                (x0, x1),
+                shares[1],
+                bases[1],
+                out[block * nodes : (block + 1) * nodes],
+            )
     return power
 
 
@@ -183,14 +236,24 @@ def _spread_columns(grad, span, shares, bases, sums):  # type: ignore[no-untyped
 
 @numba.njit(fastmath=True, nogil=True, error_model="numpy", cache=True)
 def _spread_row(sums, shares, i, row):  # type: ignore[no-untyped-def]
-    """Adjoint of :func:`_add_rows` for one row: row (re/im, column); nodes are taken four at a time."""
+    """Adjoint of :func:`_add_rows` for one row: row (re/im, column); nodes are taken
+    four at a time.
+    """
     row[:] = 0
     for a in range(0, sums.shape[0], 4):
-        s0, s1, s2, s3 = shares[a, i], shares[a + 1, i], shares[a + 2, i], shares[a + 3, i]
+        s0, s1, s2, s3 = (
+            shares[a, i],
+            shares[a + 1, i],
+            shares[a + 2, i],
+            shares[a + 3, i],
+        )
         for k in range(2):
             for j in range(sums.shape[2]):
                 row[k, j] += (
-                    s0 * sums[a, k, j] + s1 * sums[a + 1, k, j] + s2 * sums[a + 2, k, j] + s3 * sums[a + 3, k, j]
+                    s0 * sums[a, k, j]
+                    + s1 * sums[a + 1, k, j]
+                    + s2 * sums[a + 2, k, j]
+                    + s3 * sums[a + 3, k, j]
                 )
 
 
@@ -210,7 +273,9 @@ def _scaled(row, re, im, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
 def spread(phase, level, table, u, shares, bases, first, grad, out_phase, out_level):  # type: ignore[no-untyped-def]
-    """Gradients at the nodes, as ``out`` of :func:`gather`, to those of phase and transmission; empty arrays: none."""
+    """Gradients at the nodes, as ``out`` of :func:`gather`, to those of phase and
+    transmission; empty arrays: none.
+    """
     (ny, nx), (nodes, length), chunk = phase.shape, shares[0].shape, table.shape[3]
     row = np.empty((2, chunk), grad.dtype)
     re, im = np.empty(chunk, grad.dtype), np.empty(chunk, grad.dtype)
@@ -226,7 +291,13 @@ def spread(phase, level, table, u, shares, bases, first, grad, out_phase, out_le
                 for i in range(start, stop):
                     out_phase[i, x0:x1] = 0
                 continue
-            _spread_columns(grad[block * nodes : (block + 1) * nodes], (x0, x1), shares[1], bases[1], sums)
+            _spread_columns(
+                grad[block * nodes : (block + 1) * nodes],
+                (x0, x1),
+                shares[1],
+                bases[1],
+                sums,
+            )
             for i in range(start, stop):
                 _spread_row(sums, padded, i - base, row)
                 _phasors(phase[i, x0:x1], table[block, c], u[i - base], re, im)

@@ -1,6 +1,8 @@
-"""The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64, and the light that meets the lens.
+"""The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64, and the
+light that meets the lens.
 
-Beside it the angular spectrum as users know it: textbook zero-padded, and band-limited (paper Eq. 3).
+Beside it the angular spectrum as users know it: textbook zero-padded, and band-limited
+(paper Eq. 3).
 """
 
 from typing import Any
@@ -18,9 +20,11 @@ from metalens.propagate.sincos import turns64
 
 
 def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
-    """Field on the window, every pillar a source of area p² (its cell; paper Eqs. 1-3 in space, exp(-iωt)).
+    """Field on the window, every pillar a source of area p² (its cell; paper Eqs. 1-3
+    in space, exp(-iωt)).
 
-    U(X) = Σ p² T e^{iφ} U_in · d/(2πr²) (1/r - ik) e^{ikr}, with |U_in| = 1 and its phase zero at the lens centre.
+    U(X) = Σ p² T e^{iφ} U_in · d/(2πr²) (1/r - ik) e^{ikr}, with |U_in| = 1 and its
+    phase zero at the lens centre.
     Through films the kernel is that of :mod:`metalens.propagate.paths`.
 
     Args:
@@ -32,16 +36,24 @@ def field_exact(phase_rad: Array, transmission: Array, case: Case) -> Array:
     Raises:
         PropagationError: maps that do not fit, are empty or hold NaN or infinity.
 
-    Accuracy: rounding only, 1e-12 of the sum of the pillars' magnitudes for paths up to 1 m; through films that and
-    :func:`metalens.propagate.paths.films_error`, below rounding but for steep rays through some um.
+    Accuracy: rounding only, 1e-12 of the sum of the pillars' magnitudes for paths up to
+    1 m; through films that and
+    :func:`metalens.propagate.paths.films_error`, below rounding but for steep rays
+    through some um.
     """
     y, x = case.window_um
-    points = np.stack(np.meshgrid(x + case.centre_um[0], y + case.centre_um[1]), -1).reshape(-1, 2)
+    points = np.stack(
+        np.meshgrid(x + case.centre_um[0], y + case.centre_um[1]), -1
+    ).reshape(-1, 2)
     return field_at(phase_rad, transmission, case, points).reshape(-1, *case.samples)
 
 
-def field_at(phase_rad: Array, transmission: Array, case: Case, points_um: Array) -> Array:
-    """As :func:`field_exact`, at (point, [x, y]) of the sensor plane; (depth, point) complex128."""
+def field_at(
+    phase_rad: Array, transmission: Array, case: Case, points_um: Array
+) -> Array:
+    """As :func:`field_exact`, at (point, [x, y]) of the sensor plane; (depth, point)
+    complex128.
+    """
     check_aperture(phase_rad, transmission, case)
     y, x = case.pillars_um
     points = np.ascontiguousarray(points_um, float)
@@ -53,20 +65,33 @@ def field_at(phase_rad: Array, transmission: Array, case: Case, points_um: Array
         if open_.size == 0:
             continue
         columns = slice(open_[0], open_[-1] + 1)
-        light = leaving(np.asarray(phase_rad[rows], float)[:, columns], level[:, columns], case, y[rows], x[columns])
+        light = leaving(
+            np.asarray(phase_rad[rows], float)[:, columns],
+            level[:, columns],
+            case,
+            y[rows],
+            x[columns],
+        )
         _add_rows(light, (y[rows], x[columns]), points, case, out)
     return out
 
 
-def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Case, out: Array) -> None:
+def _add_rows(
+    light: Array, at_um: tuple[Array, Array], points: Array, case: Case, out: Array
+) -> None:
     """Add the light of pillar rows (depth, y, x) to ``out`` (depth, point)."""
     y, x = at_um
     real, imaginary = np.ascontiguousarray(light.real), np.ascontiguousarray(light.imag)
     numbers: Any = (case.wavenumber, case.sensor_distance_um, case.area_um2)
     kernel: Any = _accumulate
     if case.behind is not None:
-        y_far, x_far = (np.abs(points[:, i]).max() + half for i, half in zip((1, 0), case.half_size_um, strict=True))
-        films = media_arrays(case.behind, case.wavenumber, float(np.hypot(y_far, x_far)))
+        y_far, x_far = (
+            np.abs(points[:, i]).max() + half
+            for i, half in zip((1, 0), case.half_size_um, strict=True)
+        )
+        films = media_arrays(
+            case.behind, case.wavenumber, float(np.hypot(y_far, x_far))
+        )
         kernel, numbers = add_rays, (case.area_um2, (case.wavenumber, *films))
 
     def work(a: int, b: int) -> None:
@@ -75,8 +100,12 @@ def _add_rows(light: Array, at_um: tuple[Array, Array], points: Array, case: Cas
     split(len(points), work)
 
 
-def leaving(phase_rad: Array, transmission: Array, case: Case, y_um: Array, x_um: Array) -> Array:
-    """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth: (depth, y, x) complex128."""
+def leaving(
+    phase_rad: Array, transmission: Array, case: Case, y_um: Array, x_um: Array
+) -> Array:
+    """Field leaving the pillars at rows ``y_um``, columns ``x_um``, for every depth:
+    (depth, y, x) complex128.
+    """
     inverse = np.array(case.inverse_depths_per_um)[:, None, None]
     path = from_source(case, x_um[None, :], y_um[:, None], case.tangents, inverse)
     return np.asarray(transmission * np.exp(1j * (phase_rad + case.wavenumber * path)))
@@ -104,41 +133,60 @@ def _accumulate(re, im, x, y, points, numbers, out):  # type: ignore[no-untyped-
 
 
 def transfer(case: Case, count: tuple[int, int], *, band_limited: bool) -> Array:
-    """H(fy, fx) = exp(ik_z d) on the FFT grid of ``count`` (y, x) samples; evanescent waves decay.
+    """H(fy, fx) = exp(ik_z d) on the FFT grid of ``count`` (y, x) samples; evanescent
+    waves decay.
 
-    band_limited: drop frequencies whose phase the padded grid cannot sample (Matsushima and Shimobaba 2009).
+    band_limited: drop frequencies whose phase the padded grid cannot sample (Matsushima
+    and Shimobaba 2009).
     """
-    fy, fx = (np.fft.fftfreq(n, step) for n, step in zip(count, case.steps_um, strict=True))
+    fy, fx = (
+        np.fft.fftfreq(n, step) for n, step in zip(count, case.steps_um, strict=True)
+    )
     kz2 = case.wavelength_um**-2 - fx**2 - fy[:, None] ** 2
     kz = 2 * np.pi * np.sqrt(np.abs(kz2))
     d = case.sensor_distance_um
     h = np.exp(np.where(kz2 >= 0, 1j * kz, -kz) * d)
     if band_limited:
-        for f, n, step in ((fy[:, None], count[0], case.steps_um[0]), (fx, count[1], case.steps_um[1])):
+        for f, n, step in (
+            (fy[:, None], count[0], case.steps_um[0]),
+            (fx, count[1], case.steps_um[1]),
+        ):
             limit = 1 / (case.wavelength_um * np.sqrt((2 * d / (n * step)) ** 2 + 1))
             h = np.where(np.abs(f) <= limit, h, 0)
     return h
 
 
 def angular_spectrum(
-    phase_rad: Array, transmission: Array, case: Case, *, pad: int = 2, band_limited: bool = False, single: bool = False
+    phase_rad: Array,
+    transmission: Array,
+    case: Case,
+    *,
+    pad: int = 2,
+    band_limited: bool = False,
+    single: bool = False,
 ) -> Array:
     """Field on the window by FFT, linear in time in the padded grid: (depth, y, x).
 
-    The output lies on the pillars' own lattice; the window must too (step a multiple of the pitch, centre on it).
+    The output lies on the pillars' own lattice; the window must too (step a multiple of
+    the pitch, centre on it).
 
     Args:
-        pad: the grid is this many times as wide as the lens; below 2 light wraps around.
+        pad: the grid is this many times as wide as the lens; below 2 light wraps
+            around.
         single: complex64 instead of complex128.
 
     Raises:
-        PropagationError: window off the lattice or beyond the padded grid; maps that do not fit or are empty.
+        PropagationError: window off the lattice or beyond the padded grid; maps that do
+            not fit or are empty.
 
-    Accuracy: 4e-4 of the PSF for a 1 mm lens at 2 mm; worse where the window is near the edge of the padded grid.
+    Accuracy: 4e-4 of the PSF for a 1 mm lens at 2 mm; worse where the window is near
+    the edge of the padded grid.
     """
     check_aperture(phase_rad, transmission, case)
     if case.behind is not None:
-        raise PropagationError("the textbook angular spectrum knows no films; use propagate.exact")
+        raise PropagationError(
+            "the textbook angular spectrum knows no films; use propagate.exact"
+        )
     columns, rows = _lattice(case, pad)
     count = (case.shape[0] * pad, case.shape[1] * pad)
     h = transfer(case, count, band_limited=band_limited)
@@ -147,7 +195,10 @@ def angular_spectrum(
     y, x = case.pillars_um
     out = np.empty((len(case.inverse_depths_per_um), *case.samples), dtype)
     for z, inverse in enumerate(case.inverse_depths_per_um):
-        one = Case(**{n: getattr(case, n) for n in case.__slots__} | {"inverse_depths_per_um": (inverse,)})
+        one = Case(
+            **{n: getattr(case, n) for n in case.__slots__}
+            | {"inverse_depths_per_um": (inverse,)}
+        )
         light = leaving(phase_rad, transmission, one, y, x)[0].astype(dtype)
         field = np.fft.ifft2(np.fft.fft2(light, count) * h)
         out[z] = field[np.ix_(rows, columns)]
@@ -155,10 +206,14 @@ def angular_spectrum(
 
 
 def _lattice(case: Case, pad: int) -> tuple[Array, Array]:
-    """(x,), (y,) indices of the window samples in the padded grid, whose origin is the first pillar."""
+    """(x,), (y,) indices of the window samples in the padded grid, whose origin is the
+    first pillar.
+    """
     found = []
     steps = case.steps_um[::-1]
-    for name, n, c, w, step in zip("xy", case.shape[::-1], case.centre_um, case.window_um[::-1], steps, strict=True):
+    for name, n, c, w, step in zip(
+        "xy", case.shape[::-1], case.centre_um, case.window_um[::-1], steps, strict=True
+    ):
         at = (c + w) / step + (n - 1) / 2
         index = np.rint(at).astype(int)
         if np.abs(at - index).max() > 1e-6:
@@ -167,6 +222,8 @@ def _lattice(case: Case, pad: int) -> tuple[Array, Array]:
                 f"{step} um and a centre on the lattice, or another method"
             )
         if index.min() < -(n * pad - n) // 2 or index.max() >= n + (n * pad - n) // 2:
-            raise PropagationError(f"window leaves the padded grid along {name}; raise pad above {pad}")
+            raise PropagationError(
+                f"window leaves the padded grid along {name}; raise pad above {pad}"
+            )
         found.append(index % (n * pad))
     return found[0], found[1]

@@ -1,7 +1,10 @@
-"""What is propagated: pillars, one direction of light at several depths, and the window on the sensor.
+"""What is propagated: pillars, one direction of light at several depths, and the window
+on the sensor.
 
-Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor at z = +d. Time factor exp(-iωt).
-A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray meets the sensor at (d·tx, d·ty).
+Coordinates: lens plane z = 0, axis at index (n-1)/2, +x right, +y down, sensor at z =
++d. Time factor exp(-iωt).
+A source at depth z and tangents (tx, ty) sits at (-z·tx, -z·ty, -z): its chief ray
+meets the sensor at (d·tx, d·ty).
 """
 
 import itertools
@@ -20,15 +23,21 @@ from metalens.lens import Media
 class Case:
     """Geometry of one propagation; hashable, so that plans can be kept.
 
-    shape: (y, x) sites of the map; pitch_um: from column to column; row_um: from row to row (0: as the columns).
-    site_um2: area of the cell of one pillar (0: of the map's own; on a hexagonal lattice every other site is empty).
-    wavelength_um: in the medium on both sides of the lens; in vacuum where films are given.
+    shape: (y, x) sites of the map; pitch_um: from column to column; row_um: from row to
+    row (0: as the columns).
+    site_um2: area of the cell of one pillar (0: of the map's own; on a hexagonal
+    lattice every other site is empty).
+    wavelength_um: in the medium on both sides of the lens; in vacuum where films are
+    given.
     sensor_distance_um: lens plane to sensor plane.
     tangents: (x, y) tangents of the field angle; in air where films are given.
     inverse_depths_per_um: 1/z of every source, 0 for a source at infinity.
-    centre_um: (x, y) of the window on the sensor; step_um: its sampling; samples: (y, x) points of the window.
-    front: (index, thickness) of the films between source and lens, the rest air; behind: the media from lens to sensor,
-        the one that fills the gap first, their thicknesses adding up to the distance; None for one medium.
+    centre_um: (x, y) of the window on the sensor; step_um: its sampling; samples: (y,
+    x) points of the window.
+    front: (index, thickness) of the films between source and lens, the rest air;
+    behind: the media from lens to sensor,
+        the one that fills the gap first, their thicknesses adding up to the distance;
+        None for one medium.
 
     Raises:
         PropagationError: a length that is not positive and finite, no depth, no sample.
@@ -52,16 +61,26 @@ class Case:
         for name in ("pitch_um", "wavelength_um", "sensor_distance_um", "step_um"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise PropagationError(f"{name} is {value}, need a positive length in um")
+                raise PropagationError(
+                    f"{name} is {value}, need a positive length in um"
+                )
         if not all(np.isfinite(v) and v >= 0 for v in (self.row_um, self.site_um2)):
-            raise PropagationError(f"row_um = {self.row_um}, site_um2 = {self.site_um2}: need finite values, 0 or more")
+            raise PropagationError(
+                f"row_um = {self.row_um}, site_um2 = {self.site_um2}: need finite values, 0 or more"
+            )
         if min(self.shape) < 1 or min(self.samples) < 1:
-            raise PropagationError(f"{self.shape} pillars and {self.samples} samples, need at least one of each")
+            raise PropagationError(
+                f"{self.shape} pillars and {self.samples} samples, need at least one of each"
+            )
         inverse = np.array(self.inverse_depths_per_um)
         if inverse.size == 0 or not (np.isfinite(inverse) & (inverse >= 0)).all():
-            raise PropagationError("depths_um must hold at least one source depth above 0 (inf for a far source)")
+            raise PropagationError(
+                "depths_um must hold at least one source depth above 0 (inf for a far source)"
+            )
         if not np.isfinite([*self.tangents, *self.centre_um]).all():
-            raise PropagationError(f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}")
+            raise PropagationError(
+                f"field angle or window centre is not finite: {self.tangents}, {self.centre_um}"
+            )
         if inverse.max() * sum(t for _, t in self.front) > 1:
             raise PropagationError(
                 f"layers: films of {sum(t for _, t in self.front):g} um in the {1 / inverse.max():g} um from source to "
@@ -86,25 +105,36 @@ class Case:
     @property
     def half_size_um(self) -> tuple[float, float]:
         """(y, x) distance from the axis to the outermost site, at least half a step."""
-        y, x = (max(n - 1, 1) / 2 * step for n, step in zip(self.shape, self.steps_um, strict=True))
+        y, x = (
+            max(n - 1, 1) / 2 * step
+            for n, step in zip(self.shape, self.steps_um, strict=True)
+        )
         return y, x
 
     @property
     def half_window_um(self) -> tuple[float, float]:
-        """(y, x) distance from the window centre to its outermost sample, at least a hundredth of a step."""
+        """(y, x) distance from the window centre to its outermost sample, at least a
+        hundredth of a step.
+        """
         my, mx = self.samples
-        return max(my - 1, 0.02) / 2 * self.step_um, max(mx - 1, 0.02) / 2 * self.step_um
+        return max(my - 1, 0.02) / 2 * self.step_um, max(
+            mx - 1, 0.02
+        ) / 2 * self.step_um
 
     @property
     def reach_um(self) -> float:
         """Farthest that light goes sideways from a site to a sample, at least."""
-        parts = zip(self.centre_um[::-1], self.half_window_um, self.half_size_um, strict=True)
+        parts = zip(
+            self.centre_um[::-1], self.half_window_um, self.half_size_um, strict=True
+        )
         return math.hypot(*(abs(c) + w + h for c, w, h in parts))
 
     @property
     def pillars_um(self) -> tuple[Array, Array]:
         """(y,), (x,) positions of the pillar rows and columns."""
-        y, x = (axis(n, step) for n, step in zip(self.shape, self.steps_um, strict=True))
+        y, x = (
+            axis(n, step) for n, step in zip(self.shape, self.steps_um, strict=True)
+        )
         return y, x
 
     @property
@@ -119,27 +149,45 @@ def axis(count: int, step: float) -> Array:
 
 
 def windows(case: Case, parts: int) -> tuple[tuple[Case, ...], ...]:
-    """The window cut into rows of parts, at most ``parts`` along each axis, equal to within one sample."""
+    """The window cut into rows of parts, at most ``parts`` along each axis, equal to
+    within one sample.
+    """
     rows, columns = (_cut(count, min(parts, count)) for count in case.samples)
     return tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
 
 
-def tiles(case: Case, parts: int) -> tuple[tuple[list[int], list[int]], tuple[tuple[Case, ...], ...]]:
-    """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size: neighbours may overlap."""
+def tiles(
+    case: Case, parts: int
+) -> tuple[tuple[list[int], list[int]], tuple[tuple[Case, ...], ...]]:
+    """First samples (y, x) and cases of ``parts`` rows of tiles, all of one size:
+    neighbours may overlap.
+    """
     firsts, sizes = [], []
     for count in case.samples:
         number = min(parts, count)
         sizes.append(-(-count // number))
-        firsts.append([i * (count - sizes[-1]) // max(number - 1, 1) for i in range(number)])
-    rows, columns = ([(a, a + size) for a in first] for first, size in zip(firsts, sizes, strict=True))
-    return (firsts[0], firsts[1]), tuple(tuple(_part(case, row, column) for column in columns) for row in rows)
+        firsts.append(
+            [i * (count - sizes[-1]) // max(number - 1, 1) for i in range(number)]
+        )
+    rows, columns = (
+        [(a, a + size) for a in first]
+        for first, size in zip(firsts, sizes, strict=True)
+    )
+    return (firsts[0], firsts[1]), tuple(
+        tuple(_part(case, row, column) for column in columns) for row in rows
+    )
 
 
 def _part(case: Case, row: tuple[int, int], column: tuple[int, int]) -> Case:
     """The case for samples row[0] to row[1], column[0] to column[1] of the window."""
     (my, mx), (x, y) = case.samples, case.centre_um
-    centre = x + (sum(column) - mx) / 2 * case.step_um, y + (sum(row) - my) / 2 * case.step_um
-    return replace(case, centre_um=centre, samples=(row[1] - row[0], column[1] - column[0]))
+    centre = (
+        x + (sum(column) - mx) / 2 * case.step_um,
+        y + (sum(row) - my) / 2 * case.step_um,
+    )
+    return replace(
+        case, centre_um=centre, samples=(row[1] - row[0], column[1] - column[0])
+    )
 
 
 def _cut(count: int, parts: int) -> list[tuple[int, int]]:
@@ -147,7 +195,8 @@ def _cut(count: int, parts: int) -> list[tuple[int, int]]:
 
 
 def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:
-    """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or infinity.
+    """Refuse maps that do not fit the case, that hold nothing, or that hold NaN or
+    infinity.
 
     Args:
         phase_rad, transmission: (y, x) numpy arrays of float.
@@ -157,15 +206,25 @@ def check_aperture(phase_rad: Any, transmission: Any, case: Case) -> None:
     """
     for name, array in (("phase_rad", phase_rad), ("transmission", transmission)):
         if array.shape != case.shape:
-            raise PropagationError(f"{name} has shape {array.shape}, need {case.shape} (y, x)")
+            raise PropagationError(
+                f"{name} has shape {array.shape}, need {case.shape} (y, x)"
+            )
     light = 0.0
     for start in range(0, case.shape[0], 256):
         rows = slice(start, start + 256)
-        total = float(phase_rad[rows].sum()) + float(transmission[rows].sum())  # NaN and infinity survive a sum
+        total = float(phase_rad[rows].sum()) + float(
+            transmission[rows].sum()
+        )  # NaN and infinity survive a sum
         if not np.isfinite(total):
             bad = ~np.isfinite(phase_rad[rows]) | ~np.isfinite(transmission[rows])
             row, column = (int(i) for i in np.argwhere(bad)[0])
-            raise PropagationError(f"phase or transmission at row {start + row}, column {column} is not finite")
-        light = light or float(transmission[rows].max()) or float(transmission[rows].min())
+            raise PropagationError(
+                f"phase or transmission at row {start + row}, column {column} is not finite"
+            )
+        light = (
+            light or float(transmission[rows].max()) or float(transmission[rows].min())
+        )
     if light == 0:
-        raise PropagationError("empty aperture: transmission is 0 everywhere; check the aperture and the lens")
+        raise PropagationError(
+            "empty aperture: transmission is 0 everywhere; check the aperture and the lens"
+        )

@@ -1,8 +1,12 @@
-"""How many nodes, directions and correction samples a propagation needs, and how a window is cut.
+"""How many nodes, directions and correction samples a propagation needs, and how a
+window is cut.
 
-The kernel (:mod:`metalens.propagate.paths`) is smooth in everything, so each of its dependencies is sampled just
-finely enough: every count below is the least whose Legendre tail on probing lines is under the tolerance. The smaller
-the window, the smoother the kernel: so the light on the nodes of the whole window is passed on to the fewer nodes of
+The kernel (:mod:`metalens.propagate.paths`) is smooth in everything, so each of its
+dependencies is sampled just
+finely enough: every count below is the least whose Legendre tail on probing lines is
+under the tolerance. The smaller
+the window, the smoother the kernel: so the light on the nodes of the whole window is
+passed on to the fewer nodes of
 its tiles.
 """
 
@@ -17,11 +21,19 @@ from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.propagate.geometry import Case, tiles
-from metalens.propagate.paths import correction, cosine_y, direction_range, kernel, probe
+from metalens.propagate.paths import (
+    correction,
+    cosine_y,
+    direction_range,
+    kernel,
+    probe,
+)
 
 MOST_NODES = 400
 MOST_TABLE = 4e6
-EDGE = 8  # by which the error of a truncated series at the corner of a tile, where a PSF may lie, exceeds its mean
+# by which the error of a truncated series at the corner of a tile, where a PSF may lie,
+# exceeds its mean
+EDGE = 8
 PARTS = (1, 2, 3, 4, 6, 8, 12, 16)
 
 
@@ -46,7 +58,8 @@ class Sizes:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis; sizes: of every tile;
+    """nodes: (y, x) over the lens for the whole window; parts: tiles along each axis;
+    sizes: of every tile;
     seconds: expected for all tiles on one core."""
 
     nodes: tuple[int, int]
@@ -57,10 +70,12 @@ class Layout:
 
 @functools.lru_cache(maxsize=1024)
 def layout(case: Case, tolerance: float) -> Layout | None:
-    """How the window is cut so that it costs least; None where no cut brings the tables down to some 100 MB.
+    """How the window is cut so that it costs least; None where no cut brings the tables
+    down to some 100 MB.
 
     Raises:
-        PropagationError: more than 400 nodes would be needed; the window is too large for this method.
+        PropagationError: more than 400 nodes would be needed; the window is too large
+            for this method.
     """
     nodes = lens_nodes(case, tolerance / 4)
     best = None
@@ -68,7 +83,9 @@ def layout(case: Case, tolerance: float) -> Layout | None:
         if parts > max(case.samples):
             break
         rows = tiles(case, parts)[1]
-        corners = {_alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])}
+        corners = {
+            _alike(tile) for row in (rows[0], rows[-1]) for tile in (row[0], row[-1])
+        }
         found = _largest([sizes(tile, tolerance) for tile in corners])
         passed_on = nodes[0] * nodes[1] * (1e-8 + 2e-10 * found.nodes[0])
         each = _seconds(rows[0][0], found, len(case.inverse_depths_per_um)) + passed_on
@@ -81,22 +98,34 @@ def layout(case: Case, tolerance: float) -> Layout | None:
 
 
 def _alike(tile: Case) -> Case:
-    """The tile, or its mirror image, which needs the same counts, where the source is straight ahead along an axis."""
-    x, y = (abs(c) if slope == 0 else c for c, slope in zip(tile.centre_um, tile.tangents, strict=True))
+    """The tile, or its mirror image, which needs the same counts, where the source is
+    straight ahead along an axis.
+    """
+    x, y = (
+        abs(c) if slope == 0 else c
+        for c, slope in zip(tile.centre_um, tile.tangents, strict=True)
+    )
     return replace(tile, centre_um=(x, y))
 
 
 def _largest(found: list[Sizes]) -> Sizes:
     """Counts that do for all."""
-    pairs = [tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1)) for name in ("nodes", "window", "lens")]
+    pairs = [
+        tuple(max(getattr(s, name)[i] for s in found) for i in (0, 1))
+        for name in ("nodes", "window", "lens")
+    ]
     return Sizes(pairs[0], max(s.directions for s in found), pairs[1], pairs[2])
 
 
 def _seconds(case: Case, found: Sizes, depths: int) -> float:
-    """Expected time of one tile on one core: light on its own nodes, products along y and x."""
+    """Expected time of one tile on one core: light on its own nodes, products along y
+    and x.
+    """
     (my, mx), (ny, nx), b = case.samples, found.nodes, min(depths, 14)
     fields = 0.75 * b * max(found.window)
-    products = found.directions * fields * (ny * (4e-9 + 1.8e-10 * my) + 1.5e-10 * mx * my)
+    products = (
+        found.directions * fields * (ny * (4e-9 + 1.8e-10 * my) + 1.5e-10 * mx * my)
+    )
     return 2e-5 + products + 5e-9 * b * ny * nx
 
 
@@ -104,7 +133,9 @@ def lens_nodes(case: Case, tolerance: float) -> tuple[int, int]:
     """(y, x) nodes over the lens that the kernel needs."""
     high_y, high_x = case.half_size_um
     rows = _count(lambda t: _over_lens(case, None, t * high_y), tolerance, "lens rows")
-    return rows, _count(lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns")
+    return rows, _count(
+        lambda t: _over_lens(case, t * high_x, None), tolerance, "lens columns"
+    )
 
 
 def sizes(case: Case, tolerance: float) -> Sizes:
@@ -118,13 +149,25 @@ def sizes(case: Case, tolerance: float) -> Sizes:
     nodes = lens_nodes(case, share)
     low, high = direction_range(case, legendre.mapped(nodes[0], -high_y, high_y))
     middle, reach = (low + high) / 2, (high - low) / 2
-    directions = _count(lambda t: _over_directions(case, middle + reach * t), share, "directions")
+    directions = _count(
+        lambda t: _over_directions(case, middle + reach * t), share, "directions"
+    )
     wy, wx = case.half_window_um
     edge = max(share / EDGE, min(share, 1e-13))  # rounding leaves no smaller tails
-    window_x = _count(lambda t: _over_window(case, (low, high), X=t * wx), edge, "window columns")
-    window_y = _count(lambda t: _over_window(case, (low, high), Y=t * wy), edge, "window rows")
-    lens_p = _count(lambda t: _over_window(case, (low, high), p=middle + reach * t), edge, "correction directions")
-    lens_e = _count(lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows")
+    window_x = _count(
+        lambda t: _over_window(case, (low, high), X=t * wx), edge, "window columns"
+    )
+    window_y = _count(
+        lambda t: _over_window(case, (low, high), Y=t * wy), edge, "window rows"
+    )
+    lens_p = _count(
+        lambda t: _over_window(case, (low, high), p=middle + reach * t),
+        edge,
+        "correction directions",
+    )
+    lens_e = _count(
+        lambda t: _over_window(case, (low, high), e=t * high_y), edge, "correction rows"
+    )
     return Sizes(nodes, directions, (window_y, window_x), (lens_e, lens_p))
 
 
@@ -144,7 +187,9 @@ def _count(lines: Callable[[Array], Array], tolerance: float, what: str) -> int:
 def _over_lens(case: Case, x: Array | None, y: Array | None) -> Array:
     """(line, node) of the kernel along lens columns (x given) or rows (y given)."""
     (hy, hx), (wy, wx) = case.half_size_um, case.half_window_um
-    inverse = np.array([min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)])
+    inverse = np.array(
+        [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
+    )
     other = np.array([-0.9, 0.0, 0.9])
     grid = np.meshgrid(other, probe() * wx, probe() * wy, inverse, indexing="ij")
     o, X, Y, v = (g.reshape(-1, 1) for g in grid)
@@ -154,7 +199,9 @@ def _over_lens(case: Case, x: Array | None, y: Array | None) -> Array:
 def _over_directions(case: Case, p: Array) -> Array:
     """(line, direction) of the window kernel along p at fixed lens rows."""
     (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
-    grid = np.meshgrid(np.array([-0.9, 0.0, 0.9]) * hy, probe() * wx, probe() * wy, indexing="ij")
+    grid = np.meshgrid(
+        np.array([-0.9, 0.0, 0.9]) * hy, probe() * wx, probe() * wy, indexing="ij"
+    )
     e, X, Y = (g.reshape(-1, 1) for g in grid)
     residual = correction(case, p, e, X, Y)
     q = cosine_y(case, p, e)
@@ -162,12 +209,21 @@ def _over_directions(case: Case, p: Array) -> Array:
 
 
 def _over_window(case: Case, span: tuple[float, float], **line: Array) -> Array:
-    """(line, node) of the correction along one of X, Y, p, e, the others on a few probes."""
+    """(line, node) of the correction along one of X, Y, p, e, the others on a few
+    probes.
+    """
     (hy, _), (wy, wx) = case.half_size_um, case.half_window_um
     low, high = span
     middle, reach = (low + high) / 2, (high - low) / 2
-    probes = {"X": probe() * wx, "Y": probe() * wy, "p": middle + reach * probe(), "e": probe() * hy}
+    probes = {
+        "X": probe() * wx,
+        "Y": probe() * wy,
+        "p": middle + reach * probe(),
+        "e": probe() * hy,
+    }
     names = [n for n in probes if n not in line]
     grid = np.meshgrid(*(probes[n] for n in names), indexing="ij")
-    at: dict[str, Any] = {n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)} | line
+    at: dict[str, Any] = {
+        n: g.reshape(-1, 1) for n, g in zip(names, grid, strict=True)
+    } | line
     return correction(case, at["p"], at["e"], at["X"], at["Y"])

@@ -1,4 +1,6 @@
-"""The arrays of a windowed propagation: plane waves, the low-rank correction, and the fields that span all depths."""
+"""The arrays of a windowed propagation: plane waves, the low-rank correction, and the
+fields that span all depths.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -35,7 +37,8 @@ class Depths:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Operators:
-    """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column nodes, p = directions.
+    """Arrays of one tile, complex128 and float64; e = lens row nodes, x = lens column
+    nodes, p = directions.
 
     to_directions: (e, x, p); along_y: (p, Y, e); along_x: (X, p).
     lens_terms: (p, e, r), window_terms: (X, Y, r) of the correction; strength: (r,).
@@ -55,22 +58,38 @@ def depth_factors(case: Case, e: Any, x: Any, tangents: Any, inverse: Any) -> An
     return case.wavenumber * (from_source(case, x, e, tangents, inverse) - reference)
 
 
-def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False) -> Depths:
+def depth_basis(
+    case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, moving: bool = False
+) -> Depths:
     """Few fields that span the curvatures of all depths.
 
-    With ``moving`` they also span the derivatives in inverse depth and tangents. Orthonormal under the quadrature of
+    With ``moving`` they also span the derivatives in inverse depth and tangents.
+    Orthonormal under the quadrature of
     the nodes; truncated at ``tolerance`` root mean square.
     """
     e, x = nodes_um[0][:, None], nodes_um[1]
     weight = np.sqrt(np.outer(legendre.nodes(len(e))[1], legendre.nodes(len(x))[1]))
     inverse = np.array(case.inverse_depths_per_um)
     count = 48
-    while True:  # until the rank says that no depth lies between the nodes: they need pi a period, the fields two
+    # until the rank says that no depth lies between the nodes: they need pi a period,
+    # the fields two
+    while True:
         few = len(inverse) > count
-        training = np.clip(legendre.mapped(count, inverse.min(), inverse.max()), 0, None) if few else inverse
-        fields = np.exp(1j * depth_factors(case, e, x, case.tangents, training[:, None, None])) * weight
+        training = (
+            np.clip(legendre.mapped(count, inverse.min(), inverse.max()), 0, None)
+            if few
+            else inverse
+        )
+        fields = (
+            np.exp(
+                1j * depth_factors(case, e, x, case.tangents, training[:, None, None])
+            )
+            * weight
+        )
         if moving:
-            fields = np.concatenate([fields, *_tangents(case, e, x, training[:, None, None], fields)])
+            fields = np.concatenate(
+                [fields, *_tangents(case, e, x, training[:, None, None], fields)]
+            )
         _, size, v = np.linalg.svd(fields.reshape(len(fields), -1), full_matrices=False)
         tail = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1] / (size**2).sum())
         rank = int(max(1, (tail > tolerance).sum()))
@@ -82,26 +101,42 @@ def depth_basis(case: Case, nodes_um: tuple[Array, Array], tolerance: float, *, 
     for start in range(0, len(inverse), 16):
         part = inverse[start : start + 16, None, None]
         fields = np.exp(1j * depth_factors(case, e, x, case.tangents, part)) * weight
-        coefficients[start : start + 16] = fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
-    return Depths(np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0]))
+        coefficients[start : start + 16] = (
+            fields.reshape(len(part), -1) @ basis.reshape(rank, -1).conj().T
+        )
+    return Depths(
+        np.asarray(basis / weight), coefficients, np.asarray(size[:rank] / size[0])
+    )
 
 
-def _tangents(case: Case, e: Array, x: Array, inverse: Array, fields: Array) -> list[Array]:
-    """Derivatives of the depth fields in inverse depth and the tangents, each of the fields' own norm; complex step."""
+def _tangents(
+    case: Case, e: Array, x: Array, inverse: Array, fields: Array
+) -> list[Array]:
+    """Derivatives of the depth fields in inverse depth and the tangents, each of the
+    fields' own norm; complex step.
+    """
     out = []
     h = 1e-30
     for step in ((0, 0, 1j * h), (1j * h, 0, 0), (0, 1j * h, 0)):
         tangents = case.tangents[0] + step[0], case.tangents[1] + step[1]
-        slope = case.wavenumber * from_source(case, x, e, tangents, inverse + step[2]).imag / h
+        slope = (
+            case.wavenumber
+            * from_source(case, x, e, tangents, inverse + step[2]).imag
+            / h
+        )
         slope = np.broadcast_to(slope, fields.shape)
-        scale = np.sqrt((np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum())
+        scale = np.sqrt(
+            (np.abs(slope * fields) ** 2).sum() / (np.abs(fields) ** 2).sum()
+        )
         if scale > 0:
             out.append(1j * slope / scale * fields)
     return out
 
 
 def pairs(strength: Array, size: Array, tolerance: float) -> Array:
-    """(2, n) pairs (correction term, depth field) whose joint strength matters; the rest sums below tolerance."""
+    """(2, n) pairs (correction term, depth field) whose joint strength matters; the
+    rest sums below tolerance.
+    """
     joint = (np.outer(strength, size) ** 2).ravel()
     order = np.argsort(joint)
     least = np.cumsum(joint[order]) <= tolerance**2 * joint.sum()
@@ -109,8 +144,12 @@ def pairs(strength: Array, size: Array, tolerance: float) -> Array:
     return np.stack(np.unravel_index(kept, (len(strength), len(size))))
 
 
-def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None) -> Operators:
-    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance, window centre x, y instead."""
+def operators(
+    case: Case, chosen: Sizes, tolerance: float, *, slope: int | None = None
+) -> Operators:
+    """All arrays of a tile; ``slope`` 0, 1, 2 gives the derivative in sensor distance,
+    window centre x, y instead.
+    """
     (ny, nx), m = chosen.nodes, chosen.directions
     high_y, high_x = case.half_size_um
     e, x = legendre.mapped(ny, -high_y, high_y), legendre.mapped(nx, -high_x, high_x)
@@ -121,9 +160,13 @@ def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None 
     y_um, x_um = case.window_um
     k = case.wavenumber
     q = cosine_y(case, p[:, None], e[None, :])
-    lens_terms, window_terms, strength = _low_rank(case, chosen, tolerance / 2, (low, high), slope)
+    lens_terms, window_terms, strength = _low_rank(
+        case, chosen, tolerance / 2, (low, high), slope
+    )
     return Operators(
-        to_directions=legendre.interpolation(m, (2 * towards - low - high) / (high - low)),
+        to_directions=legendre.interpolation(
+            m, (2 * towards - low - high) / (high - low)
+        ),
         along_y=np.exp(-1j * k * y_um[:, None] * q[:, None, :]),
         along_x=np.exp(-1j * k * x_um[:, None] * p),
         lens_terms=lens_terms,
@@ -133,9 +176,15 @@ def operators(case: Case, chosen: Sizes, tolerance: float, *, slope: int | None 
 
 
 def _low_rank(
-    case: Case, chosen: Sizes, tolerance: float, span: tuple[float, float], slope: int | None
+    case: Case,
+    chosen: Sizes,
+    tolerance: float,
+    span: tuple[float, float],
+    slope: int | None,
 ) -> tuple[Array, Array, Array]:
-    """Correction as Σ_r lens_terms[p, e, r] window_terms[X, Y, r], pillar area included; and strengths (r,)."""
+    """Correction as Σ_r lens_terms[p, e, r] window_terms[X, Y, r], pillar area
+    included; and strengths (r,).
+    """
     (wy, wx), (hy, _) = case.half_window_um, case.half_size_um
     (my, mx), (me, mp) = chosen.window, chosen.lens
     Y, X = legendre.mapped(my, -wy, wy), legendre.mapped(mx, -wx, wx)
@@ -146,24 +195,36 @@ def _low_rank(
         table = table * slopes(case, *at)[slope]
     left, right = _factors(table.reshape(my * mx, mp * me) * case.area_um2, tolerance)
     y_um, x_um = case.window_um
-    Iy, Ix = legendre.interpolation(my, y_um / wy), legendre.interpolation(mx, x_um / wx)
-    window_terms = np.einsum("Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True)
+    Iy, Ix = (
+        legendre.interpolation(my, y_um / wy),
+        legendre.interpolation(mx, x_um / wx),
+    )
+    window_terms = np.einsum(
+        "Yj,jir,Xi->XYr", Iy, left.reshape(my, mx, -1), Ix, optimize=True
+    )
     e_um = legendre.nodes(chosen.nodes[0])[0]
     p_um = legendre.nodes(chosen.directions)[0]
     Ie, Ip = legendre.interpolation(me, e_um), legendre.interpolation(mp, p_um)
-    lens_terms = np.einsum("Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True)
+    lens_terms = np.einsum(
+        "Pp,rpe,Ee->PEr", Ip, right.reshape(-1, mp, me), Ie, optimize=True
+    )
     return lens_terms, window_terms, np.linalg.norm(left, axis=0)
 
 
 def _factors(table: Array, tolerance: float) -> tuple[Array, Array]:
-    """table ≈ left (row, r) @ right (r, column) within ``tolerance`` in the Frobenius norm; randomised range finder."""
+    """table ≈ left (row, r) @ right (r, column) within ``tolerance`` in the Frobenius
+    norm; randomised range finder.
+    """
     random = np.random.default_rng(0)
     total = np.linalg.norm(table)
     rank = min(16, *table.shape)
     while True:
         left = np.linalg.qr(table @ random.standard_normal((table.shape[1], rank)))[0]
         right = left.conj().T @ table
-        if rank == min(table.shape) or np.linalg.norm(table - left @ right) <= tolerance * total / 4:
+        if (
+            rank == min(table.shape)
+            or np.linalg.norm(table - left @ right) <= tolerance * total / 4
+        ):
             break
         rank = min(2 * rank, *table.shape)
     u, size, v = np.linalg.svd(right, full_matrices=False)

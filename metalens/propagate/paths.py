@@ -1,14 +1,18 @@
-"""Paths and amplitudes of a case: closed forms in one medium, rays through plane-parallel films where there are some.
+"""Paths and amplitudes of a case: closed forms in one medium, rays through
+plane-parallel films where there are some.
 
 The field of a point behind films is the sum of its plane waves about the ray,
 
     h = -ik/(2π√spread) (1 + iC/(kL)) √passed exp(ikL),
 
-L the optical path of the ray, spread the area on the sensor per area of p = n sin θ, passed the power that the faces
-let through, C what all waves add to the stationary phase (:mod:`metalens.lens.waves`). In one medium C = 1 and that is
+L the optical path of the ray, spread the area on the sensor per area of p = n sin θ,
+passed the power that the faces
+let through, C what all waves add to the stationary phase (:mod:`metalens.lens.waves`).
+In one medium C = 1 and that is
 d/(2πr²)(1/r - ik) exp(ikr) itself.
 
-The kernel K is h times exp(ik(s_z - s_ref)), its carrier exp(ik r_w) removed: r_w is the path to the middle of the
+The kernel K is h times exp(ik(s_z - s_ref)), its carrier exp(ik r_w) removed: r_w is
+the path to the middle of the
 window, s_ref that from the source of the middle depth. It is smooth in everything.
 """
 
@@ -26,21 +30,27 @@ SOME = 32  # pillars along an axis whose rays tell what films leave out
 
 
 def reference_depth(case: Case) -> float:
-    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the range."""
+    """Inverse depth, 1/um, of the source whose phase is taken off: the middle of the
+    range.
+    """
     inverse = case.inverse_depths_per_um
     return (min(inverse) + max(inverse)) / 2
 
 
 def from_source(case: Case, x: Any, y: Any, tangents: Any, inverse: Any) -> Any:
-    """Optical path from a source to (x, y), less its path to the lens centre, um; numpy or torch operands.
+    """Optical path from a source to (x, y), less its path to the lens centre, um; numpy
+    or torch operands.
 
     ``tangents`` are those in air.
     """
     return media.source_path(case.front, x, y, tangents, inverse)
 
 
-def to_sensor(case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None) -> Any:
-    """Optical path from (x, y) on the lens to a point of the sensor, by default the middle of the window, less that
+def to_sensor(
+    case: Case, x: Any, y: Any, centre: tuple[float, float] | None = None
+) -> Any:
+    """Optical path from (x, y) on the lens to a point of the sensor, by default the
+    middle of the window, less that
     from the lens centre, um."""
     cx, cy = case.centre_um if centre is None else centre
     if case.behind is None:
@@ -52,7 +62,9 @@ def to_sensor(case: Case, x: Any, y: Any, centre: tuple[float, float] | None = N
 
 
 def chief_path(case: Case) -> float:
-    """Optical path from the lens centre to the window centre, um: the phase that all methods share."""
+    """Optical path from the lens centre to the window centre, um: the phase that all
+    methods share.
+    """
     reach2 = case.centre_um[0] ** 2 + case.centre_um[1] ** 2
     if case.behind is None:
         return float(np.sqrt(reach2 + case.sensor_distance_um**2))
@@ -61,7 +73,9 @@ def chief_path(case: Case) -> float:
 
 
 def beyond(case: Case, x: Any, y: Any, X: Any, Y: Any) -> tuple[Any, Any]:
-    """(amplitude, path) from lens (x, y) to the window offset (X, Y); the path less that to the window's centre."""
+    """(amplitude, path) from lens (x, y) to the window offset (X, Y); the path less
+    that to the window's centre.
+    """
     dx, dy = case.centre_um[0] - x, case.centre_um[1] - y
     more = X * X + Y * Y + 2 * (X * dx + Y * dy)
     if case.behind is None:
@@ -77,17 +91,22 @@ def beyond(case: Case, x: Any, y: Any, X: Any, Y: Any) -> tuple[Any, Any]:
 
 
 def amplitude(case: Case, pairs: media.Pairs, w: Any) -> Any:
-    """Complex amplitude of the module's heading for the ray of w = p², the phase kL taken off."""
+    """Complex amplitude of the module's heading for the ray of w = p², the phase kL
+    taken off.
+    """
     real, ahead, aside = amplitudes(case, pairs, w)
     return -1j * real * (ahead + 1j * aside)
 
 
 def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any, Any]:
-    """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the ray of w = p²; for complex
+    """k/(2π) √(passed / spread), and the real and imaginary part of 1 + iC/(kL), of the
+    ray of w = p²; for complex
     steps in w and in thicknesses, on which C itself counts as not depending."""
     k = case.wavenumber
     order = case.behind.order if case.behind is not None else ()
-    level = k / (2 * np.pi) * (media.passed_at(order, w) / media.widening(pairs, w)) ** 0.5
+    level = (
+        k / (2 * np.pi) * (media.passed_at(order, w) / media.widening(pairs, w)) ** 0.5
+    )
     turn = 1 / (k * media.whole_path(pairs, w))
     if case.behind is None:
         return level, 1 + 0 * turn, turn
@@ -96,25 +115,34 @@ def amplitudes(case: Case, pairs: media.Pairs, w: Any) -> tuple[Any, Any, Any]:
 
 
 def apart(case: Case, w: Array) -> tuple[Array, Array]:
-    """Amplitudes of s and of p light behind films over :func:`amplitude`, of rays of w = p²; complex."""
+    """Amplitudes of s and of p light behind films over :func:`amplitude`, of rays of w
+    = p²; complex.
+    """
     behind, k = case.behind, case.wavenumber
     if behind is None:
         return np.ones_like(w), np.ones_like(w)
     powers = media.passed_apart(behind.order, w)
-    turn, (ahead, aside) = 1 / (k * media.whole_path(behind.layers, w)), saddle(behind, k, case.reach_um).at(w)
+    turn, (ahead, aside) = (
+        1 / (k * media.whole_path(behind.layers, w)),
+        saddle(behind, k, case.reach_um).at(w),
+    )
     found = []
     every = saddle(behind, k, case.reach_um, "s"), saddle(behind, k, case.reach_um, "p")
     for own, power in zip(every, powers, strict=True):
         own_ahead, own_aside = own.at(w)
-        waves = (1 - turn * own_aside + 1j * turn * own_ahead) / (1 - turn * aside + 1j * turn * ahead)
+        waves = (1 - turn * own_aside + 1j * turn * own_ahead) / (
+            1 - turn * aside + 1j * turn * ahead
+        )
         found.append(waves * np.sqrt(2 * power / (powers[0] + powers[1])))
     return found[0], found[1]
 
 
 def films_error(case: Case, level: Array) -> float:
-    """Relative L2 error of PSFs by what the kernel leaves out of the plane waves through films; 0 in one medium.
+    """Relative L2 error of PSFs by what the kernel leaves out of the plane waves
+    through films; 0 in one medium.
 
-    Root mean square over the light of some pillars (transmission ``level`` (y, x)), each seen from where the window is
+    Root mean square over the light of some pillars (transmission ``level`` (y, x)),
+    each seen from where the window is
     farthest; twice that of the amplitude.
     """
     if case.behind is None:
@@ -124,14 +152,21 @@ def films_error(case: Case, level: Array) -> float:
     light = np.asarray(level[some], float) ** 2
     if not light.sum() > 0:
         light = np.ones_like(light)
-    far_y, far_x = (abs(c - a) + h for c, a, h in zip(case.centre_um[::-1], (y, x), case.half_window_um, strict=True))
+    far_y, far_x = (
+        abs(c - a) + h
+        for c, a, h in zip(
+            case.centre_um[::-1], (y, x), case.half_window_um, strict=True
+        )
+    )
     w = media.square(case.behind.layers, far_x**2 + far_y[:, None] ** 2)
     error = saddle(case.behind, case.wavenumber, case.reach_um).error(w)
     return 2 * float(np.sqrt((light * error**2).sum() / light.sum()))
 
 
 def cosines(case: Case, across: Any, far: Any) -> Any:
-    """p along x of the rays to the window centre from lens points ``across``, ``far`` beside it: n sin θ cos φ."""
+    """p along x of the rays to the window centre from lens points ``across``, ``far``
+    beside it: n sin θ cos φ.
+    """
     if case.behind is None:
         return across / np.sqrt(across**2 + far**2 + case.sensor_distance_um**2)
     pairs = case.behind.layers
@@ -142,7 +177,9 @@ def cosine_y(case: Case, p: Any, e: Any) -> Any:
     """q along y of the ray from lens row e with p along x to the window centre."""
     far = e - case.centre_um[1]
     if case.behind is None:
-        return far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
+        return (
+            far * np.sqrt(1 - p * p) / np.sqrt(far * far + case.sensor_distance_um**2)
+        )
     pairs = case.behind.layers
     return far / media.bend(pairs, media.square(pairs, far * far, p * p))
 
@@ -164,7 +201,9 @@ def residual(case: Case, p: Any, e: Any, X: Any, Y: Any) -> tuple[Any, Any]:
 
 
 def _from_ray(case: Case, p: Any, far: Any, X: Any, Y: Any) -> tuple[Any, Any, Any]:
-    """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x from ``far`` rows away."""
+    """(w, reach / p, reach² to the window offset less reach²) of the ray with p along x
+    from ``far`` rows away.
+    """
     pairs: Any = case.behind.layers if case.behind is not None else ()
     w0 = media.square(pairs, far * far, p * p)
     g = media.bend(pairs, w0)
@@ -172,7 +211,9 @@ def _from_ray(case: Case, p: Any, far: Any, X: Any, Y: Any) -> tuple[Any, Any, A
 
 
 def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
-    """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x and y, at fixed pillar."""
+    """(3, …) logarithmic derivatives of the kernel in sensor distance, window centre x
+    and y, at fixed pillar.
+    """
     k, d = case.wavenumber, case.sensor_distance_um
     far = e - case.centre_um[1]
     if case.behind is not None:
@@ -188,7 +229,9 @@ def slopes(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
 
 
 def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
-    """As :func:`slopes` through films: the cover takes what the distance gains; by complex steps."""
+    """As :func:`slopes` through films: the cover takes what the distance gains; by
+    complex steps.
+    """
     h = 1e-30
     behind: Any = case.behind
     _, g, more = _from_ray(case, p, far, X, Y)
@@ -198,14 +241,19 @@ def _slopes(case: Case, p: Any, far: Any, X: Any, Y: Any) -> Array:
     for step in (0, 1, 2):
         pairs, moved = behind.layers, reach2 + 0j
         if step == 0:
-            pairs = [(n, t + (1j * h if n == behind.index[0] else 0)) for n, t in behind.layers]
+            pairs = [
+                (n, t + (1j * h if n == behind.index[0] else 0))
+                for n, t in behind.layers
+            ]
             if not any(n == behind.index[0] for n, _ in pairs):
                 pairs = [*pairs, (behind.index[0], 1j * h)]
         else:
             moved = moved + 2j * h * (across, down)[step - 1]
         w = media.square(pairs, moved)
         level, ahead, aside = amplitudes(case, pairs, w)
-        rate = level.imag / level.real + (ahead.imag + 1j * aside.imag) / (ahead.real + 1j * aside.real)
+        rate = level.imag / level.real + (ahead.imag + 1j * aside.imag) / (
+            ahead.real + 1j * aside.real
+        )
         out.append((rate + 1j * case.wavenumber * media.whole_path(pairs, w).imag) / h)
     return np.stack(np.broadcast_arrays(*out))
 
@@ -216,7 +264,9 @@ def probe() -> Array:
 
 
 def kernel(case: Case, x: Any, y: Any, X: Any, Y: Any, inverse: Any) -> Array:
-    """K of the module's heading, without the pillar's area, at lens (x, y) and window offset (X, Y)."""
+    """K of the module's heading, without the pillar's area, at lens (x, y) and window
+    offset (X, Y).
+    """
     level, away = beyond(case, x, y, X, Y)
     path = away + from_source(case, x, y, case.tangents, inverse)
     path = path - from_source(case, x, y, case.tangents, reference_depth(case))
@@ -224,7 +274,9 @@ def kernel(case: Case, x: Any, y: Any, X: Any, Y: Any, inverse: Any) -> Array:
 
 
 def direction_range(case: Case, rows_um: Array) -> tuple[float, float]:
-    """(least, largest) p = n sin θ cos φ over the lens, for the row nodes given; never of zero width."""
+    """(least, largest) p = n sin θ cos φ over the lens, for the row nodes given; never
+    of zero width.
+    """
     high_x = case.half_size_um[1]
     edge = np.array([-high_x, high_x]) - case.centre_um[0]
     far = np.concatenate([rows_um, [0.0]]) - case.centre_um[1]
@@ -236,14 +288,23 @@ def direction_range(case: Case, rows_um: Array) -> tuple[float, float]:
 
 
 def correction(case: Case, p: Any, e: Any, X: Any, Y: Any) -> Array:
-    """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w + pX + qY))."""
+    """Kernel less the plane waves exp(-ik(pX + qY)): d/(2πr²)(1/r - ik) exp(ik(r - r_w
+    + pX + qY)).
+    """
     level, path = residual(case, p, e, X, Y)
     return np.asarray(level * np.exp(1j * case.wavenumber * path))
 
 
 def over_blocks(case: Case) -> Callable[[Any, Any], Array]:
-    """The kernel at (y, x) of the lens for the corners and the middle of the window and the extreme depths."""
+    """The kernel at (y, x) of the lens for the corners and the middle of the window and
+    the extreme depths.
+    """
     wy, wx = case.half_window_um
-    inverse = np.array([min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)])
-    X, Y, v = (g.reshape(-1, 1, 1, 1) for g in np.meshgrid(probe() * wx, probe() * wy, inverse, indexing="ij"))
+    inverse = np.array(
+        [min(case.inverse_depths_per_um), max(case.inverse_depths_per_um)]
+    )
+    X, Y, v = (
+        g.reshape(-1, 1, 1, 1)
+        for g in np.meshgrid(probe() * wx, probe() * wy, inverse, indexing="ij")
+    )
     return lambda y, x: kernel(case, x, y, X, Y, v)

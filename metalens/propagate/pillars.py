@@ -1,8 +1,12 @@
-"""From millions of pillars to a few thousand Legendre moments, with the known phase taken off.
+"""From millions of pillars to a few thousand Legendre moments, with the known phase
+taken off.
 
-M_mn = Σ_ij P̂_m(y_i) P̂_n(x_j) T_ij exp(i(φ_ij + k·carrier_ij)), the carrier being source path plus sensor path of a
-reference. Pillars are first gathered at the nodes of small blocks (:mod:`metalens.propagate.blocks`), and the
-polynomials are taken there: the moments stand for those nodes, which give the same light on the window.
+M_mn = Σ_ij P̂_m(y_i) P̂_n(x_j) T_ij exp(i(φ_ij + k·carrier_ij)), the carrier being
+source path plus sensor path of a
+reference. Pillars are first gathered at the nodes of small blocks
+(:mod:`metalens.propagate.blocks`), and the
+polynomials are taken there: the moments stand for those nodes, which give the same
+light on the window.
 """
 
 import math
@@ -16,16 +20,28 @@ import torch
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.ground.threads import split
-from metalens.propagate.blocks import CHUNK, NODES, ORDER, SHARE, Blocks, Carrier, Kernel, carrier_turns, choose
+from metalens.propagate.blocks import (
+    CHUNK,
+    NODES,
+    ORDER,
+    SHARE,
+    Blocks,
+    Carrier,
+    Kernel,
+    carrier_turns,
+    choose,
+)
 from metalens.propagate.compiled import gather, spread
 from metalens.propagate.geometry import Case
 
-# (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth factors on the light of several
+# (y_um, x_um) of the lens to (components,) signs and (components, maps, y, x) smooth
+# factors on the light of several
 # maps: light on the window is Σ_c sign_c |Σ_m factor_cm of map m, propagated|²
 Pupils = Callable[[Array, Array], tuple[Array, Array]]
 Bands = list[tuple[slice, slice]]
 BAND = 128  # nodes whose shares of an even grid are taken at once
-KEEP_BYTES = 32e6  # of carrier polynomials and of nodes held at once, and of maps' copies in a thread
+# of carrier polynomials and of nodes held at once, and of maps' copies in a thread
+KEEP_BYTES = 32e6
 DEVICE_ROWS = 256
 
 
@@ -33,9 +49,12 @@ DEVICE_ROWS = 256
 class Moments:
     """How pillars are reduced.
 
-    blocks: of rows and columns; carrier: the phase that is taken off; table: its polynomials, where they are small
-    enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the blocks (on other devices than the
-    processor: at the pillars); bands: of each, the nodes that are taken at once and the moments that have a share.
+    blocks: of rows and columns; carrier: the phase that is taken off; table: its
+    polynomials, where they are small
+    enough to be kept. rows: (y, m), columns: (x, n) polynomials at the nodes of the
+    blocks (on other devices than the
+    processor: at the pillars); bands: of each, the nodes that are taken at once and the
+    moments that have a share.
     """
 
     blocks: tuple[Blocks, Blocks]
@@ -52,10 +71,15 @@ class Moments:
 
     @property
     def panels(self) -> list[slice]:
-        """Block rows that are handled at once, so that their nodes and their carrier stay below ``KEEP_BYTES``."""
+        """Block rows that are handled at once, so that their nodes and their carrier
+        stay below ``KEEP_BYTES``.
+        """
         rows, columns = self.blocks
         itemsize = self.rows.element_size()
-        nodes, carrier = 2 * rows.nodes * columns.count * columns.nodes, ORDER[itemsize] * self.carrier.case.shape[1]
+        nodes, carrier = (
+            2 * rows.nodes * columns.count * columns.nodes,
+            ORDER[itemsize] * self.carrier.case.shape[1],
+        )
         step = max(4, int(KEEP_BYTES / ((nodes + carrier) * itemsize)))
         return [slice(a, min(a + step, rows.count)) for a in range(0, rows.count, step)]
 
@@ -75,14 +99,22 @@ def moments(
     """Blocks, and what light at their nodes is worth in each moment.
 
     Args:
-        weights: of the rows and of the columns, (place,) um to (place, m): polynomials, or shares of an even grid.
+        weights: of the rows and of the columns, (place,) um to (place, m): polynomials,
+            or shares of an even grid.
         kernel, nodes, more: as :func:`metalens.propagate.blocks.choose`.
     """
     itemsize = torch.finfo(dtype).bits // 8
-    blocks = choose(case, reference, kernel, tolerance / SHARE, itemsize, nodes=nodes, more=more)
+    blocks = choose(
+        case, reference, kernel, tolerance / SHARE, itemsize, nodes=nodes, more=more
+    )
     rows, columns = blocks
     width = columns.length
-    wave = Carrier(case, reference, rows, width * max(1, min(CHUNK // width, -(-case.shape[1] // width))))
+    wave = Carrier(
+        case,
+        reference,
+        rows,
+        width * max(1, min(CHUNK // width, -(-case.shape[1] // width))),
+    )
     places = (rows.nodes_um(case.steps_um[0]), columns.nodes_um(case.steps_um[1]))
     table = None
     if device is not None and device.type != "cpu":
@@ -90,17 +122,33 @@ def moments(
     elif case.shape[0] / rows.length * case.shape[1] * 10 * itemsize <= KEEP_BYTES:
         table = wave.table(0, rows.count, np.dtype(f"f{itemsize}"))
     found = [weight(place) for weight, place in zip(weights, places, strict=True)]
-    polynomials = [torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found]
-    return Moments(blocks, wave, table, polynomials[0], polynomials[1], (_bands(found[0]), _bands(found[1])))
+    polynomials = [
+        torch.tensor(np.ascontiguousarray(f), dtype=dtype, device=device) for f in found
+    ]
+    return Moments(
+        blocks,
+        wave,
+        table,
+        polynomials[0],
+        polynomials[1],
+        (_bands(found[0]), _bands(found[1])),
+    )
 
 
 def _bands(weights: Array) -> Bands:
-    """Nodes and the moments that are not 0 at all of them; one band of all where most are not."""
+    """Nodes and the moments that are not 0 at all of them; one band of all where most
+    are not.
+    """
     bands = []
     for start in range(0, len(weights), BAND):
         at = slice(start, min(start + BAND, len(weights)))
         there = np.flatnonzero(weights[at].any(0))
-        bands.append((at, slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 0)))
+        bands.append(
+            (
+                at,
+                slice(int(there[0]), int(there[-1]) + 1) if len(there) else slice(0, 0),
+            )
+        )
     if sum(to.stop - to.start for _, to in bands) > weights.shape[1] * len(bands) / 2:
         return [(slice(0, len(weights)), slice(0, weights.shape[1]))]
     return bands
@@ -112,18 +160,29 @@ def _in(bands: Bands, start: int, stop: int) -> Bands:
     return [(at, to) for at, to in cut if at.start < at.stop]
 
 
-def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+def reduce(
+    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments
+) -> tuple[torch.Tensor, float]:
     """(m, n) complex moments of a lens, and the sum of squares of its transmission.
 
-    Differentiable in phase and transmission, (y, x) real; sums are of the plan's dtype, to which maps of another are
-    brought some rows at a time where no derivative is wanted. Values that are not finite give moments or a sum that is
+    Differentiable in phase and transmission, (y, x) real; sums are of the plan's dtype,
+    to which maps of another are
+    brought some rows at a time where no derivative is wanted. Values that are not
+    finite give moments or a sum that is
     not; closed pillars are passed over where a whole tile is closed.
 
-    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars, incoherent, and the interpolation
+    Accuracy: float32 2e-6, float64 1e-12 of the root sum of squares of the pillars,
+    incoherent, and the interpolation
     inside blocks that the plan allows.
     """
-    if phase_rad.requires_grad or transmission.requires_grad or phase_rad.device.type != "cpu":
-        phase_rad, transmission = (m.to(plan.rows.dtype) for m in (phase_rad, transmission))
+    if (
+        phase_rad.requires_grad
+        or transmission.requires_grad
+        or phase_rad.device.type != "cpu"
+    ):
+        phase_rad, transmission = (
+            m.to(plan.rows.dtype) for m in (phase_rad, transmission)
+        )
     parts, power = _Reduce.apply(phase_rad, transmission, plan)  # type: ignore[no-untyped-call]
     return torch.complex(parts[0], parts[1]), float(power)
 
@@ -131,19 +190,28 @@ def reduce(phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Moments) -
 def mixed(
     light: torch.Tensor, pupils: Pupils | None, places_um: tuple[Array, Array]
 ) -> list[tuple[float, torch.Tensor]]:
-    """Sign and light of every component, from the light of every map (map, e, x) at these places (e,), (x,)."""
+    """Sign and light of every component, from the light of every map (map, e, x) at
+    these places (e,), (x,).
+    """
     if pupils is None:
         return [(1.0, light[0])]
     signs, factors = pupils(*places_um)
     by = torch.as_tensor(factors, device=light.device).to(light.real.dtype)
-    return [(float(sign), (factor * light).sum(0)) for sign, factor in zip(signs, by, strict=True)]
+    return [
+        (float(sign), (factor * light).sum(0))
+        for sign, factor in zip(signs, by, strict=True)
+    ]
 
 
 class _Reduce(torch.autograd.Function):
-    """Moments (2, m, n); the backward pass forms the phasors again rather than keep them."""
+    """Moments (2, m, n); the backward pass forms the phasors again rather than keep
+    them.
+    """
 
     @staticmethod
-    def forward(ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(
+        ctx: Any, phase: torch.Tensor, level: torch.Tensor, plan: Moments
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         ctx.save_for_backward(phase, level)
         ctx.plan = plan
         gathered = _gather if phase.device.type == "cpu" else _gather_plain
@@ -153,7 +221,9 @@ class _Reduce(torch.autograd.Function):
         return out, total
 
     @staticmethod
-    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
+    def backward(
+        ctx: Any, *grads: torch.Tensor
+    ) -> tuple[torch.Tensor | None, torch.Tensor | None, None]:
         if torch.is_grad_enabled():
             raise PropagationError(
                 "second derivatives of sums over pillars are not known: leave create_graph out, and take differences "
@@ -170,16 +240,28 @@ class _Reduce(torch.autograd.Function):
 
 def _table(plan: Moments, panel: slice, dtype: Any) -> Any:
     """Carrier polynomials of a panel."""
-    return plan.carrier.table(panel.start, panel.stop, dtype) if plan.table is None else plan.table[panel]
+    return (
+        plan.carrier.table(panel.start, panel.stop, dtype)
+        if plan.table is None
+        else plan.table[panel]
+    )
 
 
 def _fixed(plan: Moments, dtype: Any) -> tuple[Array, Any, Any]:
-    """What both loops know of the blocks: positions of the rows, shares of the nodes, first pillars."""
+    """What both loops know of the blocks: positions of the rows, shares of the nodes,
+    first pillars.
+    """
     rows, columns = plan.blocks
-    return rows.along.astype(dtype), tuple(b.weights.astype(dtype) for b in plan.blocks), (rows.bases, columns.bases)
+    return (
+        rows.along.astype(dtype),
+        tuple(b.weights.astype(dtype) for b in plan.blocks),
+        (rows.bases, columns.bases),
+    )
 
 
-def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
+def _gather(
+    phase: torch.Tensor, level: torch.Tensor, plan: Moments
+) -> tuple[torch.Tensor, float]:
     """Moments by the compiled loops."""
     maps = phase.detach().numpy(), level.detach().numpy()
     (rows, columns), (m, n) = plan.blocks, plan.counts
@@ -188,18 +270,32 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
     powers: list[float] = []
     along, shares, (row_bases, column_bases) = _fixed(plan, out.numpy().dtype)
     # block rows at once, where maps of another dtype are copied
-    step = max(1, int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * along.itemsize)))
+    step = max(
+        1,
+        int(KEEP_BYTES / (len(maps) * rows.length * maps[0].shape[1] * along.itemsize)),
+    )
     for panel in plan.panels:
         table = _table(plan, panel, along.dtype)
         count = panel.stop - panel.start
-        nodes = torch.zeros((count * rows.nodes, 2, columns.count * columns.nodes), dtype=out.dtype)
+        nodes = torch.zeros(
+            (count * rows.nodes, 2, columns.count * columns.nodes), dtype=out.dtype
+        )
         view = nodes.numpy()
 
-        def work(a: int, b: int, first: int = panel.start, table: Any = table, view: Any = view) -> None:
+        def work(
+            a: int,
+            b: int,
+            first: int = panel.start,
+            table: Any = table,
+            view: Any = view,
+        ) -> None:
             for i in range(a, b, step):
                 end = min(i + step, b)
                 begin = (first + i) * rows.length
-                few = [np.asarray(one[begin : (first + end) * rows.length], along.dtype) for one in maps]
+                few = [
+                    np.asarray(one[begin : (first + end) * rows.length], along.dtype)
+                    for one in maps
+                ]
                 bases = row_bases[first + i : first + end] - begin, column_bases
                 part = view[i * rows.nodes : end * rows.nodes]
                 powers.append(kernel(*few, table[i:end], along, shares, bases, 0, part))
@@ -210,12 +306,21 @@ def _gather(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[to
             sums[:, to].addmm_(nodes.flatten(0, 1)[:, at], plan.columns[at, to])
         sums, before = sums.view(-1, 2 * n), panel.start * rows.nodes
         for at, to in _in(plan.bands[0], before, panel.stop * rows.nodes):
-            out[to].addmm_(plan.rows[at, to].T, sums[at.start - before : at.stop - before])
+            out[to].addmm_(
+                plan.rows[at, to].T, sums[at.start - before : at.stop - before]
+            )
     return out.view(m, 2, n).movedim(1, 0).contiguous(), math.fsum(powers)
 
 
-def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]) -> None:
-    """Gradients of the moments to those of phase and transmission by the compiled loops."""
+def _spread(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    plan: Moments,
+    grad: torch.Tensor,
+    out: tuple[Any, Any],
+) -> None:
+    """Gradients of the moments to those of phase and transmission by the compiled
+    loops.
+    """
     phase, level = (m.detach().numpy() for m in maps)
     none = np.empty((0, 0), phase.dtype)
     targets = tuple(none if t is None else t.numpy() for t in out)
@@ -227,7 +332,9 @@ def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.
         table = _table(plan, panel, phase.dtype)
         nodes = _given(plan, panel, inner).numpy()
 
-        def work(a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel) -> None:
+        def work(
+            a: int, b: int, table: Any = table, nodes: Any = nodes, panel: slice = panel
+        ) -> None:
             part = nodes[a * rows.nodes : b * rows.nodes]
             kernel(phase, level, table[a:b], *fixed, panel.start + a, part, *targets)
 
@@ -235,11 +342,17 @@ def _spread(maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.
 
 
 def _given(plan: Moments, panel: slice, inner: torch.Tensor) -> torch.Tensor:
-    """Gradients (m, re/im · n) of the moments to those of the nodes of a panel (row node, re/im, column node)."""
+    """Gradients (m, re/im · n) of the moments to those of the nodes of a panel (row
+    node, re/im, column node).
+    """
     (rows, columns), n = plan.blocks, plan.counts[1]
     before, stop = panel.start * rows.nodes, panel.stop * rows.nodes
-    sums = torch.cat([plan.rows[at, to] @ inner[to] for at, to in _in(plan.bands[0], before, stop)]).view(-1, n)
-    nodes = torch.cat([sums[:, to] @ plan.columns[at, to].T for at, to in plan.bands[1]], 1)
+    sums = torch.cat(
+        [plan.rows[at, to] @ inner[to] for at, to in _in(plan.bands[0], before, stop)]
+    ).view(-1, n)
+    nodes = torch.cat(
+        [sums[:, to] @ plan.columns[at, to].T for at, to in plan.bands[1]], 1
+    )
     return nodes.view(-1, 2, columns.count * columns.nodes)
 
 
@@ -248,30 +361,47 @@ def _phasors(phase: torch.Tensor, plan: Moments, start: int) -> torch.Tensor:
     wave = plan.carrier
     y, x = (torch.tensor(v, device=phase.device) for v in wave.case.pillars_um)
     y = y[start : start + phase.shape[0], None]
-    turns = phase.double() / (2 * torch.pi) + carrier_turns(wave.case, wave.reference, x, y)
+    turns = phase.double() / (2 * torch.pi) + carrier_turns(
+        wave.case, wave.reference, x, y
+    )
     angle = ((turns - turns.round()) * 2 * torch.pi).to(phase.dtype)
     return torch.complex(torch.cos(angle), torch.sin(angle))
 
 
-def _gather_plain(phase: torch.Tensor, level: torch.Tensor, plan: Moments) -> tuple[torch.Tensor, float]:
-    """Moments by plain tensor operations, for devices without compiled loops: every pillar is a node."""
-    out = torch.zeros(plan.counts, dtype=torch.complex(phase[0, 0], phase[0, 0]).dtype, device=phase.device)
+def _gather_plain(
+    phase: torch.Tensor, level: torch.Tensor, plan: Moments
+) -> tuple[torch.Tensor, float]:
+    """Moments by plain tensor operations, for devices without compiled loops: every
+    pillar is a node.
+    """
+    out = torch.zeros(
+        plan.counts,
+        dtype=torch.complex(phase[0, 0], phase[0, 0]).dtype,
+        device=phase.device,
+    )
     for start in range(0, phase.shape[0], DEVICE_ROWS):
         rows = slice(start, start + DEVICE_ROWS)
         light = level[rows] * _phasors(phase[rows], plan, start)
-        out = out + plan.rows[rows].T.to(light.dtype) @ (light @ plan.columns.to(light.dtype))
+        out = out + plan.rows[rows].T.to(light.dtype) @ (
+            light @ plan.columns.to(light.dtype)
+        )
     return torch.stack([out.real, out.imag]), float((level.double() ** 2).sum())
 
 
 def _spread_plain(
-    maps: tuple[torch.Tensor, torch.Tensor], plan: Moments, grad: torch.Tensor, out: tuple[Any, Any]
+    maps: tuple[torch.Tensor, torch.Tensor],
+    plan: Moments,
+    grad: torch.Tensor,
+    out: tuple[Any, Any],
 ) -> None:
     """Gradients by plain tensor operations."""
     both = torch.complex(grad[0], grad[1])
     for start in range(0, maps[0].shape[0], DEVICE_ROWS):
         rows = slice(start, start + DEVICE_ROWS)
         at = plan.rows[rows].to(both.dtype) @ both @ plan.columns.T.to(both.dtype)
-        turned = at * _phasors(maps[0][rows], plan, start).conj()  # its real part: along the phasor
+        turned = (
+            at * _phasors(maps[0][rows], plan, start).conj()
+        )  # its real part: along the phasor
         if out[0] is not None:
             out[0][rows] = turned.imag * maps[1][rows]
         if out[1] is not None:

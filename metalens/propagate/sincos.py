@@ -1,7 +1,10 @@
-"""Sine and cosine of whole turns as polynomials that a compiler turns into vector instructions.
+"""Sine and cosine of whole turns as polynomials that a compiler turns into vector
+instructions.
 
-For t in [-1/2, 1/2] turns: s = sin(πt) and c = cos(πt) from polynomials in t², then sin 2πt = 2sc, cos 2πt = c² - s².
-Accuracy: 4e-7 in float32 at most, 7e-8 root mean square, 7e-16 in float64, absolute; less where products are fused.
+For t in [-1/2, 1/2] turns: s = sin(πt) and c = cos(πt) from polynomials in t², then sin
+2πt = 2sc, cos 2πt = c² - s².
+Accuracy: 4e-7 in float32 at most, 7e-8 root mean square, 7e-16 in float64, absolute;
+less where products are fused.
 """
 
 from math import factorial, pi
@@ -16,14 +19,20 @@ from metalens.ground.arrays import Array
 
 
 def _fit(series: Any, degree: int) -> Array:
-    """Power coefficients in u = t² on [0, 1/4] of the Chebyshev interpolant of a function of u."""
+    """Power coefficients in u = t² on [0, 1/4] of the Chebyshev interpolant of a
+    function of u.
+    """
     unit = Chebyshev.interpolate(series, degree, domain=[0, 0.25])
-    return np.asarray(unit.convert(kind=Polynomial, domain=[-1, 1], window=[-1, 1]).coef)
+    return np.asarray(
+        unit.convert(kind=Polynomial, domain=[-1, 1], window=[-1, 1]).coef
+    )
 
 
 def _taylor(odd: int, terms: int = 18) -> Any:
     """sin(πt)/t (odd = 1) or cos(πt) (odd = 0) as a power series in u = t²."""
-    coefficients = [(-1) ** n * pi ** (2 * n + odd) / factorial(2 * n + odd) for n in range(terms)]
+    coefficients = [
+        (-1) ** n * pi ** (2 * n + odd) / factorial(2 * n + odd) for n in range(terms)
+    ]
     return Polynomial(coefficients)
 
 
@@ -39,8 +48,12 @@ def turns64(t):  # type: ignore[no-untyped-def]
     u = t * t
     s = _S8[5] + u * (_S8[6] + u * (_S8[7] + u * (_S8[8] + u * (_S8[9] + u * _S8[10]))))
     s = t * (_S8[0] + u * (_S8[1] + u * (_S8[2] + u * (_S8[3] + u * (_S8[4] + u * s)))))
-    c = _C8[6] + u * (_C8[7] + u * (_C8[8] + u * (_C8[9] + u * (_C8[10] + u * _C8[11]))))
-    c = _C8[0] + u * (_C8[1] + u * (_C8[2] + u * (_C8[3] + u * (_C8[4] + u * (_C8[5] + u * c)))))
+    c = _C8[6] + u * (
+        _C8[7] + u * (_C8[8] + u * (_C8[9] + u * (_C8[10] + u * _C8[11])))
+    )
+    c = _C8[0] + u * (
+        _C8[1] + u * (_C8[2] + u * (_C8[3] + u * (_C8[4] + u * (_C8[5] + u * c))))
+    )
     return c * c - s * s, 2.0 * s * c
 
 
@@ -49,13 +62,19 @@ def turns32(t):  # type: ignore[no-untyped-def]
     """(cos 2πt, sin 2πt) in float32 for t in [-1/2, 1/2]."""
     x = np.float32(t)
     u = x * x
-    s = x * (_S4[0] + u * (_S4[1] + u * (_S4[2] + u * (_S4[3] + u * (_S4[4] + u * _S4[5])))))
-    c = _C4[0] + u * (_C4[1] + u * (_C4[2] + u * (_C4[3] + u * (_C4[4] + u * (_C4[5] + u * _C4[6])))))
+    s = x * (
+        _S4[0] + u * (_S4[1] + u * (_S4[2] + u * (_S4[3] + u * (_S4[4] + u * _S4[5]))))
+    )
+    c = _C4[0] + u * (
+        _C4[1] + u * (_C4[2] + u * (_C4[3] + u * (_C4[4] + u * (_C4[5] + u * _C4[6]))))
+    )
     return c * c - s * s, np.float32(2) * s * c
 
 
 def turns(t: Any, like: Any) -> Any:
-    """(cos 2πt, sin 2πt) in the precision of the array ``like``; compiled loops choose while they are compiled."""
+    """(cos 2πt, sin 2πt) in the precision of the array ``like``; compiled loops choose
+    while they are compiled.
+    """
     return turns32(t) if like.dtype == np.float32 else turns64(t)
 
 

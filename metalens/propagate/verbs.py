@@ -1,8 +1,12 @@
-"""Light from a point source through the pillars to the sensor window: the exact sum, and faster ways to the same field.
+"""Light from a point source through the pillars to the sensor window: the exact sum,
+and faster ways to the same field.
 
-All functions take one direction of light and return complex fields (depth, y, x), incident amplitude 1, phase zero
-at the lens centre. The window is a square grid of ``samples`` cells of width ``window_um / samples``, sampled at their
-centres and centred on the chief ray, which meets the sensor at d·(tan angle_x, tan angle_y).
+All functions take one direction of light and return complex fields (depth, y, x),
+incident amplitude 1, phase zero
+at the lens centre. The window is a square grid of ``samples`` cells of width
+``window_um / samples``, sampled at their
+centres and centred on the chief ray, which meets the sensor at d·(tan angle_x, tan
+angle_y).
 """
 
 import math
@@ -19,7 +23,17 @@ from metalens.propagate.direct import angular_spectrum as _angular_spectrum
 from metalens.propagate.direct import field_at, field_exact
 from metalens.propagate.geometry import Case
 
-__all__ = ["Case", "Choice", "angular_spectrum", "case", "choose", "exact", "field_at", "field_exact", "windowed"]
+__all__ = [
+    "Case",
+    "Choice",
+    "angular_spectrum",
+    "case",
+    "choose",
+    "exact",
+    "field_at",
+    "field_exact",
+    "windowed",
+]
 
 
 def case(
@@ -42,17 +56,23 @@ def case(
     Args:
         shape: (y, x) pillars.
         depths_um: source depths, any sequence or a number; inf for a collimated beam.
-        angle_rad: field angle along x, or the pair (x, y), arctangents of the light's slopes dx/dz and dy/dz (those in
+        angle_rad: field angle along x, or the pair (x, y), arctangents of the light's
+            slopes dx/dz and dy/dz (those in
             air): light of a positive angle moves to +x (+y).
-        window_um, samples: full width of the window, and cells along it; pairs (x, y) where it is not square.
+        window_um, samples: full width of the window, and cells along it; pairs (x, y)
+            where it is not square.
         offset_um: (x, y) of the window centre from the chief ray.
-        layers: films around the lens; ``wavelength_um`` is then that in vacuum, and ``angle_rad`` that in air.
-        row_um: distance of the rows, 0 for that of the columns; site_um2: area of the cell of one pillar, 0 for that
-            of the grid. On a hexagonal lattice of pitch p: p / 2 from column to column, p sqrt(3) / 2 from row to row,
+        layers: films around the lens; ``wavelength_um`` is then that in vacuum, and
+            ``angle_rad`` that in air.
+        row_um: distance of the rows, 0 for that of the columns; site_um2: area of the
+            cell of one pillar, 0 for that
+            of the grid. On a hexagonal lattice of pitch p: p / 2 from column to column,
+            p sqrt(3) / 2 from row to row,
             an area of p² sqrt(3) / 2, and 0 transmission at every other site.
 
     Raises:
-        PropagationError: a length that is not positive, an angle of 90° or more, no depth, an offset that is no pair,
+        PropagationError: a length that is not positive, an angle of 90° or more, no
+            depth, an offset that is no pair,
             films without a gap and rays beyond their critical angle, a stop in front.
     """
     step_um, cells = window_of(window_um, samples)
@@ -61,7 +81,10 @@ def case(
     depths = _depths(depths_um, offset_um)
     d = sensor_distance_um
     films = _films(layers, float(d), float(wavelength_um))
-    meets = [chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i]) for i in (0, 1)]
+    meets = [
+        chief(films.get("behind"), float(d), tangents, i) + float(offset_um[i])
+        for i in (0, 1)
+    ]
     made = Case(
         shape=(int(shape[-2]), int(shape[-1])),
         pitch_um=float(pitch_um),
@@ -80,7 +103,9 @@ def case(
     return made
 
 
-def _films(layers: Layers | None, sensor_distance_um: float, wavelength_um: float) -> dict[str, Any]:
+def _films(
+    layers: Layers | None, sensor_distance_um: float, wavelength_um: float
+) -> dict[str, Any]:
     """What films add to a case."""
     if layers is not None and layers.stop is not None:
         raise PropagationError(
@@ -93,14 +118,21 @@ def _films(layers: Layers | None, sensor_distance_um: float, wavelength_um: floa
 
 
 def _check_rays(case: Case) -> None:
-    """Refuse rays that no face lets through: where films fill the whole gap, those that its cover cannot hold."""
+    """Refuse rays that no face lets through: where films fill the whole gap, those that
+    its cover cannot hold.
+    """
     if case.behind is None or case.behind.thickness_um[0] > 0:
         return
     turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     (high, wide), (down, across) = case.half_size_um, case.half_window_um
-    x = np.abs(np.abs(case.centre_um[0]) + across + wide * np.cos(turn))  # the rim of a round lens, the far corner
+    x = np.abs(
+        np.abs(case.centre_um[0]) + across + wide * np.cos(turn)
+    )  # the rim of a round lens, the far corner
     y = np.abs(np.abs(case.centre_um[1]) + down + high * np.sin(turn))
-    steepest, most = float(media.direction(case.behind, np.hypot(x, y).max())), min(case.behind.order)
+    steepest, most = (
+        float(media.direction(case.behind, np.hypot(x, y).max())),
+        min(case.behind.order),
+    )
     if steepest >= most:
         raise PropagationError(
             f"layers: the films fill the way from lens to sensor, and rays of n sin θ = {steepest:.3g} from the rim to "
@@ -118,17 +150,25 @@ def _depths(depths_um: Any, offset_um: Any) -> Array:
 
 
 def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
-    """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs (x, y).
+    """(step_um, (y, x) samples) of a window: widths and samples are numbers, or pairs
+    (x, y).
 
     Raises:
-        PropagationError: no number and no pair, parts of samples, or cells that are not square to 1e-6.
+        PropagationError: no number and no pair, parts of samples, or cells that are not
+            square to 1e-6.
     """
-    wide, many = np.ravel(np.asarray(window_um, float)), np.ravel(np.asarray(samples, float))
+    wide, many = (
+        np.ravel(np.asarray(window_um, float)),
+        np.ravel(np.asarray(samples, float)),
+    )
     if wide.size not in (1, 2) or many.size not in (1, 2) or (many % 1 != 0).any():
         raise PropagationError(
             f"window_um = {window_um}, samples = {samples}: need a number or a pair (x, y) of each, samples whole"
         )
-    (width, height), (across, down) = np.resize(wide, 2).tolist(), np.resize(many.astype(int), 2).tolist()
+    (width, height), (across, down) = (
+        np.resize(wide, 2).tolist(),
+        np.resize(many.astype(int), 2).tolist(),
+    )
     step = width / max(across, 1)
     if abs(height / max(down, 1) - step) > 1e-6 * abs(step):
         raise PropagationError(
@@ -138,27 +178,42 @@ def window_of(window_um: Any, samples: Any) -> tuple[float, tuple[int, int]]:
     return step, (down, across)
 
 
-def around(layers: Layers, sensor_distance_um: float, wavelength_um: float) -> dict[str, Any]:
+def around(
+    layers: Layers, sensor_distance_um: float, wavelength_um: float
+) -> dict[str, Any]:
     """``front`` and ``behind`` of a :class:`Case` with these films.
 
     Raises:
         PropagationError: films thicker than the distance, or of metal.
     """
     before = layers.before(math.inf, wavelength_um)
-    films = tuple((n, t) for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True) if t > 0)
+    films = tuple(
+        (n, t)
+        for n, t in zip(before.index[1:], before.thickness_um[1:], strict=True)
+        if t > 0
+    )
     return {"front": films, "behind": layers.after(sensor_distance_um, wavelength_um)}
 
 
-def chief(behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int) -> Any:
-    """Where the chief ray of these tangents (in air) meets the sensor, along x (axis 0) or y (1), um.
+def chief(
+    behind: Media | None, sensor_distance_um: Any, tangents: Any, axis: int
+) -> Any:
+    """Where the chief ray of these tangents (in air) meets the sensor, along x (axis 0)
+    or y (1), um.
 
     Operands may be torch tensors: behind films the cover takes what the distance gains.
     """
     if behind is None:
         return sensor_distance_um * tangents[axis]
     steep = 1 + tangents[0] * tangents[0] + tangents[1] * tangents[1]
-    value = sensor_distance_um.detach() if hasattr(sensor_distance_um, "detach") else sensor_distance_um
-    gained = [(n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0]
+    value = (
+        sensor_distance_um.detach()
+        if hasattr(sensor_distance_um, "detach")
+        else sensor_distance_um
+    )
+    gained = [
+        (n, t) for n, t in zip(behind.index, behind.thickness_um, strict=True) if t > 0
+    ]
     pairs = [*gained, (behind.index[0], sensor_distance_um - value)]
     return media.bend(pairs, 1 - 1 / steep) * tangents[axis] / steep**0.5
 
@@ -173,12 +228,15 @@ def angles(angle_rad: Any) -> tuple[float, float]:
     if pair.shape == (1,):
         pair = np.array([pair[0], 0.0])
     if pair.shape != (2,) or not (np.abs(pair) < np.pi / 2).all():
-        raise PropagationError(f"angle_rad is {angle_rad}, need one angle or a pair (x, y) within ±pi/2")
+        raise PropagationError(
+            f"angle_rad is {angle_rad}, need one angle or a pair (x, y) within ±pi/2"
+        )
     return float(pair[0]), float(pair[1])
 
 
 def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
-    """The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64 (see :func:`field_exact`).
+    """The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64 (see
+    :func:`field_exact`).
 
     Args:
         phase_rad, transmission: (y, x) numpy arrays.
@@ -203,7 +261,8 @@ def angular_spectrum(
     single: bool = False,
     **geometry: Any,
 ) -> Array:
-    """Textbook angular spectrum on the zero-padded pillar lattice (see :mod:`metalens.propagate.direct`).
+    """Textbook angular spectrum on the zero-padded pillar lattice (see
+    :mod:`metalens.propagate.direct`).
 
     Args:
         pad, band_limited, single: padding factor, band limit, complex64.
@@ -211,14 +270,20 @@ def angular_spectrum(
     """
     phase, level = np.asarray(phase_rad), np.asarray(transmission)
     one = case(phase.shape, **geometry)
-    return _angular_spectrum(phase, level, one, pad=pad, band_limited=band_limited, single=single)
+    return _angular_spectrum(
+        phase, level, one, pad=pad, band_limited=band_limited, single=single
+    )
 
 
-def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **geometry: Any) -> Any:
-    """Windowed propagation: only the field on the window, differentiable in torch phase and transmission.
+def windowed(
+    phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **geometry: Any
+) -> Any:
+    """Windowed propagation: only the field on the window, differentiable in torch phase
+    and transmission.
 
     Args:
-        phase_rad, transmission: (y, x) torch tensors or numpy arrays, float32 or float64.
+        phase_rad, transmission: (y, x) torch tensors or numpy arrays, float32 or
+            float64.
         tolerance: relative error of the field that the node counts are chosen for.
         geometry: as :func:`case`.
 
@@ -226,17 +291,21 @@ def windowed(phase_rad: Any, transmission: Any, *, tolerance: float = 1e-4, **ge
         (depth, y, x) complex, of the kind that came in.
 
     Raises:
-        PropagationError: the window is too large for the method, a tolerance that is not above 0 and below 1;
+        PropagationError: the window is too large for the method, a tolerance that is
+            not above 0 and below 1;
             otherwise as :func:`exact`.
 
-    Sums are in float64 whatever comes in, so that a tighter tolerance is not lost in rounding.
+    Sums are in float64 whatever comes in, so that a tighter tolerance is not lost in
+    rounding.
     """
     import torch
 
     from metalens.propagate.window import field_windowed, plan
 
     if not 0 < tolerance < 1:
-        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0 and below 1")
+        raise PropagationError(
+            f"tolerance is {tolerance}, need a relative error above 0 and below 1"
+        )
     phase = torch.as_tensor(phase_rad)
     level = torch.as_tensor(transmission).to(phase)
     made = plan(case(phase.shape, **geometry), tolerance, torch.float64, phase.device)

@@ -1,15 +1,20 @@
-"""Wide windows: the field by three Fourier transforms, on grids as fine as aperture and window ask for.
+"""Wide windows: the field by three Fourier transforms, on grids as fine as aperture and
+window ask for.
 
     U(c + δ) = Σ_x L(x) h(c + δ - x),    h(ρ) = ∫ √passed(p) exp(ik[p·ρ + Φ(p)]) d²p/λ²,    Φ = Σ t √(n² - p²)
 
-(the exact transfer of plane waves through plane-parallel media). Φ is split into the quadratic that follows its rays
+(the exact transfer of plane waves through plane-parallel media). Φ is split into the
+quadratic that follows its rays
 best, reach(p) ≈ A + D (p - p0) along each axis, and the rest ψ. The quadratic gives
 
     V(δ) = exp(ikδ²/2D)/(iλD) Σ_x [L(x) exp(ik((x - x0)²/2D - p0 x))] exp(-ikδ(x - x0)/D),    x0 = c - A,
 
-one transform of the light on an even grid of the lens; U = F⁻¹[√passed exp(ikψ) F[V]] moves light by a few tens of
-um at most, by which the window is padded. Pillars are handed to the even grid as to the nodes of the windowed method
-(:mod:`metalens.propagate.pillars`), by a sinc under Kaiser's window, since the kernel's carrier is taken off first.
+one transform of the light on an even grid of the lens; U = F⁻¹[√passed exp(ikψ) F[V]]
+moves light by a few tens of
+um at most, by which the window is padded. Pillars are handed to the even grid as to the
+nodes of the windowed method
+(:mod:`metalens.propagate.pillars`), by a sinc under Kaiser's window, since the kernel's
+carrier is taken off first.
 """
 
 import functools
@@ -29,18 +34,27 @@ from metalens.lens import media
 from metalens.propagate.geometry import Case
 from metalens.propagate.grids import Axis, axes, grid_um, spread_weights
 from metalens.propagate.operators import depth_basis
-from metalens.propagate.paths import from_source, over_blocks, reference_depth, to_sensor
+from metalens.propagate.paths import (
+    from_source,
+    over_blocks,
+    reference_depth,
+    to_sensor,
+)
 from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 
 BAND_BYTES = 3e6  # of the depths that are mixed at once
-EVERY = 3  # point of the grid of the lens whose light says which depth fields are needed
+EVERY = (
+    3  # point of the grid of the lens whose light says which depth fields are needed
+)
 CHUNK_BYTES = 4e7  # of the depth fields that are transformed at once
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WidePlan:
-    """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x) depth fields on the grid of the
-    lens, its phases included; coefficients: (depth, b); chirp, transfer: (X, Y) behind the first and second transform,
+    """Everything that depends on the geometry alone. axes: (y, x); fields: (b, y, x)
+    depth fields on the grid of the
+    lens, its phases included; coefficients: (depth, b); chirp, transfer: (X, Y) behind
+    the first and second transform,
     as light lies in memory between them.
     left: of the light of all depths that fewer fields may leave out, root mean square.
     """
@@ -63,12 +77,23 @@ class WidePlan:
     @property
     def bytes(self) -> int:
         """Memory that its arrays take."""
-        held = [self.fields, self.coefficients, self.chirp, self.transfer, self.moments.rows, self.moments.columns]
+        held = [
+            self.fields,
+            self.coefficients,
+            self.chirp,
+            self.transfer,
+            self.moments.rows,
+            self.moments.columns,
+        ]
         table = self.moments.table
-        return sum(int(t.nbytes) for t in held) + (int(table.nbytes) if table is not None else 0)
+        return sum(int(t.nbytes) for t in held) + (
+            int(table.nbytes) if table is not None else 0
+        )
 
 
-def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device) -> WidePlan:
+def wide_plan(
+    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device
+) -> WidePlan:
     """A new plan.
 
     Raises:
@@ -76,7 +101,9 @@ def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.de
     """
     found = axes(case, tolerance)
     if found is None:
-        raise PropagationError("rays to this window are too steep for Fourier transforms; see propagate.choose")
+        raise PropagationError(
+            "rays to this window are too steep for Fourier transforms; see propagate.choose"
+        )
     pillars = moments(
         case,
         reference_depth(case),
@@ -95,21 +122,31 @@ def wide_plan(case: Case, tolerance: float, dtype: torch.dtype, device: torch.de
     table = torch.empty((coefficients.shape[1], *lens.shape), dtype=kind, device=device)
     for one, field in zip(table, fields, strict=True):
         one.copy_(torch.from_numpy(field * lens))
-    return WidePlan(case, found, pillars, table, given[0], given[1], given[2], tolerance)
+    return WidePlan(
+        case, found, pillars, table, given[0], given[1], given[2], tolerance
+    )
 
 
-def _depth_fields(case: Case, found: tuple[Axis, Axis], tolerance: float) -> tuple[Iterator[Array], Array]:
-    """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth, b) coefficients."""
+def _depth_fields(
+    case: Case, found: tuple[Axis, Axis], tolerance: float
+) -> tuple[Iterator[Array], Array]:
+    """(b, y, x) depth fields on the grid of the lens, one after the other, and (depth,
+    b) coefficients.
+    """
     grids = [grid_um(axis) for axis in found]
     counts = [min(_coarse(case, i, g), len(g)) for i, g in enumerate(grids)]
     e, x = (legendre.mapped(n, g[0], g[-1]) for n, g in zip(counts, grids, strict=True))
     depths = depth_basis(case, (e, x), tolerance)
-    to = [legendre.interpolation(n, g / g[-1]) for n, g in zip(counts, grids, strict=True)]
+    to = [
+        legendre.interpolation(n, g / g[-1]) for n, g in zip(counts, grids, strict=True)
+    ]
     return (to[0] @ one @ to[1].T for one in depths.basis), depths.coefficients
 
 
 def _coarse(case: Case, i: int, grid: Array) -> int:
-    """Legendre nodes that hold the phase of the extreme depths along an axis: two a turn, and some."""
+    """Legendre nodes that hold the phase of the extreme depths along an axis: two a
+    turn, and some.
+    """
     far = [np.array([0.0, *case.half_size_um])[:, None], grid[[0, -1]]]
     y, x = (far[1], far[0]) if i == 0 else (far[0], far[1])
     turns = 0.0
@@ -121,73 +158,111 @@ def _coarse(case: Case, i: int, grid: Array) -> int:
 
 
 def _lens_phase(case: Case, found: tuple[Axis, Axis]) -> Array:
-    """(y, x) what the light of the grid is multiplied by before the first transform, all constants included."""
+    """(y, x) what the light of the grid is multiplied by before the first transform,
+    all constants included.
+    """
     k, lam = case.wavenumber, case.wavelength_um
     total, ramp = np.zeros((1, 1)), np.ones((1, 1), complex)
     for i, (axis, c) in enumerate(zip(found, case.centre_um[::-1], strict=True)):
         x, x0 = grid_um(axis), c - axis.reach_um
         path = (x - x0) ** 2 / (2 * axis.stretch_um) + axis.middle * (c - x)
-        turn = np.exp(2j * np.pi * (axis.size // 2) * np.arange(axis.count) / axis.first)
-        total, ramp = (total + path[:, None], ramp * turn[:, None]) if i == 0 else (total + path, ramp * turn)
+        turn = np.exp(
+            2j * np.pi * (axis.size // 2) * np.arange(axis.count) / axis.first
+        )
+        total, ramp = (
+            (total + path[:, None], ramp * turn[:, None])
+            if i == 0
+            else (total + path, ramp * turn)
+        )
     y, x = (grid_um(axis) for axis in found)
     away = np.asarray(to_sensor(case, x, y[:, None]))
-    scale = case.area_um2 / (1j * lam * math.sqrt(found[0].stretch_um * found[1].stretch_um))
+    scale = case.area_um2 / (
+        1j * lam * math.sqrt(found[0].stretch_um * found[1].stretch_um)
+    )
     start = float(_phase_path(case, found[0].middle ** 2 + found[1].middle ** 2))
     return np.asarray(scale * ramp * np.exp(1j * k * (total - away + start)))
 
 
 def _phase_path(case: Case, w: Any) -> Any:
     """Φ = Σ t √(n² - w), um."""
-    pairs = [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
+    pairs = (
+        [(1.0, case.sensor_distance_um)] if case.behind is None else case.behind.layers
+    )
     return sum(t * (n * n - w) ** 0.5 for n, t in pairs)
 
 
 def _behind(case: Case, found: tuple[Axis, Axis]) -> tuple[Array, Array]:
-    """(Y, X) chirp of the window behind the first transform, and transfer of what the quadratic leaves."""
+    """(Y, X) chirp of the window behind the first transform, and transfer of what the
+    quadratic leaves.
+    """
     k = case.wavenumber
     chirps, ramps, squares, paths = [], [], [], []
     for axis, samples, c in zip(found, case.samples, case.centre_um[::-1], strict=True):
         period = axis.fine * case.step_um / axis.every
         n, width = np.arange(axis.size) - axis.size // 2, period / axis.size
         place = (axis.first_um - (c - axis.reach_um)) / axis.step_um
-        turns = n * (axis.size // 2 / axis.size - place / axis.first)  # the lowest order of the next transform is first
-        chirps.append(np.exp(1j * k * (n * width) ** 2 / (2 * axis.stretch_um) + 2j * np.pi * turns))
+        turns = n * (
+            axis.size // 2 / axis.size - place / axis.first
+        )  # the lowest order of the next transform is first
+        chirps.append(
+            np.exp(
+                1j * k * (n * width) ** 2 / (2 * axis.stretch_um) + 2j * np.pi * turns
+            )
+        )
         u = n * case.wavelength_um / period
         first = -(samples - 1) / 2 * case.step_um / width + axis.size // 2
-        ramps.append(np.exp(2j * np.pi * n * first / axis.size) * _fade(axis, np.abs(u) - axis.most) / axis.size)
+        ramps.append(
+            np.exp(2j * np.pi * n * first / axis.size)
+            * _fade(axis, np.abs(u) - axis.most)
+            / axis.size
+        )
         squares.append((axis.middle + u) ** 2)
         paths.append(axis.reach_um * u + axis.stretch_um / 2 * u * u)
     w = squares[0][:, None] + squares[1]
     narrow = max(found, key=lambda axis: axis.guard)
     seen = w < (narrow.steepest + 1.1 * narrow.guard) ** 2
     w = np.where(seen, w, 0.0)
-    psi = _phase_path(case, w) - _phase_path(case, found[0].middle ** 2 + found[1].middle ** 2)
+    psi = _phase_path(case, w) - _phase_path(
+        case, found[0].middle ** 2 + found[1].middle ** 2
+    )
     psi = psi + paths[0][:, None] + paths[1]
     level = _fade(narrow, np.sqrt(w) - narrow.steepest)
     if case.behind is not None:
         level = level * np.sqrt(media.passed_at(case.behind.order, w))
-    transfer = np.where(seen, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0)
+    transfer = np.where(
+        seen, ramps[0][:, None] * ramps[1] * level * np.exp(1j * k * psi), 0
+    )
     return chirps[0][:, None] * chirps[1], transfer
 
 
 def _fade(axis: Axis, past: Array) -> Array:
-    """1 for rays to the window, 0 past the end of the band, by the integral of a Gaussian between."""
-    return np.asarray(scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * past / axis.guard - 1)) / 2)
+    """1 for rays to the window, 0 past the end of the band, by the integral of a
+    Gaussian between.
+    """
+    return np.asarray(
+        scipy.special.erfc(axis.sharp / math.sqrt(2) * (2 * past / axis.guard - 1)) / 2
+    )
 
 
 def light_wide(
-    maps: tuple[torch.Tensor, torch.Tensor], plan: WidePlan, pupils: Pupils | None = None
+    maps: tuple[torch.Tensor, torch.Tensor],
+    plan: WidePlan,
+    pupils: Pupils | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
-    """Light on the window (depth, y, x); that of every map on the even grid of the lens; the sums of squares of their
+    """Light on the window (depth, y, x); that of every map on the even grid of the
+    lens; the sums of squares of their
     transmissions.
 
-    Differentiable in phase and transmission. maps: (map, y, x) of both. pupils: factors on their light; None for the
+    Differentiable in phase and transmission. maps: (map, y, x) of both. pupils: factors
+    on their light; None for the
     |U|² of one map.
     """
     found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
     gathered, total = torch.stack([g for g, _ in found]), None
     for sign, light in mixed(gathered, pupils, plan.nodes_um):
-        mixture, coefficients = (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
+        mixture, coefficients = (
+            (None, plan.coefficients) if light.requires_grad else _fewer(light, plan)
+        )
         here = _mixed(fields_wide(light, plan, mixture), coefficients)
         here = here if sign == 1 else sign * here
         total = here if total is None else total + here
@@ -195,12 +270,17 @@ def light_wide(
 
 
 def _fewer(light: torch.Tensor, plan: WidePlan) -> tuple[torch.Tensor, torch.Tensor]:
-    """(fewer, b) mixtures of the depth fields and (depth, fewer) coefficients for this light on the grid of the lens:
+    """(fewer, b) mixtures of the depth fields and (depth, fewer) coefficients for this
+    light on the grid of the lens:
     a round lens leaves the corners of its square dark, where depths differ most.
 
         F_z L ≈ Σ_r U_zr (Uᴴ C B)_r L,    U: first eigenvectors of C G Cᴴ,    G_ij = Σ_x |L|² B_i B_j*
     """
-    some = (plan.fields[:, ::EVERY, ::EVERY] * light[::EVERY, ::EVERY]).flatten(1).to(torch.complex128)
+    some = (
+        (plan.fields[:, ::EVERY, ::EVERY] * light[::EVERY, ::EVERY])
+        .flatten(1)
+        .to(torch.complex128)
+    )
     c = plan.coefficients.to(torch.complex128)
     power, axes = torch.linalg.eigh(c @ (some @ some.mH) @ c.mH)
     lost = torch.cumsum(power.clamp_min(0), 0)  # ascending
@@ -209,24 +289,35 @@ def _fewer(light: torch.Tensor, plan: WidePlan) -> tuple[torch.Tensor, torch.Ten
     return (kept.mH @ c).to(plan.coefficients), kept.to(plan.coefficients)
 
 
-def fields_wide(gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | None = None) -> torch.Tensor:
-    """(b, y, x) field of every depth field, or of every mixture (fewer, b) of them, on the window from the light on the
+def fields_wide(
+    gathered: torch.Tensor, plan: WidePlan, mixture: torch.Tensor | None = None
+) -> torch.Tensor:
+    """(b, y, x) field of every depth field, or of every mixture (fewer, b) of them, on
+    the window from the light on the
     grid of the lens, up to a phase of each sample that all share."""
     y, x = plan.axes
     my, mx = plan.case.samples
     step = max(1, int(CHUNK_BYTES / (2 * y.fine * x.fine * gathered.element_size())))
     parts = []
-    fields = plan.fields if mixture is None else torch.tensordot(mixture, plan.fields, 1)
+    fields = (
+        plan.fields if mixture is None else torch.tensordot(mixture, plan.fields, 1)
+    )
     count = len(fields)
     out = None if gathered.requires_grad else gathered.new_empty((count, my, mx))
     for start in range(0, count, step):
         some = slice(start, start + step)
-        light = torch.fft.fft(fields[some] * gathered, n=x.first)[..., : x.size].mT  # every transform is along the last
+        light = torch.fft.fft(fields[some] * gathered, n=x.first)[
+            ..., : x.size
+        ].mT  # every transform is along the last
         light = torch.fft.fft(light, n=y.first)[..., : y.size] * plan.chirp
         light = torch.fft.fft2(light)
         light *= plan.transfer
-        light = torch.fft.ifft(light, n=y.fine, norm="forward")[..., : my * y.every : y.every].mT
-        seen = torch.fft.ifft(light, n=x.fine, norm="forward")[..., : mx * x.every : x.every]
+        light = torch.fft.ifft(light, n=y.fine, norm="forward")[
+            ..., : my * y.every : y.every
+        ].mT
+        seen = torch.fft.ifft(light, n=x.fine, norm="forward")[
+            ..., : mx * x.every : x.every
+        ]
         if out is None:
             parts.append(seen)
         else:
@@ -238,13 +329,20 @@ def _mixed(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
     """(depth, y, x) |Σ_b coefficients[depth, b] fields[b]|², some rows at a time."""
     depths, (count, my, mx) = len(coefficients), fields.shape
     step = max(1, int(BAND_BYTES / (2 * depths * mx * fields.element_size())))
-    bands, out = [], None if fields.requires_grad else fields.real.new_empty((depths, my, mx))
+    bands, out = (
+        [],
+        None if fields.requires_grad else fields.real.new_empty((depths, my, mx)),
+    )
     for start in range(0, my, step):
         some = fields[:, start : start + step]
-        field = torch.view_as_real((coefficients @ some.reshape(count, -1)).view(depths, -1, mx))
+        field = torch.view_as_real(
+            (coefficients @ some.reshape(count, -1)).view(depths, -1, mx)
+        )
         if out is None:
             bands.append(field.square().sum(-1))
         else:
             squares = field.square_()
-            torch.add(squares[..., 0], squares[..., 1], out=out[:, start : start + step])
+            torch.add(
+                squares[..., 0], squares[..., 1], out=out[:, start : start + step]
+            )
     return torch.cat(bands, 1) if out is None else out

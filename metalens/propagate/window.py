@@ -1,4 +1,6 @@
-"""Windowed propagation: only the field on the sensor window, from Legendre moments of the lens."""
+"""Windowed propagation: only the field on the sensor window, from Legendre moments of
+the lens.
+"""
 
 import dataclasses
 import functools
@@ -17,12 +19,21 @@ from metalens.ground.threads import one_blas_thread
 from metalens.propagate.estimate import MORE
 from metalens.propagate.geometry import Case, tiles
 from metalens.propagate.nodes import Layout, layout
-from metalens.propagate.operators import Depths, depth_basis, depth_factors, operators, pairs
+from metalens.propagate.operators import (
+    Depths,
+    depth_basis,
+    depth_factors,
+    operators,
+    pairs,
+)
 from metalens.propagate.paths import over_blocks, reference_depth, to_sensor
 from metalens.propagate.pillars import Moments, Pupils, mixed, moments, reduce
 from metalens.propagate.wide import WidePlan, wide_plan
 
-SMOOTH = 4, 2  # nodes more over the lens, and in a block, where light is multiplied by such factors there
+SMOOTH = (
+    4,
+    2,
+)  # nodes more over the lens, and in a block, where light is multiplied by such factors there
 KEPT_BYTES = 400e6  # of plans that are kept
 BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cache
 
@@ -31,8 +42,10 @@ BUDGET_BYTES = 8e6  # of what is multiplied at once: larger blocks leave the cac
 class Plan:
     """Everything that depends on the geometry alone, ready for many lenses.
 
-    The moments go ``MORE`` orders beyond what the method uses, for the error estimate. tensors: the operators in the
-    dtype and on the device in use, those of the tiles stacked (tile, …); ``turn`` (tile, e, x) is the phase from the
+    The moments go ``MORE`` orders beyond what the method uses, for the error estimate.
+    tensors: the operators in the
+    dtype and on the device in use, those of the tiles stacked (tile, …); ``turn``
+    (tile, e, x) is the phase from the
     window's centre to the tile's own on the nodes of the whole window.
     """
 
@@ -56,22 +69,30 @@ class Plan:
 
     @property
     def judged_um(self) -> tuple[Array, Array]:
-        """(e,), (x,) positions of the nodes that its moments stand for, ``MORE`` than those."""
+        """(e,), (x,) positions of the nodes that its moments stand for, ``MORE`` than
+        those.
+        """
         ny, nx = self.layout.nodes
         return _nodes_um(self.case, (ny + MORE, nx + MORE))
 
     @property
     def bytes(self) -> int:
         """Memory that its arrays take."""
-        held = [*self.tensors.values(), *(t for made in self.slopes.values() for t in made.values())]
+        held = [
+            *self.tensors.values(),
+            *(t for made in self.slopes.values() for t in made.values()),
+        ]
         held += [self.moments.rows, self.moments.columns]
         arrays = [self.depths.basis, self.depths.coefficients, self.moments.table]
-        return sum(int(t.nbytes) for t in held) + sum(int(a.nbytes) for a in arrays if a is not None)
+        return sum(int(t.nbytes) for t in held) + sum(
+            int(a.nbytes) for a in arrays if a is not None
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Moving:
-    """Geometry that carries gradients, float64 tensors: tangents (2,), inverse depths (depth,), sensor distance (),
+    """Geometry that carries gradients, float64 tensors: tangents (2,), inverse depths
+    (depth,), sensor distance (),
     window centre (2,). Values must be those of the plan's case."""
 
     tangents: torch.Tensor
@@ -94,19 +115,25 @@ def plan(
     *,
     smooth: bool = False,
 ) -> Plan:
-    """Plan a windowed propagation; those used last are kept, as many as fit in ``KEPT_BYTES``.
+    """Plan a windowed propagation; those used last are kept, as many as fit in
+    ``KEPT_BYTES``.
 
     Args:
-        moving: for use with :class:`Moving`. smooth: with factors (``Pupils``) on the light of the nodes.
+        moving: for use with :class:`Moving`. smooth: with factors (``Pupils``) on the
+            light of the nodes.
 
     Raises:
         PropagationError: the window is too large for the method.
     """
-    made = functools.partial(_planned, case, tolerance, dtype, device, moving=moving, smooth=smooth)
+    made = functools.partial(
+        _planned, case, tolerance, dtype, device, moving=moving, smooth=smooth
+    )
     return _keep((case, tolerance, dtype, device, moving, smooth), made)
 
 
-def plan_wide(case: Case, tolerance: float, dtype: torch.dtype, device: torch.device) -> WidePlan:
+def plan_wide(
+    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device
+) -> WidePlan:
     """Plan a wide window (:mod:`metalens.propagate.wide`); kept with the others.
 
     Raises:
@@ -136,12 +163,20 @@ def _keep(key: tuple[Any, ...], made: Callable[[], Kept]) -> Kept:
 
 
 def _planned(
-    case: Case, tolerance: float, dtype: torch.dtype, device: torch.device, *, moving: bool, smooth: bool
+    case: Case,
+    tolerance: float,
+    dtype: torch.dtype,
+    device: torch.device,
+    *,
+    moving: bool,
+    smooth: bool,
 ) -> Plan:
     """A new plan."""
     found = layout(case, tolerance)
     if found is None:
-        raise PropagationError("the window is too large for one plan; see propagate.choose, or make it smaller")
+        raise PropagationError(
+            "the window is too large for one plan; see propagate.choose, or make it smaller"
+        )
     lens, inside = SMOOTH if smooth else (0, 0)
     ny, nx = (n + lens for n in found.nodes)
     found = dataclasses.replace(found, nodes=(ny, nx))
@@ -156,13 +191,21 @@ def _planned(
         device=device,
         more=inside,
     )
-    depths = depth_basis(case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving)
-    tensors = _shared(case, found, depths, dtype, device) | _stacked(case, found, depths, tolerance, (dtype, device))
+    depths = depth_basis(
+        case, _nodes_um(case, found.sizes.nodes), tolerance / 2, moving=moving
+    )
+    tensors = _shared(case, found, depths, dtype, device) | _stacked(
+        case, found, depths, tolerance, (dtype, device)
+    )
     return Plan(case, tolerance, found, depths, pillars, tensors)
 
 
-def polynomials(case: Case, counts: tuple[int, int]) -> tuple[Callable[[Array], Array], ...]:
-    """Legendre polynomials over the rows and over the columns of the lens, as weights of :func:`moments`."""
+def polynomials(
+    case: Case, counts: tuple[int, int]
+) -> tuple[Callable[[Array], Array], ...]:
+    """Legendre polynomials over the rows and over the columns of the lens, as weights
+    of :func:`moments`.
+    """
 
     def over(count: int, half_um: float) -> Callable[[Array], Array]:
         return lambda places_um: legendre.values(count, places_um / half_um)
@@ -176,22 +219,31 @@ def _complex(dtype: torch.dtype) -> torch.dtype:
 
 def _nodes_um(case: Case, counts: tuple[int, int]) -> tuple[Array, Array]:
     hy, hx = case.half_size_um
-    return np.asarray(legendre.mapped(counts[0], -hy, hy)), np.asarray(legendre.mapped(counts[1], -hx, hx))
+    return np.asarray(legendre.mapped(counts[0], -hy, hy)), np.asarray(
+        legendre.mapped(counts[1], -hx, hx)
+    )
 
 
 def _shared(
     case: Case, found: Layout, depths: Depths, dtype: torch.dtype, device: torch.device
 ) -> dict[str, torch.Tensor]:
-    """Moments to the nodes of the window, those to the nodes of the tiles, and the depths."""
+    """Moments to the nodes of the window, those to the nodes of the tiles, and the
+    depths.
+    """
     arrays = {"basis": depths.basis, "coefficients": depths.coefficients}
-    for name, all_, few in zip(("rows", "columns"), found.nodes, found.sizes.nodes, strict=True):
+    for name, all_, few in zip(
+        ("rows", "columns"), found.nodes, found.sizes.nodes, strict=True
+    ):
         arrays[f"{name}_to_nodes"] = legendre.to_nodes(all_)
         arrays[f"{name}_to_tile"] = legendre.interpolation(few, legendre.nodes(all_)[0])
     e, x = _nodes_um(case, found.nodes)
     parts = [part for row in tiles(case, found.parts)[1] for part in row]
     away = [to_sensor(c, x, e[:, None]) for c in (case, *parts)]
     arrays["turn"] = np.exp(1j * case.wavenumber * (np.stack(away[1:]) - away[0]))
-    return {name: torch.tensor(a, dtype=_complex(dtype), device=device) for name, a in arrays.items()}
+    return {
+        name: torch.tensor(a, dtype=_complex(dtype), device=device)
+        for name, a in arrays.items()
+    }
 
 
 def _stacked(
@@ -202,17 +254,26 @@ def _stacked(
     kind: tuple[torch.dtype, torch.device],
     slope: int | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any of them needs; ``fields`` are
+    """Operators of all tiles (tile, …) for the pairs of terms and depth fields that any
+    of them needs; ``fields`` are
     the depth fields of the pairs."""
     parts = [part for row in tiles(case, found.parts)[1] for part in row]
     made = [operators(part, found.sizes, tolerance, slope=slope) for part in parts]
     most = max(len(one.strength) for one in made)
     strength = np.max([_padded(one.strength, most) for one in made], axis=0)
     kept = pairs(strength, depths.strength, tolerance / 2)
-    arrays = {name: np.stack([getattr(one, name) for one in made]) for name in ("along_y", "along_x")}
+    arrays = {
+        name: np.stack([getattr(one, name) for one in made])
+        for name in ("along_y", "along_x")
+    }
     for name in ("lens_terms", "window_terms"):
-        arrays[name] = np.stack([_padded(getattr(one, name), most)[..., kept[0]] for one in made])
-    out = {name: torch.tensor(a, dtype=_complex(kind[0]), device=kind[1]) for name, a in arrays.items()}
+        arrays[name] = np.stack(
+            [_padded(getattr(one, name), most)[..., kept[0]] for one in made]
+        )
+    out = {
+        name: torch.tensor(a, dtype=_complex(kind[0]), device=kind[1])
+        for name, a in arrays.items()
+    }
     directions = np.concatenate([one.to_directions for one in made])
     out["to_directions"] = torch.tensor(directions, dtype=kind[0], device=kind[1])
     out["fields"] = torch.tensor(kept[1], device=kind[1])
@@ -225,37 +286,54 @@ def _padded(array: Array, count: int) -> Array:
 
 
 def _slope(plan: Plan, axis: int) -> dict[str, torch.Tensor]:
-    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2); kept with the plan."""
+    """Tensors of the derivative in sensor distance, window centre x, y (axis 0, 1, 2);
+    kept with the plan.
+    """
     if axis not in plan.slopes:
         kind = plan.moments.rows.dtype, plan.moments.rows.device
-        plan.slopes[axis] = _stacked(plan.case, plan.layout, plan.depths, plan.tolerance, kind, axis)
+        plan.slopes[axis] = _stacked(
+            plan.case, plan.layout, plan.depths, plan.tolerance, kind, axis
+        )
     return plan.slopes[axis]
 
 
 def field_windowed(
-    phase_rad: torch.Tensor, transmission: torch.Tensor, plan: Plan, moving: Moving | None = None
+    phase_rad: torch.Tensor,
+    transmission: torch.Tensor,
+    plan: Plan,
+    moving: Moving | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of squares of its transmission.
+    """Field on the window, (depth, y, x) complex; the moments of the lens; the sum of
+    squares of its transmission.
 
-    Differentiable in phase and transmission (y, x), and in ``moving`` where given (first derivatives).
+    Differentiable in phase and transmission (y, x), and in ``moving`` where given
+    (first derivatives).
     """
     gathered, power = reduce(phase_rad, transmission, plan.moments)
     return from_moments(gathered, plan, moving), gathered.detach(), power
 
 
 def light_windowed(
-    maps: tuple[torch.Tensor, torch.Tensor], plan: Plan, moving: Moving | None, pupils: Pupils | None
+    maps: tuple[torch.Tensor, torch.Tensor],
+    plan: Plan,
+    moving: Moving | None,
+    pupils: Pupils | None,
 ) -> tuple[torch.Tensor, torch.Tensor, list[float]]:
-    """Light on the window, (depth, y, x); the moments of every map; the sums of squares of their transmissions.
+    """Light on the window, (depth, y, x); the moments of every map; the sums of squares
+    of their transmissions.
 
-    maps: (map, y, x) phase and transmission. pupils: factors on their light, for a plan made ``smooth``; None for the
+    maps: (map, y, x) phase and transmission. pupils: factors on their light, for a plan
+    made ``smooth``; None for the
     |U|² of one map.
     """
     found = [reduce(p, t, plan.moments) for p, t in zip(*maps, strict=True)]
     gathered, powers = torch.stack([g for g, _ in found]), [power for _, power in found]
     parts = mixed(_on_nodes(gathered, plan), pupils, plan.whole_um)
     lit = [(sign, _from_nodes(light, plan, moving)) for sign, light in parts]
-    total = functools.reduce(torch.add, (_power(field) if sign == 1 else sign * _power(field) for sign, field in lit))
+    total = functools.reduce(
+        torch.add,
+        (_power(field) if sign == 1 else sign * _power(field) for sign, field in lit),
+    )
     return total, gathered.detach(), powers
 
 
@@ -263,7 +341,9 @@ def _power(field: torch.Tensor) -> torch.Tensor:
     return field.real**2 + field.imag**2
 
 
-def from_moments(gathered: torch.Tensor, plan: Plan, moving: Moving | None = None) -> torch.Tensor:
+def from_moments(
+    gathered: torch.Tensor, plan: Plan, moving: Moving | None = None
+) -> torch.Tensor:
     """(depth, y, x) field on the window from the moments of a lens."""
     return _from_nodes(_on_nodes(gathered, plan), plan, moving)
 
@@ -271,7 +351,11 @@ def from_moments(gathered: torch.Tensor, plan: Plan, moving: Moving | None = Non
 def _on_nodes(gathered: torch.Tensor, plan: Plan) -> torch.Tensor:
     """(…, e, x) light on the nodes of the whole window from moments (…, m, n)."""
     ny, nx = plan.layout.nodes
-    return plan.tensors["rows_to_nodes"].T @ gathered[..., :ny, :nx] @ plan.tensors["columns_to_nodes"]
+    return (
+        plan.tensors["rows_to_nodes"].T
+        @ gathered[..., :ny, :nx]
+        @ plan.tensors["columns_to_nodes"]
+    )
 
 
 def _from_nodes(light: torch.Tensor, plan: Plan, moving: Moving | None) -> torch.Tensor:
@@ -282,10 +366,14 @@ def _from_nodes(light: torch.Tensor, plan: Plan, moving: Moving | None) -> torch
     given = fewer[:, None] * t["basis"]
     field = _at_depths(zoom(given, t), coefficients)
     if moving is not None:
-        for axis, value in enumerate((moving.distance, moving.centre[0], moving.centre[1])):
+        for axis, value in enumerate(
+            (moving.distance, moving.centre[0], moving.centre[1])
+        ):
             if value.requires_grad:
                 rate = _at_depths(zoom(given, _slope(plan, axis)), coefficients)
-                field = field + (value - value.detach()) * rate  # adds nothing but the derivative
+                field = (
+                    field + (value - value.detach()) * rate
+                )  # adds nothing but the derivative
     return _joined(field, plan)
 
 
@@ -295,12 +383,16 @@ def _at_depths(fields: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor
 
 
 def _joined(field: torch.Tensor, plan: Plan) -> torch.Tensor:
-    """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where the next one begins."""
+    """(depth, y, x) of the window from its tiles (tile, depth, Y, X), each up to where
+    the next one begins.
+    """
     (rows, columns), _ = tiles(plan.case, plan.layout.parts)
     (my, mx), n = plan.case.samples, len(columns)
     heights, widths = np.diff([*rows, my]).tolist(), np.diff([*columns, mx]).tolist()
     bands = [
-        torch.cat([field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1)
+        torch.cat(
+            [field[i * n + j, :, :height, :width] for j, width in enumerate(widths)], -1
+        )
         for i, height in enumerate(heights)
     ]
     return torch.cat(bands, -2)
@@ -312,22 +404,37 @@ def _coefficients(plan: Plan, moving: Moving) -> torch.Tensor:
     e, x = (torch.tensor(v, device=device) for v in plan.nodes_um)
     ny, nx = plan.layout.sizes.nodes
     inverse = moving.inverse_depths[:, None, None]
-    angle = depth_factors(plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse)
-    weight = torch.tensor(np.outer(legendre.nodes(ny)[1], legendre.nodes(nx)[1]), device=device)
+    angle = depth_factors(
+        plan.case, e[:, None], x, (moving.tangents[0], moving.tangents[1]), inverse
+    )
+    weight = torch.tensor(
+        np.outer(legendre.nodes(ny)[1], legendre.nodes(nx)[1]), device=device
+    )
     basis = torch.tensor(plan.depths.basis, device=device)
     found = (torch.exp(1j * angle) * weight).flatten(1) @ basis.flatten(1).conj().T
     return found.to(plan.tensors["coefficients"].dtype)
 
 
 def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Light on the lens nodes, a field for every tile and basis function (tile, b, e, x), to (tile, X, Y, b)."""
+    """Light on the lens nodes, a field for every tile and basis function (tile, b, e,
+    x), to (tile, X, Y, b).
+    """
     count, b, e, _ = light.shape
     p, (X, Y) = t["to_directions"].shape[2], t["window_terms"].shape[1:3]
-    real = torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
-    cosines = torch.bmm(real, t["to_directions"]).view(count, e, b, 2, p).permute(0, 4, 1, 2, 3).contiguous()
+    real = (
+        torch.view_as_real(light).permute(0, 2, 1, 4, 3).reshape(count * e, 2 * b, -1)
+    )
+    cosines = (
+        torch.bmm(real, t["to_directions"])
+        .view(count, e, b, 2, p)
+        .permute(0, 4, 1, 2, 3)
+        .contiguous()
+    )
     spread = torch.view_as_complex(cosines)
     pairs = len(t["fields"])
-    many = max(1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size())))  # pairs of one tile at once
+    many = max(
+        1, int(BUDGET_BYTES / (p * (Y + e) * light.element_size()))
+    )  # pairs of one tile at once
     step, few = min(pairs, many), max(1, many // pairs)
     found = []
     for first in range(0, count, few):
@@ -335,9 +442,15 @@ def zoom(light: torch.Tensor, t: dict[str, torch.Tensor]) -> torch.Tensor:
         out = light.new_zeros((len(spread[tile]), X, Y, b))
         for start in range(0, pairs, step):
             fields = t["fields"][start : start + step]
-            terms = t["lens_terms"][tile, ..., start : start + step] * spread[tile].index_select(3, fields)
+            terms = t["lens_terms"][tile, ..., start : start + step] * spread[
+                tile
+            ].index_select(3, fields)
             columns = t["along_y"][tile].flatten(0, 1) @ terms.flatten(0, 1)
-            window = (t["along_x"][tile] @ columns.view(len(out), p, -1)).view(len(out), X, Y, -1)
-            out = out.index_add(3, fields, window * t["window_terms"][tile, ..., start : start + step])
+            window = (t["along_x"][tile] @ columns.view(len(out), p, -1)).view(
+                len(out), X, Y, -1
+            )
+            out = out.index_add(
+                3, fields, window * t["window_terms"][tile, ..., start : start + step]
+            )
         found.append(out)
     return torch.cat(found)

@@ -1,6 +1,8 @@
-"""Point spread functions of a lens over depth, field angle and wavelength (paper Sec. 3.1, Eqs. 1-3).
+"""Point spread functions of a lens over depth, field angle and wavelength (paper Sec.
+3.1, Eqs. 1-3).
 
-``psf_stack`` takes phase and transmission maps, ``from_lens`` a lens file's content; ``on_pixels`` gives what a sensor
+``psf_stack`` takes phase and transmission maps, ``from_lens`` a lens file's content;
+``on_pixels`` gives what a sensor
 sees; ``save`` and ``load`` keep a stack as a file.
 """
 

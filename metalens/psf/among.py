@@ -1,9 +1,11 @@
-"""Pillars among unlike neighbours: the factor C of solved rows (:class:`metalens.lens.Neighbours`) on a lens's maps.
+"""Pillars among unlike neighbours: the factor C of solved rows
+(:class:`metalens.lens.Neighbours`) on a lens's maps.
 
     C(s, α),  s = λ |∇φ| / 2π,  α the azimuth of ∇φ          slope of the lens's own phase at every pillar
     J = C_along g gᵀ + C_across (1 - g gᵀ),  g = ∇φ/|∇φ|      on the field of the light that comes (x, y)
 
-One scalar takes the mean of both, J = C; what it leaves out is in the budget. λ is that of the rows, whatever the
+One scalar takes the mean of both, J = C; what it leaves out is in the budget. λ is that
+of the rows, whatever the
 light's: zones of one width have one factor.
 """
 
@@ -15,7 +17,9 @@ from torch import Tensor
 
 from metalens.lens import Neighbours
 
-REACH = 2  # pillars to each side over which phasors are averaged: single pillars err, slopes of lenses hardly change
+# pillars to each side over which phasors are averaged: single pillars err, slopes of
+# lenses hardly change
+REACH = 2
 ROWS = 256  # of pillars at a time
 _FLAT = 1e-8  # (rad/um)² below which a slope has no azimuth
 
@@ -29,7 +33,8 @@ class Jones(NamedTuple):
 
 
 def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
-    """(…, y, x) slopes along x and y of the phase of complex t, rad/um, from the pairs of pillars around each.
+    """(…, y, x) slopes along x and y of the phase of complex t, rad/um, from the pairs
+    of pillars around each.
 
     Slopes up to π / pitch. 0 where no pair stands. Differentiable.
     """
@@ -39,7 +44,9 @@ def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
         if count < 2:
             found.append(torch.zeros_like(light.real))
             continue
-        pairs = light.narrow(axis, 1, count - 1) * light.narrow(axis, 0, count - 1).conj()
+        pairs = (
+            light.narrow(axis, 1, count - 1) * light.narrow(axis, 0, count - 1).conj()
+        )
         around = _around(pairs, along=axis)
         lit = around.abs() > 0
         turn = torch.angle(torch.where(lit, around, torch.ones_like(around)))
@@ -48,10 +55,14 @@ def slopes(light: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 
 def _around(pairs: Tensor, *, along: int) -> Tensor:
-    """Sum of the pairs around each pillar; there is one more pillar than pairs on the axis ``along``."""
+    """Sum of the pairs around each pillar; there is one more pillar than pairs on the
+    axis ``along``.
+    """
     for axis in (-1, -2):
         wide = 2 * REACH + (axis != along)
-        padded = torch.nn.functional.pad(pairs, (REACH, REACH) if axis == -1 else (0, 0, REACH, REACH))
+        padded = torch.nn.functional.pad(
+            pairs, (REACH, REACH) if axis == -1 else (0, 0, REACH, REACH)
+        )
         count = padded.shape[axis] - wide + 1
         pairs = padded.narrow(axis, 0, count)
         for k in range(1, wide):
@@ -60,7 +71,9 @@ def _around(pairs: Tensor, *, along: int) -> Tensor:
 
 
 def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
-    """(…, y, x) complex: mean of C over both polarisations at every pillar of complex t."""
+    """(…, y, x) complex: mean of C over both polarisations at every pillar of complex
+    t.
+    """
     parts = []
     for inner, some in _shares(light):
         s, aside, _ = _turned(*slopes(some, pitch_um), neighbours)
@@ -68,13 +81,17 @@ def mean(light: Tensor, neighbours: Neighbours, pitch_um: float) -> Tensor:
     return torch.cat(parts, -2)
 
 
-def scalar(phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float) -> tuple[Tensor, Tensor]:
+def scalar(
+    phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float
+) -> tuple[Tensor, Tensor]:
     """(phase, transmission) of (…, y, x) maps times that mean."""
     factor = mean(torch.polar(level, phase), neighbours, pitch_um)
     return phase + torch.angle(factor), level * factor.abs()
 
 
-def jones(phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float) -> Jones:
+def jones(
+    phase: Tensor, level: Tensor, neighbours: Neighbours, pitch_um: float
+) -> Jones:
     """J of (…, y, x) maps, complex."""
     parts = []
     for inner, some in _shares(torch.polar(level, phase)):
@@ -91,15 +108,29 @@ def _shares(light: Tensor) -> list[tuple[slice, Tensor]]:
     rows, found = light.shape[-2], []
     for start in range(0, rows, ROWS):
         first, last = max(start - REACH - 1, 0), min(start + ROWS + REACH + 1, rows)
-        found.append((slice(start - first, min(start + ROWS, rows) - first), light[..., first:last, :]))
+        found.append(
+            (
+                slice(start - first, min(start + ROWS, rows) - first),
+                light[..., first:last, :],
+            )
+        )
     return found
 
 
-def _turned(across: Tensor, down: Tensor, neighbours: Neighbours) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+def _turned(
+    across: Tensor, down: Tensor, neighbours: Neighbours
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Sine by which light is turned, sin² 2α, and (cos² α, cos α sin α)."""
     square = across * across + down * down
     steep = square > _FLAT
     safe = torch.where(steep, square, torch.ones_like(square))
-    s = torch.where(steep, torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)), torch.zeros_like(square))
-    cosine2, both = torch.where(steep, across * across / safe, 0.5), torch.where(steep, across * down / safe, 0.0)
+    s = torch.where(
+        steep,
+        torch.sqrt(safe) * (neighbours.wavelength_um / (2 * math.pi)),
+        torch.zeros_like(square),
+    )
+    cosine2, both = (
+        torch.where(steep, across * across / safe, 0.5),
+        torch.where(steep, across * down / safe, 0.0),
+    )
     return s, 4 * both * both, (cosine2, both)

@@ -1,10 +1,12 @@
 """What the error of a PSF is made of: what was computed, and what the model leaves out.
 
-The model's terms are relative L2 errors of the PSF of a perfect lens of the same aperture, from radial integrals
+The model's terms are relative L2 errors of the PSF of a perfect lens of the same
+aperture, from radial integrals
 
     U(ρ) = ∫ √spread(p) C(p) J0(k p ρ) p dp        (scalar; C = 1 for pillars that do not feel their neighbours)
 
-and, for both polarisations, the flux of rays turned by the lens (Richards and Wolf 1959) with |E|² cos θ kept.
+and, for both polarisations, the flux of rays turned by the lens (Richards and Wolf
+1959) with |E|² cos θ kept.
 """
 
 import math
@@ -18,11 +20,18 @@ from metalens.ground.arrays import Array
 from metalens.lens import CURVED, Lens, Neighbours, media
 
 Polarisation = Literal["scalar", "flux", "vector", "auto"]
-# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell: amplitude 0.986, -0.066 rad at sine
-# 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is metalens.design.neighbours.neighbours
+# pillars among unlike neighbours, solved rows of 12 and 8 of the default cell:
+# amplitude 0.986, -0.066 rad at sine
+# 0.236, and 0.959, -0.100 rad at 0.354; another cell's own factor is
+# metalens.design.neighbours.neighbours
 NEIGHBOURS = (0.057 - 0.289j, -0.523 + 0.054j)
-ANGLE = 2.5  # change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst pillar off resonance
-RINGS, SPOKES = 8, 24  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
+# change of t over sin² of the incidence: 0.29 at 20 degrees, the default cell's worst
+# pillar off resonance
+ANGLE = 2.5
+RINGS, SPOKES = (
+    8,
+    24,
+)  # of an aperture over which obliquity is averaged: to rounding at NA 0.6 and 25 degrees
 HOW = "the default cell, rough (design --own-cell has a lens hold its own neighbours)"
 
 
@@ -36,10 +45,13 @@ CURES = {  # of an error above the tolerance, by its largest part
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """What is known of pillars that the model of a lens leaves out; by default rough, of another cell.
+    """What is known of pillars that the model of a lens leaves out; by default rough,
+    of another cell.
 
-    neighbours: rows of the lens's own pillars, whose factor its PSFs hold (at the rows' wavelength and at normal
-        incidence; what other light changes is counted); or (a, b) of the factor 1 + a s + b s² on
+    neighbours: rows of the lens's own pillars, whose factor its PSFs hold (at the rows'
+    wavelength and at normal
+        incidence; what other light changes is counted); or (a, b) of the factor 1 + a s
+        + b s² on
         light that unlike neighbours turn by the sine s, which they lack.
     angle: relative change of t over sin² of the incidence. of: whose numbers they are.
     """
@@ -63,17 +75,26 @@ ROUGH = LeftOut()
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is not known.
+    """Relative L2 errors of the PSFs by cause, the worst over angles; nan where it is
+    not known.
 
-    numerical: of the propagation, measured on the result. sampling: of the integration over the cells of the window.
-    spectrum: of the quadrature over wavelengths. source: of a source of finite size, whose points are taken as alike.
-    polarisation: of one scalar in place of both polarisations (of plain maps only that of films, which let s and p
-        through unlike, measured on the light); of both, of rays whose fields are those on their way to the window's
-        middle. neighbours: of pillars taken as if each stood among its like, or of the factor of solved rows where the
-        lens holds them. angle: of pillars that answer as at normal incidence. glass: of light that goes twice between
-        two faces. proxy: of pillars that answer by a curve, which follows those of their library to some error, and of
+    numerical: of the propagation, measured on the result. sampling: of the integration
+    over the cells of the window.
+    spectrum: of the quadrature over wavelengths. source: of a source of finite size,
+    whose points are taken as alike.
+    polarisation: of one scalar in place of both polarisations (of plain maps only that
+    of films, which let s and p
+        through unlike, measured on the light); of both, of rays whose fields are those
+        on their way to the window's
+        middle. neighbours: of pillars taken as if each stood among its like, or of the
+        factor of solved rows where the
+        lens holds them. angle: of pillars that answer as at normal incidence. glass: of
+        light that goes twice between
+        two faces. proxy: of pillars that answer by a curve, which follows those of
+        their library to some error, and of
         what their solver knows of them; of two sizes that alone.
-    outside: share of the light that falls beside the window, worst over angles and depths; a PSF of sum 1 does not
+    outside: share of the light that falls beside the window, worst over angles and
+    depths; a PSF of sum 1 does not
         show it, so it is in no total.
     """
 
@@ -91,7 +112,9 @@ class Budget:
 
     @property
     def computed(self) -> float:
-        """What the tolerance is about: numerical, sampling, spectrum and source together."""
+        """What the tolerance is about: numerical, sampling, spectrum and source
+        together.
+        """
         return math.hypot(self.numerical, self.sampling, self.spectrum, self.source)
 
     @property
@@ -102,7 +125,14 @@ class Budget:
     @property
     def model(self) -> float:
         """What the model leaves out, as far as it is known."""
-        return _together(self.polarisation, self.neighbours, self.angle, self.glass, self.stop, self.proxy)
+        return _together(
+            self.polarisation,
+            self.neighbours,
+            self.angle,
+            self.glass,
+            self.stop,
+            self.proxy,
+        )
 
     @property
     def total(self) -> float:
@@ -112,10 +142,22 @@ class Budget:
     @property
     def text(self) -> str:
         """One line for a person."""
-        terms = [(f.name, getattr(self, f.name)) for f in fields(self) if f.name != "outside"]
-        known = [f"{name} {value:.1e}" if value else f"{name} 0" for name, value in terms if not math.isnan(value)]
-        lost = "" if math.isnan(self.outside) else f"; {self.outside:.1%} of the light falls beside the window"
-        return f"error by cause: {', '.join(known)}; of the device {self.total:.1e}{lost}"
+        terms = [
+            (f.name, getattr(self, f.name)) for f in fields(self) if f.name != "outside"
+        ]
+        known = [
+            f"{name} {value:.1e}" if value else f"{name} 0"
+            for name, value in terms
+            if not math.isnan(value)
+        ]
+        lost = (
+            ""
+            if math.isnan(self.outside)
+            else f"; {self.outside:.1%} of the light falls beside the window"
+        )
+        return (
+            f"error by cause: {', '.join(known)}; of the device {self.total:.1e}{lost}"
+        )
 
 
 def _together(*terms: float) -> float:
@@ -150,17 +192,24 @@ def with_model(
     """The budget with what the model of a lens leaves out.
 
     Args:
-        aperture: half the spread in sin θ of the rays to the sensor. uneven: as in :func:`scalar_error`.
-        polarisation: that was computed. has_angles: whether the pillars answer at the light's angle.
-        light: wavelengths in um, and weights of sum 1; None for that of the rows of unlike neighbours.
+        aperture: half the spread in sin θ of the rays to the sensor. uneven: as in
+            :func:`scalar_error`.
+        polarisation: that was computed. has_angles: whether the pillars answer at the
+            light's angle.
+        light: wavelengths in um, and weights of sum 1; None for that of the rows of
+            unlike neighbours.
         lit: area of the lens in squared wavelengths, which scattered light fills.
         proxy: largest error of a pillar's t by its curve, relative to it.
     """
     slanted = min(1.0, left_out.angle * math.sin(incidence_rad) ** 2)
     return replace(
         budget,
-        polarisation=_of_scalar(budget, aperture, uneven) if polarisation == "scalar" else budget.polarisation,
-        neighbours=_neighbours(aperture, left_out.neighbours, polarisation, _Seen(light, slanted, lit)),
+        polarisation=_of_scalar(budget, aperture, uneven)
+        if polarisation == "scalar"
+        else budget.polarisation,
+        neighbours=_neighbours(
+            aperture, left_out.neighbours, polarisation, _Seen(light, slanted, lit)
+        ),
         angle=0.0 if has_angles else slanted,
         glass=ghost,
         proxy=_of_proxy(aperture, proxy, lit),
@@ -168,59 +217,80 @@ def with_model(
 
 
 def _of_proxy(aperture: float, error: float, lit: float) -> float:
-    """Of pillars off by at most ``error`` of t: a function of the diameter, so of the phase, whose mean only dims the
-    focus; the rest leaves for other orders, which cross the focus as broad as the lens, here in phase with it.
+    """Of pillars off by at most ``error`` of t: a function of the diameter, so of the
+    phase, whose mean only dims the
+    focus; the rest leaves for other orders, which cross the focus as broad as the lens,
+    here in phase with it.
 
-    Of 40 PSFs (hyperbolic and double helix of 0.1 and 0.5 mm, in focus and out of it, proxies of 6 to 16 coefficients)
+    Of 40 PSFs (hyperbolic and double helix of 0.1 and 0.5 mm, in focus and out of it,
+    proxies of 6 to 16 coefficients)
     all lie below, at 1e-4 to 0.8 of it.
     """
     return error * min(2.0, 2 * _crossed(aperture, _scalar(aperture), lit))
 
 
 def _of_scalar(budget: Budget, aperture: float, uneven: float) -> float:
-    """Of one scalar: of a perfect lens in one medium, and of films as measured on the light."""
+    """Of one scalar: of a perfect lens in one medium, and of films as measured on the
+    light.
+    """
     return _together(scalar_error(aperture, uneven), budget.polarisation)
 
 
 def aperture(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Half the spread in sin θ of the rays from the lens to the chief ray's place on the sensor."""
+    """Half the spread in sin θ of the rays from the lens to the chief ray's place on
+    the sensor.
+    """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     sine = np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))
     centre = float(media.reach(after, sine))
-    edges = centre + np.array([-1.0, 1.0]) * (lens.diameters.radius_um + lens.diameters.pitch_um / 2)
+    edges = centre + np.array([-1.0, 1.0]) * (
+        lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    )
     p = np.sign(edges) * media.direction(after, np.abs(edges))
     return float((p[1] - p[0]) / 2 / after.order[-1])
 
 
 def uneven(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the chief ray's place on the sensor."""
+    """Standard deviation over its mean of 1/cos θ of the rays from the lens to the
+    chief ray's place on the sensor.
+    """
     after = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um)
     centre = float(media.reach(after, np.sin(np.arctan(np.hypot(*np.tan(angle_rad))))))
     node, share = np.polynomial.legendre.leggauss(RINGS)
-    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt((node + 1) / 2)[:, None]
+    radius = (lens.diameters.radius_um + lens.diameters.pitch_um / 2) * np.sqrt(
+        (node + 1) / 2
+    )[:, None]
     turn = 2 * np.pi * (np.arange(SPOKES) + 0.5) / SPOKES
-    p = media.direction(after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn)))
+    p = media.direction(
+        after, np.hypot(centre + radius * np.cos(turn), radius * np.sin(turn))
+    )
     weight = 1 / np.sqrt(1 - (np.asarray(p) / after.order[-1]) ** 2)
     mean = share @ weight.mean(1) / 2
     return float(np.sqrt(share @ ((weight - mean) ** 2).mean(1) / 2) / mean)
 
 
 def scalar_error(aperture: float, uneven: float = 0.0) -> float:
-    """Relative L2 difference between the scalar PSF and the flux of both polarisations, which a pixel counts.
+    """Relative L2 difference between the scalar PSF and the flux of both polarisations,
+    which a pixel counts.
 
-    That of a perfect lens of this aperture in focus (7e-5 at NA 0.24, 4e-3 at 0.6), and of light from the side: two
-    rays b, b' of it add up as (b_z + b'_z) / 2√(b_z b'_z), which is 1 but for squares of how uneven 1/cos θ is. Of 36
-    lenses drawn (NA 0.1 to 0.6, up to 25 degrees, in focus, out of it, aberrated) 36 lie below, at 0.29 to 0.86 of it.
+    That of a perfect lens of this aperture in focus (7e-5 at NA 0.24, 4e-3 at 0.6), and
+    of light from the side: two
+    rays b, b' of it add up as (b_z + b'_z) / 2√(b_z b'_z), which is 1 but for squares
+    of how uneven 1/cos θ is. Of 36
+    lenses drawn (NA 0.1 to 0.6, up to 25 degrees, in focus, out of it, aberrated) 36
+    lie below, at 0.29 to 0.86 of it.
 
     Args:
-        uneven: standard deviation of 1/cos θ over the aperture, over its mean (:func:`metalens.psf.of_lens.uneven`).
+        uneven: standard deviation of 1/cos θ over the aperture, over its mean
+            (:func:`metalens.psf.of_lens.uneven`).
     """
     return math.hypot(_difference(_scalar(aperture), _flux(aperture)), uneven**2 / 2)
 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """light and lit: of :func:`with_model`. slanted: share of the change that light from the side may change, as t of
+    """light and lit: of :func:`with_model`. slanted: share of the change that light
+    from the side may change, as t of
     a pillar does."""
 
     light: tuple[Array, Array] | None
@@ -229,37 +299,57 @@ class _Seen:
 
 
 def _neighbours(
-    aperture: float, known: Neighbours | tuple[complex, complex], polarisation: Polarisation, seen: _Seen
+    aperture: float,
+    known: Neighbours | tuple[complex, complex],
+    polarisation: Polarisation,
+    seen: _Seen,
 ) -> float:
-    """Of pillars taken one by one; or of the factor of rows: another truncation, any row left out, zones that get
-    shorter from one to the next, other light than the rows', and for the scalar that fields along and across the slope
+    """Of pillars taken one by one; or of the factor of rows: another truncation, any
+    row left out, zones that get
+    shorter from one to the next, other light than the rows', and for the scalar that
+    fields along and across the slope
     are told apart. And of the light that they scatter."""
     p, _, _ = _nodes(aperture)
     if isinstance(known, tuple):
         factor = 1 + known[0] * p + known[1] * p * p
         used = _scalar(aperture, factor)
-        return math.hypot(_difference(used, _scalar(aperture)), _scattered(aperture, factor, used, seen.lit))
+        return math.hypot(
+            _difference(used, _scalar(aperture)),
+            _scattered(aperture, factor, used, seen.lit),
+        )
     factor = known.mean(p)
     used = _scalar(aperture, factor)
-    less = [_difference(_scalar(aperture, other.mean(p)), used) for other in known.others]
-    left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(less, default=0.0)
+    less = [
+        _difference(_scalar(aperture, other.mean(p)), used) for other in known.others
+    ]
+    left = _difference(_scalar(aperture, known.coarser.mean(p)), used) + max(
+        less, default=0.0
+    )
     left += math.hypot(CURVED, seen.slanted) * _difference(_scalar(aperture), used)
     for wave, weight in zip(*(seen.light or ((), ())), strict=True):
-        away = _difference(_scalar(aperture, known.mean(p * (wave / known.wavelength_um))), used)
+        away = _difference(
+            _scalar(aperture, known.mean(p * (wave / known.wavelength_um))), used
+        )
         left = math.hypot(left, math.sqrt(weight) * away)
     left = math.hypot(left, _scattered(aperture, factor, used, seen.lit))
     along, across = (known.at(p) + known.at(p, math.pi / 4)) / 2
     aside = _scalar(aperture, (along - across) / 2, order=2)
-    return left if polarisation != "scalar" else math.hypot(left, _difference(used + aside, used))
+    return (
+        left
+        if polarisation != "scalar"
+        else math.hypot(left, _difference(used + aside, used))
+    )
 
 
 def _scattered(aperture: float, factor: Array, used: Array, lit: float) -> float:
-    """Of the light that neighbours take from the focus (1 - |C|²) and that meets it again with any phase, spread over
+    """Of the light that neighbours take from the focus (1 - |C|²) and that meets it
+    again with any phase, spread over
     the shadow of the lens, as the order that goes straight on:
 
         |U + n|² - |U|² ≈ 2 Re U* n,   ‖2 Re U* n‖² = 2 <|n|²> ∫|U|²,   <|n|²> = P / area
 
-    A lens of few wavelengths has few places for it: 0.09 on a square of 7 um at NA 0.4, 5e-4 for 1 mm.
+    A lens of few wavelengths has few places for it: 0.09 on a square of 7 um at NA 0.4,
+    5e-4 for 1 mm.
     """
     p, weight, _ = _nodes(aperture)
     power = weight / (1 - p * p) ** 2
@@ -270,7 +360,9 @@ def _scattered(aperture: float, factor: Array, used: Array, lit: float) -> float
 def _crossed(aperture: float, used: Array, lit: float) -> float:
     """√(2 (∫|U|²)² / ∫|U|⁴ / area): what light of the same power, as broad as the lens, does to a PSF |U|²."""
     _, _, radius = _nodes(aperture)
-    ring = np.arange(len(used)) * (2 * np.pi * (radius[1] / (2 * np.pi)) ** 2)  # in squared wavelengths
+    ring = np.arange(len(used)) * (
+        2 * np.pi * (radius[1] / (2 * np.pi)) ** 2
+    )  # in squared wavelengths
     return math.sqrt(2 * float(used @ ring) ** 2 / float(used**2 @ ring) / lit)
 
 
@@ -283,7 +375,9 @@ def _nodes(aperture: float) -> tuple[Array, Array, Array]:
 
 
 def _scalar(aperture: float, factor: Array | float = 1.0, *, order: int = 0) -> Array:
-    """(ρ,) |U|² through a factor at the nodes, of light that turns ``order`` times about the axis."""
+    """(ρ,) |U|² through a factor at the nodes, of light that turns ``order`` times
+    about the axis.
+    """
     p, weight, at = _nodes(aperture)
     level = weight / (1 - p * p) * factor
     return np.asarray(np.abs(level @ jv(order, np.outer(p, at))) ** 2)
@@ -294,7 +388,10 @@ def _flux(aperture: float) -> Array:
     p, weight, at = _nodes(aperture)
     cosine = np.sqrt(1 - p * p)
     level, x = weight / (1 - p * p) / np.sqrt(cosine), np.outer(p, at)
-    return np.asarray(((level * (1 + cosine)) @ jv(0, x)) ** 2 - ((level * (1 - cosine)) @ jv(2, x)) ** 2)
+    return np.asarray(
+        ((level * (1 + cosine)) @ jv(0, x)) ** 2
+        - ((level * (1 - cosine)) @ jv(2, x)) ** 2
+    )
 
 
 def _difference(one: Array, other: Array) -> float:

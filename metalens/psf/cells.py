@@ -1,7 +1,9 @@
 """Windows whose step is too coarse for samples: light integrated over their cells.
 
-|U|² holds spatial frequencies up to B = (largest - least n sin θ) / λ of the rays to the window; samples farther apart
-than 1/(2B) fold them. Such a cell is the mean of m x m points of half that distance or less, corrected for what the
+|U|² holds spatial frequencies up to B = (largest - least n sin θ) / λ of the rays to
+the window; samples farther apart
+than 1/(2B) fold them. Such a cell is the mean of m x m points of half that distance or
+less, corrected for what the
 midpoint rule leaves of second and fourth differences along both axes,
 
     1 + (δx² + δy²)/24 - 17 (δx⁴ + δy⁴)/5760 + δx² δy²/576 + …    (the inverse of (2/δ) asinh(δ/2) along each)
@@ -25,9 +27,11 @@ FINER = (2, 4, 8)  # points in Nyquist's step that are tried
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """points: along each axis of a cell, 1 where samples are close enough; case: with the finer window.
+    """points: along each axis of a cell, 1 where samples are close enough; case: with
+    the finer window.
 
-    left: of a wave at the highest frequency, which has most: what remains over the correction by fourth differences,
+    left: of a wave at the highest frequency, which has most: what remains over the
+    correction by fourth differences,
         and that correction over the one by second differences.
     """
 
@@ -51,7 +55,8 @@ def cells(case: Case, finer: int = FINER[0]) -> Cells:
     """How a window is sampled: as it is, or ``finer`` points in Nyquist's step.
 
     Raises:
-        PropagationError: a step so coarse that its cells would take more than ``MOST`` points along an axis.
+        PropagationError: a step so coarse that its cells would take more than ``MOST``
+            points along an axis.
     """
     limit = nyquist_um(case)
     if case.step_um <= limit * (1 + 1e-9):
@@ -69,25 +74,39 @@ def cells(case: Case, finer: int = FINER[0]) -> Cells:
 
 
 def _left(s: float) -> tuple[float, float]:
-    """Of a wave that turns by 2 asin(s) from point to point, whose mean over the step between them is s / asin(s)."""
+    """Of a wave that turns by 2 asin(s) from point to point, whose mean over the step
+    between them is s / asin(s).
+    """
     second, fourth = s**2 / 6, 17 / 360 * s**4
     return (1 - second - fourth - s / math.asin(s)) / fourth, fourth / second
 
 
 def integrated(light: torch.Tensor, fine: Cells) -> tuple[torch.Tensor, float]:
-    """(…, y, x) means over the cells of fine samples with a border of two, and the error of the integration.
+    """(…, y, x) means over the cells of fine samples with a border of two, and the
+    error of the integration.
 
-    Within cells the differences add up to those of slopes at their borders, which may meet at 0 in the fourth order
+    Within cells the differences add up to those of slopes at their borders, which may
+    meet at 0 in the fourth order
     and not in the sixth: the second vouches for it.
     """
     points, whole = fine.points, slice(BORDER, -BORDER)
     across, down = _second(light, -1), _second(light, -2)
     bent = (across[..., whole, 1:-1] + down[..., 1:-1, whole]) / 24
-    fourth = -17 / 5760 * (_second(across, -1)[..., whole, :] + _second(down, -2)[..., whole])
+    fourth = (
+        -17
+        / 5760
+        * (_second(across, -1)[..., whole, :] + _second(down, -2)[..., whole])
+    )
     fourth = fourth + _second(across, -2)[..., 1:-1, 1:-1] / 576
-    first, second, last = (_means(part, points) for part in (light[..., whole, whole], bent, fourth))
+    first, second, last = (
+        _means(part, points) for part in (light[..., whole, whole], bent, fourth)
+    )
     size, *sizes = (float(part.detach().norm()) for part in (first, second, last))
-    error = fine.left[0] * math.hypot(sizes[1], fine.left[1] * sizes[0]) / size if size else 0.0
+    error = (
+        fine.left[0] * math.hypot(sizes[1], fine.left[1] * sizes[0]) / size
+        if size
+        else 0.0
+    )
     return first + second + last, error
 
 

@@ -1,4 +1,6 @@
-"""Intensity of one lens in one direction, by the cheapest method, checked and repeated until the tolerance is met."""
+"""Intensity of one lens in one direction, by the cheapest method, checked and repeated
+until the tolerance is met.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -33,17 +35,37 @@ from metalens.propagate import (
 from metalens.psf.vector import Mixing, has_faces, s_and_p
 
 FEW = 64  # samples below which a window is summed in float64: its rounding has no mean
-BRIGHT = 30.0  # times the light of random phases below which float32 loses what is left of the sum
+# times the light of random phases below which float32 loses what is left of the sum
+BRIGHT = 30.0
 MOVING = 1000  # by which the setting is tighter where the geometry carries gradients
 FINEST = 1e-12  # setting below which float64 has nothing left to give
-ROUNDING = {torch.float32: 8e-7, torch.float64: 1e-11}  # of a pillar's phasor, standard deviation
-TRANSFORMS = {torch.float32: 1e-6, torch.float64: 5e-15}  # rounding of three transforms, above all that was found
+ROUNDING = {
+    torch.float32: 8e-7,
+    torch.float64: 1e-11,
+}  # of a pillar's phasor, standard deviation
+TRANSFORMS = {
+    torch.float32: 1e-6,
+    torch.float64: 5e-15,
+}  # rounding of three transforms, above all that was found
 MANY = 8192  # samples of a window from which an estimate looks at few of them
-MISSED = 0.02  # of the setting of such a window: what rare errors those few may miss (0.002 and less were seen)
-SCATTER = 1.5  # times its estimate: errors beside a spot and where the window is dim are seen by few of the few
-EXACT = {torch.float32: 1e-7, torch.float64: 4e-12}  # rounding of exact sums and of what they are kept in
-HALF_DIGIT, SPREAD = 1.1e-16, 2.0  # rounding of a number in float64; sums of few pillars vary about their mean noise
-OUTPUT = {torch.float32: 4e-7, torch.float64: 2e-15}  # of the sums behind the pillars, in relative L2
+# of the setting of such a window: what rare errors those few may miss (0.002 and less
+# were seen)
+MISSED = 0.02
+# times its estimate: errors beside a spot and where the window is dim are seen by few
+# of the few
+SCATTER = 1.5
+EXACT = {
+    torch.float32: 1e-7,
+    torch.float64: 4e-12,
+}  # rounding of exact sums and of what they are kept in
+HALF_DIGIT, SPREAD = (
+    1.1e-16,
+    2.0,
+)  # rounding of a number in float64; sums of few pillars vary about their mean noise
+OUTPUT = {
+    torch.float32: 4e-7,
+    torch.float64: 2e-15,
+}  # of the sums behind the pillars, in relative L2
 KEPT = {
     torch.float32: 1.5e-7,
     torch.float64: 0.0,
@@ -52,12 +74,17 @@ KEPT = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Result:
-    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and why it stopped.
+    """intensity: (depth, y, x); error: estimated relative L2 error; reason: method, and
+    why it stopped.
 
-    power: sum of squares of the transmission over the pillars, wavelengths weighted. brightness: mean of the window at
-        the darkest depth, against pillars of random phases. sampling: error of an integration over cells. source: of a
-        source of finite size taken as alike. rays: of both polarisations as rays to the window's middle have them; of a
-        scalar behind films, of the mean of s and p that it takes; nan of a scalar in one medium.
+    power: sum of squares of the transmission over the pillars, wavelengths weighted.
+    brightness: mean of the window at
+        the darkest depth, against pillars of random phases. sampling: error of an
+        integration over cells. source: of a
+        source of finite size taken as alike. rays: of both polarisations as rays to the
+        window's middle have them; of a
+        scalar behind films, of the mean of s and p that it takes; nan of a scalar in
+        one medium.
     """
 
     intensity: torch.Tensor
@@ -88,26 +115,38 @@ def intensity(
     """|U|² on the window, wavelengths added with their weights.
 
     Args:
-        phase, level: (wavelength, y, x), or with ``mixing`` as many maps of a wavelength after each other as it takes.
+        phase, level: (wavelength, y, x), or with ``mixing`` as many maps of a
+            wavelength after each other as it takes.
         cases: one a wavelength, alike in everything else.
-        moving: :class:`Moving` or None. mixing: both polarisations in place of |U|² of one scalar.
+        moving: :class:`Moving` or None. mixing: both polarisations in place of |U|² of
+            one scalar.
 
-    The windowed method is repeated at a tighter setting, and at last in float64, until its own error estimate is within
-    tolerance, all that is added to it later included; the result of the last try is returned with its estimate in any
-    case. Dim and tiny windows are summed in float64, since the estimate knows rounding as noise of a mean size only.
+    The windowed method is repeated at a tighter setting, and at last in float64, until
+    its own error estimate is within
+    tolerance, all that is added to it later included; the result of the last try is
+    returned with its estimate in any
+    case. Dim and tiny windows are summed in float64, since the estimate knows rounding
+    as noise of a mean size only.
     """
     lit = Lit(phase, level, cases, weights, mixing)
     needs_grad = phase.requires_grad or level.requires_grad or moving is not None
-    if not needs_grad and phase.device.type == "cpu":  # at the setting that the windowed method begins with
+    if (
+        not needs_grad and phase.device.type == "cpu"
+    ):  # at the setting that the windowed method begins with
         choices = [choose(case, max(tolerance / 2, FINEST)) for case in cases]
         if all(choice.method == "exact" for choice in choices):
             return _exact(lit, choices[0].reason)
     first = phase.dtype if tolerance >= 2 * OUTPUT[phase.dtype] else torch.float64
     if cases[0].samples[0] * cases[0].samples[1] < FEW:
         first = torch.float64
-    # gradients see the kernel's error pillar by pillar, and at a focus their parts nearly cancel
-    start = max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
-    if moving is not None:  # parts of a derivative in the geometry exceed it some hundred times
+    # gradients see the kernel's error pillar by pillar, and at a focus their parts
+    # nearly cancel
+    start = (
+        max(tolerance / 32, min(tolerance / 8, 1e-6)) if needs_grad else tolerance / 2
+    )
+    if (
+        moving is not None
+    ):  # parts of a derivative in the geometry exceed it some hundred times
         start, first = tolerance / MOVING, torch.float64
     tries = [(start, first), (start / 4, first), (start / 50, torch.float64)]
     dim = False
@@ -118,7 +157,13 @@ def intensity(
         dim = dtype != torch.float64 and result.brightness < BRIGHT
         if error <= tolerance and not dim:
             break
-    return Result(result.intensity.to(phase.dtype), error, result.reason, result.power, rays=result.rays)
+    return Result(
+        result.intensity.to(phase.dtype),
+        error,
+        result.reason,
+        result.power,
+        rays=result.rays,
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -131,7 +176,9 @@ class Lit:
     weights: list[float]
     mixing: Mixing | None = None
 
-    def each(self) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor], Case, float, Pupils | None]]:
+    def each(
+        self,
+    ) -> Iterator[tuple[tuple[torch.Tensor, torch.Tensor], Case, float, Pupils | None]]:
         """(maps of one, case, weight, components) of every wavelength."""
         count = 1 if self.mixing is None else self.mixing.maps
         for i, (case, weight) in enumerate(zip(self.cases, self.weights, strict=True)):
@@ -141,23 +188,33 @@ class Lit:
 
     @property
     def films(self) -> float:
-        """Relative L2 error of what is left out behind films, the worst over wavelengths."""
+        """Relative L2 error of what is left out behind films, the worst over
+        wavelengths.
+        """
         if self.cases[0].behind is None:
             return 0.0
-        each = [(case, maps[1].detach()[0].cpu().numpy()) for maps, case, _, _ in self.each()]
+        each = [
+            (case, maps[1].detach()[0].cpu().numpy())
+            for maps, case, _, _ in self.each()
+        ]
         return max(paths.films_error(case, level) for case, level in each)
 
     @property
     def judged(self) -> Callable[[Case], Pupils] | None:
-        """Factors on the light of single points that it is compared with: of both polarisations by their own rays, or
+        """Factors on the light of single points that it is compared with: of both
+        polarisations by their own rays, or
         of s and p apart where a scalar meets faces of films."""
         if self.mixing is not None:
             return self.mixing.pupils
         return s_and_p if has_faces(self.cases[0]) else None
 
     def power(self, case: Case, powers: list[float], level: torch.Tensor) -> float:
-        """What the pillars of a wavelength let through, from the sums of squares of its maps."""
-        return powers[0] if self.mixing is None else self.mixing.power(case, powers, level)
+        """What the pillars of a wavelength let through, from the sums of squares of its
+        maps.
+        """
+        return (
+            powers[0] if self.mixing is None else self.mixing.power(case, powers, level)
+        )
 
 
 def _exact(lit: Lit, reason: str) -> Result:
@@ -170,9 +227,15 @@ def _exact(lit: Lit, reason: str) -> Result:
         if lit.judged is not None:
             samples.append(_of_pillars((phase, level), case, weight, pupils))
         if pupils is None:
-            total = total + weight * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
+            total = (
+                total
+                + weight
+                * np.abs(field_exact(phase[0].numpy(), level[0].numpy(), case)) ** 2
+            )
             continue
-        for sign, light in mixed(torch.polar(level.double(), phase.double()), pupils, case.pillars_um):
+        for sign, light in mixed(
+            torch.polar(level.double(), phase.double()), pupils, case.pillars_um
+        ):
             field = field_exact(torch.angle(light).numpy(), light.abs().numpy(), case)
             total = total + weight * sign * np.abs(field) ** 2
     error = math.hypot(EXACT[lit.phase.dtype], lit.films, _noisy_sum(total, noise))
@@ -181,36 +244,63 @@ def _exact(lit: Lit, reason: str) -> Result:
 
 
 def _turned(phase: torch.Tensor, level: torch.Tensor, case: Case) -> float:
-    """Rounding of a pillar's phase in float64, rad: of the paths to it and on to the window, and of its own phase."""
+    """Rounding of a pillar's phase in float64, rad: of the paths to it and on to the
+    window, and of its own phase.
+    """
     turns = case.wavenumber * (chief_path(case) + math.hypot(*case.half_size_um))
     return HALF_DIGIT * (turns + float((phase.double().abs() * (level != 0)).max()))
 
 
 def _noisy_sum(light: Array, noise: float) -> float:
-    """Relative L2 error of PSFs from light (depth, y, x) to whose field noise of this size is added: its part along the
-    field, 2 Re U* n. Nothing at a focus, where noise is of N pillars and light of N², and most beside the light."""
+    """Relative L2 error of PSFs from light (depth, y, x) to whose field noise of this
+    size is added: its part along the
+    field, 2 Re U* n. Nothing at a focus, where noise is of N pillars and light of N²,
+    and most beside the light."""
     whole = np.maximum(np.abs(light.sum((1, 2))), 1e-300)
     share, square = light / whole[:, None, None], 2 * noise**2 / whole
     return float(SPREAD * math.sqrt(square.sum() / (share**2).sum()))
 
 
-def _of_pillars(maps: tuple[torch.Tensor, torch.Tensor], case: Case, weight: float, pupils: Pupils | None) -> Sample:
+def _of_pillars(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    case: Case,
+    weight: float,
+    pupils: Pupils | None,
+) -> Sample:
     """What a sum over all pillars took of a wavelength, to be judged."""
     y, x = case.pillars_um
-    path = paths.from_source(case, x, y[:, None], case.tangents, paths.reference_depth(case))
+    path = paths.from_source(
+        case, x, y[:, None], case.tangents, paths.reference_depth(case)
+    )
     turn = case.wavenumber * np.asarray(path + paths.to_sensor(case, x, y[:, None]))
-    light = torch.polar(maps[1].double(), maps[0].double() + torch.as_tensor(turn)).numpy()
-    return Sample(case, weight, light, 0.0, 1, (y, x), None if pupils is None else pupils(y, x))
+    light = torch.polar(
+        maps[1].double(), maps[0].double() + torch.as_tensor(turn)
+    ).numpy()
+    return Sample(
+        case, weight, light, 0.0, 1, (y, x), None if pupils is None else pupils(y, x)
+    )
 
 
-def _from_middle(result: Result, lit: Lit, samples: list[list[Sample]], seen: list[Any]) -> Result:
-    """With what rays to the window's middle leave out of both polarisations; of a scalar behind films, what it does."""
-    return result if lit.judged is None else replace(result, rays=pupil_error(samples, seen, lit.judged))
+def _from_middle(
+    result: Result, lit: Lit, samples: list[list[Sample]], seen: list[Any]
+) -> Result:
+    """With what rays to the window's middle leave out of both polarisations; of a
+    scalar behind films, what it does.
+    """
+    return (
+        result
+        if lit.judged is None
+        else replace(result, rays=pupil_error(samples, seen, lit.judged))
+    )
 
 
 def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Result:
-    """One try with sums of a dtype: every wavelength and window, then the estimate from all of them."""
-    choice = choose(lit.cases[0], tolerance, differentiable=True, moving=moving is not None)
+    """One try with sums of a dtype: every wavelength and window, then the estimate from
+    all of them.
+    """
+    choice = choose(
+        lit.cases[0], tolerance, differentiable=True, moving=moving is not None
+    )
     if choice.method == "wide":
         return _wide(lit, dtype, tolerance, choice)
     samples: list[list[Sample]] = [[] for row in choice.tiles for _ in row]
@@ -222,14 +312,27 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
         for row in _windows(case, choice, tolerance):
             parts = []
             for window in row:
-                made = plan(window, tolerance, dtype, maps[0].device, moving is not None, smooth=pupils is not None)
-                light, gathered, powers = light_windowed(maps, made, _shifted(moving, case, window), pupils)
+                made = plan(
+                    window,
+                    tolerance,
+                    dtype,
+                    maps[0].device,
+                    moving is not None,
+                    smooth=pupils is not None,
+                )
+                light, gathered, powers = light_windowed(
+                    maps, made, _shifted(moving, case, window), pupils
+                )
                 _check(maps, case, sum(powers), gathered)
                 power = lit.power(case, powers, maps[1])
                 at = None if pupils is None else pupils(*made.judged_um)
-                noise = _phasor(dtype, tolerance, made) * _incoherent(_noisy(powers, at), case)
+                noise = _phasor(dtype, tolerance, made) * _incoherent(
+                    _noisy(powers, at), case
+                )
                 moments = gathered.cpu().numpy().astype(complex)
-                samples[index].append(Sample(window, weight, moments, noise, made.layout.parts, pupils=at))
+                samples[index].append(
+                    Sample(window, weight, moments, noise, made.layout.parts, pupils=at)
+                )
                 here = weight * light
                 parts.append(here)
                 seen[index] = seen[index] + here.detach().cpu().numpy()
@@ -239,16 +342,24 @@ def _windowed(lit: Lit, dtype: torch.dtype, tolerance: float, moving: Any) -> Re
         total = total + torch.cat(rows, -2)
     result = _judged(total, samples, seen, (lit.cases, lit.weights, given), choice)
     result = _from_middle(result, lit, samples, seen)
-    return _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
+    return (
+        _few_seen(result, tolerance) if math.prod(total.shape[-2:]) > MANY else result
+    )
 
 
 def _phasor(dtype: torch.dtype, tolerance: float, made: Any) -> float:
-    """Standard deviation of a pillar's phasor: arithmetic, interpolation inside blocks, polynomials of long paths."""
-    return math.hypot(ROUNDING[dtype], tolerance / SHARE, made.moments.carrier.rounding_rad)
+    """Standard deviation of a pillar's phasor: arithmetic, interpolation inside blocks,
+    polynomials of long paths.
+    """
+    return math.hypot(
+        ROUNDING[dtype], tolerance / SHARE, made.moments.carrier.rounding_rad
+    )
 
 
 def _noisy(powers: list[float], at: Any) -> float:
-    """Sum of squares of the transmission of all components, each factor as large as it gets: what rounds."""
+    """Sum of squares of the transmission of all components, each factor as large as it
+    gets: what rounds.
+    """
     if at is None:
         return powers[0]
     return float((np.abs(at[1]).max((2, 3)) ** 2 @ np.array(powers)).sum())
@@ -287,7 +398,8 @@ def _judged(
     given: tuple[list[Case], list[float], float],
     choice: Choice,
 ) -> Result:
-    """The result of a try with its estimate; seen: intensity of each part of the window; given: cases, weights, sum of
+    """The result of a try with its estimate; seen: intensity of each part of the
+    window; given: cases, weights, sum of
     squares of the transmission.
 
     Raises:
@@ -295,38 +407,64 @@ def _judged(
     """
     cases, weights, light = given
     if not bool((total.detach().sum((-1, -2)) > 0).all()):
-        raise PropagationError("no light reaches the window at some depth; move or widen the window")
+        raise PropagationError(
+            "no light reaches the window at some depth; move or widen the window"
+        )
     seen_light = total.detach().flatten(-2)
-    if choice.method == "wide":  # of the light itself: what is dim about it weighs as little in the error
+    if (
+        choice.method == "wide"
+    ):  # of the light itself: what is dim about it weighs as little in the error
         lit = torch.stack([(row @ row) / row.sum() for row in seen_light]).min()
     else:
         lit = seen_light.mean(-1).min()
     brightness = float(lit) / sum(
-        weight * _incoherent(1.0, case) ** 2 for case, weight in zip(cases, weights, strict=True)
+        weight * _incoherent(1.0, case) ** 2
+        for case, weight in zip(cases, weights, strict=True)
     )
     error, brightness = relative_error(samples, seen), brightness / max(light, 1e-300)
     return Result(total, error, choice.reason, light, brightness=brightness)
 
 
-def _windows(case: Case, choice: Choice, tolerance: float) -> tuple[tuple[Case, ...], ...]:
+def _windows(
+    case: Case, choice: Choice, tolerance: float
+) -> tuple[tuple[Case, ...], ...]:
     """Windows of a wavelength that are computed apart: cut as at the first wavelength."""
     found = choose(case, tolerance, differentiable=True).tiles
     if [len(row) for row in found] == [len(row) for row in choice.tiles]:
         return found
-    return tuple(tuple(replace(w, wavelength_um=case.wavelength_um) for w in row) for row in choice.tiles)
+    return tuple(
+        tuple(replace(w, wavelength_um=case.wavelength_um) for w in row)
+        for row in choice.tiles
+    )
 
 
-def _check(maps: tuple[torch.Tensor, torch.Tensor], case: Case, power: float, moments: torch.Tensor) -> None:
-    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars tell.
+def _check(
+    maps: tuple[torch.Tensor, torch.Tensor],
+    case: Case,
+    power: float,
+    moments: torch.Tensor,
+) -> None:
+    """Refuse maps that hold nothing or what is not finite, as the sums over all pillars
+    tell.
 
     Raises:
         PropagationError: naming row and column.
     """
-    if power > 0 and math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all()):
+    if (
+        power > 0
+        and math.isfinite(power)
+        and bool(torch.isfinite(torch.view_as_real(moments)).all())
+    ):
         return
-    check_aperture(maps[0][0].detach().cpu().numpy(), maps[1][0].detach().cpu().numpy(), case)
-    if not (math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())):
-        raise PropagationError("phase or transmission is too large for its dtype; use float64, or wrap the phase")
+    check_aperture(
+        maps[0][0].detach().cpu().numpy(), maps[1][0].detach().cpu().numpy(), case
+    )
+    if not (
+        math.isfinite(power) and bool(torch.isfinite(torch.view_as_real(moments)).all())
+    ):
+        raise PropagationError(
+            "phase or transmission is too large for its dtype; use float64, or wrap the phase"
+        )
 
 
 def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
@@ -334,10 +472,21 @@ def _shifted(moving: Moving | None, case: Case, tile: Case) -> Moving | None:
     if moving is None or tile.centre_um == case.centre_um:
         return moving
     shift = [a - b for a, b in zip(tile.centre_um, case.centre_um, strict=True)]
-    return replace(moving, centre=moving.centre + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device))
+    return replace(
+        moving,
+        centre=moving.centre
+        + torch.tensor(shift, dtype=torch.float64, device=moving.centre.device),
+    )
 
 
 def _incoherent(power: float, case: Case) -> float:
-    """Magnitude of the field at the window centre if all pillars added with random phases."""
-    area = case.area_um2 * case.sensor_distance_um * case.wavenumber / (2 * math.pi * chief_path(case) ** 2)
+    """Magnitude of the field at the window centre if all pillars added with random
+    phases.
+    """
+    area = (
+        case.area_um2
+        * case.sensor_distance_um
+        * case.wavenumber
+        / (2 * math.pi * chief_path(case) ** 2)
+    )
     return math.sqrt(power) * area

@@ -1,4 +1,6 @@
-"""PSFs of one direction: windows chosen, sources blurred, cells integrated, depths taken so many at a time as fit."""
+"""PSFs of one direction: windows chosen, sources blurred, cells integrated, depths
+taken so many at a time as fit.
+"""
 
 import math
 from collections.abc import Iterator
@@ -19,11 +21,18 @@ from metalens.psf.compute import Result, intensity
 from metalens.psf.extended import Extent
 from metalens.psf.vector import Mixing, apart_maps
 
-HELD_BYTES = 2.5e9  # of the fields of all depths that are computed at once; each share has a plan of its own
-SAMPLE_BYTES = 18  # held for each sample and depth, per byte of a number: field, intensity, and what the estimate takes
+# of the fields of all depths that are computed at once; each share has a plan of its
+# own
+HELD_BYTES = 2.5e9
+# held for each sample and depth, per byte of a number: field, intensity, and what the
+# estimate takes
+SAMPLE_BYTES = 18
 COUNTED = ("scalar", "flux", "vector")
-CELLS = 0.5  # of the tolerance that the integration over cells may take; the rest is the sums
-STRICTER = 4  # settings for sources of finite size, whose estimate takes differences of PSFs
+# of the tolerance that the integration over cells may take; the rest is the sums
+CELLS = 0.5
+STRICTER = (
+    4  # settings for sources of finite size, whose estimate takes differences of PSFs
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +40,8 @@ class Wanted:
     """What is asked of a direction, as in :func:`metalens.psf.psf_stack`.
 
     Raises:
-        PropagationError: a tolerance that is not above 0 and below 1, a polarisation that is none.
+        PropagationError: a tolerance that is not above 0 and below 1, a polarisation
+            that is none.
     """
 
     tolerance: float
@@ -42,15 +52,21 @@ class Wanted:
 
     def __post_init__(self) -> None:
         if not 0 < self.tolerance < 1:
-            raise PropagationError(f"tolerance is {self.tolerance}, need a relative error above 0 and below 1")
+            raise PropagationError(
+                f"tolerance is {self.tolerance}, need a relative error above 0 and below 1"
+            )
         if self.polarisation not in COUNTED:
-            raise PropagationError(f"polarisation = {self.polarisation!r}: need one of {', '.join(COUNTED)}")
+            raise PropagationError(
+                f"polarisation = {self.polarisation!r}: need one of {', '.join(COUNTED)}"
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Light:
-    """Maps (wavelength, y, x) of one lens, and the cases and weights of the wavelengths; with ``mixing`` both
-    polarisations of so many maps a wavelength. layers: whose stop lays its shadow on the maps."""
+    """Maps (wavelength, y, x) of one lens, and the cases and weights of the
+    wavelengths; with ``mixing`` both
+    polarisations of so many maps a wavelength. layers: whose stop lays its shadow on
+    the maps."""
 
     maps: tuple[torch.Tensor, torch.Tensor]
     cases: list[Case]
@@ -61,24 +77,39 @@ class Light:
     def at(self, like: Case) -> list[Case]:
         """The cases with the direction, depths and window of another."""
         alike = ("tangents", "inverse_depths_per_um", "centre_um", "step_um", "samples")
-        return [replace(c, **{name: getattr(like, name) for name in alike}) for c in self.cases]
+        return [
+            replace(c, **{name: getattr(like, name) for name in alike})
+            for c in self.cases
+        ]
 
     def shaded(self, cases: list[Case]) -> tuple[torch.Tensor, torch.Tensor]:
         """The maps as the light of these cases meets them, each of their first depth."""
         if self.layers is None or self.layers.stop is None:
             return self.maps
         count = 1 if self.mixing is None else self.mixing.maps
-        shadow = torch.stack([torch.from_numpy(_shadow(case, self.layers)) for case in cases for _ in range(count)])
-        return self.maps[0] + shadow.angle().to(self.maps[0]), self.maps[1] * shadow.abs().to(self.maps[1])
+        shadow = torch.stack(
+            [
+                torch.from_numpy(_shadow(case, self.layers))
+                for case in cases
+                for _ in range(count)
+            ]
+        )
+        return self.maps[0] + shadow.angle().to(self.maps[0]), self.maps[
+            1
+        ] * shadow.abs().to(self.maps[1])
 
 
 def _shadow(case: Case, layers: Layers) -> Array:
-    """(y, x) complex amplitude of the light of a case's first depth at each pillar, over that without the stop."""
+    """(y, x) complex amplitude of the light of a case's first depth at each pillar,
+    over that without the stop.
+    """
     y, x = case.pillars_um
     inverse = case.inverse_depths_per_um[0]
     depth = 1 / inverse if inverse else math.inf
     places = x, y[:, None]
-    return layers.shadow(case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2))
+    return layers.shadow(
+        case.tangents, depth, case.wavelength_um, places, math.sqrt(case.area_um2)
+    )
 
 
 def direction(
@@ -89,42 +120,71 @@ def direction(
     moving: Moving | None,
     layers: Layers | None = None,
 ) -> tuple[torch.Tensor, list[Result], torch.Tensor]:
-    """(…, depth, y, x) intensity of every lens, the results it is made of, and (…) the sum of squares of what its
+    """(…, depth, y, x) intensity of every lens, the results it is made of, and (…) the
+    sum of squares of what its
     pillars let through the faces behind them.
 
-    maps: (…, wavelength, y, x); cases, weights: of the wavelengths. layers: whose stop shades the pillars, alike for
+    maps: (…, wavelength, y, x); cases, weights: of the wavelengths. layers: whose stop
+    shades the pillars, alike for
     all depths of the cases.
     """
     if wanted.source is not None and moving is not None:
-        raise PropagationError("a source of finite size has no derivatives in the geometry: give numbers, or a point")
+        raise PropagationError(
+            "a source of finite size has no derivatives in the geometry: give numbers, or a point"
+        )
     mixing = None
     if wanted.polarisation != "scalar":
         mixing = Mixing(wanted.polarisation == "flux", wanted.fields is not None)
         maps = maps if wanted.fields is None else apart_maps(maps, wanted.fields)
     shape = maps[0].shape
     lenses = zip(*(m.reshape(-1, *shape[-3:]) for m in maps), strict=True)
-    found = [_lens(Light(pair, cases, weights, mixing, layers), wanted, moving) for pair in lenses]
-    light, results = _stacked([one for one, _ in found]), [result for _, result in found]
-    power = torch.tensor([result.power for result in results], dtype=torch.float64).view(shape[:-3])
+    found = [
+        _lens(Light(pair, cases, weights, mixing, layers), wanted, moving)
+        for pair in lenses
+    ]
+    light, results = (
+        _stacked([one for one, _ in found]),
+        [result for _, result in found],
+    )
+    power = torch.tensor(
+        [result.power for result in results], dtype=torch.float64
+    ).view(shape[:-3])
     return light.view(*shape[:-3], *light.shape[1:]), results, power * _passed(cases[0])
 
 
-def _lens(given: Light, wanted: Wanted, moving: Moving | None) -> tuple[torch.Tensor, Result]:
-    """(depth, y, x) intensity of one lens, cells as fine as they must be, and its result with all errors."""
+def _lens(
+    given: Light, wanted: Wanted, moving: Moving | None
+) -> tuple[torch.Tensor, Result]:
+    """(depth, y, x) intensity of one lens, cells as fine as they must be, and its
+    result with all errors.
+    """
     shortest = min(given.cases, key=lambda case: case.wavelength_um)
     for finer in FINER:
         fine = cells(shortest, finer) if wanted.integrate else Cells(1, shortest)
-        wide = fine.case if wanted.source is None else extended.widened(fine.case, wanted.source)[0]
+        wide = (
+            fine.case
+            if wanted.source is None
+            else extended.widened(fine.case, wanted.source)[0]
+        )
         if max(wide.samples) > MOST and fine.points > 1:
-            raise PropagationError(f"cells of {fine.points} points in {wide.samples} samples: give a smaller window")
+            raise PropagationError(
+                f"cells of {fine.points} points in {wide.samples} samples: give a smaller window"
+            )
         lit, results = [], []
-        own = wanted if fine.points == 1 else replace(wanted, tolerance=wanted.tolerance * math.sqrt(1 - CELLS**2))
+        own = (
+            wanted
+            if fine.points == 1
+            else replace(wanted, tolerance=wanted.tolerance * math.sqrt(1 - CELLS**2))
+        )
         for some in _few(wide, given, moving):
             light, result = _depths(given, fine, some, own, moving)
             lit.append(light)
             results.append(result)
         result = _together(results)
-        if result.sampling <= CELLS * wanted.tolerance or max(fine.case.samples) > MOST / 2:
+        if (
+            result.sampling <= CELLS * wanted.tolerance
+            or max(fine.case.samples) > MOST / 2
+        ):
             break
     if fine.points > 1:
         why = f"; light integrated over cells of {fine.points} x {fine.points} points"
@@ -138,7 +198,9 @@ def _stacked(parts: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:
-    """The case with as many of its depths as fit in ``HELD_BYTES``; all of them where gradients hold them anyway."""
+    """The case with as many of its depths as fit in ``HELD_BYTES``; all of them where
+    gradients hold them anyway.
+    """
     inverse, phase = wide.inverse_depths_per_um, given.maps[0]
     each = wide.samples[0] * wide.samples[1] * SAMPLE_BYTES * phase.element_size()
     step = max(1, int(HELD_BYTES / each))
@@ -146,7 +208,12 @@ def _few(wide: Case, given: Light, moving: Moving | None) -> Iterator[Case]:
         step = len(inverse)
     count = -(-len(inverse) // step)
     for i in range(count):  # even shares
-        yield replace(wide, inverse_depths_per_um=inverse[len(inverse) * i // count : len(inverse) * (i + 1) // count])
+        yield replace(
+            wide,
+            inverse_depths_per_um=inverse[
+                len(inverse) * i // count : len(inverse) * (i + 1) // count
+            ],
+        )
 
 
 def _depths(
@@ -164,23 +231,36 @@ def _depths(
     return light, replace(result, intensity=light)
 
 
-def _intensity(given: Light, case: Case, tolerance: float, moving: Moving | None) -> Result:
-    about: dict[str, Any] = {"tolerance": tolerance, "moving": moving, "mixing": given.mixing}
+def _intensity(
+    given: Light, case: Case, tolerance: float, moving: Moving | None
+) -> Result:
+    about: dict[str, Any] = {
+        "tolerance": tolerance,
+        "moving": moving,
+        "mixing": given.mixing,
+    }
     cases = given.at(case)
     return intensity(*given.shaded(cases), cases, given.weights, **about)
 
 
-def _blurred(given: Light, fine: Cells, some: Case, source: Extent, tolerance: float) -> tuple[torch.Tensor, Result]:
+def _blurred(
+    given: Light, fine: Cells, some: Case, source: Extent, tolerance: float
+) -> tuple[torch.Tensor, Result]:
     """As :func:`_depths` for a source of finite size, on the samples of the cells."""
 
     def point(case: Case) -> Result:
         return _intensity(given, case, tolerance / STRICTER, None)
 
     result = point(some)
-    more = (some.samples[0] - fine.case.samples[0]) // 2, (some.samples[1] - fine.case.samples[1]) // 2
+    more = (
+        (some.samples[0] - fine.case.samples[0]) // 2,
+        (some.samples[1] - fine.case.samples[1]) // 2,
+    )
     light, edge = extended.blurred(result.intensity, some, source, more)
     with torch.no_grad():
-        unlike = extended.unlike(result.intensity, some, source, lambda case: point(case).intensity)
+        unlike = extended.unlike(
+            result.intensity, some, source, lambda case: point(case).intensity
+        )
     reason = f"{result.reason}; blurred by a {source.shape} source"
     return light, replace(result, source=math.hypot(edge, unlike), reason=reason)
 
@@ -190,8 +270,13 @@ def _together(results: list[Result]) -> Result:
     first = max(results, key=lambda result: result.error)
     if len(results) == 1:
         return first
-    worst = {name: max(getattr(result, name) for result in results) for name in ("sampling", "source")}
-    return replace(first, **worst, reason=f"{first.reason}; depths in {len(results)} shares")
+    worst = {
+        name: max(getattr(result, name) for result in results)
+        for name in ("sampling", "source")
+    }
+    return replace(
+        first, **worst, reason=f"{first.reason}; depths in {len(results)} shares"
+    )
 
 
 def _passed(case: Case) -> float:

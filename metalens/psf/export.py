@@ -1,4 +1,6 @@
-"""PSF stacks for other programs: HDF5 (the project's own file), TIFF pages, MATLAB arrays, FITS images."""
+"""PSF stacks for other programs: HDF5 (the project's own file), TIFF pages, MATLAB
+arrays, FITS images.
+"""
 
 import io
 import json
@@ -25,18 +27,24 @@ def check(path: str | Path) -> None:
         PropagationError: naming the formats there are.
     """
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise PropagationError(f"{path}: cannot write this format; name it {', '.join(SUFFIXES)}")
+        raise PropagationError(
+            f"{path}: cannot write this format; name it {', '.join(SUFFIXES)}"
+        )
 
 
 def write(path: str | Path, stack: PsfStack) -> None:
     """Write a stack in the format that the name's ending says; same stack, same bytes.
 
-    ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32 page for every PSF, the last axis
-    before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON in the image description
+    ``.h5``: everything, read back by :func:`metalens.psf.load`. ``.tif``: a float32
+    page for every PSF, the last axis
+    before (y, x) running fastest, each of sum 1, with axes, energies and units as JSON
+    in the image description
     (a depth at infinity is null there).
     ``.mat``: MATLAB 5 variables of the same names and shapes as in the HDF5 file.
-    ``.fits``: the primary image (…, y, x) in float32 with linear x and y axes in um, row 0 first (+y down, which most
-    viewers draw from below), and an image extension of float64 for every axis and for the energies.
+    ``.fits``: the primary image (…, y, x) in float32 with linear x and y axes in um,
+    row 0 first (+y down, which most
+    viewers draw from below), and an image extension of float64 for every axis and for
+    the energies.
 
     Raises:
         PropagationError: another ending.
@@ -54,10 +62,21 @@ def tiff(stack: PsfStack) -> bytes:
     import tifffile
 
     plain = stack.numpy()
-    about = {name: getattr(plain, name) for name in _NUMBERS} | {n: v.tolist() for n, v in _arrays(plain).items()}
-    about["depths_um"] = [None if math.isinf(depth) else depth for depth in about["depths_um"]]
-    about |= {"shape": list(plain.intensity.shape), "axes": _axes(plain), "length_unit": "um", "angle_unit": "rad"}
-    pages = np.asarray(plain.intensity, np.float32).reshape(-1, *plain.intensity.shape[-2:])
+    about = {name: getattr(plain, name) for name in _NUMBERS} | {
+        n: v.tolist() for n, v in _arrays(plain).items()
+    }
+    about["depths_um"] = [
+        None if math.isinf(depth) else depth for depth in about["depths_um"]
+    ]
+    about |= {
+        "shape": list(plain.intensity.shape),
+        "axes": _axes(plain),
+        "length_unit": "um",
+        "angle_unit": "rad",
+    }
+    pages = np.asarray(plain.intensity, np.float32).reshape(
+        -1, *plain.intensity.shape[-2:]
+    )
     file = io.BytesIO()
     per_cm = (1e4 / plain.step_um, 1e4 / plain.step_um)
     tifffile.imwrite(
@@ -78,11 +97,16 @@ def matlab(stack: PsfStack) -> bytes:
     from scipy.io import savemat
 
     plain = stack.numpy()
-    values: dict[str, Any] = {name: getattr(plain, name) for name in _NUMBERS} | _arrays(plain)
+    values: dict[str, Any] = {
+        name: getattr(plain, name) for name in _NUMBERS
+    } | _arrays(plain)
     values |= {"intensity": np.asarray(plain.intensity), "axes": _axes(plain)}
     file = io.BytesIO()
     savemat(file, values, oned_as="column")
-    return b"MATLAB 5.0 MAT-file, metalens PSF stack, um and rad".ljust(116) + file.getvalue()[116:]
+    return (
+        b"MATLAB 5.0 MAT-file, metalens PSF stack, um and rad".ljust(116)
+        + file.getvalue()[116:]
+    )
 
 
 def fits(stack: PsfStack) -> bytes:
@@ -92,15 +116,25 @@ def fits(stack: PsfStack) -> bytes:
     plain = stack.numpy()
     image = library.PrimaryHDU(np.asarray(plain.intensity, np.float32))
     head = image.header
-    for axis, pixels in ((1, plain.intensity.shape[-1]), (2, plain.intensity.shape[-2])):
+    for axis, pixels in (
+        (1, plain.intensity.shape[-1]),
+        (2, plain.intensity.shape[-2]),
+    ):
         head[f"CTYPE{axis}"], head[f"CUNIT{axis}"] = " xy"[axis], "um"
-        head[f"CRPIX{axis}"], head[f"CRVAL{axis}"], head[f"CDELT{axis}"] = (pixels + 1) / 2, 0.0, plain.step_um
+        head[f"CRPIX{axis}"], head[f"CRVAL{axis}"], head[f"CDELT{axis}"] = (
+            (pixels + 1) / 2,
+            0.0,
+            plain.step_um,
+        )
     head["AXES"] = (_axes(plain), "of the image, slowest first")
     head["RELERR"] = (plain.error, "relative L2 error of the PSFs")
     head["TOLERANC"] = (plain.tolerance, "relative L2 error that was asked for")
     head["SENSDIST"] = (plain.sensor_distance_um, "um from the lens to the sensor")
     head["CREATOR"] = "metalens"
-    parts = [library.ImageHDU(values, name=name.upper()) for name, values in _arrays(plain).items()]
+    parts = [
+        library.ImageHDU(values, name=name.upper())
+        for name, values in _arrays(plain).items()
+    ]
     file = io.BytesIO()
     library.HDUList([image, *parts]).writeto(file, checksum=False)
     return file.getvalue()
@@ -115,4 +149,6 @@ def _axes(plain: PsfStack) -> str:
     """Names of the axes of the intensity, slowest first."""
     extra = plain.intensity.ndim - 3
     angle = extra > 0 and plain.intensity.shape[extra - 1] == len(plain.angles_rad)
-    return " ".join([*["lens"] * (extra - angle), *["angle"] * angle, "depth", "y", "x"])
+    return " ".join(
+        [*["lens"] * (extra - angle), *["angle"] * angle, "depth", "y", "x"]
+    )

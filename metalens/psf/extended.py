@@ -1,10 +1,14 @@
-"""Sources of finite size: the PSF of a point, blurred by the geometric image of the source.
+"""Sources of finite size: the PSF of a point, blurred by the geometric image of the
+source.
 
     P(X) = ∫ w(s) P_s(X - M s) d²s,    M = ∂(chief ray on the sensor) / ∂(point of the source)
 
-s lies in the plane through the source parallel to the lens, sides of a square along x and y; without films M = -d/z.
-P_s is taken as that of the source's middle. |U|² on samples within Nyquist's step is band-limited, so that its product
-with the transform ŵ(Mᵀf) is the convolution itself. Where P_s changes over the source as D_x s_x/σ + D_y s_y/σ, σ the
+s lies in the plane through the source parallel to the lens, sides of a square along x
+and y; without films M = -d/z.
+P_s is taken as that of the source's middle. |U|² on samples within Nyquist's step is
+band-limited, so that its product
+with the transform ŵ(Mᵀf) is the convolution itself. Where P_s changes over the source
+as D_x s_x/σ + D_y s_y/σ, σ the
 standard deviation of w, what is left out is D seen through |∇ŵ|/(2πσ); the estimate adds |ŵ| for changes that are even.
 """
 
@@ -26,18 +30,25 @@ from metalens.propagate import Case
 from metalens.psf.cells import MOST, nyquist_um
 from metalens.psf.record import SourceShape
 
-GUARD = 12  # steps of Nyquist's around what the source blurs in: light that is cut there rings
-SIGMA = {"disc": 1 / 4, "square": 1 / math.sqrt(12), "gaussian": 1 / math.sqrt(8 * math.log(2))}  # of the size
+# steps of Nyquist's around what the source blurs in: light that is cut there rings
+GUARD = 12
+SIGMA = {
+    "disc": 1 / 4,
+    "square": 1 / math.sqrt(12),
+    "gaussian": 1 / math.sqrt(8 * math.log(2)),
+}  # of the size
 REACH = {"disc": 0.5, "square": 0.5, "gaussian": 4 * SIGMA["gaussian"]}
 
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Size and shape of an incoherent source, parallel to the lens, of even radiance (Gaussian: falling off).
+    """Size and shape of an incoherent source, parallel to the lens, of even radiance
+    (Gaussian: falling off).
 
     shape: disc, square (sides along x and y) or gaussian.
     size_um: diameter, side, or full width at half maximum, of sources at finite depths.
-    size_rad: in its place, size over depth: alike at all depths, and the only one at infinity.
+    size_rad: in its place, size over depth: alike at all depths, and the only one at
+    infinity.
 
     Raises:
         PropagationError: not one size above 0, or a shape that is not known.
@@ -49,16 +60,25 @@ class Extent:
 
     def __post_init__(self) -> None:
         sizes = self.size_um, self.size_rad
-        if not (all(math.isfinite(s) and s >= 0 for s in sizes) and (sizes[0] > 0) != (sizes[1] > 0)):
-            raise PropagationError(f"source of {sizes[0]} um and {sizes[1]} rad: need one of both, above 0")
+        if not (
+            all(math.isfinite(s) and s >= 0 for s in sizes)
+            and (sizes[0] > 0) != (sizes[1] > 0)
+        ):
+            raise PropagationError(
+                f"source of {sizes[0]} um and {sizes[1]} rad: need one of both, above 0"
+            )
         if self.shape not in SIGMA:
-            raise PropagationError(f"source shape {self.shape!r}: need {', '.join(SIGMA)}")
+            raise PropagationError(
+                f"source shape {self.shape!r}: need {', '.join(SIGMA)}"
+            )
 
     def transform(self, u: Any, v: Any) -> tuple[Array, Array]:
         """(ŵ, |∇ŵ| / (2π)) at (u, v) cycles per size along x and y."""
         if self.shape == "square":
             along, across = np.sinc(u), np.sinc(v)
-            return along * across, np.hypot(_sinc_slope(u) * across, along * _sinc_slope(v)) / (2 * np.pi)
+            return along * across, np.hypot(
+                _sinc_slope(u) * across, along * _sinc_slope(v)
+            ) / (2 * np.pi)
         rho = np.hypot(u, v)
         if self.shape == "gaussian":
             level = np.exp(-((np.pi * rho) ** 2) / (4 * math.log(2)))
@@ -70,17 +90,24 @@ class Extent:
 def _sinc_slope(u: Any) -> Array:
     """d sinc(u) / du, sinc(u) = sin(πu)/(πu)."""
     safe = np.where(np.abs(u) < 1e-4, 1.0, u)
-    return np.where(np.abs(u) < 1e-4, -(np.pi**2) * u / 3, (np.cos(np.pi * safe) - np.sinc(safe)) / safe)
+    return np.where(
+        np.abs(u) < 1e-4,
+        -(np.pi**2) * u / 3,
+        (np.cos(np.pi * safe) - np.sinc(safe)) / safe,
+    )
 
 
 def images(case: Case, extent: Extent) -> Array:
-    """(depth, 2, 2) M of the module's heading times the size: sizes of the source to um on the sensor, [x, y].
+    """(depth, 2, 2) M of the module's heading times the size: sizes of the source to um
+    on the sensor, [x, y].
 
     Raises:
         PropagationError: a size in um at infinity.
     """
     onto = _slopes(lambda t: _met(case, t), case)
-    return np.array([onto @ _turn(case, extent, inverse) for inverse in case.inverse_depths_per_um])
+    return np.array(
+        [onto @ _turn(case, extent, inverse) for inverse in case.inverse_depths_per_um]
+    )
 
 
 def _turn(case: Case, extent: Extent, inverse: float) -> Array:
@@ -91,19 +118,29 @@ def _turn(case: Case, extent: Extent, inverse: float) -> Array:
         raise PropagationError(
             f"source of {extent.size_um:g} um at infinity has no angle: give its size as an angle (size_rad)"
         )
-    return np.asarray(extent.size_um * np.linalg.inv(_slopes(lambda t: _place(case, t, 1 / inverse), case)))
+    return np.asarray(
+        extent.size_um
+        * np.linalg.inv(_slopes(lambda t: _place(case, t, 1 / inverse), case))
+    )
 
 
 def _met(case: Case, tangents: tuple[float, float]) -> list[float]:
     """(x, y) where the chief ray meets the sensor."""
-    return [float(propagate.chief(case.behind, case.sensor_distance_um, tangents, i)) for i in (0, 1)]
+    return [
+        float(propagate.chief(case.behind, case.sensor_distance_um, tangents, i))
+        for i in (0, 1)
+    ]
 
 
 def _place(case: Case, tangents: tuple[float, float], depth_um: float) -> list[float]:
-    """(x, y) of the source of these tangents (in air) on its plane, through the films in front."""
+    """(x, y) of the source of these tangents (in air) on its plane, through the films
+    in front.
+    """
     steep = 1 + tangents[0] ** 2 + tangents[1] ** 2
     thick = sum(t for _, t in case.front)
-    away = float(media.bend([(1.0, depth_um - thick), *case.front], 1 - 1 / steep)) / math.sqrt(steep)
+    away = float(
+        media.bend([(1.0, depth_um - thick), *case.front], 1 - 1 / steep)
+    ) / math.sqrt(steep)
     return [-away * tangents[0], -away * tangents[1]]
 
 
@@ -116,10 +153,12 @@ def _slopes(of: Any, case: Case) -> Array:
 
 
 def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
-    """The case with the samples around its window that the source blurs into it, and how many (y, x) on each side.
+    """The case with the samples around its window that the source blurs into it, and
+    how many (y, x) on each side.
 
     Raises:
-        PropagationError: samples farther apart than Nyquist's step, a size in um at infinity, or too many samples.
+        PropagationError: samples farther apart than Nyquist's step, a size in um at
+            infinity, or too many samples.
     """
     limit = nyquist_um(fine)
     if fine.step_um > limit * (1 + 1e-9):
@@ -139,11 +178,17 @@ def widened(fine: Case, extent: Extent) -> tuple[Case, tuple[int, int]]:
     return replace(fine, samples=samples), more
 
 
-def blurred(light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, int]) -> tuple[torch.Tensor, float]:
-    """(depth, y, x) light on the window from that on the widened one, and what is wrong at its edges, relative L2."""
+def blurred(
+    light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, int]
+) -> tuple[torch.Tensor, float]:
+    """(depth, y, x) light on the window from that on the widened one, and what is wrong
+    at its edges, relative L2.
+    """
     whole = _filtered(light, case, extent, 0)
     with torch.no_grad():
-        down, across = ((n - far) // 2 for n, far in zip(more, reach(case, extent), strict=True))
+        down, across = (
+            (n - far) // 2 for n, far in zip(more, reach(case, extent), strict=True)
+        )
         inner = torch.zeros_like(light)
         inner[..., down:-down, across:-across] = light[..., down:-down, across:-across]
         cut = _cropped(_filtered(inner, case, extent, 0) - whole, more)
@@ -152,8 +197,12 @@ def blurred(light: torch.Tensor, case: Case, extent: Extent, more: tuple[int, in
 
 
 def reach(case: Case, extent: Extent) -> tuple[int, int]:
-    """(y, x) samples that the image of the source reaches from its middle, at the depth where that is most."""
-    x, y = np.ceil(np.abs(images(case, extent)).sum(2).max(0) * REACH[extent.shape] / case.step_um)
+    """(y, x) samples that the image of the source reaches from its middle, at the depth
+    where that is most.
+    """
+    x, y = np.ceil(
+        np.abs(images(case, extent)).sum(2).max(0) * REACH[extent.shape] / case.step_um
+    )
     return int(y), int(x)
 
 
@@ -161,40 +210,74 @@ def _cropped(light: torch.Tensor, more: tuple[int, int]) -> torch.Tensor:
     return light[..., more[0] : -more[0], more[1] : -more[1]]
 
 
-def _filtered(light: torch.Tensor, case: Case, extent: Extent, which: int) -> torch.Tensor:
+def _filtered(
+    light: torch.Tensor, case: Case, extent: Extent, which: int
+) -> torch.Tensor:
     """Light through ŵ (which 0), or through √(|ŵ|² + |∇ŵ|²/(2πσ)²) (which 1)."""
     shape = [scipy.fft.next_fast_len(n, real=True) for n in light.shape[-2:]]
-    fy, fx = np.fft.fftfreq(shape[0], case.step_um)[:, None], np.fft.rfftfreq(shape[1], case.step_um)
+    fy, fx = (
+        np.fft.fftfreq(shape[0], case.step_um)[:, None],
+        np.fft.rfftfreq(shape[1], case.step_um),
+    )
     filters = []
     for m in images(case, extent):
-        level, slope = extent.transform(m[0, 0] * fx + m[1, 0] * fy, m[0, 1] * fx + m[1, 1] * fy)
-        filters.append(level if which == 0 else np.hypot(level, slope / SIGMA[extent.shape]))
+        level, slope = extent.transform(
+            m[0, 0] * fx + m[1, 0] * fy, m[0, 1] * fx + m[1, 1] * fy
+        )
+        filters.append(
+            level if which == 0 else np.hypot(level, slope / SIGMA[extent.shape])
+        )
     seen = torch.as_tensor(np.array(filters)).to(light)
-    found: torch.Tensor = torch.fft.irfft2(torch.fft.rfft2(light, s=shape) * seen, s=shape)
+    found: torch.Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(light, s=shape) * seen, s=shape
+    )
     return found[..., : light.shape[-2], : light.shape[-1]]
 
 
-def unlike(light: torch.Tensor, case: Case, extent: Extent, probe: Callable[[Case], torch.Tensor]) -> float:
-    """Relative L2 error of taking the PSF as alike over the source, at the nearest and the farthest depth.
+def unlike(
+    light: torch.Tensor,
+    case: Case,
+    extent: Extent,
+    probe: Callable[[Case], torch.Tensor],
+) -> float:
+    """Relative L2 error of taking the PSF as alike over the source, at the nearest and
+    the farthest depth.
 
     Args:
-        light: (depth, y, x) on the widened window of ``case``, from the middle of the source.
+        light: (depth, y, x) on the widened window of ``case``, from the middle of the
+            source.
         probe: the same (1, y, x) for another case.
     """
     found = []
     inverse = case.inverse_depths_per_um
     for depth in {int(np.argmin(inverse)), int(np.argmax(inverse))}:
-        one, middle = replace(case, inverse_depths_per_um=(inverse[depth],)), light[depth : depth + 1].detach()
+        one, middle = (
+            replace(case, inverse_depths_per_um=(inverse[depth],)),
+            light[depth : depth + 1].detach(),
+        )
         square = 0.0
         for axis in (0, 1):
-            other = probe(_moved(one, _turn(case, extent, inverse[depth])[:, axis] * SIGMA[extent.shape]))
-            square += float(_filtered(other.detach() - middle, one, extent, 1).norm()) ** 2
-        found.append(math.sqrt(square) / float(_filtered(middle, one, extent, 0).norm()))
+            other = probe(
+                _moved(
+                    one,
+                    _turn(case, extent, inverse[depth])[:, axis] * SIGMA[extent.shape],
+                )
+            )
+            square += (
+                float(_filtered(other.detach() - middle, one, extent, 1).norm()) ** 2
+            )
+        found.append(
+            math.sqrt(square) / float(_filtered(middle, one, extent, 0).norm())
+        )
     return max(found)
 
 
 def _moved(case: Case, turn: Array) -> Case:
-    """The case of a source whose tangents are changed; the window follows its chief ray."""
+    """The case of a source whose tangents are changed; the window follows its chief
+    ray.
+    """
     tangents = case.tangents[0] + float(turn[0]), case.tangents[1] + float(turn[1])
-    x, y = np.add(case.centre_um, np.subtract(_met(case, tangents), _met(case, case.tangents))).tolist()
+    x, y = np.add(
+        case.centre_um, np.subtract(_met(case, tangents), _met(case, case.tangents))
+    ).tolist()
     return replace(case, tangents=tangents, centre_um=(x, y))

@@ -36,9 +36,15 @@ from metalens.psf.spectrum import Measured, Nodes, Source
 from metalens.psf.stack import psf_stack
 
 PLACES = 9  # of a window along an axis, whose light is judged by the paths to them
-ROWS, NEARBY = 64, 1e-4  # rows of pillars whose delays are taken, and how far apart their wavelengths are
+ROWS, NEARBY = (
+    64,
+    1e-4,
+)  # rows of pillars whose delays are taken, and how far apart their wavelengths are
 TRIES = 3  # at a spectrum: the light of one tells the paths for the next
-PILOT, PILOT_ERROR = 5, 1e-3  # wavelengths, and their tolerance, by which the light of a whole spectrum is foreseen
+PILOT, PILOT_ERROR = (
+    5,
+    1e-3,
+)  # wavelengths, and their tolerance, by which the light of a whole spectrum is foreseen
 SPARE = 0.7  # of the tolerance that is asked for by that light, so that one try does
 ABOVE = "above the tolerance by its spectrum"
 AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
@@ -48,9 +54,12 @@ AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 class View:
     """Where a lens is looked at.
 
-    depths_um: source depths, inf for a plane wave; angles_rad: (x, y) pairs, as in :func:`metalens.psf.psf_stack`.
-    window_um, samples: of the window that follows the chief ray; pairs (x, y) where it is not square.
-    offset_um: (x, y) from the chief ray to the window's centre. source: size and shape where it is no point.
+    depths_um: source depths, inf for a plane wave; angles_rad: (x, y) pairs, as in
+    :func:`metalens.psf.psf_stack`.
+    window_um, samples: of the window that follows the chief ray; pairs (x, y) where it
+    is not square.
+    offset_um: (x, y) from the chief ray to the window's centre. source: size and shape
+    where it is no point.
     """
 
     depths_um: tuple[float, ...]
@@ -64,7 +73,9 @@ class View:
     def seen(self) -> dict[str, Any]:
         """Depths, window and source as arguments of :func:`metalens.psf.psf_stack`."""
         names = ("window_um", "samples", "offset_um", "source")
-        return {"depths_um": np.array(self.depths_um)} | {name: getattr(self, name) for name in names}
+        return {"depths_um": np.array(self.depths_um)} | {
+            name: getattr(self, name) for name in names
+        }
 
 
 def from_lens(
@@ -79,48 +90,80 @@ def from_lens(
 ) -> PsfStack:
     """PSFs of a lens, (angle, depth, y, x), float32 where the tolerance allows it.
 
-    The proxy is asked at the angle of every direction where its library has angles, else at normal incidence, which
-    ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the proxy holds the mean of both
-    polarisations, at normal incidence they are alike. Where pillars of one size answer x and y apart, the PSFs are
-    those of the light that the proxy is of (``lens.one_light``), which ``reason`` says. The lens' films and cover are
-    gone through, and the factor of its own unlike neighbours where it holds their rows (``lens.neighbours``).
+    The proxy is asked at the angle of every direction where its library has angles,
+    else at normal incidence, which
+    ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the
+    proxy holds the mean of both
+    polarisations, at normal incidence they are alike. Where pillars of one size answer
+    x and y apart, the PSFs are
+    those of the light that the proxy is of (``lens.one_light``), which ``reason`` says.
+    The lens' films and cover are
+    gone through, and the factor of its own unlike neighbours where it holds their rows
+    (``lens.neighbours``).
 
     Args:
-        spectrum: wavelengths and weights, or a diode or measured curves, which get as few wavelengths as the tolerance
-            needs; by default the design wavelength alone. Its error, judged by the paths to where the light falls in
+        spectrum: wavelengths and weights, or a diode or measured curves, which get as
+            few wavelengths as the tolerance
+            needs; by default the design wavelength alone. Its error, judged by the
+            paths to where the light falls in
             the window, is in the budget.
         polarisation: as for :func:`psf_stack`, or ``auto``: the scalar where its error
             (:func:`metalens.psf.scalar_error`) is below the tolerance, else the flux.
-        left_out: what is known of the lens's own pillars (:func:`metalens.design.left_out`), for the budget; else rough
+        left_out: what is known of the lens's own pillars
+            (:func:`metalens.design.left_out`), for the budget; else rough
             numbers.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: a spectrum of which a wavelength that stands for
+        DomainError: a wavelength outside the proxy; PropagationError: a spectrum of
+            which a wavelength that stands for
             it is, as :func:`psf_stack`, no angle, and ``flux`` or
-            ``vector`` for turned pillars, those of two sizes and those that answer x and y apart (``auto`` takes the
+            ``vector`` for turned pillars, those of two sizes and those that answer x
+            and y apart (``auto`` takes the
             scalar there; its error is in the budget).
     """
     if not 0 < tolerance < 1:
-        raise PropagationError(f"tolerance is {tolerance}, need a relative error above 0 and below 1")
+        raise PropagationError(
+            f"tolerance is {tolerance}, need a relative error above 0 and below 1"
+        )
     if not view.angles_rad:
         raise PropagationError("angles_rad is empty, need one direction (x, y) or more")
-    how: dict[str, Any] = {"tolerance": tolerance, "polarisation": polarisation, "own": left_out or _known(lens)}
+    how: dict[str, Any] = {
+        "tolerance": tolerance,
+        "polarisation": polarisation,
+        "own": left_out or _known(lens),
+    }
     how["provenance"] = provenance or Provenance()
     if isinstance(spectrum, Source | Measured):
         return _of_spectrum(lens, view, spectrum, **how)
-    return _of_nodes(lens, view, spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0), **how)
+    return _of_nodes(
+        lens,
+        view,
+        spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0),
+        **how,
+    )
 
 
-def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any) -> PsfStack:
-    """PSFs of a spectrum: wavelengths for the paths to where few of them say that its light falls, in the window; more
+def _of_spectrum(
+    lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any
+) -> PsfStack:
+    """PSFs of a spectrum: wavelengths for the paths to where few of them say that its
+    light falls, in the window; more
     where the light of all of them says so."""
     within = lens.proxy.wavelengths_um
 
     def psfs(nodes: Nodes, tolerance: float, **other: Any) -> PsfStack:
-        return _of_nodes(lens, view, spectra.known(nodes, source, within), tolerance=tolerance, **how | other)
+        return _of_nodes(
+            lens,
+            view,
+            spectra.known(nodes, source, within),
+            tolerance=tolerance,
+            **how | other,
+        )
 
     spans = [paths_um(lens, view, angle, source) for angle in view.angles_rad]
-    middle = max(float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans)
+    middle = max(
+        float(span[:, span.shape[1] // 2, span.shape[2] // 2].max()) for span in spans
+    )
     nodes = spectra.nodes(source, path_um=middle, tolerance=tolerance / 2)
     if len(nodes.weights) > 2 * PILOT:
         few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
@@ -128,73 +171,133 @@ def _of_spectrum(lens: Lens, view: View, source: Source | Measured, *, tolerance
         nodes = _asked(source, spans, pilot, tolerance / 2 * SPARE)
     for last in range(TRIES):
         stack = psfs(nodes, tolerance)
-        if last == TRIES - 1 or stack.budget is None or stack.budget.spectrum <= tolerance / 2:
+        if (
+            last == TRIES - 1
+            or stack.budget is None
+            or stack.budget.spectrum <= tolerance / 2
+        ):
             break
         nodes = _asked(source, spans, stack, tolerance / 2)
-    return dataclasses.replace(stack, reason=stack.reason + spectra.beyond(source, within))
+    return dataclasses.replace(
+        stack, reason=stack.reason + spectra.beyond(source, within)
+    )
 
 
-def _asked(source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float) -> Nodes:
-    """Wavelengths for the paths of every direction (:func:`paths_um`) to where the light of PSFs lies."""
+def _asked(
+    source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float
+) -> Nodes:
+    """Wavelengths for the paths of every direction (:func:`paths_um`) to where the
+    light of PSFs lies.
+    """
     found = [
-        spectra.nodes(source, path_um=span.ravel(), light=lit(light, span.shape[1:]).ravel(), tolerance=tolerance)
+        spectra.nodes(
+            source,
+            path_um=span.ravel(),
+            light=lit(light, span.shape[1:]).ravel(),
+            tolerance=tolerance,
+        )
         for span, light in zip(spans, stack.intensity, strict=True)
     ]
     return max(found, key=lambda one: len(one.weights))
 
 
-def paths_um(lens: Lens, view: View, angle_rad: tuple[float, float], source: Source | Measured) -> Array:
-    """(depth, y, x) largest difference of optical path through two pillars to places of the window, first to last.
+def paths_um(
+    lens: Lens, view: View, angle_rad: tuple[float, float], source: Source | Measured
+) -> Array:
+    """(depth, y, x) largest difference of optical path through two pillars to places of
+    the window, first to last.
 
-    Rays of some places of the aperture through the films, and the delays of the pillars themselves; a window that a
+    Rays of some places of the aperture through the films, and the delays of the pillars
+    themselves; a window that a
     source of finite size blurs into is as much wider.
     """
     grid = lens.diameters.grid._asdict()
     seen = {name: value for name, value in view.seen.items() if name != "source"} | grid
-    about: dict[str, Any] = {"wavelength_um": lens.wavelength_um, "sensor_distance_um": lens.sensor_distance_um}
+    about: dict[str, Any] = {
+        "wavelength_um": lens.wavelength_um,
+        "sensor_distance_um": lens.sensor_distance_um,
+    }
     about["layers"] = lens.layers.open
-    case = propagate.case(lens.diameters.diameter_um.shape, angle_rad=angle_rad, **seen, **about)
+    case = propagate.case(
+        lens.diameters.diameter_um.shape, angle_rad=angle_rad, **seen, **about
+    )
     more = (0, 0) if view.source is None else reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
     turn = 2 * np.pi * np.arange(SPOKES) / SPOKES
     x, y = (radius * np.cos(turn)).ravel(), (radius * np.sin(turn)).ravel()
-    come = np.array([paths.from_source(case, x, y, case.tangents, inverse) for inverse in case.inverse_depths_per_um])
+    come = np.array(
+        [
+            paths.from_source(case, x, y, case.tangents, inverse)
+            for inverse in case.inverse_depths_per_um
+        ]
+    )
     down, across = (
         np.linspace(-1, 1, min(PLACES, n)) * ((n - 1) / 2 + far) * case.step_um + middle
         for n, far, middle in zip(case.samples, more, case.centre_um[::-1], strict=True)
     )
-    goes = np.array([[paths.to_sensor(case, x, y, (float(i), float(j))) for i in across] for j in down])
-    return np.asarray(np.ptp(come[:, None, None] + goes, axis=-1) + _delay_um(lens, angle_rad, source))
+    goes = np.array(
+        [
+            [paths.to_sensor(case, x, y, (float(i), float(j))) for i in across]
+            for j in down
+        ]
+    )
+    return np.asarray(
+        np.ptp(come[:, None, None] + goes, axis=-1) + _delay_um(lens, angle_rad, source)
+    )
 
 
-def _delay_um(lens: Lens, angle_rad: tuple[float, float], source: Source | Measured) -> float:
-    """Largest difference of the pillars' delays, d(phase)/dk, over some rows and three wavelengths of a spectrum."""
+def _delay_um(
+    lens: Lens, angle_rad: tuple[float, float], source: Source | Measured
+) -> float:
+    """Largest difference of the pillars' delays, d(phase)/dk, over some rows and three
+    wavelengths of a spectrum.
+    """
     low, high = lens.proxy.wavelengths_um
     if lens.pairs is not None or not high > low:
         return 0.0
     um, share = spectra.points(source)
     rows = slice(None, None, max(1, len(lens.diameters.diameter_um) // ROWS))
-    there, tilt, found = np.asarray(lens.diameters.diameter_um[rows]) > 0, incidence(lens, angle_rad), []
+    there, tilt, found = (
+        np.asarray(lens.diameters.diameter_um[rows]) > 0,
+        incidence(lens, angle_rad),
+        [],
+    )
     for quantile in (0.05, 0.5, 0.95):
-        middle = float(np.clip(um[np.searchsorted(np.cumsum(share), quantile)], low, high))
+        middle = float(
+            np.clip(um[np.searchsorted(np.cumsum(share), quantile)], low, high)
+        )
         ends = max(low, middle * (1 - NEARBY)), min(high, middle * (1 + NEARBY))
-        turns = [lens.rows_phase_rad(rows, wave, tilt)[there] / (2 * np.pi) for wave in ends]
+        turns = [
+            lens.rows_phase_rad(rows, wave, tilt)[there] / (2 * np.pi) for wave in ends
+        ]
         change = turns[0] - turns[1]
         found.append(np.ptp(change - np.rint(change)) / (1 / ends[0] - 1 / ends[1]))
     return float(max(found))
 
 
 def lit(light: Array, places: tuple[int, ...]) -> Array:
-    """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to places as in :func:`paths_um`."""
+    """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to
+    places as in :func:`paths_um`.
+    """
     square = np.asarray(light, float) ** 2
     for axis, count in zip((1, 2), places, strict=True):
-        first = np.ceil((np.arange(1, count) - 0.5) * (square.shape[axis] - 1) / max(count - 1, 1)).astype(int)
+        first = np.ceil(
+            (np.arange(1, count) - 0.5) * (square.shape[axis] - 1) / max(count - 1, 1)
+        ).astype(int)
         square = np.add.reduceat(square, [0, *first], axis=axis)
     return np.asarray(square / square.sum())
 
 
-def _spectral(lens: Lens, view: View, angle_rad: tuple[float, float], stack: PsfStack, nodes: Nodes) -> float:
-    """Error of wavelengths that stand for a spectrum, by the paths to where the light of a direction fell."""
+def _spectral(
+    lens: Lens,
+    view: View,
+    angle_rad: tuple[float, float],
+    stack: PsfStack,
+    nodes: Nodes,
+) -> float:
+    """Error of wavelengths that stand for a spectrum, by the paths to where the light
+    of a direction fell.
+    """
     if nodes.source is None:
         return nodes.error
     span = paths_um(lens, view, angle_rad, nodes.source)
@@ -221,7 +324,9 @@ def _of_nodes(
         counted = _counted(lens, angle, polarisation, tolerance)
         alike = incidence(lens, angle), counted == "scalar"
         if seen != alike:  # without angles in the library all directions share the maps
-            (phase, level), fields = all_maps(lens, nodes, angle, dtype, scalar=counted == "scalar")
+            (phase, level), fields = all_maps(
+                lens, nodes, angle, dtype, scalar=counted == "scalar"
+            )
             seen = alike
         parts.append(
             psf_stack(
@@ -239,27 +344,48 @@ def _of_nodes(
                 neighbours=fields,
             ).numpy()
         )
-        judged = dataclasses.replace(nodes, error=_spectral(lens, view, angle, parts[-1], nodes))
+        judged = dataclasses.replace(
+            nodes, error=_spectral(lens, view, angle, parts[-1], nodes)
+        )
         budgets.append(_budget(lens, angle, parts[-1], judged, counted, own))
-    held = f"of {lens.one_light}: these pillars answer x and y apart" if lens.one_light else ""
+    held = (
+        f"of {lens.one_light}: these pillars answer x and y apart"
+        if lens.one_light
+        else ""
+    )
     return _told(_joined(parts, provenance), worst(budgets), tolerance, held, own)
 
 
-def _told(stack: PsfStack, found: Budget, tolerance: float, held: str, own: LeftOut) -> PsfStack:
-    """With the budget of all directions, and in words what it is of; the stack's own tolerance is that of the sums."""
+def _told(
+    stack: PsfStack, found: Budget, tolerance: float, held: str, own: LeftOut
+) -> PsfStack:
+    """With the budget of all directions, and in words what it is of; the stack's own
+    tolerance is that of the sums.
+    """
     above = [ABOVE] if found.computed > tolerance and stack.converged else []
     told = [stack.reason, *above, held, AT_NORMAL if found.angle else "", own.words]
     words = "; ".join(filter(None, told))
-    return dataclasses.replace(stack, tolerance=tolerance, error=found.computed, budget=found, reason=words)
+    return dataclasses.replace(
+        stack, tolerance=tolerance, error=found.computed, budget=found, reason=words
+    )
 
 
 def unpolarised(x: PsfStack, y: PsfStack) -> PsfStack:
-    """PSFs of light without polarisation: the mean irradiance of those of light along x and along y, as one stack."""
+    """PSFs of light without polarisation: the mean irradiance of those of light along x
+    and along y, as one stack.
+    """
     energy = (x.energy_um2 + y.energy_um2) / 2
-    shares = [(one.energy_um2 / (2 * np.where(energy > 0, energy, 1.0)))[..., None, None] for one in (x, y)]
-    intensity = (x.intensity * shares[0] + y.intensity * shares[1]).astype(x.intensity.dtype)
+    shares = [
+        (one.energy_um2 / (2 * np.where(energy > 0, energy, 1.0)))[..., None, None]
+        for one in (x, y)
+    ]
+    intensity = (x.intensity * shares[0] + y.intensity * shares[1]).astype(
+        x.intensity.dtype
+    )
     worse = x if x.error >= y.error else y
-    return dataclasses.replace(worse, intensity=intensity, energy_um2=energy.astype(x.energy_um2.dtype))
+    return dataclasses.replace(
+        worse, intensity=intensity, energy_um2=energy.astype(x.energy_um2.dtype)
+    )
 
 
 def _known(lens: Lens) -> LeftOut:
@@ -268,7 +394,12 @@ def _known(lens: Lens) -> LeftOut:
 
 
 def _budget(
-    lens: Lens, angle: tuple[float, float], stack: PsfStack, nodes: Nodes, counted: Polarisation, left_out: LeftOut
+    lens: Lens,
+    angle: tuple[float, float],
+    stack: PsfStack,
+    nodes: Nodes,
+    counted: Polarisation,
+    left_out: LeftOut,
 ) -> Budget:
     """Of one direction: what was computed, and what the model of a lens leaves out."""
     made = stack.budget or Budget(stack.error)
@@ -283,15 +414,23 @@ def _budget(
         left_out=left_out,
         light=(nodes.wavelengths_um, nodes.weights),
         lit=lens.diameters.pillars * lens.diameters.site_um2 / lens.wavelength_um**2,
-        proxy=lens.proxy.error(lens.wavelength_um) if lens.pairs is None else lens.pairs.entry_error,
+        proxy=lens.proxy.error(lens.wavelength_um)
+        if lens.pairs is None
+        else lens.pairs.entry_error,
     )
 
 
-def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float) -> Polarisation:
+def _counted(
+    lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float
+) -> Polarisation:
     """``auto`` decided."""
     if lens.hand or lens.pairs is not None or lens.one_light:
         if polarisation in ("flux", "vector"):
-            sized = "has pillars of two sizes" if lens.pairs is not None else f"knows {lens.one_light} alone"
+            sized = (
+                "has pillars of two sizes"
+                if lens.pairs is not None
+                else f"knows {lens.one_light} alone"
+            )
             own = "is for circular light" if lens.hand else sized
             raise PropagationError(
                 f"polarisation = {polarisation!r} is for pillars that treat x and y alike; this lens {own}: take "
@@ -299,44 +438,78 @@ def _counted(lens: Lens, angle: tuple[float, float], polarisation: Polarisation,
             )
         return "scalar"
     if polarisation == "auto":
-        return "flux" if scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance else "scalar"
+        return (
+            "flux"
+            if scalar_error(aperture(lens, angle), uneven(lens, angle)) > tolerance
+            else "scalar"
+        )
     return polarisation
 
 
 def incidence(lens: Lens, angle_rad: tuple[float, float]) -> float:
-    """Angle in rad at which the pillars are asked for light from a direction: 0 where their library has no angles."""
-    return float(np.arctan(np.hypot(*np.tan(angle_rad)))) if lens.proxy.max_angle_rad > 0 else 0.0
+    """Angle in rad at which the pillars are asked for light from a direction: 0 where
+    their library has no angles.
+    """
+    return (
+        float(np.arctan(np.hypot(*np.tan(angle_rad))))
+        if lens.proxy.max_angle_rad > 0
+        else 0.0
+    )
 
 
 def all_maps(
-    lens: Lens, nodes: Nodes, angle_rad: tuple[float, float], dtype: torch.dtype, *, scalar: bool
+    lens: Lens,
+    nodes: Nodes,
+    angle_rad: tuple[float, float],
+    dtype: torch.dtype,
+    *,
+    scalar: bool,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], Jones | None]:
-    """(wavelength, y, x) phase and transmission of every pillar for light from a direction, with the mean factor of
+    """(wavelength, y, x) phase and transmission of every pillar for light from a
+    direction, with the mean factor of
     unlike neighbours; or that factor on both fields beside them."""
     shape = len(nodes.weights), *lens.diameters.diameter_um.shape
     phase, level = torch.empty(shape, dtype=dtype), torch.empty(shape, dtype=dtype)
-    for wave, one, other in zip(nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True):
+    for wave, one, other in zip(
+        nodes.wavelengths_um, phase.numpy(), level.numpy(), strict=True
+    ):
         answers.fill(lens, (float(wave), incidence(lens, angle_rad)), one, other)
     if lens.neighbours is None:
         return (phase, level), None
     if scalar:
-        return among.scalar(phase, level, lens.neighbours, lens.diameters.pitch_um), None
-    return (phase, level), among.jones(phase, level, lens.neighbours, lens.diameters.pitch_um)
+        return among.scalar(
+            phase, level, lens.neighbours, lens.diameters.pitch_um
+        ), None
+    return (phase, level), among.jones(
+        phase, level, lens.neighbours, lens.diameters.pitch_um
+    )
 
 
-def passed_um2(lens: Lens, angle_rad: tuple[float, float], depths_um: Sequence[float]) -> Array:
-    """(depths,) light that leaves the pillars, and the faces behind them, for unit irradiance from this direction.
+def passed_um2(
+    lens: Lens, angle_rad: tuple[float, float], depths_um: Sequence[float]
+) -> Array:
+    """(depths,) light that leaves the pillars, and the faces behind them, for unit
+    irradiance from this direction.
 
     Σ |T S|² a at the design wavelength: S the shadow of a stop, a the area of a site.
     """
     nodes = Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0)
     d, tangents = lens.diameters, (math.tan(angle_rad[0]), math.tan(angle_rad[1]))
-    level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][0].numpy()
+    level = all_maps(lens, nodes, angle_rad, torch.float64, scalar=True)[0][1][
+        0
+    ].numpy()
     places, width = (d.x_um, d.y_um[:, None]), math.sqrt(d.site_um2)
-    shades = (lens.layers.shadow(tangents, z, lens.wavelength_um, places, width) for z in depths_um)
+    shades = (
+        lens.layers.shadow(tangents, z, lens.wavelength_um, places, width)
+        for z in depths_um
+    )
     order = lens.layers.after(lens.sensor_distance_um, lens.wavelength_um).order
     faces = media.passed_at(order, 1 - 1 / (1 + tangents[0] ** 2 + tangents[1] ** 2))
-    return np.asarray(faces * d.site_um2 * np.array([(np.abs(level * shade) ** 2).sum() for shade in shades]))
+    return np.asarray(
+        faces
+        * d.site_um2
+        * np.array([(np.abs(level * shade) ** 2).sum() for shade in shades])
+    )
 
 
 def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
@@ -346,4 +519,6 @@ def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
         for n in ("intensity", "energy_um2", "angles_rad", "centres_um")
     }
     least = max(parts, key=lambda p: p.error)
-    return dataclasses.replace(parts[0], **join, error=least.error, reason=least.reason, provenance=provenance)
+    return dataclasses.replace(
+        parts[0], **join, error=least.error, reason=least.reason, provenance=provenance
+    )

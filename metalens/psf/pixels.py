@@ -18,10 +18,12 @@ def on_pixels(
     shift_um: tuple[float, float] = (0.0, 0.0),
     count: int | None = None,
 ) -> PsfStack:
-    """Light per pixel, each PSF again of sum 1 over the pixels; one without light there stays 0, with no energy.
+    """Light per pixel, each PSF again of sum 1 over the pixels; one without light there
+    stays 0, with no energy.
 
     Args:
-        pitch_um: of one pixel, a number or a torch scalar (the result is differentiable in it, continuously).
+        pitch_um: of one pixel, a number or a torch scalar (the result is differentiable
+            in it, continuously).
         bins: 1, 2, 3 … pixels along each axis that are added.
         shift_um: (y, x) of the pixel grid towards +; the energy is that of the pixels.
         count: binned pixels along each axis; by default as many as cover the window.
@@ -38,7 +40,9 @@ def on_pixels(
         )
     light = torch.as_tensor(stack.intensity)
     shape = None if count is None else (count, count)
-    pixels = integrate(light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um)
+    pixels = integrate(
+        light, stack.step_um, pitch_um=pitch, shape=shape, shift_um=shift_um
+    )
     share = pixels.sum((-1, -2))
     least = torch.finfo(share.dtype).tiny
     result: tuple[Any, Any] = (
@@ -47,4 +51,6 @@ def on_pixels(
     )
     if not isinstance(stack.intensity, torch.Tensor) and not result[0].requires_grad:
         result = result[0].numpy(), result[1].numpy()
-    return dataclasses.replace(stack, intensity=result[0], energy_um2=result[1], step_um=width)
+    return dataclasses.replace(
+        stack, intensity=result[0], energy_um2=result[1], step_um=width
+    )

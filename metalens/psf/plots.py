@@ -1,4 +1,6 @@
-"""Pictures of a PSF stack: slice along depth, montage over depth and angle, MTF and encircled energy, I(z)."""
+"""Pictures of a PSF stack: slice along depth, montage over depth and angle, MTF and
+encircled energy, I(z).
+"""
 
 from typing import Any
 
@@ -14,17 +16,25 @@ PIXEL_UM = 3.0
 
 
 def pictures(stack: PsfStack) -> dict[str, bytes]:
-    """{name: PNG}: ``xz``, ``montage``, ``mtf``, and ``information`` where neighbours of two depths or more differ."""
+    """{name: PNG}: ``xz``, ``montage``, ``mtf``, and ``information`` where neighbours
+    of two depths or more differ.
+    """
     plain = stack.numpy()
     found = {"xz": slices(plain), "montage": montage(plain), "mtf": transfer(plain)}
-    if len(plain.depths_um) > 1 and np.isfinite(plain.depths_um).all() and np.diff(plain.depths_um).all():
+    if (
+        len(plain.depths_um) > 1
+        and np.isfinite(plain.depths_um).all()
+        and np.diff(plain.depths_um).all()
+    ):
         found["information"] = information(plain)
     return found
 
 
 def _by_angle(stack: PsfStack) -> Array:
     """(angle, depth, y, x) whether or not the stack has an angle axis."""
-    return np.asarray(stack.intensity).reshape(len(stack.angles_rad), *np.shape(stack.intensity)[-3:])
+    return np.asarray(stack.intensity).reshape(
+        len(stack.angles_rad), *np.shape(stack.intensity)[-3:]
+    )
 
 
 def _angle_name(angle: Array) -> str:
@@ -37,17 +47,29 @@ def _depth_name(depth_um: float) -> str:
 
 
 def slices(stack: PsfStack) -> bytes:
-    """x against depth through the centre row, one panel an angle, brightest value of each depth at full scale."""
+    """x against depth through the centre row, one panel an angle, brightest value of
+    each depth at full scale.
+    """
     light, depths = _by_angle(stack), stack.depths_um
     order = np.argsort(depths)
-    figure, axes = canvas(1, len(light), size=(2.2 + 2.6 * len(light), 3.4), squeeze=False, sharey=True)
+    figure, axes = canvas(
+        1, len(light), size=(2.2 + 2.6 * len(light), 3.4), squeeze=False, sharey=True
+    )
     for panel, psf, angle in zip(axes[0], light, stack.angles_rad, strict=True):
         rows = psf[order, psf.shape[1] // 2]
         image = rows / rows.max(1, keepdims=True)
-        panel.pcolormesh(stack.x_um, np.arange(len(depths)), image, shading="nearest", rasterized=True)
+        panel.pcolormesh(
+            stack.x_um,
+            np.arange(len(depths)),
+            image,
+            shading="nearest",
+            rasterized=True,
+        )
         panel.set(title=_angle_name(angle), xlabel="x from the window's middle / µm")
         panel.grid(False)
-    picks = np.unique(np.linspace(0, len(depths) - 1, min(len(depths), 6)).round().astype(int))
+    picks = np.unique(
+        np.linspace(0, len(depths) - 1, min(len(depths), 6)).round().astype(int)
+    )
     axes[0, 0].set_yticks(picks, [_depth_name(depths[order][i]) for i in picks])
     axes[0, 0].set_ylabel("source depth")
     figure.suptitle("PSF along depth (each depth at its own full scale)", fontsize=10)
@@ -55,16 +77,24 @@ def slices(stack: PsfStack) -> bytes:
 
 
 def montage(stack: PsfStack, *, most: int = 7) -> bytes:
-    """PSFs over depth (across) and angle (down), square root of intensity, each at its own full scale."""
+    """PSFs over depth (across) and angle (down), square root of intensity, each at its
+    own full scale.
+    """
     light = _by_angle(stack)
-    picks = np.unique(np.linspace(0, len(stack.depths_um) - 1, min(most, len(stack.depths_um))).round().astype(int))
+    picks = np.unique(
+        np.linspace(0, len(stack.depths_um) - 1, min(most, len(stack.depths_um)))
+        .round()
+        .astype(int)
+    )
     size = (1.3 * len(picks) + 0.7, 1.35 * len(light) + 0.6)
     figure, axes = canvas(len(light), len(picks), size=size, squeeze=False)
     across, down = (stack.step_um * n / 2 for n in light.shape[:-3:-1])
     for row, (psfs, angle) in enumerate(zip(light, stack.angles_rad, strict=True)):
         for column, i in enumerate(picks):
             panel = axes[row, column]
-            seen = np.sqrt(np.maximum(psfs[i], 0))  # the flux of steep rays is below 0 at places
+            seen = np.sqrt(
+                np.maximum(psfs[i], 0)
+            )  # the flux of steep rays is below 0 at places
             panel.imshow(seen, extent=(-across, across, down, -down), vmin=0)
             panel.set(xticks=[], yticks=[])
             panel.grid(False)
@@ -72,16 +102,22 @@ def montage(stack: PsfStack, *, most: int = 7) -> bytes:
                 panel.set_title(_depth_name(stack.depths_um[i]))
         axes[row, 0].set_ylabel(_angle_name(angle))
     figure.suptitle(
-        f"√PSF over depth and field angle, {2 * across:.3g} x {2 * down:.3g} µm, +x right, +y down", fontsize=10
+        f"√PSF over depth and field angle, {2 * across:.3g} x {2 * down:.3g} µm, +x right, +y down",
+        fontsize=10,
     )
     return png(figure)
 
 
 def transfer(stack: PsfStack) -> bytes:
-    """MTF along x and y, and encircled energy, of three depths at the first and last angle."""
+    """MTF along x and y, and encircled energy, of three depths at the first and last
+    angle.
+    """
     depths = np.unique([0, len(stack.depths_um) // 2, len(stack.depths_um) - 1])
     cut = min(0.5 / stack.step_um, 0.4)
-    frequency, radius = np.linspace(0, cut, 81), np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61)
+    frequency, radius = (
+        np.linspace(0, cut, 81),
+        np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61),
+    )
     curves = psf_metrics.mtf(stack, frequencies_per_um=frequency)
     energy = psf_metrics.encircled(stack, radii_um=radius)
     angles = sorted({0, len(stack.angles_rad) - 1})
@@ -91,17 +127,44 @@ def transfer(stack: PsfStack) -> bytes:
     for style, angle in zip(("-", "--"), angles, strict=False):
         for colour, i in enumerate(depths):
             name = f"{_depth_name(stack.depths_um[i])}, {_angle_name(stack.angles_rad[angle])}"
-            axes[0].plot(frequency * 1e3, curves[angle, i, 0], style, color=f"C{colour}", label=name)
-            axes[0].plot(frequency * 1e3, curves[angle, i, 1], style, color=f"C{colour}", lw=0.6, alpha=0.7)
-            axes[1].plot(radius, energy[angle, i], style, color=f"C{colour}", label=name)
-    axes[0].set(title="MTF (thick along x, thin along y)", xlabel="cycles per mm", ylabel="modulation", ylim=(0, 1.02))
-    axes[1].set(title="encircled energy of the window's light", xlabel="radius / µm", ylabel="share", ylim=(0, 1.02))
+            axes[0].plot(
+                frequency * 1e3,
+                curves[angle, i, 0],
+                style,
+                color=f"C{colour}",
+                label=name,
+            )
+            axes[0].plot(
+                frequency * 1e3,
+                curves[angle, i, 1],
+                style,
+                color=f"C{colour}",
+                lw=0.6,
+                alpha=0.7,
+            )
+            axes[1].plot(
+                radius, energy[angle, i], style, color=f"C{colour}", label=name
+            )
+    axes[0].set(
+        title="MTF (thick along x, thin along y)",
+        xlabel="cycles per mm",
+        ylabel="modulation",
+        ylim=(0, 1.02),
+    )
+    axes[1].set(
+        title="encircled energy of the window's light",
+        xlabel="radius / µm",
+        ylabel="share",
+        ylim=(0, 1.02),
+    )
     axes[1].legend(fontsize=7)
     return png(figure)
 
 
 def information(stack: PsfStack) -> bytes:
-    """I(z) of Eq. 11 on pixels of 3 µm, binned 1, 2 and 3 times, under each named normalisation."""
+    """I(z) of Eq. 11 on pixels of 3 µm, binned 1, 2 and 3 times, under each named
+    normalisation.
+    """
     figure, axes = canvas(1, 2, size=(9.5, 3.4))
     for panel, name in zip(axes, ("sum", "l2"), strict=True):
         for colour, bins in enumerate((1, 2, 3)):
@@ -109,10 +172,21 @@ def information(stack: PsfStack) -> bytes:
             value = value.reshape(len(stack.angles_rad), -1)
             for angle in sorted({0, len(value) - 1}):
                 label = f"{bins}×{bins}, {_angle_name(stack.angles_rad[angle])}"
-                panel.plot(depth * 1e-3, value[angle], "-" if angle == 0 else "--", color=f"C{colour}", label=label)
-        panel.set(title=f"normalised by {'the sum' if name == 'sum' else 'the L2 norm'}", xlabel="source depth / mm")
+                panel.plot(
+                    depth * 1e-3,
+                    value[angle],
+                    "-" if angle == 0 else "--",
+                    color=f"C{colour}",
+                    label=label,
+                )
+        panel.set(
+            title=f"normalised by {'the sum' if name == 'sum' else 'the L2 norm'}",
+            xlabel="source depth / mm",
+        )
         panel.set(ylabel="I(z) / mm⁻²", ylim=(0, None))
-    axes[1].legend(fontsize=7, title=f"bins of {PIXEL_UM:g} µm pixels", title_fontsize=7)
+    axes[1].legend(
+        fontsize=7, title=f"bins of {PIXEL_UM:g} µm pixels", title_fontsize=7
+    )
     figure.suptitle(
         "Axial information of Eq. 11, mean over 9 sub-pixel positions; the normalisation decides the ranking"
     )

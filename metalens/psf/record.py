@@ -26,16 +26,24 @@ def _made_here() -> Provenance:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PsfStack:
-    """PSFs over depth (and field angle, and lens), each of sum 1, with their energy beside them.
+    """PSFs over depth (and field angle, and lens), each of sum 1, with their energy
+    beside them.
 
-    intensity: (…, depth, y, x), sum over (y, x) is 1 (paper: normalised PSF); numpy or torch, as the lens came in.
-        With several field angles the axis before depth is the angle; axes before that are a batch of lenses.
-    energy_um2: (…, depth) light in the window for unit incident irradiance: Σ|U|²·step².
-    depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are; wavelengths are summed with the weights.
-    step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a row per angle.
+    intensity: (…, depth, y, x), sum over (y, x) is 1 (paper: normalised PSF); numpy or
+    torch, as the lens came in.
+        With several field angles the axis before depth is the angle; axes before that
+        are a batch of lenses.
+    energy_um2: (…, depth) light in the window for unit incident irradiance:
+    Σ|U|²·step².
+    depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are;
+    wavelengths are summed with the weights.
+    step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a
+    row per angle.
     sensor_distance_um: lens to sensor. tolerance: that was asked for.
-    error: estimated relative L2 error of the intensity as computed, the worst over angles and lenses, which the
-        tolerance is about. budget: the same by cause, with what the model leaves out. reason: method, and why.
+    error: estimated relative L2 error of the intensity as computed, the worst over
+    angles and lenses, which the
+        tolerance is about. budget: the same by cause, with what the model leaves out.
+        reason: method, and why.
     """
 
     intensity: Any
@@ -59,9 +67,11 @@ class PsfStack:
 
     @property
     def irradiance_per_um2(self) -> Array:
-        """(angle, depth) irradiance on the lens plane from a point source of intensity 1 per steradian: cos³θ / z².
+        """(angle, depth) irradiance on the lens plane from a point source of intensity
+        1 per steradian: cos³θ / z².
 
-        ``energy_um2`` times it is the power in the window: energies of angles and depths then compare. 0 at infinity.
+        ``energy_um2`` times it is the power in the window: energies of angles and
+        depths then compare. 0 at infinity.
         """
         steep = 1 + (np.tan(np.asarray(self.angles_rad)) ** 2).sum(-1, keepdims=True)
         return np.asarray(steep**-1.5 / np.asarray(self.depths_um) ** 2)
@@ -83,11 +93,17 @@ class PsfStack:
 
     def numpy(self) -> "PsfStack":
         """The same record with numpy arrays, detached from any graph."""
-        return dataclasses.replace(self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2))
+        return dataclasses.replace(
+            self, intensity=_array(self.intensity), energy_um2=_array(self.energy_um2)
+        )
 
 
 def _array(value: Any) -> Array:
-    return value if isinstance(value, np.ndarray) else np.asarray(value.detach().cpu().numpy())
+    return (
+        value
+        if isinstance(value, np.ndarray)
+        else np.asarray(value.detach().cpu().numpy())
+    )
 
 
 _AXES = ("depths_um", "angles_rad", "wavelengths_um", "weights", "centres_um")
@@ -97,9 +113,15 @@ _NUMBERS = ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
 def save(path: str | Path, stack: PsfStack) -> None:
     """Write a PSF file (kind ``psf``)."""
     plain = stack.numpy()
-    arrays = {name: np.asarray(getattr(plain, name)) for name in ("intensity", "energy_um2", *_AXES)}
+    arrays = {
+        name: np.asarray(getattr(plain, name))
+        for name in ("intensity", "energy_um2", *_AXES)
+    }
     about = {name: getattr(plain, name) for name in _NUMBERS}
-    about |= {f"budget_{name}": value for name, value in dataclasses.asdict(_budget(plain)).items()}
+    about |= {
+        f"budget_{name}": value
+        for name, value in dataclasses.asdict(_budget(plain)).items()
+    }
     store.save(path, "psf", arrays, attributes=about, provenance=stack.provenance)
 
 
@@ -111,9 +133,18 @@ def load(path: str | Path) -> PsfStack:
         StoreError: missing, truncated, or not a PSF file.
     """
     stored = store.load(path, "psf")
-    fields: dict[str, Any] = {name: stored.attributes[name] for name in _NUMBERS} | stored.arrays
-    terms = {f.name: stored.attributes.get(f"budget_{f.name}") for f in dataclasses.fields(Budget)}
-    budget = Budget(**{n: float(v) for n, v in terms.items() if v is not None}) if terms["numerical"] else None
+    fields: dict[str, Any] = {
+        name: stored.attributes[name] for name in _NUMBERS
+    } | stored.arrays
+    terms = {
+        f.name: stored.attributes.get(f"budget_{f.name}")
+        for f in dataclasses.fields(Budget)
+    }
+    budget = (
+        Budget(**{n: float(v) for n, v in terms.items() if v is not None})
+        if terms["numerical"]
+        else None
+    )
     return PsfStack(**fields, provenance=stored.provenance, budget=budget)
 
 

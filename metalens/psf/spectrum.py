@@ -1,4 +1,6 @@
-"""LED times sensor response as a few wavelengths with weights: Gauss quadrature for that very weight."""
+"""LED times sensor response as a few wavelengths with weights: Gauss quadrature for
+that very weight.
+"""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +25,8 @@ class Source:
     """A light-emitting diode seen by a silicon sensor.
 
     peak_nm, fwhm_nm: of the diode, a Gaussian line.
-    silicon_um: thickness of silicon that collects charge; the response is 1 - exp(-4πk·thickness/λ) with k of
+    silicon_um: thickness of silicon that collects charge; the response is 1 -
+    exp(-4πk·thickness/λ) with k of
         crystalline silicon, times λ (photons per watt).
     """
 
@@ -42,13 +45,16 @@ class Source:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Nodes:
-    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band that was asked for.
+    """wavelengths_um and weights (sum 1), and the error of the quadrature on the band
+    that was asked for.
 
-    source: the spectrum that they stand for, by which :func:`missed` judges them on any path; None for wavelengths as
+    source: the spectrum that they stand for, by which :func:`missed` judges them on any
+    path; None for wavelengths as
         such.
 
     Raises:
-        PropagationError: no wavelength, one that is not above 0, or weights that are not one of 0 or more for each, of
+        PropagationError: no wavelength, one that is not above 0, or weights that are
+            not one of 0 or more for each, of
             sum 1.
     """
 
@@ -59,16 +65,27 @@ class Nodes:
 
     def __post_init__(self) -> None:
         waves, weights = np.asarray(self.wavelengths_um), np.asarray(self.weights)
-        if waves.ndim != 1 or not len(waves) or not (np.isfinite(waves) & (waves > 0)).all():
-            raise PropagationError(f"wavelengths_um is {waves.tolist()}, need one wavelength above 0 or more")
-        if weights.shape != waves.shape or not (weights >= 0).all() or not abs(weights.sum() - 1) <= SUM_ERROR:
+        if (
+            waves.ndim != 1
+            or not len(waves)
+            or not (np.isfinite(waves) & (waves > 0)).all()
+        ):
+            raise PropagationError(
+                f"wavelengths_um is {waves.tolist()}, need one wavelength above 0 or more"
+            )
+        if (
+            weights.shape != waves.shape
+            or not (weights >= 0).all()
+            or not abs(weights.sum() - 1) <= SUM_ERROR
+        ):
             raise PropagationError(
                 f"{len(waves)} wavelengths with weights {weights.tolist()}, need one of 0 or more each, sum 1"
             )
 
 
 def weight(source: Source) -> tuple[Array, Array]:
-    """(wavelengths in um, weight of sum 1) of diode times silicon over ±2.5 FWHM, every 0.25 nm or FWHM / 40.
+    """(wavelengths in um, weight of sum 1) of diode times silicon over ±2.5 FWHM, every
+    0.25 nm or FWHM / 40.
 
     Raises:
         MaterialError: the line leaves the range of the silicon data.
@@ -76,7 +93,10 @@ def weight(source: Source) -> tuple[Array, Array]:
     from metalens.cell import materials
 
     step_nm = min(0.25, source.fwhm_nm / 40)
-    for end_nm in (source.peak_nm - 2.5 * source.fwhm_nm, source.peak_nm + 2.5 * source.fwhm_nm):
+    for end_nm in (
+        source.peak_nm - 2.5 * source.fwhm_nm,
+        source.peak_nm + 2.5 * source.fwhm_nm,
+    ):
         try:  # before an absurd width takes memory
             materials.index("Si", end_nm * 1e-3)
         except MaterialError as error:
@@ -97,7 +117,8 @@ def weight(source: Source) -> tuple[Array, Array]:
 class Measured:
     """A spectrum as measured: wavelengths (n,) in um, ascending, and weights of sum 1.
 
-    beside: share of the light that is left out at its ends, outside of what the pillars are known for.
+    beside: share of the light that is left out at its ends, outside of what the pillars
+    are known for.
     """
 
     wavelengths_um: Array
@@ -108,30 +129,44 @@ class Measured:
 def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measured:
     """Product of measured curves (LED, filter, sensor) where all of them are known.
 
-    A file has two columns, wavelength in nm and value, parted by commas, semicolons or blanks; lines that start with #
-    or with a word are skipped. Where semicolons, tabs or blanks part the columns, a comma stands for the decimal
-    point. Values are interpolated linearly, and the product is integrated from one row of any of the curves to the
-    next, at two points each and at most 0.25 nm at a time, so that lines narrower than that are seen; a constant
+    A file has two columns, wavelength in nm and value, parted by commas, semicolons or
+    blanks; lines that start with #
+    or with a word are skipped. Where semicolons, tabs or blanks part the columns, a
+    comma stands for the decimal
+    point. Values are interpolated linearly, and the product is integrated from one row
+    of any of the curves to the
+    next, at two points each and at most 0.25 nm at a time, so that lines narrower than
+    that are seen; a constant
     factor of each drops out.
 
     Raises:
-        PropagationError: no file, one that is missing or no such table, curves without a common range, or light outside
-            ``within_um``, which the pillars are known for (less than 1e-4 of the largest value is left out there).
+        PropagationError: no file, one that is missing or no such table, curves without
+            a common range, or light outside
+            ``within_um``, which the pillars are known for (less than 1e-4 of the
+            largest value is left out there).
     """
     if not files:
-        raise PropagationError("spectrum: no file; need one of wavelength in nm and value, or more")
+        raise PropagationError(
+            "spectrum: no file; need one of wavelength in nm and value, or more"
+        )
     curves = [_curve(file) for file in files]
     low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
     if low >= high:
-        raise PropagationError(f"spectrum: {', '.join(map(str, files))} share no wavelength")
+        raise PropagationError(
+            f"spectrum: {', '.join(map(str, files))} share no wavelength"
+        )
     rows = np.concatenate([c[:, 0] for c in curves] + [np.arange(low, high, STEP_NM)])
     ends = np.unique(np.clip(rows, low, high))
     half, middle = np.diff(ends) / 2, (ends[1:] + ends[:-1]) / 2
-    nm = np.stack([middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1).ravel()  # Gauss, of third degree
+    nm = np.stack(
+        [middle - half / np.sqrt(3), middle + half / np.sqrt(3)], 1
+    ).ravel()  # Gauss, of third degree
     value = np.prod([np.interp(nm, c[:, 0], c[:, 1]) for c in curves], axis=0)
     share = value * np.repeat(half, 2)
     if not share.sum() > 0:
-        raise PropagationError(f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere")
+        raise PropagationError(
+            f"spectrum: the product of {', '.join(map(str, files))} is 0 everywhere"
+        )
     share = share / share.sum()
     first, last = _kept(nm, value, within_um)
     nm, share = nm[first:last], share[first:last]
@@ -139,7 +174,8 @@ def measured(files: Sequence[Path], *, within_um: tuple[float, float]) -> Measur
 
 
 def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int, int]:
-    """First and last (excluded) point of what the pillars are known for; all that is lit, where that is one wavelength.
+    """First and last (excluded) point of what the pillars are known for; all that is
+    lit, where that is one wavelength.
 
     Raises:
         PropagationError: light beyond.
@@ -150,7 +186,11 @@ def _kept(nm: Array, value: Array, within_um: tuple[float, float]) -> tuple[int,
         return int(lit[0]), int(lit[-1]) + 1
     if not (low - 1e-3 <= nm[lit[0]] and nm[lit[-1]] <= high + 1e-3):
         few = slice(int(lit[0]), int(lit[-1]) + 1)
-        raise _refusal((nm[few], value[few] / value[few].sum()), within_um, "narrow it (a filter among the files)")
+        raise _refusal(
+            (nm[few], value[few] / value[few].sum()),
+            within_um,
+            "narrow it (a filter among the files)",
+        )
     inside = np.flatnonzero((nm >= low - 1e-3) & (nm <= high + 1e-3) & (value > 0))
     return int(inside[0]), int(inside[-1]) + 1
 
@@ -161,15 +201,23 @@ def _curve(file: Path) -> Array:
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise PropagationError(f"{file}: cannot be read as a table of wavelength and value: {error}") from None
+        raise PropagationError(
+            f"{file}: cannot be read as a table of wavelength and value: {error}"
+        ) from None
     for number, line in enumerate(lines, 1):
         words = reading.columns(line)
-        if not words or words[0][0] in "#\"'" or (words[0][0].isalpha() and not _number(words[0])):
+        if (
+            not words
+            or words[0][0] in "#\"'"
+            or (words[0][0].isalpha() and not _number(words[0]))
+        ):
             continue
         try:
             nm, value = float(words[0]), float(words[1])
         except (ValueError, IndexError):
-            raise PropagationError(f"{file}: line {number} is {line[:60]!r}, need wavelength in nm and value") from None
+            raise PropagationError(
+                f"{file}: line {number} is {line[:60]!r}, need wavelength in nm and value"
+            ) from None
         if not (100 <= nm < np.inf and 0 <= value < np.inf):
             raise PropagationError(
                 f"{file}: line {number} is {line[:60]!r}, need a wavelength in nm (100 or more) and a value of 0 or "
@@ -183,7 +231,9 @@ def _curve(file: Path) -> Array:
     table = np.array(sorted(rows))
     twice = np.flatnonzero(np.diff(table[:, 0]) == 0)
     if len(twice):
-        raise PropagationError(f"{file}: {table[twice[0], 0]:g} nm stands twice; need one value for each wavelength")
+        raise PropagationError(
+            f"{file}: {table[twice[0], 0]:g} nm stands twice; need one value for each wavelength"
+        )
     return table
 
 
@@ -196,14 +246,23 @@ def _number(word: str) -> bool:
     return True
 
 
-def nodes(source: Source | Measured, *, path_um: float | Array, tolerance: float, light: Array | None = None) -> Nodes:
+def nodes(
+    source: Source | Measured,
+    *,
+    path_um: float | Array,
+    tolerance: float,
+    light: Array | None = None,
+) -> Nodes:
     """As few wavelengths as meet the tolerance.
 
     Args:
-        path_um: largest difference in optical path between two parts of the lens, for light that reaches the window:
-            intensities vary with wavelength as exp(2πi·path/λ), and no faster. Or (n,) of parts of the window, with
+        path_um: largest difference in optical path between two parts of the lens, for
+            light that reaches the window:
+            intensities vary with wavelength as exp(2πi·path/λ), and no faster. Or (n,)
+            of parts of the window, with
             ``light`` (n,), the share of each in its squared intensity.
-        tolerance: of the mean over the spectrum of every such exponential, root mean square over the parts.
+        tolerance: of the mean over the spectrum of every such exponential, root mean
+            square over the parts.
 
     Raises:
         PropagationError: more than 64 wavelengths would be needed.
@@ -223,22 +282,35 @@ def nodes(source: Source | Measured, *, path_um: float | Array, tolerance: float
 
 
 def missed(nodes: Nodes, span_um: Array) -> Array:
-    """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up to each of these."""
+    """(n,) largest error of the mean of exp(2πi·path/λ) over the spectrum for paths up
+    to each of these.
+    """
     if nodes.source is None:
         return np.full(len(span_um), nodes.error)
-    return _Judge(nodes.source, float(span_um.max())).missed(nodes.wavelengths_um, nodes.weights, span_um)
+    return _Judge(nodes.source, float(span_um.max())).missed(
+        nodes.wavelengths_um, nodes.weights, span_um
+    )
 
 
 def points(source: Source | Measured) -> tuple[Array, Array]:
     """(wavelengths in um, shares of sum 1) of a spectrum."""
-    return (source.wavelengths_um, source.share) if isinstance(source, Measured) else weight(source)
+    return (
+        (source.wavelengths_um, source.share)
+        if isinstance(source, Measured)
+        else weight(source)
+    )
 
 
-def unknown(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> float:
-    """Share of the light of a spectrum outside of the wavelengths that pillars are known for, which those within stand
-    for; 0 of wavelengths as such and of pillars that are known at one, where others are refused.
+def unknown(
+    source: Source | Measured | Nodes | None, within_um: tuple[float, float]
+) -> float:
+    """Share of the light of a spectrum outside of the wavelengths that pillars are
+    known for, which those within stand
+    for; 0 of wavelengths as such and of pillars that are known at one, where others are
+    refused.
 
-    It is no error of that size: pillars that answer smoothly beyond are off by what the quadrature is.
+    It is no error of that size: pillars that answer smoothly beyond are off by what the
+    quadrature is.
     """
     low, high = within_um
     if not high > low or not isinstance(source, Source | Measured):
@@ -247,29 +319,47 @@ def unknown(source: Source | Measured | Nodes | None, within_um: tuple[float, fl
     return float(share[(um < low - 1e-6) | (um > high + 1e-6)].sum())
 
 
-def known(nodes: Nodes, source: Source | Measured, within_um: tuple[float, float]) -> Nodes:
-    """The wavelengths that stand for a spectrum, all of which lie within those that pillars are known for.
+def known(
+    nodes: Nodes, source: Source | Measured, within_um: tuple[float, float]
+) -> Nodes:
+    """The wavelengths that stand for a spectrum, all of which lie within those that
+    pillars are known for.
 
     Raises:
-        PropagationError: one lies beyond; with the share of the light that does, and what serves.
+        PropagationError: one lies beyond; with the share of the light that does, and
+            what serves.
     """
     low, high = within_um
     um = np.asarray(nodes.wavelengths_um)
     if ((low - 1e-9 <= um) & (um <= high + 1e-9)).all():
         return nodes
     narrow = "narrow it (a filter among the files)"
-    if isinstance(source, Source):  # no wavelength that stands for it lies beyond 2.5 widths
+    if isinstance(
+        source, Source
+    ):  # no wavelength that stands for it lies beyond 2.5 widths
         width = min(source.peak_nm - low * 1e3, high * 1e3 - source.peak_nm) / 2.5
-        narrow = f"narrow it to a width of {math.floor(width * 10) / 10:g} nm" if width >= LEAST_FWHM_NM else ""
+        narrow = (
+            f"narrow it to a width of {math.floor(width * 10) / 10:g} nm"
+            if width >= LEAST_FWHM_NM
+            else ""
+        )
     um, share = points(source)
     raise _refusal((um * 1e3, share), within_um, narrow)
 
 
-def _refusal(light: tuple[Array, Array], within_um: tuple[float, float], narrow: str) -> PropagationError:
-    """What to say of light (nm ascending, shares of sum 1) that the pillars are not known for, and of what serves."""
+def _refusal(
+    light: tuple[Array, Array], within_um: tuple[float, float], narrow: str
+) -> PropagationError:
+    """What to say of light (nm ascending, shares of sum 1) that the pillars are not
+    known for, and of what serves.
+    """
     (nm, share), (low, high) = light, (edge * 1e3 for edge in within_um)
     told = f"from {low:g} to {high:g} nm" if high > low else f"at {low:g} nm alone"
-    part = float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum()) if high > low else 1.0
+    part = (
+        float(share[(nm < low - 1e-3) | (nm > high + 1e-3)].sum())
+        if high > low
+        else 1.0
+    )
     return PropagationError(
         f"spectrum: light from {nm[0]:g} to {nm[-1]:g} nm, the pillars are known {told}, and {part:.2g} of it lies "
         f"beyond: {narrow}{', or ' * bool(narrow)}sweep a library over it ([sweep] {sweep(nm)})"
@@ -277,12 +367,16 @@ def _refusal(light: tuple[Array, Array], within_um: tuple[float, float], narrow:
 
 
 def sweep(nm: Array) -> str:
-    """The key of CELL.toml whose library is known for light of these wavelengths (n,), ascending."""
+    """The key of CELL.toml whose library is known for light of these wavelengths (n,),
+    ascending.
+    """
     ends = math.floor(nm[0]) / 1e3, math.ceil(nm[-1]) / 1e3
     return f"wavelengths_um = [{ends[0]:g}, {sum(ends) / 2:.6g}, {ends[1]:g}]"
 
 
-def beyond(source: Source | Measured | Nodes | None, within_um: tuple[float, float]) -> str:
+def beyond(
+    source: Source | Measured | Nodes | None, within_um: tuple[float, float]
+) -> str:
     """Words for :func:`unknown` light; empty where that is less than 1e-4 of it."""
     share = unknown(source, within_um)
     if share < 1e-4:
@@ -300,20 +394,30 @@ class _Judge:
     def __init__(self, source: Source | Measured, longest_um: float) -> None:
         um, share = points(source)
         self.paths = np.linspace(0, longest_um, PATHS)
-        self.want = np.array([np.exp(2j * np.pi * path / um) @ share for path in self.paths])
+        self.want = np.array(
+            [np.exp(2j * np.pi * path / um) @ share for path in self.paths]
+        )
         self.beside = source.beside if isinstance(source, Measured) else 0.0
 
     def missed(self, um: Array, weights: Array, span_um: Array) -> Array:
         """(n,) of a rule, for paths up to each of these."""
-        error = np.abs(np.exp(2j * np.pi * self.paths[:, None] / um) @ weights - self.want)
+        error = np.abs(
+            np.exp(2j * np.pi * self.paths[:, None] / um) @ weights - self.want
+        )
         place = np.searchsorted(self.paths, span_um * (1 - 1e-12)).clip(max=PATHS - 1)
         return np.asarray(np.maximum.accumulate(error)[place] + self.beside)
 
 
 def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
-    """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1 (Lanczos, Golub and Welsch)."""
+    """Gauss rule of a discrete weight: exact for polynomials of degree 2·count - 1
+    (Lanczos, Golub and Welsch).
+    """
     count = min(count, len(points))
-    basis, diagonal, beside = np.zeros((count, len(points))), np.zeros(count), np.zeros(count)
+    basis, diagonal, beside = (
+        np.zeros((count, len(points))),
+        np.zeros(count),
+        np.zeros(count),
+    )
     q = np.sqrt(share / share.sum())
     for i in range(count):
         basis[i] = q
@@ -323,5 +427,7 @@ def gauss(points: Array, share: Array, count: int) -> tuple[Array, Array]:
         r = r - basis[: i + 1].T @ (basis[: i + 1] @ r)
         beside[i] = np.linalg.norm(r)
         q = r / beside[i] if beside[i] > 0 else r
-    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], -1))  # by its lower triangle
+    values, vectors = np.linalg.eigh(
+        np.diag(diagonal) + np.diag(beside[:-1], -1)
+    )  # by its lower triangle
     return values, vectors[0] ** 2 * share.sum()

@@ -45,92 +45,163 @@ def psf_stack(
     row_um: float = 0.0,
     site_um2: float = 0.0,
 ) -> PsfStack:
-    """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum 1.
+    """PSF stack of a lens: |U|² on a window that follows the chief ray, each PSF of sum
+    1.
 
-    Light travels along +z with exp(-iωt): phases of a lens that focuses fall towards its rim. +x is right, +y down.
+    Light travels along +z with exp(-iωt): phases of a lens that focuses fall towards
+    its rim. +x is right, +y down.
 
     Args:
-        phase_rad, transmission: (…, y, x) maps, numpy or torch, float32 or float64; leading axes are a batch of
-            lenses. With several wavelengths the axis before y is the wavelength. Torch maps are differentiable
+        phase_rad, transmission: (…, y, x) maps, numpy or torch, float32 or float64;
+            leading axes are a batch of
+            lenses. With several wavelengths the axis before y is the wavelength. Torch
+            maps are differentiable
             once; second derivatives (``create_graph``) are refused.
-        wavelength_um: one, or several with ``weights`` (equal if None), whose intensities add (incoherent light).
+        wavelength_um: one, or several with ``weights`` (equal if None), whose
+            intensities add (incoherent light).
         depths_um: source depths from the lens along its axis, inf for a plane wave.
-        angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles: the light's direction has slopes
-            dx/dz = tan x, dy/dz = tan y, so that a positive angle moves the image to +x (+y); the source is at -x.
-        window_um, samples: full width of the window, and cells along it; samples lie at cell centres. Pairs (x, y) for
+        angle_rad: field angle along x, a pair (x, y), or (n, 2) for several angles: the
+            light's direction has slopes
+            dx/dz = tan x, dy/dz = tan y, so that a positive angle moves the image to +x
+            (+y); the source is at -x.
+        window_um, samples: full width of the window, and cells along it; samples lie at
+            cell centres. Pairs (x, y) for
             a window that is not square; its cells are.
-        tolerance: relative L2 error of the PSFs of one direction; the estimate is in the result.
+        tolerance: relative L2 error of the PSFs of one direction; the estimate is in
+            the result.
         offset_um: (x, y) of the window from the chief ray.
-        layers: films around the lens and the medium behind it; ``wavelength_um`` is then that in vacuum, ``angle_rad``
-            that in air, and what the sensor distance gains is cover. A stop in front lays its shadow on the pillars
-            (:mod:`metalens.lens.stop`; its error is ``budget.stop``), of every depth apart: each costs a call.
-        source: its size and shape where it is no point; the PSF is then that of a point blurred by the image of the
+        layers: films around the lens and the medium behind it; ``wavelength_um`` is
+            then that in vacuum, ``angle_rad``
+            that in air, and what the sensor distance gains is cover. A stop in front
+            lays its shadow on the pillars
+            (:mod:`metalens.lens.stop`; its error is ``budget.stop``), of every depth
+            apart: each costs a call.
+        source: its size and shape where it is no point; the PSF is then that of a point
+            blurred by the image of the
             source (:mod:`metalens.psf.extended`), its error ``budget.source``.
-        integrate: give means over cells where samples would fold; False for samples at cell centres in any case.
-        polarisation: ``scalar``; or of both polarisations (:mod:`metalens.psf.vector`) the ``flux`` through the
+        integrate: give means over cells where samples would fold; False for samples at
+            cell centres in any case.
+        polarisation: ``scalar``; or of both polarisations (:mod:`metalens.psf.vector`)
+            the ``flux`` through the
             sensor's plane, which a pixel counts, or ``vector``: |Ex|² + |Ey|² + |Ez|². A 1 mm lens at 21 depths takes
-            3.0 and 4.5 times the processor time of the scalar in one medium, 2.3 and 2.2 times behind films, where the
+            3.0 and 4.5 times the processor time of the scalar in one medium, 2.3 and
+            2.2 times behind films, where the
             scalar itself costs 4 times that in air.
-        neighbours: solved rows of unlike pillars, whose factor goes onto the maps where the phase has that slope
-            (:mod:`metalens.psf.among`): onto fields along and across it apart, their mean for the scalar; at every
-            wavelength and angle as at those of the rows. Or, for both polarisations, what
-            :func:`metalens.psf.among.jones` made of them. None: pillars taken one by one. Square lattices.
-        row_um, site_um2: of another lattice than a square one, see :func:`metalens.propagate.case`.
+        neighbours: solved rows of unlike pillars, whose factor goes onto the maps where
+            the phase has that slope
+            (:mod:`metalens.psf.among`): onto fields along and across it apart, their
+            mean for the scalar; at every
+            wavelength and angle as at those of the rows. Or, for both polarisations,
+            what
+            :func:`metalens.psf.among.jones` made of them. None: pillars taken one by
+            one. Square lattices.
+        row_um, site_um2: of another lattice than a square one, see
+            :func:`metalens.propagate.case`.
 
-    Sensor distance, depths, angle and offset may be torch tensors that carry gradients, for slip, gaze and tilt. The
+    Sensor distance, depths, angle and offset may be torch tensors that carry gradients,
+    for slip, gaze and tilt. The
     window moves with the chief ray, and so do the derivatives.
 
     Returns:
-        PsfStack with intensity (…, [angle,] depth, y, x) of the kind and dtype that came in.
+        PsfStack with intensity (…, [angle,] depth, y, x) of the kind and dtype that
+        came in.
 
     Raises:
-        PropagationError: empty aperture, NaN (row and column named), impossible geometry, no light in the window, a
-            tolerance that is not above 0, a window that no method reaches, a source of finite size in um at infinity, a
+        PropagationError: empty aperture, NaN (row and column named), impossible
+            geometry, no light in the window, a
+            tolerance that is not above 0, a window that no method reaches, a source of
+            finite size in um at infinity, a
             source behind the stop, derivatives in the geometry of a lens with a stop.
 
-    A step too coarse for samples of |U|² (:func:`metalens.psf.cells.nyquist_um`) gives the mean over each cell.
+    A step too coarse for samples of |U|² (:func:`metalens.psf.cells.nyquist_um`) gives
+    the mean over each cell.
 
-    Accuracy: ``error`` of the record, 1 to 3 times the true error; ``budget`` has its parts.
+    Accuracy: ``error`` of the record, 1 to 3 times the true error; ``budget`` has its
+    parts.
     """
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
-    maps, wanted = _among(maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source))
-    about: dict[str, Any] = {"pitch_um": pitch_um, "row_um": row_um, "site_um2": site_um2, "window_um": window_um}
-    about |= {"sensor_distance_um": _value(sensor_distance_um), "samples": samples, "layers": layers and layers.open}
-    about |= {"depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)), "offset_um": _value(offset_um)}
+    maps, wanted = _among(
+        maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source)
+    )
+    about: dict[str, Any] = {
+        "pitch_um": pitch_um,
+        "row_um": row_um,
+        "site_um2": site_um2,
+        "window_um": window_um,
+    }
+    about |= {
+        "sensor_distance_um": _value(sensor_distance_um),
+        "samples": samples,
+        "layers": layers and layers.open,
+    }
+    about |= {
+        "depths_um": np.atleast_1d(np.asarray(_value(depths_um), float)),
+        "offset_um": _value(offset_um),
+    }
     several, angles = _directions(angle_rad)
     cases, found = [], []
     for angle in angles:
-        seen = [propagate.case(maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about) for w in waves]
+        seen = [
+            propagate.case(
+                maps[0].shape, wavelength_um=w, angle_rad=_value(angle), **about
+            )
+            for w in waves
+        ]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
         moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
-        found.append(_seen(maps, (_centred(seen, cases[-1]), share.tolist(), wanted, moving), layers))
+        found.append(
+            _seen(
+                maps,
+                (_centred(seen, cases[-1]), share.tolist(), wanted, moving),
+                layers,
+            )
+        )
     light = torch.stack([row[0] for row in found], dim=-4) if several else found[0][0]
-    worst = max((result for row in found for result in row[1]), key=lambda result: result.whole)
-    stack = _record(light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance)
+    worst = max(
+        (result for row in found for result in row[1]), key=lambda result: result.whole
+    )
+    stack = _record(
+        light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance
+    )
     power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
     stack = _budgeted(stack, worst, power * cases[0].area_um2, cases, layers)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
-_Given = tuple[list[Case], list[float], Wanted, Moving | None]  # cases and weights of the wavelengths of a direction
+_Given = tuple[
+    list[Case], list[float], Wanted, Moving | None
+]  # cases and weights of the wavelengths of a direction
 _Found = tuple[torch.Tensor, list[Result], torch.Tensor]
 
 
-def _seen(maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None) -> _Found:
-    """:func:`direction`, the sum of squares (…, depth), of 1 where it is that of all; behind a stop each depth alone,
+def _seen(
+    maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None
+) -> _Found:
+    """:func:`direction`, the sum of squares (…, depth), of 1 where it is that of all;
+    behind a stop each depth alone,
     whose shadow on the pillars is another at every depth, if it lies before them."""
     cases, weights, wanted, moving = given
     inverse = cases[0].inverse_depths_per_um
     shares = [inverse]
     if layers is not None and layers.stop is not None:
         if moving is not None:
-            raise PropagationError("a stop has no derivatives in the geometry: give numbers")
-        shares = [inverse] if layers.stop.distance_um == 0 else [(one,) for one in inverse]
+            raise PropagationError(
+                "a stop has no derivatives in the geometry: give numbers"
+            )
+        shares = (
+            [inverse] if layers.stop.distance_um == 0 else [(one,) for one in inverse]
+        )
     found = []
     for depths in shares:
-        seen = [dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases]
+        seen = [
+            dataclasses.replace(case, inverse_depths_per_um=depths) for case in cases
+        ]
         found.append(direction(maps, seen, weights, wanted, moving, layers))
-    light = found[0][0] if len(found) == 1 else torch.cat([light for light, _, _ in found], -3)
+    light = (
+        found[0][0]
+        if len(found) == 1
+        else torch.cat([light for light, _, _ in found], -3)
+    )
     results = [result for _, some, _ in found for result in some]
     return light, results, torch.stack([power for _, _, power in found], -1)
 
@@ -139,7 +210,9 @@ def _directions(angle_rad: Any) -> tuple[bool, Any]:
     """Whether several field angles are given, and each of them."""
     shape = np.shape(_value(angle_rad))
     if len(shape) == 2 and 0 in shape:
-        raise PropagationError(f"angle_rad of shape {shape}: need one direction or more")
+        raise PropagationError(
+            f"angle_rad of shape {shape}: need one direction or more"
+        )
     return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
 
 
@@ -149,57 +222,100 @@ def _centred(cases: list[Case], like: Case) -> list[Case]:
 
 
 def _among(
-    maps: tuple[torch.Tensor, torch.Tensor], neighbours: Neighbours | Jones | None, pitch_um: float, wanted: Wanted
+    maps: tuple[torch.Tensor, torch.Tensor],
+    neighbours: Neighbours | Jones | None,
+    pitch_um: float,
+    wanted: Wanted,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], Wanted]:
-    """The maps with the mean factor of unlike neighbours, or as they are and with it on both fields."""
+    """The maps with the mean factor of unlike neighbours, or as they are and with it on
+    both fields.
+    """
     if neighbours is None:
         return maps, wanted
     if isinstance(neighbours, Jones):
         if wanted.polarisation == "scalar":
-            raise PropagationError("factors on both fields, but one scalar: give the rows, or polarisation = 'flux'")
+            raise PropagationError(
+                "factors on both fields, but one scalar: give the rows, or polarisation = 'flux'"
+            )
         return maps, dataclasses.replace(wanted, fields=neighbours)
     if wanted.polarisation == "scalar":
         return among.scalar(*maps, neighbours, pitch_um), wanted
-    return maps, dataclasses.replace(wanted, fields=among.jones(*maps, neighbours, pitch_um))
+    return maps, dataclasses.replace(
+        wanted, fields=among.jones(*maps, neighbours, pitch_um)
+    )
 
 
-def _ripples(stack: PsfStack, share: Array, cases: list[Case], layers: Layers | None) -> float:
-    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan without one.
+def _ripples(
+    stack: PsfStack, share: Array, cases: list[Case], layers: Layers | None
+) -> float:
+    """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan
+    without one.
 
     share: (…, [angle,] depth) of the light that the windows hold.
     """
     if layers is None or layers.stop is None:
         return math.nan
-    light = stack.intensity.detach().cpu().numpy().reshape(-1, len(cases), *stack.intensity.shape[-3:])
+    light = (
+        stack.intensity.detach()
+        .cpu()
+        .numpy()
+        .reshape(-1, len(cases), *stack.intensity.shape[-3:])
+    )
     held = share.clip(1e-6, 1).reshape(light.shape[:-2])
     blurs_um, found = blur_um(light, stack.step_um, held), []
     for case, row, shares in zip(cases, blurs_um.max(0), held.min(0), strict=True):
         rads = row / propagate.chief_path(case)
         found += [
             layers.shadow_error(case.tangents, z, w, rad, part)
-            for z, rad, part in zip(stack.depths_um.tolist(), rads.tolist(), shares.tolist(), strict=True)
+            for z, rad, part in zip(
+                stack.depths_um.tolist(), rads.tolist(), shares.tolist(), strict=True
+            )
             for w in stack.wavelengths_um.tolist()
         ]
     return max(found)
 
 
 def _budgeted(
-    stack: PsfStack, worst: Result, whole: torch.Tensor, cases: list[Case], layers: Layers | None
+    stack: PsfStack,
+    worst: Result,
+    whole: torch.Tensor,
+    cases: list[Case],
+    layers: Layers | None,
 ) -> PsfStack:
-    """With its error by cause; whole: light that leaves the pillars towards the sensor for unit irradiance, um²."""
+    """With its error by cause; whole: light that leaves the pillars towards the sensor
+    for unit irradiance, um².
+    """
     share = (stack.energy_um2.detach().cpu().double() / whole).numpy()
-    outside, stop = max(0.0, 1 - float(share.min())), _ripples(stack, share, cases, layers)
-    parts = {"sampling": worst.sampling, "source": worst.source, "polarisation": worst.rays, "stop": stop}
-    return dataclasses.replace(stack, budget=Budget(worst.error, outside=outside, **parts))
+    outside, stop = (
+        max(0.0, 1 - float(share.min())),
+        _ripples(stack, share, cases, layers),
+    )
+    parts = {
+        "sampling": worst.sampling,
+        "source": worst.source,
+        "polarisation": worst.rays,
+        "stop": stop,
+    }
+    return dataclasses.replace(
+        stack, budget=Budget(worst.error, outside=outside, **parts)
+    )
 
 
 def _record(
-    light: torch.Tensor, cases: list[Case], axes: tuple[Array, Array, Array], worst: Result, tolerance: float
+    light: torch.Tensor,
+    cases: list[Case],
+    axes: tuple[Array, Array, Array],
+    worst: Result,
+    tolerance: float,
 ) -> PsfStack:
-    """The stack for intensities (…, depth, y, x), a case for each angle; axes are depths, wavelengths, weights."""
+    """The stack for intensities (…, depth, y, x), a case for each angle; axes are
+    depths, wavelengths, weights.
+    """
     energy = light.sum((-1, -2))
     error = worst.whole
-    divided = torch.div if light.requires_grad else torch.Tensor.div_  # in place where nothing else looks at it
+    divided = (
+        torch.div if light.requires_grad else torch.Tensor.div_
+    )  # in place where nothing else looks at it
     return PsfStack(
         divided(light, energy[..., None, None]),
         energy * cases[0].step_um ** 2,
@@ -212,7 +328,9 @@ def _record(
         sensor_distance_um=cases[0].sensor_distance_um,
         tolerance=tolerance,
         error=error,
-        reason=worst.reason if error <= tolerance else f"{worst.reason}; {_above(worst, tolerance, light.dtype)}",
+        reason=worst.reason
+        if error <= tolerance
+        else f"{worst.reason}; {_above(worst, tolerance, light.dtype)}",
     )
 
 
@@ -222,7 +340,11 @@ def _above(worst: Result, tolerance: float, dtype: torch.dtype) -> str:
     if tolerance < least:
         more = ", give float64 maps" if dtype != torch.float64 else ""
         return f"above the tolerance: {str(dtype).removeprefix('torch.')} holds {least:.2g}{more}"
-    terms = {"sums": worst.error, "integration over cells": worst.sampling, "size of the source": worst.source}
+    terms = {
+        "sums": worst.error,
+        "integration over cells": worst.sampling,
+        "size of the source": worst.source,
+    }
     return f"above the tolerance by its {max(terms, key=lambda name: terms[name])}"
 
 
@@ -235,13 +357,22 @@ def _value(argument: Any) -> Any:
     return argument
 
 
-def _moving(angle: Any, depths: Any, distance: Any, offset: Any, case: Case) -> Moving | None:
+def _moving(
+    angle: Any, depths: Any, distance: Any, offset: Any, case: Case
+) -> Moving | None:
     """Geometry as tensors where any of it carries a gradient."""
-    given = [angle, depths, distance, *(offset if isinstance(offset, list | tuple) else [offset])]
+    given = [
+        angle,
+        depths,
+        distance,
+        *(offset if isinstance(offset, list | tuple) else [offset]),
+    ]
     if not any(isinstance(g, torch.Tensor) and g.requires_grad for g in given):
         return None
     pair = _double(angle).reshape(-1)
-    tangents = torch.tan(pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)]))
+    tangents = torch.tan(
+        pair if pair.numel() == 2 else torch.cat([pair, torch.zeros_like(pair)])
+    )
     d = _double(distance).reshape(())
     shift = torch.stack([_double(o).reshape(()) for o in offset])
     meets = torch.stack([propagate.chief(case.behind, d, tangents, i) for i in (0, 1)])
@@ -255,15 +386,26 @@ def _double(argument: Any) -> torch.Tensor:
 
 
 def _maps(
-    phase: Any, level: Any, wavelength_um: float | Sequence[float], weights: Sequence[float] | None
+    phase: Any,
+    level: Any,
+    wavelength_um: float | Sequence[float],
+    weights: Sequence[float] | None,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor], list[float], Array]:
-    """Maps (…, wavelength, y, x) as tensors of one dtype, the wavelengths, and their weights of sum 1."""
+    """Maps (…, wavelength, y, x) as tensors of one dtype, the wavelengths, and their
+    weights of sum 1.
+    """
     waves = np.atleast_1d(np.asarray(wavelength_um, float)).ravel().tolist()
     if not waves:
         raise PropagationError("wavelength_um is empty, need one wavelength or more")
-    share = np.full(len(waves), 1 / len(waves)) if weights is None else np.asarray(weights, float)
+    share = (
+        np.full(len(waves), 1 / len(waves))
+        if weights is None
+        else np.asarray(weights, float)
+    )
     if share.shape != (len(waves),) or not (share >= 0).all() or not share.sum() > 0:
-        raise PropagationError(f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each")
+        raise PropagationError(
+            f"{len(waves)} wavelengths with weights {share.tolist()}, need one weight >= 0 for each"
+        )
     phase = torch.as_tensor(phase)
     if phase.dtype not in KEPT:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")

@@ -1,23 +1,31 @@
-"""Both polarisations: Ex, Ey, Ez of light whose rays the lens turns, each propagated as a scalar.
+"""Both polarisations: Ex, Ey, Ez of light whose rays the lens turns, each propagated as
+a scalar.
 
-The factors below are smooth over the lens. They go onto the light where a method knows the lens by a few nodes, behind
+The factors below are smooth over the lens. They go onto the light where a method knows
+the lens by a few nodes, behind
 the one sum over its pillars.
 
-A ray of direction a, polarised along e, leaves a pillar in direction b for the window: its field is turned with it,
-R e = e - (a + b)(b·e)/(1 + a·b), and |E|² cos θ is kept: E = t R e / √b_z (Richards and Wolf 1959, for the two
-polarisations of the source). The direction is that to the window's centre; what other points of a wide window see of
+A ray of direction a, polarised along e, leaves a pillar in direction b for the window:
+its field is turned with it,
+R e = e - (a + b)(b·e)/(1 + a·b), and |E|² cos θ is kept: E = t R e / √b_z (Richards and
+Wolf 1959, for the two
+polarisations of the source). The direction is that to the window's centre; what other
+points of a wide window see of
 another is measured (:func:`metalens.propagate.pupil_error`). Intensity is |Ex|² + |Ey|² + |Ez|², the mean of both
 polarisations.
 
-What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), whatever the slope of the rays. With
+What a pixel counts is the power through its face, S_z = Re(Ex Hy* - Ey Hx*), whatever
+the slope of the rays. With
 H = b x E of every ray it is a sum of squares with signs, like that of E:
 
     S_z = Σ_c s_c |Σ_j f_c(j) S_j|²        S_j: the scalar's light; f_c: (Ex ± Hy)/2, (Ey ± Hx)/2; s_c = ±1
 
-Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where pillars treat them alike and no
+Turned from x to y, E becomes H, and H -E: light along x and along y have one flux where
+pillars treat them alike and no
 face of a film tells s from p.
 
-Rays leave the pillars into their cover; at the faces of films s stays across them and p turns with the ray, each by its
+Rays leave the pillars into their cover; at the faces of films s stays across them and p
+turns with the ray, each by its
 own share of the power that passes (the scalar's light holds the mean of both).
 """
 
@@ -34,13 +42,15 @@ from metalens.lens import media
 from metalens.propagate import Case, Pupils, apart, cosines
 from metalens.psf.among import Jones
 
-POOLED = 64  # blocks of pillars along an axis over which the cosine of a ray is taken as alike
+# blocks of pillars along an axis over which the cosine of a ray is taken as alike
+POOLED = 64
 NOTHING = 1e-12  # of the light of the strongest combination of factors: rounding
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Mixed:
-    """pupils: (components, …) factors on the scalar's pupil, real or complex; signs: 1 or -1, of what each adds
+    """pupils: (components, …) factors on the scalar's pupil, real or complex; signs: 1
+    or -1, of what each adds
     to the light."""
 
     pupils: Tensor
@@ -49,9 +59,11 @@ class Mixed:
 
 @dataclass(frozen=True, slots=True)
 class Mixing:
-    """Both polarisations of light from maps of pillars, as smooth factors where a lens is known by a few nodes.
+    """Both polarisations of light from maps of pillars, as smooth factors where a lens
+    is known by a few nodes.
 
-    flux: through the sensor's plane, else |E|². apart: of three maps (:func:`apart_maps`) in place of one, whose
+    flux: through the sensor's plane, else |E|². apart: of three maps
+    (:func:`apart_maps`) in place of one, whose
     pillars treat both polarisations alike.
     """
 
@@ -64,22 +76,38 @@ class Mixing:
         return 3 if self.apart else 1
 
     def pupils(self, case: Case) -> Pupils:
-        """Components of the light of a case: of one map four of the flux of light along x, which is that of light along
-        y but behind films, or six of the mean |E|²; of three maps or behind films eight of the mean flux, or six. Those
+        """Components of the light of a case: of one map four of the flux of light along
+        x, which is that of light along
+        y but behind films, or six of the mean |E|²; of three maps or behind films eight
+        of the mean flux, or six. Those
         that are 0 all over are left out."""
         return lambda y_um, x_um: self._components(case, (y_um, x_um))
 
-    def _components(self, case: Case, at_um: tuple[Array, Array]) -> tuple[Array, Array]:
+    def _components(
+        self, case: Case, at_um: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
         """(components,) signs and (components, map, y, x) factors."""
         order = order_behind(case)
         first, b = rays_to(case, at_um, order[0]), rays_to(case, at_um)
         steep = math.sqrt(1 + case.tangents[0] ** 2 + case.tangents[1] ** 2)
-        a = torch.tensor([case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep], dtype=torch.float64)
+        a = torch.tensor(
+            [case.tangents[0] / steep, case.tangents[1] / steep, 1 / steep],
+            dtype=torch.float64,
+        )
         x, y = beyond_faces(turned(a, first), first, order).chunk(2)
         none = torch.zeros_like(x)
-        both = [torch.cat(pair) for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])]
-        fields = [of_flux(one, b) if self.flux else Mixed(one, (1.0,) * len(one)) for one in both]
-        factors, signs = torch.stack([one.pupils for one in fields], 1).numpy(), np.array(fields[0].signs)
+        both = [
+            torch.cat(pair)
+            for pair in ([(x, none), (none, y), (y, x)] if self.apart else [(x, y)])
+        ]
+        fields = [
+            of_flux(one, b) if self.flux else Mixed(one, (1.0,) * len(one))
+            for one in both
+        ]
+        factors, signs = (
+            torch.stack([one.pupils for one in fields], 1).numpy(),
+            np.array(fields[0].signs),
+        )
         if self.flux and not self.apart and not has_faces(case):
             factors, signs = factors[:4], signs[:4]
         else:
@@ -89,7 +117,8 @@ class Mixing:
         return signs[lit], factors[lit]
 
     def power(self, case: Case, powers: Sequence[float], levels: Tensor) -> float:
-        """Mean over both polarisations of what the pillars let through, from the sums of squares of the maps; of |E|²
+        """Mean over both polarisations of what the pillars let through, from the sums
+        of squares of the maps; of |E|²
         over the cosine of every ray, as it lies on the plane.
 
         levels: (map, y, x) transmissions.
@@ -97,20 +126,39 @@ class Mixing:
         weights = (0.5, 0.5, 1.0) if self.apart else (1.0,)
         total = 0.0
         for weight, power, level in zip(weights, powers, levels, strict=True):
-            total += weight * power * (1.0 if self.flux or not power > 0 else self._steep(case, level))
+            total += (
+                weight
+                * power
+                * (1.0 if self.flux or not power > 0 else self._steep(case, level))
+            )
         return total
 
     def _steep(self, case: Case, level: Tensor) -> float:
-        """Mean of 1/cos of the rays to the sensor, weighed by the light of the pillars; from means over blocks."""
+        """Mean of 1/cos of the rays to the sensor, weighed by the light of the pillars;
+        from means over blocks.
+        """
         counts = min(POOLED, case.shape[0]), min(POOLED, case.shape[1])
-        light = torch.nn.functional.adaptive_avg_pool2d(level.detach()[None] ** 2, counts)[0].double().cpu()
-        halves = [(n * step) / 2 for n, step in zip(case.shape, case.steps_um, strict=True)]
-        y, x = (half * ((2 * np.arange(n) + 1) / n - 1) for half, n in zip(halves, counts, strict=True))
+        light = (
+            torch.nn.functional.adaptive_avg_pool2d(level.detach()[None] ** 2, counts)[
+                0
+            ]
+            .double()
+            .cpu()
+        )
+        halves = [
+            (n * step) / 2 for n, step in zip(case.shape, case.steps_um, strict=True)
+        ]
+        y, x = (
+            half * ((2 * np.arange(n) + 1) / n - 1)
+            for half, n in zip(halves, counts, strict=True)
+        )
         return float((light / rays_to(case, (y, x))[2]).sum() / light.sum())
 
 
 def order_behind(case: Case) -> tuple[float, ...]:
-    """Indices of the media from the pillars to the sensor; 1 for one medium, whose wavelength is its own."""
+    """Indices of the media from the pillars to the sensor; 1 for one medium, whose
+    wavelength is its own.
+    """
     return (1.0,) if case.behind is None else case.behind.order
 
 
@@ -119,30 +167,45 @@ def has_faces(case: Case) -> bool:
     return len(set(order_behind(case))) > 1
 
 
-def rays_to(case: Case, at_um: tuple[Array, Array], index: float | None = None) -> Tensor:
-    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's centre, as they reach the sensor, or
+def rays_to(
+    case: Case, at_um: tuple[Array, Array], index: float | None = None
+) -> Tensor:
+    """(3, y, x) directions of the rays from (y,), (x,) of the lens to the window's
+    centre, as they reach the sensor, or
     in a medium of this index."""
-    across, down = at_um[1][None, :] - case.centre_um[0], (at_um[0] - case.centre_um[1])[:, None]
+    across, down = (
+        at_um[1][None, :] - case.centre_um[0],
+        (at_um[0] - case.centre_um[1])[:, None],
+    )
     n = index or order_behind(case)[-1]
-    p, q = (torch.as_tensor(-cosines(case, *at) / n) for at in ((across, down), (down, across)))
+    p, q = (
+        torch.as_tensor(-cosines(case, *at) / n)
+        for at in ((across, down), (down, across))
+    )
     return torch.stack([p, q, torch.sqrt(1 - p * p - q * q)])
 
 
 def s_and_p(case: Case) -> Pupils:
-    """Two components of a scalar's light behind films: light that is s all over, and p, whose mean power is the light;
-    each over the one amplitude that the scalar takes for both, as they reach the window's middle."""
+    """Two components of a scalar's light behind films: light that is s all over, and p,
+    whose mean power is the light;
+    each over the one amplitude that the scalar takes for both, as they reach the
+    window's middle."""
 
     def components(y_um: Array, x_um: Array) -> tuple[Array, Array]:
         b = rays_to(case, (y_um, x_um), 1.0).numpy()  # p = n sin θ
-        return np.ones(2), np.stack(apart(case, b[0] ** 2 + b[1] ** 2))[:, None] * math.sqrt(0.5)
+        return np.ones(2), np.stack(apart(case, b[0] ** 2 + b[1] ** 2))[
+            :, None
+        ] * math.sqrt(0.5)
 
     return components
 
 
 def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> Tensor:
-    """(2 polarisations x 3 components, …) fields in the last medium of rays whose fields in the first are ``electric``.
+    """(2 polarisations x 3 components, …) fields in the last medium of rays whose
+    fields in the first are ``electric``.
 
-    E = √S (E·s) s + √P (E·p) p', times √(cos / cos') to keep |E|² cos θ: s across the plane of the ray, p and p' in it,
+    E = √S (E·s) s + √P (E·p) p', times √(cos / cos') to keep |E|² cos θ: s across the
+    plane of the ray, p and p' in it,
     S and P the powers that pass over the mean of both.
 
     Args:
@@ -152,8 +215,12 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
         return electric
     w = (first[0] ** 2 + first[1] ** 2) * order[0] ** 2
     sine, least = torch.sqrt(w), torch.finfo(w.dtype).tiny
-    along_x = torch.stack([torch.ones_like(w), torch.zeros_like(w)])  # of the ray along the axis any plane is its own
-    ux, uy = torch.where(sine > least, first[:2] * order[0] / sine.clamp_min(least), along_x)
+    along_x = torch.stack(
+        [torch.ones_like(w), torch.zeros_like(w)]
+    )  # of the ray along the axis any plane is its own
+    ux, uy = torch.where(
+        sine > least, first[:2] * order[0] / sine.clamp_min(least), along_x
+    )
     steep, cosine = sine / order[-1], torch.sqrt(1 - w / order[-1] ** 2)
     s_power, p_power = media.passed_apart(order, w)
     both = (s_power + p_power) / 2 * cosine / first[2]
@@ -167,26 +234,36 @@ def beyond_faces(electric: Tensor, first: Tensor, order: tuple[float, ...]) -> T
 
 
 def apart_maps(maps: tuple[Tensor, Tensor], fields: Jones) -> tuple[Tensor, Tensor]:
-    """(…, wavelength · 3, y, x) phase and transmission of light from x to x, y to y, and between, of (…, wavelength, y,
+    """(…, wavelength · 3, y, x) phase and transmission of light from x to x, y to y,
+    and between, of (…, wavelength, y,
     x) maps of pillars with factors ``fields`` on the light that comes."""
     phase, level = (one.unsqueeze(-3) for one in maps)
     answered = torch.stack([fields.xx, fields.yy, fields.xy], -3)
-    return (phase + torch.angle(answered)).flatten(-4, -3), (level * answered.abs()).flatten(-4, -3)
+    return (phase + torch.angle(answered)).flatten(-4, -3), (
+        level * answered.abs()
+    ).flatten(-4, -3)
 
 
 def turned(a: Tensor, b: Tensor) -> Tensor:
-    """(2 polarisations x 3 components, …) of light of amplitude 1 that a lens turns from the direction a to b.
+    """(2 polarisations x 3 components, …) of light of amplitude 1 that a lens turns
+    from the direction a to b.
 
     Args:
-        a: (3,) unit vector of the light that comes. b: (3, …) of the rays that leave, both towards the sensor.
+        a: (3,) unit vector of the light that comes. b: (3, …) of the rays that leave,
+            both towards the sensor.
 
     Returns:
-        x, y, z component of light polarised along x, then along y (both turned to a); squares add up to 2 / b_z.
+        x, y, z component of light polarised along x, then along y (both turned to a);
+        squares add up to 2 / b_z.
     """
-    both = (a.reshape(3, *[1] * (b.ndim - 1)) + b) / (1 + torch.einsum("i,i...->...", a, b))
+    both = (a.reshape(3, *[1] * (b.ndim - 1)) + b) / (
+        1 + torch.einsum("i,i...->...", a, b)
+    )
     out = []
     for e in _polarisations(a):
-        turned = e.reshape(3, *[1] * (b.ndim - 1)) - both * torch.einsum("i,i...->...", e, b)
+        turned = e.reshape(3, *[1] * (b.ndim - 1)) - both * torch.einsum(
+            "i,i...->...", e, b
+        )
         out.append(turned / torch.sqrt(b[2]))
     return torch.cat(out)
 
@@ -199,7 +276,9 @@ def _polarisations(a: Tensor) -> list[Tensor]:
 
 
 def of_flux(electric: Tensor, b: Tensor) -> Mixed:
-    """From (2 polarisations x 3 components, …) fields of rays in the directions b (3, …) to those of their flux."""
+    """From (2 polarisations x 3 components, …) fields of rays in the directions b (3,
+    …) to those of their flux.
+    """
     parts: list[Tensor] = []
     for e in electric.reshape(2, 3, *electric.shape[1:]):
         h = torch.linalg.cross(b.expand_as(e), e, dim=0)
@@ -208,9 +287,11 @@ def of_flux(electric: Tensor, b: Tensor) -> Mixed:
 
 
 def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
-    """Mixtures, ``count`` or all that are not 0, that hold most of the light, whose sum is that of ``weight``².
+    """Mixtures, ``count`` or all that are not 0, that hold most of the light, whose sum
+    is that of ``weight``².
 
-    With A Aᴴ the products of the fields over the nodes and D their signs, axes y of Aᵀ D A* of eigenvalue λ are pupils
+    With A Aᴴ the products of the fields over the nodes and D their signs, axes y of Aᵀ
+    D A* of eigenvalue λ are pupils
     √|λ| (A*)⁻¹ y of sign λ. Differentiable in the fields.
 
     Args:
@@ -226,6 +307,11 @@ def strongest(fields: Mixed, weight: Tensor, count: int) -> Mixed:
     size, turn = torch.linalg.eigh(inner)
     first = torch.argsort(size.abs(), descending=True)[:count]
     first = first[size[first].abs() > NOTHING * size.abs().max()]
-    mixture = (axes[:, kept].conj() / root) @ turn[:, first] * torch.sqrt(size[first].abs())
+    mixture = (
+        (axes[:, kept].conj() / root) @ turn[:, first] * torch.sqrt(size[first].abs())
+    )
     level = torch.sqrt((weight**2).sum() / size[first].sum())
-    return Mixed(level * torch.einsum("dc,d...->c...", mixture, fields.pupils), tuple(torch.sign(size[first]).tolist()))
+    return Mixed(
+        level * torch.einsum("dc,d...->c...", mixture, fields.pupils),
+        tuple(torch.sign(size[first]).tolist()),
+    )

@@ -1,9 +1,12 @@
 """Rigorous coupled-wave analysis of one pillar cell.
 
-``jones`` gives both polarisations of a cell of any shape, lattice and layers, ``jones_derivatives`` also their exact
+``jones`` gives both polarisations of a cell of any shape, lattice and layers,
+``jones_derivatives`` also their exact
 derivatives by every number of it, ``near_field`` the fields in it.
-``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares the work over diameters,
-``derivatives`` differentiates it exactly (round pillars). Light comes from the substrate.
+``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares
+the work over diameters,
+``derivatives`` differentiates it exactly (round pillars). Light comes from the
+substrate.
 """
 
 from typing import TYPE_CHECKING

@@ -1,14 +1,20 @@
-"""Round pillars with a tilted wall or films: coupled waves, put right by the modal method.
+"""Round pillars with a tilted wall or films: coupled waves, put right by the modal
+method.
 
-What a truncation of coupled waves gets wrong is the pillar, not what is done with it: at N orders a disc acts as one a
-nanometre or less wider or thinner would, by an amount that changes slowly with its diameter. The upright pillar
+What a truncation of coupled waves gets wrong is the pillar, not what is done with it:
+at N orders a disc acts as one a
+nanometre or less wider or thinner would, by an amount that changes slowly with its
+diameter. The upright pillar
 without films is known from the modal method, so
 
     D -> D + s_N(D)   with   |t_N(D + s) - t(D)|² + |r_N(D + s) - r(D)|²  least over s                         (1)
 
-is solved at a few diameters between foot and top, and every cross-section of the wall is taken as wide as (1) says. The
-answers of four truncations then lie closer together by one order of magnitude, on both sides of the limit; their mean
-is the answer. Its error estimate: the farthest of the four from it, half of what (1) leaves unexplained, the error
+is solved at a few diameters between foot and top, and every cross-section of the wall
+is taken as wide as (1) says. The
+answers of four truncations then lie closer together by one order of magnitude, on both
+sides of the limit; their mean
+is the answer. Its error estimate: the farthest of the four from it, half of what (1)
+leaves unexplained, the error
 of the modal solves, and that of the collocation along the wall.
 """
 
@@ -35,7 +41,9 @@ SHARE = 0.2  # of the tolerance, for the modal solves
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Anchors:
-    """Upright pillars without films: diameters (k,), (k, 2) t and r, and the largest error of them."""
+    """Upright pillars without films: diameters (k,), (k, 2) t and r, and the largest
+    error of them.
+    """
 
     diameter_um: Array
     amplitudes: Array
@@ -44,7 +52,8 @@ class Anchors:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Shift:
-    """Solution of (1) at one truncation: polynomial over the nodes, and what it leaves unexplained
+    """Solution of (1) at one truncation: polynomial over the nodes, and what it leaves
+    unexplained
     of t, root mean square."""
 
     at: np.polynomial.Polynomial
@@ -65,8 +74,10 @@ def solve_anchored(
 ) -> Response:
     """Response of a round pillar with a tilted wall or films.
 
-    upright: of the pillars of :func:`node_diameters`, without films, from the modal method.
-    reaches: truncations to try, at least four; it ends with the first four neighbours that meet the tolerance.
+    upright: of the pillars of :func:`node_diameters`, without films, from the modal
+    method.
+    reaches: truncations to try, at least four; it ends with the first four neighbours
+    that meet the tolerance.
 
     Raises:
         CellError, MaterialError: as :func:`metalens.rcwa.solve`.
@@ -74,7 +85,9 @@ def solve_anchored(
     this, bare = (case(made, light) for made in (cell, plain(cell)))
     nodes = node_diameters(cell, diameter_um)
     anchors = Anchors(
-        np.array(nodes), np.array([(found.t, found.r) for found in upright]), max(found.t_error for found in upright)
+        np.array(nodes),
+        np.array([(found.t, found.r) for found in upright]),
+        max(found.t_error for found in upright),
     )
     stages, cut = wall_stages(this, np.array([diameter_um]), tolerance)
     found, left = [], []
@@ -88,14 +101,29 @@ def solve_anchored(
         last = np.array(found[-COMPARED:])
         t, r, energy = last.mean(axis=0)
         apart = np.abs(last[:, 0] - t).max()
-        error = float(apart + UNEXPLAINED * np.mean(left[-COMPARED:]) + anchors.error + cut)
+        error = float(
+            apart + UNEXPLAINED * np.mean(left[-COMPARED:]) + anchors.error + cut
+        )
         if error <= tolerance:
             break
     met = error <= tolerance
     reason = f"orders within {reach}, anchored: estimate {'meets' if met else 'above'} the tolerance {tolerance:.3g}"
-    count = int(np.count_nonzero(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach))
+    count = int(
+        np.count_nonzero(
+            np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
+        )
+    )
     error = min(error, float(farthest(np.array([t, r]))))
-    return Response(complex(t), complex(r), error, count, float(energy.real), "anchored", met, reason)
+    return Response(
+        complex(t),
+        complex(r),
+        error,
+        count,
+        float(energy.real),
+        "anchored",
+        met,
+        reason,
+    )
 
 
 def plain(cell: Cell) -> Cell:
@@ -104,7 +132,8 @@ def plain(cell: Cell) -> Cell:
 
 
 def node_diameters(cell: Cell, diameter_um: float) -> tuple[float, ...]:
-    """Where (1) is solved: Chebyshev points between foot and top, the diameter itself where the wall is upright.
+    """Where (1) is solved: Chebyshev points between foot and top, the diameter itself
+    where the wall is upright.
 
     Raises:
         CellError: pillars that overlap, or whose wall closes them.
@@ -121,13 +150,24 @@ def shifted(bare: Case, anchors: Anchors, reach: int) -> Shift:
     """(1) at every node."""
     shift = np.zeros_like(anchors.diameter_um)
     for _ in range(STEPS):
-        here, there = (_amplitudes(bare, anchors.diameter_um + shift + more, reach) for more in (0.0, STEP_UM))
+        here, there = (
+            _amplitudes(bare, anchors.diameter_um + shift + more, reach)
+            for more in (0.0, STEP_UM)
+        )
         slope, missing = (there - here) / STEP_UM, anchors.amplitudes - here
-        move = (slope.conj() * missing).sum(axis=1).real / (np.abs(slope) ** 2).sum(axis=1)
+        move = (slope.conj() * missing).sum(axis=1).real / (np.abs(slope) ** 2).sum(
+            axis=1
+        )
         shift = np.clip(shift + move, -MOST_UM, MOST_UM)
-    left = np.abs(anchors.amplitudes - _amplitudes(bare, anchors.diameter_um + shift, reach))[:, 0]
+    left = np.abs(
+        anchors.amplitudes - _amplitudes(bare, anchors.diameter_um + shift, reach)
+    )[:, 0]
     degree = len(shift) - 1
-    at = np.polynomial.Polynomial.fit(anchors.diameter_um, shift, degree) if degree else np.polynomial.Polynomial(shift)
+    at = (
+        np.polynomial.Polynomial.fit(anchors.diameter_um, shift, degree)
+        if degree
+        else np.polynomial.Polynomial(shift)
+    )
     return Shift(at, float(np.sqrt((left**2).mean())))
 
 

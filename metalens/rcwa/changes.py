@@ -20,7 +20,9 @@ def rim(this: Case, ways: Waves, diameter_um: Array) -> Change:
     return _pattern(this, ways, diameter_um, (direct, inverse), normal)
 
 
-def indices(this: Case, ways: Waves, diameter_um: Array, pillar: complex, between: complex) -> Change:
+def indices(
+    this: Case, ways: Waves, diameter_um: Array, pillar: complex, between: complex
+) -> Change:
     """dP and dQ when the indices of pillar and surroundings change by these amounts."""
     shape = fourier.disc(ways.space, diameter_um, this.cell.pitch_um)
     rest = (ways.space.shells == 0) - shape
@@ -31,14 +33,26 @@ def indices(this: Case, ways: Waves, diameter_um: Array, pillar: complex, betwee
 
 
 def _pattern(
-    this: Case, ways: Waves, diameter_um: Array, change: Change, normal: tuple[Array, Array, Array] | None
+    this: Case,
+    ways: Waves,
+    diameter_um: Array,
+    change: Change,
+    normal: tuple[Array, Array, Array] | None,
 ) -> Change:
-    """dP and dQ for changes of the Fourier coefficients of (eps, 1/eps), and of the normal field."""
+    """dP and dQ for changes of the Fourier coefficients of (eps, 1/eps), and of the
+    normal field.
+    """
     space = ways.space
-    (direct, inverse), (now, now_inverse) = change, _coefficients(this, ways, diameter_um)
+    (direct, inverse), (now, now_inverse) = (
+        change,
+        _coefficients(this, ways, diameter_um),
+    )
     laurent, delta_rate, delta = [], [], []
     for link in (fourier.EX, fourier.EY):
-        plain, bend = fourier.products(space, direct, link), fourier.products(space, inverse, link)
+        plain, bend = (
+            fourier.products(space, direct, link),
+            fourier.products(space, inverse, link),
+        )
         impermeability = np.linalg.inv(fourier.products(space, now_inverse, link))
         laurent.append(plain)
         delta_rate.append(plain + impermeability @ bend @ impermeability)
@@ -58,15 +72,21 @@ def _pattern(
 def _coefficients(this: Case, ways: Waves, diameter_um: Array) -> tuple[Array, Array]:
     shape = fourier.disc(ways.space, diameter_um, this.cell.pitch_um)
     inside, outside, start = this.pillar**2, this.between**2, ways.space.shells == 0
-    return (inside - outside) * shape + outside * start, (1 / inside - 1 / outside) * shape + start / outside
+    return (inside - outside) * shape + outside * start, (
+        1 / inside - 1 / outside
+    ) * shape + start / outside
 
 
 def turning(ways: Waves, change: Array) -> Change:
-    """Changes of K (waves, Ez orders) and R (waves, Hz orders) for changes (2, n) of k, the waves held as they are."""
+    """Changes of K (waves, Ez orders) and R (waves, Hz orders) for changes (2, n) of k,
+    the waves held as they are.
+    """
     along = (change * ways.along).sum(axis=0)
     across = change[1] * ways.along[0] - change[0] * ways.along[1]
     p, s = np.arange(ways.bare, ways.p_count), np.arange(ways.p_count, len(ways.kappa))
-    same = ((ways.m[s][:, None] == ways.m[p]) & (ways.n[s][:, None] == ways.n[p])).astype(float)
+    same = (
+        (ways.m[s][:, None] == ways.m[p]) & (ways.n[s][:, None] == ways.n[p])
+    ).astype(float)
     dK, dR = np.zeros((len(ways.kappa), len(p))), np.zeros((len(ways.kappa), len(s)))
     dK[p, np.arange(len(p))] = along[p]
     dK[s] = same * across[p]

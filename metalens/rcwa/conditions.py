@@ -1,4 +1,6 @@
-"""From a cell, a wavelength and a direction to the numbers of one RCWA case; refuses what cannot be computed."""
+"""From a cell, a wavelength and a direction to the numbers of one RCWA case; refuses
+what cannot be computed.
+"""
 
 import math
 from dataclasses import dataclass
@@ -18,9 +20,12 @@ class Case:
     """One wavelength, direction and polarisation of a cell, whatever the diameter.
 
     k0: 2 pi / wavelength_um.
-    kx, ky: tangential wave vector over k0; turned into the plane y = 0 where a mirror plane allows it.
-    symmetry: of the fields, see :mod:`metalens.rcwa.orders.basis`; wave: which zero order is incident.
-    pillar, between: indices, exp(-iwt). media: indices and reduced thicknesses around and between.
+    kx, ky: tangential wave vector over k0; turned into the plane y = 0 where a mirror
+    plane allows it.
+    symmetry: of the fields, see :mod:`metalens.rcwa.orders.basis`; wave: which zero
+    order is incident.
+    pillar, between: indices, exp(-iwt). media: indices and reduced thicknesses around
+    and between.
     """
 
     cell: Cell
@@ -40,12 +45,15 @@ def case(cell: Cell, light: Light) -> Case:
     """The case of a cell and a plane wave.
 
     Raises:
-        CellError: a polarisation that is ambiguous in this direction, or a zero order that does not propagate in
+        CellError: a polarisation that is ambiguous in this direction, or a zero order
+            that does not propagate in
             the substrate.
         MaterialError: a wavelength outside the range of a material.
     """
     if not cell.round:
-        raise CellError(f"this solver takes round pillars on a square lattice, not {cell.described}")
+        raise CellError(
+            f"this solver takes round pillars on a square lattice, not {cell.described}"
+        )
     k0 = 2 * math.pi / light.wavelength_um
 
     def index(material: object) -> complex:
@@ -54,7 +62,13 @@ def case(cell: Cell, light: Light) -> Case:
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
         return tuple((index(film.material), film.thickness_um * k0) for film in stack)
 
-    media = Media(index(cell.substrate), index(cell.cover), films(cell.under), films(cell.over), (cell.height_um * k0,))
+    media = Media(
+        index(cell.substrate),
+        index(cell.cover),
+        films(cell.under),
+        films(cell.over),
+        (cell.height_um * k0,),
+    )
     kx, ky, azimuth_rad, symmetry, wave = direction(light)
     if media.substrate.real <= math.hypot(kx, ky):
         raise CellError(
@@ -62,11 +76,25 @@ def case(cell: Cell, light: Light) -> Case:
             "cannot come from there; need a smaller angle_rad or another substrate"
         )
     pillar, between = index(cell.pillar), index(cell.between)
-    return Case(cell, light.wavelength_um, k0, kx, ky, azimuth_rad, symmetry, wave, pillar, between, media)
+    return Case(
+        cell,
+        light.wavelength_um,
+        k0,
+        kx,
+        ky,
+        azimuth_rad,
+        symmetry,
+        wave,
+        pillar,
+        between,
+        media,
+    )
 
 
 def case_waves(this: Case, harmonics: int) -> tuple[Waves, int]:
-    """The waves of a case within ``harmonics`` orders, and the place of its incident wave."""
+    """The waves of a case within ``harmonics`` orders, and the place of its incident
+    wave.
+    """
     ways = waves(
         fourier.basis(harmonics, this.symmetry),
         pitch_um=this.cell.pitch_um,
@@ -79,7 +107,8 @@ def case_waves(this: Case, harmonics: int) -> tuple[Waves, int]:
 
 
 def check_diameter(cell: Cell, diameter_um: float) -> None:
-    """Refuse a diameter that is no length, or pillars that overlap (touching ones can be computed).
+    """Refuse a diameter that is no length, or pillars that overlap (touching ones can
+    be computed).
 
     Raises:
         CellError: says which diameter, of foot or top where the wall is tilted.
@@ -102,15 +131,28 @@ def check_diameter(cell: Cell, diameter_um: float) -> None:
             )
 
 
-def direction(light: Light) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
-    """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into the plane y = 0 where it may be.
+def direction(
+    light: Light,
+) -> tuple[float, float, float, fourier.Symmetry, Literal["s", "p"]]:
+    """(kx, ky, azimuth, symmetry of the fields, which zero order comes); turned into
+    the plane y = 0 where it may be.
 
     Raises:
         CellError: a polarisation along x or y, in a plane of incidence off both.
     """
-    angle_rad, azimuth_rad, polarization = light.angle_rad, light.azimuth_rad, light.polarization
+    angle_rad, azimuth_rad, polarization = (
+        light.angle_rad,
+        light.azimuth_rad,
+        light.polarization,
+    )
     if angle_rad == 0:
-        return 0.0, 0.0, 0.0, "x", "p"  # the disc and the lattice look alike from x and y: one solution serves all
+        return (
+            0.0,
+            0.0,
+            0.0,
+            "x",
+            "p",
+        )  # the disc and the lattice look alike from x and y: one solution serves all
     sine, c, s = math.sin(angle_rad), math.cos(azimuth_rad), math.sin(azimuth_rad)
     along_x, along_y = abs(s) < _STRAIGHT, abs(c) < _STRAIGHT
     wave: Literal["s", "p"] = "p" if polarization == "p" else "s"

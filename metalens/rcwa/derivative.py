@@ -1,12 +1,17 @@
-"""Exact derivatives of the transmission, from the fields of the light and of its reverse.
+"""Exact derivatives of the transmission, from the fields of the light and of its
+reverse.
 
-With tilde the fields of unit power incident from the cover, a change dP, dQ of the operators anywhere changes the
-power-normalised transmission by (Lagrange's identity of u' = i P w, w' = i Q u; P and Q symmetric)
+With tilde the fields of unit power incident from the cover, a change dP, dQ of the
+operators anywhere changes the
+power-normalised transmission by (Lagrange's identity of u' = i P w, w' = i Q u; P and Q
+symmetric)
 
     dt = i/2 ∫ (u^T dQ u~ - w^T dP w~) dz,      layer stretched by dh:  dt = i/2 (u^T Q u~ - w^T P w~) dh.
 
-No mode is differentiated, so equal propagation constants need no care: only divided differences of exponentials
-appear. In the half-spaces outgoing waves are integrated in closed form; there the incident wave adds nothing, since
+No mode is differentiated, so equal propagation constants need no care: only divided
+differences of exponentials
+appear. In the half-spaces outgoing waves are integrated in closed form; there the
+incident wave adds nothing, since
 its power is fixed.
 """
 
@@ -27,7 +32,9 @@ from metalens.rcwa.orders.waves import Waves, half_space, normal_component
 from metalens.rcwa.solver import homogeneous
 from metalens.rcwa.stack import Fields, match, outgoing
 
-_GRAZING = 1e-8  # |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh anomaly
+# |kz| below which the slope of a half-space is cut off: it is infinite at a Rayleigh
+# anomaly
+_GRAZING = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +55,11 @@ class Derivatives:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One layer: its share of the height, and the (weight, lift) of the cross-sections that it mixes.
+    """One layer: its share of the height, and the (weight, lift) of the cross-sections
+    that it mixes.
 
-    lift: height of the cross-section above the middle of the pillar, over the height of the pillar.
+    lift: height of the cross-section above the middle of the pillar, over the height of
+    the pillar.
     """
 
     share: float
@@ -60,9 +69,12 @@ class Section:
 def sections(steps: int) -> tuple[Section, ...]:
     """Layers of a tilted wall in this many steps, foot first; 0 steps: an upright wall.
 
-    Commutator-free Magnus of fourth order: over a step two layers of half the height, mixed from the cross-sections at
-    the Gauss points 1/2 -+ sqrt(3)/6, (b, a) in the lower and (a, b) in the upper one, a, b = 1/2 -+ sqrt(3)/3 (Blanes
-    and Moan, Appl. Numer. Math. 56, 1519 (2006)). Layers have modes, which the integrals here need; ``solve`` follows
+    Commutator-free Magnus of fourth order: over a step two layers of half the height,
+    mixed from the cross-sections at
+    the Gauss points 1/2 -+ sqrt(3)/6, (b, a) in the lower and (a, b) in the upper one,
+    a, b = 1/2 -+ sqrt(3)/3 (Blanes
+    and Moan, Appl. Numer. Math. 56, 1519 (2006)). Layers have modes, which the
+    integrals here need; ``solve`` follows
     the wall by collocation (:mod:`metalens.rcwa.wall`).
     """
     if not steps:
@@ -70,16 +82,22 @@ def sections(steps: int) -> tuple[Section, ...]:
     small, large = 0.5 - math.sqrt(3) / 3, 0.5 + math.sqrt(3) / 3
     found = []
     for i in range(steps):
-        low, high = ((i + 0.5 + sign * math.sqrt(3) / 6) / steps - 0.5 for sign in (-1, 1))
+        low, high = (
+            (i + 0.5 + sign * math.sqrt(3) / 6) / steps - 0.5 for sign in (-1, 1)
+        )
         found.append(Section(0.5 / steps, ((large, low), (small, high))))
         found.append(Section(0.5 / steps, ((small, low), (large, high))))
     return tuple(found)
 
 
-def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[Array, Array]:
+def mixed(
+    this: Case, ways: Waves, diameter_um: Array, part: Section
+) -> tuple[Array, Array]:
     """P and Q of one section of the pillar."""
     wide = [diameter_um + lift * widening(this.cell) for _, lift in part.nodes]
-    here = [operators(ways, w, this.cell.pitch_um, this.pillar, this.between) for w in wide]
+    here = [
+        operators(ways, w, this.cell.pitch_um, this.pillar, this.between) for w in wide
+    ]
     weights = [weight for weight, _ in part.nodes]
     P = sum(weight * P for weight, (P, _) in zip(weights, here, strict=True))
     Q = sum(weight * Q for weight, (_, Q) in zip(weights, here, strict=True))
@@ -88,7 +106,9 @@ def mixed(this: Case, ways: Waves, diameter_um: Array, part: Section) -> tuple[A
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Region:
-    """A layer between the half-spaces: its modes and reduced height; its film, or its section of the pillar."""
+    """A layer between the half-spaces: its modes and reduced height; its film, or its
+    section of the pillar.
+    """
 
     part: Layer
     height: float
@@ -108,11 +128,14 @@ class _Problem:
     t: complex
 
 
-def differentiate(this: Case, diameter_um: float, *, harmonics: int, steps: int, angle_rad: float) -> Derivatives:
+def differentiate(
+    this: Case, diameter_um: float, *, harmonics: int, steps: int, angle_rad: float
+) -> Derivatives:
     """Derivatives at one truncation.
 
     Raises:
-        CellError: an absorbing half-space, or a zero order that does not propagate in the cover.
+        CellError: an absorbing half-space, or a zero order that does not propagate in
+            the cover.
     """
     problem = _solve(this, diameter_um, harmonics, steps)
     by_index = _by_index(problem)
@@ -133,9 +156,14 @@ def _solve(this: Case, diameter_um: float, harmonics: int, steps: int) -> _Probl
     if media.substrate.imag or media.cover.imag:
         raise CellError("derivatives need a substrate and a cover that do not absorb")
     if media.cover.real <= ways.kappa[zero]:
-        raise CellError("derivatives need a zero order that propagates in the cover; here it is totally reflected")
+        raise CellError(
+            "derivatives need a zero order that propagates in the cover; here it is totally reflected"
+        )
     regions = _regions(this, ways, diameter_um, steps)
-    layers, heights = [region.part for region in regions], tuple(region.height for region in regions)
+    layers, heights = (
+        [region.part for region in regions],
+        tuple(region.height for region in regions),
+    )
     below, above = half_space(ways, media.substrate), half_space(ways, media.cover)
     light = match(layers, heights, above, below, _source(below, zero))
     reverse = match(layers[::-1], heights[::-1], below, above, _source(above, zero))
@@ -163,27 +191,50 @@ def _returned(pair: tuple[Array, Array], fields: Fields, unit: Array) -> Array:
 
 
 def _regions(this: Case, ways: Waves, diameter_um: float, steps: int) -> list[_Region]:
-    def films(stack: tuple[Film, ...], indices: tuple[tuple[complex, float], ...]) -> list[_Region]:
+    def films(
+        stack: tuple[Film, ...], indices: tuple[tuple[complex, float], ...]
+    ) -> list[_Region]:
         pairs = zip(stack, indices, strict=True)
-        return [_Region(film_layer(ways, index), height, film.material, None) for film, (index, height) in pairs]
+        return [
+            _Region(film_layer(ways, index), height, film.material, None)
+            for film, (index, height) in pairs
+        ]
 
     pillar = []
     for section in sections(steps):
         flat = bool(homogeneous(this, np.array(diameter_um)))
-        part = film_layer(ways, this.between) if flat else layer(*mixed(this, ways, np.array(diameter_um), section))
-        pillar.append(_Region(part, section.share * this.cell.height_um * this.k0, None, section))
-    return films(this.cell.under, this.media.under) + pillar + films(this.cell.over, this.media.over)
+        part = (
+            film_layer(ways, this.between)
+            if flat
+            else layer(*mixed(this, ways, np.array(diameter_um), section))
+        )
+        pillar.append(
+            _Region(part, section.share * this.cell.height_um * this.k0, None, section)
+        )
+    return (
+        films(this.cell.under, this.media.under)
+        + pillar
+        + films(this.cell.over, this.media.over)
+    )
 
 
 def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
-    """A homogeneous layer, its plane waves as modes, the longest-lived first; symmetric: whether all that it is matched
+    """A homogeneous layer, its plane waves as modes, the longest-lived first;
+    symmetric: whether all that it is matched
     with are (:class:`metalens.rcwa.layer.Layer`)."""
     kz = normal_component(ways.kappa, index)
     kz = np.where(np.abs(kz) < _GRAZING, _GRAZING, kz)
     is_p = np.arange(len(kz)) < ways.p_count
     P, Q = np.where(is_p, kz**2 / index**2, 1.0), np.where(is_p, index**2, kz**2)
     order = np.argsort(kz.imag, kind="stable")
-    return Layer(np.diag(P), np.diag(Q), kz[order], np.eye(len(kz))[:, order], np.diag(Q / kz)[:, order], symmetric)
+    return Layer(
+        np.diag(P),
+        np.diag(Q),
+        kz[order],
+        np.eye(len(kz))[:, order],
+        np.diag(Q / kz)[:, order],
+        symmetric,
+    )
 
 
 def _by_diameter(problem: _Problem, share: Callable[[float], float]) -> complex:
@@ -206,7 +257,11 @@ def _by_index(problem: _Problem) -> complex:
 def _by_height(problem: _Problem) -> complex:
     this, total = problem.this, 0j
     for region, i in ((problem.regions[i], i) for i in _pillar(problem)):
-        total += region.section.share * this.k0 * _stretch(problem, i) if region.section else 0
+        total += (
+            region.section.share * this.k0 * _stretch(problem, i)
+            if region.section
+            else 0
+        )
     if this.cell.sidewall_rad:
         spread = -2 * math.tan(this.cell.sidewall_rad)
         total += _by_diameter(problem, lambda lift: lift * spread)
@@ -218,12 +273,16 @@ def _pillar(problem: _Problem) -> list[int]:
 
 
 def _mix(problem: _Problem, i: int, change: Callable[[Array, float], Change]) -> Change:
-    """Change of the operators of a section, from that of each cross-section (diameter, lift) that it mixes."""
+    """Change of the operators of a section, from that of each cross-section (diameter,
+    lift) that it mixes.
+    """
     section = problem.regions[i].section
     n = len(problem.ways.kappa)
     dP, dQ = np.zeros((n, n), complex), np.zeros((n, n), complex)
     for weight, lift in section.nodes if section else ():
-        part = change(np.array(problem.diameter_um + lift * widening(problem.this.cell)), lift)
+        part = change(
+            np.array(problem.diameter_um + lift * widening(problem.this.cell)), lift
+        )
         dP, dQ = dP + weight * part[0], dQ + weight * part[1]
     return dP, dQ
 
@@ -238,7 +297,9 @@ def _by_wavelength(problem: _Problem) -> complex:
     turn = changes.turning(ways, np.stack([ways.m, ways.n]) / cell.pitch_um)
 
     def pattern(diameter: Array, lift: float) -> Change:
-        bulk = changes.indices(this, ways, diameter, slope(cell.pillar), slope(cell.between))
+        bulk = changes.indices(
+            this, ways, diameter, slope(cell.pillar), slope(cell.between)
+        )
         return changes.add(changes.turned_pattern(this, ways, diameter, turn), bulk)
 
     total = 0j
@@ -248,9 +309,19 @@ def _by_wavelength(problem: _Problem) -> complex:
         else:
             index = materials.index(region.film, wavelength)
             change = changes.medium(ways, index, 2 * index * slope(region.film), turn)
-        total += _inside(problem, i, change) - region.height / wavelength * _stretch(problem, i)
-    for (index, out, back), material in zip(problem.ends, (cell.substrate, cell.cover), strict=True):
-        total += _outside(ways, index, out, back, changes.medium(ways, index, 2 * index * slope(material), turn))
+        total += _inside(problem, i, change) - region.height / wavelength * _stretch(
+            problem, i
+        )
+    for (index, out, back), material in zip(
+        problem.ends, (cell.substrate, cell.cover), strict=True
+    ):
+        total += _outside(
+            ways,
+            index,
+            out,
+            back,
+            changes.medium(ways, index, 2 * index * slope(material), turn),
+        )
     return total
 
 
@@ -269,7 +340,9 @@ def _by_angle(problem: _Problem, angle_rad: float) -> complex:
         if region.film is None:
             change = _mix(problem, i, pattern)
         else:
-            change = changes.medium(ways, materials.index(region.film, this.wavelength_um), 0j, turn)
+            change = changes.medium(
+                ways, materials.index(region.film, this.wavelength_um), 0j, turn
+            )
         total += _inside(problem, i, change)
     for index, out, back in problem.ends:
         total += _outside(ways, index, out, back, changes.medium(ways, index, 0j, turn))
@@ -286,7 +359,9 @@ def _inside(problem: _Problem, i: int, change: Change) -> complex:
     near = np.abs(apart) * h < 0.5
     x = np.where(near, apart, 0) * h / 2
     middle = np.exp(1j * np.where(near, total, 0) * h / 2) * h * np.sinc(x / np.pi)
-    opposite = np.where(near, middle, (fade[:, None] - fade) / np.where(near, 1, 1j * apart))
+    opposite = np.where(
+        near, middle, (fade[:, None] - fade) / np.where(near, 1, 1j * apart)
+    )
     even = same * (np.outer(a, c) + np.outer(b, d))
     odd = opposite * (np.outer(a, d) + np.outer(b, c))
     from_q = (part.W.T @ change[1] @ part.W) * (even + odd)
@@ -295,7 +370,9 @@ def _inside(problem: _Problem, i: int, change: Change) -> complex:
 
 
 def _stretch(problem: _Problem, i: int) -> complex:
-    """i/2 (u^T Q u~ - w^T P w~), the same at every height of a layer; taken at its foot."""
+    """i/2 (u^T Q u~ - w^T P w~), the same at every height of a layer; taken at its
+    foot.
+    """
     region, (a, b), (c, d) = problem.regions[i], *_amplitudes(problem, i)
     part = region.part
     fade = np.exp(1j * part.q * region.height)
@@ -304,14 +381,18 @@ def _stretch(problem: _Problem, i: int) -> complex:
     return complex(0.5j * (u @ part.Q @ u_back - w @ part.P @ w_back))
 
 
-def _amplitudes(problem: _Problem, i: int) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _amplitudes(
+    problem: _Problem, i: int
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """(up, down) of the light and of the reverse in a layer, both as seen from below."""
     j = len(problem.regions) - 1 - i
     light, reverse = problem.light, problem.reverse
     return (light.up[i], light.down[i]), (reverse.down[j], reverse.up[j])
 
 
-def _outside(ways: Waves, index: complex, out: Array, back: Array, change: Change) -> complex:
+def _outside(
+    ways: Waves, index: complex, out: Array, back: Array, change: Change
+) -> complex:
     """i/2 of the integral over a half-space, of its outgoing waves."""
     U, V = half_space(ways, index)
     kz = normal_component(ways.kappa, index)

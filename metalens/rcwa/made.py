@@ -1,4 +1,6 @@
-"""The sections of a pillar as it is made: layers one upon another, their walls tilted, refused where they overlap."""
+"""The sections of a pillar as it is made: layers one upon another, their walls tilted,
+refused where they overlap.
+"""
 
 import functools
 import itertools
@@ -13,29 +15,49 @@ from metalens.ground.errors import CellError
 from metalens.rcwa import pattern
 from metalens.rcwa.wall import Sample, Wall
 
-_NODES = 8  # cross-sections of a tilted wall: coefficients turn by a few radians between foot and top
+# cross-sections of a tilted wall: coefficients turn by a few radians between foot and
+# top
+_NODES = 8
 Operators = Callable[[pattern.Slab], tuple[Array, Array]]
 
 
-def walls(cell: Cell, size_um: float, wavelength_um: float, operators: Operators) -> list[Wall]:
+def walls(
+    cell: Cell, size_um: float, wavelength_um: float, operators: Operators
+) -> list[Wall]:
     """Every section, foot first; operators: P and Q of a cross-section."""
-    made = [_wall(cell, layer, grow, size_um, wavelength_um, operators) for layer, grow in spread(cell)]
-    return [Wall(interpolated(part.sample), part.reduced_height) for part in made] if cell.sidewall_rad else made
+    made = [
+        _wall(cell, layer, grow, size_um, wavelength_um, operators)
+        for layer, grow in spread(cell)
+    ]
+    return (
+        [Wall(interpolated(part.sample), part.reduced_height) for part in made]
+        if cell.sidewall_rad
+        else made
+    )
 
 
 def nodes() -> Array:
-    """(k,) shares of the height whose cross-sections stand for a tilted wall: Chebyshev points."""
+    """(k,) shares of the height whose cross-sections stand for a tilted wall: Chebyshev
+    points.
+    """
     return np.asarray((1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2)
 
 
 def weights(share: float | Array) -> Array:
     """(*shape, k) of the nodes, in the polynomial through their values."""
-    vandermonde = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * nodes() - 1, _NODES - 1))
-    return np.asarray(np.polynomial.chebyshev.chebvander(2 * np.asarray(share) - 1, _NODES - 1) @ vandermonde)
+    vandermonde = np.linalg.inv(
+        np.polynomial.chebyshev.chebvander(2 * nodes() - 1, _NODES - 1)
+    )
+    return np.asarray(
+        np.polynomial.chebyshev.chebvander(2 * np.asarray(share) - 1, _NODES - 1)
+        @ vandermonde
+    )
 
 
 def interpolated(sample: Sample) -> Sample:
-    """P and Q from polynomials through their values at Chebyshev points of the height, worked out when first asked."""
+    """P and Q from polynomials through their values at Chebyshev points of the height,
+    worked out when first asked.
+    """
 
     @functools.cache
     def values() -> tuple[Array, Array]:
@@ -49,10 +71,19 @@ def interpolated(sample: Sample) -> Sample:
     return at
 
 
-def _wall(cell: Cell, layer: Layer, grow_um: float, size_um: float, wavelength_um: float, operators: Operators) -> Wall:
+def _wall(
+    cell: Cell,
+    layer: Layer,
+    grow_um: float,
+    size_um: float,
+    wavelength_um: float,
+    operators: Operators,
+) -> Wall:
     def sample(share: float) -> tuple[Array, Array]:
         wide = grow_um + lift(cell, layer, share)
-        return operators(pattern.slab(cell, layer, size_um, wavelength_um, grow_um=wide))
+        return operators(
+            pattern.slab(cell, layer, size_um, wavelength_um, grow_um=wide)
+        )
 
     return Wall(sample, layer.height_um * 2 * math.pi / wavelength_um)
 

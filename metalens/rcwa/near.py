@@ -1,13 +1,17 @@
-"""The field in and around one cell: E and H at any points, from the coupled waves of every slab of the stack.
+"""The field in and around one cell: E and H at any points, from the coupled waves of
+every slab of the stack.
 
-Films and sections are slabs alike. With the amplitudes a of the upward modes at the foot of a slab of height h and b of
+Films and sections are slabs alike. With the amplitudes a of the upward modes at the
+foot of a slab of height h and b of
 the downward ones at its top (:mod:`metalens.rcwa.stack`), lengths in units of 1/k0,
 
     u = (Ex, Ey) = W (e^(iqz) a + e^(iq(h-z)) b),   w = (Hy, -Hx) = V (e^(iqz) a - e^(iq(h-z)) b),
     Ez = -[eps]^-1 K^T w,   Hz = R^T u,   D = Q u + R R^T u.                                                        (1)
 
-At a wall the normal part of E jumps, and the sum of its orders rings; that of D does not. With the unit normal n of the
-nearest boundary and a weight N that is 1 there (:func:`metalens.rcwa.pattern.normals_at`)
+At a wall the normal part of E jumps, and the sum of its orders rings; that of D does
+not. With the unit normal n of the
+nearest boundary and a weight N that is 1 there
+(:func:`metalens.rcwa.pattern.normals_at`)
 
     E = E_sum + N n n^T (D_sum / eps - E_sum)                                                                       (2)
 
@@ -31,7 +35,10 @@ from metalens.rcwa.problem import Problem, problem
 from metalens.rcwa.solver import safety
 
 MOST_POINTS = 4_000_000  # of one call: 1 GB with the truncations that are compared
-_SAFETY, _ENOUGH = 2.5, 7  # times the farthest truncation before, from so many orders on; below, as for t
+_SAFETY, _ENOUGH = (
+    2.5,
+    7,
+)  # times the farthest truncation before, from so many orders on; below, as for t
 _STEPS = 12  # of a tilted wall, as a staircase; half as many tell what they leave
 
 
@@ -39,7 +46,8 @@ _STEPS = 12  # of a tilted wall, as a staircase; half as many tell what they lea
 class Grid:
     """Points (z, y, x) of three axes; a cut takes one value of an axis.
 
-    x_um (nx,), y_um (ny,): from the middle of the pillar; z_um (nz,): from its foot, light goes along +z.
+    x_um (nx,), y_um (ny,): from the middle of the pillar; z_um (nz,): from its foot,
+    light goes along +z.
     """
 
     x_um: Sequence[float] | Array
@@ -50,7 +58,9 @@ class Grid:
         for name in ("x_um", "y_um", "z_um"):
             axis = np.asarray(getattr(self, name), float)
             if axis.ndim != 1 or not len(axis) or not np.isfinite(axis).all():
-                raise CellError(f"{name} has shape {axis.shape}: need a list of finite lengths, at least one")
+                raise CellError(
+                    f"{name} has shape {axis.shape}: need a list of finite lengths, at least one"
+                )
             object.__setattr__(self, name, axis)
 
     @property
@@ -63,11 +73,14 @@ class Grid:
 class NearField:
     """Fields of one plane wave from the substrate on the points of a grid, exp(-iwt).
 
-    e: (3, nz, ny, nx) Ex, Ey, Ez for an incident wave of electric amplitude 1, whose phase is 0 above the origin at the
-        foot of the pillar (with films under it: at their outer face). h: likewise, times the impedance of vacuum. On an
+    e: (3, nz, ny, nx) Ex, Ey, Ez for an incident wave of electric amplitude 1, whose
+    phase is 0 above the origin at the
+        foot of the pillar (with films under it: at their outer face). h: likewise,
+        times the impedance of vacuum. On an
         interface across z both are those just above it.
     index: (nz, ny, nx) refractive index there.
-    error: estimate of the root-mean-square error of e over all the points, relative to e.
+    error: estimate of the root-mean-square error of e over all the points, relative to
+    e.
     orders: of the truncation. converged: whether ``error`` meets the tolerance.
     """
 
@@ -82,7 +95,9 @@ class NearField:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Look:
-    """What the points of a slab see: eps (ny, nx) and N n n^T of (2) as (xx, yy, xy), None where it is homogeneous."""
+    """What the points of a slab see: eps (ny, nx) and N n n^T of (2) as (xx, yy, xy),
+    None where it is homogeneous.
+    """
 
     eps: Array
     normal: tuple[Array, Array, Array] | None
@@ -111,16 +126,23 @@ def near_fields(
 
     Args:
         size_um: of the shape (what other stages call the diameter).
-        light: polarisation x or y: E (its tangential part) along that axis; p: along the plane of incidence, s: along
+        light: polarisation x or y: E (its tangential part) along that axis; p: along
+            the plane of incidence, s: along
             z x k.
-        tolerance: of the relative root-mean-square error over the points of any grid; harmonics: fix the largest
+        tolerance: of the relative root-mean-square error over the points of any grid;
+            harmonics: fix the largest
             truncation instead.
 
-    Accuracy: ``error`` is 2.5 times the farthest of the four (six where something is narrow) truncations before the
-        last, more below seven orders. On 40 random cells (circles to crosses, index 1.8 to 3.7, some absorbing, some
-        oblique; 7 to 13 orders against 16) the error was at most 1.8 times the farthest, half of it in the median.
-        Within a few nm of an edge that runs along z no truncation is near: the field has no bound
-        there. A tilted wall is a staircase of twelve steps, and half as many tell what it leaves.
+    Accuracy: ``error`` is 2.5 times the farthest of the four (six where something is
+    narrow) truncations before the
+        last, more below seven orders. On 40 random cells (circles to crosses, index 1.8
+        to 3.7, some absorbing, some
+        oblique; 7 to 13 orders against 16) the error was at most 1.8 times the
+        farthest, half of it in the median.
+        Within a few nm of an edge that runs along z no truncation is near: the field
+        has no bound
+        there. A tilted wall is a staircase of twelve steps, and half as many tell what
+        it leaves.
 
     Raises:
         CellError: as :func:`metalens.rcwa.jones`; too many points.
@@ -129,25 +151,52 @@ def near_fields(
     check_tolerance(tolerance)
     count = sum(math.prod(grid.shape) for grid in grids)
     if not 0 < count <= MOST_POINTS:
-        raise CellError(f"{count} points: need 1 to {MOST_POINTS} in one call; take cuts, or fewer samples")
-    this = problem(cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad)
+        raise CellError(
+            f"{count} points: need 1 to {MOST_POINTS} in one call; take cuts, or fewer samples"
+        )
+    this = problem(
+        cell, size_um, light.wavelength_um, light.angle_rad, light.azimuth_rad
+    )
     climb = ladder(this, harmonics)
     steps = _STEPS if cell.sidewall_rad else 1
     stack = _stack(this, steps, grids)
-    cut = np.zeros(len(grids)) if steps == 1 else _staircase(this, stack, steps, light, grids, climb)
+    cut = (
+        np.zeros(len(grids))
+        if steps == 1
+        else _staircase(this, stack, steps, light, grids, climb)
+    )
     history: list[list[tuple[Array, Array]]] = []
     for reach in climb.reaches:
         found = _fields(this, stack, light, grids, reach)
-        farthest = np.max([[1.0] * len(grids)] if not history else [_apart(one, found) for one in history], axis=0)
+        farthest = np.max(
+            [[1.0] * len(grids)]
+            if not history
+            else [_apart(one, found) for one in history],
+            axis=0,
+        )
         factor = climb.crowded * (_SAFETY if reach >= _ENOUGH else safety(reach))
         error = np.minimum(factor * farthest + cut, 2.0)
         if len(history) >= climb.before and error.max() <= tolerance:
             break
         history = [*history, found][-climb.before :]
-    orders = int(np.count_nonzero(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach))
+    orders = int(
+        np.count_nonzero(
+            np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
+        )
+    )
     return [
-        NearField(grid, e, h, _index(this, stack.slabs, looks, grid), float(bar), orders, bool(bar <= tolerance))
-        for grid, looks, (e, h), bar in zip(grids, stack.looks, found, error, strict=True)
+        NearField(
+            grid,
+            e,
+            h,
+            _index(this, stack.slabs, looks, grid),
+            float(bar),
+            orders,
+            bool(bar <= tolerance),
+        )
+        for grid, looks, (e, h), bar in zip(
+            grids, stack.looks, found, error, strict=True
+        )
     ]
 
 
@@ -163,10 +212,19 @@ def near_field(
     harmonics: int | None = None,
 ) -> NearField:
     """As :func:`near_fields`, on one grid: ``y_um=[0.0]`` gives a cut along x and z."""
-    return near_fields(cell, size_um, light, [Grid(x_um, y_um, z_um)], tolerance=tolerance, harmonics=harmonics)[0]
+    return near_fields(
+        cell,
+        size_um,
+        light,
+        [Grid(x_um, y_um, z_um)],
+        tolerance=tolerance,
+        harmonics=harmonics,
+    )[0]
 
 
-def _apart(some: list[tuple[Array, Array]], others: list[tuple[Array, Array]]) -> list[float]:
+def _apart(
+    some: list[tuple[Array, Array]], others: list[tuple[Array, Array]]
+) -> list[float]:
     """For every grid the root-mean-square distance of e, over that of the second."""
     return [
         float(np.linalg.norm(one - other) / np.linalg.norm(other))
@@ -174,7 +232,14 @@ def _apart(some: list[tuple[Array, Array]], others: list[tuple[Array, Array]]) -
     ]
 
 
-def _staircase(this: Problem, stack: _Stack, steps: int, light: Light, grids: Sequence[Grid], climb: Ladder) -> Array:
+def _staircase(
+    this: Problem,
+    stack: _Stack,
+    steps: int,
+    light: Light,
+    grids: Sequence[Grid],
+    climb: Ladder,
+) -> Array:
     """What half as many steps of a tilted wall change, at few orders."""
     coarse = min(climb.reaches[-1], climb.reaches[0] + 2)
     half = _fields(this, _stack(this, steps // 2, grids), light, grids, coarse)
@@ -196,19 +261,31 @@ def _looks(this: Problem, slabs: list[Slab], grid: Grid) -> list[_Look]:
             found.append(_Look(slab.index**2 * flat, None))
             continue
         n, weight = pattern.normals_at(slab.section.outlines, this.cell, x, y)
-        normal = weight * n[..., 0] ** 2, weight * n[..., 1] ** 2, weight * n[..., 0] * n[..., 1]
+        normal = (
+            weight * n[..., 0] ** 2,
+            weight * n[..., 1] ** 2,
+            weight * n[..., 0] * n[..., 1],
+        )
         found.append(_Look(pattern.permittivity(slab.section, this.cell, x, y), normal))
     return [*found, _Look(this.media.cover**2 * flat, None)]
 
 
 def _index(this: Problem, slabs: list[Slab], looks: list[_Look], grid: Grid) -> Array:
     """(nz, ny, nx)."""
-    return np.asarray(np.sqrt(np.stack([looks[i].eps for i in places(this, slabs, np.asarray(grid.z_um))])))
+    return np.asarray(
+        np.sqrt(
+            np.stack([looks[i].eps for i in places(this, slabs, np.asarray(grid.z_um))])
+        )
+    )
 
 
-def _fields(this: Problem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int) -> list[tuple[Array, Array]]:
+def _fields(
+    this: Problem, stack: _Stack, light: Light, grids: Sequence[Grid], reach: int
+) -> list[tuple[Array, Array]]:
     """(3, nz, ny, nx) e and h of every grid, at one truncation."""
-    found = [tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids]
+    found = [
+        tuple(np.zeros((n, *grid.shape), complex) for n in (3, 3, 2)) for grid in grids
+    ]
     for operations in this.classes:
         space = mirrors.orders(reach, pattern.frame(this.cell, operations))
         one = solved(this, stack.slabs, light, space)
@@ -216,9 +293,22 @@ def _fields(this: Problem, stack: _Stack, light: Light, grids: Sequence[Grid], r
             continue
         for grid, (e, h, d) in zip(grids, found, strict=True):
             at = orders_at(this, stack.slabs, one, np.asarray(grid.z_um))
-            summed = Points(this, operations, space.reach, (np.asarray(grid.x_um), np.asarray(grid.y_um)))
-            e += [summed(space.ex, at.ex), summed(space.ey, at.ey), summed(space.ez, at.ez)]
-            h += [summed(space.ey, at.hx), summed(space.ex, at.hy), summed(space.hz, at.hz)]
+            summed = Points(
+                this,
+                operations,
+                space.reach,
+                (np.asarray(grid.x_um), np.asarray(grid.y_um)),
+            )
+            e += [
+                summed(space.ex, at.ex),
+                summed(space.ey, at.ey),
+                summed(space.ez, at.ez),
+            ]
+            h += [
+                summed(space.ey, at.hx),
+                summed(space.ex, at.hy),
+                summed(space.hz, at.hz),
+            ]
             d += [summed(space.ex, at.dx), summed(space.ey, at.dy)]
     for grid, looks, (e, _, d) in zip(grids, stack.looks, found, strict=True):
         for i, place in enumerate(places(this, stack.slabs, np.asarray(grid.z_um))):

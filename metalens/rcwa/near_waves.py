@@ -1,4 +1,6 @@
-"""Orders of the field at any height of a stack of slabs, and their sums on points; see :mod:`metalens.rcwa.near`."""
+"""Orders of the field at any height of a stack of slabs, and their sums on points; see
+:mod:`metalens.rcwa.near`.
+"""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +29,9 @@ class Slab:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solved:
-    """One symmetry class: its waves, the modes of every slab, 1/eps for Ez, incident amplitudes (n,), the fields."""
+    """One symmetry class: its waves, the modes of every slab, 1/eps for Ez, incident
+    amplitudes (n,), the fields.
+    """
 
     space: mirrors.Orders
     ways: Waves
@@ -39,7 +43,9 @@ class Solved:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Orders:
-    """Amplitudes (nz, k) of the orders of every component at every height, h times the impedance of vacuum."""
+    """Amplitudes (nz, k) of the orders of every component at every height, h times the
+    impedance of vacuum.
+    """
 
     ex: Array
     ey: Array
@@ -52,34 +58,48 @@ class Orders:
 
 
 def slabs_of(this: Problem, steps: int) -> list[Slab]:
-    """Films under the pillar, sections from the foot up, films over it; a tilted wall in equal steps."""
+    """Films under the pillar, sections from the foot up, films over it; a tilted wall
+    in equal steps.
+    """
     k0, cell = 2 * math.pi / this.light.wavelength_um, this.cell
     found = [Slab(index, None, thickness) for index, thickness in this.media.under]
     for part, grow in made.spread(cell):
         for i in range(steps):
             lift = ((i + 0.5) / steps - 0.5) * part.height_um * made.widening(cell)
-            section = pattern.slab(cell, part, this.size_um, this.light.wavelength_um, grow_um=grow + lift)
+            section = pattern.slab(
+                cell, part, this.size_um, this.light.wavelength_um, grow_um=grow + lift
+            )
             found.append(Slab(0j, section, k0 * part.height_um / steps))
-    return found + [Slab(index, None, thickness) for index, thickness in this.media.over]
+    return found + [
+        Slab(index, None, thickness) for index, thickness in this.media.over
+    ]
 
 
 def edges(this: Problem, slabs: list[Slab]) -> Array:
     """Interfaces along z times k0, 0 at the foot of the pillar."""
     heights = [slab.height for slab in slabs]
-    return np.concatenate([[0.0], np.cumsum(heights)]) - sum(heights[: len(this.media.under)])
+    return np.concatenate([[0.0], np.cumsum(heights)]) - sum(
+        heights[: len(this.media.under)]
+    )
 
 
 def places(this: Problem, slabs: list[Slab], z_um: Array) -> Array:
     """(nz,) 0 for the substrate, then the slabs, last the cover."""
     ends, heights = edges(this, slabs), 2 * math.pi / this.light.wavelength_um * z_um
-    return np.asarray(np.searchsorted(ends, heights + _ON * (ends[-1] - ends[0]), side="right"))
+    return np.asarray(
+        np.searchsorted(ends, heights + _ON * (ends[-1] - ends[0]), side="right")
+    )
 
 
 _ON = 1e-12  # of the height: a point so little below an interface lies on it
 
 
-def solved(this: Problem, slabs: list[Slab], light: Light, space: mirrors.Orders) -> Solved | None:
-    """The waves, modes and fields of one symmetry class; None where the light has no part in it."""
+def solved(
+    this: Problem, slabs: list[Slab], light: Light, space: mirrors.Orders
+) -> Solved | None:
+    """The waves, modes and fields of one symmetry class; None where the light has no
+    part in it.
+    """
     ways, columns = waves_of(space, this.cell, this.light)
     incident = np.zeros(len(ways.kappa), complex)
     for column, (place, sign) in columns.items():
@@ -94,31 +114,56 @@ def solved(this: Problem, slabs: list[Slab], light: Light, space: mirrors.Orders
             z = np.eye(len(space.ez.m)) / slab.index**2
         else:
             P, Q = pattern.operators(space, ways, slab.section, this.cell)
-            z = np.linalg.inv(mirrors.product(space, pattern.tables(slab.section, this.cell, space.reach)[0], 2))
+            z = np.linalg.inv(
+                mirrors.product(
+                    space, pattern.tables(slab.section, this.cell, space.reach)[0], 2
+                )
+            )
         layers.append(modes.layer(P, Q, symmetric=symmetric))
         inverse_z.append(z)
-    below, above = half_space(ways, this.media.substrate), half_space(ways, this.media.cover)
-    found = match(layers, tuple(slab.height for slab in slabs), above, below, 2 * below[0] * below[1] * incident)
+    below, above = (
+        half_space(ways, this.media.substrate),
+        half_space(ways, this.media.cover),
+    )
+    found = match(
+        layers,
+        tuple(slab.height for slab in slabs),
+        above,
+        below,
+        2 * below[0] * below[1] * incident,
+    )
     return Solved(space, ways, layers, inverse_z, incident, found)
 
 
 def come(light: Light) -> tuple[float, float]:
-    """Amplitudes of the incident wave along x and y at normal incidence, of s and p else."""
+    """Amplitudes of the incident wave along x and y at normal incidence, of s and p
+    else.
+    """
     c, s = math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
     if light.angle_rad == 0:
-        return {"x": (1.0, 0.0), "y": (0.0, 1.0), "p": (c, s), "s": (-s, c)}[light.polarization]
+        return {"x": (1.0, 0.0), "y": (0.0, 1.0), "p": (c, s), "s": (-s, c)}[
+            light.polarization
+        ]
     wave = direction(light)[-1]
     if light.polarization in ("s", "p"):
         return (1.0, 0.0) if wave == "s" else (0.0, 1.0)
-    across, along = (-s, c) if light.polarization == "x" else (c, s)  # of the unit vectors of s and p
-    return (math.copysign(1.0, across), 0.0) if wave == "s" else (0.0, math.copysign(1.0, along))
+    across, along = (
+        (-s, c) if light.polarization == "x" else (c, s)
+    )  # of the unit vectors of s and p
+    return (
+        (math.copysign(1.0, across), 0.0)
+        if wave == "s"
+        else (0.0, math.copysign(1.0, along))
+    )
 
 
 def homogeneous(ways: Waves, index: complex) -> tuple[Array, Array]:
     """P and Q of a film."""
     is_p, square = np.arange(len(ways.kappa)) < ways.p_count, ways.kappa**2
     eps = index**2 if complex(index).imag else complex(index).real ** 2
-    return np.diag(np.where(is_p, 1 - square / eps, 1.0)), np.diag(np.where(is_p, eps, eps - square))
+    return np.diag(np.where(is_p, 1 - square / eps, 1.0)), np.diag(
+        np.where(is_p, eps, eps - square)
+    )
 
 
 def orders_at(this: Problem, slabs: list[Slab], one: Solved, z_um: Array) -> Orders:
@@ -127,7 +172,9 @@ def orders_at(this: Problem, slabs: list[Slab], one: Solved, z_um: Array) -> Ord
     u, w = _heights(this, slabs, one, z_um)
     ez, d = np.zeros((len(z_um), len(space.ez.m)), complex), np.zeros_like(u)
     p = slice(ways.bare, ways.p_count)
-    turning = np.where(np.arange(len(ways.kappa)) >= ways.p_count, ways.kappa**2, 0.0)  # R R^T: of s waves alone
+    turning = np.where(
+        np.arange(len(ways.kappa)) >= ways.p_count, ways.kappa**2, 0.0
+    )  # R R^T: of s waves alone
     for i, place in enumerate(places(this, slabs, z_um)):
         along = ways.kappa[p] * w[i, p]
         if 0 < place <= len(slabs):
@@ -142,39 +189,56 @@ def orders_at(this: Problem, slabs: list[Slab], one: Solved, z_um: Array) -> Ord
     return Orders(e[:, x], e[:, y], ez, -h[:, y], h[:, x], hz, d[:, x], d[:, y])
 
 
-def _heights(this: Problem, slabs: list[Slab], one: Solved, z_um: Array) -> tuple[Array, Array]:
+def _heights(
+    this: Problem, slabs: list[Slab], one: Solved, z_um: Array
+) -> tuple[Array, Array]:
     """(nz, n) amplitudes u and w of the waves at every height."""
     ends, heights = edges(this, slabs), 2 * math.pi / this.light.wavelength_um * z_um
     u, w = (np.zeros((len(z_um), len(one.incident)), complex) for _ in range(2))
-    for i, (place, z) in enumerate(zip(places(this, slabs, z_um), heights, strict=True)):
+    for i, (place, z) in enumerate(
+        zip(places(this, slabs, z_um), heights, strict=True)
+    ):
         if 0 < place <= len(slabs):
             part = one.layers[place - 1]
-            up = np.exp(1j * part.q * max(z - ends[place - 1], 0.0)) * one.found.up[place - 1]
+            up = (
+                np.exp(1j * part.q * max(z - ends[place - 1], 0.0))
+                * one.found.up[place - 1]
+            )
             down = np.exp(1j * part.q * (ends[place] - z)) * one.found.down[place - 1]
             u[i], w[i] = part.W @ (up + down), part.V @ (up - down)
         else:
-            u[i], w[i] = _outside(this, one, z - (ends[-1] if place else ends[0]), above=bool(place))
+            u[i], w[i] = _outside(
+                this, one, z - (ends[-1] if place else ends[0]), above=bool(place)
+            )
     return u, w
 
 
-def _outside(this: Problem, one: Solved, z: float, *, above: bool) -> tuple[Array, Array]:
+def _outside(
+    this: Problem, one: Solved, z: float, *, above: bool
+) -> tuple[Array, Array]:
     """u and w in a half-space, z times k0 from the slabs."""
     index = this.media.cover if above else this.media.substrate
     U, V = half_space(one.ways, index)
     kz = normal_component(one.ways.kappa, index)
     if above:
-        up = outgoing((U, V), one.found.u_top, one.found.w_top) * np.exp(1j * kz * max(z, 0.0))
+        up = outgoing((U, V), one.found.u_top, one.found.w_top) * np.exp(
+            1j * kz * max(z, 0.0)
+        )
         return U * up, V * up
     comes = np.flatnonzero(one.incident)
     up = one.incident.copy()
     up[comes] *= np.exp(1j * kz[comes] * z)
-    back = outgoing((U, V), one.found.u - U * one.incident, V * one.incident - one.found.w)
+    back = outgoing(
+        (U, V), one.found.u - U * one.incident, V * one.incident - one.found.w
+    )
     down = back * np.exp(-1j * kz * z)
     return U * (up + down), V * (up - down)
 
 
 class Points:
-    """Sums of orders on points x (nx,) and y (ny,): amplitudes (nz, k), unfolded by the symmetries, to (nz, ny, nx)."""
+    """Sums of orders on points x (nx,) and y (ny,): amplitudes (nz, k), unfolded by the
+    symmetries, to (nz, ny, nx).
+    """
 
     def __init__(
         self,
@@ -183,16 +247,27 @@ class Points:
         reach: tuple[int, int],
         axes_um: tuple[Array, Array],
     ) -> None:
-        k0, periods = 2 * math.pi / this.light.wavelength_um, this.cell.lattice.periods_um(this.cell.pitch_um)
+        k0, periods = (
+            2 * math.pi / this.light.wavelength_um,
+            this.cell.lattice.periods_um(this.cell.pitch_um),
+        )
         self.operations, self.reach = operations, reach
         self.along, self.across = (
-            np.exp(1j * (k0 * k + 2 * np.pi / period * np.arange(-r, r + 1)) * axis[:, None])
-            for k, period, r, axis in zip((this.light.kx, this.light.ky), periods, reach, axes_um, strict=True)
+            np.exp(
+                1j
+                * (k0 * k + 2 * np.pi / period * np.arange(-r, r + 1))
+                * axis[:, None]
+            )
+            for k, period, r, axis in zip(
+                (this.light.kx, this.light.ky), periods, reach, axes_um, strict=True
+            )
         )
 
     def __call__(self, part: mirrors.Set, amplitude: Array) -> Array:
         mx, my = self.reach
         table = np.zeros((len(amplitude), 2 * my + 1, 2 * mx + 1), complex)
         for (sx, sy, _), sign in zip(self.operations, part.signs, strict=True):
-            table[:, sy * part.n + my, sx * part.m + mx] = sign * amplitude / np.sqrt(part.size)
+            table[:, sy * part.n + my, sx * part.m + mx] = (
+                sign * amplitude / np.sqrt(part.size)
+            )
         return np.asarray(self.across @ table @ self.along.T)

@@ -1,4 +1,6 @@
-"""One cell of any shape in one light, as coupled waves take it: tangential wave vector, media, symmetries, waves."""
+"""One cell of any shape in one light, as coupled waves take it: tangential wave vector,
+media, symmetries, waves.
+"""
 
 import math
 from dataclasses import dataclass
@@ -34,7 +36,9 @@ class Tangent:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A cell at one size and light, its media, and the symmetries that its polarisations have."""
+    """A cell at one size and light, its media, and the symmetries that its
+    polarisations have.
+    """
 
     cell: Cell
     size_um: float
@@ -43,11 +47,18 @@ class Problem:
     classes: tuple[tuple[Operation, ...], ...]
 
 
-def problem(cell: Cell, size_um: float, wavelength_um: float, angle_rad: float, azimuth_rad: float) -> Problem:
+def problem(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    angle_rad: float,
+    azimuth_rad: float,
+) -> Problem:
     """Check a cell, its size and its light, and put them together.
 
     Raises:
-        CellError: pillars that touch or lose their outline, an impossible angle, no zero order.
+        CellError: pillars that touch or lose their outline, an impossible angle, no
+            zero order.
         MaterialError: a wavelength outside the range of a material.
     """
     light = tangent(wavelength_um, angle_rad, azimuth_rad)
@@ -61,7 +72,10 @@ def tangent(wavelength_um: float, angle_rad: float, azimuth_rad: float) -> Tange
     check_direction(angle_rad, azimuth_rad)
     sine = math.sin(angle_rad)
     flat = 0.0 if sine == 0 else azimuth_rad
-    kx, ky = (0.0 if abs(v) < _STRAIGHT else v for v in (sine * math.cos(flat), sine * math.sin(flat)))
+    kx, ky = (
+        0.0 if abs(v) < _STRAIGHT else v
+        for v in (sine * math.cos(flat), sine * math.sin(flat))
+    )
     return Tangent(kx, ky, flat, wavelength_um)
 
 
@@ -69,14 +83,20 @@ def media(cell: Cell, light: Tangent) -> Media:
     """Indices of half-spaces and films, thicknesses times k0.
 
     Raises:
-        CellError: no zero order in the substrate. MaterialError: a wavelength outside the range of a material.
+        CellError: no zero order in the substrate. MaterialError: a wavelength outside
+            the range of a material.
     """
     k0 = 2 * math.pi / light.wavelength_um
 
     def films(stack: tuple[Film, ...]) -> tuple[tuple[complex, float], ...]:
-        return tuple((materials.index(f.material, light.wavelength_um), f.thickness_um * k0) for f in stack)
+        return tuple(
+            (materials.index(f.material, light.wavelength_um), f.thickness_um * k0)
+            for f in stack
+        )
 
-    below, above = (materials.index(m, light.wavelength_um) for m in (cell.substrate, cell.cover))
+    below, above = (
+        materials.index(m, light.wavelength_um) for m in (cell.substrate, cell.cover)
+    )
     if below.real <= math.hypot(light.kx, light.ky):
         raise CellError(
             f"sin(angle_rad) = {math.hypot(light.kx, light.ky):.6g} in a substrate of n = {below.real:.6g}: the light "
@@ -85,8 +105,12 @@ def media(cell: Cell, light: Tangent) -> Media:
     return Media(below, above, films(cell.under), films(cell.over))
 
 
-def classes(cell: Cell, size_um: float, light: Tangent) -> tuple[tuple[Operation, ...], ...]:
-    """Sets of operations whose fields together make every polarisation: one set, or one for each polarisation."""
+def classes(
+    cell: Cell, size_um: float, light: Tangent
+) -> tuple[tuple[Operation, ...], ...]:
+    """Sets of operations whose fields together make every polarisation: one set, or one
+    for each polarisation.
+    """
     outline = cell.outline(size_um)
     flip_x = outline.keeps(-1, 1) and light.kx == 0
     flip_y = outline.keeps(1, -1) and light.ky == 0
@@ -97,24 +121,44 @@ def classes(cell: Cell, size_um: float, light: Tangent) -> tuple[tuple[Operation
     if flip_x or flip_y:
         table = FLIP_X if flip_x else FLIP_Y
         return tuple((IDENTITY, table[way]) for way in ("x", "y"))
-    return ((IDENTITY, HALF_TURN),) if outline.keeps(-1, -1) and light.normal else ((IDENTITY,),)
+    return (
+        ((IDENTITY, HALF_TURN),)
+        if outline.keeps(-1, -1) and light.normal
+        else ((IDENTITY,),)
+    )
 
 
-def waves_of(space: mirrors.Orders, cell: Cell, light: Tangent) -> tuple[Waves, dict[int, tuple[int, float]]]:
-    """The waves, and for each polarisation of the basis that this class holds: its place, and its sign there.
+def waves_of(
+    space: mirrors.Orders, cell: Cell, light: Tangent
+) -> tuple[Waves, dict[int, tuple[int, float]]]:
+    """The waves, and for each polarisation of the basis that this class holds: its
+    place, and its sign there.
 
-    At normal incidence the zero order has no Ez or Hz of its own: it is put in front where its set lacks it.
+    At normal incidence the zero order has no Ez or Hz of its own: it is put in front
+    where its set lacks it.
     """
 
     (ex, ey, ez, hz), quarter = _zero_orders(space, light)
     p_in, s_in = (ex, ey) if quarter == 0 else (ey, ex)
-    bare_p, bare_s = (light.normal and p_in and not ez), (light.normal and s_in and not hz)
+    bare_p, bare_s = (
+        (light.normal and p_in and not ez),
+        (light.normal and s_in and not hz),
+    )
     zero = np.zeros(1, int)
-    p_m, p_n = (np.concatenate([zero[: int(bare_p)], v]) for v in (space.ez.m, space.ez.n))
-    s_m, s_n = (np.concatenate([zero[: int(bare_s)], v]) for v in (space.hz.m, space.hz.n))
+    p_m, p_n = (
+        np.concatenate([zero[: int(bare_p)], v]) for v in (space.ez.m, space.ez.n)
+    )
+    s_m, s_n = (
+        np.concatenate([zero[: int(bare_s)], v]) for v in (space.hz.m, space.hz.n)
+    )
     m, n = np.concatenate([p_m, s_m]), np.concatenate([p_n, s_n])
     px, py = cell.lattice.periods_um(cell.pitch_um)
-    k = np.stack([light.kx + light.wavelength_um / px * m, light.ky + light.wavelength_um / py * n])
+    k = np.stack(
+        [
+            light.kx + light.wavelength_um / px * m,
+            light.ky + light.wavelength_um / py * n,
+        ]
+    )
     kappa = np.hypot(*k)
     turn = light.azimuth_rad + quarter * math.pi / 2
     straight = np.array([round(math.cos(turn), 15), round(math.sin(turn), 15)])[:, None]
@@ -139,8 +183,13 @@ def waves_of(space: mirrors.Orders, cell: Cell, light: Tangent) -> tuple[Waves, 
 
 
 def _zero_orders(space: mirrors.Orders, light: Tangent) -> tuple[tuple[bool, ...], int]:
-    """Which of Ex, Ey, Ez, Hz hold the zero order, and whether its p wave lies along y (1) or x (0)."""
-    held = tuple(bool(((s.m == 0) & (s.n == 0)).any()) for s in (space.ex, space.ey, space.ez, space.hz))
+    """Which of Ex, Ey, Ez, Hz hold the zero order, and whether its p wave lies along y
+    (1) or x (0).
+    """
+    held = tuple(
+        bool(((s.m == 0) & (s.n == 0)).any())
+        for s in (space.ex, space.ey, space.ez, space.hz)
+    )
     ex, ey, ez, hz = held
     quarter = 0
     if light.normal:

@@ -1,7 +1,10 @@
-"""Rigorous coupled-wave analysis of one pillar: round on a square lattice by the fast way, any other by ``jones``.
+"""Rigorous coupled-wave analysis of one pillar: round on a square lattice by the fast
+way, any other by ``jones``.
 
-``solve`` gives the zero-order response of one cell with an error estimate, ``solve_many`` shares the work over
-diameters. Light comes from the substrate, phases run from the foot of the pillar (or the outer face of the films under
+``solve`` gives the zero-order response of one cell with an error estimate,
+``solve_many`` shares the work over
+diameters. Light comes from the substrate, phases run from the foot of the pillar (or
+the outer face of the films under
 it) to its top, time factor exp(-iwt).
 """
 
@@ -28,20 +31,27 @@ def solve(
     tolerance: float = 1e-3,
     harmonics: int | None = None,
 ) -> Response:
-    """Zero-order response of a pillar, at the least number of harmonics that meets the tolerance.
+    """Zero-order response of a pillar, at the least number of harmonics that meets the
+    tolerance.
 
     Args:
-        diameter_um: at half height, 0 (no pillar) to the pitch (touching pillars); of another shape its size.
-        angle_rad: of the light outside, in vacuum: its tangential wave vector is k0 sin(angle_rad).
+        diameter_um: at half height, 0 (no pillar) to the pitch (touching pillars); of
+            another shape its size.
+        angle_rad: of the light outside, in vacuum: its tangential wave vector is k0
+            sin(angle_rad).
         azimuth_rad: of the plane of incidence, from +x to +y.
-        polarization: s or p; x and y where the plane of incidence contains an axis. At normal incidence all are
+        polarization: s or p; x and y where the plane of incidence contains an axis. At
+            normal incidence all are
             the same.
-        tolerance: wanted bound of |t - exact|; beyond what the largest truncation reaches, the result comes with its
+        tolerance: wanted bound of |t - exact|; beyond what the largest truncation
+            reaches, the result comes with its
             larger ``t_error`` and ``converged`` False.
         harmonics: fix the largest order instead, and take the estimate there.
 
-    Accuracy: ``t_error`` estimates the truncation, from how t moves between truncations; the number of
-        steps of a tilted wall is chosen likewise. Lossless energy and reciprocity hold to rounding.
+    Accuracy: ``t_error`` estimates the truncation, from how t moves between
+    truncations; the number of
+        steps of a tilted wall is chosen likewise. Lossless energy and reciprocity hold
+        to rounding.
 
     Raises:
         CellError: an impossible diameter, angle, polarisation or tolerance.
@@ -70,16 +80,25 @@ def solve_many(
     tolerance: float = 1e-3,
     harmonics: int | None = None,
 ) -> list[Response]:
-    """As :func:`solve`, for several diameters at once; each stops at its own truncation."""
+    """As :func:`solve`, for several diameters at once; each stops at its own
+    truncation.
+    """
     check_tolerance(tolerance)
     if harmonics is not None and harmonics < 1:
         raise CellError(f"harmonics = {harmonics}: need at least 1")
     diameters = np.array([float(diameter) for diameter in diameter_um])
     for diameter in diameters if cell.round else ():
         check_diameter(cell, float(diameter))
-    light = Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad))
+    light = Light(
+        float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)
+    )
     if not cell.round:
-        return [co_polarised(cell, float(d), light, tolerance=tolerance, harmonics=harmonics) for d in diameters]
+        return [
+            co_polarised(
+                cell, float(d), light, tolerance=tolerance, harmonics=harmonics
+            )
+            for d in diameters
+        ]
     this = case(cell, light)
     return solve_case(this, diameters, tolerance=tolerance, harmonics=harmonics)
 
@@ -94,19 +113,31 @@ def derivatives(
     polarization: Polarization = "x",
     harmonics: int = 9,
 ) -> Derivatives:
-    """Transmission at a fixed truncation, with its exact derivatives in every number of the cell.
+    """Transmission at a fixed truncation, with its exact derivatives in every number of
+    the cell.
 
     Args: as for :func:`solve`.
 
-    Accuracy: rounding (1e-10 of the derivative) with respect to the truncated result; as the result itself with
+    Accuracy: rounding (1e-10 of the derivative) with respect to the truncated result;
+    as the result itself with
         respect to the exact one. A tilted wall is taken in eight steps of fourth order.
 
     Raises:
-        CellError, MaterialError: as :func:`solve`; also where substrate or cover absorb.
+        CellError, MaterialError: as :func:`solve`; also where substrate or cover
+            absorb.
     """
     check_diameter(cell, float(diameter_um))
     if harmonics < 1:
         raise CellError(f"harmonics = {harmonics}: need at least 1")
-    this = case(cell, Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)))
+    this = case(
+        cell,
+        Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)),
+    )
     steps = 8 if cell.sidewall_rad else 0
-    return differentiate(this, float(diameter_um), harmonics=harmonics, steps=steps, angle_rad=float(angle_rad))
+    return differentiate(
+        this,
+        float(diameter_um),
+        harmonics=harmonics,
+        steps=steps,
+        angle_rad=float(angle_rad),
+    )

@@ -1,13 +1,19 @@
-"""A wall that changes with height: u' = i P(z) w, w' = i Q(z) u by Gauss collocation, of high order in z.
+"""A wall that changes with height: u' = i P(z) w, w' = i Q(z) u by Gauss collocation,
+of high order in z.
 
-On a panel of height h with the m Gauss points c_j the derivative is a polynomial through its values there, so with
-a_jk = ∫_0^c_j l_k and b_k = ∫_0^1 l_k (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.7)
+On a panel of height h with the m Gauss points c_j the derivative is a polynomial
+through its values there, so with
+a_jk = ∫_0^c_j l_k and b_k = ∫_0^1 l_k (Hairer, Norsett, Wanner, Solving Ordinary
+Differential Equations I, II.7)
 
     u_j = u_0 + i h Σ a_jk P_k w_k,    w_j = w_0 + i h Σ a_jk Q_k u_k,    (u, w)_1 = (u, w)_0 + h Σ b_k (...)_k:
 
-order 2 m where the waves are resolved, and |R| <= 1 for the stiff ones: those that decay within nanometres live at
-foot and top alone, where panels are short, and follow the others between. (A staircase wakes them at every step: its
-error falls as 1/steps, and grows with the number of harmonics.) P and Q stay symmetric, and Gauss collocation keeps
+order 2 m where the waves are resolved, and |R| <= 1 for the stiff ones: those that
+decay within nanometres live at
+foot and top alone, where panels are short, and follow the others between. (A staircase
+wakes them at every step: its
+error falls as 1/steps, and grows with the number of harmonics.) P and Q stay symmetric,
+and Gauss collocation keeps
 quadratic invariants: power and reciprocity hold to rounding for any number of panels.
 """
 
@@ -20,24 +26,42 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.rcwa.stack import Fields, Pair
 
-Sample = Callable[[float], tuple[Array, Array]]  # P and Q at this share of the height, 0 at the foot
-EDGES = (0.0, 0.025, 0.09, 0.26, 0.5, 0.74, 0.91, 0.975, 1.0)  # of the panels: shorter towards foot and top
+Sample = Callable[
+    [float], tuple[Array, Array]
+]  # P and Q at this share of the height, 0 at the foot
+EDGES = (
+    0.0,
+    0.025,
+    0.09,
+    0.26,
+    0.5,
+    0.74,
+    0.91,
+    0.975,
+    1.0,
+)  # of the panels: shorter towards foot and top
 FIRST, MOST = 4, 10  # stages: 2e-3, 2e-5, 2e-7 of t for 4, 5, 6 and a wall of 0.03 rad
 
 
 @lru_cache(maxsize=8)
 def gauss(stages: int) -> tuple[Array, Array, Array]:
-    """Points c (m,), weights b (m,) and integrals a (m, m) of the Lagrange polynomials on [0, 1]."""
+    """Points c (m,), weights b (m,) and integrals a (m, m) of the Lagrange polynomials
+    on [0, 1].
+    """
     x, w = np.polynomial.legendre.leggauss(stages)
     c = (x + 1) / 2
     powers = np.arange(stages)
-    a = np.linalg.solve(np.vander(c, increasing=True).T, (c[:, None] ** (powers + 1) / (powers + 1)).T).T
+    a = np.linalg.solve(
+        np.vander(c, increasing=True).T, (c[:, None] ** (powers + 1) / (powers + 1)).T
+    ).T
     return c, w / 2, a
 
 
 @dataclass(frozen=True, slots=True)
 class Wall:
-    """One section of a pillar: P and Q at a share of its height, 0 at its foot, and its height times k0."""
+    """One section of a pillar: P and Q at a share of its height, 0 at its foot, and its
+    height times k0.
+    """
 
     sample: Sample
     reduced_height: float
@@ -45,9 +69,11 @@ class Wall:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Panel:
-    """A part of a wall, its unknowns put in: fields at the Gauss points from those at its upper end.
+    """A part of a wall, its unknowns put in: fields at the Gauss points from those at
+    its upper end.
 
-    share: (m,) of the height. step: -i times its reduced height. weights: (m,). P, Q: (m, n, n).
+    share: (m,) of the height. step: -i times its reduced height. weights: (m,). P, Q:
+    (m, n, n).
     u, w: (m n, 2 n) from (u, w) at the upper end.
     """
 
@@ -61,12 +87,19 @@ class Panel:
 
     @property
     def downwards(self) -> Array:
-        """(2 n, 2 n) matrix from the fields (u, w) at the upper end to those at the lower end."""
+        """(2 n, 2 n) matrix from the fields (u, w) at the upper end to those at the
+        lower end.
+        """
         stages, n = self.P.shape[:2]
         both = np.eye(2 * n, dtype=complex)
-        for half, part, field in ((slice(n), self.P, self.w), (slice(n, None), self.Q, self.u)):
+        for half, part, field in (
+            (slice(n), self.P, self.w),
+            (slice(n, None), self.Q, self.u),
+        ):
             inner = field.reshape(stages, n, -1)
-            both[half] += self.step * np.einsum("k,kij,kjl->il", self.weights, part, inner, optimize=True)
+            both[half] += self.step * np.einsum(
+                "k,kij,kjl->il", self.weights, part, inner, optimize=True
+            )
         return both
 
 
@@ -74,23 +107,35 @@ def panel(this: Wall, low: float, high: float, stages: int) -> Panel:
     """The part of a wall between two shares of its height."""
     c, b, a = gauss(stages)
     share = high - c * (high - low)
-    P, Q = (np.stack(part) for part in zip(*(this.sample(float(s)) for s in share), strict=True))
+    P, Q = (
+        np.stack(part)
+        for part in zip(*(this.sample(float(s)) for s in share), strict=True)
+    )
     step = -1j * this.reduced_height * (high - low)
     n = P.shape[-1]
 
     def integrated(part: Array) -> Array:
-        return np.asarray((a[:, None, :, None] * part.transpose(1, 0, 2)[None]).reshape(stages * n, stages * n))
+        return np.asarray(
+            (a[:, None, :, None] * part.transpose(1, 0, 2)[None]).reshape(
+                stages * n, stages * n
+            )
+        )
 
     p, q = integrated(P), integrated(Q)
     start = np.tile(np.eye(n), (stages, 1))
     given = np.concatenate([start, step * (p @ start)], axis=1)
-    u = np.linalg.solve(np.eye(stages * n) - step**2 * (p @ q), given)  # u = u0 + step p w, with w put in
+    u = np.linalg.solve(
+        np.eye(stages * n) - step**2 * (p @ q), given
+    )  # u = u0 + step p w, with w put in
     w = np.concatenate([np.zeros_like(start), start], axis=1) + step * (q @ u)
     return Panel(share, step, b, P, Q, u, w)
 
 
-def match(walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages: int) -> Fields:
-    """Fields that radiate into ``top``, and whose incident part gives foot V u + U w = source; see ``stack.match``.
+def match(
+    walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages: int
+) -> Fields:
+    """Fields that radiate into ``top``, and whose incident part gives foot V u + U w =
+    source; see ``stack.match``.
 
     walls: foot first. stages: Gauss points of every panel.
     """
@@ -110,7 +155,9 @@ def match(walls: Sequence[Wall], top: Pair, foot: Pair, source: Array, *, stages
 
 
 def enough(respond_at: Callable[[int], Array], tolerance: float) -> tuple[int, float]:
-    """Stages that leave less than a tenth of the tolerance, and the error they leave: as the last one changed t."""
+    """Stages that leave less than a tenth of the tolerance, and the error they leave:
+    as the last one changed t.
+    """
     stages, t = FIRST, respond_at(FIRST)
     while True:
         finer = respond_at(stages + 1)

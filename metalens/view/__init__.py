@@ -1,4 +1,6 @@
-"""One self-contained page to explore an artefact: figures that can be turned, their numbers beside them."""
+"""One self-contained page to explore an artefact: figures that can be turned, their
+numbers beside them.
+"""
 
 from typing import TYPE_CHECKING
 

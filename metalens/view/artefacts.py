@@ -1,4 +1,6 @@
-"""Panels of the artefacts of the optics core: library, lens, PSF stack; and of any other HDF5 artefact, plainly."""
+"""Panels of the artefacts of the optics core: library, lens, PSF stack; and of any
+other HDF5 artefact, plainly.
+"""
 
 import dataclasses
 import math
@@ -15,13 +17,26 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import StoreError
 from metalens.pillars import axes
 from metalens.view import standing
-from metalens.view.panels import Axis, Classes, Curves, Images, Numbers, Panel, at_brightest, classes_of
+from metalens.view.panels import (
+    Axis,
+    Classes,
+    Curves,
+    Images,
+    Numbers,
+    Panel,
+    at_brightest,
+    classes_of,
+)
 
-MOST_SAMPLES = 40_000_000  # float32 values of one figure: 160 MB before they are deflated
+MOST_SAMPLES = (
+    40_000_000  # float32 values of one figure: 160 MB before they are deflated
+)
 
 
 def library_panels(path: Path) -> list[Panel]:
-    """t, r and their error bars over every parameter, with the stretches that resonances take."""
+    """t, r and their error bars over every parameter, with the stretches that
+    resonances take.
+    """
     made = libraries.load(path)
     axes = [
         Axis("polarisation", list(made.polarization)),
@@ -30,7 +45,9 @@ def library_panels(path: Path) -> list[Panel]:
     ]
     x, error = 1e3 * made.diameter_um, made.t_error
     phase = np.unwrap(np.angle(made.t), axis=-1)
-    bands = [(1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()]
+    bands = [
+        (1e3 * (d - w), 1e3 * (d + w)) for _, _, _, d, w in made.resonances.tolist()
+    ]
     return [
         Curves(
             "Transmission of the pillar",
@@ -50,18 +67,38 @@ def library_panels(path: Path) -> list[Panel]:
             {"phase": phase / (2 * math.pi)},
             "turns",
             axes,
-            {"phase": np.arcsin(np.minimum(1, error / np.maximum(np.abs(made.t), 1e-12))) / (2 * math.pi)},
+            {
+                "phase": np.arcsin(
+                    np.minimum(1, error / np.maximum(np.abs(made.t), 1e-12))
+                )
+                / (2 * math.pi)
+            },
             bands,
         ),
-        Curves("Error bar of t", x, "diameter / nm", {"error bar": error}, "|t - exact| at most", axes, scale="log"),
+        Curves(
+            "Error bar of t",
+            x,
+            "diameter / nm",
+            {"error bar": error},
+            "|t - exact| at most",
+            axes,
+            scale="log",
+        ),
     ]
 
 
 def axes_panels(path: Path) -> list[Panel]:
-    """Phase, level and error bar over both sizes; what is left out has phase and level 0."""
+    """Phase, level and error bar over both sizes; what is left out has phase and level
+    0.
+    """
     made = axes.load(path)
-    names = [Axis("polarisation", ["x", "y"]), Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm")]
-    own = np.stack([made.t[..., k, k] for k in (0, 1)]).swapaxes(-1, -2)  # the size along x runs to the right
+    names = [
+        Axis("polarisation", ["x", "y"]),
+        Axis("wavelength", (1e3 * made.wavelength_um).tolist(), "nm"),
+    ]
+    own = np.stack([made.t[..., k, k] for k in (0, 1)]).swapaxes(
+        -1, -2
+    )  # the size along x runs to the right
     step = float(made.x_um[1] - made.x_um[0])
     kept = made.usable.swapaxes(-1, -2)
     middle = [1e3 * float(v[0] + v[-1]) / 2 for v in (made.x_um, made.y_um)]
@@ -74,8 +111,25 @@ def axes_panels(path: Path) -> list[Panel]:
     return [
         Images("Phase", turns, names, step, "turns", words),
         Images("Level", np.where(kept, np.abs(own), 0.0), names, step, "|t|", words),
-        Images("Error bar", made.t_error.swapaxes(-1, -2), names[1:], step, "|t - exact| at most", words),
-        Numbers("Pairs held out", ("wavelength", "x / nm", "y / nm", "error of the interpolation", "error bar"), held),
+        Images(
+            "Error bar",
+            made.t_error.swapaxes(-1, -2),
+            names[1:],
+            step,
+            "|t - exact| at most",
+            words,
+        ),
+        Numbers(
+            "Pairs held out",
+            (
+                "wavelength",
+                "x / nm",
+                "y / nm",
+                "error of the interpolation",
+                "error bar",
+            ),
+            held,
+        ),
     ]
 
 
@@ -96,7 +150,8 @@ def lens_panels(path: Path) -> list[Panel]:
             "Diameters. Drag to move, wheel or + and - to zoom: far away the mean over the sites of a pixel is shown, "
             "near by every pillar in its size.",
             {
-                "phase / turns": lens.proxy.phase_rad(sizes, lens.wavelength_um) / (2 * math.pi),
+                "phase / turns": lens.proxy.phase_rad(sizes, lens.wavelength_um)
+                / (2 * math.pi),
                 "|T|": lens.proxy.transmission(sizes, lens.wavelength_um),
             },
         ),
@@ -111,7 +166,13 @@ def _section(diameter: Array, lens: lenses.Lens) -> Curves:
     phase = lens.phase_rad()[len(diameter) // 2]
     x = lens.diameters.x_um[held]
     wrapped = (phase[held] / (2 * math.pi)) % 1
-    return Curves("Phase along the middle row", x, "x / µm", {"phase modulo a turn": wrapped}, "turns")
+    return Curves(
+        "Phase along the middle row",
+        x,
+        "x / µm",
+        {"phase modulo a turn": wrapped},
+        "turns",
+    )
 
 
 def psf_panels(path: Path) -> list[Panel]:
@@ -121,47 +182,69 @@ def psf_panels(path: Path) -> list[Panel]:
 
 
 def lights_panels(path: Path) -> list[Panel]:
-    """The PSF files of a folder, a slider over them: one lens in light of several wavelengths or polarisations.
+    """The PSF files of a folder, a slider over them: one lens in light of several
+    wavelengths or polarisations.
 
     Raises:
-        StoreError: a file that is no PSF stack, or of other depths, angles or samples than the first.
+        StoreError: a file that is no PSF stack, or of other depths, angles or samples
+            than the first.
     """
     files = sorted(path.glob("*.h5"))
     stacks = [psf.load(file) for file in files]
     for file, stack in zip(files, stacks, strict=True):
         for what in ("depths_um", "angles_rad", "step_um"):
             if not np.array_equal(getattr(stack, what), getattr(stacks[0], what)):
-                raise StoreError(f"{file} has other {what} than {files[0].name}: look at them one by one")
+                raise StoreError(
+                    f"{file} has other {what} than {files[0].name}: look at them one by one"
+                )
         if np.shape(stack.intensity) != np.shape(stacks[0].intensity):
-            raise StoreError(f"{file} has other samples than {files[0].name}: look at them one by one")
-    names = [f"{file.stem}, {_light(stack)}" for file, stack in zip(files, stacks, strict=True)]
+            raise StoreError(
+                f"{file} has other samples than {files[0].name}: look at them one by one"
+            )
+    names = [
+        f"{file.stem}, {_light(stack)}"
+        for file, stack in zip(files, stacks, strict=True)
+    ]
     return [*_psfs(stacks, names), _budgets(stacks, names)]
 
 
 def _light(stack: psf.PsfStack) -> str:
     """Its wavelength, or the first and last of a spectrum."""
-    waves = [f"{1e3 * w:.4g}" for w in np.asarray(stack.wavelengths_um)[[0, -1]].tolist()]
+    waves = [
+        f"{1e3 * w:.4g}" for w in np.asarray(stack.wavelengths_um)[[0, -1]].tolist()
+    ]
     return f"{waves[0]} nm" if waves[0] == waves[1] else f"{waves[0]} to {waves[1]} nm"
 
 
 def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
     """Stacks on one grid, with a slider over them where there are several."""
     first = stacks[0]
-    some = slice(None, None, math.ceil(len(stacks) * first.intensity.size / MOST_SAMPLES))  # of the depths
-    values = np.stack([np.asarray(stack.intensity)[..., some, :, :] for stack in stacks])
+    some = slice(
+        None, None, math.ceil(len(stacks) * first.intensity.size / MOST_SAMPLES)
+    )  # of the depths
+    values = np.stack(
+        [np.asarray(stack.intensity)[..., some, :, :] for stack in stacks]
+    )
     energy = np.stack([np.asarray(stack.energy_um2)[..., some] for stack in stacks])
     depth = 1e-3 * first.depths_um[some]
     names = [Axis("depth", depth.tolist(), "mm")]
     if values.ndim >= 5:
-        names.insert(0, Axis("field angle", [_angle(pair) for pair in first.angles_rad]))
+        names.insert(
+            0, Axis("field angle", [_angle(pair) for pair in first.angles_rad])
+        )
     while values.ndim - 3 > len(names):
-        names.insert(0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)]))))
+        names.insert(
+            0, Axis("lens", list(range(values.shape[values.ndim - 3 - len(names)])))
+        )
     if len(stacks) > 1:
         names.insert(0, Axis("light", lights))
     else:
         values, energy = values[0], energy[0]
     peak, names = float(values.max()), at_brightest(names, values)
-    lines = {"peak": values.max(axis=(-2, -1)) / peak, "light in the window": energy / energy.max()}
+    lines = {
+        "peak": values.max(axis=(-2, -1)) / peak,
+        "light in the window": energy / energy.max(),
+    }
     worst = max(stacks, key=lambda stack: stack.error)
     return [
         Images(
@@ -179,9 +262,15 @@ def _psfs(stacks: list[psf.PsfStack], lights: list[str]) -> list[Panel]:
 
 def _budgets(stacks: list[psf.PsfStack], names: list[str]) -> Numbers:
     """The error of the PSFs by cause; what is not known of a cause is a dash."""
-    held = [dataclasses.asdict(stack.budget or psf.Budget(stack.error)) for stack in stacks]
+    held = [
+        dataclasses.asdict(stack.budget or psf.Budget(stack.error)) for stack in stacks
+    ]
     rows = [
-        (report.in_words(cause), *("–" if math.isnan(one[cause]) else one[cause] for one in held)) for cause in held[0]
+        (
+            report.in_words(cause),
+            *("–" if math.isnan(one[cause]) else one[cause] for one in held),
+        )
+        for cause in held[0]
     ]
     words = "Relative L2 error of the intensity that each cause brings; –: not known for this lens."
     return Numbers("Budget of the error", ("cause", *names), rows, words)
@@ -191,22 +280,55 @@ def far_field_panels(path: Path) -> list[Panel]:
     """Light over direction cosines, what cones about the axis hold, and the beams."""
     stored = store.load(path, "far-field")
     held, about = stored.arrays, stored.attributes
-    share, sine, angles = np.asarray(held["share"], float), np.asarray(held["sine"]), held["angles_deg"]
-    step, names = float(sine[1] - sine[0]), [Axis("light from", [_degrees(pair) for pair in angles])]
-    edges = np.degrees(np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1))))
-    beams = [(_degrees(angles[int(i)]), x, y, part) for i, x, y, part in held["beams"].tolist()]
+    share, sine, angles = (
+        np.asarray(held["share"], float),
+        np.asarray(held["sine"]),
+        held["angles_deg"],
+    )
+    step, names = (
+        float(sine[1] - sine[0]),
+        [Axis("light from", [_degrees(pair) for pair in angles])],
+    )
+    edges = np.degrees(
+        np.arcsin(np.minimum(1.0, step * np.arange(1, held["rings"].shape[-1] + 1)))
+    )
+    beams = [
+        (_degrees(angles[int(i)]), x, y, part)
+        for i, x, y, part in held["beams"].tolist()
+    ]
     words = (
         f"Direction cosines along x and y of light of {1e3 * float(about['wavelength_um']):g} nm, in squares "
         f"{step:.3g} wide; relative error {float(np.max(held['error'])):.1e}."
     )
-    passed = ", ".join(f"{_degrees(pair)}: {part:.3f}" for pair, part in zip(angles, held["transmitted"], strict=True))
+    passed = ", ".join(
+        f"{_degrees(pair)}: {part:.3f}"
+        for pair, part in zip(angles, held["transmitted"], strict=True)
+    )
     cone = {"share": np.cumsum(held["rings"], axis=-1)}
     return [
-        Images("Far field", share / share.max(), names, step, "of the brightest", words, across="sine"),
-        Curves(
-            "Light within a cone about the axis", edges, "angle / deg", cone, "share of the light that passes", names
+        Images(
+            "Far field",
+            share / share.max(),
+            names,
+            step,
+            "of the brightest",
+            words,
+            across="sine",
         ),
-        Numbers("Beams", ("light from", "sine x", "sine y", "share"), beams, f"Passes the pillars from {passed}."),
+        Curves(
+            "Light within a cone about the axis",
+            edges,
+            "angle / deg",
+            cone,
+            "share of the light that passes",
+            names,
+        ),
+        Numbers(
+            "Beams",
+            ("light from", "sine x", "sine y", "share"),
+            beams,
+            f"Passes the pillars from {passed}.",
+        ),
     ]
 
 
@@ -214,11 +336,25 @@ def near_field_panels(path: Path) -> list[Panel]:
     """Both cuts and the maps of a pillar's field: |E|, |H| and the parts of E, and the refractive index."""
     stored = store.load(path, "near-field")
     held, about = stored.arrays, stored.attributes
-    step, heights = float(about["step_um"]), Axis("height", (1e3 * held["heights_um"]).tolist(), "nm")
+    step, heights = (
+        float(about["step_um"]),
+        Axis("height", (1e3 * held["heights_um"]).tolist(), "nm"),
+    )
     out: list[Panel] = []
-    for name, title in (("xz", "Along x and z"), ("yz", "Along y and z"), ("xy", "Across, along x and y")):
+    for name, title in (
+        ("xz", "Along x and z"),
+        ("yz", "Along y and z"),
+        ("xy", "Across, along x and y"),
+    ):
         e, h = np.abs(held[f"{name}/e"]), np.abs(held[f"{name}/h"])
-        shown = np.stack([np.sqrt((e**2).sum(axis=0)), *e, np.sqrt((h**2).sum(axis=0)), held[f"{name}/index"].real])
+        shown = np.stack(
+            [
+                np.sqrt((e**2).sum(axis=0)),
+                *e,
+                np.sqrt((h**2).sum(axis=0)),
+                held[f"{name}/index"].real,
+            ]
+        )
         up = shown if name == "xy" else shown[..., ::-1, :]
         parts = Axis("part", ["|E|", "|Ex|", "|Ey|", "|Ez|", "|H|", "index"])
         words = (
@@ -227,7 +363,16 @@ def near_field_panels(path: Path) -> list[Panel]:
         )
         if name != "xy":
             words += f" Light goes upwards; z from {held['z_um'][0]:.4g} to {held['z_um'][-1]:.4g} um, 0 at the foot."
-        out.append(Images(title, up, [parts, heights] if name == "xy" else [parts], step, "", words))
+        out.append(
+            Images(
+                title,
+                up,
+                [parts, heights] if name == "xy" else [parts],
+                step,
+                "",
+                words,
+            )
+        )
     return out
 
 
@@ -245,15 +390,36 @@ def plain_panels(path: Path) -> list[Panel]:
     stored = store.load(path)
     out: list[Panel] = []
     for name, array in sorted(stored.arrays.items()):
-        if array.dtype.kind not in "fiu" or array.size == 0 or array.size > MOST_SAMPLES:
+        if (
+            array.dtype.kind not in "fiu"
+            or array.size == 0
+            or array.size > MOST_SAMPLES
+        ):
             continue
         if array.ndim >= 2 and min(array.shape[-2:]) >= 8:
-            axes = [Axis(f"axis {i}", list(range(n))) for i, n in enumerate(array.shape[:-2])]
-            out.append(Images(name, _finite(array), axes, 1.0, signed=bool(array.min() < 0), across="samples"))
+            axes = [
+                Axis(f"axis {i}", list(range(n)))
+                for i, n in enumerate(array.shape[:-2])
+            ]
+            out.append(
+                Images(
+                    name,
+                    _finite(array),
+                    axes,
+                    1.0,
+                    signed=bool(array.min() < 0),
+                    across="samples",
+                )
+            )
         elif array.ndim == 1 and len(array) >= 8:
-            out.append(Curves(name, np.arange(len(array)), "index", {name: _finite(array)}, ""))
+            out.append(
+                Curves(name, np.arange(len(array)), "index", {name: _finite(array)}, "")
+            )
     rows = [(key, _short(value)) for key, value in sorted(stored.attributes.items())]
-    rows += [(name, f"{a.dtype} {tuple(a.shape)}") for name, a in sorted(stored.arrays.items())]
+    rows += [
+        (name, f"{a.dtype} {tuple(a.shape)}")
+        for name, a in sorted(stored.arrays.items())
+    ]
     return [*out, Numbers("Content", ("name", "value"), rows)]
 
 

@@ -1,4 +1,6 @@
-"""The page: panels as JSON and deflated arrays, with the script and style that show them, in one file."""
+"""The page: panels as JSON and deflated arrays, with the script and style that show
+them, in one file.
+"""
 
 import base64
 import json
@@ -14,16 +16,38 @@ import numpy as np
 from metalens import __version__
 from metalens.ground import store
 from metalens.ground.arrays import Array
-from metalens.view.panels import Axis, Classes, Curves, Drawing, Images, Numbers, Outline, Panel, Points
+from metalens.view.panels import (
+    Axis,
+    Classes,
+    Curves,
+    Drawing,
+    Images,
+    Numbers,
+    Outline,
+    Panel,
+    Points,
+)
 
-DTYPES = {"float32": "Float32Array", "int32": "Int32Array", "uint8": "Uint8Array", "uint16": "Uint16Array"}
+DTYPES = {
+    "float32": "Float32Array",
+    "int32": "Int32Array",
+    "uint8": "Uint8Array",
+    "uint16": "Uint16Array",
+}
 
 
-def write(path: str | Path, title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None) -> None:
+def write(
+    path: str | Path,
+    title: str,
+    panels: Sequence[Panel],
+    *,
+    about: Mapping[str, Any] | None = None,
+) -> None:
     """Write the page.
 
     Args:
-        title: file and kind. panels: in order. about: header and provenance, shown at the end.
+        title: file and kind. panels: in order. about: header and provenance, shown at
+            the end.
 
     Raises:
         OSError: the target cannot be written.
@@ -31,11 +55,17 @@ def write(path: str | Path, title: str, panels: Sequence[Panel], *, about: Mappi
     store.write_text(path, html(title, panels, about=about))
 
 
-def html(title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None) -> str:
+def html(
+    title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None = None
+) -> str:
     """The page as text; no address in it leads out of the file."""
     from jinja2 import Environment
 
-    content = {"title": title, "panels": [_plain(panel) for panel in panels], "about": dict(about or {})}
+    content = {
+        "title": title,
+        "panels": [_plain(panel) for panel in panels],
+        "about": dict(about or {}),
+    }
     template = Environment(autoescape=False).from_string(_data("view.html"))
     return template.render(
         title=title.replace("<", "&lt;"),
@@ -49,11 +79,19 @@ def html(title: str, panels: Sequence[Panel], *, about: Mapping[str, Any] | None
 
 
 def _data(name: str) -> str:
-    return resources.files("metalens").joinpath("data", "view", name).read_text(encoding="utf-8")
+    return (
+        resources.files("metalens")
+        .joinpath("data", "view", name)
+        .read_text(encoding="utf-8")
+    )
 
 
 def _plain(panel: Panel) -> dict[str, Any]:
-    shared = {"type": type(panel).__name__, "title": panel.title, "caption": panel.caption}
+    shared = {
+        "type": type(panel).__name__,
+        "title": panel.title,
+        "caption": panel.caption,
+    }
     if isinstance(panel, Images):
         return shared | {
             "values": packed(np.asarray(panel.values, np.float32)),
@@ -70,8 +108,14 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "x": packed(np.asarray(panel.x, np.float32)),
             "xName": panel.x_name,
             "yName": panel.y_name,
-            "lines": {name: packed(np.asarray(line, np.float32)) for name, line in panel.lines.items()},
-            "errors": {name: packed(np.asarray(line, np.float32)) for name, line in panel.errors.items()},
+            "lines": {
+                name: packed(np.asarray(line, np.float32))
+                for name, line in panel.lines.items()
+            },
+            "errors": {
+                name: packed(np.asarray(line, np.float32))
+                for name, line in panel.errors.items()
+            },
             "axes": [_axis(axis) for axis in panel.axes],
             "bands": [list(band) for band in panel.bands],
             "scale": panel.scale,
@@ -82,7 +126,10 @@ def _plain(panel: Panel) -> dict[str, Any]:
             "sizes": [_number(v) for v in panel.sizes],
             "pitch": panel.pitch_um,
             "unit": panel.unit,
-            "columns": {name: [_number(v) for v in column] for name, column in panel.columns.items()},
+            "columns": {
+                name: [_number(v) for v in column]
+                for name, column in panel.columns.items()
+            },
             "marks": [list(mark) for mark in panel.marks],
         }
     if isinstance(panel, Drawing):
@@ -109,7 +156,9 @@ def _points(panel: Points) -> dict[str, Any]:
 
 
 def _outline(outline: Outline) -> dict[str, Any]:
-    """Places by rising y, then x, as steps: those of a lattice repeat and deflate to a fraction of a byte."""
+    """Places by rising y, then x, as steps: those of a lattice repeat and deflate to a
+    fraction of a byte.
+    """
     places = outline.places[np.lexsort((outline.places[:, 0], outline.places[:, 1]))]
     steps = np.diff(places, axis=0, prepend=np.zeros((1, 2), places.dtype))
     return {
@@ -122,12 +171,21 @@ def _outline(outline: Outline) -> dict[str, Any]:
 
 
 def _table(panel: Numbers) -> dict[str, Any]:
-    return {"head": list(panel.head), "rows": [[_number(v) for v in row] for row in panel.rows]}
+    return {
+        "head": list(panel.head),
+        "rows": [[_number(v) for v in row] for row in panel.rows],
+    }
 
 
 def _axis(axis: Axis) -> dict[str, Any]:
     values = [_number(v) for v in axis.values]
-    return {"name": axis.name, "values": values, "unit": axis.unit, "blink": axis.blink, "first": axis.first}
+    return {
+        "name": axis.name,
+        "values": values,
+        "unit": axis.unit,
+        "blink": axis.blink,
+        "first": axis.first,
+    }
 
 
 def _number(value: Any) -> Any:
@@ -139,7 +197,9 @@ def _number(value: Any) -> Any:
 
 
 def packed(array: Array) -> dict[str, Any]:
-    """An array for the page: type, shape, and its little-endian bytes deflated, in base 64."""
+    """An array for the page: type, shape, and its little-endian bytes deflated, in base
+    64.
+    """
     array = np.ascontiguousarray(array)
     content = zlib.compress(array.astype(array.dtype.newbyteorder("<")).tobytes(), 6)
     return {

@@ -1,4 +1,6 @@
-"""What a page can show: images with sliders, curves, maps of classes, points to pick, numbers. Data, no drawing."""
+"""What a page can show: images with sliders, curves, maps of classes, points to pick,
+numbers. Data, no drawing.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +17,8 @@ from metalens.ground.errors import StoreError
 class Axis:
     """A slider: its name, its values, and their unit.
 
-    blink: steps through its values by itself, on one scale. first: place of the value that is shown at first.
+    blink: steps through its values by itself, on one scale. first: place of the value
+    that is shown at first.
     """
 
     name: str
@@ -28,7 +31,10 @@ class Axis:
 def at_brightest(axes: Sequence[Axis], values: Array) -> list[Axis]:
     """The sliders of images (*axes, y, x), set to the one with the highest peak."""
     places = np.unravel_index(int(values.argmax()), values.shape)
-    return [replace(axis, first=int(place)) for axis, place in zip(axes, places, strict=False)]
+    return [
+        replace(axis, first=int(place))
+        for axis, place in zip(axes, places, strict=False)
+    ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,9 +42,11 @@ class Images:
     """A stack of images, one slider an axis before (y, x).
 
     values: (*axes, y, x) real; shown in single precision.
-    step_um: spacing of the samples; centre at (n-1)/2. across: its unit, where it is no length.
+    step_um: spacing of the samples; centre at (n-1)/2. across: its unit, where it is no
+    length.
     from_least: whether colours begin at the least value in place of zero (depths).
-    unit: of the values. signed: zero has a colour of its own (residuals). optics: MTF and encircled energy are shown.
+    unit: of the values. signed: zero has a colour of its own (residuals). optics: MTF
+    and encircled energy are shown.
     """
 
     title: str
@@ -55,14 +63,17 @@ class Images:
     def __post_init__(self) -> None:
         counts = tuple(len(axis.values) for axis in self.axes)
         if self.values.shape[:-2] != counts:
-            raise StoreError(f"{self.title}: sliders {counts} do not fit images of shape {self.values.shape}")
+            raise StoreError(
+                f"{self.title}: sliders {counts} do not fit images of shape {self.values.shape}"
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Curves:
     """Curves over one axis, one slider for each further one.
 
-    x: (n,). lines: {name: (*axes, n)}; errors: {name of a line: (*axes, n)}, drawn as a band of ± that much.
+    x: (n,). lines: {name: (*axes, n)}; errors: {name of a line: (*axes, n)}, drawn as a
+    band of ± that much.
     bands: (start, stop) stretches of x that are left out.
     """
 
@@ -80,9 +91,11 @@ class Curves:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Classes:
-    """A map of classes on a lattice, every site present: averaged where many share a pixel of the screen.
+    """A map of classes on a lattice, every site present: averaged where many share a
+    pixel of the screen.
 
-    index: (y, x) class of each site, 0 where there is nothing. sizes: (classes,) value of each, from 1.
+    index: (y, x) class of each site, 0 where there is nothing. sizes: (classes,) value
+    of each, from 1.
     columns: further values of each class, shown where the pointer is (dose, datatype).
     marks: (x_um, y_um, text) places with something to say (broken rules).
     """
@@ -98,7 +111,9 @@ class Classes:
 
     def __post_init__(self) -> None:
         if self.index.size and int(self.index.max()) > len(self.sizes):
-            raise StoreError(f"{self.title}: class {int(self.index.max())} of {len(self.sizes)}")
+            raise StoreError(
+                f"{self.title}: class {int(self.index.max())} of {len(self.sizes)}"
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,7 +130,8 @@ class Numbers:
 class Outline:
     """Copies of one polygon, nothing left out.
 
-    layer: name of the layer it is drawn on. corners: (n, 2), places: (m, 2) int32, both in the drawing's unit.
+    layer: name of the layer it is drawn on. corners: (n, 2), places: (m, 2) int32, both
+    in the drawing's unit.
     notes: shown where the pointer is (cell, size, dose).
     """
 
@@ -127,9 +143,11 @@ class Outline:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drawing:
-    """Polygons on layers that can be turned on and off; far away the covered part of a pixel is shown.
+    """Polygons on layers that can be turned on and off; far away the covered part of a
+    pixel is shown.
 
-    unit_um: of corners and places. marks: (x_um, y_um, text) places with something to say (broken rules).
+    unit_um: of corners and places. marks: (x_um, y_um, text) places with something to
+    say (broken rules).
     """
 
     title: str
@@ -141,10 +159,13 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Points:
-    """Points that can be picked, by a click or with the arrow keys; what is known of the picked one is told.
+    """Points that can be picked, by a click or with the arrow keys; what is known of
+    the picked one is told.
 
-    x, y: (n,) finite. groups: (n,) name of each, which gives its colour. front: places of the points that a stepped
-    line joins, by rising x (a Pareto set). notes: (n,) further values of each point by name.
+    x, y: (n,) finite. groups: (n,) name of each, which gives its colour. front: places
+    of the points that a stepped
+    line joins, by rising x (a Pareto set). notes: (n,) further values of each point by
+    name.
     """
 
     title: str
@@ -161,7 +182,9 @@ class Points:
     def __post_init__(self) -> None:
         counts = {len(self.x), len(self.y), len(self.groups), len(self.notes or self.x)}
         if len(counts) > 1 or not all(map(math.isfinite, [*self.x, *self.y])):
-            raise StoreError(f"{self.title}: need as many finite x, finite y, groups and notes, found {sorted(counts)}")
+            raise StoreError(
+                f"{self.title}: need as many finite x, finite y, groups and notes, found {sorted(counts)}"
+            )
 
 
 Panel = Images | Curves | Classes | Drawing | Numbers | Points
@@ -170,7 +193,8 @@ Panel = Images | Curves | Classes | Drawing | Numbers | Points
 def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:
     """(index, sizes) of a map of few distinct positive values; 0 stays 0.
 
-    Where there are more than ``most`` distinct values they are put into ``most`` equal steps (a diameter map in
+    Where there are more than ``most`` distinct values they are put into ``most`` equal
+    steps (a diameter map in
     float64 has as many as it has sites; 65535 steps over 200 nm are 3 pm).
     """
     kinds = np.unique(values[values > 0])
@@ -179,6 +203,8 @@ def classes_of(values: Array, *, most: int = 65535) -> tuple[Array, Array]:
     else:
         low, high = float(kinds[0]), float(kinds[-1])
         step = (high - low) / (most - 1)
-        index = np.where(values > 0, np.rint((values - low) / step).astype(np.int64) + 1, 0)
+        index = np.where(
+            values > 0, np.rint((values - low) / step).astype(np.int64) + 1, 0
+        )
         kinds = low + step * np.arange(most)
     return index.astype(np.uint8 if len(kinds) < 256 else np.uint16), kinds

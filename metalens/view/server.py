@@ -1,4 +1,6 @@
-"""Pages of a file or a folder that grows: served to this machine alone, made anew when what they show has changed."""
+"""Pages of a file or a folder that grows: served to this machine alone, made anew when
+what they show has changed.
+"""
 
 import html
 import os
@@ -16,7 +18,8 @@ Make = Callable[[Path], str]
 HOME, STAMP = "/", "/stamp"
 _EVERY_MS = 2000
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
-# asks whether what the page shows has changed; a page that is being read (a slider in hand) is not torn away
+# asks whether what the page shows has changed; a page that is being read (a slider in
+# hand) is not torn away
 _ASK = """<script>(() => { const at = location.pathname; let held = null;
 setInterval(async () => { try { const now = await (await fetch("/stamp" + at)).text();
 if (held !== null && now !== held && document.visibilityState === "visible") location.reload();
@@ -24,13 +27,16 @@ held = now; } catch {} }, %d); })();</script>"""
 
 
 class Server(ThreadingHTTPServer):
-    """Pages of one artefact, or of every artefact of a folder with a list of them in front.
+    """Pages of one artefact, or of every artefact of a folder with a list of them in
+    front.
 
-    Only this machine can ask (127.0.0.1, and no other name in the request), only what lies in the folder is shown.
+    Only this machine can ask (127.0.0.1, and no other name in the request), only what
+    lies in the folder is shown.
     Pages are kept until their files change.
 
     Args:
-        root: what is shown. make: the page of one artefact. listed: artefacts below the root; none: the root is one.
+        root: what is shown. make: the page of one artefact. listed: artefacts below the
+            root; none: the root is one.
         port: 0 for any that is free.
 
     Raises:
@@ -39,14 +45,18 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, root: Path, make: Make, listed: Callable[[], list[Path]], *, port: int = 0) -> None:
+    def __init__(
+        self, root: Path, make: Make, listed: Callable[[], list[Path]], *, port: int = 0
+    ) -> None:
         self.root, self.make, self.listed = root, make, listed
         self._kept: dict[str, tuple[str, str]] = {}
         self._one = Lock()
         try:
             super().__init__(("127.0.0.1", port), _Handler)
         except (OSError, OverflowError) as error:
-            raise OutputError(f"port {port} cannot be used ({error}); give another --port, or 0 for any") from None
+            raise OutputError(
+                f"port {port} cannot be used ({error}); give another --port, or 0 for any"
+            ) from None
 
     @property
     def address(self) -> str:
@@ -57,11 +67,16 @@ class Server(ThreadingHTTPServer):
         """The artefact that a page's path names; None: there is none."""
         if path == HOME:
             return self.root
-        named = {f"/{_link(one.relative_to(self.root).as_posix())}": one for one in self.listed()}
+        named = {
+            f"/{_link(one.relative_to(self.root).as_posix())}": one
+            for one in self.listed()
+        }
         return named.get(quote(unquote_to_bytes(path)))
 
     def page(self, path: str) -> str | None:
-        """The page of a path, made anew if its files have changed; what cannot be read says why."""
+        """The page of a path, made anew if its files have changed; what cannot be read
+        says why.
+        """
         target = self.target(path)
         if target is None:
             return None
@@ -76,7 +91,9 @@ class Server(ThreadingHTTPServer):
         try:
             body = _list(self.root, listed) if listed else self.make(target)
         except (MetalensError, OSError) as error:
-            body = _plain(target.name, f"<p>cannot be shown now: {html.escape(str(error))}</p>")
+            body = _plain(
+                target.name, f"<p>cannot be shown now: {html.escape(str(error))}</p>"
+            )
         return body.replace("</body>", _ASK % _EVERY_MS + "</body>")
 
 
@@ -125,7 +142,14 @@ def stamp(path: Path) -> str:
     return f"{hash(tuple(seen)):x}"
 
 
-def serve(root: Path, make: Make, listed: Callable[[], list[Path]], *, port: int, ready: Callable[[str], None]) -> None:
+def serve(
+    root: Path,
+    make: Make,
+    listed: Callable[[], list[Path]],
+    *,
+    port: int,
+    ready: Callable[[str], None],
+) -> None:
     """Serve until interrupted.
 
     Args:
@@ -146,8 +170,13 @@ def serve(root: Path, make: Make, listed: Callable[[], list[Path]], *, port: int
 
 def _list(root: Path, listed: list[Path]) -> str:
     names = [one.relative_to(root).as_posix() for one in listed]
-    rows = "".join(f'<li><a href="/{_link(name)}">{html.escape(name)}</a></li>' for name in names)
-    return _plain(root.resolve().name, f"<p>{len(names)} to look at; the page follows the folder.</p><ul>{rows}</ul>")
+    rows = "".join(
+        f'<li><a href="/{_link(name)}">{html.escape(name)}</a></li>' for name in names
+    )
+    return _plain(
+        root.resolve().name,
+        f"<p>{len(names)} to look at; the page follows the folder.</p><ul>{rows}</ul>",
+    )
 
 
 def _link(name: str) -> str:

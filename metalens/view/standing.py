@@ -1,4 +1,6 @@
-"""Pillars that no map of discs on a square grid shows: drawn as they stand, whatever their lattice, shape and turn."""
+"""Pillars that no map of discs on a square grid shows: drawn as they stand, whatever
+their lattice, shape and turn.
+"""
 
 import dataclasses
 import math
@@ -19,7 +21,8 @@ _NM = 1e3
 
 @dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class _Standing:
-    """Pillars one by one: (n,) positions in um (+y up, as on the mask), size, length (0: the shape says it)
+    """Pillars one by one: (n,) positions in um (+y up, as on the mask), size, length
+    (0: the shape says it)
     in whole nm, turn in whole degrees."""
 
     x_um: Array
@@ -34,19 +37,29 @@ class _Standing:
 
 
 def drawn(lens: Lens) -> Drawing:
-    """Every pillar's outline where it stands, coloured by its size, or by its turn where pillars are turned."""
+    """Every pillar's outline where it stands, coloured by its size, or by its turn
+    where pillars are turned.
+    """
     this, whole = _standing(lens)
     kinds, place = this.kinds
     what, unit = (2, "deg") if lens.diameters.angle_rad is not None else (0, "nm")
     named = _bands(kinds[:, what], unit)
     at = np.rint(_NM * np.stack([this.x_um, this.y_um], axis=1)).astype(np.int32)
     order = np.argsort(place, kind="stable")
-    parts = np.split(at[order], np.cumsum(np.bincount(place, minlength=len(kinds)))[:-1])
+    parts = np.split(
+        at[order], np.cumsum(np.bincount(place, minlength=len(kinds)))[:-1]
+    )
     outlines = []
-    for (size, length, turn), places, name in zip(kinds.tolist(), parts, named, strict=True):
+    for (size, length, turn), places, name in zip(
+        kinds.tolist(), parts, named, strict=True
+    ):
         notes = {"size / nm": size} | ({"length / nm": length} if length else {})
         corners = _NM * _corners(lens, size / _NM, length / _NM, math.radians(turn))
-        outlines.append(Outline(name, corners, places, notes | ({"turn / deg": turn} if what else {})))
+        outlines.append(
+            Outline(
+                name, corners, places, notes | ({"turn / deg": turn} if what else {})
+            )
+        )
     text = (
         f"{len(at):,} pillars, each a {lens.cell.shape.name} where it stands, +y of the lens up, as on the mask"
         f"{'' if whole else ' (the middle of a larger lens)'}. Drag to move, wheel or + and - to zoom."
@@ -59,20 +72,32 @@ def phase(lens: Lens) -> Images:
     d = lens.diameters
     edge = max(d.x_um[-1] - d.x_um[0], d.y_um[-1] - d.y_um[0], d.pitch_um)
     step = max(edge / _PIXELS, min(d.steps_um))
-    y, x = (np.arange(-math.ceil(end / step), math.ceil(end / step) + 1) * step for end in (d.y_um[-1], d.x_um[-1]))
+    y, x = (
+        np.arange(-math.ceil(end / step), math.ceil(end / step) + 1) * step
+        for end in (d.y_um[-1], d.x_um[-1])
+    )
     row, column = nearest(d, y[:, None], x[None])
     seen = [lens] if lens.pairs is None else [lens.seen("x"), lens.seen("y")]
-    values = np.stack([np.mod(one.phase_rad()[row, column] / (2 * np.pi), 1) for one in seen])
+    values = np.stack(
+        [np.mod(one.phase_rad()[row, column] / (2 * np.pi), 1) for one in seen]
+    )
     values = np.where(d.diameter_um[row, column] > 0, values, 0.0)
     names = [lens.hand or "any"] if lens.pairs is None else ["along x", "along y"]
     return Images("Phase", values, [Axis("light", names)], step, "turns, modulo one")
 
 
 def nearest(d: DiameterMap, y_um: Array, x_um: Array) -> tuple[Array, Array]:
-    """(row, column) of the site of the lattice nearest to places; a hexagonal one is two rectangular ones."""
+    """(row, column) of the site of the lattice nearest to places; a hexagonal one is
+    two rectangular ones.
+    """
     step = 2 if d.lattice.centred else 1
-    found = [(_place(d, 0, y_um, start, step), _place(d, 1, x_um, start, step)) for start in range(step)]
-    away = [np.hypot(d.y_um[row] - y_um, d.x_um[column] - x_um) for row, column in found]
+    found = [
+        (_place(d, 0, y_um, start, step), _place(d, 1, x_um, start, step))
+        for start in range(step)
+    ]
+    away = [
+        np.hypot(d.y_um[row] - y_um, d.x_um[column] - x_um) for row, column in found
+    ]
     best = np.argmin(np.broadcast_arrays(*away), axis=0)
     rows, columns = (np.choose(best, [pair[k] for pair in found]) for k in (0, 1))
     return rows, columns
@@ -95,13 +120,17 @@ def _standing(lens: Lens) -> tuple[_Standing, bool]:
         reach = math.sqrt(MOST_DRAWN * d.site_um2) / 2
         kept = (np.abs(d.y_um[rows]) <= reach) & (np.abs(d.x_um[columns]) <= reach)
         rows, columns = rows[kept], columns[kept]
-    size = np.rint(_NM * np.asarray(d.diameter_um)[rows, columns].astype(float)).astype(int)
+    size = np.rint(_NM * np.asarray(d.diameter_um)[rows, columns].astype(float)).astype(
+        int
+    )
     turn, length = np.zeros((2, len(size)), int)
     if d.length_um is not None:
         length = np.rint(_NM * d.length_um[rows, columns].astype(float)).astype(int)
     if d.angle_rad is not None:
         turn = np.rint(np.degrees(d.angle_rad[rows, columns].astype(float))).astype(int)
-    return _Standing(d.x_um[columns], d.y_um[rows], np.stack([size, length, turn], axis=1)), whole
+    return _Standing(
+        d.x_um[columns], d.y_um[rows], np.stack([size, length, turn], axis=1)
+    ), whole
 
 
 def _corners(lens: Lens, size_um: float, length_um: float, turn_rad: float) -> Array:
@@ -117,7 +146,12 @@ def _bands(values: Array, unit: str) -> list[str]:
     """The band of each value, by name, padded so that names sort as numbers."""
     low, high = int(values.min()), int(values.max())
     edges = np.unique(np.rint(np.linspace(low, high + 1, BANDS + 1)).astype(int))
-    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2))
+    place = np.clip(
+        np.searchsorted(edges, values, side="right") - 1, 0, max(0, len(edges) - 2)
+    )
     digits = len(str(high))
-    ends = [(int(edges[i]), max(int(edges[i + 1]) - 1, int(edges[i]))) for i in range(max(1, len(edges) - 1))]
+    ends = [
+        (int(edges[i]), max(int(edges[i + 1]) - 1, int(edges[i])))
+        for i in range(max(1, len(edges) - 1))
+    ]
     return [f"{ends[i][0]:0{digits}} to {ends[i][1]:0{digits}} {unit}" for i in place]

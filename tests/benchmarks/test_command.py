@@ -34,11 +34,17 @@ def test_what_takes_long_is_a_topic():
 
 def test_rows_are_told_with_their_error():
     told = table(
-        [Row("case", "method", 0.0123, 2.5e-4, "exact sum", 2, 17.6, "<= 1"), Row("b", "c", 1.0, float("nan"), "-")]
+        [
+            Row("case", "method", 0.0123, 2.5e-4, "exact sum", 2, 17.6, "<= 1"),
+            Row("b", "c", 1.0, float("nan"), "-"),
+        ]
     )
     head, one, other = told.splitlines()
     assert one.endswith(" <= 1")
-    assert [one[head.index(word) :].split()[0] for word in ("threads", "time/ms", "peak/MB", "error")] == [
+    assert [
+        one[head.index(word) :].split()[0]
+        for word in ("threads", "time/ms", "peak/MB", "error")
+    ] == [
         "2",
         "12.3",
         "18",
@@ -47,7 +53,9 @@ def test_rows_are_told_with_their_error():
     assert other[head.index("error") :].split() == ["-", "-"]
 
 
-def test_rows_made_anew_are_told_beside_the_stored_ones_of_their_case_and_method(tmp_path):
+def test_rows_made_anew_are_told_beside_the_stored_ones_of_their_case_and_method(
+    tmp_path,
+):
     old = [
         Row("lens", "fast", 2.0, 1e-3, "sum"),
         Row("lens", "fast", 4.0, float("nan"), "-"),
@@ -55,7 +63,11 @@ def test_rows_made_anew_are_told_beside_the_stored_ones_of_their_case_and_method
     ]
     path = tmp_path / "topic.json"
     path.write_text(json.dumps({"rows": [asdict(row) for row in old]}))
-    new = [replace(old[0], seconds=5.0, error=1.5e-3), replace(old[1], seconds=3.0), replace(old[0], method="slow")]
+    new = [
+        replace(old[0], seconds=5.0, error=1.5e-3),
+        replace(old[1], seconds=3.0),
+        replace(old[0], method="slow"),
+    ]
     assert compared(path, new).splitlines() == [
         "lens, fast: time x2.5, error x1.5",
         "lens, fast: time x0.75, error -",

@@ -1,4 +1,6 @@
-"""Every figure of the README's table and of its sentences comes from a file of benchmarks/results."""
+"""Every figure of the README's table and of its sentences comes from a file of
+benchmarks/results.
+"""
 
 import json
 import re
@@ -8,11 +10,22 @@ import pytest
 from benchmarks import figures
 
 # what was asked, not what was measured
-SETTINGS = ("225 terms", "160²", "400²", "within 1e-3", "float64", "1 mm mask", "at 1 %", "at 0.2 %")
+SETTINGS = (
+    "225 terms",
+    "160²",
+    "400²",
+    "within 1e-3",
+    "float64",
+    "1 mm mask",
+    "at 1 %",
+    "at 0.2 %",
+)
 
 
 def test_the_table_of_the_readme_is_what_the_result_files_say():
-    assert figures.table() in figures.README.read_text(encoding="utf-8"), "run python -m benchmarks.figures"
+    assert figures.table() in figures.README.read_text(encoding="utf-8"), (
+        "run python -m benchmarks.figures"
+    )
 
 
 @pytest.mark.parametrize("sentence", figures.SENTENCES)
@@ -43,12 +56,26 @@ def test_no_time_and_no_error_of_the_table_is_typed_by_hand():
         (0.01644, "rate", "61"),
     ],
 )
-def test_a_figure_is_written_with_the_digits_asked_for(tmp_path, monkeypatch, value, form, written):
-    row = {"case": "lens", "method": "fit", "against": "", "goal": "7 of 9", "threads": 3, "error": value}
+def test_a_figure_is_written_with_the_digits_asked_for(
+    tmp_path, monkeypatch, value, form, written
+):
+    row = {
+        "case": "lens",
+        "method": "fit",
+        "against": "",
+        "goal": "7 of 9",
+        "threads": 3,
+        "error": value,
+    }
     other = row | {"method": "fit, with gradient", "error": -1.0}
-    (tmp_path / "made.json").write_text(json.dumps({"rows": [row, other]}), encoding="utf-8")
+    (tmp_path / "made.json").write_text(
+        json.dumps({"rows": [row, other]}), encoding="utf-8"
+    )
     monkeypatch.setattr(figures, "RESULTS", tmp_path)
-    assert figures.filled(f"x {{made; lens & fit & 3 threads; error; {form}}} y") == f"x {written} y"
+    assert (
+        figures.filled(f"x {{made; lens & fit & 3 threads; error; {form}}} y")
+        == f"x {written} y"
+    )
     assert figures.filled("{made; fit, with; (\\d+) of; text}") == "7"
     with pytest.raises(LookupError, match="has 0 rows"):
         figures.filled("{made; mask; error; 2}")

@@ -1,4 +1,6 @@
-"""Low-rank PSF fields: the certificate is the truth, the rank is that of the stack, gradients pass."""
+"""Low-rank PSF fields: the certificate is the truth, the rank is that of the stack,
+gradients pass.
+"""
 
 import numpy as np
 import pytest
@@ -36,10 +38,14 @@ def stack(depths, angles=0.0, n=96, as_torch=False):
 def test_every_psf_is_within_tolerance_and_errors_are_measured(tolerance):
     made, _ = stack(np.linspace(900, 2500, 12))
     found = lowrank.compress(made, tolerance=tolerance)
-    error = np.linalg.norm(found.psf() - made.intensity, axis=(1, 2)) / np.linalg.norm(made.intensity, axis=(1, 2))
+    error = np.linalg.norm(found.psf() - made.intensity, axis=(1, 2)) / np.linalg.norm(
+        made.intensity, axis=(1, 2)
+    )
     assert found.errors == pytest.approx(error, rel=1e-6, abs=1e-14)
     assert error.max() <= tolerance
-    whole = np.linalg.norm(found.psf() - made.intensity) / np.linalg.norm(made.intensity)
+    whole = np.linalg.norm(found.psf() - made.intensity) / np.linalg.norm(
+        made.intensity
+    )
     assert found.error == pytest.approx(whole, rel=1e-6, abs=1e-14)
 
 
@@ -62,13 +68,19 @@ def test_field_angles_share_the_basis():
 
 def test_gradient_of_the_compressed_stack_is_that_of_the_stack_within_its_span():
     made, phase = stack(np.linspace(900, 2500, 8), as_torch=True)
-    weight = torch.rand(made.intensity.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = torch.rand(
+        made.intensity.shape,
+        generator=torch.Generator().manual_seed(0),
+        dtype=torch.float64,
+    )
     compressed = lowrank.compress(made, tolerance=1e-12).psf()
     (got,) = torch.autograd.grad((compressed * weight).sum(), phase, retain_graph=True)
     basis = lowrank.compress(made, tolerance=1e-12).basis.flatten(1)
     inside = (weight.flatten(1) @ basis.T @ basis).view_as(weight)
     (exact,) = torch.autograd.grad((made.intensity * inside).sum(), phase)
-    assert torch.allclose(got, exact, atol=1e-12 * float(exact.abs().max()) + 1e-18, rtol=1e-8)
+    assert torch.allclose(
+        got, exact, atol=1e-12 * float(exact.abs().max()) + 1e-18, rtol=1e-8
+    )
 
 
 def test_a_tolerance_of_zero_is_refused():

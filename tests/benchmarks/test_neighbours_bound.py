@@ -1,4 +1,6 @@
-"""The share by which zones that get shorter change less is what the lenses solved whole show at most."""
+"""The share by which zones that get shorter change less is what the lenses solved whole
+show at most.
+"""
 
 import json
 import re
@@ -12,7 +14,9 @@ RESULT = Path(__file__).parents[2] / "benchmarks" / "results" / "neighbours.json
 
 
 def test_the_share_is_the_largest_that_was_found():
-    """Error of the predicted power in the focus over what unlike neighbours take of it; of four cuts."""
+    """Error of the predicted power in the focus over what unlike neighbours take of it;
+    of four cuts.
+    """
     shares = []
     for row in json.loads(RESULT.read_text(encoding="utf-8"))["rows"]:
         without = re.search(r"without: ([0-9.]+)", row["against"])

@@ -12,7 +12,10 @@ K = 2 * np.pi / 0.85
 
 def radial(radius, distance, source, taper=0.0):
     def phase(r):
-        return -K * (r * r / (np.hypot(r, distance) + distance) + r * r / (np.hypot(r, source) + source))
+        return -K * (
+            r * r / (np.hypot(r, distance) + distance)
+            + r * r / (np.hypot(r, source) + source)
+        )
 
     return Radial(phase, lambda r: np.exp(-taper * (r / radius) ** 2), radius)
 
@@ -30,22 +33,33 @@ def test_agrees_with_the_pixelated_lens_and_says_how_well(n):
         samples=16,
     )
     got = field_radial(lens, case, 1e-5)
-    a, b = (np.abs(f) ** 2 for f in (got.field, propagate.field_exact(*lens.maps(case.shape, 0.4), case)))
+    a, b = (
+        np.abs(f) ** 2
+        for f in (got.field, propagate.field_exact(*lens.maps(case.shape, 0.4), case))
+    )
     a, b = (i / i.sum((1, 2), keepdims=True) for i in (a, b))
     error = np.linalg.norm(a - b) / np.linalg.norm(b)
     assert error < 1e-3
-    assert error < got.error < 5 * error  # a rough rim of 350 cells, judged at a few samples
+    assert (
+        error < got.error < 5 * error
+    )  # a rough rim of 350 cells, judged at a few samples
 
 
 @pytest.mark.parametrize(
     ("radius", "n", "depths_um", "distance"),
-    [(50.0, 252, [2500.0, np.inf], 200.0), (50.0, 252, [2500.0, np.inf], 120.0), (100.0, 502, [2500.0, np.inf], 400.0)],
+    [
+        (50.0, 252, [2500.0, np.inf], 200.0),
+        (50.0, 252, [2500.0, np.inf], 120.0),
+        (100.0, 502, [2500.0, np.inf], 400.0),
+    ],
 )
 @pytest.mark.parametrize("samples", [16, 32])
 def test_the_estimate_is_never_below_the_error_where_the_rim_scatters_beyond_the_band(
     radius, n, depths_um, distance, samples
 ):
-    """Depths out of focus, whose light lies far from the axis: what the rim scatters counts most."""
+    """Depths out of focus, whose light lies far from the axis: what the rim scatters
+    counts most.
+    """
     lens = radial(radius, distance, 2000.0)
     case = propagate.case(
         (n, n),
@@ -57,7 +71,10 @@ def test_the_estimate_is_never_below_the_error_where_the_rim_scatters_beyond_the
         samples=samples,
     )
     got = field_radial(lens, case, 1e-5)
-    a, b = (np.abs(f) ** 2 for f in (got.field, propagate.field_exact(*lens.maps(case.shape, 0.4), case)))
+    a, b = (
+        np.abs(f) ** 2
+        for f in (got.field, propagate.field_exact(*lens.maps(case.shape, 0.4), case))
+    )
     a, b = (i / i.sum((1, 2), keepdims=True) for i in (a, b))
     error = np.linalg.norm(a - b) / np.linalg.norm(b)
     assert error <= got.error <= 3 * error

@@ -1,4 +1,6 @@
-"""A small lens with a hand-made proxy, and captures of it on the virtual bench; shared by the tests beside it."""
+"""A small lens with a hand-made proxy, and captures of it on the virtual bench; shared
+by the tests beside it.
+"""
 
 import dataclasses
 import functools
@@ -57,30 +59,55 @@ def proxy() -> Proxy:
 
 @functools.lru_cache
 def lens(strength_rad: float = 0.0) -> Lens:
-    """A hyperbolic lens of 40 um, with a cubic term on top where ``strength_rad`` is not 0."""
+    """A hyperbolic lens of 40 um, with a cubic term on top where ``strength_rad`` is
+    not 0.
+    """
     focus = profiles.Focus(0.85, 110.0, 600.0)
     shape = profiles.Cubic(strength_rad) if strength_rad else None
     return design.make(
-        design.phase_of(shape, focus, radius_um=20.0), focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=proxy()
+        design.phase_of(shape, focus, radius_um=20.0),
+        focus,
+        aperture_um=40.0,
+        cell=Cell(pitch_um=0.4),
+        proxy=proxy(),
     )[0]
 
 
-GLASS = Layers(behind=(Film(Index(1.4), 245.0),))  # Σ t / n from the pillars is 70 um less than the distance
+GLASS = Layers(
+    behind=(Film(Index(1.4), 245.0),)
+)  # Σ t / n from the pillars is 70 um less than the distance
 
 
 def row(radius_um: float = 20.0, **more: object) -> Lens:
-    """One row of equal pillars from rim to rim, for what asks a lens for its radius, distances and films alone."""
+    """One row of equal pillars from rim to rim, for what asks a lens for its radius,
+    distances and films alone.
+    """
     n = round(radius_um / 0.2) + 1
     across = DiameterMap(np.full((1, n), 0.2), 2 * radius_um / (n - 1))
-    usual = {"diameters": across, "cell": Cell(across.pitch_um), "proxy": proxy(), "wavelength_um": 0.85}
-    usual |= {"sensor_distance_um": 110.0, "source_distance_um": 600.0, "profile": "hyperbolic"}
+    usual = {
+        "diameters": across,
+        "cell": Cell(across.pitch_um),
+        "proxy": proxy(),
+        "wavelength_um": 0.85,
+    }
+    usual |= {
+        "sensor_distance_um": 110.0,
+        "source_distance_um": 600.0,
+        "profile": "hyperbolic",
+    }
     return Lens(**(usual | more))
 
 
 def truth(peak_e: float = 6000.0, seed: int = 0, **more: float) -> Truth:
     """The hidden lens and its bench."""
     known = tuple(Known(name, value) for name, value in (VALUES | more).items())
-    return Truth(DEPTHS, peak_e=peak_e, parameter=known, camera=Camera(pixel_um=1.5, pixels=16), seed=seed)
+    return Truth(
+        DEPTHS,
+        peak_e=peak_e,
+        parameter=known,
+        camera=Camera(pixel_um=1.5, pixels=16),
+        seed=seed,
+    )
 
 
 @functools.lru_cache
@@ -90,17 +117,31 @@ def light(strength_rad: float = 0.0, **more: float) -> np.ndarray:
 
 
 def counts(
-    electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf
+    electrons: np.ndarray,
+    *,
+    seed: int = 0,
+    read_noise_e: float = 2.0,
+    full_well: float = math.inf,
 ) -> np.ndarray:
-    """(n, y, x) counts of 12 bits of expected electrons: shot and read noise, 2 e a count, offset 64."""
+    """(n, y, x) counts of 12 bits of expected electrons: shot and read noise, 2 e a
+    count, offset 64.
+    """
     random = np.random.default_rng(seed)
     seen = np.minimum(
-        random.poisson(np.maximum(electrons, 0)) + random.normal(0, read_noise_e, electrons.shape), full_well
+        random.poisson(np.maximum(electrons, 0))
+        + random.normal(0, read_noise_e, electrons.shape),
+        full_well,
     )
     return np.clip(np.round(seen / 2.0 + 64), 0, 4095).astype(np.uint16)
 
 
-def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, full_well: float = math.inf) -> Capture:
+def capture(
+    electrons: np.ndarray,
+    *,
+    seed: int = 0,
+    read_noise_e: float = 2.0,
+    full_well: float = math.inf,
+) -> Capture:
     """Noise on expected electrons, read out at 2 e a count with stated gain and offset."""
     read = counts(electrons, seed=seed, read_noise_e=read_noise_e, full_well=full_well)
     n = len(read)
@@ -117,22 +158,43 @@ def capture(electrons: np.ndarray, *, seed: int = 0, read_noise_e: float = 2.0, 
     )
 
 
-def electrons(peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float) -> np.ndarray:
+def electrons(
+    peak_e: float = 6000.0, strength_rad: float = 0.0, **more: float
+) -> np.ndarray:
     """Expected electrons of the hidden lens."""
     bright = light(strength_rad, **more)
     return bright * (peak_e / bright.max()) + bench.background(truth(**more))
 
 
-def near_focus(depths_um: tuple[float, ...], **values: float) -> tuple[Data, ForwardModel]:
-    """Frames of a lens of these parameters with 6000 electrons at the peak and a floor of 9 e², and their model."""
+def near_focus(
+    depths_um: tuple[float, ...], **values: float
+) -> tuple[Data, ForwardModel]:
+    """Frames of a lens of these parameters with 6000 electrons at the peak and a floor
+    of 9 e², and their model.
+    """
     known = tuple(Known(name, value) for name, value in values.items())
-    hidden = Truth(depths_um, peak_e=6000.0, parameter=known, camera=Camera(pixel_um=1.5, pixels=16))
+    hidden = Truth(
+        depths_um,
+        peak_e=6000.0,
+        parameter=known,
+        camera=Camera(pixel_um=1.5, pixels=16),
+    )
     electrons = bench.irradiance(lens(), hidden, RESPONSE)
     electrons = electrons * (6000.0 / electrons.max())
     electrons = electrons + np.random.default_rng(8).normal(0, np.sqrt(electrons + 9))
     everywhere, n = np.ones(electrons.shape, bool), len(depths_um)
-    data = Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
-    return data, ForwardModel(lens(), Setting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16), RESPONSE)
+    data = Data(
+        electrons,
+        everywhere,
+        ~everywhere,
+        np.full(electrons.shape, 9.0),
+        np.ones(electrons.shape),
+    )
+    return data, ForwardModel(
+        lens(),
+        Setting(np.array(depths_um), np.zeros((n, 2)), np.ones(n), 1.5, 16, 16),
+        RESPONSE,
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -143,10 +205,22 @@ class Given(Task):
     prior: Prior | None = None
 
 
-def given(model: object, frames: np.ndarray, noise: float, names: tuple[str, ...], prior: Prior) -> Given:
+def given(
+    model: object,
+    frames: np.ndarray,
+    noise: float,
+    names: tuple[str, ...],
+    prior: Prior,
+) -> Given:
     """Frames with the same noise in every pixel, and a stand-in for the model."""
     everywhere = np.ones(frames.shape, bool)
-    data = Data(frames, everywhere, ~everywhere, np.full(frames.shape, noise**2), np.full(frames.shape, 1e15))
+    data = Data(
+        frames,
+        everywhere,
+        ~everywhere,
+        np.full(frames.shape, noise**2),
+        np.full(frames.shape, 1e15),
+    )
     return Given(model, data, np.zeros(len(NAMES)), {}, None, names=names, prior=prior)
 
 
@@ -158,14 +232,30 @@ def with_a_moved_frame(shots: Capture) -> Capture:
 
 
 def found_again(made: Lens) -> tuple[AsBuilt, dict[str, float], dict[str, float]]:
-    """The fit of a lens to frames of the hidden one by the engine that designs; what it is off in standard deviations
+    """The fit of a lens to frames of the hidden one by the engine that designs; what it
+    is off in standard deviations
     of the model, and these, by name."""
     hidden = truth(peak_e=6000.0)
     light = bench.irradiance(made, hidden, RESPONSE)
     frames = capture(light * (6000.0 / light.max()) + bench.background(hidden))
-    found = fit(frames, made, Options(scan_um=60.0), response=dataclasses.replace(RESPONSE, error=0.08))
-    names = [name for name in found.names if name in VALUES and not name.startswith("background")]
+    found = fit(
+        frames,
+        made,
+        Options(scan_um=60.0),
+        response=dataclasses.replace(RESPONSE, error=0.08),
+    )
+    names = [
+        name
+        for name in found.names
+        if name in VALUES and not name.startswith("background")
+    ]
     places = [found.names.index(name) for name in names]
-    sigma = {name: float(np.sqrt(found.within_covariance[i, i])) for name, i in zip(names, places, strict=True)}
-    off = {name: (found.value[i] - VALUES[name]) / sigma[name] for name, i in zip(names, places, strict=True)}
+    sigma = {
+        name: float(np.sqrt(found.within_covariance[i, i]))
+        for name, i in zip(names, places, strict=True)
+    }
+    off = {
+        name: (found.value[i] - VALUES[name]) / sigma[name]
+        for name, i in zip(names, places, strict=True)
+    }
     return found, off, sigma

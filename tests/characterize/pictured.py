@@ -1,4 +1,6 @@
-"""What a fit asks of a model, for toys of a few pictures: frames by index, rough and quick forms of it."""
+"""What a fit asks of a model, for toys of a few pictures: frames by index, rough and
+quick forms of it.
+"""
 
 from types import SimpleNamespace
 
@@ -10,12 +12,16 @@ DEPTH = np.array([31e3, 22e3, 27e3, 24e3, 29e3])
 
 
 class Pictured:
-    """Frames of 4 x 3 pixels at five depths; a quick one sees a hundredth less of all, as one term of a field would."""
+    """Frames of 4 x 3 pixels at five depths; a quick one sees a hundredth less of all,
+    as one term of a field would.
+    """
 
     def __init__(self, index=None, seen=1.0):
         self.seen = seen
         self.index = index = np.arange(5) if index is None else index
-        self.setting = Setting(DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3)
+        self.setting = Setting(
+            DEPTH[index], np.zeros((len(index), 2)), np.ones(len(index)), 1.7, 4, 3
+        )
         self.groups = [SimpleNamespace(index=np.arange(len(index)))]
 
     def only(self, index):

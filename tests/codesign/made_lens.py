@@ -1,4 +1,6 @@
-"""A small lens, a fit of it written down by hand, and a finished run of it; shared by the tests beside it."""
+"""A small lens, a fit of it written down by hand, and a finished run of it; shared by
+the tests beside it.
+"""
 
 import functools
 import json
@@ -20,10 +22,25 @@ from metalens.ground.store import Provenance
 from metalens.made import sensitivity
 from metalens.pillars.proxy import Proxy
 
-# phase of 3 turns over the domain, with a wavelength so that a change of it is felt; |T| of 0.9 that varies a little
-PROXY = Proxy(np.array([[6.0, 3 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+# phase of 3 turns over the domain, with a wavelength so that a change of it is felt;
+# |T| of 0.9 that varies a little
+PROXY = Proxy(
+    np.array([[6.0, 3 * math.pi]]),
+    np.array([[0.9, -0.03]]),
+    (0.08, 0.32),
+    (0.85, 0.85),
+    1e-6,
+    1e-6,
+)
 CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
-TRUE = {"bias_nm": 6.0, "bias_x_nm": 4.0, "bias_r_nm": 3.0, "height_nm": -8.0, "distance_um": 3.0, "coma_x_rad": 0.2}
+TRUE = {
+    "bias_nm": 6.0,
+    "bias_x_nm": 4.0,
+    "bias_r_nm": 3.0,
+    "height_nm": -8.0,
+    "distance_um": 3.0,
+    "coma_x_rad": 0.2,
+}
 TINY = """
 preset = "smoke"
 validation_batches = 1
@@ -57,7 +74,9 @@ depths = [2]
 budgets_mmacs = [2.0]
 pitch_um = 3.0
 """
-OPTICS = OpticsConfig(0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11, image="uniform")
+OPTICS = OpticsConfig(
+    0.12, 0.3, 850.0, 3.0, 0, 0, (2.0, 6.0), 3, 3.0, 11, image="uniform"
+)
 SEEN = replace(OPTICS, depths_mm=(12.0, 40.0))  # of TINY, where eyes are
 
 
@@ -98,12 +117,20 @@ def asbuilt(problems=(), sigma=0.1, made=None) -> AsBuilt:
 
 
 def finished_baseline(folder, network="nvgaze"):
-    """The files of a run of somebody else's network, untrained: one row, no budget, no architecture."""
+    """The files of a run of somebody else's network, untrained: one row, no budget, no
+    architecture.
+    """
     folder.mkdir(parents=True)
-    (folder / "run.toml").write_text(TINY.replace('preset = "smoke"', f'preset = "smoke"\nnetwork = "{network}"'))
-    run.save(folder / "checkpoint.safetensors", run.start(run.load(folder / "run.toml")))
+    (folder / "run.toml").write_text(
+        TINY.replace('preset = "smoke"', f'preset = "smoke"\nnetwork = "{network}"')
+    )
+    run.save(
+        folder / "checkpoint.safetensors", run.start(run.load(folder / "run.toml"))
+    )
     row = {"budget_mmacs": None, "mmacs": 1.5, "architecture": None}
-    (folder / "result.json").write_text(json.dumps({"rows": [row], "network": network, "frozen": []}))
+    (folder / "result.json").write_text(
+        json.dumps({"rows": [row], "network": network, "frozen": []})
+    )
     lens.save(folder / "lens.h5", small())
     return folder
 

@@ -1,4 +1,6 @@
-"""The budget's entry of what a process draws, of any lens: nothing of its bench but the aperture is asked."""
+"""The budget's entry of what a process draws, of any lens: nothing of its bench but the
+aperture is asked.
+"""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,6 @@
-"""Every key of every settings file with every value that it should not have: refused by file and key, none computes."""
+"""Every key of every settings file with every value that it should not have: refused by
+file and key, none computes.
+"""
 
 import functools
 import typing
@@ -7,18 +9,30 @@ import pytest
 
 from benchmarks import _hardness_values as matrix
 
-# what may be below 0: turns and offsets either way, sections narrower than their mask, parameters of a made lens, a
+# what may be below 0: turns and offsets either way, sections narrower than their mask,
+# parameters of a made lens, a
 # stage that runs backwards
 SIGNED = {"n_offset", "k_offset", "angle_rad", "strength_rad", "isolated_nm", "sidewall_deg", "value", "step_um",
           "elevation_deg", "angle_deg", "gaze_step_deg", "slip_step_mm", "mask_turn_deg", "grow_um",
           "turn_deg", "x_um", "y_um", "x_mm", "y_mm"}  # fmt: skip
 # a measure of these has no meaning at 0
-ABOVE_ZERO = ("tolerance", "wavelength", "pitch_um", "aperture", "pixel_um", "samples", "window", "frames")
+ABOVE_ZERO = (
+    "tolerance",
+    "wavelength",
+    "pitch_um",
+    "aperture",
+    "pixel_um",
+    "samples",
+    "window",
+    "frames",
+)
 
 
 @pytest.fixture(scope="module")
 def trials():
-    """All of them; kinds of a record's keys are worked out once and not for each of ten thousand."""
+    """All of them; kinds of a record's keys are worked out once and not for each of ten
+    thousand.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typing, "get_type_hints", functools.cache(typing.get_type_hints))
         return list(matrix.trials())

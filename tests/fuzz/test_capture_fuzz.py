@@ -1,4 +1,6 @@
-"""Damaged captures and process tables: TIFF, PNG, stage.csv, capture.toml and CSV are refused by type or read whole."""
+"""Damaged captures and process tables: TIFF, PNG, stage.csv, capture.toml and CSV are
+refused by type or read whole.
+"""
 
 import math
 
@@ -19,7 +21,20 @@ FRAMES = (np.arange(2 * 6 * 5).reshape(2, 6, 5) * 37 % 1000).astype(np.uint16)
 STAGE = "file,page,depth_mm,angle_deg,exposure_s\nf.tif,0,18.0,0.0,0.01\nf.tif,1,22.5,1.5,0.01\n"
 ABOUT = 'pixel_um = 3.0\nwavelength_um = 0.85\nbits = 10\ncamera = "x"\n'
 DOSE = b"radius_um,energy\n0.05,10.0\n0.1,4.0\n0.3,1.0\n1.0,0.3\n3.0,0.1\n10.0,0.01\n"
-ODD = ("nan", "inf", "-1", "1e400", "", '"', "f.tif", "99999999999999999999", "\x00", "0x10", "1;2", "ä")
+ODD = (
+    "nan",
+    "inf",
+    "-1",
+    "1e400",
+    "",
+    '"',
+    "f.tif",
+    "99999999999999999999",
+    "\x00",
+    "0x10",
+    "1;2",
+    "ä",
+)
 
 
 def _write(folder):
@@ -29,18 +44,34 @@ def _write(folder):
 
 
 def _damaged(whole, data):
-    """Bytes that were cut, flipped, doubled or had an odd value put in the place of a word."""
-    how = data.draw(st.sampled_from(["cut", "flip", "insert", "twice", "value"]), label="how")
+    """Bytes that were cut, flipped, doubled or had an odd value put in the place of a
+    word.
+    """
+    how = data.draw(
+        st.sampled_from(["cut", "flip", "insert", "twice", "value"]), label="how"
+    )
     if how == "cut":
         return whole[: data.draw(st.integers(0, len(whole) - 1), label="length")]
     if how == "twice":
         return whole + whole
     at = data.draw(st.integers(0, len(whole) - 1), label="at")
     if how == "flip":
-        return whole[:at] + bytes([whole[at] ^ (1 << data.draw(st.integers(0, 7), label="bit"))]) + whole[at + 1 :]
+        return (
+            whole[:at]
+            + bytes([whole[at] ^ (1 << data.draw(st.integers(0, 7), label="bit"))])
+            + whole[at + 1 :]
+        )
     if how == "insert":
-        return whole[:at] + bytes([data.draw(st.integers(0, 255), label="byte")]) + whole[at:]
-    return whole[:at] + data.draw(st.sampled_from(ODD), label="odd").encode() + whole[at + 1 :]
+        return (
+            whole[:at]
+            + bytes([data.draw(st.integers(0, 255), label="byte")])
+            + whole[at:]
+        )
+    return (
+        whole[:at]
+        + data.draw(st.sampled_from(ODD), label="odd").encode()
+        + whole[at + 1 :]
+    )
 
 
 def _read(load):
@@ -62,7 +93,9 @@ def test_the_exposure_table_itself_is_good(tmp_path):
     """Its density falls from the first radius to the last, as the table does."""
     path = tmp_path / "dose.csv"
     path.write_bytes(DOSE)
-    found = exposure.point_exposure(Exposure(csv=path)).density(np.array([0.05, 0.3, 3.0, 10.0]))
+    found = exposure.point_exposure(Exposure(csv=path)).density(
+        np.array([0.05, 0.3, 3.0, 10.0])
+    )
     assert (found > 0).all()
     assert (np.diff(found) < 0).all()
 
@@ -70,7 +103,9 @@ def test_the_exposure_table_itself_is_good(tmp_path):
 @pytest.mark.parametrize("name", ["f.tif", "stage.csv", "capture.toml"])
 @settings(**LIMITS)
 @given(data=st.data())
-def test_damaged_captures_are_refused_by_type_or_read_whole(tmp_path_factory, name, data):
+def test_damaged_captures_are_refused_by_type_or_read_whole(
+    tmp_path_factory, name, data
+):
     folder = tmp_path_factory.mktemp("fuzz")
     _write(folder)
     path = folder / name
@@ -105,7 +140,12 @@ def test_damaged_png_frames_are_refused_by_type_or_read_whole(tmp_path_factory, 
 def test_a_tiff_whose_list_of_frames_is_a_ring_is_refused(tmp_path, first):
     """The last of three frames names an earlier one as the next."""
     path = tmp_path / "f.tif"
-    tifffile.imwrite(path, np.concatenate([FRAMES, FRAMES[:1] + 7]), photometric="minisblack", metadata=None)
+    tifffile.imwrite(
+        path,
+        np.concatenate([FRAMES, FRAMES[:1] + 7]),
+        photometric="minisblack",
+        metadata=None,
+    )
     with tifffile.TiffFile(path) as file:
         places = [(page.offset, len(page.tags)) for page in file.pages]
     assert len(places) == len(capture.load(path).frames) == 3
@@ -119,7 +159,9 @@ def test_a_tiff_whose_list_of_frames_is_a_ring_is_refused(tmp_path, first):
 
 
 @pytest.mark.parametrize("claim", [0xFF000000, 10_000])
-def test_a_png_block_longer_than_its_file_is_refused_before_room_is_made(tmp_path, monkeypatch, claim):
+def test_a_png_block_longer_than_its_file_is_refused_before_room_is_made(
+    tmp_path, monkeypatch, claim
+):
     """The library takes the memory that the length claims, 4.3 GB here."""
     import cv2
 
@@ -150,7 +192,9 @@ def test_a_png_of_two_heads_is_refused(tmp_path):
 
 @settings(**LIMITS)
 @given(data=st.data())
-def test_damaged_bias_tables_are_refused_by_type_or_hold_numbers(tmp_path_factory, data):
+def test_damaged_bias_tables_are_refused_by_type_or_hold_numbers(
+    tmp_path_factory, data
+):
     path = tmp_path_factory.mktemp("fuzz") / "bias.csv"
     path.write_bytes(_damaged(b"drawn_nm,bias_nm\n80,-6.0\n120,1.0\n200,2.5\n", data))
     found, said = _read(lambda: bias.Bias(table_nm=bias.read_csv(path)))

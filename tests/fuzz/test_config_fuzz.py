@@ -1,4 +1,6 @@
-"""Damaged settings: TOML of every command and CSV tables, with flipped bytes or odd values, are refused by type."""
+"""Damaged settings: TOML of every command and CSV tables, with flipped bytes or odd
+values, are refused by type.
+"""
 
 import pytest
 from hypothesis import given, settings
@@ -51,21 +53,46 @@ def test_the_texts_themselves_are_good(tmp_path, kind):
 @given(data=st.data())
 def test_damaged_settings_are_refused_by_type(tmp_path_factory, kind, data):
     whole = bytearray(TEXTS[kind][0].encode())
-    how = data.draw(st.sampled_from(["cut", "flip", "byte", "twice", "value"]), label="how")
+    how = data.draw(
+        st.sampled_from(["cut", "flip", "byte", "twice", "value"]), label="how"
+    )
     if how == "cut":
         whole = whole[: data.draw(st.integers(0, len(whole)), label="length")]
     elif how == "flip":
         at = data.draw(st.integers(0, len(whole) - 1), label="at")
         whole[at] ^= 1 << data.draw(st.integers(0, 7), label="bit")
     elif how == "byte":
-        whole.insert(data.draw(st.integers(0, len(whole)), label="at"), data.draw(st.integers(0, 255), label="byte"))
+        whole.insert(
+            data.draw(st.integers(0, len(whole)), label="at"),
+            data.draw(st.integers(0, 255), label="byte"),
+        )
     elif how == "twice":
         whole = whole + whole
     else:
         lines = TEXTS[kind][0].splitlines()
-        at = data.draw(st.sampled_from([i for i, line in enumerate(lines) if "=" in line]), label="line")
-        odd = ["nan", "inf", "-inf", "-1", "0", "1e308", "99999999999999999999", '""', "[]", "{}", "true", "1979-05-27"]
-        lines[at] = lines[at].split("=")[0] + "= " + data.draw(st.sampled_from(odd), label="value")
+        at = data.draw(
+            st.sampled_from([i for i, line in enumerate(lines) if "=" in line]),
+            label="line",
+        )
+        odd = [
+            "nan",
+            "inf",
+            "-inf",
+            "-1",
+            "0",
+            "1e308",
+            "99999999999999999999",
+            '""',
+            "[]",
+            "{}",
+            "true",
+            "1979-05-27",
+        ]
+        lines[at] = (
+            lines[at].split("=")[0]
+            + "= "
+            + data.draw(st.sampled_from(odd), label="value")
+        )
         whole = bytearray("\n".join(lines).encode())
     path = tmp_path_factory.mktemp("fuzz") / "c.toml"
     path.write_bytes(bytes(whole))
@@ -81,7 +108,9 @@ def test_damaged_settings_are_refused_by_type(tmp_path_factory, kind, data):
 @settings(**LIMITS)
 @given(data=st.data())
 def test_damaged_material_tables_are_refused_by_type(tmp_path_factory, data):
-    whole = bytearray(b"wavelength_um,n,k\n0.80,3.70,0.010\n0.85,3.60,0.005\n0.90,3.55,0.002\n")
+    whole = bytearray(
+        b"wavelength_um,n,k\n0.80,3.70,0.010\n0.85,3.60,0.005\n0.90,3.55,0.002\n"
+    )
     at = data.draw(st.integers(0, len(whole) - 1), label="at")
     whole[at] = data.draw(st.integers(0, 255), label="byte")
     whole = whole[: data.draw(st.integers(0, len(whole)), label="length")]

@@ -1,4 +1,6 @@
-"""Damaged artefacts: every kind of HDF5 file, truncated or with flipped bits, is refused by type or read as it was."""
+"""Damaged artefacts: every kind of HDF5 file, truncated or with flipped bits, is
+refused by type or read as it was.
+"""
 
 import dataclasses
 import functools
@@ -28,7 +30,9 @@ from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.psf import PsfStack
 
 CELL = Cell(pitch_um=0.30, pillar=Index(3.6))
-PROXY = Proxy(np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[8.0, 3.5]]), np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
+)
 RESPONSE = Sensitivity(np.zeros((3, 6)), 0.15)
 
 
@@ -40,14 +44,31 @@ def _lens():
 def _library():
     d = np.linspace(0.08, 0.21, 20)
     t = (0.9 * np.exp(55j * d))[None, None, None]
-    parts = (np.zeros(1), np.array([0.85]), d, t, t, np.full(t.shape, 1e-4), np.ones(t.shape), np.zeros((0, 5)))
+    parts = (
+        np.zeros(1),
+        np.array([0.85]),
+        d,
+        t,
+        t,
+        np.full(t.shape, 1e-4),
+        np.ones(t.shape),
+        np.zeros((0, 5)),
+    )
     return PillarLibrary(CELL, Sweep(), ("x",), *parts, "modal", 20, PROXY)
 
 
 def _psf():
     axis = (np.array([2e4]), np.zeros((1, 2)), np.array([0.85]), np.ones(1))
     return PsfStack(
-        np.full((1, 1, 4, 4), 1 / 16), np.ones((1, 1)), *axis, 0.75, np.zeros((1, 2)), 2000.0, 1e-4, 1e-5, "x"
+        np.full((1, 1, 4, 4), 1 / 16),
+        np.ones((1, 1)),
+        *axis,
+        0.75,
+        np.zeros((1, 2)),
+        2000.0,
+        1e-4,
+        1e-5,
+        "x",
     )
 
 
@@ -63,12 +84,17 @@ def _asbuilt():
 
 
 def _budget_rows():
-    return [Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"), Entry("all links", 0.1, math.nan, 1e-3, "sum")]
+    return [
+        Entry("mask grid", 0.1, 0.2, 1e-4, "rounded"),
+        Entry("all links", 0.1, math.nan, 1e-3, "sum"),
+    ]
 
 
 def _people():
     rng = np.random.default_rng(0)
-    model = Mixed(rng.normal(0, 1, (36, 2)), rng.uniform(0.1, 2, (36, 2)), rng.uniform(0.1, 1, 2))
+    model = Mixed(
+        rng.normal(0, 1, (36, 2)), rng.uniform(0.1, 2, (36, 2)), rng.uniform(0.1, 1, 2)
+    )
     return People(model, rng.normal(0, 3, 7), rng.uniform(0.5, 5, 7))
 
 
@@ -77,7 +103,10 @@ KINDS = {
     "library": (lambda p: library.save(p, _library()), library.load),
     "psf": (lambda p: psf.save(p, _psf()), psf.load),
     "asbuilt": (lambda p: asbuilt.save(p, _asbuilt()), asbuilt.load),
-    "budget": (lambda p: command_budget.save(p, _budget_rows(), store.Provenance()), command_budget.load),
+    "budget": (
+        lambda p: command_budget.save(p, _budget_rows(), store.Provenance()),
+        command_budget.load,
+    ),
     "people": (lambda p: people_file.save(p, _people()), people_file.load),
 }
 
@@ -90,7 +119,9 @@ def _same(one, other):
         names = [f.name for f in dataclasses.fields(one) if f.name != "provenance"]
         return all(_same(getattr(one, n), getattr(other, n)) for n in names)
     if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(_same(a, b) for a, b in zip(one, other, strict=True))
+        return len(one) == len(other) and all(
+            _same(a, b) for a, b in zip(one, other, strict=True)
+        )
     return one == other or str(one) == str(other)
 
 
@@ -107,7 +138,9 @@ def written(kind):
 @pytest.mark.parametrize("kind", sorted(KINDS))
 @settings(max_examples=20)
 @given(data=st.data())
-def test_damaged_artefacts_are_refused_or_read_as_they_were(tmp_path_factory, kind, data):
+def test_damaged_artefacts_are_refused_or_read_as_they_were(
+    tmp_path_factory, kind, data
+):
     path = tmp_path_factory.mktemp("fuzz") / "file.h5"
     whole, want = written(kind)
     read, whole = KINDS[kind][1], bytearray(whole)
@@ -147,7 +180,9 @@ def test_a_missing_entry_is_named(tmp_path):
 
 def test_another_version_is_named_with_what_to_do(tmp_path):
     store.save(tmp_path / "l.h5", "lens", {"x": np.ones(3)}, version=99)
-    with pytest.raises(store.StoreError, match="version 99, need 'lens' version 1; make it again"):
+    with pytest.raises(
+        store.StoreError, match="version 99, need 'lens' version 1; make it again"
+    ):
         lens.load(tmp_path / "l.h5")
 
 
@@ -158,7 +193,10 @@ def test_every_kind_that_is_fuzzed_is_the_kind_it_says(tmp_path):
 
 
 def test_scene_shards_survive_or_are_refused(tmp_path):
-    arrays = {"radiance": np.zeros((1, 2, 4, 4), np.uint8), "coverage": np.zeros((1, 4, 4), np.uint8)}
+    arrays = {
+        "radiance": np.zeros((1, 2, 4, 4), np.uint8),
+        "coverage": np.zeros((1, 4, 4), np.uint8),
+    }
     store.save(tmp_path / "s.h5", "scene", arrays)
     with pytest.raises(store.StoreError, match="holds no"):
         dataset.read_shard(tmp_path / "s.h5")

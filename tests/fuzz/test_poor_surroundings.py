@@ -1,4 +1,6 @@
-"""Every command from end to end where little is given: a locale of ASCII, a home and an installation to read only."""
+"""Every command from end to end where little is given: a locale of ASCII, a home and an
+installation to read only.
+"""
 
 import os
 import subprocess
@@ -10,7 +12,8 @@ import pytest
 from benchmarks._hardness_commands import VERBS
 
 ROOT = Path(__file__).parents[2]
-# Names of inputs and outputs begin with a letter that ASCII lacks: its bytes are lone surrogates there.
+# Names of inputs and outputs begin with a letter that ASCII lacks: its bytes are lone
+# surrogates there.
 MAKE = """
 import os, sys
 from pathlib import Path
@@ -51,12 +54,24 @@ for verb in sys.argv[1:]:
 @pytest.mark.slow
 def test_every_command_ends_well_in_an_ascii_locale_and_a_read_only_home(tmp_path):
     (tmp_path / "home").mkdir()
-    told = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
-    told |= {"HOME": str(tmp_path / "home"), "ROOT": str(ROOT), "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    told = os.environ | {
+        "LC_ALL": "C",
+        "PYTHONUTF8": "0",
+        "PYTHONCOERCECLOCALE": "0",
+        "PYTHONIOENCODING": "ascii",
+    }
+    told |= {
+        "HOME": str(tmp_path / "home"),
+        "ROOT": str(ROOT),
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+    }
     told.pop("XDG_CACHE_HOME", None)
     (tmp_path / "work").mkdir()
     for code in (MAKE, RUN):
         words = [sys.executable, "-c", code, *VERBS]
-        done = subprocess.run(words, cwd=tmp_path / "work", env=told, capture_output=True, check=False)
+        done = subprocess.run(
+            words, cwd=tmp_path / "work", env=told, capture_output=True, check=False
+        )
         bad = [line for line in done.stdout.splitlines() if b"FAILED" in line]
         assert (done.returncode, bad) == (0, []), done.stderr[-2000:]

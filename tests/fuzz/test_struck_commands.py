@@ -1,4 +1,6 @@
-"""Commands that are killed, run twice at once or out of room, a few of each; ``benchmarks.hardness`` does hundreds."""
+"""Commands that are killed, run twice at once or out of room, a few of each;
+``benchmarks.hardness`` does hundreds.
+"""
 
 import os
 import subprocess
@@ -33,6 +35,16 @@ with bench(("export",)) as made:
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [STRIKE, POINTS], ids=["drawn", "every_operation"])
 def test_nothing_is_mixed_lost_or_left(tmp_path, code):
-    root, told = Path(__file__).parents[2], os.environ | {"XDG_CACHE_HOME": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, env=told, capture_output=True, text=True, check=False)
+    root, told = (
+        Path(__file__).parents[2],
+        os.environ | {"XDG_CACHE_HOME": str(tmp_path), "OMP_NUM_THREADS": "1"},
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=root,
+        env=told,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr

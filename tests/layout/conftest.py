@@ -9,11 +9,23 @@ from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
 def small_plan(classes=None, *, kinds=7, pitch=400, seed=0, figures=True, first=100):
     """A random lattice of a few diameters, without any symmetry, with a figure."""
     if classes is None:
-        classes = np.random.default_rng(seed).integers(0, kinds + 1, (23, 31)).astype(np.uint8)
+        classes = (
+            np.random.default_rng(seed)
+            .integers(0, kinds + 1, (23, 31))
+            .astype(np.uint8)
+        )
     made = pillar_classes(
-        np.arange(first, first + 10 * kinds, 10), layer=(1, 0), grid=1, unit_nm=1.0, vertices=16, shape="round"
+        np.arange(first, first + 10 * kinds, 10),
+        layer=(1, 0),
+        grid=1,
+        unit_nm=1.0,
+        vertices=16,
+        shape="round",
     )
-    corner = np.add([[0, 0], [9000, 0], [9000, 500], [500, 500], [500, 9000], [0, 9000]], (20000, 3000))
+    corner = np.add(
+        [[0, 0], [9000, 0], [9000, 500], [500, 500], [500, 9000], [0, 9000]],
+        (20000, 3000),
+    )
     return MaskPlan(
         name="TOP",
         classes=made,

@@ -13,7 +13,16 @@ def test_public_names_are_functions_even_after_their_modules_are_loaded():
     import layout.oasis.write
     import layout.rules.check
 
-    for name in ("plan", "check", "compare", "write_oasis", "read_oasis", "write_gdsii", "read_gdsii", "write_dxf"):
+    for name in (
+        "plan",
+        "check",
+        "compare",
+        "write_oasis",
+        "read_oasis",
+        "write_gdsii",
+        "read_gdsii",
+        "write_dxf",
+    ):
         assert callable(getattr(layout, name))
         assert name in dir(layout)
 
@@ -30,5 +39,7 @@ def test_making_a_mask_never_loads_torch_nor_the_cad_kernel():
         "plan = layout.plan(DiameterMap(np.full((3, 3), 0.2), 0.4), Process())\n"
         "layout.check(plan, Process().rules)\nprint(' '.join(sys.modules))"
     )
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert not {"torch", "build123d", "OCP", "matplotlib"} & set(loaded)

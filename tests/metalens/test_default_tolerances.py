@@ -1,4 +1,6 @@
-"""How exact results are where nobody says: part of the public surface, so changing it changes the contract."""
+"""How exact results are where nobody says: part of the public surface, so changing it
+changes the contract.
+"""
 
 import inspect
 
@@ -16,4 +18,6 @@ from metalens import modal, propagate, psf, rcwa
 )
 def test_solvers_take_a_thousandth_and_images_a_ten_thousandth(verbs, tolerance):
     for verb in verbs:
-        assert inspect.signature(verb).parameters["tolerance"].default == tolerance, verb.__qualname__
+        assert inspect.signature(verb).parameters["tolerance"].default == tolerance, (
+            verb.__qualname__
+        )

@@ -1,4 +1,6 @@
-"""Hidden lenses for the fit: designs with the library's own proxy, truths wider and elsewhere than assumed."""
+"""Hidden lenses for the fit: designs with the library's own proxy, truths wider and
+elsewhere than assumed.
+"""
 
 import functools
 import math
@@ -12,7 +14,8 @@ from metalens.design import profiles
 from metalens.pillars.record import DEFAULT_CELL
 
 DEPTHS = (380.0, 470.0, 590.0, 640.0, 800.0, 1150.0)
-# (middle, standard deviation) of the truths; the fit assumes 0 and 15, 10 nm ..., 0.5 nm, 1 rad, 0.3 px about 0.2
+# (middle, standard deviation) of the truths; the fit assumes 0 and 15, 10 nm ..., 0.5
+# nm, 1 rad, 0.3 px about 0.2
 TRUTHS = {
     "bias_nm": (2.5, 8.0),
     "bias_x_nm": (-0.7, 2.5),
@@ -44,23 +47,34 @@ def lens(aperture_um=40.0, focal_um=110.0, object_um=600.0):
     table = pillar_table.load()
     focus = profiles.Focus(0.85, focal_um, object_um)
     phase = design.phase_of(None, focus, radius_um=aperture_um / 2)
-    return design.make(phase, focus, aperture_um=aperture_um, cell=DEFAULT_CELL, proxy=table.proxy)[0]
+    return design.make(
+        phase, focus, aperture_um=aperture_um, cell=DEFAULT_CELL, proxy=table.proxy
+    )[0]
 
 
 def hidden(seed, *, scale=1.0):
-    """True parameters of a seed; ``scale``: of the stage and distance errors, for larger lenses."""
+    """True parameters of a seed; ``scale``: of the stage and distance errors, for
+    larger lenses.
+    """
     rng = np.random.default_rng([seed, 2024])
-    values = {name: middle + sigma * float(rng.standard_normal()) for name, (middle, sigma) in TRUTHS.items()}
+    values = {
+        name: middle + sigma * float(rng.standard_normal())
+        for name, (middle, sigma) in TRUTHS.items()
+    }
     for name in ("stage_zero_um", "distance_um"):
         values[name] *= scale
     for name, limit in LIMITS.items():
-        values[name] = float(np.clip(values[name], 0.1 if name == "crosstalk_px" else -limit, limit))
+        values[name] = float(
+            np.clip(values[name], 0.1 if name == "crosstalk_px" else -limit, limit)
+        )
     return values | PLANE
 
 
 def session(seed, **changes):
     """A session with the hidden values of a seed."""
-    return Session(**({"depths_um": DEPTHS, "values": hidden(seed), "seed": seed} | changes))
+    return Session(
+        **({"depths_um": DEPTHS, "values": hidden(seed), "seed": seed} | changes)
+    )
 
 
 # what a fit reckons with where nobody states it, kind by kind
@@ -73,7 +87,9 @@ UNSTATED = {
     "light": ("light_x", "light_y", "light_r"),
     "saddles": ("bias_a_nm", "bias_o_nm"),
 }
-LEFT_OUT = (  # that this bench lacks; a tilt of the glass shows as shifts from frame to frame, and is refused
+# that this bench lacks; a tilt of the glass shows as shifts from frame to frame, and is
+# refused
+LEFT_OUT = (
     "bandwidth_nm",
     "camera_turn_deg",
     "glass_tilt_x_deg",
@@ -85,9 +101,11 @@ LEFT_OUT = (  # that this bench lacks; a tilt of the glass shows as shifts from 
 
 
 def unstated(seed):
-    """(kind, faults of that kind, names to state as absent) of a seed: one kind is there and nobody says so.
+    """(kind, faults of that kind, names to state as absent) of a seed: one kind is
+    there and nobody says so.
 
-    As large as the fit reckons with, drawn. Of what acts by its square (source, wall) that square is drawn, of what
+    As large as the fit reckons with, drawn. Of what acts by its square (source, wall)
+    that square is drawn, of what
     cannot be negative its size.
     """
     kind = tuple(UNSTATED)[seed % len(UNSTATED)]
@@ -98,7 +116,11 @@ def unstated(seed):
         "side wall": {"sidewall_deg": 2 * math.sqrt(abs(a))},
         "pixel pitch": {"pixel_error": 0.01 * a},
         "source": {"source_um": 5 * math.sqrt(abs(a))},
-        "light": {"gradient": math.exp(0.1 * a) - 1, "light_y": 0.2 * b, "light_r": 0.2 * c},
+        "light": {
+            "gradient": math.exp(0.1 * a) - 1,
+            "light_y": 0.2 * b,
+            "light_r": 0.2 * c,
+        },
         "saddles": {"saddle_nm": 10 * a, "oblique_nm": 10 * b},
     }[kind]
     others = (name for one, names in UNSTATED.items() if one != kind for name in names)

@@ -1,10 +1,16 @@
-"""A bench that shares nothing with the fit: pillars one by one in float64, its own camera, faults that no fit knows.
+"""A bench that shares nothing with the fit: pillars one by one in float64, its own
+camera, faults that no fit knows.
 
-E(X) = sum over pillars of a_j t_j exp(ik (s_j + r_j)) d / (2 pi r_j²) (1/r_j - ik), with true distances from the source
-to the pillar (through plates of glass, by Snell's law) and from the pillar to the sensor. t_j comes from the modal
-library at the pillar's own height and wavelength (``pillar_table``), never from the proxy or its slopes. Intensity is
-sampled on the lens's own pitch, so that the sum is a discrete convolution, formed by FFT without any approximation;
-write fields that are shifted are convolved one by one. Blur, crosstalk and pixels are weights of error functions; a
+E(X) = sum over pillars of a_j t_j exp(ik (s_j + r_j)) d / (2 pi r_j²) (1/r_j - ik),
+with true distances from the source
+to the pillar (through plates of glass, by Snell's law) and from the pillar to the
+sensor. t_j comes from the modal
+library at the pillar's own height and wavelength (``pillar_table``), never from the
+proxy or its slopes. Intensity is
+sampled on the lens's own pitch, so that the sum is a discrete convolution, formed by
+FFT without any approximation;
+write fields that are shifted are convolved one by one. Blur, crosstalk and pixels are
+weights of error functions; a
 source is a sum of points.
 """
 
@@ -26,7 +32,9 @@ ZERNIKE = {
     "coma_y": lambda u, v: math.sqrt(8) * (3 * (u * u + v * v) - 2) * v,
     "trefoil_x": lambda u, v: math.sqrt(8) * (u**3 - 3 * u * v * v),
     "trefoil_y": lambda u, v: math.sqrt(8) * (3 * u * u * v - v**3),
-    "spherical": lambda u, v: math.sqrt(5) * (6 * (u * u + v * v) ** 2 - 6 * (u * u + v * v) + 1),
+    "spherical": lambda u, v: (
+        math.sqrt(5) * (6 * (u * u + v * v) ** 2 - 6 * (u * u + v * v) + 1)
+    ),
 }
 
 
@@ -34,15 +42,21 @@ ZERNIKE = {
 class Faults:
     """What a real bench adds and a plain model lacks; zeros are none.
 
-    glass_um, glass_tilt_deg: a cover of index 1.51 between source and lens, and its tilt.
+    glass_um, glass_tilt_deg: a cover of index 1.51 between source and lens, and its
+    tilt.
     stitch_nm: standard deviation of the shift of each write field of ``field_um``.
     missing: share of the pillars that are not there.
-    drift_nm: wavelength from the first frame to the last. led_nm: full width at half maximum of the spectrum.
-    vibration_px: standard deviation of the blur of every second frame. ghost: its share of the light, (5, -4) px off.
+    drift_nm: wavelength from the first frame to the last. led_nm: full width at half
+    maximum of the spectrum.
+    vibration_px: standard deviation of the blur of every second frame. ghost: its share
+    of the light, (5, -4) px off.
     pixel_error: true pixel over stated, less 1. full_well_e: where pixels saturate.
-    stage_um: standard deviation of the depth of single frames. gradient: light at the +x rim over the axis, less 1.
-    light_y, light_r: ln of the irradiance there over that at the axis: at the +y rim, at the rim all round.
-    source_um: diameter of an evenly lit source. saddle_nm, oblique_nm: diameters x² - y² and 2xy over R².
+    stage_um: standard deviation of the depth of single frames. gradient: light at the
+    +x rim over the axis, less 1.
+    light_y, light_r: ln of the irradiance there over that at the axis: at the +y rim,
+    at the rim all round.
+    source_um: diameter of an evenly lit source. saddle_nm, oblique_nm: diameters x² -
+    y² and 2xy over R².
     """
 
     glass_um: float = 0.0
@@ -68,7 +82,9 @@ class Faults:
 
 @dataclass(frozen=True)
 class Session:
-    """Depths, camera and hidden values (names as the fit calls them) of one set of captures."""
+    """Depths, camera and hidden values (names as the fit calls them) of one set of
+    captures.
+    """
 
     depths_um: tuple[float, ...]
     values: dict[str, float] = field(default_factory=dict)
@@ -127,16 +143,28 @@ def irradiance(lens, session, depths_um=None):
     stated = np.array(session.depths_um)
     rng = np.random.default_rng([session.seed, 5])
     asked = stated if depths_um is None else np.asarray(depths_um, float)
-    depth = asked + session.of("stage_zero_um") + session.of("stage_scale") * (asked - stated.mean())
+    depth = (
+        asked
+        + session.of("stage_zero_um")
+        + session.of("stage_scale") * (asked - stated.mean())
+    )
     depth = depth + session.faults.stage_um * rng.standard_normal(len(depth))
     pillars = _pillars(lens, session, rng)
     frames = np.zeros((len(depth), session.pixels, session.pixels))
-    drift = session.faults.drift_nm * np.linspace(-0.5, 0.5, len(depth)) if len(depth) > 1 else np.zeros(1)
+    drift = (
+        session.faults.drift_nm * np.linspace(-0.5, 0.5, len(depth))
+        if len(depth) > 1
+        else np.zeros(1)
+    )
     for line, weight in _lines(session):
         for shift in np.unique(drift):
             some = np.flatnonzero(drift == shift)
-            wave = lens.wavelength_um + (session.of("wavelength_nm") + line + shift) * 1e-3
-            frames[some] += weight * _frames(lens, session, pillars, wave, depth[some], some)
+            wave = (
+                lens.wavelength_um + (session.of("wavelength_nm") + line + shift) * 1e-3
+            )
+            frames[some] += weight * _frames(
+                lens, session, pillars, wave, depth[some], some
+            )
     ghost = session.faults.ghost
     return frames + ghost * np.roll(frames, (5, -4), (1, 2)) if ghost else frames
 
@@ -151,19 +179,31 @@ def _lines(session):
 
 
 def _pillars(lens, session, rng):
-    """(x, y, diameter, illumination, field shifts) on the lattice, um; illumination 0 where there is no pillar."""
+    """(x, y, diameter, illumination, field shifts) on the lattice, um; illumination 0
+    where there is no pillar.
+    """
     faults, d = session.faults, lens.diameters.diameter_um.astype(float)
     ny, nx = d.shape
-    y, x = np.meshgrid((np.arange(ny) - (ny - 1) / 2), (np.arange(nx) - (nx - 1) / 2), indexing="ij")
+    y, x = np.meshgrid(
+        (np.arange(ny) - (ny - 1) / 2), (np.arange(nx) - (nx - 1) / 2), indexing="ij"
+    )
     x, y = x * lens.diameters.pitch_um, y * lens.diameters.pitch_um
     there = (d > 0) & (rng.random(d.shape) >= faults.missing)
     radius = np.hypot(x, y)[d > 0].max()
     u, v = x / radius, y / radius
-    bias = session.of("bias_nm") + session.of("bias_x_nm") * u + session.of("bias_y_nm") * v
+    bias = (
+        session.of("bias_nm")
+        + session.of("bias_x_nm") * u
+        + session.of("bias_y_nm") * v
+    )
     bias = bias + session.of("bias_r_nm") * (u * u + v * v - 0.5)
     bias = bias + faults.saddle_nm * (u * u - v * v) + faults.oblique_nm * 2 * u * v
-    phase = sum(session.of(f"{name}_rad") * shape(u, v) for name, shape in ZERNIKE.items())
-    uneven = (1 + faults.gradient * u) * np.exp((faults.light_y * v + faults.light_r * (u * u + v * v)) / 2)
+    phase = sum(
+        session.of(f"{name}_rad") * shape(u, v) for name, shape in ZERNIKE.items()
+    )
+    uneven = (1 + faults.gradient * u) * np.exp(
+        (faults.light_y * v + faults.light_r * (u * u + v * v)) / 2
+    )
     light = there * uneven * np.exp(1j * phase)
     fields = [(slice(0, ny), slice(0, nx), 0.0, 0.0)]
     if faults.stitch_nm:
@@ -171,22 +211,29 @@ def _pillars(lens, session, rng):
         starts = [(i, j) for i in range(0, ny, step) for j in range(0, nx, step)]
         shifts = 1e-3 * faults.stitch_nm * rng.standard_normal((len(starts), 2))
         fields = [
-            (slice(i, i + step), slice(j, j + step), *shift) for (i, j), shift in zip(starts, shifts, strict=True)
+            (slice(i, i + step), slice(j, j + step), *shift)
+            for (i, j), shift in zip(starts, shifts, strict=True)
         ]
     return x, y, d + bias * 1e-3, light, fields
 
 
 def _transmission(lens, session, diameter_um, wave):
-    """t of every pillar; a tilted wall is a stack of pillars, its phase and light the mean over the height of ln t."""
+    """t of every pillar; a tilted wall is a stack of pillars, its phase and light the
+    mean over the height of ln t.
+    """
     height = lens.cell.height_um + session.of("height_nm") * 1e-3
     table = pillar_table.load()
     lean = math.tan(math.radians(session.faults.sidewall_deg))
     if lean == 0:
         return table.at(diameter_um, height, wave)
     slices = (np.arange(5) + 0.5) / 5 - 0.5
-    parts = [table.at(diameter_um - 2 * lean * height * s, height, wave) for s in slices]
+    parts = [
+        table.at(diameter_um - 2 * lean * height * s, height, wave) for s in slices
+    ]
     turns = np.unwrap([np.angle(part) for part in parts], axis=0)
-    return np.exp(np.mean([np.log(np.abs(part)) for part in parts], axis=0) + 1j * turns.mean(0))
+    return np.exp(
+        np.mean([np.log(np.abs(part)) for part in parts], axis=0) + 1j * turns.mean(0)
+    )
 
 
 def _frames(lens, session, pillars, wave, depth, index):
@@ -218,10 +265,13 @@ def _sources(session):
 
 
 def _source_path(faults, x, y, z):
-    """Optical path from a point at depth z to (x, y) on the lens; through a plate by the invariant sine along the ray.
+    """Optical path from a point at depth z to (x, y) on the lens; through a plate by
+    the invariant sine along the ray.
 
-    With lateral offset rho = (z - t) tan a + t tan b and sin a = n sin b, the path is (z - t) / cos a + n t / cos b.
-    A tilted plate adds the difference that a plane-parallel plate makes between directions: n t cos b - t cos a.
+    With lateral offset rho = (z - t) tan a + t tan b and sin a = n sin b, the path is
+    (z - t) / cos a + n t / cos b.
+    A tilted plate adds the difference that a plane-parallel plate makes between
+    directions: n t cos b - t cos a.
     """
     t, n = faults.glass_um, 1.51
     rho = np.hypot(x, y)
@@ -243,15 +293,26 @@ def _source_path(faults, x, y, z):
 
 def _fine_side(session, pitch_um):
     """Intensity samples a side, odd: the window and its margin, on the lens's pitch."""
-    return 2 * math.ceil((session.pixels / 2 * session.pixel_um * 1.05 + MARGIN_UM) / pitch_um) + 1
+    return (
+        2
+        * math.ceil(
+            (session.pixels / 2 * session.pixel_um * 1.05 + MARGIN_UM) / pitch_um
+        )
+        + 1
+    )
 
 
 def _kernel(lens, session, shape, k, field):
-    """FFT of the kernel from the pillars of a write field to every sample, by their difference; side lengths.
+    """FFT of the kernel from the pillars of a write field to every sample, by their
+    difference; side lengths.
 
-    Samples are those of a circular convolution that no wrapped light reaches: one less than pillars and samples a side.
+    Samples are those of a circular convolution that no wrapped light reaches: one less
+    than pillars and samples a side.
     """
-    pitch, d = lens.diameters.pitch_um, lens.sensor_distance_um + session.of("distance_um")
+    pitch, d = (
+        lens.diameters.pitch_um,
+        lens.sensor_distance_um + session.of("distance_um"),
+    )
     side = _fine_side(session, pitch)
     *slices, dx, dy = field
     counts = [one.stop - one.start for one in slices]
@@ -268,7 +329,9 @@ def _kernel(lens, session, shape, k, field):
 
 
 def _intensity(lit, kernels, fields):
-    """(Y, X) |E|² on the fine samples of the sensor: the sum over all pillars, field by field (all are as large)."""
+    """(Y, X) |E|² on the fine samples of the sensor: the sum over all pillars, field by
+    field (all are as large).
+    """
     (_, side, size), total = kernels[0], 0.0
     for (spectrum, *_), (rows, columns, *_) in zip(kernels, fields, strict=True):
         total = total + spectrum * fft.fft2(lit[rows, columns], size)
@@ -277,7 +340,8 @@ def _intensity(lit, kernels, fields):
 
 
 def _pixels(fine, pitch_um, session, frame):
-    """Light in the pixels: a box convolved with a Gaussian is a difference of error functions, along each axis.
+    """Light in the pixels: a box convolved with a Gaussian is a difference of error
+    functions, along each axis.
 
     The axis of the lens meets the middle of pixel (n // 2, n // 2).
     """
@@ -285,7 +349,9 @@ def _pixels(fine, pitch_um, session, frame):
     blur = session.values.get("crosstalk_px", 0.2)
     blur = math.hypot(blur, session.faults.vibration_px * (frame % 2))
     at = (np.arange(len(fine)) - (len(fine) - 1) / 2) * pitch_um / pixel
-    apart = (at[None] - (np.arange(session.pixels) - session.pixels // 2)[:, None]) / (math.sqrt(2) * blur)
+    apart = (at[None] - (np.arange(session.pixels) - session.pixels // 2)[:, None]) / (
+        math.sqrt(2) * blur
+    )
     half = 0.5 / (math.sqrt(2) * blur)
     weight = (special.erf(apart + half) - special.erf(apart - half)) / 2
     return weight @ fine @ weight.T
@@ -298,11 +364,17 @@ def _background(session):
 
 
 def _read(electrons, session, rng, fixed):
-    seen = rng.poisson(np.maximum(electrons, 0)) + session.read_noise_e * rng.standard_normal(electrons.shape)
+    seen = rng.poisson(
+        np.maximum(electrons, 0)
+    ) + session.read_noise_e * rng.standard_normal(electrons.shape)
     seen = np.minimum(seen, session.faults.full_well_e)
-    return np.clip(np.rint(seen / session.gain_e + fixed), 0, 2**session.bits - 1).astype(np.uint16)
+    return np.clip(
+        np.rint(seen / session.gain_e + fixed), 0, 2**session.bits - 1
+    ).astype(np.uint16)
 
 
 def with_faults(session, **faults):
     """The session with faults added."""
-    return dataclasses.replace(session, faults=dataclasses.replace(session.faults, **faults))
+    return dataclasses.replace(
+        session, faults=dataclasses.replace(session.faults, **faults)
+    )

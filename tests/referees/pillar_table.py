@@ -1,7 +1,10 @@
-"""Transmission of every pillar over diameter, height and wavelength, straight from the modal solver's library.
+"""Transmission of every pillar over diameter, height and wavelength, straight from the
+modal solver's library.
 
-``python tests/referees/pillar_table.py`` writes ``pillar_table.json``: the complex t(D) of the default cell at five
-heights and three wavelengths, and the proxy that a design would be made with. No linear slopes are used.
+``python tests/referees/pillar_table.py`` writes ``pillar_table.json``: the complex t(D)
+of the default cell at five
+heights and three wavelengths, and the proxy that a design would be made with. No linear
+slopes are used.
 """
 
 import dataclasses
@@ -25,20 +28,26 @@ SAMPLES, TOLERANCE = 200, 3e-4
 
 
 class Table:
-    """t(D, height, wavelength): cubic in the diameter, polynomials through all heights and wavelengths.
+    """t(D, height, wavelength): cubic in the diameter, polynomials through all heights
+    and wavelengths.
 
-    Accuracy: 1e-3 of t inside the proxy's domain, by the solver's own bar and a held-out height.
+    Accuracy: 1e-3 of t inside the proxy's domain, by the solver's own bar and a
+    held-out height.
     """
 
     def __init__(self, stored):
         self.diameter_um = np.array(stored["diameter_um"])
         t = np.array(stored["real"]) + 1j * np.array(stored["imaginary"])
         self._spline = CubicSpline(self.diameter_um, np.moveaxis(t, -1, 0))
-        self.proxy = Proxy.from_arrays({name: np.array(value) for name, value in stored["proxy"].items()})
+        self.proxy = Proxy.from_arrays(
+            {name: np.array(value) for name, value in stored["proxy"].items()}
+        )
 
     def at(self, diameter_um, height_um, wavelength_um):
         """(*shape) complex t; height and wavelength may vary with the pillar."""
-        values = self._spline(np.clip(diameter_um, self.diameter_um[0], self.diameter_um[-1]))
+        values = self._spline(
+            np.clip(diameter_um, self.diameter_um[0], self.diameter_um[-1])
+        )
         by_height = _lagrange(HEIGHTS_UM, height_um)
         by_wave = _lagrange(WAVELENGTHS_UM, wavelength_um)
         return np.einsum("...hw,...h,...w->...", values, by_height, by_wave)
@@ -52,7 +61,9 @@ def load():
 
 def _lagrange(nodes, place):
     place = np.asarray(place, float)
-    weights = [np.prod([(place - b) / (a - b) for b in nodes if b != a], axis=0) for a in nodes]
+    weights = [
+        np.prod([(place - b) / (a - b) for b in nodes if b != a], axis=0) for a in nodes
+    ]
     return np.stack(weights, -1)
 
 
@@ -63,13 +74,18 @@ def make():
     libraries = [library.sweep(cell, sweep) for cell in cells]
     even = np.linspace(*sweep.span_um(DEFAULT_CELL), SAMPLES)
     places = [np.searchsorted(made.diameter_um, even - 1e-9) for made in libraries]
-    t = np.stack([made.t[0, 0][:, place] for made, place in zip(libraries, places, strict=True)])
+    t = np.stack(
+        [made.t[0, 0][:, place] for made, place in zip(libraries, places, strict=True)]
+    )
     proxy = proxies.fit_proxy(libraries[2])
     stored = {
         "diameter_um": even.round(9).tolist(),
         "real": t.real.round(6).tolist(),
         "imaginary": t.imag.round(6).tolist(),
-        "proxy": {name: np.asarray(value).tolist() for name, value in proxy.to_arrays().items()},
+        "proxy": {
+            name: np.asarray(value).tolist()
+            for name, value in proxy.to_arrays().items()
+        },
     }
     store.write_text(PATH, json.dumps(stored) + "\n")
 

@@ -1,4 +1,6 @@
-"""The fit judged by a bench that shares nothing with it: its intervals, and what it says of errors unknown to it."""
+"""The fit judged by a bench that shares nothing with it: its intervals, and what it
+says of errors unknown to it.
+"""
 
 import dataclasses
 import sys
@@ -38,14 +40,28 @@ def test_the_table_is_what_the_solver_says_between_its_entries():
 
 @pytest.mark.parametrize("stitch_nm", [0.0, 900.0])
 def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
-    """The same sum in another order, of one write field or of sixteen out of place (the last ones narrower)."""
-    lens, session = hidden.lens(12.0, 40.0, 200.0), hidden.session(4, depths_um=(200.0,))
+    """The same sum in another order, of one write field or of sixteen out of place (the
+    last ones narrower).
+    """
+    lens, session = (
+        hidden.lens(12.0, 40.0, 200.0),
+        hidden.session(4, depths_um=(200.0,)),
+    )
     session = bench.with_faults(session, stitch_nm=stitch_nm, field_um=3.1)
     x, y, d, light, fields = bench._pillars(lens, session, np.random.default_rng(0))
     k, z = 2 * np.pi / 0.85, 211.0
     path = bench._source_path(session.faults, x - 3.1, y + 1.7, z)
-    lit = bench._transmission(lens, session, d, 0.85) * light * np.exp(1j * k * (path - path.min())) / z
-    found = bench._intensity(lit, [bench._kernel(lens, session, lit.shape, k, field) for field in fields], fields)
+    lit = (
+        bench._transmission(lens, session, d, 0.85)
+        * light
+        * np.exp(1j * k * (path - path.min()))
+        / z
+    )
+    found = bench._intensity(
+        lit,
+        [bench._kernel(lens, session, lit.shape, k, field) for field in fields],
+        fields,
+    )
     assert len(fields) == (16 if stitch_nm else 1)
     for rows, columns, dx, dy in fields:
         x[rows, columns] += dx
@@ -55,7 +71,13 @@ def test_the_convolution_is_the_sum_over_all_pillars(stitch_nm):
     Y = (at[0] - middle) * lens.diameters.pitch_um + session.of("decentre_y_um")
     distance = lens.sensor_distance_um + session.of("distance_um")
     r = np.sqrt((X - x) ** 2 + (Y - y) ** 2 + distance**2)
-    field = (lit * np.exp(1j * k * (r - distance)) * distance / (2 * np.pi * r * r) * (1 / r - 1j * k)).sum()
+    field = (
+        lit
+        * np.exp(1j * k * (r - distance))
+        * distance
+        / (2 * np.pi * r * r)
+        * (1 / r - 1j * k)
+    ).sum()
     assert abs(field) ** 2 == pytest.approx(found[at], rel=1e-10)
 
 
@@ -65,19 +87,26 @@ def test_saddles_widen_one_way_and_thin_the_other_and_light_fades_as_stated():
     faults = {"saddle_nm": 7.0, "oblique_nm": 11.0, "light_y": 0.3, "light_r": -0.4}
     lens, rng = hidden.lens(12.0, 40.0, 200.0), np.random.default_rng
     (x, y, d, light, _), (_, _, plain, one, _) = (
-        bench._pillars(lens, bench.with_faults(session, **some), rng(0)) for some in (faults, {})
+        bench._pillars(lens, bench.with_faults(session, **some), rng(0))
+        for some in (faults, {})
     )
     radius = np.hypot(x, y)[plain > 0].max()
     for place in ((20, 31), (33, 20), (9, 12)):
         u, v = x[place] / radius, y[place] / radius
-        assert d[place] - plain[place] == pytest.approx(7e-3 * (u * u - v * v) + 11e-3 * 2 * u * v, abs=1e-12)
+        assert d[place] - plain[place] == pytest.approx(
+            7e-3 * (u * u - v * v) + 11e-3 * 2 * u * v, abs=1e-12
+        )
         irradiance = abs(light[place] / one[place]) ** 2
-        assert irradiance == pytest.approx(np.exp(0.3 * v - 0.4 * (u * u + v * v)), rel=1e-12)
+        assert irradiance == pytest.approx(
+            np.exp(0.3 * v - 0.4 * (u * u + v * v)), rel=1e-12
+        )
 
 
 def test_a_cause_that_nobody_states_is_the_only_one_left_open():
     """By names that the fit knows: each kind in turn, every other one stated."""
-    every = {name for names in hidden.UNSTATED.values() for name in names} | set(hidden.LEFT_OUT)
+    every = {name for names in hidden.UNSTATED.values() for name in names} | set(
+        hidden.LEFT_OUT
+    )
     kinds = [hidden.unstated(seed) for seed in range(len(hidden.UNSTATED))]
     assert [kind for kind, *_ in kinds] == list(hidden.UNSTATED)
     assert every <= {*NAMES, *(row.name for row in UNFITTED)}
@@ -87,12 +116,18 @@ def test_a_cause_that_nobody_states_is_the_only_one_left_open():
 
 
 def test_a_plate_of_glass_bends_by_snell():
-    """Fermat: the path through the plate is the least over all places where the ray could enter it."""
+    """Fermat: the path through the plate is the least over all places where the ray
+    could enter it.
+    """
     glass = bench.Faults(glass_um=100.0)
     rho, z = 37.3, 411.0
-    enter = np.linspace(0, rho, 200001)  # on the plate's far side, the plate lying on the lens
+    enter = np.linspace(
+        0, rho, 200001
+    )  # on the plate's far side, the plate lying on the lens
     want = (np.hypot(enter, z - 100.0) + 1.51 * np.hypot(rho - enter, 100.0)).min()
-    assert bench._source_path(glass, np.array(rho), np.array(0.0), z) == pytest.approx(want, abs=1e-7)
+    assert bench._source_path(glass, np.array(rho), np.array(0.0), z) == pytest.approx(
+        want, abs=1e-7
+    )
 
 
 def test_one_frame_cannot_fix_twenty_parameters():
@@ -103,7 +138,9 @@ def test_one_frame_cannot_fix_twenty_parameters():
 
 def test_depths_in_millimetres_are_called_so():
     seen = bench.shoot(hidden.lens(), hidden.session(1))
-    short = dataclasses.replace(seen.capture, position_um=seen.capture.position_um / 1e3)
+    short = dataclasses.replace(
+        seen.capture, position_um=seen.capture.position_um / 1e3
+    )
     with pytest.raises(CaptureError, match="look like mm"):
         characterize.fit(short, hidden.lens(), USUAL)
 
@@ -111,7 +148,8 @@ def test_depths_in_millimetres_are_called_so():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_hidden_lens_lies_within_its_intervals(response, seed):
-    """19 intervals of 95 % within the model: three that miss have a probability of 7 % together, four of 1.5 %.
+    """19 intervals of 95 % within the model: three that miss have a probability of 7 %
+    together, four of 1.5 %.
 
     The wider ones, which reckon with what this bench does not have, hold all.
     """
@@ -123,38 +161,64 @@ def test_a_hidden_lens_lies_within_its_intervals(response, seed):
         low, high = found.within_model(name)
         if not low <= session.of(name) <= high:
             missed.append(name)
-        assert found.interval(name)[0] < session.of(name) < found.interval(name)[1], name
+        assert found.interval(name)[0] < session.of(name) < found.interval(name)[1], (
+            name
+        )
     assert len(missed) < 4, missed
     assert len(found.verdicts) == 2
 
 
 @pytest.mark.slow
 def test_uneven_light_is_found_fitted_and_the_rest_comes_back(response):
-    """Amplitudes 15 % higher at one rim and lower at the other: without it decentre misses by 13 standard errors."""
+    """Amplitudes 15 % higher at one rim and lower at the other: without it decentre
+    misses by 13 standard errors.
+    """
     session = bench.with_faults(hidden.session(0), gradient=0.15)
-    found = characterize.fit(bench.shoot(hidden.lens(), session).capture, hidden.lens(), USUAL, response=response)
-    assert any("light_x, light_y, light_r fitted too" in words for words in found.cautions)
+    found = characterize.fit(
+        bench.shoot(hidden.lens(), session).capture,
+        hidden.lens(),
+        USUAL,
+        response=response,
+    )
+    assert any(
+        "light_x, light_y, light_r fitted too" in words for words in found.cautions
+    )
     low, high = found.interval("light_x")
-    assert low < np.log(1.15 / 0.85) < high  # half the ln of the ratio of the rims' irradiances
+    assert (
+        low < np.log(1.15 / 0.85) < high
+    )  # half the ln of the ratio of the rims' irradiances
     for name in ("decentre_x_um", "bias_x_nm", "astigmatism_rad"):
         low, high = found.interval(name)
         assert low < session.of(name) < high, name
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", [{"glass_um": 100.0}, {"stitch_nm": 60.0}, {"sidewall_deg": 1.5}])
+@pytest.mark.parametrize(
+    "fault", [{"glass_um": 100.0}, {"stitch_nm": 60.0}, {"sidewall_deg": 1.5}]
+)
 def test_what_cannot_be_told_lies_within_the_interval(response, fault):
     """19 intervals: one may miss by chance."""
     session = bench.with_faults(hidden.session(0), **fault)
-    found = characterize.fit(bench.shoot(hidden.lens(), session).capture, hidden.lens(), USUAL, response=response)
+    found = characterize.fit(
+        bench.shoot(hidden.lens(), session).capture,
+        hidden.lens(),
+        USUAL,
+        response=response,
+    )
     ends = {name: found.interval(name) for name in hidden.TRUTHS}
-    missed = [name for name, (low, high) in ends.items() if not low <= session.of(name) <= high]
+    missed = [
+        name
+        for name, (low, high) in ends.items()
+        if not low <= session.of(name) <= high
+    ]
     assert len(missed) < 2, missed
 
 
 @pytest.mark.slow
 def test_a_ghost_is_refused_or_spoken_of(response):
-    """The other faults have their rows in ``benchmarks.characterize_referee``: not all are found."""
+    """The other faults have their rows in ``benchmarks.characterize_referee``: not all
+    are found.
+    """
     session = bench.with_faults(hidden.session(0), ghost=0.08)
     seen = bench.shoot(hidden.lens(), session)
     try:
@@ -162,4 +226,9 @@ def test_a_ghost_is_refused_or_spoken_of(response):
     except FitError:
         return
     words = " ".join(found.cautions)
-    assert "residuals" in words or "left out" in words or "fitted too" in words or "phase" in words
+    assert (
+        "residuals" in words
+        or "left out" in words
+        or "fitted too" in words
+        or "phase" in words
+    )

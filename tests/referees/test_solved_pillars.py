@@ -1,4 +1,6 @@
-"""t of the pillars of a fit under a process, against the referee's table: height, bias past the proxy, wavelength."""
+"""t of the pillars of a fit under a process, against the referee's table: height, bias
+past the proxy, wavelength.
+"""
 
 import dataclasses
 import sys
@@ -27,19 +29,31 @@ def response():
 
 
 def amounts(height_um=0.0, index=0.0, sidewall_rad=0.0):
-    """Of the causes that pillars answer, in the order of the table; of a round one no others."""
+    """Of the causes that pillars answer, in the order of the table; of a round one no
+    others.
+    """
     names, found = named(Answers), np.zeros(len(named(Answers)))
-    for name, amount in (("height_nm", height_um), ("index", index), ("sidewall_deg", sidewall_rad)):
+    for name, amount in (
+        ("height_nm", height_um),
+        ("index", index),
+        ("sidewall_deg", sidewall_rad),
+    ):
         found[names.index(name)] = amount
     return found
 
 
 @pytest.mark.parametrize("bias_um", [-0.0237, 0.0113, 0.0261])
 @pytest.mark.parametrize("height_um", [-0.0193, 0.0091, 0.0214])
-def test_pillars_are_those_of_the_solver_under_a_bias_and_a_height(response, bias_um, height_um):
-    """Cubics over D add 1e-3, the referee's quartic over the height as much; most at the resonance past 0.21 um."""
+def test_pillars_are_those_of_the_solver_under_a_bias_and_a_height(
+    response, bias_um, height_um
+):
+    """Cubics over D add 1e-3, the referee's quartic over the height as much; most at
+    the resonance past 0.21 um.
+    """
     want = pillar_table.load().at(D + bias_um, 0.7 + height_um, 0.85)
-    found = transmission(hidden.lens().proxy, response, D + bias_um, 0.85, amounts(height_um))
+    found = transmission(
+        hidden.lens().proxy, response, D + bias_um, 0.85, amounts(height_um)
+    )
     assert np.abs(found - want).max() < 3e-3
 
 
@@ -56,8 +70,12 @@ def test_index_and_height_act_together(response):
     cell = dataclasses.replace(DEFAULT_CELL, pillar=Index(3.56), height_um=0.712)
     want = np.array([modal.solve(cell, d, 0.85, tolerance=1e-3).t for d in D])
     found = transmission(hidden.lens().proxy, response, D, 0.85, amounts(0.012, -0.04))
-    assert np.abs(found - want)[:4].max() < 6e-3  # the mixed derivative and the third by the index are left out
-    assert np.abs(found - want)[4] < 0.05  # 0.1994 um: next to a resonance, which the index moves
+    assert (
+        np.abs(found - want)[:4].max() < 6e-3
+    )  # the mixed derivative and the third by the index are left out
+    assert (
+        np.abs(found - want)[4] < 0.05
+    )  # 0.1994 um: next to a resonance, which the index moves
     alone = transmission(hidden.lens().proxy, response, D, 0.85, amounts(0.012))
     assert np.abs(alone - want).max() > 0.1
 
@@ -70,7 +88,9 @@ def test_rates_are_derivatives_of_the_factor(response):
         up[n] += step
         down[n] -= step
         want = np.log(ready.factor(up) / ready.factor(down)) / (2 * step)
-        assert ready.rates(at)[n] == pytest.approx(want, rel=1e-6, abs=1e-8)  # third derivative times step²
+        assert ready.rates(at)[n] == pytest.approx(
+            want, rel=1e-6, abs=1e-8
+        )  # third derivative times step²
 
 
 def test_few_functions_hold_every_change(response):
@@ -82,12 +102,20 @@ def test_few_functions_hold_every_change(response):
         coefficients = pillars.coefficients(change)
         found = pillars.basis.conj().T @ (weight @ coefficients)
         assert np.abs(found - pillars.exact(bias_um, change)).max() < 2e-3
-        near = [pillars.weights(np.array(bias_um + s)) @ coefficients for s in (1e-6, -1e-6)]
-        assert rate @ coefficients == pytest.approx((near[0] - near[1]) / 2e-6, rel=1e-5, abs=1e-5)
+        near = [
+            pillars.weights(np.array(bias_um + s)) @ coefficients for s in (1e-6, -1e-6)
+        ]
+        assert rate @ coefficients == pytest.approx(
+            (near[0] - near[1]) / 2e-6, rel=1e-5, abs=1e-5
+        )
 
 
 def test_a_proxy_of_something_else_is_believed():
-    """Twice the phase of this cell: a measured library, say. The solver is not put in its place."""
+    """Twice the phase of this cell: a measured library, say. The solver is not put in
+    its place.
+    """
     lens = hidden.lens()
-    proxy = dataclasses.replace(lens.proxy, phase_coefficients=0.8 * lens.proxy.phase_coefficients)
+    proxy = dataclasses.replace(
+        lens.proxy, phase_coefficients=0.8 * lens.proxy.phase_coefficients
+    )
     assert slopes(dataclasses.replace(lens, proxy=proxy)).solved is None

@@ -1,4 +1,6 @@
-"""Options of the verbs of co-design, apart from their work: what ``--help`` shows needs neither torch nor time."""
+"""Options of the verbs of co-design, apart from their work: what ``--help`` shows needs
+neither torch nor time.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,8 @@
-"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each with how it was found.
+"""lens.h5 -> error budget: every link of the chain as phase, PSF and gaze error, each
+with how it was found.
 
-Links that are done are kept beside the output (NAME.resume): after an interruption the same command goes on.
+Links that are done are kept beside the output (NAME.resume): after an interruption the
+same command goes on.
 """
 
 from dataclasses import dataclass, field
@@ -24,12 +26,15 @@ class Options(Common):
         library: library.h5 that the lens was made from: parts solver and proxy.
         process: PROCESS.toml: adds mask grid and process spread.
         asbuilt: asbuilt.h5 of the same lens: adds the calibration uncertainty.
-        run: RUN_DIR of a co-design run: its network reads the frames of the virtual experiment, and the sum is held
+        run: RUN_DIR of a co-design run: its network reads the frames of the virtual
+            experiment, and the sum is held
             against the error measured on them.
-        frames: subjects, stimuli, slippage states, calibration: those of the experiment.
+        frames: subjects, stimuli, slippage states, calibration: those of the
+            experiment.
         led_fwhm_nm: width of the diode; 0 for that of the run.
         depths: number of PSFs over depth. wavelengths: over the diode's line.
-        tolerance: of the PSF engine. kernels: of the kernels that images are formed with.
+        tolerance: of the PSF engine. kernels: of the kernels that images are formed
+            with.
     """
 
     lens: tyro.conf.Positional[Path]
@@ -38,7 +43,9 @@ class Options(Common):
     process: Path | None = None
     asbuilt: Path | None = None
     run: Path | None = None
-    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=lambda: ExperimentConfig(subjects=5))
+    frames: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(
+        default_factory=lambda: ExperimentConfig(subjects=5)
+    )
     led_fwhm_nm: float = 0.0
     depths: int = 24
     wavelengths: int = 3

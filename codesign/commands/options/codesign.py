@@ -1,4 +1,6 @@
-"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched under compute budgets."""
+"""RUN.toml to RUN_DIR: lens, pixel pitch and network trained together, then searched
+under compute budgets.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +21,16 @@ class Options(Common):
         config: RUN.toml.
         output: folder of the run.
         resume: go on from the folder's checkpoint, bit for bit.
-        freeze: parts that stay as they start, beside those of the config: the ablations.
-        device: of images and network; auto takes a GPU where there is one. Frames are rendered on the processor.
-        export: write every budget's network as ONNX too (opset 17): frames of the sensor's pixels in; pupil, slippage,
-            landmarks in mm and the angles of the optic axis out, which gaze is calibrated from.
-        events: write TensorBoard events too (scalars of every step, pictures at every checkpoint).
+        freeze: parts that stay as they start, beside those of the config: the
+            ablations.
+        device: of images and network; auto takes a GPU where there is one. Frames are
+            rendered on the processor.
+        export: write every budget's network as ONNX too (opset 17): frames of the
+            sensor's pixels in; pupil, slippage,
+            landmarks in mm and the angles of the optic axis out, which gaze is
+            calibrated from.
+        events: write TensorBoard events too (scalars of every step, pictures at every
+            checkpoint).
     """
 
     config: tyro.conf.Positional[Path]

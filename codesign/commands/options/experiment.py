@@ -1,4 +1,6 @@
-"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each run's lens and network (Sec. 5)."""
+"""RUN_DIR... to Figs. 9 to 11: gaze and slippage of synthetic subjects before each
+run's lens and network (Sec. 5).
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,10 +18,14 @@ class Options(Common):
     """Options of ``metalens evaluate experiment``.
 
     Attributes:
-        runs: folders of finished runs of one geometry; the first is compared with each of the others. A folder of
-            metalens retrain shows its network before the lens as made; nominal.safetensors in it, the unwarned one.
-        output: folder for experiment.json, samples.png, ambiguity.png, errors.png, report.html and, of every run that
-            tells the optic axis, people_1.h5 ...: what calibrates a wearer of that device (codesign.gaze.people_file).
+        runs: folders of finished runs of one geometry; the first is compared with each
+            of the others. A folder of
+            metalens retrain shows its network before the lens as made;
+            nominal.safetensors in it, the unwarned one.
+        output: folder for experiment.json, samples.png, ambiguity.png, errors.png,
+            report.html and, of every run that
+            tells the optic axis, people_1.h5 ...: what calibrates a wearer of that
+            device (codesign.gaze.people_file).
         names: of the runs; by default their folders'.
         settings: subjects, stimuli, slippage states, calibration.
     """
@@ -27,4 +33,6 @@ class Options(Common):
     runs: tyro.conf.Positional[tuple[Path, ...]]
     output: Output = Path("experiment")
     names: tuple[str, ...] = ()
-    settings: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(default_factory=ExperimentConfig)
+    settings: tyro.conf.OmitArgPrefixes[ExperimentConfig] = field(
+        default_factory=ExperimentConfig
+    )

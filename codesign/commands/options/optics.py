@@ -1,4 +1,6 @@
-"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about depth, and about whole scenes."""
+"""LENS... to Tables 1 and 3 and Figs. 5 and 7 of the paper: what lenses tell about
+depth, and about whole scenes.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +18,16 @@ class Options(Common):
 
     Attributes:
         lenses: lens files; the first is what the others are compared with.
-        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png, field.png, mtf.png, report.html.
-        config: OPTICS.toml with the tables [axial], [over_field], [scenes] and [reader]; without it the defaults.
+        output: folder for optics.json, tables.txt, axial.png, slices.png, scenes.png,
+            field.png, mtf.png, report.html.
+        config: OPTICS.toml with the tables [axial], [over_field], [scenes] and
+            [reader]; without it the defaults.
         scenes: number of scenes, in place of the one in the settings.
-        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones and focus), made of the pillars
+        baselines: add the best hyperbolic lens (focus scanned) and double helix (zones
+            and focus), made of the pillars
             and at the aperture of the first lens; tuned on axis for the finest binning.
-        reader: train the reference reader behind every lens and print what it reads: depth of windows, slippage, with
+        reader: train the reference reader behind every lens and print what it reads:
+            depth of windows, slippage, with
             calibrated intervals; some minutes a lens, the same numbers every time.
     """
 

@@ -1,4 +1,6 @@
-"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours, ratio, conditions."""
+"""RUN_DIR... to one page: every table and figure of the paper beside ours: paper, ours,
+ratio, conditions.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +17,20 @@ class Options(Common):
     """Options of ``metalens evaluate paper``.
 
     Attributes:
-        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at best focus, double helix, as
-            far as there are; without any, the claims are listed with the commands that measure them.
-        others: further finished runs: other networks (Table 2), runs with one part frozen (Fig. 8b); each run's
+        runs: folders of finished runs: proposed, hyperbolic at mid-range, hyperbolic at
+            best focus, double helix, as
+            far as there are; without any, the claims are listed with the commands that
+            measure them.
+        others: further finished runs: other networks (Table 2), runs with one part
+            frozen (Fig. 8b); each run's
             result.json tells which it is.
-        output: folder for paper.json, report.html, and the measurements in optics, experiment and dim beside them.
+        output: folder for paper.json, report.html, and the measurements in optics,
+            experiment and dim beside them.
         subjects: of the experiment.
-        scenes: of Table 1; imaged at the largest ``optics.image_tolerance`` of the runs.
-        measure: measure what is not in the folder yet; without it only what is there is used.
+        scenes: of Table 1; imaged at the largest ``optics.image_tolerance`` of the
+            runs.
+        measure: measure what is not in the folder yet; without it only what is there is
+            used.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()

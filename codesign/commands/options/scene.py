@@ -16,12 +16,17 @@ class Options(Common):
 
     Attributes:
         config: SCENE.toml; without it the defaults.
-        output: folder for scene.h5, layers.h5, sheet.png and labels.csv; with --lens also image.h5 and image.png.
-        lens: a lens that images the first frames onto its sensor, over the whole field and in its light: scene, image,
-            their difference, and the PSFs over field and depth. Ends 1 where the image's error is above 0.03.
+        output: folder for scene.h5, layers.h5, sheet.png and labels.csv; with --lens
+            also image.h5 and image.png.
+        lens: a lens that images the first frames onto its sensor, over the whole field
+            and in its light: scene, image,
+            their difference, and the PSFs over field and depth. Ends 1 where the
+            image's error is above 0.03.
         fwhm_nm: width of that light, 0 for one wavelength.
-        referee: path trace the first frame with Mitsuba 3 as well (an extra: metalens-toolchain[referee]) and write
-            referee.png and referee.txt: the radiance error of the renderer by region. About a minute.
+        referee: path trace the first frame with Mitsuba 3 as well (an extra:
+            metalens-toolchain[referee]) and write
+            referee.png and referee.txt: the radiance error of the renderer by region.
+            About a minute.
     """
 
     config: tyro.conf.Positional[Path | None] = None

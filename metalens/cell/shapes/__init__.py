@@ -1,4 +1,6 @@
-"""The section of a pillar as one record: outline, area, Fourier factors, boundary, mask polygon, name."""
+"""The section of a pillar as one record: outline, area, Fourier factors, boundary, mask
+polygon, name.
+"""
 
 from typing import TYPE_CHECKING
 

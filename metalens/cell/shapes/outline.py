@@ -1,7 +1,10 @@
-"""The section of a pillar of a given size: signed ellipses and polygons, with everything that follows from them.
+"""The section of a pillar of a given size: signed ellipses and polygons, with
+everything that follows from them.
 
-Whatever asks for area, Fourier factors, boundary or mask polygon asks here; a new shape only says which ellipses and
-polygons it is made of. Lengths in um, +x right, +y down, the site of the pillar at the origin.
+Whatever asks for area, Fourier factors, boundary or mask polygon asks here; a new shape
+only says which ellipses and
+polygons it is made of. Lengths in um, +x right, +y down, the site of the pillar at the
+origin.
 """
 
 import math
@@ -15,13 +18,19 @@ from metalens.ground.errors import CellError
 Point = tuple[float, float]
 _ALIKE = 1e-9  # of the area: Fourier factors that differ less are the same
 _ASIDE = 1e-4  # of an edge, from its end
-_PROBES = np.array([[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]])  # over the radius, no two alike
-_DIRECTIONS = np.stack([np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1)
+_PROBES = np.array(
+    [[1.31, 0.73], [2.9, -1.7], [0.4, 4.1], [5.3, 3.3], [-7.1, 2.2]]
+)  # over the radius, no two alike
+_DIRECTIONS = np.stack(
+    [np.cos(np.arange(180) * np.pi / 180), np.sin(np.arange(180) * np.pi / 180)], axis=1
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Conic:
-    """An ellipse about the origin with half axes a (along x before the turn) and b; sign -1 cuts it out."""
+    """An ellipse about the origin with half axes a (along x before the turn) and b;
+    sign -1 cuts it out.
+    """
 
     half_x_um: float
     half_y_um: float
@@ -34,20 +43,33 @@ class Conic:
         return self.sign * math.pi * self.half_x_um * self.half_y_um
 
     def fourier(self, gx: Array, gy: Array) -> Array:
-        """∫ exp(-i g r) d²r = pi a b 2 J1(s) / s, s = |(a gx', b gy')| in the axes of the ellipse."""
+        """∫ exp(-i g r) d²r = pi a b 2 J1(s) / s, s = |(a gx', b gy')| in the axes of
+        the ellipse.
+        """
         from scipy.special import j1
 
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        along, across = self.half_x_um * (c * gx + s * gy), self.half_y_um * (c * gy - s * gx)
+        along, across = (
+            self.half_x_um * (c * gx + s * gy),
+            self.half_y_um * (c * gy - s * gx),
+        )
         x = np.hypot(along, across)
         safe = np.where(x < 1e-6, 1.0, x)
-        return np.asarray(self.area_um2 * np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe), complex)
+        return np.asarray(
+            self.area_um2 * np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe),
+            complex,
+        )
 
     def vertices(self, count: int) -> Array:
-        """(count, 2) points, anticlockwise, of the inscribed polygon with the area of the ellipse."""
+        """(count, 2) points, anticlockwise, of the inscribed polygon with the area of
+        the ellipse.
+        """
         turn = 2 * np.pi * np.arange(count) / count
         swell = math.sqrt(2 * math.pi / count / math.sin(2 * math.pi / count))
-        x, y = swell * self.half_x_um * np.cos(turn), swell * self.half_y_um * np.sin(turn)
+        x, y = (
+            swell * self.half_x_um * np.cos(turn),
+            swell * self.half_y_um * np.sin(turn),
+        )
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return np.stack([c * x - s * y, s * x + c * y], axis=1)
 
@@ -61,13 +83,17 @@ class Loop:
 
     @property
     def area_um2(self) -> float:
-        """Half the sum of cross products of neighbouring corners, with the sign of the part."""
+        """Half the sum of cross products of neighbouring corners, with the sign of the
+        part.
+        """
         return self.sign * abs(_signed_area(np.array(self.corners_um)))
 
     def fourier(self, gx: Array, gy: Array) -> Array:
-        """∫ exp(-i g r) d²r by Green's theorem over the edges: sum of i (g x d) / g² exp(-i g m) sinc(g d / 2).
+        """∫ exp(-i g r) d²r by Green's theorem over the edges: sum of i (g x d) / g²
+        exp(-i g m) sinc(g d / 2).
 
-        m is the middle and d the vector of an edge; below |g| size = 1e-4 the area and the centroid are used.
+        m is the middle and d the vector of an edge; below |g| size = 1e-4 the area and
+        the centroid are used.
         """
         points = _anticlockwise(np.array(self.corners_um))
         edge = np.roll(points, -1, axis=0) - points
@@ -77,11 +103,15 @@ class Loop:
         small = np.sqrt(square) * np.abs(points).max() < 1e-4
         half = g @ edge.T / 2
         cross = g[..., :1] * edge[:, 1] - g[..., 1:] * edge[:, 0]
-        total = (cross * np.sinc(half / np.pi) * np.exp(-1j * (g @ middle.T))).sum(axis=-1)
+        total = (cross * np.sinc(half / np.pi) * np.exp(-1j * (g @ middle.T))).sum(
+            axis=-1
+        )
         area = _signed_area(points)
         centre = _centroid(points, area)
         near = area * (1 - 1j * (g @ centre))
-        return np.asarray(self.sign * np.where(small, near, 1j * total / np.where(small, 1.0, square)))
+        return np.asarray(
+            self.sign * np.where(small, near, 1j * total / np.where(small, 1.0, square))
+        )
 
     def vertices(self, count: int) -> Array:
         """(n, 2) corners, anticlockwise; a polygon needs no more points than it has."""
@@ -90,7 +120,8 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A section: ellipses and polygons that do not overlap but where one cuts another out.
+    """A section: ellipses and polygons that do not overlap but where one cuts another
+    out.
 
     parts: with signs; the first is the outermost.
     """
@@ -112,7 +143,9 @@ class Outline:
         return np.asarray(sum(part.fourier(gx, gy) for part in self.parts))
 
     def polygons(self, count: int = 64) -> tuple[tuple[int, Array], ...]:
-        """(sign, (n, 2) corners) of every part: what a mask or a solid is made of; ellipses keep their area."""
+        """(sign, (n, 2) corners) of every part: what a mask or a solid is made of;
+        ellipses keep their area.
+        """
         return tuple((part.sign, part.vertices(count)) for part in self.parts)
 
     def turned(self, angle_rad: float) -> "Outline":
@@ -127,9 +160,11 @@ class Outline:
         return Outline(tuple(made))
 
     def line(self, count: int = 64) -> Array:
-        """(n, 2) one closed line around the solid part, for pictures: to every hole and back on the same way.
+        """(n, 2) one closed line around the solid part, for pictures: to every hole and
+        back on the same way.
 
-        It encloses the area of the section (ellipses by ``count`` corners); a mask is drawn from :meth:`polygons`.
+        It encloses the area of the section (ellipses by ``count`` corners); a mask is
+        drawn from :meth:`polygons`.
         """
         made = self.parts[0].vertices(count)
         for hole in self.parts[1:]:
@@ -141,10 +176,16 @@ class Outline:
         return made
 
     def boundary(self, step_um: float) -> tuple[Array, Array]:
-        """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit normals there, out of the part."""
+        """Points (n, 2) on the boundary no farther apart than ``step_um``, and unit
+        normals there, out of the part.
+        """
         points, normals = [], []
         for part in self.parts:
-            count = max(32, math.ceil(2 * math.pi * self.radius_um / step_um)) if isinstance(part, Conic) else 0
+            count = (
+                max(32, math.ceil(2 * math.pi * self.radius_um / step_um))
+                if isinstance(part, Conic)
+                else 0
+            )
             corners = part.vertices(count)
             edge = np.roll(corners, -1, axis=0) - corners
             for start, d in zip(corners, edge, strict=True):
@@ -160,46 +201,74 @@ class Outline:
         points = np.stack(np.broadcast_arrays(x_um, y_um), axis=-1)
         depth = np.zeros(points.shape[:-1], int)
         for sign, corners in self.polygons(256):
-            depth += sign * Polygon(corners).contains_points(points.reshape(-1, 2)).reshape(depth.shape)
+            depth += sign * Polygon(corners).contains_points(
+                points.reshape(-1, 2)
+            ).reshape(depth.shape)
         return np.asarray(depth > 0)
 
     def keeps(self, flip_x: int, flip_y: int) -> bool:
-        """Whether (x, y) -> (flip_x x, flip_y y), flips +-1, leaves it as it is (judged by its Fourier factors)."""
+        """Whether (x, y) -> (flip_x x, flip_y y), flips +-1, leaves it as it is (judged
+        by its Fourier factors).
+        """
         gx, gy = (_PROBES / self.radius_um).T
-        apart = np.abs(self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)).max()
+        apart = np.abs(
+            self.fourier(gx, gy) - self.fourier(flip_x * gx, flip_y * gy)
+        ).max()
         return bool(apart <= _ALIKE * self.area_um2)
 
     def repeats(self, turn_rad: float) -> bool:
-        """Whether a turn in the plane leaves it as it is (judged by its Fourier factors)."""
+        """Whether a turn in the plane leaves it as it is (judged by its Fourier
+        factors).
+        """
         gx, gy = (_PROBES / self.radius_um).T
         c, s = math.cos(turn_rad), math.sin(turn_rad)
-        apart = np.abs(self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)).max()
+        apart = np.abs(
+            self.fourier(gx, gy) - self.fourier(c * gx - s * gy, s * gx + c * gy)
+        ).max()
         return bool(apart <= _ALIKE * self.area_um2)
 
     @property
     def narrowest_um(self) -> float:
-        """Least width across, between parallel lines (of the outermost part, its hollows filled)."""
+        """Least width across, between parallel lines (of the outermost part, its
+        hollows filled).
+        """
         return _across(self.parts[0].vertices(64))
 
     @property
     def spans_um(self) -> tuple[float, float]:
-        """Least width of what is solid (walls of rings, bars of crosses) and least space within (holes, hollows; inf).
+        """Least width of what is solid (walls of rings, bars of crosses) and least
+        space within (holes, hollows; inf).
 
-        Convex outlines and holes between parallel lines, all else edge to edge, where one lies before the other (edges
-        that share a corner do not). Curves are taken as 64 edges of the same area: 1e-3 of their radius.
+        Convex outlines and holes between parallel lines, all else edge to edge, where
+        one lies before the other (edges
+        that share a corner do not). Curves are taken as 64 edges of the same area: 1e-3
+        of their radius.
         """
         parts = [corners[::sign] for sign, corners in self.polygons()]
-        bends = [_bends(corners[:: part.sign]) for corners, part in zip(parts, self.parts, strict=True)]
-        start, end = np.concatenate(parts), np.concatenate([np.roll(c, -1, axis=0) for c in parts])
+        bends = [
+            _bends(corners[:: part.sign])
+            for corners, part in zip(parts, self.parts, strict=True)
+        ]
+        start, end = (
+            np.concatenate(parts),
+            np.concatenate([np.roll(c, -1, axis=0) for c in parts]),
+        )
         of = np.repeat(np.arange(len(parts)), [len(c) for c in parts])
         along = (end - start) / np.hypot(*(end - start).T)[:, None]
-        i, j = np.nonzero(along @ along.T < -_ALIKE)  # those that run against each other
+        i, j = np.nonzero(
+            along @ along.T < -_ALIKE
+        )  # those that run against each other
         counted = (of[i] != of[j]) | np.array(bends)[of[i]]
         counted &= (start[i] != end[j]).any(axis=1) & (end[i] != start[j]).any(axis=1)
         i, j = i[counted], j[counted]
-        holes = [_across(c) for c, bent in zip(parts[1:], bends[1:], strict=True) if not bent]
+        holes = [
+            _across(c) for c, bent in zip(parts[1:], bends[1:], strict=True) if not bent
+        ]
         solid, space = self.narrowest_um, min(holes, default=math.inf)
-        for tip in (start[i] + _ASIDE * (end - start)[i], end[i] - _ASIDE * (end - start)[i]):
+        for tip in (
+            start[i] + _ASIDE * (end - start)[i],
+            end[i] - _ASIDE * (end - start)[i],
+        ):
             foot, before = _foot(tip, start[j], end[j])
             within, away = self.inside(*((tip + foot) / 2).T), np.hypot(*(tip - foot).T)
             solid = min(solid, float(away[before & within].min(initial=math.inf)))
@@ -207,7 +276,9 @@ class Outline:
         return solid, space
 
     def gap_um(self, steps: tuple[Point, ...]) -> float:
-        """Least distance to its copies at these lattice steps; 0 where they touch or overlap (within 1 % of radius)."""
+        """Least distance to its copies at these lattice steps; 0 where they touch or
+        overlap (within 1 % of radius).
+        """
         from scipy.spatial import cKDTree
 
         points, _ = self.boundary(self.radius_um / 100)
@@ -235,7 +306,9 @@ def moved(corners: Array, grow_um: float) -> tuple[Point, ...]:
     mitre = (out + before) / (1 + (out * before).sum(axis=1))[:, None]
     made = points + grow_um / 2 * mitre
     if ((np.roll(made, -1, axis=0) - made) * edge).sum(axis=1).min() <= 0:
-        raise CellError(f"an outline moved in by {-grow_um / 2:.4g} um loses an edge; need a larger size or less bias")
+        raise CellError(
+            f"an outline moved in by {-grow_um / 2:.4g} um loses an edge; need a larger size or less bias"
+        )
     return tuple((float(x), float(y)) for x, y in made)
 
 
@@ -257,11 +330,16 @@ def _bends(corners: Array) -> bool:
     """Whether an anticlockwise polygon has hollows."""
     edge = np.roll(corners, -1, axis=0) - corners
     after = np.roll(edge, -1, axis=0)
-    return bool((edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]).min() < -_ALIKE * np.abs(edge).max() ** 2)
+    return bool(
+        (edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]).min()
+        < -_ALIKE * np.abs(edge).max() ** 2
+    )
 
 
 def _foot(tip: Array, start: Array, end: Array) -> tuple[Array, Array]:
-    """(n, 2) nearest points of lines from start to end, and whether they lie on these edges."""
+    """(n, 2) nearest points of lines from start to end, and whether they lie on these
+    edges.
+    """
     edge = end - start
     along = ((tip - start) * edge).sum(axis=1) / (edge**2).sum(axis=1)
     return start + along[:, None] * edge, (along > -_ALIKE) & (along < 1 + _ALIKE)

@@ -9,7 +9,8 @@ from metalens.ground.errors import CellError
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A disc; its size is the diameter. hole: the disc is the opening in a film of the pillar's material.
+    """A disc; its size is the diameter. hole: the disc is the opening in a film of the
+    pillar's material.
 
     kind: of the shape.
     """
@@ -32,7 +33,8 @@ class Circle:
 class Ellipse:
     """Its size is the axis along x before the turn; ratio: of the other axis to it.
 
-    angle_rad: in the plane, from +x towards +y. grow_um moves both axes alike (not quite a parallel curve: the error
+    angle_rad: in the plane, from +x towards +y. grow_um moves both axes alike (not
+    quite a parallel curve: the error
     is of second order in grow / axis).
     hole: an opening in a film. kind: of the shape.
     """
@@ -44,7 +46,9 @@ class Ellipse:
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.ratio <= 100:
-            raise CellError(f"ellipse ratio = {self.ratio}: need the other axis over the size, 0.01 to 100")
+            raise CellError(
+                f"ellipse ratio = {self.ratio}: need the other axis over the size, 0.01 to 100"
+            )
 
     @property
     def name(self) -> str:
@@ -59,7 +63,8 @@ class Ellipse:
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """A disc with a round hole; its size is the outer diameter. ratio: of the inner to the outer diameter.
+    """A disc with a round hole; its size is the outer diameter. ratio: of the inner to
+    the outer diameter.
 
     hole: an opening in a film. kind: of the shape.
     """
@@ -70,7 +75,9 @@ class Ring:
 
     def __post_init__(self) -> None:
         if not 0 < self.ratio < 1:
-            raise CellError(f"ring ratio = {self.ratio}: need the inner over the outer diameter, between 0 and 1")
+            raise CellError(
+                f"ring ratio = {self.ratio}: need the inner over the outer diameter, between 0 and 1"
+            )
 
     @property
     def name(self) -> str:
@@ -78,7 +85,9 @@ class Ring:
         return f"ring {self.ratio:g}"
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this outer diameter; ``grow_um`` widens the rim and closes the hole."""
+        """The section of this outer diameter; ``grow_um`` widens the rim and closes the
+        hole.
+        """
         outer, inner = _half(size_um + grow_um), self.ratio * size_um / 2 - grow_um / 2
         whole = Conic(outer, outer)
         return Outline((whole, Conic(inner, inner, sign=-1)) if inner > 0 else (whole,))
@@ -86,5 +95,7 @@ class Ring:
 
 def _half(width_um: float) -> float:
     if not width_um > 0:
-        raise CellError(f"an outline {width_um:.4g} um wide: nothing is left; need a larger size or less bias")
+        raise CellError(
+            f"an outline {width_um:.4g} um wide: nothing is left; need a larger size or less bias"
+        )
     return width_um / 2

@@ -1,4 +1,6 @@
-"""Sections with straight edges: square, rectangle, cross, regular polygon, and the user's own polygon."""
+"""Sections with straight edges: square, rectangle, cross, regular polygon, and the
+user's own polygon.
+"""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +23,8 @@ def _box(width_um: float, depth_um: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an opening in a film.
+    """Its size is the edge. angle_rad: in the plane, from +x towards +y. hole: an
+    opening in a film.
 
     kind: of the shape.
     """
@@ -42,7 +45,8 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
-    """Its size is the edge along x before the turn; ratio: of the other edge to it. hole: an opening in a film.
+    """Its size is the edge along x before the turn; ratio: of the other edge to it.
+    hole: an opening in a film.
 
     angle_rad: in the plane, from +x towards +y. kind: of the shape.
     """
@@ -54,7 +58,9 @@ class Rectangle:
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.ratio <= 100:
-            raise CellError(f"rectangle ratio = {self.ratio}: need the other edge over the size, 0.01 to 100")
+            raise CellError(
+                f"rectangle ratio = {self.ratio}: need the other edge over the size, 0.01 to 100"
+            )
 
     @property
     def name(self) -> str:
@@ -68,9 +74,11 @@ class Rectangle:
 
 @dataclass(frozen=True, slots=True)
 class Cross:
-    """Two bars of equal length at right angles; its size is the length. ratio: of the width of a bar to its length.
+    """Two bars of equal length at right angles; its size is the length. ratio: of the
+    width of a bar to its length.
 
-    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of the shape.
+    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of
+    the shape.
     """
 
     ratio: float = 1 / 3
@@ -80,7 +88,9 @@ class Cross:
 
     def __post_init__(self) -> None:
         if not 0 < self.ratio < 1:
-            raise CellError(f"cross ratio = {self.ratio}: need the width over the length of a bar, between 0 and 1")
+            raise CellError(
+                f"cross ratio = {self.ratio}: need the width over the length of a bar, between 0 and 1"
+            )
 
     @property
     def name(self) -> str:
@@ -92,15 +102,21 @@ class Cross:
         a, b = size_um / 2, self.ratio * size_um / 2
         corner = np.array([(b, -a), (b, -b), (a, -b)])
         return _made(
-            np.concatenate([turned(corner, quarter * math.pi / 2) for quarter in range(4)]), self.angle_rad, grow_um
+            np.concatenate(
+                [turned(corner, quarter * math.pi / 2) for quarter in range(4)]
+            ),
+            self.angle_rad,
+            grow_um,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class RegularPolygon:
-    """``sides`` equal edges; its size is the diameter of the circle through the corners, the first corner at +x.
+    """``sides`` equal edges; its size is the diameter of the circle through the
+    corners, the first corner at +x.
 
-    sides: number of edges, from 3. angle_rad: in the plane, from +x towards +y. hole: an opening in a film.
+    sides: number of edges, from 3. angle_rad: in the plane, from +x towards +y. hole:
+    an opening in a film.
     kind: of the shape.
     """
 
@@ -119,17 +135,25 @@ class RegularPolygon:
         return f"polygon of {self.sides} sides"
 
     def outline(self, size_um: float, *, grow_um: float = 0.0) -> Outline:
-        """The section of this circumscribed diameter, every edge moved out by half of ``grow_um``."""
+        """The section of this circumscribed diameter, every edge moved out by half of
+        ``grow_um``.
+        """
         turn = 2 * np.pi * np.arange(self.sides) / self.sides
-        return _made(size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1), self.angle_rad, grow_um)
+        return _made(
+            size_um / 2 * np.stack([np.cos(turn), np.sin(turn)], axis=1),
+            self.angle_rad,
+            grow_um,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """The user's own corners (x, y), in units of the size of the pillar; any order of turning, no crossings.
+    """The user's own corners (x, y), in units of the size of the pillar; any order of
+    turning, no crossings.
 
     corners: e.g. [[-0.5, -0.3], [0.5, -0.3], [0.0, 0.6]].
-    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of the shape.
+    angle_rad: in the plane, from +x towards +y. hole: an opening in a film. kind: of
+    the shape.
     """
 
     corners: tuple[Point, ...]
@@ -140,15 +164,21 @@ class Polygon:
     def __post_init__(self) -> None:
         points = np.array(self.corners, float)
         if len(points) < 3 or not np.isfinite(points).all():
-            raise CellError(f"polygon with {len(points)} corners: need at least 3, finite")
+            raise CellError(
+                f"polygon with {len(points)} corners: need at least 3, finite"
+            )
         edges = np.stack([points, np.roll(points, -1, axis=0)], axis=1)
         if (np.hypot(*(edges[:, 1] - edges[:, 0]).T) == 0).any():
-            raise CellError("polygon with two equal neighbouring corners: leave one of them out")
+            raise CellError(
+                "polygon with two equal neighbouring corners: leave one of them out"
+            )
         n = len(points)
         for i in range(n):
             for j in range(i + 2, n - (i == 0)):
                 if _cross(*edges[i], *edges[j]):
-                    raise CellError(f"polygon edges {i} and {j} cross: need a polygon without crossings")
+                    raise CellError(
+                        f"polygon edges {i} and {j} cross: need a polygon without crossings"
+                    )
 
     @property
     def name(self) -> str:
@@ -166,5 +196,11 @@ def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
     def side(p: Array, q: Array, r: Array) -> float:
         return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
 
-    apart = (np.maximum(a, b) < np.minimum(c, d)) | (np.maximum(c, d) < np.minimum(a, b))  # also edges of one line
-    return not apart.any() and side(a, b, c) * side(a, b, d) <= 0 and side(c, d, a) * side(c, d, b) <= 0
+    apart = (np.maximum(a, b) < np.minimum(c, d)) | (
+        np.maximum(c, d) < np.minimum(a, b)
+    )  # also edges of one line
+    return (
+        not apart.any()
+        and side(a, b, c) * side(a, b, d) <= 0
+        and side(c, d, a) * side(c, d, b) <= 0
+    )

@@ -1,4 +1,6 @@
-"""The last steps of a free-form design by NLopt's method of moving asymptotes, the energy as a true constraint."""
+"""The last steps of a free-form design by NLopt's method of moving asymptotes, the
+energy as a true constraint.
+"""
 
 import contextlib
 import math
@@ -16,25 +18,41 @@ REACH_RAD = 0.5  # from the start, for every control
 
 
 def refine(
-    controls: Tensor, build: Callable[[Tensor], Tensor], objective: Objective, settings: Asked, focus_um: float
+    controls: Tensor,
+    build: Callable[[Tensor], Tensor],
+    objective: Objective,
+    settings: Asked,
+    focus_um: float,
 ) -> Tensor:
-    """Lower the objective at fixed depths and positions, with the energy of every depth at least what is asked.
+    """Lower the objective at fixed depths and positions, with the energy of every depth
+    at least what is asked.
 
-    Best feasible point of ``settings.refine`` evaluations (Svanberg 2002); the start where none is better.
+    Best feasible point of ``settings.refine`` evaluations (Svanberg 2002); the start
+    where none is better.
     """
     start = controls.detach().numpy().ravel()
-    known: dict[bytes, tuple[float, np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
+    known: dict[
+        bytes,
+        tuple[float, np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]],
+    ] = {}
     best = (math.inf, start)
 
-    def evaluate(x: np.ndarray[Any, Any]) -> tuple[float, np.ndarray[Any, Any], np.ndarray[Any, Any], Any]:
+    def evaluate(
+        x: np.ndarray[Any, Any],
+    ) -> tuple[float, np.ndarray[Any, Any], np.ndarray[Any, Any], Any]:
         nonlocal best
         key = x.tobytes()
         if key not in known:
             known.clear()
-            point = torch.from_numpy(x.copy()).reshape(controls.shape).requires_grad_(True)
+            point = (
+                torch.from_numpy(x.copy()).reshape(controls.shape).requires_grad_(True)
+            )
             loss, energy = objective.loss(build(point), focus_um, None)
             slope = torch.autograd.grad(loss, point, retain_graph=True)[0]
-            rows = [torch.autograd.grad(e, point, retain_graph=True)[0].numpy().ravel() for e in energy]
+            rows = [
+                torch.autograd.grad(e, point, retain_graph=True)[0].numpy().ravel()
+                for e in energy
+            ]
             missing = settings.encircled + 1e-3 - energy.detach().double().numpy()
             value = float(loss.detach())
             known[key] = (value, slope.numpy().ravel(), missing, -np.stack(rows))
@@ -48,13 +66,23 @@ def refine(
             gradient[:] = found[1]
         return found[0]
 
-    def constraint(result: np.ndarray[Any, Any], x: np.ndarray[Any, Any], gradient: np.ndarray[Any, Any]) -> None:
+    def constraint(
+        result: np.ndarray[Any, Any],
+        x: np.ndarray[Any, Any],
+        gradient: np.ndarray[Any, Any],
+    ) -> None:
         found = evaluate(x)
         result[:] = found[2]
         if gradient.size:
             gradient[:] = found[3]
 
-    _climb(start, value, constraint, constraints=len(evaluate(start)[2]), evaluations=settings.refine)
+    _climb(
+        start,
+        value,
+        constraint,
+        constraints=len(evaluate(start)[2]),
+        evaluations=settings.refine,
+    )
     return torch.from_numpy(best[1]).reshape(controls.shape)
 
 
@@ -66,7 +94,9 @@ def _climb(
     constraints: int,
     evaluations: int,
 ) -> None:
-    """Let NLopt call ``value`` and ``constraint`` within REACH_RAD of the start; who calls keeps the best point."""
+    """Let NLopt call ``value`` and ``constraint`` within REACH_RAD of the start; who
+    calls keeps the best point.
+    """
     import nlopt
 
     solver = nlopt.opt(nlopt.LD_MMA, start.size)

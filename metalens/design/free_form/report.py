@@ -1,4 +1,6 @@
-"""What a free-form design is worth: honest figures beside simple lenses tuned as hard; as text, numbers and picture."""
+"""What a free-form design is worth: honest figures beside simple lenses tuned as hard;
+as text, numbers and picture.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +23,9 @@ STRIP = 6  # depths of them
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Judged:
-    """A lens on the quick pupil. phase_rad: (nodes, nodes) without its focus. score: over (angles, depths)."""
+    """A lens on the quick pupil. phase_rad: (nodes, nodes) without its focus. score:
+    over (angles, depths).
+    """
 
     name: str
     phase_rad: Tensor
@@ -30,17 +34,28 @@ class Judged:
 
 
 def judged(made: FisherPhase, pupil: Pupil, settings: Asked) -> tuple[Judged, ...]:
-    """The design, and the best hyperbolic lens and double helix for the same pixels, depths and angles.
+    """The design, and the best hyperbolic lens and double helix for the same pixels,
+    depths and angles.
 
-    Intensities every ``settings.sample_um``, averaged over sub-pixel positions, at 11 depths.
+    Intensities every ``settings.sample_um``, averaged over sub-pixel positions, at 11
+    depths.
     """
     lenses = [("free form", phase_on(pupil, made), made.focus_um)]
     for simple in baselines.tuned_pair(pupil, settings):
-        lenses.append((f"{simple.name}, tuned", baselines.baseline_phase(pupil, simple.zones), simple.focus_um))
+        lenses.append(
+            (
+                f"{simple.name}, tuned",
+                baselines.baseline_phase(pupil, simple.zones),
+                simple.focus_um,
+            )
+        )
     out = []
     for name, phase, focus in lenses:
         found = score(phase, pupil, focus_um=focus, settings=settings)
-        rows = [t.reshape(len(settings.angles_deg), -1) for t in (found.information, found.encircled)]
+        rows = [
+            t.reshape(len(settings.angles_deg), -1)
+            for t in (found.information, found.encircled)
+        ]
         out.append(Judged(name, phase, focus, Score(rows[0], rows[1])))
     return tuple(out)
 
@@ -72,25 +87,44 @@ def values(lenses: tuple[Judged, ...], settings: Asked) -> dict[str, Any]:
 
 
 def text(lenses: tuple[Judged, ...], settings: Asked) -> str:
-    """A table: information (mean over the depths) at every angle, and the least energy over the depths."""
+    """A table: information (mean over the depths) at every angle, and the least energy
+    over the depths.
+    """
     low, high = settings.depths_mm
     lines = [
         f"I(z) per mm², mean over {low:g}-{high:g} mm (least energy in {settings.radius_um:g} um); pixels of "
         f"{settings.pixel_um:g} um, {settings.normalisation} normalisation, smooth phases",
-        f"  {'lens':<36}" + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
+        f"  {'lens':<36}"
+        + "".join(f"{f'{angle:g}°':<16}" for angle in settings.angles_deg),
     ]
     for lens in lenses:
-        pairs = zip(lens.score.information.mean(1), lens.score.encircled.amin(1), strict=True)
-        lines.append(f"  {lens.name:<36}" + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs))
+        pairs = zip(
+            lens.score.information.mean(1), lens.score.encircled.amin(1), strict=True
+        )
+        lines.append(
+            f"  {lens.name:<36}"
+            + "".join(f"{f'{i:.3f} ({e:.2f})':<16}" for i, e in pairs)
+        )
     energy = ", ".join(
         f"{depth:g} mm {share:.2f}"
-        for depth, share in zip(_depths(lenses, settings)[::2], lenses[0].score.encircled.amin(0)[::2], strict=True)
+        for depth, share in zip(
+            _depths(lenses, settings)[::2],
+            lenses[0].score.encircled.amin(0)[::2],
+            strict=True,
+        )
     )
-    return "\n".join([*lines, f"  {times(lenses):.2f} x the better baseline; energy of the free form: {energy}"])
+    return "\n".join(
+        [
+            *lines,
+            f"  {times(lenses):.2f} x the better baseline; energy of the free form: {energy}",
+        ]
+    )
 
 
 def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Asked) -> bytes:
-    """Information and energy over depth at the first angle, and PSFs of the lenses through the range."""
+    """Information and energy over depth at the first angle, and PSFs of the lenses
+    through the range.
+    """
     figure, _ = canvas(1, 1, size=(10, 7.6))
     figure.clear()
     top, bottom = figure.subfigures(2, 1, height_ratios=(3, 0.4 + 1.3 * len(lenses)))
@@ -100,11 +134,25 @@ def picture(lenses: tuple[Judged, ...], pupil: Pupil, settings: Asked) -> bytes:
         left.plot(depths, lens.score.information[0].numpy(), ".-", label=lens.name)
         right.plot(depths, lens.score.encircled[0].numpy(), ".-")
     right.axhline(settings.encircled, color="0.5", ls=":")
-    left.set(ylabel="I(z) / mm⁻²", xlabel="source depth / mm", title=f"axial information at {angle:g}°", ylim=(0, None))
-    right.set(ylabel=f"energy in {settings.radius_um:g} µm", xlabel="source depth / mm", ylim=(0, 1))
+    left.set(
+        ylabel="I(z) / mm⁻²",
+        xlabel="source depth / mm",
+        title=f"axial information at {angle:g}°",
+        ylim=(0, None),
+    )
+    right.set(
+        ylabel=f"energy in {settings.radius_um:g} µm",
+        xlabel="source depth / mm",
+        ylim=(0, 1),
+    )
     right.set_title("encircled energy; dotted: what was asked for")
     left.legend(fontsize=7)
-    planes = torch.linspace(1e3 * settings.depths_mm[0], 1e3 * settings.depths_mm[1], STRIP, dtype=torch.float64)
+    planes = torch.linspace(
+        1e3 * settings.depths_mm[0],
+        1e3 * settings.depths_mm[1],
+        STRIP,
+        dtype=torch.float64,
+    )
     fields = [Field(float(np.radians(angle)))] * STRIP
     samples = max(2, int(settings.window_um / SHOWN / settings.sample_um))
     panels = bottom.subplots(len(lenses), STRIP, squeeze=False)

@@ -1,9 +1,14 @@
-"""Free-form phases that carry depth: an objective climbed at a bounded spread of light, coarse to fine.
+"""Free-form phases that carry depth: an objective climbed at a bounded spread of light,
+coarse to fine.
 
-The phase is a cubic spline on a control grid that is refined in stages, on top of a hyperbolic focus or of a double
-helix, whose vortices no smooth phase can grow. Adam climbs the objective (the honest axial information of Eq. 11 at
-random sub-pixel positions, or Eq. 6 on scenes); a penalty whose target follows the energy that is reached holds the
-encircled energy, and the best iterate that keeps it at every depth is returned. Several starts, all reported.
+The phase is a cubic spline on a control grid that is refined in stages, on top of a
+hyperbolic focus or of a double
+helix, whose vortices no smooth phase can grow. Adam climbs the objective (the honest
+axial information of Eq. 11 at
+random sub-pixel positions, or Eq. 6 on scenes); a penalty whose target follows the
+energy that is reached holds the
+encircled energy, and the best iterate that keeps it at every depth is returned. Several
+starts, all reported.
 """
 
 import math
@@ -14,7 +19,13 @@ import torch
 from torch import Tensor
 
 from metalens.design import Focus, PhaseOf, hyperbolic
-from metalens.design.free_form.objective import AxialObjective, Objective, Robust, Score, score
+from metalens.design.free_form.objective import (
+    AxialObjective,
+    Objective,
+    Robust,
+    Score,
+    score,
+)
 from metalens.design.free_form.settings import Asked, Fisher
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
@@ -25,17 +36,29 @@ RATE = 0.15  # first step of Adam, rad
 NODE_RATE = 0.5  # the same on free nodes: large steps leave poor optima
 NODES_WEIGHT = 160  # size of a stage on the nodes, for its share of the iterations
 CHECKS = 20  # iterations between two honest looks
-__all__ = ["Fisher", "FisherPhase", "Score", "fisher_profile", "optimise", "phase_on", "score", "spline", "vortices"]
+__all__ = [
+    "Fisher",
+    "FisherPhase",
+    "Score",
+    "fisher_profile",
+    "optimise",
+    "phase_on",
+    "score",
+    "spline",
+    "vortices",
+]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FisherPhase:
     """A designed phase.
 
-    controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every node of the pupil.
+    controls: (n, n) spline coefficients in rad, or with ``cells`` the phase of every
+    node of the pupil.
     focus_um: source distance of the hyperbolic part.
     zones: rings of the double helix below, 0 for none.
-    score: of this phase. starts: (information, least encircled energy) that each start reached.
+    score: of this phase. starts: (information, least encircled energy) that each start
+    reached.
     converged: whether the encircled energy is kept at every depth. reason: in words.
     """
 
@@ -50,11 +73,17 @@ class FisherPhase:
 
 
 def fisher_profile(
-    focus: Focus, *, radius_um: float, settings: Fisher | None = None, objective: Objective | None = None
+    focus: Focus,
+    *,
+    radius_um: float,
+    settings: Fisher | None = None,
+    objective: Objective | None = None,
 ) -> tuple[PhaseOf, FisherPhase]:
-    """The whole lens phase (focus and free form) as a function of position, and how it was found.
+    """The whole lens phase (focus and free form) as a function of position, and how it
+    was found.
 
-    ``focus.source_distance_um`` is used where the settings leave depths and foci to the lens.
+    ``focus.source_distance_um`` is used where the settings leave depths and foci to the
+    lens.
     """
     asked = (settings or Fisher()).about(focus, radius_um)
     pupil = design_pupil(focus, radius_um, asked)
@@ -64,23 +93,35 @@ def fisher_profile(
 
     def phase(x_um: Array, y_um: Array) -> Array:
         smooth = hyperbolic(x_um, y_um[:, None], base) + extra(x_um, y_um)
-        return np.asarray(smooth + vortices(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones))
+        return np.asarray(
+            smooth
+            + vortices(x_um, y_um[:, None], radius_um=radius_um, zones=found.zones)
+        )
 
     return phase, found
 
 
 def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
-    """The free-form part as a function of position: a spline of its controls, or one value a node of the pupil."""
+    """The free-form part as a function of position: a spline of its controls, or one
+    value a node of the pupil.
+    """
 
     def smooth(x_um: Array, y_um: Array) -> Array:
-        across, down = (spline(a / pupil.radius_um, len(controls)) for a in (x_um, y_um))
+        across, down = (
+            spline(a / pupil.radius_um, len(controls)) for a in (x_um, y_um)
+        )
         return np.asarray(down @ controls @ across.T)
 
     def stepped(x_um: Array, y_um: Array) -> Array:
         path = np.sqrt(x_um**2 + y_um[:, None] ** 2 + pupil.sensor_distance_um**2)
-        scale, middle, last = pupil.nodes / (2 * pupil.edge), (pupil.nodes - 1) / 2, pupil.nodes - 1
+        scale, middle, last = (
+            pupil.nodes / (2 * pupil.edge),
+            (pupil.nodes - 1) / 2,
+            pupil.nodes - 1,
+        )
         row, column = (
-            np.clip(np.rint(a / path * scale + middle), 0, last).astype(np.intp) for a in (y_um[:, None], x_um)
+            np.clip(np.rint(a / path * scale + middle), 0, last).astype(np.intp)
+            for a in (y_um[:, None], x_um)
         )
         return np.asarray(controls[row, column])
 
@@ -90,22 +131,30 @@ def free_form(controls: Array, pupil: Pupil, *, cells: bool = False) -> PhaseOf:
 def design_pupil(focus: Focus, radius_um: float, settings: Asked) -> Pupil:
     """Enough nodes that the PSF's period is 1.9 windows, in whole blocks of 16."""
     edge = Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um).edge
-    nodes = max(64, 16 * math.ceil(1.9 * settings.window_um * 2 * edge / focus.wavelength_um / 16))
+    nodes = max(
+        64,
+        16 * math.ceil(1.9 * settings.window_um * 2 * edge / focus.wavelength_um / 16),
+    )
     return Pupil(radius_um, focus.sensor_distance_um, focus.wavelength_um, nodes)
 
 
-def optimise(pupil: Pupil, settings: Asked, *, objective: Objective | None = None) -> FisherPhase:
+def optimise(
+    pupil: Pupil, settings: Asked, *, objective: Objective | None = None
+) -> FisherPhase:
     """Best of several starts; deterministic for a seed.
 
     Args:
-        objective: by default the axial information; :mod:`codesign.evaluate.scenes` has Eq. 6 on scenes.
+        objective: by default the axial information; :mod:`codesign.evaluate.scenes` has
+            Eq. 6 on scenes.
 
     Raises:
         ConfigError: the settings ask for scenes and no such objective is given.
     """
     if objective is None:
         if settings.objective != "axial":
-            raise ConfigError(f"objective {settings.objective!r} needs its scenes: give optimise(objective=...)")
+            raise ConfigError(
+                f"objective {settings.objective!r} needs its scenes: give optimise(objective=...)"
+            )
         objective = AxialObjective(pupil, settings)
     if settings.variation.phase or settings.variation.distance_um:
         objective = Robust(objective, pupil, settings.variation)
@@ -113,13 +162,21 @@ def optimise(pupil: Pupil, settings: Asked, *, objective: Objective | None = Non
     reached = []
     for start in range(settings.starts):
         share = (start + 0.5) / settings.starts
-        focus = 1e3 * (settings.focus_mm[0] + share * (settings.focus_mm[1] - settings.focus_mm[0]))
+        focus = 1e3 * (
+            settings.focus_mm[0] + share * (settings.focus_mm[1] - settings.focus_mm[0])
+        )
         generator = torch.Generator().manual_seed(1000 * settings.seed + start)
         zones = settings.zones[start % len(settings.zones)]
         made = _climb(pupil, settings, objective, focus, zones, generator)
-        information, least = float(made.score.information.mean()), float(made.score.encircled.min())
+        information, least = (
+            float(made.score.information.mean()),
+            float(made.score.encircled.min()),
+        )
         reached.append((information, least))
-        if best is None or (made.converged, information) > (best.converged, float(best.score.information.mean())):
+        if best is None or (made.converged, information) > (
+            best.converged,
+            float(best.score.information.mean()),
+        ):
             best = made
     if best is None:
         raise ConfigError("no start was tried")
@@ -128,11 +185,15 @@ def optimise(pupil: Pupil, settings: Asked, *, objective: Objective | None = Non
 
 def phase_on(pupil: Pupil, made: FisherPhase) -> Tensor:
     """(nodes, nodes) phase of a design on the nodes of a pupil, without its focus."""
-    return _Phase(pupil, 0 if made.cells else len(made.controls), made.zones)(made.controls)
+    return _Phase(pupil, 0 if made.cells else len(made.controls), made.zones)(
+        made.controls
+    )
 
 
 def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array:
-    """Phase of a double helix without its focus: ring l of equal areas carries the charge 2l - 1; 0 for no zones."""
+    """Phase of a double helix without its focus: ring l of equal areas carries the
+    charge 2l - 1; 0 for no zones.
+    """
     if zones == 0:
         return np.zeros(np.broadcast_shapes(x_um.shape, y_um.shape))
     ring = np.clip(np.ceil(zones * (x_um**2 + y_um**2) / radius_um**2), 1, zones)
@@ -140,11 +201,18 @@ def vortices(x_um: Array, y_um: Array, *, radius_um: float, zones: int) -> Array
 
 
 def spline(position: Array, count: int) -> Array:
-    """(n, count) cubic B-spline weights of positions in [-1, 1] (held at the ends), uniform knots."""
+    """(n, count) cubic B-spline weights of positions in [-1, 1] (held at the ends),
+    uniform knots.
+    """
     place = (np.clip(position, -1, 1) + 1) / 2 * (count - 3)
     first = np.clip(np.floor(place).astype(int), 0, count - 4)
     t = place - first
-    parts = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
+    parts = (
+        (1 - t) ** 3,
+        3 * t**3 - 6 * t**2 + 4,
+        -3 * t**3 + 3 * t**2 + 3 * t + 1,
+        t**3,
+    )
     weights = np.zeros((len(position), count))
     for k, part in enumerate(parts):
         weights[np.arange(len(position)), first + k] = part / 6
@@ -171,7 +239,12 @@ class _Best:
 
 
 def _climb(
-    pupil: Pupil, settings: Asked, objective: Objective, focus_um: float, zones: int, generator: torch.Generator
+    pupil: Pupil,
+    settings: Asked,
+    objective: Objective,
+    focus_um: float,
+    zones: int,
+    generator: torch.Generator,
 ) -> FisherPhase:
     controls = _begun(settings, zones, generator)
     total, done, margin = settings.iterations, 0, 0.01
@@ -183,12 +256,17 @@ def _climb(
             controls = _refined(controls, grid)
         controls = controls.detach().requires_grad_(True)
         rate = RATE if grid else NODE_RATE
-        build, step = _Phase(pupil, grid, zones), torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99))
+        build, step = (
+            _Phase(pupil, grid, zones),
+            torch.optim.Adam([controls], lr=rate, betas=(0.9, 0.99)),
+        )
         for _ in range(count):
             for group in step.param_groups:
                 group["lr"] = _rate(rate, done, total)
             loss, energy = objective.loss(build(controls), focus_um, generator)
-            loss = loss + _penalty(torch.relu(settings.encircled + margin - energy), done / total)
+            loss = loss + _penalty(
+                torch.relu(settings.encircled + margin - energy), done / total
+            )
             step.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             step.step()
@@ -200,16 +278,37 @@ def _climb(
     if settings.refine:
         from metalens.design.free_form.refine import refine
 
-        refined = refine(best.controls if best.controls is not None else controls, build, objective, settings, focus_um)
+        refined = refine(
+            best.controls if best.controls is not None else controls,
+            build,
+            objective,
+            settings,
+            focus_um,
+        )
         best.look(refined, build(refined))
     if best.controls is None or best.score is None:
         raise ConfigError("no iterate was judged")
-    reason = "encircled energy kept at every depth" if best.rank[0] else "encircled energy missed: raise iterations"
-    return FisherPhase(best.controls, focus_um, zones, settings.grids[-1] == 0, best.score, (), best.rank[0], reason)
+    reason = (
+        "encircled energy kept at every depth"
+        if best.rank[0]
+        else "encircled energy missed: raise iterations"
+    )
+    return FisherPhase(
+        best.controls,
+        focus_um,
+        zones,
+        settings.grids[-1] == 0,
+        best.score,
+        (),
+        best.rank[0],
+        reason,
+    )
 
 
 def _begun(settings: Asked, zones: int, generator: torch.Generator) -> Tensor:
-    """Controls of the coarsest grid at random; on a double helix a tenth of the spread, which leaves its vortices."""
+    """Controls of the coarsest grid at random; on a double helix a tenth of the spread,
+    which leaves its vortices.
+    """
     spread = settings.spread_rad * (0.1 if zones else 1.0)
     size = settings.grids[0]
     return spread * torch.randn(size, size, generator=generator, dtype=torch.float64)
@@ -221,28 +320,38 @@ def _rate(first: float, done: int, total: int) -> float:
 
 
 def _penalty(missing: Tensor, share: float) -> Tensor:
-    """Of encircled energy that is missing: five times as strong at the end as at the beginning."""
+    """Of encircled energy that is missing: five times as strong at the end as at the
+    beginning.
+    """
     return 10 * (1 + 4 * share) * (missing.mean() + 8 * (missing**2).mean())
 
 
 def _margin(margin: float, spare: float) -> float:
-    """What is asked for beyond the bound: more where an honest look has less than 0.0015 to spare, within limits."""
+    """What is asked for beyond the bound: more where an honest look has less than
+    0.0015 to spare, within limits.
+    """
     return min(max(margin + 0.35 * (0.0015 - spare), -0.03), 0.05)
 
 
 def _shares(settings: Fisher) -> list[int]:
     """Iterations of every stage: in proportion to its grid, at least one."""
     whole = sum(settings.grids[:-1]) + (settings.grids[-1] or NODES_WEIGHT)
-    early = [max(1, settings.iterations * grid // whole) for grid in settings.grids[:-1]]
+    early = [
+        max(1, settings.iterations * grid // whole) for grid in settings.grids[:-1]
+    ]
     return [*early, max(1, settings.iterations - sum(early))]
 
 
 class _Phase:
-    """Controls to the phase on the pupil's nodes: a sparse product for a spline, themselves for a grid of 0."""
+    """Controls to the phase on the pupil's nodes: a sparse product for a spline,
+    themselves for a grid of 0.
+    """
 
     def __init__(self, pupil: Pupil, grid: int, zones: int) -> None:
         px, py = (a.numpy() for a in pupils.coordinates(pupil))
-        self.base = torch.from_numpy(vortices(px, py, radius_um=pupil.radius_um, zones=zones))
+        self.base = torch.from_numpy(
+            vortices(px, py, radius_um=pupil.radius_um, zones=zones)
+        )
         self.matrix: Tensor | None = None
         if grid == 0:
             return
@@ -254,14 +363,20 @@ class _Phase:
             rows.append(np.full(len(i) * len(j), k))
             columns.append((i[:, None] * grid + j).ravel())
             values.append((down[k, i][:, None] * across[k, j]).ravel())
-        index = torch.from_numpy(np.stack([np.concatenate(rows), np.concatenate(columns)]))
+        index = torch.from_numpy(
+            np.stack([np.concatenate(rows), np.concatenate(columns)])
+        )
         entries = torch.from_numpy(np.concatenate(values))
-        self.matrix = torch.sparse_coo_tensor(index, entries, (len(x), grid * grid), check_invariants=True)
+        self.matrix = torch.sparse_coo_tensor(
+            index, entries, (len(x), grid * grid), check_invariants=True
+        )
 
     def __call__(self, controls: Tensor) -> Tensor:
         if self.matrix is None:
             return self.base + controls
-        phase: Tensor = torch.sparse.mm(self.matrix, controls.reshape(-1, 1)).reshape(self.base.shape)
+        phase: Tensor = torch.sparse.mm(self.matrix, controls.reshape(-1, 1)).reshape(
+            self.base.shape
+        )
         return self.base + phase
 
 

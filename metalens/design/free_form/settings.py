@@ -7,15 +7,23 @@ from metalens.design.profiles import Focus
 from metalens.ground.errors import ConfigError
 from metalens.lens import reach
 
-WINDOW, CLIMB = 42.4, 2 / 3  # width of the PSFs in wavelength / NA; of the window, while climbing
-FOCI = (0.29, 0.71)  # of the range of depths in 1/z, from its near end: where the hyperbolic part is focused
+WINDOW, CLIMB = (
+    42.4,
+    2 / 3,
+)  # width of the PSFs in wavelength / NA; of the window, while climbing
+FOCI = (
+    0.29,
+    0.71,
+)  # of the range of depths in 1/z, from its near end: where the hyperbolic part is focused
 
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """What the process may do to the lens; the design is made to stand plus and minus these.
+    """What the process may do to the lens; the design is made to stand plus and minus
+    these.
 
-    phase: relative error of every pillar's phase within its turn (height, index, or a bias of the diameters).
+    phase: relative error of every pillar's phase within its turn (height, index, or a
+    bias of the diameters).
     distance_um: error of the lens-to-sensor distance.
     """
 
@@ -33,27 +41,37 @@ class Variation:
 class Fisher:
     """What a Fisher-designed lens is asked for.
 
-    objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets of eyes).
-    depths_mm: range of the source; left out, from 1.75 waves out of focus at the rim on one side of the design's source
+    objective: axial (I(z) of Eq. 11 of a point), or scenes (Eq. 6 on rendered triplets
+    of eyes).
+    depths_mm: range of the source; left out, from 1.75 waves out of focus at the rim on
+    one side of the design's source
         distance to as many on the other.
-    angles_deg: field angles that the lens is made for, each in every direction; the energy is held at all of them, and
+    angles_deg: field angles that the lens is made for, each in every direction; the
+    energy is held at all of them, and
         the information of each counts alike.
-    pixel_um: pixels that the information is read with: the sensor's pitch, or 2 or 3 times it for 2 x 2 or 3 x 3
+    pixel_um: pixels that the information is read with: the sensor's pitch, or 2 or 3
+    times it for 2 x 2 or 3 x 3
         binning; left out, 0.88 wavelength / NA.
-    encircled: least share of the light inside ``radius_um`` of the axis, at every depth; 0 leaves it free.
+    encircled: least share of the light inside ``radius_um`` of the axis, at every
+    depth; 0 leaves it free.
     radius_um: left out, 5.3 wavelength / NA.
-    focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread between them. Left out, the
+    focus_mm: (least, largest) source distance of the hyperbolic part; starts are spread
+    between them. Left out, the
         middle two fifths of the depths, in 1/z.
-    grids: control points across the aperture, stage by stage; 0 as the last for one free value a node of the pupil
+    grids: control points across the aperture, stage by stage; 0 as the last for one
+    free value a node of the pupil
         (cells of about 6 um), which sends light away best where the energy allows it.
     iterations: of all stages, shared in proportion to their grids. starts: tried.
     zones: rings of the double helix that the starts begin from, in turn; 0 for none.
     spread_rad: deviation of the random start (a tenth of it on a double helix).
-    even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth), 0 the logarithm of its mean.
+    even: 1 climbs the mean of the logarithm of I(z) over the depths (even over depth),
+    0 the logarithm of its mean.
     normalisation: of Eq. 11. seed: of starts and positions.
-    refine: iterations of NLopt's constrained method of moving asymptotes (MMA) after the last stage.
+    refine: iterations of NLopt's constrained method of moving asymptotes (MMA) after
+    the last stage.
     variation: of the process; 0 leaves it out.
-    scenes: of the objective of that name. orthogonality: its weight lambda in Eq. 6, of the squared cosine of the
+    scenes: of the objective of that name. orthogonality: its weight lambda in Eq. 6, of
+    the squared cosine of the
         span angle.
     """
 
@@ -83,35 +101,58 @@ class Fisher:
         if self.focus_mm is not None and not 0 < self.focus_mm[0] <= self.focus_mm[1]:
             raise ConfigError(f"focus_mm = {self.focus_mm}: need 0 < least <= largest")
         if not self.angles_deg or not all(0 <= a <= 40 for a in self.angles_deg):
-            raise ConfigError(f"angles_deg = {self.angles_deg}: need at least one field angle of 0 to 40 degrees")
-        lengths = [1.0 if length is None else length for length in (self.radius_um, self.pixel_um)]
+            raise ConfigError(
+                f"angles_deg = {self.angles_deg}: need at least one field angle of 0 to 40 degrees"
+            )
+        lengths = [
+            1.0 if length is None else length
+            for length in (self.radius_um, self.pixel_um)
+        ]
         if not 0 <= self.encircled < 1 or not min(lengths) > 0:
             raise ConfigError(
                 f"encircled = {self.encircled}, radius_um = {self.radius_um}, pixel_um = {self.pixel_um}: need a share "
                 "below 1, and a radius and pixels above 0"
             )
-        fine = (*self.grids[:-1], self.grids[-1] or 4) if len(self.grids) > 1 else self.grids
+        fine = (
+            (*self.grids[:-1], self.grids[-1] or 4)
+            if len(self.grids) > 1
+            else self.grids
+        )
         if self.starts < 1 or self.iterations < 1 or not fine or min(fine) < 4:
             raise ConfigError(
                 f"starts, iterations = {self.starts}, {self.iterations}: need 1 or more; grids = {self.grids}: need 4 "
                 "or more each, or 0 as the last of several"
             )
-        if self.refine < 0 or self.scenes < 1 or self.orthogonality < 0 or not self.zones:
+        if (
+            self.refine < 0
+            or self.scenes < 1
+            or self.orthogonality < 0
+            or not self.zones
+        ):
             raise ConfigError(
                 f"refine = {self.refine}, scenes = {self.scenes}, orthogonality = {self.orthogonality}, zones = "
                 f"{self.zones}: need 0 or more, 1 or more, 0 or more, and at least one entry"
             )
 
     def about(self, focus: Focus, radius_um: float) -> "Asked":
-        """These for a lens of this radius, its depths, foci and disc where they were left out.
+        """These for a lens of this radius, its depths, foci and disc where they were
+        left out.
 
         Raises:
             ConfigError: pixels larger than the window of this lens.
         """
         lens = reach.Aperture(
-            radius_um, focus.wavelength_um, focus.sensor_distance_um, focus.source_distance_um, focus.layers
+            radius_um,
+            focus.wavelength_um,
+            focus.sensor_distance_um,
+            focus.source_distance_um,
+            focus.layers,
         )
-        near, far = (1e3 * z for z in self.depths_mm) if self.depths_mm else reach.depth_range_um(lens)
+        near, far = (
+            (1e3 * z for z in self.depths_mm)
+            if self.depths_mm
+            else reach.depth_range_um(lens)
+        )
         pixel = self.pixel_um or reach.pixel_um(lens)
         window = reach.window_um(lens, (near, far), airy=WINDOW)
         climbed = CLIMB * window
@@ -121,7 +162,10 @@ class Fisher:
                 f"window of {climbed:g} um"
             )
         own = {f.name: getattr(self, f.name) for f in fields(self)}
-        own |= {"depths_mm": (near * 1e-3, far * 1e-3), "radius_um": self.radius_um or reach.disc_um(lens)}
+        own |= {
+            "depths_mm": (near * 1e-3, far * 1e-3),
+            "radius_um": self.radius_um or reach.disc_um(lens),
+        }
         own["focus_mm"] = self.focus_mm or between_mm((near, far), *FOCI)
         own |= {
             "pixel_um": pixel,
@@ -133,9 +177,11 @@ class Fisher:
 
 @dataclass(frozen=True, slots=True)
 class Asked(Fisher):
-    """A :class:`Fisher` with nothing left to the lens: what a search climbs, and what its results are judged by.
+    """A :class:`Fisher` with nothing left to the lens: what a search climbs, and what
+    its results are judged by.
 
-    window_um, climb_window_um: widths of the PSFs. sample_um: of their intensities. step_um: of the difference in
+    window_um, climb_window_um: widths of the PSFs. sample_um: of their intensities.
+    step_um: of the difference in
     Eq. 11.
     """
 
@@ -153,8 +199,12 @@ class Asked(Fisher):
         return self
 
 
-def between_mm(depths_um: tuple[float, float], first: float, last: float) -> tuple[float, float]:
-    """Depths at two shares of the range in 1/z, from its near end: 0 is near, 1 far; below 0 nearer. 2 digits."""
+def between_mm(
+    depths_um: tuple[float, float], first: float, last: float
+) -> tuple[float, float]:
+    """Depths at two shares of the range in 1/z, from its near end: 0 is near, 1 far;
+    below 0 nearer. 2 digits.
+    """
     near, far = (1e3 / z for z in depths_um)
     ends = (1 / max(near + share * (far - near), 0.1 * far) for share in (first, last))
     low, high = (float(f"{z:.2g}") for z in ends)

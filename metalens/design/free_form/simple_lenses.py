@@ -1,4 +1,6 @@
-"""Baselines tuned as hard as a design: the focus of a hyperbolic lens, zones and focus of a double helix."""
+"""Baselines tuned as hard as a design: the focus of a hyperbolic lens, zones and focus
+of a double helix.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +16,10 @@ from metalens.ground.errors import ConfigError
 from metalens.image import Pupil
 from metalens.image import pupil as pupils
 
-FOCI = (-0.87, 1.77)  # searched for the hyperbolic lens: of the range of depths in 1/z, from its near end
+FOCI = (
+    -0.87,
+    1.77,
+)  # searched for the hyperbolic lens: of the range of depths in 1/z, from its near end
 HELIX_FOCI = (-0.37, 1.21)
 ZONES = (1, 2, 3, 4, 5, 6)
 
@@ -23,8 +28,10 @@ ZONES = (1, 2, 3, 4, 5, 6)
 class Baseline:
     """A simple lens and what it is worth.
 
-    zones: of the double helix, 0 for a hyperbolic lens. focus_um: source distance of best focus.
-    information: mean of I(z) over the depths, per mm². encircled: least share of the light over the depths.
+    zones: of the double helix, 0 for a hyperbolic lens. focus_um: source distance of
+    best focus.
+    information: mean of I(z) over the depths, per mm². encircled: least share of the
+    light over the depths.
     """
 
     zones: int
@@ -35,7 +42,11 @@ class Baseline:
     @property
     def name(self) -> str:
         """Kind and focus, for tables."""
-        kind = f"helix of {self.zones} zone{'s' * (self.zones > 1)}" if self.zones else "hyperbolic"
+        kind = (
+            f"helix of {self.zones} zone{'s' * (self.zones > 1)}"
+            if self.zones
+            else "hyperbolic"
+        )
         return f"{kind}, {self.focus_um / 1e3:.1f} mm"
 
     def phase(self, focus: Focus, *, radius_um: float) -> tuple[PhaseOf, Focus]:
@@ -49,7 +60,9 @@ def judged(pupil: Pupil, settings: Asked, *, zones: int, focus_um: float) -> Bas
     """One simple lens on the quick pupil, honestly measured at ``settings.pixel_um``."""
     phase = baseline_phase(pupil, zones)
     found = score(phase, pupil, focus_um=focus_um, settings=settings)
-    return Baseline(zones, focus_um, float(found.information.mean()), float(found.encircled.min()))
+    return Baseline(
+        zones, focus_um, float(found.information.mean()), float(found.encircled.min())
+    )
 
 
 def baseline_phase(pupil: Pupil, zones: int) -> Tensor:
@@ -66,14 +79,17 @@ def tuned(
     foci_mm: tuple[float, float],
     count: int = 12,
 ) -> Baseline:
-    """Most informative lens over zones and focus: a scan at equal steps of 1/z, then twice a finer one around the best.
+    """Most informative lens over zones and focus: a scan at equal steps of 1/z, then
+    twice a finer one around the best.
 
     Raises:
         ConfigError: no zones, foci that do not ascend, or fewer than 3 foci.
     """
     low, high = foci_mm
     if not (zones and 0 < low < high and count >= 3):
-        raise ConfigError(f"zones = {zones}, foci_mm = {foci_mm}, count = {count}: need 0 < least < largest and 3 foci")
+        raise ConfigError(
+            f"zones = {zones}, foci_mm = {foci_mm}, count = {count}: need 0 < least < largest and 3 foci"
+        )
     tried: list[Baseline] = []
     for rings in zones:
         here = 1e3 / np.linspace(1 / low, 1 / high, count)
@@ -83,7 +99,11 @@ def tuned(
             best = max(found, key=lambda b: b.information)
             step /= 2
             near = [1 / (1e3 / best.focus_um + side * step) for side in (-1, 1)]
-            found += [judged(pupil, settings, zones=rings, focus_um=1e3 * f) for f in near if low <= f <= high]
+            found += [
+                judged(pupil, settings, zones=rings, focus_um=1e3 * f)
+                for f in near
+                if low <= f <= high
+            ]
         tried += found
     return max(tried, key=lambda b: b.information)
 

@@ -1,4 +1,6 @@
-"""Libraries over two sizes: the width and the length of a rectangle, or both axes of an ellipse."""
+"""Libraries over two sizes: the width and the length of a rectangle, or both axes of an
+ellipse.
+"""
 
 from typing import TYPE_CHECKING
 

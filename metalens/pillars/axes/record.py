@@ -1,4 +1,6 @@
-"""The library over two sizes: Jones matrices of every pair of sizes, an error bar on each, and what is left out."""
+"""The library over two sizes: Jones matrices of every pair of sizes, an error bar on
+each, and what is left out.
+"""
 
 import dataclasses
 import itertools
@@ -23,19 +25,26 @@ _NAMES = ("wavelength_um", "x_um", "y_um", "t", "t_error", "held_out")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AxesLibrary:
-    """Transmission of one pillar cell over the size along x and the size along y, at normal incidence.
+    """Transmission of one pillar cell over the size along x and the size along y, at
+    normal incidence.
 
-    Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the pillar's foot to that of its top,
-    as :class:`metalens.cell.response.Response` has it. The sizes are those before the turn of the shape.
+    Power-normalised, exp(-iwt), light from the substrate, phase from the plane of the
+    pillar's foot to that of its top,
+    as :class:`metalens.cell.response.Response` has it. The sizes are those before the
+    turn of the shape.
 
     cell, sweep: what was computed.
     wavelength_um: (w,). x_um: (m,), y_um: (n,) sizes, evenly spaced with one step.
-    t: (w, m, n, 2, 2) Jones matrices; last axis: polarisation that comes (x, y), the one before: that leaves.
-    t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not below the true error: solver and
+    t: (w, m, n, 2, 2) Jones matrices; last axis: polarisation that comes (x, y), the
+    one before: that leaves.
+    t_error: (w, m, n) estimate of the largest |t - exact| of the four elements, not
+    below the true error: solver and
         interpolation.
-    held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the wavelength, x, y, largest
+    held_out: (k, 5) pairs of sizes that were solved but not interpolated: index of the
+    wavelength, x, y, largest
         |interpolated - solved| on one truncation, error bar of the entry.
-    solves: behind the entries. harmonics: orders of the truncation, the same for all entries.
+    solves: behind the entries. harmonics: orders of the truncation, the same for all
+    entries.
     """
 
     cell: Cell
@@ -62,7 +71,9 @@ class AxesLibrary:
 
     @property
     def usable(self) -> Array:
-        """(w, m, n) whether the error bar meets the tolerance; the others are the excluded bands of resonances."""
+        """(w, m, n) whether the error bar meets the tolerance; the others are the
+        excluded bands of resonances.
+        """
         return np.asarray(self.t_error <= self.sweep.bar)
 
     @property
@@ -74,12 +85,15 @@ class AxesLibrary:
         """Place of a wavelength.
 
         Raises:
-            DomainError: the library does not hold it (nothing is interpolated between wavelengths).
+            DomainError: the library does not hold it (nothing is interpolated between
+                wavelengths).
         """
         found = np.flatnonzero(np.abs(self.wavelength_um - wavelength_um) <= 1e-9)
         if not len(found):
             held = ", ".join(f"{w:g}" for w in self.wavelength_um)
-            raise DomainError(f"wavelength {wavelength_um:g} um: this library holds {held} um; sweep it there too")
+            raise DomainError(
+                f"wavelength {wavelength_um:g} um: this library holds {held} um; sweep it there too"
+            )
         return int(found[0])
 
 
@@ -87,23 +101,35 @@ def sized(cell: Cell, x_um: float, y_um: float) -> Cell:
     """The cell whose pillar of size ``x_um`` is ``y_um`` long along its other axis."""
     shape = cell.shape
     if not isinstance(shape, Rectangle | Ellipse):
-        raise CellError(f"lengths_um: a {shape.name} has one size; need a rectangle or an ellipse")
-    return dataclasses.replace(cell, shape=dataclasses.replace(shape, ratio=y_um / x_um))
+        raise CellError(
+            f"lengths_um: a {shape.name} has one size; need a rectangle or an ellipse"
+        )
+    return dataclasses.replace(
+        cell, shape=dataclasses.replace(shape, ratio=y_um / x_um)
+    )
 
 
 def check(cell: Cell, sweep: Sweep) -> None:
-    """Refuse a sweep over two sizes that cannot be computed, before anything is computed.
+    """Refuse a sweep over two sizes that cannot be computed, before anything is
+    computed.
 
     Raises:
-        ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one with a ratio of its own, pillars
+        ConfigError: no ranges. CellError: another shape than rectangle or ellipse, one
+            with a ratio of its own, pillars
             that touch; and as :func:`metalens.pillars.record.check`.
     """
     spans = ranges(sweep)
-    if getattr(sized(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(cell.shape, "ratio", 1.0):
-        raise CellError("cell.shape.ratio: both sizes are swept (diameters_um, lengths_um); leave ratio out")
+    if getattr(sized(cell, 1.0, 1.0).shape, "ratio", 1.0) != getattr(
+        cell.shape, "ratio", 1.0
+    ):
+        raise CellError(
+            "cell.shape.ratio: both sizes are swept (diameters_um, lengths_um); leave ratio out"
+        )
     for x, y in itertools.product(*spans):
         if not 0.01 <= y / x <= 100:
-            raise CellError(f"sizes {x:g} by {y:g} um: need sides within a factor of 100")
+            raise CellError(
+                f"sizes {x:g} by {y:g} um: need sides within a factor of 100"
+            )
         if sized(cell, x, y).gap_um(x) <= 0:
             raise CellError(
                 f"a {cell.shape.kind} of {x:g} by {y:g} um touches its neighbour on a pitch of {cell.pitch_um:g} um; "
@@ -119,14 +145,22 @@ def ranges(sweep: Sweep) -> tuple[tuple[float, float], tuple[float, float]]:
         ConfigError: not both are given.
     """
     if sweep.diameters_um is None or sweep.lengths_um is None:
-        raise ConfigError("a library over two sizes needs diameters_um (along x) and lengths_um (along y)")
+        raise ConfigError(
+            "a library over two sizes needs diameters_um (along x) and lengths_um (along y)"
+        )
     return sweep.diameters_um, sweep.lengths_um
 
 
 def swaps(cell: Cell, sweep: Sweep) -> bool:
-    """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square lattice, not turned."""
+    """Whether exchanging the sizes exchanges x and y: both ranges alike, on a square
+    lattice, not turned.
+    """
     quarter = getattr(cell.shape, "angle_rad", 0.0) / (math.pi / 2)
-    return cell.lattice.kind == "square" and sweep.diameters_um == sweep.lengths_um and quarter == round(quarter)
+    return (
+        cell.lattice.kind == "square"
+        and sweep.diameters_um == sweep.lengths_um
+        and quarter == round(quarter)
+    )
 
 
 def save(path: str | Path, library: AxesLibrary) -> None:

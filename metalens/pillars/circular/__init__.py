@@ -1,4 +1,6 @@
-"""Libraries for circular light: what is converted to the other hand, and pillars turned one by one."""
+"""Libraries for circular light: what is converted to the other hand, and pillars turned
+one by one.
+"""
 
 from typing import TYPE_CHECKING
 

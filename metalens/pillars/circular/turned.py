@@ -1,8 +1,12 @@
-"""Circular light on pillars that are turned one by one: the geometric phase, and what the lattice adds to it.
+"""Circular light on pillars that are turned one by one: the geometric phase, and what
+the lattice adds to it.
 
-A pillar with mirrors along its own axes passes diag(t_x, t_y). Turned by θ in the plane, and alone, it passes
-R(θ) diag(t_x, t_y) R(-θ): of the circular wave x ± iy the share (t_x + t_y)/2 keeps its hand, and (t_x - t_y)/2 leaves
-with the other hand and the phase ±2θ (Pancharatnam and Berry). On a lattice the neighbours see the turn; how much is
+A pillar with mirrors along its own axes passes diag(t_x, t_y). Turned by θ in the
+plane, and alone, it passes
+R(θ) diag(t_x, t_y) R(-θ): of the circular wave x ± iy the share (t_x + t_y)/2 keeps its
+hand, and (t_x - t_y)/2 leaves
+with the other hand and the phase ±2θ (Pancharatnam and Berry). On a lattice the
+neighbours see the turn; how much is
 solved, not guessed.
 """
 
@@ -18,16 +22,20 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError
 from metalens.rcwa import SAFETY, jones
 
-STEPS = 3  # turns that are solved, evenly up to half the angle after which the lattice repeats
+# turns that are solved, evenly up to half the angle after which the lattice repeats
+STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Turned:
     """Solved cells of one pillar, turned in its lattice.
 
-    size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one period of the lattice.
-    t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver. earlier: (n, k, 2, 2) t of coarser
-    truncations: shares of the light have ``rcwa.SAFETY`` times their farthest change over them as error bar.
+    size_um: of the pillar; wavelength_um: in vacuum. angle_rad: (n,) turns over one
+    period of the lattice.
+    t: (n, 2, 2) Jones matrices in x and y. t_error: (n,) error bars of the solver.
+    earlier: (n, k, 2, 2) t of coarser
+    truncations: shares of the light have ``rcwa.SAFETY`` times their farthest change
+    over them as error bar.
     """
 
     size_um: float
@@ -38,71 +46,111 @@ class Turned:
     earlier: Array
 
     def converted(self, hand: float) -> Array:
-        """(n,) amplitude that leaves with the other hand, without the geometric phase; hand +1: x + iy comes."""
-        return np.asarray(circular(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad))
+        """(n,) amplitude that leaves with the other hand, without the geometric phase;
+        hand +1: x + iy comes.
+        """
+        return np.asarray(
+            circular(self.t, hand)[1] * np.exp(-2j * hand * self.angle_rad)
+        )
 
     def _share(self, of: Callable[["Turned"], float]) -> tuple[float, float]:
         """A number that follows from t, and its error bar."""
         here = of(self)
-        before = [of(dataclasses.replace(self, t=self.earlier[:, k])) for k in range(self.earlier.shape[1])]
+        before = [
+            of(dataclasses.replace(self, t=self.earlier[:, k]))
+            for k in range(self.earlier.shape[1])
+        ]
         return here, SAFETY * max((abs(value - here) for value in before), default=1.0)
 
     def efficiency(self, hand: float) -> tuple[float, float]:
-        """Share of the light in the converted wave, averaged over all turns, and the error bar of it.
+        """Share of the light in the converted wave, averaged over all turns, and the
+        error bar of it.
 
-        |mean over the turns of the converted amplitude, its geometric phase taken off|²: what its spread over the turns
+        |mean over the turns of the converted amplitude, its geometric phase taken
+        off|²: what its spread over the turns
         scatters is no part of it.
         """
         return self._share(lambda one: float(abs(one.converted(hand).mean()) ** 2))
 
     def unconverted(self, hand: float) -> tuple[float, float]:
-        """Share of the light that keeps its hand, the mean over all turns, and its error bar."""
-        return self._share(lambda one: float((np.abs(circular(one.t, hand)[0]) ** 2).mean()))
+        """Share of the light that keeps its hand, the mean over all turns, and its
+        error bar.
+        """
+        return self._share(
+            lambda one: float((np.abs(circular(one.t, hand)[0]) ** 2).mean())
+        )
 
     @property
     def model_error(self) -> float:
-        """Largest |solved - isolated| of the converted amplitude: the isolated pillar is that at angle 0, turned."""
-        return max(float(np.abs(self.converted(hand) - circular(self.t[0], hand)[1]).max()) for hand in (1.0, -1.0))
+        """Largest |solved - isolated| of the converted amplitude: the isolated pillar
+        is that at angle 0, turned.
+        """
+        return max(
+            float(np.abs(self.converted(hand) - circular(self.t[0], hand)[1]).max())
+            for hand in (1.0, -1.0)
+        )
 
     def to_arrays(self) -> dict[str, Array]:
         """Everything as arrays, for a store file."""
         at = np.array([self.size_um, self.wavelength_um])
-        return {"at": at} | {name: getattr(self, name) for name in ("angle_rad", "t", "t_error", "earlier")}
+        return {"at": at} | {
+            name: getattr(self, name)
+            for name in ("angle_rad", "t", "t_error", "earlier")
+        }
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, Array]) -> "Turned":
         """Inverse of :meth:`to_arrays`."""
         size, wavelength = arrays["at"].tolist()
-        return cls(size, wavelength, *(arrays[name] for name in ("angle_rad", "t", "t_error", "earlier")))
+        return cls(
+            size,
+            wavelength,
+            *(arrays[name] for name in ("angle_rad", "t", "t_error", "earlier")),
+        )
 
 
 def circular(t: Array, hand: float) -> tuple[Array, Array]:
-    """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1) through Jones matrices."""
+    """(kept, converted) amplitudes of the circular wave x + iy (hand +1) or x - iy (-1)
+    through Jones matrices.
+    """
     come = np.array([1.0, 1j * hand]) / math.sqrt(2)
     leave = t @ come
     return np.asarray(leave @ come.conj()), np.asarray(leave @ come)
 
 
 def mirrored(t: Array) -> Array:
-    """Jones matrices of the mirror image (y to -y): those of the pillar turned the other way."""
+    """Jones matrices of the mirror image (y to -y): those of the pillar turned the
+    other way.
+    """
     return np.asarray(t * np.array([[1.0, -1.0], [-1.0, 1.0]]))
 
 
 def period_rad(cell: Cell) -> float:
-    """Turn after which lattice and pillar are those of angle 0, turned as a whole, the axes of the pillar aside."""
-    return {"square": math.pi / 2, "hexagonal": math.pi / 3}.get(cell.lattice.kind, math.pi)
+    """Turn after which lattice and pillar are those of angle 0, turned as a whole, the
+    axes of the pillar aside.
+    """
+    return {"square": math.pi / 2, "hexagonal": math.pi / 3}.get(
+        cell.lattice.kind, math.pi
+    )
 
 
 def check(cell: Cell, size_um: float) -> None:
-    """Refuse pillars that carry no geometric phase, and those whose mirrors do not lie along x and y.
+    """Refuse pillars that carry no geometric phase, and those whose mirrors do not lie
+    along x and y.
 
     Raises:
-        CellError: the shape is the same along both axes, is turned already, or has no such mirrors.
+        CellError: the shape is the same along both axes, is turned already, or has no
+            such mirrors.
     """
     outline = cell.outline(size_um)
     if not (outline.keeps(-1, 1) and outline.keeps(1, -1)):
-        raise CellError(f"circular light: a {cell.shape.name} without mirrors along x and y; need angle_rad = 0")
-    quarter = getattr(cell.shape, "ratio", 1.0) != 1.0 and cell.shape.kind in ("rectangle", "ellipse")
+        raise CellError(
+            f"circular light: a {cell.shape.name} without mirrors along x and y; need angle_rad = 0"
+        )
+    quarter = getattr(cell.shape, "ratio", 1.0) != 1.0 and cell.shape.kind in (
+        "rectangle",
+        "ellipse",
+    )
     if not quarter and cell.shape.kind != "polygon":
         raise CellError(
             f"circular light: a {cell.shape.name} answers x and y alike and gives no geometric phase; "
@@ -110,11 +158,15 @@ def check(cell: Cell, size_um: float) -> None:
         )
 
 
-def solve(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float) -> Turned:
-    """Solve the pillar turned in its lattice, over one period; half of it follows from the mirror of the lattice.
+def solve(
+    cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float
+) -> Turned:
+    """Solve the pillar turned in its lattice, over one period; half of it follows from
+    the mirror of the lattice.
 
     Raises:
-        CellError: a shape that cannot be turned (see :func:`check`), or that meets its neighbours when turned.
+        CellError: a shape that cannot be turned (see :func:`check`), or that meets its
+            neighbours when turned.
     """
     check(cell, size_um)
     period = period_rad(cell)
@@ -122,8 +174,18 @@ def solve(cell: Cell, size_um: float, wavelength_um: float, *, tolerance: float)
     found = []
     for angle in angles.tolist():
         shape = dataclasses.replace(cell.shape, angle_rad=angle)
-        found.append(jones(dataclasses.replace(cell, shape=shape), size_um, wavelength_um, tolerance=tolerance))
-    t, error = np.array([one.t for one in found]), np.array([one.t_error for one in found])
+        found.append(
+            jones(
+                dataclasses.replace(cell, shape=shape),
+                size_um,
+                wavelength_um,
+                tolerance=tolerance,
+            )
+        )
+    t, error = (
+        np.array([one.t for one in found]),
+        np.array([one.t_error for one in found]),
+    )
     earlier = np.array([one.earlier for one in found])
     back = slice(STEPS - 1, 0, -1)  # neither 0 nor half the period again
     return Turned(

@@ -1,4 +1,6 @@
-"""Fourier orders of a square cell under its mirrors, and of any lattice under what it shares with shape and light."""
+"""Fourier orders of a square cell under its mirrors, and of any lattice under what it
+shares with shape and light.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -9,4 +11,6 @@ if TYPE_CHECKING:
     from metalens.rcwa.orders import mirrors as mirrors
     from metalens.rcwa.orders import waves as waves
 
-__getattr__, __dir__, __all__ = attach(__name__, {"basis": "", "mirrors": "", "waves": ""})
+__getattr__, __dir__, __all__ = attach(
+    __name__, {"basis": "", "mirrors": "", "waves": ""}
+)

@@ -1,7 +1,9 @@
 """Fourier orders of a square cell, reduced by the mirror symmetries of the case.
 
-A field that a mirror plane leaves unchanged (or turns into its negative) has one amplitude for all the orders that the
-mirrors carry into each other. Four scalar sets belong to a case: Ex, Ey, and the parities of Ez and Hz, from which the
+A field that a mirror plane leaves unchanged (or turns into its negative) has one
+amplitude for all the orders that the
+mirrors carry into each other. Four scalar sets belong to a case: Ex, Ey, and the
+parities of Ez and Hz, from which the
 transverse waves of a homogeneous medium are made (p from Ez, s from Hz).
 """
 
@@ -14,8 +16,12 @@ from scipy.special import j0, j1, jv
 
 from metalens.ground.arrays import Array
 
-Symmetry = Literal["x", "p", "s", "none"]  # E along x at normal incidence; E in, or across, the mirror plane y = 0
-_PARITY: dict[str, tuple[tuple[int, int], ...]] = {  # of Ex, Ey, Ez, Hz under x -> -x and y -> -y; 0: no such mirror
+Symmetry = Literal[
+    "x", "p", "s", "none"
+]  # E along x at normal incidence; E in, or across, the mirror plane y = 0
+_PARITY: dict[
+    str, tuple[tuple[int, int], ...]
+] = {  # of Ex, Ey, Ez, Hz under x -> -x and y -> -y; 0: no such mirror
     "x": ((1, 1), (-1, -1), (-1, 1), (1, -1)),
     "p": ((0, 1), (0, -1), (0, 1), (0, -1)),
     "s": ((0, -1), (0, 1), (0, -1), (0, 1)),
@@ -25,7 +31,8 @@ _PARITY: dict[str, tuple[tuple[int, int], ...]] = {  # of Ex, Ey, Ez, Hz under x
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Orders:
-    """Amplitudes of one scalar field: one representative order for each set of mirror images.
+    """Amplitudes of one scalar field: one representative order for each set of mirror
+    images.
 
     m, n: (k,) representative orders along x and y.
     size: (k,) number of orders in each set.
@@ -43,9 +50,11 @@ class Basis:
     """Orders within a circle of radius ``harmonics``, for one symmetry.
 
     ex, ey, ez, hz: the scalar sets.
-    shells: (q,) distinct squared distances between orders; disc coefficients depend on nothing else.
+    shells: (q,) distinct squared distances between orders; disc coefficients depend on
+    nothing else.
     links: for the products (ex, ex), (ey, ey), (ez, ez), (ex, ey).
-    normal: matrices of nx nx (ex, ex), ny ny (ey, ey), nx ny (ex, ey) for the radial unit field n.
+    normal: matrices of nx nx (ex, ex), ny ny (ey, ey), nx ny (ex, ey) for the radial
+    unit field n.
     """
 
     harmonics: int
@@ -61,10 +70,12 @@ class Basis:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Link:
-    """How a function of the cell couples two scalar sets: a sum over the mirror images of the column's order.
+    """How a function of the cell couples two scalar sets: a sum over the mirror images
+    of the column's order.
 
     shell: (k, l, images) place in ``Basis.shells`` of the difference of orders.
-    weight, cos2, sin2: (k, l, images) sign and norm of each image; the same times cos 2f and sin 2f, where f is
+    weight, cos2, sin2: (k, l, images) sign and norm of each image; the same times cos
+    2f and sin 2f, where f is
         the direction of the difference.
     """
 
@@ -82,7 +93,17 @@ def basis(harmonics: int, symmetry: Symmetry) -> Basis:
     reach = np.arange(2 * harmonics + 1) ** 2
     shells = np.unique(reach[:, None] + reach)
     links = tuple(_link(rows, columns, shells) for rows, columns in pairs)
-    return Basis(harmonics, symmetry, ex, ey, ez, hz, shells, links, _normal(ex, ey, 2 * harmonics))
+    return Basis(
+        harmonics,
+        symmetry,
+        ex,
+        ey,
+        ez,
+        hz,
+        shells,
+        links,
+        _normal(ex, ey, 2 * harmonics),
+    )
 
 
 def _orders(harmonics: int, parity: tuple[int, int]) -> Orders:
@@ -93,14 +114,22 @@ def _orders(harmonics: int, parity: tuple[int, int]) -> Orders:
         if sign:
             keep &= order >= (0 if sign > 0 else 1)
     m, n = m[keep], n[keep]
-    size = np.where(m != 0, 2, 1) ** (parity[0] != 0) * np.where(n != 0, 2, 1) ** (parity[1] != 0)
+    size = np.where(m != 0, 2, 1) ** (parity[0] != 0) * np.where(n != 0, 2, 1) ** (
+        parity[1] != 0
+    )
     return Orders(m, n, size, parity)
 
 
 def _images(rows: Orders, columns: Orders) -> tuple[Array, Array, Array]:
-    """Differences between the rows and every mirror image of the columns, with the weight of each."""
+    """Differences between the rows and every mirror image of the columns, with the
+    weight of each.
+    """
     signs = [
-        (sx, sy, (columns.parity[0] if sx < 0 else 1) * (columns.parity[1] if sy < 0 else 1))
+        (
+            sx,
+            sy,
+            (columns.parity[0] if sx < 0 else 1) * (columns.parity[1] if sy < 0 else 1),
+        )
         for sx in ((1, -1) if columns.parity[0] else (1,))
         for sy in ((1, -1) if columns.parity[1] else (1,))
     ]
@@ -122,13 +151,18 @@ EX, EY, EZ, MIXED = range(4)  # places in Basis.links
 
 
 def products(space: Basis, coefficients: Array, link: int) -> Array:
-    """Matrix of the product with a round function: (*batch, shells) Fourier coefficients -> (*batch, k, k)."""
+    """Matrix of the product with a round function: (*batch, shells) Fourier
+    coefficients -> (*batch, k, k).
+    """
     pair = space.links[link]
-    return np.asarray(np.einsum("...ijg,ijg->...ij", coefficients[..., pair.shell], pair.weight))
+    return np.asarray(
+        np.einsum("...ijg,ijg->...ij", coefficients[..., pair.shell], pair.weight)
+    )
 
 
 def disc(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
-    """Fourier coefficients of the indicator of a disc: f 2 J1(x)/x, x = pi D |G| / pitch, f its share of the cell.
+    """Fourier coefficients of the indicator of a disc: f 2 J1(x)/x, x = pi D |G| /
+    pitch, f its share of the cell.
 
     diameter_um: (*batch,), real or complex. Returns (*batch, shells).
     """
@@ -140,9 +174,13 @@ def disc(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
 
 
 def disc_rate(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
-    """d(disc)/d(diameter_um) = (pi D / 2 pitch²) J0(x): the rim moves outwards everywhere alike."""
+    """d(disc)/d(diameter_um) = (pi D / 2 pitch²) J0(x): the rim moves outwards
+    everywhere alike.
+    """
     radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
-    return np.asarray(radius / (2 * pitch_um) * _bessel(0, np.sqrt(space.shells) * radius))
+    return np.asarray(
+        radius / (2 * pitch_um) * _bessel(0, np.sqrt(space.shells) * radius)
+    )
 
 
 def _bessel(order: int, x: Array) -> Array:
@@ -151,11 +189,16 @@ def _bessel(order: int, x: Array) -> Array:
     return np.asarray(j1(x) if order else j0(x))
 
 
-def normals(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, Array, Array]:
-    """Matrices (xx, yy, xy) of a field N that is n n^T of the radial unit field at the rim and outside the disc.
+def normals(
+    space: Basis, diameter_um: Array, pitch_um: float
+) -> tuple[Array, Array, Array]:
+    """Matrices (xx, yy, xy) of a field N that is n n^T of the radial unit field at the
+    rim and outside the disc.
 
-    Inside it is (r/R)² n n^T = (r r^T)/R², smooth at the centre: what is taken off n n^T there, (1 - r²/R²) n n^T,
-    has the Fourier coefficients pi R² (a + b cos 2f, b sin 2f, a - b cos 2f) with Bessel functions a, b of x = |G| R.
+    Inside it is (r/R)² n n^T = (r r^T)/R², smooth at the centre: what is taken off n
+    n^T there, (1 - r²/R²) n n^T,
+    has the Fourier coefficients pi R² (a + b cos 2f, b sin 2f, a - b cos 2f) with
+    Bessel functions a, b of x = |G| R.
     (Half the worst truncation error of n n^T, whose centre is singular.)
     """
     radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
@@ -164,11 +207,16 @@ def normals(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, A
     share = radius**2 / (4 * np.pi)
     a = share * np.where(small, 0.25 - x**2 / 48, 2 * j2 / y**2)
     b = -share * np.where(small, x**2 / 96, (2 - 2 * j0 - 4 * j2) / y**2)
-    xx, yy, xy = (whole - part for whole, part in zip(space.normal, _directed(space, a, b), strict=True))
+    xx, yy, xy = (
+        whole - part
+        for whole, part in zip(space.normal, _directed(space, a, b), strict=True)
+    )
     return xx, yy, xy
 
 
-def normals_rate(space: Basis, diameter_um: Array, pitch_um: float) -> tuple[Array, Array, Array]:
+def normals_rate(
+    space: Basis, diameter_um: Array, pitch_um: float
+) -> tuple[Array, Array, Array]:
     """Derivative of :func:`normals` with respect to diameter_um."""
     radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
     x, y, small = _argument(space, radius)
@@ -187,7 +235,9 @@ def _argument(space: Basis, radius: Array) -> tuple[Array, Array, Array]:
 
 
 def _directed(space: Basis, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Matrices of the functions with coefficients a + b cos 2f, a - b cos 2f and b sin 2f: (xx, yy, xy)."""
+    """Matrices of the functions with coefficients a + b cos 2f, a - b cos 2f and b sin
+    2f: (xx, yy, xy).
+    """
     taken = []
     for link, sign in ((EX, 1), (EY, -1)):
         pair = space.links[link]
@@ -195,7 +245,11 @@ def _directed(space: Basis, a: Array, b: Array) -> tuple[Array, Array, Array]:
         directed = np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.cos2)
         taken.append(isotropic + sign * directed)
     pair = space.links[MIXED]
-    return taken[0], taken[1], np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.sin2)
+    return (
+        taken[0],
+        taken[1],
+        np.einsum("...ijg,ijg->...ij", b[..., pair.shell], pair.sin2),
+    )
 
 
 def _normal(ex: Orders, ey: Orders, reach: int) -> tuple[Array, Array, Array]:
@@ -214,9 +268,11 @@ def _normal(ex: Orders, ey: Orders, reach: int) -> tuple[Array, Array, Array]:
 
 
 def _radial_field(reach: int) -> tuple[Array, Array]:
-    """Fourier coefficients of x²/r² and x y/r² over the unit cell, orders 0..reach on both axes.
+    """Fourier coefficients of x²/r² and x y/r² over the unit cell, orders 0..reach on
+    both axes.
 
-    Each eighth of the cell is mapped to a square (x = s, y = s v), where the field depends on v alone and the
+    Each eighth of the cell is mapped to a square (x = s, y = s v), where the field
+    depends on v alone and the
     integrand is smooth: Gauss-Legendre is exact to rounding.
     """
     nodes, weights = np.polynomial.legendre.leggauss(3 * reach // 2 + 30)
@@ -226,7 +282,12 @@ def _radial_field(reach: int) -> tuple[Array, Array]:
     along = angle[:, None] * s
     across = angle[:, None, None] * (s[:, None] * v)
     area = 4 * ws * s
-    near, far = wv / (1 + v * v), wv * v * v / (1 + v * v)  # x² / r² where x > y, and where y > x
-    even = (np.cos(along) * area) @ (np.cos(across) @ near).T + (np.cos(across) @ far) @ (np.cos(along) * area).T
+    near, far = (
+        wv / (1 + v * v),
+        wv * v * v / (1 + v * v),
+    )  # x² / r² where x > y, and where y > x
+    even = (np.cos(along) * area) @ (np.cos(across) @ near).T + (
+        np.cos(across) @ far
+    ) @ (np.cos(along) * area).T
     mixed = (np.sin(along) * area) @ (np.sin(across) @ (wv * v / (1 + v * v))).T
     return even, -(mixed + mixed.T)

@@ -1,7 +1,10 @@
-"""Fourier orders of any lattice, reduced by whatever mirrors and half turns shape, lattice and light share.
+"""Fourier orders of any lattice, reduced by whatever mirrors and half turns shape,
+lattice and light share.
 
-The fields of a case are carried by its operations g into themselves with a sign for each of Ex, Ey, Ez, Hz; one
-amplitude stands for an orbit of orders. The rectangle of a hexagonal lattice holds two sites: orders with m + n even.
+The fields of a case are carried by its operations g into themselves with a sign for
+each of Ex, Ey, Ez, Hz; one
+amplitude stands for an orbit of orders. The rectangle of a hexagonal lattice holds two
+sites: orders with m + n even.
 """
 
 from dataclasses import dataclass
@@ -14,7 +17,8 @@ from metalens.ground.arrays import Array
 Sign = tuple[int, int, int, int]  # of Ex, Ey, Ez, Hz
 Operation = tuple[int, int, Sign]  # (x, y) -> (sx x, sy y)
 IDENTITY: Operation = (1, 1, (1, 1, 1, 1))
-# An electric field along x (or y) that a mirror leaves as it is has Ex (or Ey) even; see basis._PARITY.
+# An electric field along x (or y) that a mirror leaves as it is has Ex (or Ey) even;
+# see basis._PARITY.
 FLIP_X = {"x": (-1, 1, (1, -1, -1, 1)), "y": (-1, 1, (-1, 1, 1, -1))}
 FLIP_Y = {"x": (1, -1, (1, -1, 1, -1)), "y": (1, -1, (-1, 1, -1, 1))}
 HALF_TURN: Operation = (-1, -1, (1, 1, -1, -1))
@@ -22,7 +26,9 @@ HALF_TURN: Operation = (-1, -1, (1, 1, -1, -1))
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the orders depend on: edges of the rectangle that repeats over the pitch, centred or not, operations."""
+    """What the orders depend on: edges of the rectangle that repeats over the pitch,
+    centred or not, operations.
+    """
 
     along: float
     across: float
@@ -32,7 +38,9 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Set:
-    """Amplitudes of one scalar field: (k,) orders m, n, sizes of their orbits, sign of each operation."""
+    """Amplitudes of one scalar field: (k,) orders m, n, sizes of their orbits, sign of
+    each operation.
+    """
 
     m: Array
     n: Array
@@ -42,7 +50,9 @@ class Set:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Link:
-    """How a function couples two sets: (k, l, operations) places in its table of coefficients, and weights."""
+    """How a function couples two sets: (k, l, operations) places in its table of
+    coefficients, and weights.
+    """
 
     place: Array
     weight: Array
@@ -50,7 +60,9 @@ class Link:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Orders:
-    """The reduced sets of one truncation; coefficients are tabled over m, n from -2 reach to 2 reach."""
+    """The reduced sets of one truncation; coefficients are tabled over m, n from -2
+    reach to 2 reach.
+    """
 
     ex: Set
     ey: Set
@@ -62,22 +74,33 @@ class Orders:
 
 @lru_cache(maxsize=24)
 def orders(harmonics: int, frame: Frame) -> Orders:
-    """All orders within the circle of radius ``harmonics`` orders of a square lattice of this cell's area."""
-    radius = harmonics / np.sqrt(frame.along * frame.across / (2 if frame.centred else 1))
+    """All orders within the circle of radius ``harmonics`` orders of a square lattice
+    of this cell's area.
+    """
+    radius = harmonics / np.sqrt(
+        frame.along * frame.across / (2 if frame.centred else 1)
+    )
     reach = (int(radius * frame.along), int(radius * frame.across))
-    m, n = (a.ravel() for a in np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"))
+    m, n = (
+        a.ravel()
+        for a in np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij")
+    )
     keep = (m / frame.along) ** 2 + (n / frame.across) ** 2 <= radius**2 * (1 + 1e-9)
     if frame.centred:
         keep &= (m + n) % 2 == 0
     m, n = m[keep], n[keep]
     ex, ey, ez, hz = (_reduced(m, n, frame.operations, field) for field in range(4))
     pairs = ((ex, ex), (ey, ey), (ez, ez), (ex, ey))
-    first, second, third, fourth = (link(rows, columns, frame.operations, reach) for rows, columns in pairs)
+    first, second, third, fourth = (
+        link(rows, columns, frame.operations, reach) for rows, columns in pairs
+    )
     return Orders(ex, ey, ez, hz, reach, (first, second, third, fourth))
 
 
 def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) -> Set:
-    """One order of each orbit; those that an operation keeps but whose field it turns into its negative vanish."""
+    """One order of each orbit; those that an operation keeps but whose field it turns
+    into its negative vanish.
+    """
     images = np.stack([(sx * m) * 4096 + sy * n for sx, sy, _ in operations])
     own, signs = images[0], tuple(sign[field] for _, _, sign in operations)
     first = own == images.max(axis=0)
@@ -87,21 +110,31 @@ def _reduced(m: Array, n: Array, operations: tuple[Operation, ...], field: int) 
     return Set(m[keep], n[keep], size, signs)
 
 
-def link(rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]) -> Link:
-    """How a function couples two sets; it must turn the fields of the columns into those of the rows.
+def link(
+    rows: Set, columns: Set, operations: tuple[Operation, ...], reach: tuple[int, int]
+) -> Link:
+    """How a function couples two sets; it must turn the fields of the columns into
+    those of the rows.
 
-    Rows and columns of one class take functions that all operations leave as they are. Of classes that differ by the
+    Rows and columns of one class take functions that all operations leave as they are.
+    Of classes that differ by the
     sign s(g) of each operation, functions with f(g r) = s(g) f(r).
     """
-    dm = np.stack([rows.m[:, None] - sx * columns.m for sx, _, _ in operations], axis=-1)
-    dn = np.stack([rows.n[:, None] - sy * columns.n for _, sy, _ in operations], axis=-1)
+    dm = np.stack(
+        [rows.m[:, None] - sx * columns.m for sx, _, _ in operations], axis=-1
+    )
+    dn = np.stack(
+        [rows.n[:, None] - sy * columns.n for _, sy, _ in operations], axis=-1
+    )
     share = np.sqrt(rows.size[:, None] * columns.size) / len(operations)
     place = (dm + 2 * reach[0]) * (4 * reach[1] + 1) + dn + 2 * reach[1]
     return Link(place, share[..., None] * np.array(columns.signs, float))
 
 
 def product(space: Orders, table: Array, pair: int) -> Array:
-    """(k, l) matrix of the product with a function of these coefficients ((2 m reach) x (2 n reach) table)."""
+    """(k, l) matrix of the product with a function of these coefficients ((2 m reach) x
+    (2 n reach) table).
+    """
     return product_by(space.links[pair], table)
 
 

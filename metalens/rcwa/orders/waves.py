@@ -1,12 +1,16 @@
-"""Transverse waves of the homogeneous media, in the orders of one basis; tangential fields are expanded in them.
+"""Transverse waves of the homogeneous media, in the orders of one basis; tangential
+fields are expanded in them.
 
-With lengths in units of 1/k0 (k0 = 2 pi / wavelength), u = (Ex, Ey) and w = (Hy, -Hx) obey, in any medium,
+With lengths in units of 1/k0 (k0 = 2 pi / wavelength), u = (Ex, Ey) and w = (Hy, -Hx)
+obey, in any medium,
 
     u' = i P w,  P = 1 - K [eps]^-1 K^T,   K = (kx, ky)        (from Ez = -[eps]^-1 K^T w)
     w' = i Q u,  Q = E - R R^T,            R = (-ky, kx)       (from Hz = R^T u)
 
-P and Q are symmetric, also in absorbing media. A p wave has u along k = (kx, ky), an s wave across it, so that K^T and
-R^T become the bare length of k. In a homogeneous medium an outgoing wave of unit electric amplitude has, with
+P and Q are symmetric, also in absorbing media. A p wave has u along k = (kx, ky), an s
+wave across it, so that K^T and
+R^T become the bare length of k. In a homogeneous medium an outgoing wave of unit
+electric amplitude has, with
 kz² = eps - |k|²:   p: u = kz / n, w = n;   s: u = 1, w = kz.  No form divides by kz, so kz = 0 needs no care.
 """
 
@@ -20,11 +24,13 @@ from metalens.rcwa.orders.basis import Basis, Orders
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Waves:
-    """The waves of a basis at one wavelength and direction: all p waves, then all s waves.
+    """The waves of a basis at one wavelength and direction: all p waves, then all s
+    waves.
 
     m, n: (n,) orders; kappa: (n,) |k| / k0; along: (2, n) direction of k.
     p_count: number of p waves.
-    bare: number of leading p waves that have no Ez at all (the zero order at normal incidence, E along x).
+    bare: number of leading p waves that have no Ez at all (the zero order at normal
+    incidence, E along x).
     fold: (ex + ey, n) orthogonal matrix from the waves to Ex and Ey.
     zero_p, zero_s: place of the zero order, -1 where the symmetry excludes it.
     """
@@ -41,8 +47,18 @@ class Waves:
     zero_s: int
 
 
-def waves(space: Basis, *, pitch_um: float, wavelength_um: float, kx: float, ky: float, azimuth_rad: float) -> Waves:
-    """The waves around the zero order (kx, ky) / k0, whose azimuth gives the direction of E where k vanishes."""
+def waves(
+    space: Basis,
+    *,
+    pitch_um: float,
+    wavelength_um: float,
+    kx: float,
+    ky: float,
+    azimuth_rad: float,
+) -> Waves:
+    """The waves around the zero order (kx, ky) / k0, whose azimuth gives the direction
+    of E where k vanishes.
+    """
     step = wavelength_um / pitch_um
     bare = int(space.symmetry == "x")
     ex, ey, ez, hz = space.ex, space.ey, space.ez, space.hz
@@ -60,14 +76,18 @@ def waves(space: Basis, *, pitch_um: float, wavelength_um: float, kx: float, ky:
 
 
 def normal_component(kappa: Array, index: complex) -> Array:
-    """kz / k0 = sqrt(n² - kappa²) of outgoing or decaying waves: positive real or imaginary part."""
+    """kz / k0 = sqrt(n² - kappa²) of outgoing or decaying waves: positive real or
+    imaginary part.
+    """
     square = (index - kappa) * (index + kappa)
     kz = np.sqrt(square.astype(complex))
     return np.asarray(np.where(kz.imag < 0, -kz, kz))
 
 
 def half_space(basis_waves: Waves, index: complex) -> tuple[Array, Array]:
-    """(u, w) of the outgoing waves of unit electric amplitude; (u, -w) are the incoming ones."""
+    """(u, w) of the outgoing waves of unit electric amplitude; (u, -w) are the incoming
+    ones.
+    """
     kz = normal_component(basis_waves.kappa, index)
     is_p = np.arange(len(kz)) < basis_waves.p_count
     return np.where(is_p, kz / index, 1.0), np.where(is_p, index, kz)

@@ -1,4 +1,6 @@
-"""Derivatives of the Jones matrices of any pillar by every number of its shape, section and material."""
+"""Derivatives of the Jones matrices of any pillar by every number of its shape, section
+and material.
+"""
 
 from typing import TYPE_CHECKING
 

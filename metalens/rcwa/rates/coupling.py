@@ -1,4 +1,6 @@
-"""One section of the pillar between two symmetry classes: that of the waves sent back (rows) and that of the light."""
+"""One section of the pillar between two symmetry classes: that of the waves sent back
+(rows) and that of the light.
+"""
 
 import functools
 
@@ -16,22 +18,40 @@ from metalens.rcwa.rates.tables import Change, Section, Tables
 class Coupling:
     """What all numbers of the pillar share in it, worked out when first asked.
 
-    rows, columns: the classes; i: the region. slabs: the cross-sections at the shares of the height where motions are
+    rows, columns: the classes; i: the region. slabs: the cross-sections at the shares
+    of the height where motions are
     told; those of an upright section are alike.
     """
 
-    def __init__(self, rows: Solved, columns: Solved, i: int, cell: Cell, slabs: list[Slab]) -> None:
-        self._rows, self._columns, self._i, self._cell, self._slabs = rows, columns, i, cell, slabs
+    def __init__(
+        self, rows: Solved, columns: Solved, i: int, cell: Cell, slabs: list[Slab]
+    ) -> None:
+        self._rows, self._columns, self._i, self._cell, self._slabs = (
+            rows,
+            columns,
+            i,
+            cell,
+            slabs,
+        )
         self._z = rows.uprights, columns.uprights
 
     def rate(self, changes: list[Tables | None]) -> Array:
-        """(2, b, k) derivatives of t and r, from those of the coefficients: of every cross-section of a tilted wall, or
-        of an upright one those that are alike at every height, and those of the top less those of the foot."""
-        rows, columns = self._rows.regions[self._i].transposed, self._columns.regions[self._i].plain
+        """(2, b, k) derivatives of t and r, from those of the coefficients: of every
+        cross-section of a tilted wall, or
+        of an upright one those that are alike at every height, and those of the top
+        less those of the foot."""
+        rows, columns = (
+            self._rows.regions[self._i].transposed,
+            self._columns.regions[self._i].plain,
+        )
         count = len(self._columns.columns)
         total = np.zeros((2 * len(self._rows.columns), count), complex)
         if not (isinstance(rows, Modes) and isinstance(columns, Modes)):
-            total += kernels.tilted(self._stages, self._z, [self._changed(k, table) for k, table in enumerate(changes)])
+            total += kernels.tilted(
+                self._stages,
+                self._z,
+                [self._changed(k, table) for k, table in enumerate(changes)],
+            )
         else:
             back, light = self._rows.sent[self._i], self._columns.light[self._i]
             for table, sign in zip(changes, (1, -1), strict=True):
@@ -52,7 +72,9 @@ class Coupling:
     def _sections(self, k: int) -> tuple[Section, Section]:
         if k not in self._held:
             first, second = (
-                tables.section(one.space, one.ways, one.operations, self._slabs[k], self._cell)
+                tables.section(
+                    one.space, one.ways, one.operations, self._slabs[k], self._cell
+                )
                 for one in (self._rows, self._columns)
             )
             self._held[k] = first, second
@@ -61,7 +83,9 @@ class Coupling:
     @functools.cached_property
     def _stages(self) -> kernels.Stages:
         rows, columns, i = self._rows, self._columns, self._i
-        return kernels.stages(rows.regions[i], columns.regions[i], rows.sent[i], columns.light[i])
+        return kernels.stages(
+            rows.regions[i], columns.regions[i], rows.sent[i], columns.light[i]
+        )
 
     @functools.cached_property
     def _plain(self) -> kernels.Integrals:
@@ -73,7 +97,10 @@ class Coupling:
 
     @property
     def _modes(self) -> tuple[Modes, Modes]:
-        rows, columns = self._rows.regions[self._i].transposed, self._columns.regions[self._i].plain
+        rows, columns = (
+            self._rows.regions[self._i].transposed,
+            self._columns.regions[self._i].plain,
+        )
         if not (isinstance(rows, Modes) and isinstance(columns, Modes)):
             raise TypeError("a tilted wall has no modes")
         return rows, columns

@@ -1,6 +1,8 @@
-"""Rates of amplitudes, i ∫ (u~^T dQ u - w~^T dP w) dz, from the fields of the light and of the waves sent back.
+"""Rates of amplitudes, i ∫ (u~^T dQ u - w~^T dP w) dz, from the fields of the light and
+of the waves sent back.
 
-Between two modes there are only divided differences of exponentials, so that equal propagation constants need no care.
+Between two modes there are only divided differences of exponentials, so that equal
+propagation constants need no care.
 Rows belong to the waves sent back, columns to the light: (b, k) of b and k of them.
 """
 
@@ -18,7 +20,9 @@ _NEAR = 0.3  # of the half phase between two modes: below it a series
 Integrals = tuple[Array, Array]  # between modes that go the same way, and opposite ways
 
 
-def in_modes(rows: Modes, columns: Modes, z: tuple[slice, slice], change: Change) -> tuple[Array, Array]:
+def in_modes(
+    rows: Modes, columns: Modes, z: tuple[slice, slice], change: Change
+) -> tuple[Array, Array]:
     """V~^T dP V and W~^T dQ W; z: where among the waves those of dP stand."""
     first, second = rows.part, columns.part
     left, right = (first.Q @ first.W)[z[0]], (second.Q @ second.W)[z[1]]
@@ -26,8 +30,16 @@ def in_modes(rows: Modes, columns: Modes, z: tuple[slice, slice], change: Change
     return of_P, first.W.T @ change[1] @ second.W
 
 
-def upright(change: tuple[Array, Array], integrals: Integrals, sign: int, back: Fields, light: Fields) -> Array:
-    """(b, k) rates for a change :func:`in_modes`; sign: of the integrals between modes that go down."""
+def upright(
+    change: tuple[Array, Array],
+    integrals: Integrals,
+    sign: int,
+    back: Fields,
+    light: Fields,
+) -> Array:
+    """(b, k) rates for a change :func:`in_modes`; sign: of the integrals between modes
+    that go down.
+    """
     of_P, of_Q = change
     same, opposite = (of_Q - of_P) * integrals[0], (of_Q + of_P) * integrals[1]
     ups = same @ light.up + opposite @ light.down
@@ -42,12 +54,18 @@ def plain(rows: Modes, columns: Modes) -> Integrals:
     near = np.abs(q - p) * h / 2 < _NEAR
     x = np.where(near, q - p, 0) * h / 2
     middle = np.exp(1j * np.where(near, q + p, 0) * h / 2) * h * np.sinc(x / np.pi)
-    return same, np.where(near, middle, (np.exp(1j * q * h) - np.exp(1j * p * h)) / np.where(near, 1, 1j * (q - p)))
+    return same, np.where(
+        near,
+        middle,
+        (np.exp(1j * q * h) - np.exp(1j * p * h)) / np.where(near, 1, 1j * (q - p)),
+    )
 
 
 def sloped(rows: Modes, columns: Modes) -> Integrals:
-    """The same with z / h - 1/2 as a factor, i h / 2 j1(y) exp(i (q + p) h / 2), y = (q +- p) h / 2: of changes that
-    grow from -1/2 at the foot to 1/2 at the top. Between modes that go down it is the negative."""
+    """The same with z / h - 1/2 as a factor, i h / 2 j1(y) exp(i (q + p) h / 2), y = (q
+    +- p) h / 2: of changes that
+    grow from -1/2 at the foot to 1/2 at the top. Between modes that go down it is the
+    negative."""
     q, p, h = rows.part.q[:, None], columns.part.q, columns.height
     middle = np.exp(1j * (q + p) * h / 2)
 
@@ -65,7 +83,8 @@ def sloped(rows: Modes, columns: Modes) -> Integrals:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stages:
-    """All Gauss points of a tilted wall. share: (m, nodes) what a change of each of the cross-sections whose polynomial
+    """All Gauss points of a tilted wall. share: (m, nodes) what a change of each of the
+    cross-sections whose polynomial
     the wall is counts there; u, w, u_back, w_back: (m, n, k) and (m, n, b) fields."""
 
     share: Array
@@ -78,23 +97,37 @@ class Stages:
 def stages(rows: Region, columns: Region, back: Fields, light: Fields) -> Stages:
     """Of one wall in two symmetry classes."""
     share, parts = [], []
-    for i, (step, other) in enumerate(zip(columns.panels, rows.panels_transposed, strict=True)):
+    for i, (step, other) in enumerate(
+        zip(columns.panels, rows.panels_transposed, strict=True)
+    ):
         m, n = step.P.shape[:2]
         share.append(-step.step * step.weights[:, None] * made.weights(step.share))
-        here = [(part @ light.ends[i + 1]).reshape(m, n, -1) for part in (step.u, step.w)]
-        sent = [(part @ back.ends[i + 1]).reshape(m, len(other.P[0]), -1) for part in (other.u, other.w)]
+        here = [
+            (part @ light.ends[i + 1]).reshape(m, n, -1) for part in (step.u, step.w)
+        ]
+        sent = [
+            (part @ back.ends[i + 1]).reshape(m, len(other.P[0]), -1)
+            for part in (other.u, other.w)
+        ]
         parts.append(here + sent)
     u, w, u_back, w_back = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Stages(np.concatenate(share), u, w, u_back, w_back)
 
 
-def tilted(this: Stages, z: tuple[slice, slice], changes: Sequence[Change | None]) -> Array:
+def tilted(
+    this: Stages, z: tuple[slice, slice], changes: Sequence[Change | None]
+) -> Array:
     """(b, k) rates for a change of every cross-section."""
     total = np.zeros((this.u_back.shape[2], this.u.shape[2]), complex)
     for share, change in zip(this.share.T, changes, strict=True):
         if change is not None:
             total += np.einsum("m,mib,mik->bk", share, this.u_back, change[1] @ this.u)
-            total -= np.einsum("m,mib,mik->bk", share, this.w_back[:, z[0]], change[0] @ this.w[:, z[1]])
+            total -= np.einsum(
+                "m,mib,mik->bk",
+                share,
+                this.w_back[:, z[0]],
+                change[0] @ this.w[:, z[1]],
+            )
     return total
 
 
@@ -102,14 +135,21 @@ def stretch(this: Region, back: Fields, light: Fields) -> Array:
     """(b, k) rates for each unit of reduced height: i (u~^T Q u - w~^T P w)."""
     if isinstance(this.plain, Modes) and isinstance(this.transposed, Modes):
         part = this.plain.part
-        (u, w), (u_back, w_back) = _at_foot(this.plain, light), _at_foot(this.transposed, back)
+        (u, w), (u_back, w_back) = (
+            _at_foot(this.plain, light),
+            _at_foot(this.transposed, back),
+        )
         return np.asarray(1j * (u_back.T @ part.Q @ u - w_back.T @ part.P @ w))
     found, start = stages(this, this, back, light), 0
     total = np.zeros((found.u_back.shape[2], found.u.shape[2]), complex)
     for step in this.panels:
         at = slice(start, start + len(step.share))
-        each = np.einsum("mib,mij,mjk->mbk", found.u_back[at], step.Q, found.u[at], optimize=True)
-        each = each - np.einsum("mib,mij,mjk->mbk", found.w_back[at], step.P, found.w[at], optimize=True)
+        each = np.einsum(
+            "mib,mij,mjk->mbk", found.u_back[at], step.Q, found.u[at], optimize=True
+        )
+        each = each - np.einsum(
+            "mib,mij,mjk->mbk", found.w_back[at], step.P, found.w[at], optimize=True
+        )
         total -= step.step / this.height * np.tensordot(step.weights, each, 1)
         start = at.stop
     return total

@@ -1,6 +1,8 @@
-"""Every number of a pillar by its name, as a cell file has it, and how sections, permittivities and heights follow it.
+"""Every number of a pillar by its name, as a cell file has it, and how sections,
+permittivities and heights follow it.
 
-Rims and permittivities follow by elementary functions, whose derivatives are differences of sixth order: 1e-11.
+Rims and permittivities follow by elementary functions, whose derivatives are
+differences of sixth order: 1e-11.
 """
 
 import dataclasses
@@ -20,13 +22,17 @@ from metalens.rcwa import made
 from metalens.rcwa.rates.tables import numbers
 from metalens.rcwa.rates.truncated import Motion, shares, slab_at
 
-_STEP = 1e-4  # of a number; of 1 where it is an angle or a coordinate, of the size where it is a change of width
+# of a number; of 1 where it is an angle or a coordinate, of the size where it is a
+# change of width
+_STEP = 1e-4
 _FILM_UM = 0.1  # thickness of a film at least, about which its change is looked at
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """A pillar whose number has changed: the cell, its size, and what all widths have grown by."""
+    """A pillar whose number has changed: the cell, its size, and what all widths have
+    grown by.
+    """
 
     cell: Cell
     size_um: float
@@ -35,14 +41,18 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number of a pillar: what the pillar is when it changes by an amount, and a step for differences."""
+    """A number of a pillar: what the pillar is when it changes by an amount, and a step
+    for differences.
+    """
 
     name: str
     moved: Callable[[float], Moved]
     step: float
 
 
-def parameters(cell: Cell, size_um: float, wavelength_um: float) -> dict[str, Parameter]:
+def parameters(
+    cell: Cell, size_um: float, wavelength_um: float
+) -> dict[str, Parameter]:
     """All of them, by name."""
     found = [
         Parameter("size_um", lambda x: Moved(cell, size_um + x), _STEP * size_um),
@@ -70,7 +80,9 @@ def _of(cell: Cell, size_um: float, name: str) -> Callable[[float], Moved]:
 
 
 def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parameter]:
-    """Real parts of the indices of pillar and surroundings, and of layers that have their own."""
+    """Real parts of the indices of pillar and surroundings, and of layers that have
+    their own.
+    """
 
     def beside(material: Material, x: float) -> Index:
         now = materials.index(material, wavelength_um)
@@ -83,25 +95,47 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
         changed = _with(cell.layers[i], name, beside(getattr(cell.layers[i], name), x))
         return Moved(_with(cell, "layers", _in_place(cell.layers, i, changed)), size_um)
 
-    found = [Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP) for name in ("pillar", "between")]
+    found = [
+        Parameter(f"{name}.n", functools.partial(of_cell, name), _STEP)
+        for name in ("pillar", "between")
+    ]
     for i, layer in enumerate(cell.layers):
-        own = [name for name in ("material", "between", "coat") if getattr(layer, name) is not None]
-        found += [Parameter(f"layers.{i}.{name}.n", functools.partial(of_layer, i, name), _STEP) for name in own]
+        own = [
+            name
+            for name in ("material", "between", "coat")
+            if getattr(layer, name) is not None
+        ]
+        found += [
+            Parameter(
+                f"layers.{i}.{name}.n", functools.partial(of_layer, i, name), _STEP
+            )
+            for name in own
+        ]
     return found
 
 
 def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
-    """Ratios, the in-plane angle, corners: every number that the record of the shape has."""
+    """Ratios, the in-plane angle, corners: every number that the record of the shape
+    has.
+    """
     shape, found = cell.shape, []
 
     def changed(name: str, value: Callable[[float], Any]) -> Callable[[float], Moved]:
-        return lambda x: Moved(dataclasses.replace(cell, shape=_with(shape, name, value(x))), size_um)
+        return lambda x: Moved(
+            dataclasses.replace(cell, shape=_with(shape, name, value(x))), size_um
+        )
 
     for part in dataclasses.fields(shape):
         name, now = part.name, getattr(shape, part.name)
         if part.type is float:  # a whole number too, but no count of sides
             step = _STEP if name.endswith("_rad") else _STEP * now
-            found.append(Parameter(f"shape.{name}", changed(name, functools.partial(operator.add, now)), step))
+            found.append(
+                Parameter(
+                    f"shape.{name}",
+                    changed(name, functools.partial(operator.add, now)),
+                    step,
+                )
+            )
         elif isinstance(now, tuple):
             for i, axis in np.ndindex(len(now), 2):
                 corner = changed(name, functools.partial(_shifted, now, i, axis))
@@ -109,34 +143,57 @@ def _of_shape(cell: Cell, size_um: float) -> list[Parameter]:
     return found
 
 
-def _shifted(corners: tuple[tuple[float, float], ...], i: int, axis: int, x: float) -> tuple[tuple[float, float], ...]:
+def _shifted(
+    corners: tuple[tuple[float, float], ...], i: int, axis: int, x: float
+) -> tuple[tuple[float, float], ...]:
     moved = np.array(corners, float)
     moved[i, axis] += x
     return tuple((float(a), float(b)) for a, b in moved)
 
 
 def _of_heights(cell: Cell, size_um: float) -> list[Parameter]:
-    """Heights of the pillar or of its layers, their growth and coats, thicknesses of films."""
+    """Heights of the pillar or of its layers, their growth and coats, thicknesses of
+    films.
+    """
     found = []
     if not cell.layers:
-        found.append(Parameter("height_um", _of(cell, size_um, "height_um"), _STEP * cell.height_um))
+        found.append(
+            Parameter(
+                "height_um", _of(cell, size_um, "height_um"), _STEP * cell.height_um
+            )
+        )
     for i, layer in enumerate(cell.layers):
-        for name in ("height_um", "grow_um", *(("coat_um",) if layer.coat is not None else ())):
+        for name in (
+            "height_um",
+            "grow_um",
+            *(("coat_um",) if layer.coat is not None else ()),
+        ):
             step = _STEP * (size_um if name == "grow_um" else getattr(layer, name))
-            found.append(Parameter(f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step))
+            found.append(
+                Parameter(f"layers.{i}.{name}", _of_layer(cell, size_um, i, name), step)
+            )
     for side in ("under", "over"):
         for i, film in enumerate(getattr(cell, side)):
             step = _STEP * max(film.thickness_um, _FILM_UM)
-            found.append(Parameter(f"{side}.{i}.thickness_um", _of_film(cell, size_um, side, i), step))
+            found.append(
+                Parameter(
+                    f"{side}.{i}.thickness_um", _of_film(cell, size_um, side, i), step
+                )
+            )
     return found
 
 
-def _of_layer(cell: Cell, size_um: float, i: int, name: str) -> Callable[[float], Moved]:
+def _of_layer(
+    cell: Cell, size_um: float, i: int, name: str
+) -> Callable[[float], Moved]:
     def moved(x: float) -> Moved:
         changed = _with(cell.layers[i], name, getattr(cell.layers[i], name) + x)
         layers = _in_place(cell.layers, i, changed)
         return Moved(
-            dataclasses.replace(cell, layers=layers, height_um=sum(layer.height_um for layer in layers)), size_um
+            dataclasses.replace(
+                cell, layers=layers, height_um=sum(layer.height_um for layer in layers)
+            ),
+            size_um,
         )
 
     return moved
@@ -147,7 +204,9 @@ def _of_film(cell: Cell, size_um: float, side: str, i: int) -> Callable[[float],
 
     def moved(x: float) -> Moved:
         films = getattr(cell, side)
-        changed = _with(films[i], "thickness_um", max(films[i].thickness_um, _FILM_UM) + x)
+        changed = _with(
+            films[i], "thickness_um", max(films[i].thickness_um, _FILM_UM) + x
+        )
         return Moved(_with(cell, side, _in_place(films, i, changed)), size_um)
 
     return moved
@@ -157,30 +216,47 @@ def motion(this: Parameter, wavelength_um: float) -> Motion:
     """What it moves.
 
     Raises:
-        CellError: a pillar that is at an end of where it may be, or just losing or gaining a part.
+        CellError: a pillar that is at an end of where it may be, or just losing or
+            gaining a part.
     """
     try:
         cell = this.moved(0.0).cell
         heights = difference(lambda x: _heights(this.moved(x).cell), this.step)
         by = tuple(
             np.stack(
-                [difference(functools.partial(_numbers, this, wavelength_um, i, s), this.step) for s in shares(cell)]
+                [
+                    difference(
+                        functools.partial(_numbers, this, wavelength_um, i, s),
+                        this.step,
+                    )
+                    for s in shares(cell)
+                ]
             )
             for i in range(len(cell.sections))
         )
     except CellError as error:
-        raise CellError(f"no derivative by {this.name}: {error} (or ask for others alone, by = ...)") from None
+        raise CellError(
+            f"no derivative by {this.name}: {error} (or ask for others alone, by = ...)"
+        ) from None
     return Motion(heights, by)
 
 
-def _numbers(this: Parameter, wavelength_um: float, i: int, share: float, x: float) -> Array:
+def _numbers(
+    this: Parameter, wavelength_um: float, i: int, share: float, x: float
+) -> Array:
     """Of section i at a share of its height, where the number has changed by x."""
     now = this.moved(x)
     layer, grow = made.spread(now.cell)[i]
-    return numbers(slab_at(now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share))
+    return numbers(
+        slab_at(
+            now.cell, (layer, grow + now.grow_um), now.size_um, wavelength_um, share
+        )
+    )
 
 
 def _heights(cell: Cell) -> Array:
     """(regions,) um, foot first."""
-    under, over = ([film.thickness_um for film in side] for side in (cell.under, cell.over))
+    under, over = (
+        [film.thickness_um for film in side] for side in (cell.under, cell.over)
+    )
     return np.array([*under, *(layer.height_um for layer in cell.sections), *over])

@@ -1,9 +1,14 @@
-"""What lies between the half-spaces, and the fields in it of several waves at once, also of the transposed operators.
+"""What lies between the half-spaces, and the fields in it of several waves at once,
+also of the transposed operators.
 
-A change of the operators anywhere changes an amplitude that leaves by i ∫ (u~^T dQ u - w~^T dP w) dz, with tilde the
-fields of a wave sent the other way in the medium with P^T and Q^T (Lagrange's identity of u' = i P w, w' = i Q u).
-The transposed modes are the inverses of the modes, V^-T and W^-T; a step of Gauss collocation is symplectic, so that
-the same identity holds from one end of it to the other, and for the values at its points, to rounding.
+A change of the operators anywhere changes an amplitude that leaves by i ∫ (u~^T dQ u -
+w~^T dP w) dz, with tilde the
+fields of a wave sent the other way in the medium with P^T and Q^T (Lagrange's identity
+of u' = i P w, w' = i Q u).
+The transposed modes are the inverses of the modes, V^-T and W^-T; a step of Gauss
+collocation is symplectic, so that
+the same identity holds from one end of it to the other, and for the values at its
+points, to rounding.
 """
 
 import itertools
@@ -28,15 +33,19 @@ class Modes:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Steps:
-    """A tilted wall by the matrices of its panels from their upper to their lower ends, foot first."""
+    """A tilted wall by the matrices of its panels from their upper to their lower ends,
+    foot first.
+    """
 
     downwards: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fields:
-    """Of waves in one region, (..., k) of k of them. up, down: (n, k) of its modes, at foot and top; or of a tilted
-    wall ends: (panels + 1, 2 n, k) fields (u, w) at the ends of the panels, foot first."""
+    """Of waves in one region, (..., k) of k of them. up, down: (n, k) of its modes, at
+    foot and top; or of a tilted
+    wall ends: (panels + 1, 2 n, k) fields (u, w) at the ends of the panels, foot first.
+    """
 
     up: Array
     down: Array
@@ -51,7 +60,9 @@ class Fields:
     def upside_down(self) -> "Fields":
         """The same, seen in a frame that is turned upside down."""
         n = self.ends.shape[1] // 2
-        return Fields(self.down, self.up, self.ends[::-1] * np.repeat([1.0, -1.0], n)[:, None])
+        return Fields(
+            self.down, self.up, self.ends[::-1] * np.repeat([1.0, -1.0], n)[:, None]
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,7 +98,9 @@ def of_wall(this: Wall, stages: int, *, symmetric: bool) -> Region:
         return P.T, Q.T
 
     def panels(wall: Wall) -> tuple[Panel, ...]:
-        return tuple(panel(wall, low, high, stages) for low, high in itertools.pairwise(EDGES))
+        return tuple(
+            panel(wall, low, high, stages) for low, high in itertools.pairwise(EDGES)
+        )
 
     plain = panels(this)
     turned = plain if symmetric else panels(Wall(transposed, this.reduced_height))
@@ -98,15 +111,23 @@ def of_wall(this: Wall, stages: int, *, symmetric: bool) -> Region:
 
 
 def _reversed(matrix: Array) -> Array:
-    """Of a panel with transposed operators and upside down: the inverse, with w turned, of a symplectic matrix."""
+    """Of a panel with transposed operators and upside down: the inverse, with w turned,
+    of a symplectic matrix.
+    """
     n = len(matrix) // 2
-    return np.block([[matrix[n:, n:].T, matrix[:n, n:].T], [matrix[n:, :n].T, matrix[:n, :n].T]])
+    return np.block(
+        [[matrix[n:, n:].T, matrix[:n, n:].T], [matrix[n:, :n].T, matrix[:n, :n].T]]
+    )
 
 
-def match(regions: Sequence[Modes | Steps], top: Pair, foot: Pair, sources: Array) -> tuple[list[Fields], Array, Array]:
-    """Fields that radiate into ``top``, and whose incident part gives foot V u + U w = sources; see ``stack.match``.
+def match(
+    regions: Sequence[Modes | Steps], top: Pair, foot: Pair, sources: Array
+) -> tuple[list[Fields], Array, Array]:
+    """Fields that radiate into ``top``, and whose incident part gives foot V u + U w =
+    sources; see ``stack.match``.
 
-    sources: (n, k). Returns the fields of every region, foot first, and (2 n, k) those at the foot and at the top.
+    sources: (n, k). Returns the fields of every region, foot first, and (2 n, k) those
+    at the foot and at the top.
     """
     pair: Pair = top
     returns: list[tuple[Array, ...]] = []
@@ -136,7 +157,9 @@ def _down(region: Modes | Steps, pair: Pair) -> tuple[Pair, tuple[Array, ...]]:
     return (both[:n], both[n:]), tuple(made)
 
 
-def _up(region: Modes | Steps, state: tuple[Array, ...], here: Array) -> tuple[Fields, Array]:
+def _up(
+    region: Modes | Steps, state: tuple[Array, ...], here: Array
+) -> tuple[Fields, Array]:
     n = len(here) // 2
     if isinstance(region, Modes):
         part, (back, fade) = region.part, state

@@ -1,4 +1,6 @@
-"""One symmetry class of one truncation: t and r, and the fields of the light and of the waves sent back."""
+"""One symmetry class of one truncation: t and r, and the fields of the light and of the
+waves sent back.
+"""
 
 import functools
 from dataclasses import dataclass
@@ -21,9 +23,12 @@ from metalens.rcwa.stack import flux, outgoing
 class Solved:
     """One symmetry class.
 
-    columns: the k polarisations that its zero orders are. regions, light, sent: what lies between the half-spaces,
-    fields of the k waves that come, and of 2 k waves sent back, from above (for t) and from below (for r).
-    both: (2, k, k) t and r; energy, scale: (k,) power of all orders, and what makes light of unit power of ``light``.
+    columns: the k polarisations that its zero orders are. regions, light, sent: what
+    lies between the half-spaces,
+    fields of the k waves that come, and of 2 k waves sent back, from above (for t) and
+    from below (for r).
+    both: (2, k, k) t and r; energy, scale: (k,) power of all orders, and what makes
+    light of unit power of ``light``.
     """
 
     space: Orders
@@ -43,12 +48,19 @@ class Solved:
         return slice(self.ways.bare, self.ways.p_count)
 
 
-def solved(this: Problem, operations: tuple[Operation, ...], reach: int, stages: int) -> Solved:
-    """At one truncation; stages: of the collocation of a tilted wall, 0 for an upright one."""
+def solved(
+    this: Problem, operations: tuple[Operation, ...], reach: int, stages: int
+) -> Solved:
+    """At one truncation; stages: of the collocation of a tilted wall, 0 for an upright
+    one.
+    """
     space = mirrors.orders(reach, pattern.frame(this.cell, operations))
     ways, places = waves_of(space, this.cell, this.light)
     regions = _regions(this, space, ways, stages)
-    below, above = half_space(ways, this.media.substrate), half_space(ways, this.media.cover)
+    below, above = (
+        half_space(ways, this.media.substrate),
+        half_space(ways, this.media.cover),
+    )
     unit = np.zeros((len(ways.kappa), len(places)))
     for k, (at, sign) in enumerate(places.values()):
         unit[at, k] = sign
@@ -56,16 +68,29 @@ def solved(this: Problem, operations: tuple[Operation, ...], reach: int, stages:
     scale = 1 / (np.abs(unit) * foot_share).sum(axis=0)
     source = 2 * (below[0] * below[1])[:, None] * unit
     light, foot, top = match([part.plain for part in regions], above, below, source)
-    from_below, _, _ = match([part.transposed for part in regions], above, below, foot_share * unit)
-    from_above, _, _ = match([part.reverse for part in regions[::-1]], below, above, top_share * unit)
-    sent = [high.upside_down.beside(low) for high, low in zip(from_above[::-1], from_below, strict=True)]
+    from_below, _, _ = match(
+        [part.transposed for part in regions], above, below, foot_share * unit
+    )
+    from_above, _, _ = match(
+        [part.reverse for part in regions[::-1]], below, above, top_share * unit
+    )
+    sent = [
+        high.upside_down.beside(low)
+        for high, low in zip(from_above[::-1], from_below, strict=True)
+    ]
     n = len(unit)
     U, V = below[0][:, None], below[1][:, None]
-    t = outgoing((above[0][:, None], above[1][:, None]), top[:n], top[n:]) * top_share * scale
+    t = (
+        outgoing((above[0][:, None], above[1][:, None]), top[:n], top[n:])
+        * top_share
+        * scale
+    )
     r = outgoing((U, V), foot[:n] - U * unit, V * unit - foot[n:]) * foot_share * scale
     energy = (np.abs(t) ** 2 + np.abs(r) ** 2).sum(axis=0)
     both = np.stack([unit.T @ t, unit.T @ r])
-    return Solved(space, ways, operations, list(places), regions, light, sent, both, energy, scale)
+    return Solved(
+        space, ways, operations, list(places), regions, light, sent, both, energy, scale
+    )
 
 
 def _regions(this: Problem, space: Orders, ways: Waves, stages: int) -> list[Region]:
@@ -77,9 +102,15 @@ def _regions(this: Problem, space: Orders, ways: Waves, stages: int) -> list[Reg
         middle = [of_wall(wall, stages, symmetric=symmetric) for wall in walls]
     else:
         parts = [modes.layer(*wall.sample(0.5), symmetric=symmetric) for wall in walls]
-        middle = [of_modes(part, wall.reduced_height) for part, wall in zip(parts, walls, strict=True)]
+        middle = [
+            of_modes(part, wall.reduced_height)
+            for part, wall in zip(parts, walls, strict=True)
+        ]
     under, over = (
-        [of_modes(film_layer(ways, index, symmetric=symmetric), thickness) for index, thickness in films]
+        [
+            of_modes(film_layer(ways, index, symmetric=symmetric), thickness)
+            for index, thickness in films
+        ]
         for films in (this.media.under, this.media.over)
     )
     return [*under, *middle, *over]

@@ -19,7 +19,8 @@ from metalens.rcwa.rates.truncated import Motion, Rates, truncated
 class Rate:
     """Derivative by one number, per um, rad or 1 as its name says.
 
-    t, r: (2, 2) as of :class:`metalens.rcwa.Jones`. error: estimate of the largest |rate - exact| of both.
+    t, r: (2, 2) as of :class:`metalens.rcwa.Jones`. error: estimate of the largest
+    |rate - exact| of both.
     """
 
     t: Array
@@ -29,7 +30,9 @@ class Rate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JonesDerivatives:
-    """jones: the value. by: name of a number -> its derivative, see :func:`jones_derivatives`."""
+    """jones: the value. by: name of a number -> its derivative, see
+    :func:`jones_derivatives`.
+    """
 
     jones: Jones
     by: dict[str, Rate]
@@ -46,21 +49,29 @@ def jones_derivatives(
     harmonics: int | None = None,
     by: Iterable[str] | None = None,
 ) -> JonesDerivatives:
-    """The result of :func:`metalens.rcwa.jones` and its derivatives by every number of shape, section and material.
+    """The result of :func:`metalens.rcwa.jones` and its derivatives by every number of
+    shape, section and material.
 
     Args:
-        by: which numbers, None: all. They are named as in a cell file: size_um, height_um (of a pillar without
-            layers), sidewall_rad, shape.ratio, shape.angle_rad, shape.corners.2.y (the third corner),
-            layers.0.height_um (also grow_um, coat_um), under.0.thickness_um, over.0.thickness_um, pillar.n, between.n,
-            layers.0.material.n (also between.n, coat.n), and grow_um, by which every section is wider along every
+        by: which numbers, None: all. They are named as in a cell file: size_um,
+            height_um (of a pillar without
+            layers), sidewall_rad, shape.ratio, shape.angle_rad, shape.corners.2.y (the
+            third corner),
+            layers.0.height_um (also grow_um, coat_um), under.0.thickness_um,
+            over.0.thickness_um, pillar.n, between.n,
+            layers.0.material.n (also between.n, coat.n), and grow_um, by which every
+            section is wider along every
             pair of edges, whatever its shape. The rest as for ``jones``.
 
-    Accuracy: the exact derivatives of the truncation that ``jones`` gives (1e-9 of the largest), with its field of
-        normals held: it is sampled, and any gives the same limit. By k: 1j times that by n. ``error`` follows from how
+    Accuracy: the exact derivatives of the truncation that ``jones`` gives (1e-9 of the
+    largest), with its field of
+        normals held: it is sampled, and any gives the same limit. By k: 1j times that
+            by n. ``error`` follows from how
         the derivative moves between truncations as ``t_error`` does from t.
 
     Raises:
-        CellError, MaterialError: as ``jones``; a number that the cell does not have, or at which it has no derivative
+        CellError, MaterialError: as ``jones``; a number that the cell does not have, or
+            at which it has no derivative
             (the hole of a ring is just closing, a ratio at its end).
 
     >>> from metalens.cell import Cell, Index
@@ -88,7 +99,11 @@ def jones_derivatives(
     rates = {}
     for name in motions:
         history = [one.by[name] for one in found]
-        error = climb.crowded * moved(history, last, climb.before) if len(history) > 1 else math.inf
+        error = (
+            climb.crowded * moved(history, last, climb.before)
+            if len(history) > 1
+            else math.inf
+        )
         rates[name] = Rate(history[-1][0], history[-1][1], error + left[name])
     return JonesDerivatives(value, rates)
 
@@ -97,13 +112,19 @@ def _wanted(known: dict[str, Parameter], by: Iterable[str] | None) -> list[Param
     names = list(known) if by is None else list(by)
     for name in names:
         if name not in known:
-            raise CellError(f"no number {name!r} in this cell; it has {', '.join(known)}")
+            raise CellError(
+                f"no number {name!r} in this cell; it has {', '.join(known)}"
+            )
     return [known[name] for name in names]
 
 
-def _left_by_collocation(this: Problem, motions: dict[str, Motion], stages: int, reach: int) -> dict[str, float]:
+def _left_by_collocation(
+    this: Problem, motions: dict[str, Motion], stages: int, reach: int
+) -> dict[str, float]:
     """What one stage more changes at a coarse truncation; 0 for upright walls."""
     if not stages:
         return dict.fromkeys(motions, 0.0)
-    few, more = (truncated(this, reach, count, motions).by for count in (stages - 1, stages))
+    few, more = (
+        truncated(this, reach, count, motions).by for count in (stages - 1, stages)
+    )
     return {name: float(np.abs(more[name] - few[name]).max()) for name in motions}

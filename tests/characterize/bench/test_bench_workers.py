@@ -1,4 +1,6 @@
-"""The virtual bench on workers: the frames of this process, byte for byte, also where a cluster loses a worker."""
+"""The virtual bench on workers: the frames of this process, byte for byte, also where a
+cluster loses a worker.
+"""
 
 import pytest
 
@@ -15,7 +17,11 @@ TRUTH = Truth(
     angles_deg=(0.0, 3.0),
     camera=Camera(pixels=12),
     diameter_noise_nm=1.7,
-    parameter=(Known("bias_nm", 4.0, 0.0), Known("bandwidth_nm", 1.0, 0.0), Known("decentre_y_um", 1.3, 0.0)),
+    parameter=(
+        Known("bias_nm", 4.0, 0.0),
+        Known("bandwidth_nm", 1.0, 0.0),
+        Known("decentre_y_um", 1.3, 0.0),
+    ),
 )
 
 
@@ -40,7 +46,9 @@ def test_frames_are_the_same_from_a_cluster_that_loses_a_worker(here, tmp_path):
 
 
 def test_pillars_of_another_colour_or_incidence_are_made_anew(monkeypatch):
-    """What is kept for the last colour and incidence is told apart by both; the noise of a pillar is its own always."""
+    """What is kept for the last colour and incidence is told apart by both; the noise
+    of a pillar is its own always.
+    """
     asked = []
 
     def pillars(lens, response, x, *, noise_um, angle_rad):
@@ -51,7 +59,16 @@ def test_pillars_of_another_colour_or_incidence_are_made_anew(monkeypatch):
     hidden = bench._Made(bench_lens.lens(), TRUTH, bench_lens.RESPONSE)
     blue, red = TRUTH.vector(), TRUTH.vector()
     red[bench.PLACE["wavelength_nm"]] += 5.0
-    made = [hidden.pillars(*one) for one in ((blue, 0.0), (blue.copy(), 0.0), (red, 0.0), (red, 0.1), (blue, 0.1))]
+    made = [
+        hidden.pillars(*one)
+        for one in (
+            (blue, 0.0),
+            (blue.copy(), 0.0),
+            (red, 0.0),
+            (red, 0.1),
+            (blue, 0.1),
+        )
+    ]
     assert asked == [(0.0, 0.0), (5.0, 0.0), (5.0, 0.1), (0.0, 0.1)]
     assert all((one == made[0]).all() for one in made)
     assert 0.9 * 1.7e-3 < made[0].std() < 1.1 * 1.7e-3
@@ -60,5 +77,8 @@ def test_pillars_of_another_colour_or_incidence_are_made_anew(monkeypatch):
 def test_fewer_than_one_worker_and_two_places_at_once_are_refused():
     with pytest.raises(ConfigError, match="0 workers"), executor.on(processes=0):
         pass
-    with pytest.raises(ConfigError, match="ask for one"), executor.on("tcp://127.0.0.1:9", processes=2):
+    with (
+        pytest.raises(ConfigError, match="ask for one"),
+        executor.on("tcp://127.0.0.1:9", processes=2),
+    ):
         pass

@@ -1,4 +1,6 @@
-"""Likeness of frames that hold single lit pixels, and what is left of them above their rim, by hand."""
+"""Likeness of frames that hold single lit pixels, and what is left of them above their
+rim, by hand.
+"""
 
 import math
 
@@ -20,10 +22,14 @@ def pixels(**lit):
 
 
 ONE = pixels(r4c4=2.0)
-TWO = pixels(r2c3=3.0, r6c8=4.0)  # of norm 5; its brighter pixel is 2 rows and 4 columns off
+TWO = pixels(
+    r2c3=3.0, r6c8=4.0
+)  # of norm 5; its brighter pixel is 2 rows and 4 columns off
 
 
-@pytest.mark.parametrize(("noise", "norm"), [(0.0, 5.0), (2.0, math.sqrt(21)), (3.0, 4.0)])
+@pytest.mark.parametrize(
+    ("noise", "norm"), [(0.0, 5.0), (2.0, math.sqrt(21)), (3.0, 4.0)]
+)
 def test_likeness_is_the_largest_product_over_norms_freed_of_noise(noise, norm):
     score, shift = likeness(TWO, ONE, noise)
     assert score == pytest.approx(4 * 2 / (norm * 2))
@@ -33,7 +39,9 @@ def test_likeness_is_the_largest_product_over_norms_freed_of_noise(noise, norm):
 
 
 def test_of_a_frame_of_noise_a_tenth_of_the_power_is_left():
-    """Twelve pixels of 1, whose noise is nearly all: √1.2 in place of √0.5. Nothing is more alike than 1."""
+    """Twelve pixels of 1, whose noise is nearly all: √1.2 in place of √0.5. Nothing is
+    more alike than 1.
+    """
     many = np.zeros(SHAPE)
     many.flat[[0, 5, 13, 22, 30, 41, 47, 58, 66, 75, 83, 98]] = 1.0
     assert likeness(many, ONE, math.sqrt(11.5))[0] == pytest.approx(1 / math.sqrt(1.2))
@@ -46,8 +54,15 @@ def test_of_a_frame_of_noise_a_tenth_of_the_power_is_left():
 @pytest.mark.parametrize(("row", "column"), [(8, 10), (8, 0), (0, 10), (0, 0), (4, 5)])
 def test_shifts_reach_from_rim_to_rim(row, column):
     a = pixels(**{f"r{row}c{column}": 1.5})
-    for b, at in ((pixels(r0c0=1.0), (0, 0)), (pixels(r8c10=1.0), (8, 10)), (pixels(r8c0=1.0), (8, 0))):
-        assert likeness(a, b, 0.0) == (pytest.approx(1.0), (row - at[0], column - at[1]))
+    for b, at in (
+        (pixels(r0c0=1.0), (0, 0)),
+        (pixels(r8c10=1.0), (8, 10)),
+        (pixels(r8c0=1.0), (8, 0)),
+    ):
+        assert likeness(a, b, 0.0) == (
+            pytest.approx(1.0),
+            (row - at[0], column - at[1]),
+        )
 
 
 def test_stacks_are_as_alike_as_their_frames_on_the_mean():
@@ -56,16 +71,23 @@ def test_stacks_are_as_alike_as_their_frames_on_the_mean():
     noise = np.array([1.0, 3.0, 0.5, 20.0])
     seen, told = Spectra.of(light, noise), Spectra.of(expected, np.zeros(3))
     for order in ([0, 1, 2], [3, 0, 1], [2, 2, 3]):
-        want = np.mean([likeness(light[i], expected[k], noise[i])[0] for k, i in enumerate(order)])
+        want = np.mean(
+            [likeness(light[i], expected[k], noise[i])[0] for k, i in enumerate(order)]
+        )
         assert seen.alike(told, np.array(order)) == pytest.approx(want, rel=1e-9)
-    strong, one = (Spectra.of(each[None], np.array([noise])) for each, noise in ((TWO, 4.9), (ONE, 0.0)))
+    strong, one = (
+        Spectra.of(each[None], np.array([noise]))
+        for each, noise in ((TWO, 4.9), (ONE, 0.0))
+    )
     assert strong.alike(one, np.array([0])) == 1.0
     dark = Spectra.of(np.zeros((1, *SHAPE)), np.zeros(1))
     assert dark.alike(Spectra.of(expected[:1], np.zeros(1)), np.array([0])) == 0.0
 
 
 def test_frames_do_not_reach_round_their_rims():
-    """Of two pixels each, apart by unlike steps, one at a time meets another: half as alike, however the frame ends."""
+    """Of two pixels each, apart by unlike steps, one at a time meets another: half as
+    alike, however the frame ends.
+    """
     for a, b in (
         (pixels(r0c0=1, r0c10=1), pixels(r0c0=1, r0c8=1)),
         (pixels(r0c0=1, r0c10=1), pixels(r0c0=1, r0c1=1)),
@@ -78,12 +100,16 @@ def test_frames_do_not_reach_round_their_rims():
 
 
 def test_a_plane_through_the_two_outermost_pixels_is_taken_off_and_holes_are_filled():
-    """Light further in than two pixels is left as it is; a hole has the median of its frame, above the same plane."""
+    """Light further in than two pixels is left as it is; a hole has the median of its
+    frame, above the same plane.
+    """
     y, x = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]
     planes = np.stack([40 + 3.0 * x - 7.0 * y, 5 - 1.5 * x + 0.5 * y])
     inner = np.zeros(SHAPE)
     inner[2, 2], inner[6, 8], inner[4, 5] = 11.0, 6.0, 3.0
-    assert above_rim(planes + inner) == pytest.approx(np.stack([inner, inner]), abs=1e-9)
+    assert above_rim(planes + inner) == pytest.approx(
+        np.stack([inner, inner]), abs=1e-9
+    )
     holed = planes + inner
     holed[0, 4, 4] = np.nan
     median = np.nanmedian(holed[0])

@@ -1,4 +1,6 @@
-"""Stacks whose frames run along the last axis: taken so where that is known, refused where it only reads so."""
+"""Stacks whose frames run along the last axis: taken so where that is known, refused
+where it only reads so.
+"""
 
 import cv2
 import h5py
@@ -35,7 +37,9 @@ def rows(name, n):
 
 @pytest.mark.parametrize("name", ["s.h5", "s.tif"])
 def test_the_number_of_rows_says_that_frames_run_along_the_last_axis(tmp_path, name):
-    found = capture.load(folder(tmp_path, name, np.moveaxis(FRAMES, 0, 2), rows(name, 5)))
+    found = capture.load(
+        folder(tmp_path, name, np.moveaxis(FRAMES, 0, 2), rows(name, 5))
+    )
     assert np.array_equal(found.frames, FRAMES)
     assert found.position_um.tolist() == [7, 107, 207, 307, 407]
     words = f"{name} taken as (y, x, n), 5 frames of 26 x 19 pixels, since 5 frames of it are listed"
@@ -43,10 +47,15 @@ def test_the_number_of_rows_says_that_frames_run_along_the_last_axis(tmp_path, n
 
 
 def test_pages_from_the_first_on_say_it_too(tmp_path):
-    stage = "file,page,depth_um\n" + "".join(f"s.h5,{k},{9 - k}\n" for k in (3, 0, 4, 1, 2))
+    stage = "file,page,depth_um\n" + "".join(
+        f"s.h5,{k},{9 - k}\n" for k in (3, 0, 4, 1, 2)
+    )
     found = capture.load(folder(tmp_path, "s.h5", np.moveaxis(FRAMES, 0, 2), stage))
     assert np.array_equal(found.frames, FRAMES[[3, 0, 4, 1, 2]])
-    assert "s.h5 taken as (y, x, n), 5 frames of 26 x 19 pixels, since its pages 0 to 4 are listed" in found.corrections
+    assert (
+        "s.h5 taken as (y, x, n), 5 frames of 26 x 19 pixels, since its pages 0 to 4 are listed"
+        in found.corrections
+    )
 
 
 def test_a_number_that_fits_both_axes_means_the_first(tmp_path):
@@ -58,7 +67,10 @@ def test_a_number_that_fits_both_axes_means_the_first(tmp_path):
 
 def test_a_number_that_fits_no_axis_is_refused_and_the_axes_are_named(tmp_path):
     folder(tmp_path, "s.h5", np.moveaxis(FRAMES, 0, 2), rows("s.h5", 4))
-    with pytest.raises(CaptureError, match=r"26 pages and stands in 4 rows.*\(26, 19, 5\).*axes = \"yxn\""):
+    with pytest.raises(
+        CaptureError,
+        match=r"26 pages and stands in 4 rows.*\(26, 19, 5\).*axes = \"yxn\"",
+    ):
         capture.load(tmp_path)
 
 
@@ -72,11 +84,18 @@ def test_a_number_that_fits_no_axis_is_refused_and_the_axes_are_named(tmp_path):
         ("s.h5", (26, 19, 1)),
     ],
 )
-def test_a_lone_stack_that_reads_like_rows_is_refused_until_its_axes_are_stated(tmp_path, name, shape):
-    """Strips of 19 x 5 pixels; frames as many as they are high, and narrower; frames of one column."""
+def test_a_lone_stack_that_reads_like_rows_is_refused_until_its_axes_are_stated(
+    tmp_path, name, shape
+):
+    """Strips of 19 x 5 pixels; frames as many as they are high, and narrower; frames of
+    one column.
+    """
     lying = RNG.integers(37, 4096, shape).astype(np.uint16)
     stack(tmp_path / name, lying)
-    with pytest.raises(CaptureError, match=r'reads like .* as \(y, x, n\); say which: axes = "nyx" or axes = "yxn"'):
+    with pytest.raises(
+        CaptureError,
+        match=r'reads like .* as \(y, x, n\); say which: axes = "nyx" or axes = "yxn"',
+    ):
         capture.load(tmp_path / name)
     (tmp_path / "s.toml").write_text(ABOUT + 'step_um = 0.3\naxes = "yxn"\n')
     found = capture.load(tmp_path / name)
@@ -87,7 +106,10 @@ def test_a_lone_stack_that_reads_like_rows_is_refused_until_its_axes_are_stated(
         assert np.array_equal(capture.load(tmp_path / name).frames, lying)
 
 
-@pytest.mark.parametrize("shape", [(5, 26, 19), (30, 12, 12), (12, 12, 19), (9, 26, 9), (40, 24, 12), (1, 26, 5)])
+@pytest.mark.parametrize(
+    "shape",
+    [(5, 26, 19), (30, 12, 12), (12, 12, 19), (9, 26, 9), (40, 24, 12), (1, 26, 5)],
+)
 def test_stacks_of_frames_of_usual_shapes_are_taken_as_they_lie(tmp_path, shape):
     lying = RNG.integers(37, 4096, shape).astype(np.uint16)
     stack(tmp_path / "s.h5", lying)
@@ -97,18 +119,29 @@ def test_stacks_of_frames_of_usual_shapes_are_taken_as_they_lie(tmp_path, shape)
 def test_dark_and_flat_are_known_by_the_size_of_the_frames(tmp_path):
     """Stated axes are of the frames: the dark lies as it should, the flat otherwise."""
     dark, flat = FRAMES[:3] // 50, FRAMES[:4] // 2
-    folder(tmp_path, "s.h5", np.moveaxis(FRAMES, 0, 2), rows("s.h5", 5), ABOUT + 'axes = "yxn"\nbits = 12\n')
+    folder(
+        tmp_path,
+        "s.h5",
+        np.moveaxis(FRAMES, 0, 2),
+        rows("s.h5", 5),
+        ABOUT + 'axes = "yxn"\nbits = 12\n',
+    )
     stack(tmp_path / "dark.tif", dark)
     stack(tmp_path / "flat.h5", np.moveaxis(flat, 0, 2))
     found = capture.load(tmp_path)
-    assert [np.array_equal(*pair) for pair in ((found.frames, FRAMES), (found.dark, dark), (found.flat, flat))] == [
-        True
-    ] * 3
-    assert [words.split()[0] for words in found.corrections if "(y, x, n)" in words] == ["s.h5", "flat.h5"]
+    assert [
+        np.array_equal(*pair)
+        for pair in ((found.frames, FRAMES), (found.dark, dark), (found.flat, flat))
+    ] == [True] * 3
+    assert [
+        words.split()[0] for words in found.corrections if "(y, x, n)" in words
+    ] == ["s.h5", "flat.h5"]
 
 
 def test_a_raw_mosaic_lies_otherwise_too(tmp_path):
-    """25 x 19 pixels hold 13 x 10 red ones; the dark is as large as the frames on disk, not as those used."""
+    """25 x 19 pixels hold 13 x 10 red ones; the dark is as large as the frames on disk,
+    not as those used.
+    """
     about = ABOUT + 'bits = 12\nchannel = "red"\nmosaic = "RGGB"\naxes = "yxn"\n'
     frames = FRAMES[:, :25]
     folder(tmp_path, "s.h5", np.moveaxis(frames, 0, 2), rows("s.h5", 5), about)
@@ -120,24 +153,43 @@ def test_a_raw_mosaic_lies_otherwise_too(tmp_path):
 
 def test_other_axes_are_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"axes = 'nxy'; need \"nyx\""):
-        capture.load(folder(tmp_path, "s.h5", FRAMES, rows("s.h5", 5), ABOUT + 'axes = "nxy"\n'))
+        capture.load(
+            folder(tmp_path, "s.h5", FRAMES, rows("s.h5", 5), ABOUT + 'axes = "nxy"\n')
+        )
 
 
-@pytest.mark.parametrize(("shape", "told"), [((64, 48, 40), True), ((12, 12, 19), True), ((9, 26, 19), False)])
-def test_how_a_stack_was_taken_is_told_where_the_other_way_is_as_likely(tmp_path, shape, told):
+@pytest.mark.parametrize(
+    ("shape", "told"),
+    [((64, 48, 40), True), ((12, 12, 19), True), ((9, 26, 19), False)],
+)
+def test_how_a_stack_was_taken_is_told_where_the_other_way_is_as_likely(
+    tmp_path, shape, told
+):
     """64 frames of 48 x 40 pixels or 40 of 64 x 48; 12 of 12 x 19 or 19 of 12 x 12."""
     first, second, last = shape
     stack(tmp_path / "s.h5", RNG.integers(37, 4096, shape).astype(np.uint16))
     taken = f"s.h5 taken as (n, y, x), {first} frames of {second} x {last} pixels; if it is {last} frames of {first} x "
-    assert any(words.startswith(taken) for words in capture.load(tmp_path / "s.h5").corrections) == told
+    assert (
+        any(
+            words.startswith(taken)
+            for words in capture.load(tmp_path / "s.h5").corrections
+        )
+        == told
+    )
     (tmp_path / "s.toml").write_text('axes = "nyx"\n')
-    assert not any("(n, y, x)" in words for words in capture.load(tmp_path / "s.h5").corrections)
+    assert not any(
+        "(n, y, x)" in words for words in capture.load(tmp_path / "s.h5").corrections
+    )
 
 
 def test_pages_that_were_written_one_by_one_are_frames_however_narrow(tmp_path):
-    """As OpenCV writes them; listed by another number they are not taken the other way round."""
+    """As OpenCV writes them; listed by another number they are not taken the other way
+    round.
+    """
     narrow = np.moveaxis(FRAMES, 0, 2)  # 26 frames of 19 x 5
-    cv2.imwritemulti(str(tmp_path / "s.tif"), list(narrow), [cv2.IMWRITE_TIFF_COMPRESSION, 1])
+    cv2.imwritemulti(
+        str(tmp_path / "s.tif"), list(narrow), [cv2.IMWRITE_TIFF_COMPRESSION, 1]
+    )
     found = capture.load(tmp_path / "s.tif")
     assert np.array_equal(found.frames, narrow)
     assert len(found.corrections) == 1  # of bits, not of axes
@@ -146,9 +198,16 @@ def test_pages_that_were_written_one_by_one_are_frames_however_narrow(tmp_path):
         capture.load(tmp_path)
 
 
-@pytest.mark.parametrize(("letters", "lying"), [("YXZ", (1, 2, 0)), ("TYX", (0, 1, 2)), ("ZYX", (0, 1, 2))])
+@pytest.mark.parametrize(
+    ("letters", "lying"), [("YXZ", (1, 2, 0)), ("TYX", (0, 1, 2)), ("ZYX", (0, 1, 2))]
+)
 def test_axes_that_an_array_was_written_with_are_its_axes(tmp_path, letters, lying):
     frames = FRAMES if letters == "YXZ" else np.moveaxis(FRAMES, 0, 2)
     metadata = {"axes": letters}
-    tifffile.imwrite(tmp_path / "s.tif", frames.transpose(lying), photometric="minisblack", metadata=metadata)
+    tifffile.imwrite(
+        tmp_path / "s.tif",
+        frames.transpose(lying),
+        photometric="minisblack",
+        metadata=metadata,
+    )
     assert np.array_equal(capture.load(tmp_path / "s.tif").frames, frames)

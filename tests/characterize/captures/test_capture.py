@@ -16,11 +16,15 @@ RNG = np.random.default_rng(1)
 FRAMES = RNG.integers(0, 4096, (4, 12, 16)).astype(np.uint16)
 
 
-def folder(path, frames=FRAMES, stage=None, about="pixel_um = 3.0\nwavelength_um = 0.85\n"):
+def folder(
+    path, frames=FRAMES, stage=None, about="pixel_um = 3.0\nwavelength_um = 0.85\n"
+):
     for i, frame in enumerate(frames):
         tifffile.imwrite(path / f"frame_{i}.tif", frame)
     rows = [f"frame_{i}.tif,{20 + 2 * i},0.5" for i in range(len(frames))]
-    (path / "stage.csv").write_text(stage or "file,depth_mm,angle_deg\n" + "\n".join(rows) + "\n")
+    (path / "stage.csv").write_text(
+        stage or "file,depth_mm,angle_deg\n" + "\n".join(rows) + "\n"
+    )
     (path / "capture.toml").write_text(about)
     return path
 
@@ -33,13 +37,22 @@ def test_folder_with_stage_and_description(tmp_path):
     assert (found.pixel_um, found.wavelength_um, found.bits) == (3.0, 0.85, 12)
 
 
-@pytest.mark.parametrize(("about", "pitch"), [("", 3.0), ('channel = "blue"\nmosaic = "RGGB"\n', 6.0)])
-def test_a_pixel_is_as_wide_as_the_camera_has_it_whatever_its_colour(tmp_path, about, pitch):
-    """3 um wide and high, each or every second of them, in a folder or a file of all frames."""
+@pytest.mark.parametrize(
+    ("about", "pitch"), [("", 3.0), ('channel = "blue"\nmosaic = "RGGB"\n', 6.0)]
+)
+def test_a_pixel_is_as_wide_as_the_camera_has_it_whatever_its_colour(
+    tmp_path, about, pitch
+):
+    """3 um wide and high, each or every second of them, in a folder or a file of all
+    frames.
+    """
     (tmp_path / "stack.toml").write_text(f"pixel_um = 3.0\n{about}")
     tifffile.imwrite(tmp_path / "stack.tif", FRAMES, photometric="minisblack")
     (tmp_path / "folder").mkdir()
-    for place in (folder(tmp_path / "folder", about=f"pixel_um = 3.0\n{about}"), tmp_path / "stack.tif"):
+    for place in (
+        folder(tmp_path / "folder", about=f"pixel_um = 3.0\n{about}"),
+        tmp_path / "stack.tif",
+    ):
         found = capture.load(place)
         assert found.pixel_um == pitch
         assert found.fill * found.pixel_um == 3.0
@@ -57,7 +70,13 @@ def test_stack_png_and_hdf5_hold_the_same_frames(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES)
     cv2.imwrite(str(tmp_path / "b.png"), FRAMES[1])
     with h5py.File(tmp_path / "c.h5", "w") as file:
-        file.create_dataset("frames", data=FRAMES.astype(">u2"), chunks=(2, 12, 5), compression="gzip", shuffle=True)
+        file.create_dataset(
+            "frames",
+            data=FRAMES.astype(">u2"),
+            chunks=(2, 12, 5),
+            compression="gzip",
+            shuffle=True,
+        )
     assert capture.load(tmp_path / "c.h5").frames.dtype.isnative
     assert np.array_equal(capture.load(tmp_path / "a.tif").frames, FRAMES)
     assert np.array_equal(capture.load(tmp_path / "b.png").frames[0], FRAMES[1])
@@ -77,7 +96,9 @@ def test_counts_shifted_into_the_high_bits_are_shifted_back(tmp_path, bits):
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_dark_and_flat_are_shifted_back_with_the_frames(tmp_path, stated):
-    """12-bit counts in the high bits: those of the dark (37 to 44) take 10 bits with their shift, and fit into 12."""
+    """12-bit counts in the high bits: those of the dark (37 to 44) take 10 bits with
+    their shift, and fit into 12.
+    """
     dark = RNG.integers(37, 45, (3, 12, 16)).astype(np.uint16)
     flat = RNG.integers(1500, 2600, (2, 12, 16)).astype(np.uint16)
     about = "pixel_um = 3.0\nwavelength_um = 0.85\n" + "bits = 12\n" * stated
@@ -103,12 +124,20 @@ def test_dim_frames_beside_bright_flats_have_the_bits_of_the_flats(tmp_path):
 
 
 def test_imagej_spacing_gives_the_positions(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, metadata={"spacing": 300.0, "unit": "nm", "axes": "ZYX"})
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        FRAMES,
+        imagej=True,
+        metadata={"spacing": 300.0, "unit": "nm", "axes": "ZYX"},
+    )
     assert np.allclose(capture.load(tmp_path / "a.tif").position_um, [0, 0.3, 0.6, 0.9])
 
 
 def test_wrong_bit_shift_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="counts use 12 bits above the lowest 0, the capture states 10"):
+    with pytest.raises(
+        CaptureError,
+        match="counts use 12 bits above the lowest 0, the capture states 10",
+    ):
         capture.load(folder(tmp_path, about="bits = 10\n"))
 
 
@@ -170,10 +199,12 @@ def test_colour_and_foreign_files_are_refused(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["tif", "png"])
 @pytest.mark.parametrize(("channel", "place"), [("red", 0), ("green", 1), ("blue", 2)])
-def test_one_channel_of_colour_frames_is_taken_where_it_is_named(tmp_path, suffix, channel, place):
-    colours = np.random.default_rng(7).integers(0, 900, (2, 9, 14, 3)).astype(np.uint16) * np.array(
-        [1, 2, 4], np.uint16
-    )
+def test_one_channel_of_colour_frames_is_taken_where_it_is_named(
+    tmp_path, suffix, channel, place
+):
+    colours = np.random.default_rng(7).integers(0, 900, (2, 9, 14, 3)).astype(
+        np.uint16
+    ) * np.array([1, 2, 4], np.uint16)
     for i, image in enumerate(colours):
         path = tmp_path / f"frame_{i}.{suffix}"
         if suffix == "png":
@@ -195,7 +226,9 @@ def test_one_channel_of_colour_frames_is_taken_where_it_is_named(tmp_path, suffi
 def test_colours_in_separate_planes_are_colours_where_a_channel_is_named(tmp_path):
     colours = np.random.default_rng(7).integers(0, 900, (2, 3, 9, 14)).astype(np.uint16)
     for i, image in enumerate(colours):
-        tifffile.imwrite(tmp_path / f"f{i}.tif", image, photometric="rgb", planarconfig="separate")
+        tifffile.imwrite(
+            tmp_path / f"f{i}.tif", image, photometric="rgb", planarconfig="separate"
+        )
     tifffile.imwrite(tmp_path / "dark.tif", colours[:, 2])
     (tmp_path / "capture.toml").write_text('channel = "green"\n')
     (tmp_path / "stage.csv").write_text("file,depth_um\nf1.tif,7\nf0.tif,9\n")
@@ -207,14 +240,18 @@ def test_colours_in_separate_planes_are_colours_where_a_channel_is_named(tmp_pat
 def test_a_channel_of_grey_frames_is_refused(tmp_path):
     """It changed nothing, and the corrections said that it had been used."""
     folder(tmp_path, about='channel = "green"\n')
-    with pytest.raises(CaptureError, match=r"grey images.*channel = 'green'; leave it out"):
+    with pytest.raises(
+        CaptureError, match=r"grey images.*channel = 'green'; leave it out"
+    ):
         capture.load(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["dark_3.tif", "Flats.tif", "dark-01.tif"])
 def test_dark_and_flat_files_that_would_not_be_used_are_refused(tmp_path, name):
     tifffile.imwrite(folder(tmp_path) / name, FRAMES[1])
-    with pytest.raises(CaptureError, match=f"'{name}' is not named there.*one stack (dark|flat).tif"):
+    with pytest.raises(
+        CaptureError, match=f"'{name}' is not named there.*one stack (dark|flat).tif"
+    ):
         capture.load(tmp_path)
 
 
@@ -226,11 +263,15 @@ def test_images_that_the_stage_file_does_not_name_are_told(tmp_path):
 
 
 def test_a_name_with_an_umlaut_is_found_in_either_spelling(tmp_path):
-    """One disk keeps a letter with its dots, another the letter and then the dots; a table keeps what was typed."""
+    """One disk keeps a letter with its dots, another the letter and then the dots; a
+    table keeps what was typed.
+    """
     for listed, lies in (("NFC", "NFD"), ("NFD", "NFC")):
         at = tmp_path / listed
         at.mkdir()
-        tifffile.imwrite(at / unicodedata.normalize(lies, "Bild für 7 µm.tif"), FRAMES[2])
+        tifffile.imwrite(
+            at / unicodedata.normalize(lies, "Bild für 7 µm.tif"), FRAMES[2]
+        )
         table = unicodedata.normalize(listed, "file,depth_um\nBild für 7 µm.tif,730\n")
         (at / "stage.csv").write_text(table, encoding="utf-8")
         found = capture.load(at)
@@ -242,7 +283,9 @@ def test_a_preview_beside_a_frame_is_refused_by_name(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(FRAMES[0])
         file.write(FRAMES[0, ::2, ::2])
-    with pytest.raises(CaptureError, match=r"frame 1 is \(6, 8\), frame 0 \(12, 16\); keep one size"):
+    with pytest.raises(
+        CaptureError, match=r"frame 1 is \(6, 8\), frame 0 \(12, 16\); keep one size"
+    ):
         capture.load(tmp_path / "a.tif")
 
 
@@ -255,7 +298,13 @@ def test_compressed_frames_of_another_program_are_read(tmp_path):
 def test_imagej_tags_tell_pixel_and_step(tmp_path):
     frames = np.random.default_rng(0).integers(0, 900, (5, 20, 31), dtype=np.uint16)
     about = {"spacing": 0.25, "unit": "um", "axes": "ZYX"}
-    tifffile.imwrite(tmp_path / "a.tif", frames, imagej=True, resolution=(1 / 0.13, 1 / 0.13), metadata=about)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        frames,
+        imagej=True,
+        resolution=(1 / 0.13, 1 / 0.13),
+        metadata=about,
+    )
     shots = capture.load(tmp_path / "a.tif")
     assert np.allclose(shots.position_um, np.arange(5) * 0.25)
     assert abs(shots.pixel_um - 0.13) < 1e-6
@@ -269,7 +318,9 @@ def test_imagej_tags_tell_pixel_and_step(tmp_path):
     ],
 )
 def test_sizes_beside_a_file_or_in_a_folder_of_numbered_frames(tmp_path, words):
-    """Numbers count: z10 comes after z9; NAME.json beside a stack and capture.json in a folder say the same."""
+    """Numbers count: z10 comes after z9; NAME.json beside a stack and capture.json in a
+    folder say the same.
+    """
     frames = np.random.default_rng(0).integers(0, 250, (12, 9, 11), dtype=np.uint8)
     folder = tmp_path / "planes"
     folder.mkdir()
@@ -286,20 +337,33 @@ def test_sizes_beside_a_file_or_in_a_folder_of_numbered_frames(tmp_path, words):
 
 def test_several_channels_are_refused(tmp_path):
     frames = np.zeros((4, 2, 9, 11), np.uint16)
-    tifffile.imwrite(tmp_path / "c.tif", frames, imagej=True, metadata={"axes": "ZCYX", "channels": 2})
+    tifffile.imwrite(
+        tmp_path / "c.tif",
+        frames,
+        imagej=True,
+        metadata={"axes": "ZCYX", "channels": 2},
+    )
     with pytest.raises(CaptureError, match="2 channels"):
         capture.load(tmp_path / "c.tif")
 
 
 def test_a_stack_without_a_column_of_pages_has_a_row_for_each_page(tmp_path):
-    """Rows of one file are its pages in turn, beside a single image; a stack of other length is not guessed at."""
-    folder(tmp_path, stage="file,depth_um\n" + "s.tif,7\nframe_1.tif,8\ns.tif,9\ns.tif,11\n")
+    """Rows of one file are its pages in turn, beside a single image; a stack of other
+    length is not guessed at.
+    """
+    folder(
+        tmp_path,
+        stage="file,depth_um\n" + "s.tif,7\nframe_1.tif,8\ns.tif,9\ns.tif,11\n",
+    )
     tifffile.imwrite(tmp_path / "s.tif", FRAMES[[2, 0, 3]], photometric="minisblack")
     found = capture.load(tmp_path)
     assert np.array_equal(found.frames, FRAMES[[2, 1, 0, 3]])
     assert found.position_um.tolist() == [7, 8, 9, 11]
     (tmp_path / "stage.csv").write_text("file,depth_um\ns.tif,7\ns.tif,9\n")
-    with pytest.raises(CaptureError, match=r"row 2: 's.tif' holds 3 pages and stands in 2 rows.*column page"):
+    with pytest.raises(
+        CaptureError,
+        match=r"row 2: 's.tif' holds 3 pages and stands in 2 rows.*column page",
+    ):
         capture.load(tmp_path)
     (tmp_path / "stage.csv").write_text("file,page,depth_um\ns.tif,2,7\ns.tif,0,9\n")
     assert np.array_equal(capture.load(tmp_path).frames, FRAMES[[3, 2]])

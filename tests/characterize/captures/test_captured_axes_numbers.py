@@ -1,4 +1,6 @@
-"""Which axis of a stack is that of its frames, shape by shape at the bounds of every rule."""
+"""Which axis of a stack is that of its frames, shape by shape at the bounds of every
+rule.
+"""
 
 from pathlib import Path
 
@@ -29,7 +31,10 @@ def test_frames_along_the_last_axis_keep_their_colours_behind_and_lie_close():
     assert note == "s.tif taken as (y, x, n), 4 frames of 7 x 5 pixels, as stated"
 
 
-@pytest.mark.parametrize(("shape", "order"), [((7, 5), None), ((7, 5), "yxn"), ((1, 7, 2), None), ((7, 5, 2), "nyx")])
+@pytest.mark.parametrize(
+    ("shape", "order"),
+    [((7, 5), None), ((7, 5), "yxn"), ((1, 7, 2), None), ((7, 5, 2), "nyx")],
+)
 def test_single_frames_and_what_is_stated_are_left_alone(shape, order):
     whole = lying(shape)
     found, note = axes.frames_first(whole, PATH, order)
@@ -44,7 +49,11 @@ def test_single_frames_and_what_is_stated_are_left_alone(shape, order):
         ((5, 7, 5), {"count": 5}, ""),
         ((9, 7, 5), {"count": 9}, ""),
         ((9, 7, 5), {"count": 7}, ""),
-        ((9, 7, 2), {"count": 4}, ""),  # a number that is none of them is left to the caller, however narrow
+        (
+            (9, 7, 2),
+            {"count": 4},
+            "",
+        ),  # a number that is none of them is left to the caller, however narrow
         ((9, 7, 5), {"pages": 5}, "since its pages 0 to 4 are listed"),
         ((9, 7, 5), {"pages": 9}, ""),
         ((2, 7, 2), {"pages": 2}, ""),
@@ -56,7 +65,10 @@ def test_numbers_of_frames_that_are_known_decide(shape, known, why):
     first, second, last = shape
     if why:
         assert np.array_equal(found, moved(shape))
-        assert note == f"s.tif taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
+        assert (
+            note
+            == f"s.tif taken as (y, x, n), {last} frames of {first} x {second} pixels, {why}"
+        )
     else:
         assert np.array_equal(found, lying(shape))
         assert note == "" or "taken as (n, y, x)" in note
@@ -78,10 +90,14 @@ def test_numbers_of_frames_that_are_known_decide(shape, known, why):
         ((3, 9, 8), "plain"),
     ],
 )
-def test_a_stack_of_which_nothing_is_known_is_taken_told_or_refused_by_its_shape(shape, taken):
+def test_a_stack_of_which_nothing_is_known_is_taken_told_or_refused_by_its_shape(
+    shape, taken
+):
     first, second, last = shape
     if taken == "refused":
-        with pytest.raises(CaptureError, match=f"is {first} frames of {second} x {last} pixels as"):
+        with pytest.raises(
+            CaptureError, match=f"is {first} frames of {second} x {last} pixels as"
+        ):
             axes.frames_first(lying(shape), PATH, None)
         return
     found, note = axes.frames_first(lying(shape), PATH, None)

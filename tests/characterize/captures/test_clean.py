@@ -19,7 +19,15 @@ def shoot(light_e, rng):
 def capture(frames, **more):
     n = len(frames)
     unknown = np.full(n, np.nan)
-    return Capture(frames, unknown, np.zeros((n, 2)), unknown, tuple(map(str, range(n))), 12, **more)
+    return Capture(
+        frames,
+        unknown,
+        np.zeros((n, 2)),
+        unknown,
+        tuple(map(str, range(n))),
+        12,
+        **more,
+    )
 
 
 def test_photon_transfer_finds_gain_and_read_noise():
@@ -31,7 +39,9 @@ def test_photon_transfer_finds_gain_and_read_noise():
     found = clean.photon_transfer(flat, dark)
     assert abs(found.gain_e - GAIN) < 4 * found.gain_sigma_e
     assert found.gain_sigma_e < 0.02 * GAIN
-    assert abs(found.read_noise_e - READ) < 0.1  # sqrt(2 / 43200) of 5 e, with quantisation
+    assert (
+        abs(found.read_noise_e - READ) < 0.1
+    )  # sqrt(2 / 43200) of 5 e, with quantisation
 
 
 def test_flats_that_are_copies_are_refused():
@@ -41,13 +51,17 @@ def test_flats_that_are_copies_are_refused():
 
 
 def test_flats_of_full_wells_have_no_gain():
-    """All pixels full before the converter is: their noise is that of the readout, as in the dark, whatever the light.
+    """All pixels full before the converter is: their noise is that of the readout, as
+    in the dark, whatever the light.
 
-    Differences of noise that by chance are above 0 gave gains of 1e4 and more electrons a count.
+    Differences of noise that by chance are above 0 gave gains of 1e4 and more electrons
+    a count.
     """
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        dark, flat = (np.round(rng.normal(level, 1.3, (8, 26, 24))) for level in (37.0, 1850.0))
+        dark, flat = (
+            np.round(rng.normal(level, 1.3, (8, 26, 24))) for level in (37.0, 1850.0)
+        )
         with pytest.raises(CaptureError, match=r"does not grow with light.*saturated"):
             clean.photon_transfer(flat, dark)
 
@@ -75,8 +89,12 @@ def test_clean_gives_electrons_and_says_what_it_did():
     dark = np.stack([shoot(np.zeros((64, 64)), rng) for _ in range(8)])
     frames = np.stack([shoot(np.full((64, 64), 800.0), rng) for _ in range(3)])
     found = clean.clean(capture(frames, dark=dark, flat=flat))
-    assert abs(found.electrons.mean() - 800) < 800 * 4 * found.gain.gain_sigma_e / GAIN + 2
-    z2 = (found.electrons - found.electrons.mean()) ** 2 / (found.variance_e2 + 800 / found.scale)
+    assert (
+        abs(found.electrons.mean() - 800) < 800 * 4 * found.gain.gain_sigma_e / GAIN + 2
+    )
+    z2 = (found.electrons - found.electrons.mean()) ** 2 / (
+        found.variance_e2 + 800 / found.scale
+    )
     assert abs(z2.mean() - 1) < 0.06  # sqrt(2 / 12288) is 0.013; gain known to 1-2 %
     assert any("dark" in words for words in found.corrections)
     assert any("gain" in words for words in found.corrections)
@@ -84,7 +102,9 @@ def test_clean_gives_electrons_and_says_what_it_did():
 
 def test_full_well_plateau_is_saturation_below_full_scale():
     rng = np.random.default_rng(4)
-    frames = np.minimum(np.stack([shoot(np.linspace(0, 9000, 900).reshape(30, 30), rng)]), 3000)
+    frames = np.minimum(
+        np.stack([shoot(np.linspace(0, 9000, 900).reshape(30, 30), rng)]), 3000
+    )
     found = clean.clean(capture(frames))
     assert found.saturated.sum() == (frames == 3000).sum() > 50
 
@@ -99,22 +119,31 @@ def test_brackets_merge_to_the_true_rate_with_the_stated_variance():
         frames = np.stack([shoot(rate * t, rng) for t in times])
         ready = clean.clean(
             capture(
-                frames, dark=np.full((1, 50, 50), int(OFFSET), np.uint16), about={"gain_e": GAIN, "read_noise_e": READ}
+                frames,
+                dark=np.full((1, 50, 50), int(OFFSET), np.uint16),
+                about={"gain_e": GAIN, "read_noise_e": READ},
             )
         )
         merged, first = clean.merge_brackets(ready, times, np.zeros(3))
         assert first.tolist() == [0]
         assert not merged.saturated.any()
-        z.append((merged.electrons[0] - rate) / np.sqrt(merged.variance_e2[0] + rate / merged.scale[0]))
+        z.append(
+            (merged.electrons[0] - rate)
+            / np.sqrt(merged.variance_e2[0] + rate / merged.scale[0])
+        )
     z = np.array(z)
     assert abs(z.mean()) < 0.03  # 1 / sqrt(50000) is 0.005, weights are estimated
-    assert 0.9 < z.std() < 1.05  # the dark of one frame counts as noisy here, though it is exact
+    assert (
+        0.9 < z.std() < 1.05
+    )  # the dark of one frame counts as noisy here, though it is exact
 
 
 def test_a_dark_background_of_few_bits_is_not_taken_for_dead_pixels():
     y, x = np.mgrid[:40, :40] - 20
     spot = 200 * np.exp(-(x**2 + y**2) / (2 * 2.0**2))
-    frames = np.stack([np.round(spot * share) for share in (0.5, 1.0, 0.7)]).astype(np.uint8)
+    frames = np.stack([np.round(spot * share) for share in (0.5, 1.0, 0.7)]).astype(
+        np.uint8
+    )
     assert (np.ptp(frames, axis=0) == 0).mean() > 0.5
     assert not clean.bad_pixels(capture(frames)).any()
     frames[:, 22] = 0  # a dead row through the light
@@ -123,7 +152,9 @@ def test_a_dark_background_of_few_bits_is_not_taken_for_dead_pixels():
 
 @pytest.mark.parametrize("levels", [(700.0, 1900.0, 3300.0), (2600.0,)])
 def test_gain_and_its_error_bar_cover_a_gain_of_3_7(levels):
-    """Sixty small flats: the deviations from the truth are as large as stated (each level once: the floor is used)."""
+    """Sixty small flats: the deviations from the truth are as large as stated (each
+    level once: the floor is used).
+    """
     rng, gain, read, offset = np.random.default_rng(11), 3.7, 9.2, 113.0
 
     def counts(light_e):
@@ -136,20 +167,28 @@ def test_gain_and_its_error_bar_cover_a_gain_of_3_7(levels):
         found = clean.photon_transfer(flat, np.stack([counts(0.0) for _ in range(4)]))
         z.append((found.gain_e - gain) / found.gain_sigma_e)
         reads.append(found.read_noise_e)
-    assert abs(np.mean(z)) < 0.5  # 1 / sqrt(60) = 0.13, and 6 sigma of clipping in the variance
+    assert (
+        abs(np.mean(z)) < 0.5
+    )  # 1 / sqrt(60) = 0.13, and 6 sigma of clipping in the variance
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.3  # 60 draws: 9 %
-    assert np.mean(reads) == pytest.approx(read, rel=0.01)  # sqrt(1 / 9600 / 60) = 0.001; the gain's mean 0.003
+    assert np.mean(reads) == pytest.approx(
+        read, rel=0.01
+    )  # sqrt(1 / 9600 / 60) = 0.001; the gain's mean 0.003
 
 
 def test_gain_of_small_flats_is_not_drawn_to_their_quiet_pairs():
-    """Pairs of 8 x 8 pixels scatter by 18 % in variance: weighed by their own, the gain comes out 7 % high."""
+    """Pairs of 8 x 8 pixels scatter by 18 % in variance: weighed by their own, the gain
+    comes out 7 % high.
+    """
     rng, gain = np.random.default_rng(5), 3.7
     found = []
     for _ in range(60):
         flat = np.round(rng.poisson(6100.0, (24, 8, 8)) / gain + 113.0)
         dark = np.round(rng.normal(0, 3.1, (8, 8, 8)) / gain + 113.0)
         found.append(clean.photon_transfer(flat, dark).gain_e)
-    assert np.mean(found) == pytest.approx(gain, rel=0.02)  # sqrt(2 / 12 / 63 / 60) = 0.7 %, three of them
+    assert np.mean(found) == pytest.approx(
+        gain, rel=0.02
+    )  # sqrt(2 / 12 / 63 / 60) = 0.7 %, three of them
 
 
 def test_gain_from_levels_alone_has_an_error_bar_that_covers():
@@ -158,7 +197,14 @@ def test_gain_from_levels_alone_has_an_error_bar_that_covers():
     z = []
     for _ in range(60):
         light = np.repeat([400.0, 1900.0, 5300.0], 2)
-        flat = np.stack([np.round((rng.poisson(e, (40, 40)) + rng.normal(0, 9.2, (40, 40))) / gain) for e in light])
+        flat = np.stack(
+            [
+                np.round(
+                    (rng.poisson(e, (40, 40)) + rng.normal(0, 9.2, (40, 40))) / gain
+                )
+                for e in light
+            ]
+        )
         found = clean.photon_transfer(flat)
         z.append((found.gain_e - gain) / found.gain_sigma_e)
     assert abs(np.mean(z)) < 0.5
@@ -166,29 +212,47 @@ def test_gain_from_levels_alone_has_an_error_bar_that_covers():
 
 
 def test_noise_at_zero_light_counts_read_rounding_dark_and_flat():
-    """Frames of no light, a flat of 0.6 and 1.4 halves, one dark of four: the scatter of the electrons is as stated."""
-    rng, gain, read = np.random.default_rng(13), 3.7, 2.1  # rounding: 3.7² / 12 = 1.14 beside 4.41
+    """Frames of no light, a flat of 0.6 and 1.4 halves, one dark of four: the scatter
+    of the electrons is as stated.
+    """
+    rng, gain, read = (
+        np.random.default_rng(13),
+        3.7,
+        2.1,
+    )  # rounding: 3.7² / 12 = 1.14 beside 4.41
     shade = np.where(np.arange(60) < 30, 0.6, 1.4) * np.ones((60, 1))
 
     def counts(light_e):
-        return np.round((rng.poisson(light_e * shade) + rng.normal(0, read, (60, 60))) / gain + 20).astype(np.uint16)
+        return np.round(
+            (rng.poisson(light_e * shade) + rng.normal(0, read, (60, 60))) / gain + 20
+        ).astype(np.uint16)
 
     flat = np.stack([counts(4000.0) for _ in range(40)])
     z = []
     for _ in range(12):
-        dark, frames = np.stack([counts(0.0) for _ in range(4)]), np.stack([counts(0.0) for _ in range(3)])
+        dark, frames = (
+            np.stack([counts(0.0) for _ in range(4)]),
+            np.stack([counts(0.0) for _ in range(3)]),
+        )
         about = {"gain_e": gain, "read_noise_e": read}
         found = clean.clean(capture(frames, dark=dark, flat=flat, about=about))
         assert found.scale[0, 0, [0, 59]] == pytest.approx([0.6, 1.4], rel=0.02)
         z.append(found.electrons / np.sqrt(found.variance_e2))
     left, right = np.split(np.array(z), 2, axis=-1)
     for half in (left, right):
-        assert half.std() == pytest.approx(1, abs=0.04)  # 65000 draws over shared darks: 0.01
+        assert half.std() == pytest.approx(
+            1, abs=0.04
+        )  # 65000 draws over shared darks: 0.01
 
 
-@pytest.mark.parametrize(("read_e", "least", "most"), [(0.1, 0.15, 0.5), (0.3, 0.0, 0.055), (0.45, 0.0, 0.01)])
+@pytest.mark.parametrize(
+    ("read_e", "least", "most"),
+    [(0.1, 0.15, 0.5), (0.3, 0.0, 0.055), (0.45, 0.0, 0.01)],
+)
 def test_rounding_is_off_on_average_where_noise_does_not_hide_it(read_e, least, most):
-    """Means of 40 000 rounded counts at every twentieth of a count: to 0.003, against which the gain's word is held."""
+    """Means of 40 000 rounded counts at every twentieth of a count: to 0.003, against
+    which the gain's word is held.
+    """
     level = np.arange(0, 1, 0.05)[:, None]
     noise = np.random.default_rng(3).normal(0, read_e, (20, 40_000))
     off = np.abs(np.rint(level + noise).mean(1) - level[:, 0] - noise.mean(1)).max()
@@ -200,16 +264,24 @@ def test_noise_in_the_dark_is_known_from_two_dark_frames():
     rng = np.random.default_rng(8)
     flat = np.stack([shoot(np.full((40, 40), 4000.0), rng) for _ in range(6)])
     dark = np.stack([shoot(np.zeros((40, 40)), rng) for _ in range(4)])
-    known = [clean.photon_transfer(flat, some).read_known for some in (dark, dark[:1], None)]
+    known = [
+        clean.photon_transfer(flat, some).read_known for some in (dark, dark[:1], None)
+    ]
     assert known == [True, False, False]
     assert not clean.photon_transfer(flat, None).coarse
 
 
 @pytest.mark.parametrize("noise_counts", [0.16, 0.27, 0.33, 0.61])
-def test_counts_are_coarse_where_rounding_is_off_by_a_twentieth_of_a_count(noise_counts):
-    """What rounded counts are off by on average is summed over the counts; a twentieth is reached at 0.306."""
+def test_counts_are_coarse_where_rounding_is_off_by_a_twentieth_of_a_count(
+    noise_counts,
+):
+    """What rounded counts are off by on average is summed over the counts; a twentieth
+    is reached at 0.306.
+    """
     light, whole = np.linspace(0, 1, 41), np.arange(-8, 10)
-    below, above = (norm.cdf((whole[:, None] + half - light) / noise_counts) for half in (-0.5, 0.5))
+    below, above = (
+        norm.cdf((whole[:, None] + half - light) / noise_counts) for half in (-0.5, 0.5)
+    )
     off = np.abs((whole[:, None] * (above - below)).sum(0) - light).max()
     gain = clean.Gain(gain_e=2.3, gain_sigma_e=0.01, read_noise_e=2.3 * noise_counts)
     assert gain.coarse is bool(off > 0.05)

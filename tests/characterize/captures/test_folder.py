@@ -1,4 +1,6 @@
-"""Capture folders as other programs, disks and spreadsheets leave them: read, told, or refused with what to do."""
+"""Capture folders as other programs, disks and spreadsheets leave them: read, told, or
+refused with what to do.
+"""
 
 import cv2
 import numpy as np
@@ -18,13 +20,20 @@ def frames(path, names=("a0.tif", "a1.tif", "a2.tif")):
     return path
 
 
-@pytest.mark.parametrize("name", ["img_channel000_position000_time000000000_z{:03d}_a.tif", "Z{}.TIF"])
-def test_numbered_frames_of_which_one_is_missing_are_not_placed_by_a_step(tmp_path, name):
+@pytest.mark.parametrize(
+    "name", ["img_channel000_position000_time000000000_z{:03d}_a.tif", "Z{}.TIF"]
+)
+def test_numbered_frames_of_which_one_is_missing_are_not_placed_by_a_step(
+    tmp_path, name
+):
     """Files 3, 4, 7, 8 of a scan by 2 um: the third lies 8 um off the first, not 4."""
     frames(tmp_path, [name.format(k) for k in (3, 4, 7, 8)])
     assert np.array_equal(capture.load(tmp_path).frames, FRAMES[:4])
     (tmp_path / "capture.toml").write_text("step_um = 2.0\n")
-    with pytest.raises(CaptureError, match=r"is 3 numbers after .*, others 1: .*list frames and depths in stage\.csv"):
+    with pytest.raises(
+        CaptureError,
+        match=r"is 3 numbers after .*, others 1: .*list frames and depths in stage\.csv",
+    ):
         capture.load(tmp_path)
 
 
@@ -33,7 +42,11 @@ def test_numbered_frames_of_which_one_is_missing_are_not_placed_by_a_step(tmp_pa
     [
         ("z07.tif", "z09.tif", "z11.tif"),  # every other one
         ("b.tif", "d.tif", "z.tif"),
-        ("t3_z1.tif", "t4_z2.tif", "t7_z3.tif"),  # two numbers: which one counts is not known
+        (
+            "t3_z1.tif",
+            "t4_z2.tif",
+            "t7_z3.tif",
+        ),  # two numbers: which one counts is not known
         ("z1.tif", "z2.tif", "last9.tif"),
         ("z1.tif",),
     ],
@@ -46,7 +59,9 @@ def test_other_names_are_placed_by_the_step(tmp_path, names):
 
 def test_listed_frames_may_leave_numbers_out(tmp_path):
     frames(tmp_path, ("z1.tif", "z2.tif", "z9.tif"))
-    (tmp_path / "stage.csv").write_text("file,exposure_s\nz9.tif,0.1\nz2.tif,0.1\nz1.tif,0.1\n")
+    (tmp_path / "stage.csv").write_text(
+        "file,exposure_s\nz9.tif,0.1\nz2.tif,0.1\nz1.tif,0.1\n"
+    )
     (tmp_path / "capture.toml").write_text("step_um = 2.5\n")
     assert capture.load(tmp_path).position_um.tolist() == [0.0, 2.5, 5.0]
 
@@ -67,10 +82,14 @@ def test_images_in_other_kinds_of_file_are_told_and_a_dark_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a4.bmp"), (FRAMES[3] >> 4).astype(np.uint8))
     found = capture.load(tmp_path)
     assert len(found.frames) == 3
-    assert "2 files left out, of kinds that are not read: a3.fits, a4.bmp" in found.corrections
+    assert (
+        "2 files left out, of kinds that are not read: a3.fits, a4.bmp"
+        in found.corrections
+    )
     np.save(tmp_path / "Dark.npy", FRAMES[:2])
     with pytest.raises(
-        CaptureError, match=r"Dark\.npy: cannot read \.npy, and it would not be used: save it in Python"
+        CaptureError,
+        match=r"Dark\.npy: cannot read \.npy, and it would not be used: save it in Python",
     ):
         capture.load(tmp_path)
     tifffile.imwrite(tmp_path / "dark.tif", FRAMES[:2], photometric="minisblack")
@@ -88,18 +107,29 @@ def test_images_in_other_kinds_of_file_are_told_and_a_dark_refused(tmp_path):
         (".nxs", r"named \.h5"),
     ],
 )
-def test_a_kind_of_file_that_is_not_read_is_refused_with_its_cure(tmp_path, suffix, words):
+def test_a_kind_of_file_that_is_not_read_is_refused_with_its_cure(
+    tmp_path, suffix, words
+):
     (tmp_path / f"s{suffix}").write_bytes(bytes(99))
-    with pytest.raises(CaptureError, match=rf"cannot read \{suffix}; need TIFF, PNG or HDF5: save it .*{words}"):
+    with pytest.raises(
+        CaptureError,
+        match=rf"cannot read \{suffix}; need TIFF, PNG or HDF5: save it .*{words}",
+    ):
         capture.load(tmp_path / f"s{suffix}")
     assert folder.cure(".xyz") == ""
 
 
 @pytest.mark.parametrize(
     ("name", "right"),
-    [("stage.xlsx", "stage.csv"), ("Stage.TXT", "stage.csv"), ("capture.yaml", "capture.toml")],
+    [
+        ("stage.xlsx", "stage.csv"),
+        ("Stage.TXT", "stage.csv"),
+        ("capture.yaml", "capture.toml"),
+    ],
 )
-def test_tables_in_a_format_that_nothing_reads_are_refused_unless_the_right_one_is_there(tmp_path, name, right):
+def test_tables_in_a_format_that_nothing_reads_are_refused_unless_the_right_one_is_there(
+    tmp_path, name, right
+):
     """They were passed over: depths and pixels unknown, without a word."""
     frames(tmp_path)
     (tmp_path / name).write_bytes(b"PK")
@@ -137,14 +167,32 @@ def test_tables_as_spreadsheets_and_people_write_them_are_read(tmp_path, table):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        (TABLE.replace("1.5", "1,5"), r"row 2: more values than columns \(file, depth_mm\); a comma inside a number"),
-        (TABLE.replace("2.5", '"2,5"'), "row 3: depth_mm is '2,5', need a number with a point"),
-        (TABLE.replace("depth_mm", "depth"), "column 'depth' without a unit; name it depth_um"),
+        (
+            TABLE.replace("1.5", "1,5"),
+            r"row 2: more values than columns \(file, depth_mm\); a comma inside a number",
+        ),
+        (
+            TABLE.replace("2.5", '"2,5"'),
+            "row 3: depth_mm is '2,5', need a number with a point",
+        ),
+        (
+            TABLE.replace("depth_mm", "depth"),
+            "column 'depth' without a unit; name it depth_um",
+        ),
         (TABLE.replace("depth_mm", "depth (mm)"), "did you mean 'depth_mm'"),
-        (TABLE.replace("file,", "Depth_mm,file,").replace("a", "1,a"), "are not all different"),
+        (
+            TABLE.replace("file,", "Depth_mm,file,").replace("a", "1,a"),
+            "are not all different",
+        ),
         (TABLE.replace("\r\na1", "\r\n,2\r\na1"), "row 3: no 'file'"),
-        (TABLE.replace("a1.tif", "A1.TIFF"), r"row 3: frame 'A1\.TIFF' is not in .*; did you mean 'a1\.tif'"),
-        ("file,page\na0.tif,1\n", "row 2: page 1 \\(from 0\\) of 'a0.tif', which holds 1"),
+        (
+            TABLE.replace("a1.tif", "A1.TIFF"),
+            r"row 3: frame 'A1\.TIFF' is not in .*; did you mean 'a1\.tif'",
+        ),
+        (
+            "file,page\na0.tif,1\n",
+            "row 2: page 1 \\(from 0\\) of 'a0.tif', which holds 1",
+        ),
     ],
 )
 def test_tables_that_cannot_be_read_say_why(tmp_path, table, words):
@@ -156,5 +204,7 @@ def test_tables_that_cannot_be_read_say_why(tmp_path, table, words):
 
 @pytest.mark.parametrize("name", ["s.btf", "s.tf8"])
 def test_big_tiff_files_are_read_by_their_own_suffixes(tmp_path, name):
-    tifffile.imwrite(tmp_path / name, FRAMES, bigtiff=True, byteorder=">", photometric="minisblack")
+    tifffile.imwrite(
+        tmp_path / name, FRAMES, bigtiff=True, byteorder=">", photometric="minisblack"
+    )
     assert np.array_equal(capture.load(tmp_path / name).frames, FRAMES)

@@ -1,4 +1,6 @@
-"""Names in a folder: numbers counted within words, steps between them, and how many names are said."""
+"""Names in a folder: numbers counted within words, steps between them, and how many
+names are said.
+"""
 
 import pytest
 
@@ -12,9 +14,22 @@ def made(path, *names):
     return [path / name for name in names]
 
 
-def test_numbers_are_counted_wherever_they_stand_and_words_go_by_their_letters(tmp_path):
-    """Numbers stand before words, small and capital letters alike: 2 before 10, z2_t10 before z10_t2."""
-    names = ("10.tif", "2.TIF", "a_9.tif", "A_10.tif", "a_10_3.tif", "b.tif", "z2_t10.tif", "z10_t2.tif")
+def test_numbers_are_counted_wherever_they_stand_and_words_go_by_their_letters(
+    tmp_path,
+):
+    """Numbers stand before words, small and capital letters alike: 2 before 10, z2_t10
+    before z10_t2.
+    """
+    names = (
+        "10.tif",
+        "2.TIF",
+        "a_9.tif",
+        "A_10.tif",
+        "a_10_3.tif",
+        "b.tif",
+        "z2_t10.tif",
+        "z10_t2.tif",
+    )
     made(tmp_path, *reversed(names), ".hidden.tif", "c.tiff", "d.txt")
     assert [path.name for path in folder.images(tmp_path, {".tif"})] == [
         "2.TIF", "10.tif", "a_9.tif", "A_10.tif", "a_10_3.tif", "b.tif", "z2_t10.tif", "z10_t2.tif",
@@ -23,17 +38,24 @@ def test_numbers_are_counted_wherever_they_stand_and_words_go_by_their_letters(t
 
 
 @pytest.mark.parametrize(("count", "said"), [(1, 1), (5, 5), (6, 5)])
-def test_five_files_that_are_not_read_are_named_and_all_are_counted(tmp_path, count, said):
+def test_five_files_that_are_not_read_are_named_and_all_are_counted(
+    tmp_path, count, said
+):
     names = [f"f{k}.npy" for k in range(count)]
     made(tmp_path, *names, ".g.npy", "a.tif")
     (words,) = folder.unread(tmp_path, ())
-    assert words == f"{count} files left out, of kinds that are not read: {', '.join(names[:said])}"
+    assert (
+        words
+        == f"{count} files left out, of kinds that are not read: {', '.join(names[:said])}"
+    )
     assert folder.unread(tmp_path, ("dark",)) == (words,)
 
 
 def test_dark_frames_of_another_kind_are_refused_unless_there_are_others(tmp_path):
     made(tmp_path, "Dark.bmp")
-    assert folder.unread(tmp_path, ("dark",)) == ("1 files left out, of kinds that are not read: Dark.bmp",)
+    assert folder.unread(tmp_path, ("dark",)) == (
+        "1 files left out, of kinds that are not read: Dark.bmp",
+    )
     for beside in ((), ("flat",)):
         with pytest.raises(CaptureError, match=r"Dark\.bmp: cannot read \.bmp"):
             folder.unread(tmp_path, beside)
@@ -42,8 +64,14 @@ def test_dark_frames_of_another_kind_are_refused_unless_there_are_others(tmp_pat
 @pytest.mark.parametrize(
     ("names", "gap"),
     [
-        (("t3_z5.tif", "t3_z7.tif", "t3_z9.tif", "t3_z13.tif", "t3_z15.tif"), (13, 9, 4, 2)),
-        (("t3_z5.tif", "t3_z12.tif", "t3_z13.tif", "t3_z14.tif"), (12, 5, 7, 1)),  # the first step is the wide one
+        (
+            ("t3_z5.tif", "t3_z7.tif", "t3_z9.tif", "t3_z13.tif", "t3_z15.tif"),
+            (13, 9, 4, 2),
+        ),
+        (
+            ("t3_z5.tif", "t3_z12.tif", "t3_z13.tif", "t3_z14.tif"),
+            (12, 5, 7, 1),
+        ),  # the first step is the wide one
         (("t3_z5.tif", "t3_z7.tif", "t3_z9.tif"), None),
         (("t3_z5.tif", "t4_z7.tif", "t5_z11.tif"), None),  # two numbers count
         (("t3_z5.tif", "t4_z7.tif", "t4_z13.tif"), None),
@@ -75,7 +103,9 @@ def test_a_table_is_found_by_its_first_right_kind(tmp_path):
     assert folder.table(tmp_path, "stage").name == "Stage.CSV"
     (tmp_path / "Stage.CSV").unlink()
     assert folder.table(tmp_path, "stage").name == "stage.json"
-    with pytest.raises(CaptureError, match=r"capture\.yml: not read, .*; save it as capture\.toml"):
+    with pytest.raises(
+        CaptureError, match=r"capture\.yml: not read, .*; save it as capture\.toml"
+    ):
         folder.table(tmp_path, "capture")
     (tmp_path / "capture.yml").unlink()
     assert folder.table(tmp_path, "capture") is None

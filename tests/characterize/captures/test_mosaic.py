@@ -24,16 +24,27 @@ def folder(path, about, **tags):
     for i, frame in enumerate(RAW):
         tifffile.imwrite(path / f"f{i}.tif", frame, **tags)
     tifffile.imwrite(path / "dark.tif", RAW[:2] // 9)
-    (path / "capture.toml").write_text(f"bits = 12\npixel_um = 1.7\npixel_sigma_um = 0.034\n{about}\n")
+    (path / "capture.toml").write_text(
+        f"bits = 12\npixel_um = 1.7\npixel_sigma_um = 0.034\n{about}\n"
+    )
     return path
 
 
 @pytest.mark.parametrize(
     ("mosaic", "channel", "first"),
-    [("RGGB", "red", (0, 0)), ("RGGB", "green", (0, 1)), ("grbg", "blue", (1, 0)), ("BGGR", "red", (1, 1))],
+    [
+        ("RGGB", "red", (0, 0)),
+        ("RGGB", "green", (0, 1)),
+        ("grbg", "blue", (1, 0)),
+        ("BGGR", "red", (1, 1)),
+    ],
 )
-def test_the_lit_colour_of_a_mosaic_is_taken_at_twice_the_pitch(tmp_path, mosaic, channel, first):
-    path = folder(tmp_path, f'channel = "{channel}"\nmosaic = "{mosaic}"', photometric=32803)
+def test_the_lit_colour_of_a_mosaic_is_taken_at_twice_the_pitch(
+    tmp_path, mosaic, channel, first
+):
+    path = folder(
+        tmp_path, f'channel = "{channel}"\nmosaic = "{mosaic}"', photometric=32803
+    )
     found = capture.load(path)
     row, column = first
     assert np.array_equal(found.frames, RAW[:, row::2, column::2])
@@ -44,7 +55,9 @@ def test_the_lit_colour_of_a_mosaic_is_taken_at_twice_the_pitch(tmp_path, mosaic
 
 def test_an_error_of_the_pitch_is_the_same_share_of_a_mosaic(tmp_path):
     """0.034 of 1.7 um: 2 %, at either pitch."""
-    found = capture.load(folder(tmp_path, 'channel = "green"\nmosaic = "GBRG"\nwavelength_um = 0.85'))
+    found = capture.load(
+        folder(tmp_path, 'channel = "green"\nmosaic = "GBRG"\nwavelength_um = 0.85')
+    )
     known = {k.name: k for k in prepare.stated(found, b.row())}
     assert known["pixel_percent"].sigma == pytest.approx(2.0)
     placed = dataclasses.replace(found, position_um=np.array([400.0, 500.0, 600.0]))
@@ -74,7 +87,10 @@ def test_colours_that_were_put_together_are_no_mosaic(tmp_path):
 
 @pytest.mark.parametrize(
     ("meaning", "words"),
-    [(32803, r'CFA.*mosaic = "RGGB"'), ("miniswhite", r"white is 0.*in which black is 0")],
+    [
+        (32803, r'CFA.*mosaic = "RGGB"'),
+        ("miniswhite", r"white is 0.*in which black is 0"),
+    ],
 )
 def test_values_that_are_not_light_are_refused_by_name(tmp_path, meaning, words):
     with pytest.raises(CaptureError, match=words):
@@ -83,35 +99,54 @@ def test_values_that_are_not_light_are_refused_by_name(tmp_path, meaning, words)
 
 def test_places_in_a_table_of_colours_are_no_light(tmp_path):
     table = np.zeros((3, 256), np.uint16)
-    tifffile.imwrite(tmp_path / "f.tif", RAW[0].astype(np.uint8), photometric="palette", colormap=table)
+    tifffile.imwrite(
+        tmp_path / "f.tif",
+        RAW[0].astype(np.uint8),
+        photometric="palette",
+        colormap=table,
+    )
     with pytest.raises(CaptureError, match="table of colours"):
         capture.load(tmp_path / "f.tif")
 
 
 def test_a_pixel_of_a_mosaic_is_half_as_wide_as_its_pitch():
-    """Every second of small pixels: the same numbers as those of the whole sensor, half a pixel off, to rounding."""
+    """Every second of small pixels: the same numbers as those of the whole sensor, half
+    a pixel off, to rounding.
+    """
     light = np.random.default_rng(5).normal(size=(2, 2 * 4 * (9 + 4), 2 * 4 * (7 + 4)))
     whole, part = Grid(18, 14, 1.7, 4, margin=4), Grid(9, 7, 3.4, 8, margin=2, fill=0.5)
     for blur, size in ((0.3, 0.0), (0.3, 2.1)):
         sizes = np.full(2, size)
-        every = whole.sample(np.roll(light, (2, 2), (1, 2)), transfers(whole, blur, sizes, np.ones(2), sized=False)[0])
-        some = part.sample(light, transfers(part, blur, sizes, np.ones(2), sized=False)[0])
+        every = whole.sample(
+            np.roll(light, (2, 2), (1, 2)),
+            transfers(whole, blur, sizes, np.ones(2), sized=False)[0],
+        )
+        some = part.sample(
+            light, transfers(part, blur, sizes, np.ones(2), sized=False)[0]
+        )
         assert _nearest(some, every) < 1e-9
 
 
 def _nearest(some, every):
     """Largest difference to every second pixel, whichever these are."""
-    return min(np.abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1))
+    return min(
+        np.abs(some - every[:, a::2, b::2]).max() for a in (0, 1) for b in (0, 1)
+    )
 
 
 def test_the_shares_of_a_mosaic_are_a_cause_of_their_own():
-    """Pixels of 2 x 2 that see 1, 0.4, 0.4 and 0.2 of the light, less the gain: these three waves of it, no more."""
+    """Pixels of 2 x 2 that see 1, 0.4, 0.4 and 0.2 of the light, less the gain: these
+    three waves of it, no more.
+    """
     from characterize.inference.causes import _of_mosaic
 
     light = np.random.default_rng(8).uniform(3, 9, (2, 5, 6))
     shares = np.tile(np.array([[1.0, 0.4], [0.4, 0.2]]), (3, 3))[:5]
     missed = light * (shares - shares[:2, :2].mean())
     waves = _of_mosaic(light).reshape(3, -1)
-    left = missed.ravel() - waves.T @ np.linalg.lstsq(waves.T, missed.ravel(), rcond=None)[0]
+    left = (
+        missed.ravel()
+        - waves.T @ np.linalg.lstsq(waves.T, missed.ravel(), rcond=None)[0]
+    )
     assert np.abs(left).max() < 1e-12 * light.max()
     assert math.isclose(float(np.abs(waves).max()), float(light.max()))

@@ -1,4 +1,6 @@
-"""Counts coarser than their noise, against scipy's normal distribution, draws, and the likelihood maximised by hand."""
+"""Counts coarser than their noise, against scipy's normal distribution, draws, and the
+likelihood maximised by hand.
+"""
 
 import numpy as np
 import pytest
@@ -14,16 +16,23 @@ from characterize.inference.leastsquares import Data
 def chances(light, noise):
     """Counts and the chance of each, by the distribution's own function."""
     counts = np.arange(-40, 41)
-    return counts, stats.norm.cdf((counts + 0.5 - light) / noise) - stats.norm.cdf((counts - 0.5 - light) / noise)
+    return counts, stats.norm.cdf((counts + 0.5 - light) / noise) - stats.norm.cdf(
+        (counts - 0.5 - light) / noise
+    )
 
 
 @pytest.mark.parametrize("noise", [0.07, 0.21, 0.48, 0.97, 1.9])
 @pytest.mark.parametrize("light", [0.03, 0.31, 0.5, 0.84])
 def test_score_and_information_are_those_of_the_normal_distribution(noise, light):
-    """Score: ln P by central differences; on average 0, with the information as its variance."""
+    """Score: ln P by central differences; on average 0, with the information as its
+    variance.
+    """
     counts, chance = chances(light, noise)
     some, step = chance > 1e-4, 1e-4 * noise
-    slope = (np.log(chances(light + step, noise)[1][some]) - np.log(chances(light - step, noise)[1][some])) / (2 * step)
+    slope = (
+        np.log(chances(light + step, noise)[1][some])
+        - np.log(chances(light - step, noise)[1][some])
+    ) / (2 * step)
     score, _ = told((counts - light)[some], np.full(some.sum(), noise))
     assert score == pytest.approx(
         slope, rel=5e-3, abs=1e-6
@@ -33,7 +42,9 @@ def test_score_and_information_are_those_of_the_normal_distribution(noise, light
     weight = chance[some]
     assert float(weight @ score) == pytest.approx(0, abs=1e-8 / noise)
     wanted = max(float(weight @ score**2), 1e-6)
-    assert information[0] == pytest.approx(wanted, rel=1e-6)  # above one count of noise: 1 / (s² + 1/12) to 1e-8
+    assert information[0] == pytest.approx(
+        wanted, rel=1e-6
+    )  # above one count of noise: 1 / (s² + 1/12) to 1e-8
 
 
 @pytest.mark.parametrize(("level", "noise"), [(9.31, 0.13), (9.5, 0.21), (8.72, 0.27)])
@@ -42,8 +53,12 @@ def test_dark_level_and_noise_are_found_below_a_count(level, noise):
     true = level + 0.08 * rng.standard_normal((31, 27))
     found = Dark.of(np.rint(true + noise * rng.standard_normal((9, 31, 27))))
     off = found.level - true
-    assert found.noise == pytest.approx(noise, abs=0.025)  # 7500 draws, of which a sixth tell: 0.01
-    assert abs(off.mean()) < 0.05  # the mean of the counts is off by 0.1 to 0.27 but at 9.5
+    assert found.noise == pytest.approx(
+        noise, abs=0.025
+    )  # 7500 draws, of which a sixth tell: 0.01
+    assert (
+        abs(off.mean()) < 0.05
+    )  # the mean of the counts is off by 0.1 to 0.27 but at 9.5
     assert off.std() < 1.25 * np.sqrt((found.error**2).mean())
 
 
@@ -58,15 +73,20 @@ def test_dark_frames_that_all_read_the_same_leave_the_level_open():
 
 
 def test_gain_of_flats_counts_the_rounding_that_the_dark_does_not_show():
-    """Dark frames that all read 12 have no variance; flats of 3.1 counts of noise have 1/12 of their own: 0.9 %."""
+    """Dark frames that all read 12 have no variance; flats of 3.1 counts of noise have
+    1/12 of their own: 0.9 %.
+    """
     rng = np.random.default_rng(8)
     gain, read = 11.0, 0.9
     dark = np.rint(12.0 + read / gain * rng.standard_normal((6, 60, 60)))
     assert np.ptp(dark) == 0
-    electrons = rng.poisson(130.0, (160, 60, 60)) + read * rng.standard_normal((160, 60, 60))
+    electrons = rng.poisson(130.0, (160, 60, 60)) + read * rng.standard_normal(
+        (160, 60, 60)
+    )
     found = photon_transfer(np.rint(12.0 + electrons / gain), dark)
     variance = (130.0 + read**2) / gain**2 + 1 / 12
-    # variance / mean: 2.9e5 differences of 2 frames, 0.26 %; the dark noise is known to a factor of two: 1 %
+    # variance / mean: 2.9e5 differences of 2 frames, 0.26 %; the dark noise is known to
+    # a factor of two: 1 %
     without = (130.0 / gain) / variance
     assert abs(without / gain - 1) > 0.06
     assert found.gain_e == pytest.approx(gain, rel=0.02)
@@ -78,7 +98,9 @@ def seen(rng, light, gain, read):
 
 
 def test_fit_of_rounded_counts_ends_where_their_likelihood_is_greatest():
-    """One spot on a background below a count: (brightness, background), by Nelder and Mead on the exact likelihood."""
+    """One spot on a background below a count: (brightness, background), by Nelder and
+    Mead on the exact likelihood.
+    """
     rng, gain, read = np.random.default_rng(13), 29.0, 4.3
     y, x = np.mgrid[-6:7, -6:7]
     shape = np.stack([np.exp(-(x**2 + y**2) / s) for s in (3.1, 7.7)])
@@ -89,25 +111,38 @@ def test_fit_of_rounded_counts_ends_where_their_likelihood_is_greatest():
     counts = Data(electrons, full, ~full, floor, np.ones(shape.shape), count_e=gain)
 
     def model(value, jacobian):
-        return value[0] * shape + value[1], np.stack([shape, np.ones_like(shape)]) if jacobian else None
+        return value[0] * shape + value[1], np.stack(
+            [shape, np.ones_like(shape)]
+        ) if jacobian else None
 
     found = leastsquares.fit(model, counts, truth)
     plain = found
     for _ in range(6):
         noise = np.sqrt(read**2 + found.image)  # held, as the weights of a fit are
-        found = leastsquares.fit(model, prepare.unrounded(counts, found.image), found.value)
+        found = leastsquares.fit(
+            model, prepare.unrounded(counts, found.image), found.value
+        )
 
     def unlikely(value):
         off = (electrons - model(value, False)[0]) / gain
-        upper, lower = (stats.norm.logcdf((half - np.abs(off)) * gain / noise) for half in (0.5, -0.5))
+        upper, lower = (
+            stats.norm.logcdf((half - np.abs(off)) * gain / noise)
+            for half in (0.5, -0.5)
+        )
         return -float((upper + np.log1p(-np.exp(lower - upper))).sum())
 
-    best = optimize.minimize(unlikely, truth, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9}).x
+    best = optimize.minimize(
+        unlikely, truth, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9}
+    ).x
     sigma = np.sqrt(np.diag(found.covariance))
     assert (np.abs(found.value - best) < 0.05 * sigma).all()
     assert (np.abs(found.value - truth) < 3 * sigma).all()
-    assert abs(plain.value[1] - truth[1]) > 4 * sigma[1]  # a third of a count reads as less
-    assert found.chi2_per_dof == pytest.approx(1, abs=0.3)  # 338 pixels: 0.08, and their scores are no normal numbers
+    assert (
+        abs(plain.value[1] - truth[1]) > 4 * sigma[1]
+    )  # a third of a count reads as less
+    assert found.chi2_per_dof == pytest.approx(
+        1, abs=0.3
+    )  # 338 pixels: 0.08, and their scores are no normal numbers
 
 
 def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
@@ -133,11 +168,20 @@ def test_pseudo_counts_keep_what_is_full_and_what_dark_frames_have_in_common():
 
 
 def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_is_stated():
-    """0.43 counts of light on steps of 1700 electrons, without read noise: 0.016 counts by themselves."""
+    """0.43 counts of light on steps of 1700 electrons, without read noise: 0.016 counts
+    by themselves.
+    """
     step, light, noise = 1700.0, 0.43, 0.05
     electrons = step * np.array([[[0.0, 1.0]]])
     image, full = np.full_like(electrons, light * step), np.ones(electrons.shape, bool)
-    data = Data(electrons, full, ~full, np.full_like(electrons, step**2 / 12), np.ones(electrons.shape), count_e=step)
+    data = Data(
+        electrons,
+        full,
+        ~full,
+        np.full_like(electrons, step**2 / 12),
+        np.ones(electrons.shape),
+        count_e=step,
+    )
     made = prepare.unrounded(data, image)
     counts, chance = chances(light, noise)
     up, down = (chances(light + sign * 1e-5, noise)[1] for sign in (1, -1))
@@ -145,41 +189,79 @@ def test_levels_of_pixels_add_a_twentieth_of_a_count_of_noise_where_hardly_any_i
     score = (up - down)[some] / 2e-5 / chance[some]
     information = float(chance[some] @ score**2)
     want = [light + float(score[counts[some] == k][0]) / information for k in (0, 1)]
-    assert made.electrons.ravel() / step == pytest.approx(want, rel=1e-4)  # the difference: (1e-5 / 0.05)² x 7²
-    assert made.variance(image).ravel() == pytest.approx(step**2 / information, rel=1e-4)
+    assert made.electrons.ravel() / step == pytest.approx(
+        want, rel=1e-4
+    )  # the difference: (1e-5 / 0.05)² x 7²
+    assert made.variance(image).ravel() == pytest.approx(
+        step**2 / information, rel=1e-4
+    )
 
 
 def test_frames_of_coarse_counts_say_their_step_and_the_dark_level_below_a_count():
     rng = np.random.default_rng(21)
     gain, read, level = 31.0, 4.0, 9.3
     light = np.zeros((3, 22, 24))
-    frames = np.rint(level + (rng.poisson(light + 12) + read * rng.standard_normal(light.shape)) / gain)
+    frames = np.rint(
+        level
+        + (rng.poisson(light + 12) + read * rng.standard_normal(light.shape)) / gain
+    )
     dark = np.rint(level + read / gain * rng.standard_normal((8, 22, 24)))
-    flat = np.rint(level + (rng.poisson(3100.0, (24, 22, 24)) + read * rng.standard_normal((24, 22, 24))) / gain)
+    flat = np.rint(
+        level
+        + (rng.poisson(3100.0, (24, 22, 24)) + read * rng.standard_normal((24, 22, 24)))
+        / gain
+    )
     blank = np.full(3, np.nan)
-    found = clean(Capture(frames, blank, np.zeros((3, 2)), blank, ("a", "b", "c"), 8, dark=dark, flat=flat))
+    found = clean(
+        Capture(
+            frames,
+            blank,
+            np.zeros((3, 2)),
+            blank,
+            ("a", "b", "c"),
+            8,
+            dark=dark,
+            flat=flat,
+        )
+    )
     assert found.count_e == found.gain.gain_e == pytest.approx(gain, rel=0.05)
     assert found.gain.coarse
-    assert found.gain.read_noise_e == pytest.approx(read, rel=0.4)  # one level for all pixels: noise and level trade
+    assert found.gain.read_noise_e == pytest.approx(
+        read, rel=0.4
+    )  # one level for all pixels: noise and level trade
     zero = np.median(frames - found.electrons * found.scale / found.count_e)
-    assert abs(zero - level) < 0.15 < level - dark.mean()  # 1.6 sigma of noise that is taken for 0.17, not 0.13
+    assert (
+        abs(zero - level) < 0.15 < level - dark.mean()
+    )  # 1.6 sigma of noise that is taken for 0.17, not 0.13
 
 
-@pytest.mark.parametrize(("read", "count_e", "exact"), [(4.3, 29.0, True), (9.1, 29.0, False), (4.3, 0.0, False)])
-def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(monkeypatch, read, count_e, exact):
+@pytest.mark.parametrize(
+    ("read", "count_e", "exact"),
+    [(4.3, 29.0, True), (9.1, 29.0, False), (4.3, 0.0, False)],
+)
+def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(
+    monkeypatch, read, count_e, exact
+):
     """A level of 0.27 counts alone, read as 0 with a chance of Phi((1/2 - m) / s).
 
-    Greatest where the share of counts above a half is as read: m = 1/2 + s Phi^-1(share), with s at the level found."""
+    Greatest where the share of counts above a half is as read: m = 1/2 + s
+    Phi^-1(share), with s at the level found."""
     rng = np.random.default_rng(4)
     electrons = seen(rng, np.full((1, 40, 50), 0.27 * 29.0), 29.0, 4.3)
     full = np.ones(electrons.shape, bool)
     floor = np.full(electrons.shape, 4.3**2 + 29.0**2 / 12)
-    counts = Data(electrons, full, ~full, floor, np.ones(electrons.shape), count_e=count_e)
+    counts = Data(
+        electrons, full, ~full, floor, np.ones(electrons.shape), count_e=count_e
+    )
 
     def model(value, jacobian):
-        return np.full(electrons.shape, value[0]), np.ones((1, *electrons.shape)) if jacobian else None
+        return np.full(electrons.shape, value[0]), np.ones(
+            (1, *electrons.shape)
+        ) if jacobian else None
 
-    monkeypatch.setattr(search, "refine", lambda task, value: leastsquares.fit(model, task.data, value))
+    monkeypatch.setattr(
+        search, "refine", lambda task, value: leastsquares.fit(model, task.data, value)
+    )
     task = search.Task(None, counts, np.zeros(1), {}, None)
     first = leastsquares.fit(model, counts, np.array([3.0]))
     made, ends = estimate._unrounded(task, [first], Gain(29.0, 0.3, read))
@@ -187,5 +269,7 @@ def test_only_single_counts_coarser_than_their_noise_are_fitted_as_rounded(monke
     if exact:
         noise = np.sqrt(4.3**2 + ends[0].value[0])
         level = 29.0 / 2 + noise * stats.norm.ppf((electrons > 0).mean())
-        assert ends[0].value[0] == pytest.approx(level, abs=0.1 * np.sqrt(ends[0].covariance[0, 0]))
+        assert ends[0].value[0] == pytest.approx(
+            level, abs=0.1 * np.sqrt(ends[0].covariance[0, 0])
+        )
         assert abs(first.value[0] - 0.27 * 29.0) > 9 * np.sqrt(first.covariance[0, 0])

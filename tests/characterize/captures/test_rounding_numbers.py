@@ -1,4 +1,6 @@
-"""Counts coarser than their noise: sums over all counts, and levels of pixels by a plain search of their likelihood."""
+"""Counts coarser than their noise: sums over all counts, and levels of pixels by a
+plain search of their likelihood.
+"""
 
 import math
 
@@ -10,7 +12,9 @@ from characterize.captures.rounding import Dark, told
 
 
 def by_sum(off, noise):
-    """Score of a count and the information of all, from the normal distribution's own functions."""
+    """Score of a count and the information of all, from the normal distribution's own
+    functions.
+    """
 
     def chance(distance):
         """Of a count so far from the light, from the tail that it lies in."""
@@ -18,7 +22,10 @@ def by_sum(off, noise):
         return stats.norm.sf(low) - stats.norm.sf(high)
 
     def slope(distance):
-        return (stats.norm.pdf((distance - 0.5) / noise) - stats.norm.pdf((distance + 0.5) / noise)) / noise
+        return (
+            stats.norm.pdf((distance - 0.5) / noise)
+            - stats.norm.pdf((distance + 0.5) / noise)
+        ) / noise
 
     nearest = off - round(off)
     every = [nearest + k for k in range(-30, 31)]
@@ -27,7 +34,9 @@ def by_sum(off, noise):
 
 
 def test_counts_of_unlike_noise_are_told_each_by_its_own():
-    """Below a count of noise exactly, from one count on as if rounding were a variance of 1/12."""
+    """Below a count of noise exactly, from one count on as if rounding were a variance
+    of 1/12.
+    """
     off = np.array([[0.2, -1.3, 0.45], [2.6, 0.0, -0.7], [0.31, -0.31, 1.9]])
     noise = np.array([[0.06, 0.9, 0.2], [0.99, 0.31, 0.5], [1.0, 3.7, 1.2]])
     score, information = told(off, noise)
@@ -37,13 +46,18 @@ def test_counts_of_unlike_noise_are_told_each_by_its_own():
         assert information[at] == pytest.approx(want[1], rel=1e-9)
     assert score[2] == pytest.approx(off[2] / (noise[2] ** 2 + 1 / 12), rel=1e-12)
     assert information[2] == pytest.approx(1 / (noise[2] ** 2 + 1 / 12), rel=1e-12)
-    assert [float(part) for part in told(0.45, 0.2)] == [score[0, 2], information[0, 2]]  # plain numbers
+    assert [float(part) for part in told(0.45, 0.2)] == [
+        score[0, 2],
+        information[0, 2],
+    ]  # plain numbers
     one = told(np.array([0.45, -0.2]), 0.2)[1]  # one noise for all
     assert one == pytest.approx([by_sum(0.45, 0.2)[1], by_sum(-0.2, 0.2)[1]], rel=1e-9)
 
 
 def test_what_says_nothing_has_a_millionth():
-    """In the middle of a count with 0.05 counts of noise: 1e-18 of information; half-way to the next 255."""
+    """In the middle of a count with 0.05 counts of noise: 1e-18 of information;
+    half-way to the next 255.
+    """
     found = told(np.array([0.0, 0.5]), np.array([0.05, 0.05]))[1]
     # of two counts whose chances are one half each: twice phi(0)² / s² over a half
     assert found == pytest.approx([1e-6, 2 / math.pi / 0.05**2], rel=1e-9)
@@ -57,28 +71,39 @@ def drawn(seed, level, scatter, noise, shape=(12, 40, 41)):
 
 @pytest.mark.parametrize(("level", "noise"), [(9.31, 0.2), (-4.4, 0.27), (120.5, 0.15)])
 def test_errors_of_dark_levels_are_as_large_as_the_levels_are_off(level, noise):
-    """1640 pixels: 2 % of the scatter, without their common error; and their noise is told to a twentieth."""
+    """1640 pixels: 2 % of the scatter, without their common error; and their noise is
+    told to a twentieth.
+    """
     truth, counts = drawn(5, level, 0.09, noise)
     found = Dark.of(counts)
     off = found.level - truth
-    assert (off - off.mean()).std() == pytest.approx(np.sqrt((found.error**2).mean()), rel=0.12)
+    assert (off - off.mean()).std() == pytest.approx(
+        np.sqrt((found.error**2).mean()), rel=0.12
+    )
     assert found.noise == pytest.approx(noise, rel=0.15)
     assert abs(off.mean()) < 0.03
 
 
 def test_pixels_that_read_alike_have_one_level_and_its_error_by_their_likelihood():
-    """The mean and the spread of a level among pixels' levels, by sums over a fine grid at the noise that was found.
+    """The mean and the spread of a level among pixels' levels, by sums over a fine grid
+    at the noise that was found.
 
-    The common level and scatter are those that make all counts likeliest, told by their own mean and spread."""
+    The common level and scatter are those that make all counts likeliest, told by their
+    own mean and spread."""
     _, counts = drawn(8, 6.4, 0.1, 0.22)
     found = Dark.of(counts)
     often = np.stack([(counts == k).sum(0) for k in (5, 6, 7, 8)], -1)
     kinds = np.unique(often.reshape(-1, 4), axis=0)
-    levels = {tuple(k): np.unique(found.level[(often == k).all(-1)].round(12)) for k in kinds}
+    levels = {
+        tuple(k): np.unique(found.level[(often == k).all(-1)].round(12)) for k in kinds
+    }
     assert all(len(v) == 1 for v in levels.values())
     grid = np.linspace(5.5, 7.5, 4001)
     counted = np.array([5, 6, 7, 8])
-    edges = [stats.norm.cdf((counted[:, None] + side - grid) / found.noise) for side in (0.5, -0.5)]
+    edges = [
+        stats.norm.cdf((counted[:, None] + side - grid) / found.noise)
+        for side in (0.5, -0.5)
+    ]
     chance = np.log(np.maximum(edges[0] - edges[1], 1e-300))
 
     def posterior(common, scatter):
@@ -93,13 +118,17 @@ def test_pixels_that_read_alike_have_one_level_and_its_error_by_their_likelihood
     for _ in range(200):  # expectation and maximisation
         mean, spread = posterior(common, scatter)
         common = float(many @ mean / many.sum())
-        scatter = math.sqrt(float(many @ ((mean - common) ** 2 + spread**2) / many.sum()))
+        scatter = math.sqrt(
+            float(many @ ((mean - common) ** 2 + spread**2) / many.sum())
+        )
     mean, spread = posterior(common, scatter)
     for k, (want, error) in enumerate(zip(mean, spread, strict=True)):
         if many[k] < 5:
             continue
         place = (often == kinds[k]).all(-1)
-        assert found.level[place] == pytest.approx(want, abs=0.01)  # the search also knows what noise is usual
+        assert found.level[place] == pytest.approx(
+            want, abs=0.01
+        )  # the search also knows what noise is usual
         assert found.error[place] == pytest.approx(error, rel=0.06)
 
 
@@ -118,21 +147,32 @@ def test_hot_pixels_read_as_they_are_with_the_scatter_of_all():
 
 
 def test_frames_that_read_alike_leave_what_is_usual_to_a_factor_of_two():
-    """72 pixels, four times 7 each: noise about 0.15 and scatter about 0.1 counts, and the chance that all read so."""
+    """72 pixels, four times 7 each: noise about 0.15 and scatter about 0.1 counts, and
+    the chance that all read so.
+    """
     level = np.linspace(-1, 1, 2001)
 
     def unlikely(x):
         noise, scatter = np.exp(x)
-        alike = stats.norm.cdf((0.5 - level) / noise) - stats.norm.cdf((-0.5 - level) / noise)
+        alike = stats.norm.cdf((0.5 - level) / noise) - stats.norm.cdf(
+            (-0.5 - level) / noise
+        )
         chance = np.trapezoid(stats.norm.pdf(level, scale=scatter) * alike**4, level)
         away = (x - np.log([0.15, 0.1])) / math.log(2)
         return away @ away / 2 - 72 * math.log(chance)
 
     best = optimize.minimize(
-        unlikely, np.log([0.15, 0.1]), method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-6}
+        unlikely,
+        np.log([0.15, 0.1]),
+        method="Nelder-Mead",
+        options={"xatol": 1e-4, "fatol": 1e-6},
     )
     noise, scatter = np.exp(best.x)
     found = Dark.of(np.full((4, 9, 8), 7.0))
-    assert found.noise == pytest.approx(noise, rel=0.02)  # the search ends at 1e-3, on 61 levels
+    assert found.noise == pytest.approx(
+        noise, rel=0.02
+    )  # the search ends at 1e-3, on 61 levels
     assert found.level == pytest.approx(np.full((9, 8), 7.0), abs=0.01)
-    assert found.error[2, 3] == pytest.approx(scatter, rel=0.1)  # of levels whose ends are a little less likely
+    assert found.error[2, 3] == pytest.approx(
+        scatter, rel=0.1
+    )  # of levels whose ends are a little less likely

@@ -36,7 +36,9 @@ def test_positions_and_angles_carry_their_unit(tmp_path, column, scale):
 
 
 def test_what_is_not_listed_is_unknown_and_along_the_axis(tmp_path):
-    (tmp_path / "stage.json").write_text(json.dumps([{"file": "a.png", "angle_rad": 0.1, "angle_y_deg": 2}]))
+    (tmp_path / "stage.json").write_text(
+        json.dumps([{"file": "a.png", "angle_rad": 0.1, "angle_y_deg": 2}])
+    )
     rows = stage.read_stage(tmp_path)
     assert np.isnan(rows.position_um).all()
     assert np.isnan(rows.exposure_s).all()
@@ -57,10 +59,16 @@ def test_what_an_editor_saved_with_a_byte_order_mark_is_read(tmp_path):
 
 
 def test_other_names_and_units_of_a_description_are_taken(tmp_path):
-    (tmp_path / "capture.toml").write_text("pixel_size_nm = 65\nz_step_um = -0.2\nemission_nm = 520\n")
+    (tmp_path / "capture.toml").write_text(
+        "pixel_size_nm = 65\nz_step_um = -0.2\nemission_nm = 520\n"
+    )
     found = stage.read_about(tmp_path)
-    assert found == pytest.approx({"pixel_um": 0.065, "step_um": -0.2, "wavelength_um": 0.52})
-    (tmp_path / "capture.toml").write_text("voxel_um = [0.3, 0.11, 0.12]\nstep_um = 0.4\n")
+    assert found == pytest.approx(
+        {"pixel_um": 0.065, "step_um": -0.2, "wavelength_um": 0.52}
+    )
+    (tmp_path / "capture.toml").write_text(
+        "voxel_um = [0.3, 0.11, 0.12]\nstep_um = 0.4\n"
+    )
     assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.12}
 
 
@@ -68,7 +76,11 @@ def test_a_name_in_the_right_unit_goes_before_another(tmp_path):
     (tmp_path / "capture.json").write_text(
         json.dumps({"pixel_um": 0.2, "pixel_size_um": 0.3, "voxel_um": [0.4, 5, 0.6]})
     )
-    assert stage.read_about(tmp_path) == {"step_um": 0.4, "pixel_um": 0.2, "pixel_size_um": 0.3}
+    assert stage.read_about(tmp_path) == {
+        "step_um": 0.4,
+        "pixel_um": 0.2,
+        "pixel_size_um": 0.3,
+    }
     (tmp_path / "capture.json").write_text(json.dumps({"bits": True}))
     with pytest.raises(CaptureError, match="bits = True"):
         stage.read_about(tmp_path)
@@ -77,9 +89,18 @@ def test_a_name_in_the_right_unit_goes_before_another(tmp_path):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ("file,depth_um,depth_mm\na.tif,730,0.9\n", "depth_um and depth_mm say the same"),
-        ("file,angle_deg,angle_rad\na.tif,7,0.3\n", "angle_deg and angle_rad say the same"),
-        ("file,angle_y_deg,angle_y_rad\na.tif,7,0.3\n", "angle_y_deg and angle_y_rad say the same"),
+        (
+            "file,depth_um,depth_mm\na.tif,730,0.9\n",
+            "depth_um and depth_mm say the same",
+        ),
+        (
+            "file,angle_deg,angle_rad\na.tif,7,0.3\n",
+            "angle_deg and angle_rad say the same",
+        ),
+        (
+            "file,angle_y_deg,angle_y_rad\na.tif,7,0.3\n",
+            "angle_y_deg and angle_y_rad say the same",
+        ),
         ("file;depth_mm\na.tif;0,73\n", "parted by ';'; save it with commas"),
         ("file\tdepth_mm\na.tif\t0.73\n", "save it with commas"),
         ("file,page\na.tif,1\na.tif,2.5\n", "row 3: page is 2.5, need a whole number"),
@@ -104,7 +125,11 @@ def test_frames_of_which_only_names_are_known():
     rows = stage.Rows.unknown(("a", "b", "c"))
     assert rows.page == (None, None, None)
     assert rows.angle_rad.tolist() == [[0, 0]] * 3
-    assert np.isnan(rows.position_um).tolist() == np.isnan(rows.exposure_s).tolist() == [True] * 3
+    assert (
+        np.isnan(rows.position_um).tolist()
+        == np.isnan(rows.exposure_s).tolist()
+        == [True] * 3
+    )
 
 
 def pixels(planes, about=""):
@@ -112,21 +137,43 @@ def pixels(planes, about=""):
 
 
 def test_planes_of_ome_xml_carry_their_unit():
-    units = {"mm": 1e3, "um": 1.0, "&#181;m": 1.0, "\u00b5m": 1.0, "\u03bcm": 1.0, "nm": 1e-3, "m": 1e6}
-    planes = '<Plane PositionZ="-2"/>' + "".join(f"<Plane PositionZUnit='{u}' PositionZ='1.5'/>" for u in units)
-    assert stage.ome_positions(pixels(planes)) == pytest.approx([-2.0, *(1.5 * um for um in units.values())])
-    for strange in ('<Plane PositionZ="3" PositionZUnit="reference frame"/>', '<Plane DeltaT="0.1"/>'):
+    units = {
+        "mm": 1e3,
+        "um": 1.0,
+        "&#181;m": 1.0,
+        "\u00b5m": 1.0,
+        "\u03bcm": 1.0,
+        "nm": 1e-3,
+        "m": 1e6,
+    }
+    planes = '<Plane PositionZ="-2"/>' + "".join(
+        f"<Plane PositionZUnit='{u}' PositionZ='1.5'/>" for u in units
+    )
+    assert stage.ome_positions(pixels(planes)) == pytest.approx(
+        [-2.0, *(1.5 * um for um in units.values())]
+    )
+    for strange in (
+        '<Plane PositionZ="3" PositionZUnit="reference frame"/>',
+        '<Plane DeltaT="0.1"/>',
+    ):
         assert len(stage.ome_positions(pixels(planes + strange))) == 0
 
 
-@pytest.mark.parametrize(("order", "found"), [("XYZCT", [7, 5, 9, 11]), ("XYCTZ", [7, 9, 5, 11])])
+@pytest.mark.parametrize(
+    ("order", "found"), [("XYZCT", [7, 5, 9, 11]), ("XYCTZ", [7, 9, 5, 11])]
+)
 def test_planes_of_ome_xml_stand_where_they_say(order, found):
-    """Two depths, two times: the first depth at both times, then the second; pages by the order that is stated."""
+    """Two depths, two times: the first depth at both times, then the second; pages by
+    the order that is stated.
+    """
     planes = "".join(
         f'<Plane TheZ="{z}" TheT="{t}" TheC="0" PositionZ="{at}"/>'
         for z, t, at in ((0, 0, 7), (0, 1, 9), (1, 0, 5), (1, 1, 11))
     )
-    assert stage.ome_positions(pixels(planes, f'DimensionOrder="{order}"')).tolist() == found
+    assert (
+        stage.ome_positions(pixels(planes, f'DimensionOrder="{order}"')).tolist()
+        == found
+    )
 
 
 @pytest.mark.parametrize(
@@ -148,23 +195,38 @@ def test_planes_of_ome_xml_stand_where_they_say(order, found):
         ("pixels_um = 2.1", "unknown entry 'pixels_um'; did you mean 'pixel_um'"),
     ],
 )
-def test_what_no_camera_has_is_refused_and_misspelt_names_are_told(tmp_path, line, words):
+def test_what_no_camera_has_is_refused_and_misspelt_names_are_told(
+    tmp_path, line, words
+):
     (tmp_path / "capture.toml").write_text(line + "\n")
     with pytest.raises(CaptureError, match="capture.toml: .*" + words):
         stage.read_about(tmp_path)
 
 
 def test_notes_of_the_user_and_whole_bits_are_kept(tmp_path):
-    (tmp_path / "capture.toml").write_text('bits = 14.0\noffset = -3.5\noperator = "E. Q."\ncamera = "XB-7"\n')
+    (tmp_path / "capture.toml").write_text(
+        'bits = 14.0\noffset = -3.5\noperator = "E. Q."\ncamera = "XB-7"\n'
+    )
     found = stage.read_about(tmp_path)
     assert found == {"bits": 14, "offset": -3.5, "operator": "E. Q.", "camera": "XB-7"}
     assert isinstance(found["bits"], int)
 
 
 def test_what_may_be_0_and_tilts_to_either_side_are_taken(tmp_path):
-    (tmp_path / "capture.toml").write_text("read_noise_e = 0\nglass_um = 0.0\nglass_tilt_x_deg = -89.0\nbits = 32\n")
-    assert stage.read_about(tmp_path) == {"read_noise_e": 0, "glass_um": 0.0, "glass_tilt_x_deg": -89.0, "bits": 32}
-    for line in ("glass_tilt_x_deg = -90.5", "glass_tilt_y_deg = 90", "wavelength_um = 0"):
+    (tmp_path / "capture.toml").write_text(
+        "read_noise_e = 0\nglass_um = 0.0\nglass_tilt_x_deg = -89.0\nbits = 32\n"
+    )
+    assert stage.read_about(tmp_path) == {
+        "read_noise_e": 0,
+        "glass_um": 0.0,
+        "glass_tilt_x_deg": -89.0,
+        "bits": 32,
+    }
+    for line in (
+        "glass_tilt_x_deg = -90.5",
+        "glass_tilt_y_deg = 90",
+        "wavelength_um = 0",
+    ):
         (tmp_path / "capture.toml").write_text(line + "\n")
         with pytest.raises(CaptureError, match=line):
             stage.read_about(tmp_path)
@@ -177,20 +239,28 @@ def test_images_that_the_table_does_not_name_are_told_and_dark_ones_refused(tmp_
     assert told.startswith("6 images that ")
     assert told.endswith("left out: a.tif, d.tif, e.tif, f.tif, g.tif")
     assert stage.left_out(every[1:3], rows) == ()
-    with pytest.raises(CaptureError, match=r"'darks_2.tif' is not named .* one stack dark.tif"):
+    with pytest.raises(
+        CaptureError, match=r"'darks_2.tif' is not named .* one stack dark.tif"
+    ):
         stage.left_out([tmp_path / "darks_2.tif"], rows)
     assert stage.left_out([tmp_path / "darkroom.tif"], rows)
 
 
 @pytest.mark.parametrize("time", ["0", "-0.02"])
 def test_an_exposure_of_no_length_is_refused_by_its_row(tmp_path, time):
-    (tmp_path / "stage.csv").write_text(f"file,depth_um,exposure_s\na.tif,2.5,0.1\nb.tif,3.5,{time}\n")
-    with pytest.raises(CaptureError, match=r"stage\.csv, row 3: exposure_s is -?0.*above 0"):
+    (tmp_path / "stage.csv").write_text(
+        f"file,depth_um,exposure_s\na.tif,2.5,0.1\nb.tif,3.5,{time}\n"
+    )
+    with pytest.raises(
+        CaptureError, match=r"stage\.csv, row 3: exposure_s is -?0.*above 0"
+    ):
         stage.read_stage(tmp_path)
 
 
 def test_entries_that_nothing_reads_are_named():
     """Where the sensor's window lay is not read: the axis is sought in the frames."""
-    (said,) = stage.unread({"pixel_um": 3.0, "roi_x_px": 12, "window": "fixed", "operator": "K"})
+    (said,) = stage.unread(
+        {"pixel_um": 3.0, "roi_x_px": 12, "window": "fixed", "operator": "K"}
+    )
     assert said.endswith(": roi_x_px, operator")
     assert not stage.unread({"wavelength_um": 0.53, "gain_e": 2.3})

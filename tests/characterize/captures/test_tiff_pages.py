@@ -1,4 +1,6 @@
-"""Images of TIFF files: what is compressed with loss, claims too much or holds colours in planes of their own."""
+"""Images of TIFF files: what is compressed with loss, claims too much or holds colours
+in planes of their own.
+"""
 
 import importlib.util
 import struct
@@ -17,7 +19,9 @@ FRAMES = np.arange(3 * 6 * 5, dtype=np.uint16).reshape(3, 6, 5)
 
 
 def written(tmp_path, frames=FRAMES, **about):
-    tifffile.imwrite(tmp_path / "a.tif", frames, photometric="minisblack", metadata=None, **about)
+    tifffile.imwrite(
+        tmp_path / "a.tif", frames, photometric="minisblack", metadata=None, **about
+    )
     return tmp_path / "a.tif"
 
 
@@ -25,10 +29,16 @@ def test_plain_frames_are_read_as_they_are(tmp_path):
     assert np.array_equal(tiff_pages.read(written(tmp_path)), FRAMES)
 
 
-def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(tmp_path):
+def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_too(
+    tmp_path,
+):
     stack = written(tmp_path)
-    tifffile.imwrite(tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None)
-    names, frames, _ = capture._all_frames([stack, tmp_path / "b.tif"], tmp_path, Colours(), None)
+    tifffile.imwrite(
+        tmp_path / "b.tif", FRAMES[1], photometric="minisblack", metadata=None
+    )
+    names, frames, _ = capture._all_frames(
+        [stack, tmp_path / "b.tif"], tmp_path, Colours(), None
+    )
     assert names == ("a.tif[0]", "a.tif[1]", "a.tif[2]", "b.tif")
     assert np.array_equal(frames, np.stack([*FRAMES, FRAMES[1]]))
 
@@ -36,14 +46,19 @@ def test_frames_are_named_by_their_files_and_those_of_a_stack_by_their_places_to
 @pytest.mark.parametrize(
     ("code", "words"),
     [
-        *((code, "JPEG-compressed, its noise says nothing") for code in (6, 7, 33003, 33005, 34712)),
+        *(
+            (code, "JPEG-compressed, its noise says nothing")
+            for code in (6, 7, 33003, 33005, 34712)
+        ),
         (5, r"compressed \(LZW\) and damaged"),
         (32773, r"compressed \(PackBits\) and damaged"),
         (34925, r"compressed \(LZMA\)"),
         (50000, r"compressed \(Zstandard\)"),
     ],
 )
-def test_frames_that_are_compressed_with_loss_or_by_a_stranger_are_refused_by_name(tmp_path, code, words):
+def test_frames_that_are_compressed_with_loss_or_by_a_stranger_are_refused_by_name(
+    tmp_path, code, words
+):
     """The tag of the last frame of a plain file says another compression."""
     if "JPEG" not in words and importlib.util.find_spec("imagecodecs"):
         pytest.skip("read by its package")
@@ -65,29 +80,54 @@ def test_frames_together_may_claim_no_more_than_is_held(tmp_path, monkeypatch):
 def test_planes_are_images_or_the_colours_of_one(tmp_path):
     path = written(tmp_path, FRAMES[None], planarconfig="separate")
     assert np.array_equal(tiff_pages.read(path), FRAMES)
-    assert np.array_equal(tiff_pages.read(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None])
+    assert np.array_equal(
+        tiff_pages.read(path, coloured=True), np.moveaxis(FRAMES, 0, -1)[None]
+    )
     assert np.array_equal(tiff_pages.read(written(tmp_path), coloured=True), FRAMES)
 
 
 @pytest.mark.parametrize(
-    ("kind", "words"), [("f2", "float16 round counts above 2048"), ("c8", "complex64; need whole")]
+    ("kind", "words"),
+    [("f2", "float16 round counts above 2048"), ("c8", "complex64; need whole")],
 )
-def test_kinds_of_numbers_that_hold_no_counts_are_refused_by_name(tmp_path, kind, words):
+def test_kinds_of_numbers_that_hold_no_counts_are_refused_by_name(
+    tmp_path, kind, words
+):
     with pytest.raises(CaptureError, match=words):
         capture.load(written(tmp_path, FRAMES.astype(kind)))
 
 
 @pytest.mark.parametrize(("mark", "order"), [(b"MM", ">"), (b"II", "<")])
-def test_what_imagej_lays_behind_the_head_of_one_image_is_a_stack(tmp_path, mark, order):
-    """Stacks above 4 GB have one head and say images=N. A file that has no room for them is refused."""
-    words, (_, height, width) = b"ImageJ=1.53t\nimages=3\nslices=3\nunit=um\nspacing=0.3\n\0\0", FRAMES.shape
+def test_what_imagej_lays_behind_the_head_of_one_image_is_a_stack(
+    tmp_path, mark, order
+):
+    """Stacks above 4 GB have one head and say images=N. A file that has no room for
+    them is refused.
+    """
+    words, (_, height, width) = (
+        b"ImageJ=1.53t\nimages=3\nslices=3\nunit=um\nspacing=0.3\n\0\0",
+        FRAMES.shape,
+    )
     begins = 8 + 2 + 9 * 12 + 4
-    plain = (lambda v: v << 16) if order == ">" else int  # a short lies at the start of its word
-    tags = ((256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, plain(16)), (259, 3, 1, plain(1)))
-    tags += ((262, 3, 1, plain(1)), (270, 2, len(words), begins), (273, 4, 1, begins + len(words)))
+    plain = (
+        (lambda v: v << 16) if order == ">" else int
+    )  # a short lies at the start of its word
+    tags = (
+        (256, 4, 1, width),
+        (257, 4, 1, height),
+        (258, 3, 1, plain(16)),
+        (259, 3, 1, plain(1)),
+    )
+    tags += (
+        (262, 3, 1, plain(1)),
+        (270, 2, len(words), begins),
+        (273, 4, 1, begins + len(words)),
+    )
     tags += ((278, 4, 1, height), (279, 4, 1, 2 * height * width))
     head = mark + struct.pack(order + "HI", 42, 8) + struct.pack(order + "H", len(tags))
-    head += b"".join(struct.pack(order + "HHII", *tag) for tag in tags) + bytes(4) + words
+    head += (
+        b"".join(struct.pack(order + "HHII", *tag) for tag in tags) + bytes(4) + words
+    )
     path = tmp_path / "a.tif"
     path.write_bytes(head + FRAMES.astype(order + "u2").tobytes())
     assert np.array_equal(tiff_pages.read(path), FRAMES)
@@ -104,22 +144,37 @@ def test_pages_of_unlike_types_are_refused(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         for frame in (FRAMES[0], FRAMES[1].astype(np.uint8)):
             file.write(frame, photometric="minisblack", metadata=None)
-    with pytest.raises(CaptureError, match="frame 1 is uint8, frame 0 uint16; keep one type a file"):
+    with pytest.raises(
+        CaptureError, match="frame 1 is uint8, frame 0 uint16; keep one type a file"
+    ):
         tiff_pages.read(tmp_path / "a.tif")
 
 
-@pytest.mark.skipif(importlib.util.find_spec("imagecodecs") is not None, reason="reads packed values")
+@pytest.mark.skipif(
+    importlib.util.find_spec("imagecodecs") is not None, reason="reads packed values"
+)
 def test_packed_values_are_refused_by_their_width(tmp_path):
     """Two values of 12 bits in three bytes."""
     packed = np.zeros((6, 9), np.uint8).tobytes()
-    about = {"shape": (6, 6), "dtype": "uint16", "bitspersample": 12, "rowsperstrip": 6, "metadata": None}
+    about = {
+        "shape": (6, 6),
+        "dtype": "uint16",
+        "bitspersample": 12,
+        "rowsperstrip": 6,
+        "metadata": None,
+    }
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(iter([packed]), photometric="minisblack", **about)
-    with pytest.raises(CaptureError, match="values of frame 0 are 12 bits wide, packed"):
+    with pytest.raises(
+        CaptureError, match="values of frame 0 are 12 bits wide, packed"
+    ):
         tiff_pages.read(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize("about", [{"byteorder": ">"}, {"bigtiff": True}, {"compression": "zlib", "predictor": True}])
+@pytest.mark.parametrize(
+    "about",
+    [{"byteorder": ">"}, {"bigtiff": True}, {"compression": "zlib", "predictor": True}],
+)
 def test_other_ways_to_lay_counts_are_read_as_the_counts_they_are(tmp_path, about):
     found = capture.load(written(tmp_path, **about))
     assert np.array_equal(found.frames, FRAMES)
@@ -129,14 +184,26 @@ def test_other_ways_to_lay_counts_are_read_as_the_counts_they_are(tmp_path, abou
 @pytest.mark.parametrize("predictor", [1, 2])
 @pytest.mark.parametrize("packing", ["tiff_lzw", "packbits"])
 @pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
-def test_frames_that_other_programs_packed_are_read_as_the_counts_they_are(tmp_path, kind, packing, predictor):
-    """Written by Pillow. Values of all bytes, so that a wrong order of bytes or a difference left in would show."""
+def test_frames_that_other_programs_packed_are_read_as_the_counts_they_are(
+    tmp_path, kind, packing, predictor
+):
+    """Written by Pillow. Values of all bytes, so that a wrong order of bytes or a
+    difference left in would show.
+    """
     if kind == "f4" and predictor == 2:
         pytest.skip("differences are of whole numbers")
-    frames = np.random.default_rng(3).integers(0, 256 if kind == "u1" else 65_536, (3, 37, 53)).astype(kind)
+    frames = (
+        np.random.default_rng(3)
+        .integers(0, 256 if kind == "u1" else 65_536, (3, 37, 53))
+        .astype(kind)
+    )
     pages = [image.fromarray(frame) for frame in frames]
     pages[0].save(
-        tmp_path / "a.tif", save_all=True, append_images=pages[1:], compression=packing, tiffinfo={317: predictor}
+        tmp_path / "a.tif",
+        save_all=True,
+        append_images=pages[1:],
+        compression=packing,
+        tiffinfo={317: predictor},
     )
     found = tiff_pages.read(tmp_path / "a.tif")
     assert found.dtype == frames.dtype
@@ -159,13 +226,20 @@ def test_a_plain_frame_behind_a_packed_one_stays_itself(tmp_path):
     assert np.array_equal(tiff_pages.read(tmp_path / "a.tif"), FRAMES[:2])
 
 
-@pytest.mark.skipif(importlib.util.find_spec("imagecodecs") is not None, reason="reads what is stored")
+@pytest.mark.skipif(
+    importlib.util.find_spec("imagecodecs") is not None, reason="reads what is stored"
+)
 @pytest.mark.parametrize("way_up", [2, 6])
 def test_packed_frames_that_opencv_would_set_upright_are_refused(tmp_path, way_up):
     """Mirrored, or turned on its side: plain ones come as they are stored."""
     path = tmp_path / "a.tif"
     image.fromarray(FRAMES[0]).save(path, tiffinfo={274: way_up})
     assert np.array_equal(tiff_pages.read(path)[0], FRAMES[0])
-    image.fromarray(FRAMES[0]).save(path, compression="tiff_lzw", tiffinfo={274: way_up})
-    with pytest.raises(CaptureError, match=r"compressed \(LZW\) and damaged, turned or of a kind .* plain or deflated"):
+    image.fromarray(FRAMES[0]).save(
+        path, compression="tiff_lzw", tiffinfo={274: way_up}
+    )
+    with pytest.raises(
+        CaptureError,
+        match=r"compressed \(LZW\) and damaged, turned or of a kind .* plain or deflated",
+    ):
         tiff_pages.read(path)

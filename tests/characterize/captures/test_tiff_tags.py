@@ -14,28 +14,55 @@ FRAMES = np.arange(4 * 6 * 5, dtype=np.uint16).reshape(4, 6, 5)
 
 @pytest.mark.parametrize(
     ("unit", "um"),
-    [("nm", 1e-3), ("um", 1.0), ("micron", 1.0), ("mm", 1e3), ("cm", 1e4), ("inch", 25400.0), ("pixel", None)],
+    [
+        ("nm", 1e-3),
+        ("um", 1.0),
+        ("micron", 1.0),
+        ("mm", 1e3),
+        ("cm", 1e4),
+        ("inch", 25400.0),
+        ("pixel", None),
+    ],
 )
 def test_imagej_gives_steps_and_pixels_in_the_unit_that_it_names(tmp_path, unit, um):
-    """Pixels of 1 / 8 unit along x and 1 / 5 along y: that of x. A unit that is no length tells nothing."""
+    """Pixels of 1 / 8 unit along x and 1 / 5 along y: that of x. A unit that is no
+    length tells nothing.
+    """
     about = {"axes": "ZYX", "spacing": 2.5, "unit": unit}
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, resolution=(8.0, 5.0), metadata=about)
+    tifffile.imwrite(
+        tmp_path / "a.tif", FRAMES, imagej=True, resolution=(8.0, 5.0), metadata=about
+    )
     found = tiff_tags.read(tmp_path / "a.tif")
     if um is None:
-        assert (len(found.position_um), math.isnan(found.pixel_um), found.notes) == (0, True, ())
+        assert (len(found.position_um), math.isnan(found.pixel_um), found.notes) == (
+            0,
+            True,
+            (),
+        )
         return
     assert found.pixel_um == pytest.approx(um / 8, rel=1e-12)
     assert found.position_um == pytest.approx(2.5 * um * np.arange(4), rel=1e-12)
-    step, pixel = f"stage step of {2.5 * um:.4g} um from the ImageJ tags", f"pixel of {um / 8:.4g} um from the tags"
+    step, pixel = (
+        f"stage step of {2.5 * um:.4g} um from the ImageJ tags",
+        f"pixel of {um / 8:.4g} um from the tags",
+    )
     assert found.notes == (step, f"{pixel} of the file")
 
 
 @pytest.mark.parametrize(
     ("about", "steps"),
-    [({"unit": "um"}, []), ({"unit": "um", "spacing": 0.0}, []), ({"spacing": 2.5}, [0, 2.5, 5, 7.5])],
+    [
+        ({"unit": "um"}, []),
+        ({"unit": "um", "spacing": 0.0}, []),
+        ({"spacing": 2.5}, [0, 2.5, 5, 7.5]),
+    ],
 )
-def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(tmp_path, about, steps):
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES, imagej=True, metadata={"axes": "ZYX"} | about)
+def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(
+    tmp_path, about, steps
+):
+    tifffile.imwrite(
+        tmp_path / "a.tif", FRAMES, imagej=True, metadata={"axes": "ZYX"} | about
+    )
     found = tiff_tags.read(tmp_path / "a.tif")
     assert found.position_um.tolist() == steps
     assert math.isnan(found.pixel_um)
@@ -43,17 +70,31 @@ def test_no_step_and_no_resolution_tell_nothing_and_no_unit_is_um(tmp_path, abou
 
 
 def test_two_channels_are_refused(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES.reshape(2, 2, 6, 5), imagej=True, metadata={"axes": "ZCYX"})
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        FRAMES.reshape(2, 2, 6, 5),
+        imagej=True,
+        metadata={"axes": "ZCYX"},
+    )
     with pytest.raises(CaptureError, match="2 channels in one file"):
         tiff_tags.read(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize(("unit", "um"), [("nm", 1e-3), ("µm", 1.0), ("mm", 1e3), (None, 1.0)])
+@pytest.mark.parametrize(
+    ("unit", "um"), [("nm", 1e-3), ("µm", 1.0), ("mm", 1e3), (None, 1.0)]
+)
 def test_ome_gives_positions_and_the_pixel_along_x(tmp_path, unit, um):
     about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeY": 0.91}
-    about |= {} if unit is None else {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": "cm"}
-    planes = {"PositionZ": [3.5, 1.5, -2.0, 8.25], "PositionZUnit": ["mm", "um", "nm", "mm"]}
-    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about | {"Plane": planes})
+    about |= (
+        {} if unit is None else {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": "cm"}
+    )
+    planes = {
+        "PositionZ": [3.5, 1.5, -2.0, 8.25],
+        "PositionZUnit": ["mm", "um", "nm", "mm"],
+    }
+    tifffile.imwrite(
+        tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about | {"Plane": planes}
+    )
     found = tiff_tags.read(tmp_path / "a.ome.tif")
     assert found.pixel_um == pytest.approx(0.37 * um, rel=1e-12)
     assert found.position_um == pytest.approx([3500.0, 1.5, -2e-3, 8250.0], rel=1e-12)
@@ -71,7 +112,9 @@ def test_ome_without_positions_gives_steps_of_the_height_of_a_voxel(tmp_path, un
 
 
 def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
-    """The unit first, in single quotes, a micro sign as an entity or a Greek letter: all mean 0.37 and 2.5 um."""
+    """The unit first, in single quotes, a micro sign as an entity or a Greek letter:
+    all mean 0.37 and 2.5 um.
+    """
     about = {"axes": "ZYX", "PhysicalSizeX": 0.37, "PhysicalSizeZ": 2.5}
     about |= {"PhysicalSizeXUnit": "um", "PhysicalSizeZUnit": "um"}
     tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata=about)
@@ -79,8 +122,13 @@ def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
     turned = written
     for axis, nm in (("X", 370), ("Z", 2500)):
         name, um = f"PhysicalSize{axis}", nm / 1000
-        turned = turned.replace(f'{name}="{um}" {name}Unit="um"', f'{name}Unit="nm" {name}="{nm}"')
-    spelt = (written.replace('"um"', f'"{unit}"') for unit in ("&#181;m", "\u00b5m", "&#x3bc;m"))
+        turned = turned.replace(
+            f'{name}="{um}" {name}Unit="um"', f'{name}Unit="nm" {name}="{nm}"'
+        )
+    spelt = (
+        written.replace('"um"', f'"{unit}"')
+        for unit in ("&#181;m", "\u00b5m", "&#x3bc;m")
+    )
     for words in (turned, written.replace('"', "'"), *spelt):
         assert words != written
         tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
@@ -90,7 +138,12 @@ def test_ome_tags_say_the_same_however_they_are_spelt(tmp_path):
 
 
 def test_ome_tags_that_are_no_xml_are_told(tmp_path):
-    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES, ome=True, metadata={"axes": "ZYX", "PhysicalSizeZ": 2.5})
+    tifffile.imwrite(
+        tmp_path / "a.ome.tif",
+        FRAMES,
+        ome=True,
+        metadata={"axes": "ZYX", "PhysicalSizeZ": 2.5},
+    )
     words = tifffile.tiffcomment(tmp_path / "a.ome.tif").replace("<Pixels", "<Pixels<")
     tifffile.tiffcomment(tmp_path / "a.ome.tif", words.encode())
     found = tiff_tags.read(tmp_path / "a.ome.tif")
@@ -98,8 +151,14 @@ def test_ome_tags_that_are_no_xml_are_told(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["imagej", "ome"])
-def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(tmp_path, kind):
-    sizes = {"spacing": 0.3, "unit": "um"} if kind == "imagej" else {"PhysicalSizeZ": 300.0, "PhysicalSizeZUnit": "nm"}
+def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(
+    tmp_path, kind
+):
+    sizes = (
+        {"spacing": 0.3, "unit": "um"}
+        if kind == "imagej"
+        else {"PhysicalSizeZ": 300.0, "PhysicalSizeZUnit": "nm"}
+    )
     frames = np.arange(12 * 6 * 5, dtype=np.uint16).reshape(3, 4, 6, 5)
     for axes, stack, steps in (
         ("TZYX", frames, [0, 1, 2, 3] * 3),
@@ -108,21 +167,38 @@ def test_a_stack_that_is_seen_several_times_steps_through_its_planes_each_time(t
     ):
         if kind == "imagej" and axes == "ZTYX":  # it has an order of its own
             continue
-        tifffile.imwrite(tmp_path / "a.tif", stack, metadata={"axes": axes, **sizes}, **{kind: True})
-        assert tiff_tags.read(tmp_path / "a.tif").position_um == pytest.approx(0.3 * np.array(steps), rel=1e-12)
+        tifffile.imwrite(
+            tmp_path / "a.tif", stack, metadata={"axes": axes, **sizes}, **{kind: True}
+        )
+        assert tiff_tags.read(tmp_path / "a.tif").position_um == pytest.approx(
+            0.3 * np.array(steps), rel=1e-12
+        )
 
 
 def test_two_channels_of_ome_are_refused_and_three_colours_of_a_pixel_are_one(tmp_path):
-    tifffile.imwrite(tmp_path / "a.ome.tif", FRAMES.reshape(2, 2, 6, 5), ome=True, metadata={"axes": "ZCYX"})
+    tifffile.imwrite(
+        tmp_path / "a.ome.tif",
+        FRAMES.reshape(2, 2, 6, 5),
+        ome=True,
+        metadata={"axes": "ZCYX"},
+    )
     with pytest.raises(CaptureError, match="2 channels in one file"):
         tiff_tags.read(tmp_path / "a.ome.tif")
     colours = np.repeat(FRAMES[..., None], 3, -1)
-    tifffile.imwrite(tmp_path / "b.ome.tif", colours, ome=True, photometric="rgb", metadata={"axes": "ZYXS"})
+    tifffile.imwrite(
+        tmp_path / "b.ome.tif",
+        colours,
+        ome=True,
+        photometric="rgb",
+        metadata={"axes": "ZYXS"},
+    )
     assert len(tiff_tags.read(tmp_path / "b.ome.tif").position_um) == 0
 
 
 def test_a_plain_file_tells_nothing(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack", metadata=None)
+    tifffile.imwrite(
+        tmp_path / "a.tif", FRAMES, photometric="minisblack", metadata=None
+    )
     found = tiff_tags.read(tmp_path / "a.tif")
     assert (len(found.position_um), found.notes) == (0, ())
     assert math.isnan(found.pixel_um)

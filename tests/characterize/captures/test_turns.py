@@ -10,7 +10,11 @@ FRAME = np.arange(16.0).reshape(1, 4, 4) ** 2
 
 @pytest.mark.parametrize("first", range(8))
 def test_what_lies_between_two_orientations_leads_from_one_to_the_other(first):
-    """64 pairs of a frame without symmetry; a quarter of a mirrored one turns the other way."""
+    """64 pairs of a frame without symmetry; a quarter of a mirrored one turns the other
+    way.
+    """
     for second in range(8):
-        assert np.array_equal(turn(turn(FRAME, first), between(first, second)), turn(FRAME, second))
+        assert np.array_equal(
+            turn(turn(FRAME, first), between(first, second)), turn(FRAME, second)
+        )
     assert between(first, first) == 0

@@ -6,7 +6,8 @@ import pytest
 from characterize.captures.turns import MIRRORED, TURNS, between, turn
 
 FRAMES = np.array([[[1, 2, 3], [4, 5, 6]], [[11, 12, 13], [14, 15, 16]]])
-LYING = {  # of the first frame: turned against the clock as it is drawn, rows from the top
+# of the first frame: turned against the clock as it is drawn, rows from the top
+LYING = {
     0: [[1, 2, 3], [4, 5, 6]],
     1: [[3, 6], [2, 5], [1, 4]],
     2: [[6, 5, 4], [3, 2, 1]],
@@ -25,7 +26,9 @@ def test_every_frame_of_a_stack_is_turned_alike(orientation):
 
 
 def test_what_lies_between_is_the_one_that_leads_there():
-    """Quarters add up; behind a mirror they count the other way, as two mirrors about axes 45° apart turn by 90°."""
+    """Quarters add up; behind a mirror they count the other way, as two mirrors about
+    axes 45° apart turn by 90°.
+    """
     assert [between(0, k) for k in range(8)] == list(range(8))
     assert [between(1, k) for k in range(8)] == [3, 0, 1, 2, 5, 6, 7, 4]
     assert [between(6, k) for k in range(8)] == [6, 7, 4, 5, 2, 3, 0, 1]

@@ -1,4 +1,6 @@
-"""From a lens file to captures, and from captures to the as-built lens, on the command line."""
+"""From a lens file to captures, and from captures to the as-built lens, on the command
+line.
+"""
 
 import json
 import subprocess
@@ -48,7 +50,15 @@ def bench(tmp_path):
 
 def shoot(bench, *more):
     return main(
-        ["capture", str(bench / "lens.h5"), "--truth", str(bench / "truth.toml"), "-o", str(bench / "shots"), *more]
+        [
+            "capture",
+            str(bench / "lens.h5"),
+            "--truth",
+            str(bench / "truth.toml"),
+            "-o",
+            str(bench / "shots"),
+            *more,
+        ]
     )
 
 
@@ -61,9 +71,18 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert shoot(bench) == 2  # exists
     assert shoot(bench, "--force", "--quiet") == 0
     assert store.sha256(bench / "shots" / "frame_000.tif") == first
-    (bench / "told.toml").write_text('scan_um = 60.0\n[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n')
+    (bench / "told.toml").write_text(
+        'scan_um = 60.0\n[[known]]\nname = "height_nm"\nvalue = 0.0\nsigma = 2.0\n'
+    )
     capsys.readouterr()
-    words = ["fit", str(bench / "shots"), "--design", str(bench / "lens.h5"), "--metrology", str(bench / "told.toml")]
+    words = [
+        "fit",
+        str(bench / "shots"),
+        "--design",
+        str(bench / "lens.h5"),
+        "--metrology",
+        str(bench / "told.toml"),
+    ]
     words += ["--truth", str(bench / "truth.toml")]
     assert main([*words, "-o", str(bench / "as.h5"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -76,19 +95,43 @@ def test_capture_then_fit(bench, capsys, fine_pictures):
     assert "the hidden truth" in page
     the_psfs_are_those_of_the_made_lens(bench)
     for shown, title in (("shots", "Frames"), ("as.h5", "Captured less fitted")):
-        assert main(["view", str(bench / shown), "-o", str(bench / "page.html"), "--force", "--quiet"]) == 0
-        assert f'"title": "{title}"' in (bench / "page.html").read_text(encoding="utf-8")
+        assert (
+            main(
+                [
+                    "view",
+                    str(bench / shown),
+                    "-o",
+                    str(bench / "page.html"),
+                    "--force",
+                    "--quiet",
+                ]
+            )
+            == 0
+        )
+        assert f'"title": "{title}"' in (bench / "page.html").read_text(
+            encoding="utf-8"
+        )
 
 
 def the_psfs_are_those_of_the_made_lens(bench):
-    """``metalens psf`` of an as-built file: the record's own PSFs, and not those of the design."""
+    """``metalens psf`` of an as-built file: the record's own PSFs, and not those of the
+    design.
+    """
     (bench / "psf.toml").write_text(
         "depths_mm = [0.5, 0.7, 0.2]\nangles_deg = [0.0]\nwindow_um = 24.0\nsamples = 32\ntolerance = 1e-3\n"
     )
     for source in ("as", "lens"):
-        words = ["psf", str(bench / f"{source}.h5"), "--config", str(bench / "psf.toml"), "--quiet"]
+        words = [
+            "psf",
+            str(bench / f"{source}.h5"),
+            "--config",
+            str(bench / "psf.toml"),
+            "--quiet",
+        ]
         assert main([*words, "-o", str(bench / f"{source}_psf.h5")]) == 0
-    built, design = (psf.load(bench / f"{name}_psf.h5").intensity for name in ("as", "lens"))
+    built, design = (
+        psf.load(bench / f"{name}_psf.h5").intensity for name in ("as", "lens")
+    )
     want = (
         asbuilt.load(bench / "as.h5")
         .psf_stack(psf.View((500.0, 700.0), ((0.0, 0.0),), 24.0, 32), tolerance=1e-3)
@@ -99,7 +142,19 @@ def the_psfs_are_those_of_the_made_lens(bench):
 
 
 def test_bad_words_end_with_2_and_leave_nothing(bench):
-    assert main(["fit", str(bench / "none"), "--design", str(bench / "lens.h5"), "-o", str(bench / "a.h5")]) == 2
+    assert (
+        main(
+            [
+                "fit",
+                str(bench / "none"),
+                "--design",
+                str(bench / "lens.h5"),
+                "-o",
+                str(bench / "a.h5"),
+            ]
+        )
+        == 2
+    )
     assert main(["fit", str(bench / "none"), "-o", str(bench / "a.h5")]) == 2
     (bench / "truth.toml").write_text(TRUTH.replace("bias_nm", "bais_nm"))
     assert shoot(bench) == 2
@@ -113,5 +168,7 @@ def test_commands_of_the_bench_and_their_help_do_without_torch():
         "\n".join(f"import characterize.commands.{name}" for name in names)
         + "\nimport sys\nprint('torch' in sys.modules)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert told.stdout.split() == ["False"]

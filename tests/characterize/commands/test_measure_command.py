@@ -1,4 +1,6 @@
-"""``metalens measure``: numbers of drawn spots and drawn pillars, in files that other tools read."""
+"""``metalens measure``: numbers of drawn spots and drawn pillars, in files that other
+tools read.
+"""
 
 import csv
 import json
@@ -23,33 +25,50 @@ from metalens.pillars.proxy import Proxy
 
 
 def spots(folder, sigma_um, pixel_um=0.9):
-    """Gaussian spots on a background, one a depth; D4 sigma is 4 sigma, FWHM 2.355 sigma, MTF50 0.1874 / sigma."""
+    """Gaussian spots on a background, one a depth; D4 sigma is 4 sigma, FWHM 2.355
+    sigma, MTF50 0.1874 / sigma.
+    """
     folder.mkdir()
     rng = np.random.default_rng(2)
     axis = (np.arange(41) - 20) * pixel_um
     lines = ["file,depth_um"]
     for i, sigma in enumerate(sigma_um):
-        light = 9000 * np.exp(-((axis[None] - 0.7) ** 2 + (axis[:, None] + 0.4) ** 2) / 2 / sigma**2)
-        counts = np.rint(light + 120 + 2 * rng.standard_normal(light.shape)).astype(np.uint16)
+        light = 9000 * np.exp(
+            -((axis[None] - 0.7) ** 2 + (axis[:, None] + 0.4) ** 2) / 2 / sigma**2
+        )
+        counts = np.rint(light + 120 + 2 * rng.standard_normal(light.shape)).astype(
+            np.uint16
+        )
         tifffile.imwrite(folder / f"f{i}.tif", counts)
         lines.append(f"f{i}.tif,{500 + 100 * i}")
     (folder / "stage.csv").write_text("\n".join(lines) + "\n")
-    (folder / "capture.toml").write_text(f"pixel_um = {pixel_um}\nwavelength_um = 0.85\nbits = 16\n")
+    (folder / "capture.toml").write_text(
+        f"pixel_um = {pixel_um}\nwavelength_um = 0.85\nbits = 16\n"
+    )
 
 
 def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
     sigmas = (4.1, 3.2, 2.7, 3.0, 3.9)
     spots(tmp_path / "shots", sigmas)
-    assert main(["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out"), "--quiet"]) == 0
+    assert (
+        main(
+            ["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out"), "--quiet"]
+        )
+        == 0
+    )
     with open(tmp_path / "out" / "frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     for row, sigma in zip(rows, sigmas, strict=True):
-        wide = math.hypot(sigma, 0.9 / math.sqrt(12) * 0)  # drawn at the pixels' middles
+        wide = math.hypot(
+            sigma, 0.9 / math.sqrt(12) * 0
+        )  # drawn at the pixels' middles
         assert float(row["fwhm_um"]) == pytest.approx(2.3548 * wide, rel=0.02)
         assert float(row["mtf50_x_per_um"]) == pytest.approx(0.18739 / wide, rel=0.02)
         assert float(row["centroid_x_um"]) == pytest.approx(0.7, abs=0.1)
         assert float(row["centroid_y_um"]) == pytest.approx(-0.4, abs=0.1)
-        assert float(row["efficiency"]) != float(row["efficiency"])  # no reference: not known
+        assert float(row["efficiency"]) != float(
+            row["efficiency"]
+        )  # no reference: not known
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     (best,) = told["best_depth"]
     assert 690 < best["depth_um"] < 760
@@ -58,9 +77,12 @@ def test_captures_give_spot_sizes_and_the_sharpest_depth(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("sigmas", "end"), [((2.7, 3.0, 3.9, 4.1), 500), ((4.1, 3.4, 3.0), 700), ((3.9, 3.0, 3.6), None)]
+    ("sigmas", "end"),
+    [((2.7, 3.0, 3.9, 4.1), 500), ((4.1, 3.4, 3.0), 700), ((3.9, 3.0, 3.6), None)],
 )
-def test_a_sharpest_depth_that_is_the_first_or_last_is_told(tmp_path, capsys, sigmas, end):
+def test_a_sharpest_depth_that_is_the_first_or_last_is_told(
+    tmp_path, capsys, sigmas, end
+):
     spots(tmp_path / "shots", sigmas)
     assert main(["measure", str(tmp_path / "shots"), "-o", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
@@ -70,32 +92,65 @@ def test_a_sharpest_depth_that_is_the_first_or_last_is_told(tmp_path, capsys, si
 
 
 def test_light_beside_that_of_an_empty_aperture_is_the_efficiency(tmp_path):
-    """A circle of three widths at half height holds 1 - exp(-(3 x 2.3548 / 2)² / 2) = 0.998 of a Gaussian's light."""
+    """A circle of three widths at half height holds 1 - exp(-(3 x 2.3548 / 2)² / 2) =
+    0.998 of a Gaussian's light.
+    """
     spots(tmp_path / "shots", (3.0, 2.5, 2.8))
     light = 9000 * 2 * math.pi * (2.5 / 0.9) ** 2
     words = ["--reference-e", str(1.25 * light), "-o", str(tmp_path / "out"), "--quiet"]
     assert main(["measure", str(tmp_path / "shots"), *words]) == 0
     row = json.loads((tmp_path / "out" / "measure.json").read_text())["frames"][1]
-    assert row["efficiency"] == pytest.approx(0.998 / 1.25, rel=0.02)  # pixels cut by the circle, the border's median
+    assert row["efficiency"] == pytest.approx(
+        0.998 / 1.25, rel=0.02
+    )  # pixels cut by the circle, the border's median
 
 
 def test_an_edge_gives_the_modulation_across_it(tmp_path):
-    """An edge blurred by a Gaussian of 1.7 pixels and by the pixels: MTF sinc(f) exp(-2 (pi f 1.7)²), f a pixel."""
+    """An edge blurred by a Gaussian of 1.7 pixels and by the pixels: MTF sinc(f) exp(-2
+    (pi f 1.7)²), f a pixel.
+    """
     y, x = np.mgrid[:90, :80]
     across = (x - 38.3 + 0.12 * (y - 44)) / math.hypot(1, 0.12)
     light = 200 + 3000 * special.ndtr(across / math.hypot(1.7, 1 / math.sqrt(12)))
     tifffile.imwrite(tmp_path / "edge.tif", np.rint(light).astype(np.uint16))
     out = tmp_path / "out"
-    assert main(["measure", str(tmp_path / "edge.tif"), "--edge-um", "2.4", "-o", str(out), "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "measure",
+                str(tmp_path / "edge.tif"),
+                "--edge-um",
+                "2.4",
+                "-o",
+                str(out),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     rows = np.loadtxt(out / "edge.csv", delimiter=",", skiprows=1)
     f = rows[:, 0] * 2.4
     want = np.sinc(f) * np.exp(-2 * (math.pi * f * 1.7) ** 2)
     low = f < 0.2
-    assert np.abs(rows[low, 1] - want[low]).max() < 0.02  # of the metric; the box of a pixel is nearly a Gaussian
+    assert (
+        np.abs(rows[low, 1] - want[low]).max() < 0.02
+    )  # of the metric; the box of a pixel is nearly a Gaussian
     half = float(np.interp(-0.5, -want[f < 0.4], f[f < 0.4])) / 2.4
-    assert json.loads((out / "measure.json").read_text())["mtf50_per_um"] == pytest.approx(half, rel=0.02)
+    assert json.loads((out / "measure.json").read_text())[
+        "mtf50_per_um"
+    ] == pytest.approx(half, rel=0.02)
     assert (out / "measure.html").is_file()
-    both = ["measure", str(tmp_path / "edge.tif"), "--edge-um", "2.4", "--pixel-nm", "4", "-o", str(out), "--quiet"]
+    both = [
+        "measure",
+        str(tmp_path / "edge.tif"),
+        "--edge-um",
+        "2.4",
+        "--pixel-nm",
+        "4",
+        "-o",
+        str(out),
+        "--quiet",
+    ]
     assert main(both) == 2
 
 
@@ -104,12 +159,24 @@ def test_a_micrograph_gives_every_pillar(tmp_path):
     image = test_sem.render(truth, missing={(1, 2)})
     counts = np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16)
     tifffile.imwrite(tmp_path / "sem.tif", counts)
-    arguments = ["measure", str(tmp_path / "sem.tif"), "-o", str(tmp_path / "out"), "--pixel-nm", "4.0", "--quiet"]
+    arguments = [
+        "measure",
+        str(tmp_path / "sem.tif"),
+        "-o",
+        str(tmp_path / "out"),
+        "--pixel-nm",
+        "4.0",
+        "--quiet",
+    ]
     assert main(arguments) == 0
     with open(tmp_path / "out" / "pillars.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows].count("missing") == 1
-    error = [float(r["diameter_nm"]) - t for r, t in zip(rows, truth.ravel(), strict=True) if r["state"] == "good"]
+    error = [
+        float(r["diameter_nm"]) - t
+        for r, t in zip(rows, truth.ravel(), strict=True)
+        if r["state"] == "good"
+    ]
     assert len(error) == 15
     assert np.abs(np.mean(error)) < 1.2
     assert main(arguments) == 2  # exists
@@ -117,16 +184,35 @@ def test_a_micrograph_gives_every_pillar(tmp_path):
 
 @pytest.mark.parametrize("repeats", [False, True])
 def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats):
-    """A mask of unlike pillars holds the picture once; where all its rows and columns come again, it may lie twice."""
+    """A mask of unlike pillars holds the picture once; where all its rows and columns
+    come again, it may lie twice.
+    """
     drawn = np.random.default_rng(4).uniform(160, 280, (4, 4))
-    mask = np.tile(drawn, (2, 2)) if repeats else np.pad(drawn, 2, mode="wrap")[:7, :7] + np.arange(7) ** 2
+    mask = (
+        np.tile(drawn, (2, 2))
+        if repeats
+        else np.pad(drawn, 2, mode="wrap")[:7, :7] + np.arange(7) ** 2
+    )
     cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
-    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
+    )
     drawn_map = DiameterMap(mask * 1e-3, cell.pitch_um)
-    lenses.save(tmp_path / "lens.h5", Lens(drawn_map, cell, proxy, 0.85, 100.0, 1e3, "map"))
+    lenses.save(
+        tmp_path / "lens.h5", Lens(drawn_map, cell, proxy, 0.85, 100.0, 1e3, "map")
+    )
     image = test_sem.render(drawn if repeats else mask[2:6, 2:6])
-    tifffile.imwrite(tmp_path / "sem.tif", np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16))
-    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    tifffile.imwrite(
+        tmp_path / "sem.tif", np.clip((image + 0.5) * 2e4, 0, 65535).astype(np.uint16)
+    )
+    arguments = [
+        "measure",
+        str(tmp_path / "sem.tif"),
+        "--pixel-nm",
+        "4.0",
+        "--design",
+        str(tmp_path / "lens.h5"),
+    ]
     assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["place_is_clear"] != repeats
@@ -135,25 +221,44 @@ def test_no_bias_table_where_two_places_of_the_mask_fit_alike(tmp_path, repeats)
 
 
 def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, capsys):
-    """A pixel stated 1.7 % too large makes pillars of 220 nm 3.7 nm too wide; the mask's lattice tells by how much."""
+    """A pixel stated 1.7 % too large makes pillars of 220 nm 3.7 nm too wide; the
+    mask's lattice tells by how much.
+    """
     mask = np.random.default_rng(4).uniform(160, 280, (7, 7))
     cell = Cell(pitch_um=test_sem.PITCH * 1e-3, pillar=Index(3.6))
-    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
+    )
     drawn = DiameterMap(mask * 1e-3, cell.pitch_um)
     lenses.save(tmp_path / "lens.h5", Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
-    image = np.clip((test_sem.render(mask[1:6, 2:7]) + 0.5) * 2e4, 0, 65535).astype(np.uint16)  # pixels of 4 nm
+    image = np.clip((test_sem.render(mask[1:6, 2:7]) + 0.5) * 2e4, 0, 65535).astype(
+        np.uint16
+    )  # pixels of 4 nm
     tifffile.imwrite(tmp_path / "sem.tif", image)
-    arguments = ["measure", str(tmp_path / "sem.tif"), "--design", str(tmp_path / "lens.h5"), "--pixel-nm"]
+    arguments = [
+        "measure",
+        str(tmp_path / "sem.tif"),
+        "--design",
+        str(tmp_path / "lens.h5"),
+        "--pixel-nm",
+    ]
     assert main([*arguments, "4.068", "-o", str(tmp_path / "out")]) == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["place_is_clear"]
-    assert told["pitch_over_design"] == pytest.approx(1.017, abs=5e-4)  # 0.1 pixels at either end of 4 x 100
+    assert told["pitch_over_design"] == pytest.approx(
+        1.017, abs=5e-4
+    )  # 0.1 pixels at either end of 4 x 100
     assert told["bias_nm"] == []
     assert not (tmp_path / "out" / "bias.toml").exists()
     better = capsys.readouterr().out.split("--pixel-nm ")[1].split()[0]
     assert main([*arguments, better, "-o", str(tmp_path / "again")]) == 0
     assert "what the microscope adds" in capsys.readouterr().out
-    assert main([*arguments, better, "--edge-bias-nm", "0.3", "-o", str(tmp_path / "told")]) == 0
+    assert (
+        main(
+            [*arguments, better, "--edge-bias-nm", "0.3", "-o", str(tmp_path / "told")]
+        )
+        == 0
+    )
     assert "what the microscope adds" not in capsys.readouterr().out
     told = json.loads((tmp_path / "again" / "measure.json").read_text())
     assert max(abs(bias) for _, bias, *_ in told["bias_nm"]) < 1.5
@@ -161,54 +266,107 @@ def test_no_bias_table_on_a_pixel_that_the_mask_shows_to_be_wrong(tmp_path, caps
 
 
 def _lens_file(path, cell, drawn_nm):
-    proxy = Proxy(np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[1.0, 2.0]]), np.array([[0.9]]), (0.1, 0.35), (0.85, 0.85), 0.0, 0.0
+    )
     drawn = DiameterMap(drawn_nm * 1e-3, cell.pitch_um, cell.lattice)
     lenses.save(path, Lens(drawn, cell, proxy, 0.85, 100.0, 1e3, "map"))
 
 
 def test_a_picture_of_a_hexagonal_lens_gives_its_bias_table(tmp_path):
-    """Pillars drawn 3.3 nm wider than made; blur moves either edge by less than 0.3 of a pixel of 4 nm."""
+    """Pillars drawn 3.3 nm wider than made; blur moves either edge by less than 0.3 of
+    a pixel of 4 nm.
+    """
     pitch_nm, pixel_nm = 400.0, 4.0
     random = np.random.default_rng(6)
     mask = random.uniform(170, 260, (13, 16)) * (np.indices((13, 16)).sum(0) % 2 == 0)
-    _lens_file(tmp_path / "lens.h5", Cell(pitch_um=0.4, pillar=Index(3.6), lattice=Lattice("hexagonal")), mask)
+    _lens_file(
+        tmp_path / "lens.h5",
+        Cell(pitch_um=0.4, pillar=Index(3.6), lattice=Lattice("hexagonal")),
+        mask,
+    )
     rows, columns = np.nonzero(mask[3:9, 2:12])
     y, x = np.mgrid[:480, :500]
     image = np.full(y.shape, 0.25)
     for row, column in zip(rows, columns, strict=True):
-        cy, cx = ((row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm, (column + 0.7) * 0.5 * pitch_nm / pixel_nm)
-        out_px = np.hypot(y - cy, x - cx) - (mask[3 + row, 2 + column] - 3.3) / 2 / pixel_nm
+        cy, cx = (
+            (row + 0.5) * 0.75**0.5 * pitch_nm / pixel_nm,
+            (column + 0.7) * 0.5 * pitch_nm / pixel_nm,
+        )
+        out_px = (
+            np.hypot(y - cy, x - cx) - (mask[3 + row, 2 + column] - 3.3) / 2 / pixel_nm
+        )
         image = np.maximum(image, 0.25 + 0.6 * special.expit(-2 * out_px))
     image += 0.02 * random.standard_normal(image.shape)
     tifffile.imwrite(tmp_path / "sem.tif", (image * 4e4).astype(np.uint16))
-    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    arguments = [
+        "measure",
+        str(tmp_path / "sem.tif"),
+        "--pixel-nm",
+        "4.0",
+        "--design",
+        str(tmp_path / "lens.h5"),
+    ]
     assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 0
     told = json.loads((tmp_path / "out" / "measure.json").read_text())
     assert told["lattice"] == "hexagonal"
     assert told["pitch_over_design"] == pytest.approx(1.0, abs=1e-3)
-    assert [bias for _, bias, *_ in told["bias_nm"]] == pytest.approx([-3.3] * len(told["bias_nm"]), abs=0.6 * pixel_nm)
+    assert [bias for _, bias, *_ in told["bias_nm"]] == pytest.approx(
+        [-3.3] * len(told["bias_nm"]), abs=0.6 * pixel_nm
+    )
     assert (tmp_path / "out" / "bias.toml").is_file()
 
 
 @pytest.mark.parametrize("shape", [Square(), Circle(hole=True)])
-def test_pillars_whose_diameter_is_not_what_is_drawn_are_refused(tmp_path, capsys, shape):
-    """A circle through the sides of a square is 1.12 times as wide as its side: a bias of 25 nm that is none."""
-    _lens_file(tmp_path / "lens.h5", Cell(pitch_um=0.4, pillar=Index(3.6), shape=shape), np.full((7, 7), 220.0))
+def test_pillars_whose_diameter_is_not_what_is_drawn_are_refused(
+    tmp_path, capsys, shape
+):
+    """A circle through the sides of a square is 1.12 times as wide as its side: a bias
+    of 25 nm that is none.
+    """
+    _lens_file(
+        tmp_path / "lens.h5",
+        Cell(pitch_um=0.4, pillar=Index(3.6), shape=shape),
+        np.full((7, 7), 220.0),
+    )
     image = np.clip(test_sem.render(np.full((4, 4), 220.0)) * 2e4, 0, 65535)
     tifffile.imwrite(tmp_path / "sem.tif", image.astype(np.uint16))
-    arguments = ["measure", str(tmp_path / "sem.tif"), "--pixel-nm", "4.0", "--design", str(tmp_path / "lens.h5")]
+    arguments = [
+        "measure",
+        str(tmp_path / "sem.tif"),
+        "--pixel-nm",
+        "4.0",
+        "--design",
+        str(tmp_path / "lens.h5"),
+    ]
     assert main([*arguments, "-o", str(tmp_path / "out"), "--quiet"]) == 2
     assert "--design takes round pillars" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(tmp_path, capsys):
-    """Bars of 60 x 28 pixels at 100: their edges lie 14 to 33 pixels from the middle, on no circle."""
+def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(
+    tmp_path, capsys
+):
+    """Bars of 60 x 28 pixels at 100: their edges lie 14 to 33 pixels from the middle,
+    on no circle.
+    """
     y, x = np.indices((400, 400)) % 100 - 49.5
     bar = (np.abs(x) < 30) & (np.abs(y) < 14)
     picture = 40 + 120 * bar + 3 * np.random.default_rng(3).standard_normal(bar.shape)
     tifffile.imwrite(tmp_path / "a.tif", picture.astype(np.uint8))
-    assert main(["measure", str(tmp_path / "a.tif"), "--pixel-nm", "4", "-o", str(tmp_path / "out")]) == 1
+    assert (
+        main(
+            [
+                "measure",
+                str(tmp_path / "a.tif"),
+                "--pixel-nm",
+                "4",
+                "-o",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 1
+    )
     told = capsys.readouterr().out
     assert "  FAILED: most sites hold no round pillar: is the lattice of" in told
     assert "--pitch-nm states it" in told
@@ -216,7 +374,9 @@ def test_a_lattice_on_which_most_pillars_are_no_discs_ends_1_and_says_so(tmp_pat
 
 
 def test_writing_below_a_micrograph_changes_no_pillar(tmp_path, capsys):
-    """A strip of 120 rows, high enough for a row of sites, with a bar of 125 pixels: 500 nm, of pixels of 4 nm."""
+    """A strip of 120 rows, high enough for a row of sites, with a bar of 125 pixels:
+    500 nm, of pixels of 4 nm.
+    """
     picture = test_sem.render(np.random.default_rng(8).uniform(150, 250, (4, 4)))
     grey = np.clip(60 + 120 * picture, 0, 254).astype(np.uint8)
     strip = np.zeros((120, grey.shape[1]), np.uint8)
@@ -224,7 +384,22 @@ def test_writing_below_a_micrograph_changes_no_pillar(tmp_path, capsys):
     for name, image in (("bare", grey), ("written", np.concatenate([grey, strip]))):
         tifffile.imwrite(tmp_path / f"{name}.tif", image)
         scale = ["--pixel-nm", "4"] if name == "bare" else ["--bar-nm", "500"]
-        assert main(["measure", str(tmp_path / f"{name}.tif"), *scale, "-o", str(tmp_path / name)]) == 0
-        assert ("120 rows of writing below" in capsys.readouterr().out) == (name == "written")
-    bare, written = ((tmp_path / name / "pillars.csv").read_text() for name in ("bare", "written"))
+        assert (
+            main(
+                [
+                    "measure",
+                    str(tmp_path / f"{name}.tif"),
+                    *scale,
+                    "-o",
+                    str(tmp_path / name),
+                ]
+            )
+            == 0
+        )
+        assert ("120 rows of writing below" in capsys.readouterr().out) == (
+            name == "written"
+        )
+    bare, written = (
+        (tmp_path / name / "pillars.csv").read_text() for name in ("bare", "written")
+    )
     assert bare == written

@@ -27,7 +27,9 @@ from metalens.cell import Cell
 
 @pytest.mark.parametrize("side", [4, 6, 16])
 def test_frames_in_order_stay_so_in_windows_that_the_light_fills(side):
-    """Less a plane through their rim, such frames may sum to nothing or less; no number may grow beyond bounds."""
+    """Less a plane through their rim, such frames may sum to nothing or less; no number
+    may grow beyond bounds.
+    """
     shots = b.capture(b.electrons())
     middle = slice(8 - side // 2, 8 + side // 2)
     shots = dataclasses.replace(shots, frames=shots.frames[:, middle, middle])
@@ -42,10 +44,14 @@ def test_frames_in_order_stay_so_in_windows_that_the_light_fills(side):
 
 @functools.lru_cache
 def helix():
-    """A double helix of 40 um: its image turns with depth, and half a turn changes it by a part in 2000."""
+    """A double helix of 40 um: its image turns with depth, and half a turn changes it
+    by a part in 2000.
+    """
     focus = profiles.Focus(0.85, 110.0, 600.0)
     phase = design.phase_of(profiles.DoubleHelix(3), focus, radius_um=20.0)
-    return design.make(phase, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=b.proxy())[0]
+    return design.make(
+        phase, focus, aperture_um=40.0, cell=Cell(pitch_um=0.4), proxy=b.proxy()
+    )[0]
 
 
 def task_of(shots, lens):
@@ -56,39 +62,72 @@ def task_of(shots, lens):
 
 
 def laid(way, *, peak_e=6000.0):
-    """How frames of a helix as made seem to lie whose camera lies some way, and how a fit takes them."""
+    """How frames of a helix as made seem to lie whose camera lies some way, and how a
+    fit takes them.
+    """
     light = bench.irradiance(helix(), b.truth(), b.RESPONSE)
     shots = b.capture(light * (peak_e / light.max()) + bench.background(b.truth()))
-    shots = dataclasses.replace(shots, frames=np.ascontiguousarray(turn(shots.frames, way)))
+    shots = dataclasses.replace(
+        shots, frames=np.ascontiguousarray(turn(shots.frames, way))
+    )
     whole = task_of(shots, helix())
     found = whole.found
-    return found, search.oriented([estimate._as_laid(whole, one) for one in (found, *found.others)]).found
+    return found, search.oriented(
+        [estimate._as_laid(whole, one) for one in (found, *found.others)]
+    ).found
 
 
-@pytest.mark.parametrize(("way", "back"), [(0, 0), (2, 2), (3, 1), (4, 4), (6, 6), (7, 7)])
+@pytest.mark.parametrize(
+    ("way", "back"), [(0, 0), (2, 2), (3, 1), (4, 4), (6, 6), (7, 7)]
+)
 def test_half_a_turn_that_images_hardly_show_is_told_by_a_fit(way, back):
-    """As made, images are alike to 0.956, turned by 180° to 0.953: the plainer of the two was taken."""
+    """As made, images are alike to 0.956, turned by 180° to 0.953: the plainer of the
+    two was taken.
+    """
     seen, taken = laid(way)
-    assert (taken.orientation, taken.clearly, taken.reordered, taken.alike) == (back, back != 0, False, ())
-    assert abs(seen.stage_zero_um - b.VALUES["stage_zero_um"]) < 20  # astigmatism moves the best focus by as much
+    assert (taken.orientation, taken.clearly, taken.reordered, taken.alike) == (
+        back,
+        back != 0,
+        False,
+        (),
+    )
+    assert (
+        abs(seen.stage_zero_um - b.VALUES["stage_zero_um"]) < 20
+    )  # astigmatism moves the best focus by as much
 
 
 @pytest.mark.parametrize("way", [1, 5])
 def test_frames_of_a_camera_on_its_side_that_are_not_square_lie_as_if_never_turned(way):
-    """Of 12 rows and 16 columns as the lens has them; the camera wrote 16 rows and 12 columns."""
+    """Of 12 rows and 16 columns as the lens has them; the camera wrote 16 rows and 12
+    columns.
+    """
     light = bench.irradiance(helix(), b.truth(), b.RESPONSE)
     shots = b.capture(light * (6000.0 / light.max()) + bench.background(b.truth()))
-    wide = dataclasses.replace(shots, frames=np.ascontiguousarray(shots.frames[:, 2:14]))
-    aside = dataclasses.replace(shots, frames=np.ascontiguousarray(turn(wide.frames, way)))
+    wide = dataclasses.replace(
+        shots, frames=np.ascontiguousarray(shots.frames[:, 2:14])
+    )
+    aside = dataclasses.replace(
+        shots, frames=np.ascontiguousarray(turn(wide.frames, way))
+    )
     plain, turned = (task_of(some, helix()) for some in (wide, aside))
     assert turned.data.electrons.shape == (5, 16, 12)
-    back = next(k for k in range(8) if np.array_equal(turn(turn(wide.frames, way), k), wide.frames))
-    assert (turned.found.orientation, turned.found.clearly, plain.found.clearly) == (back, True, False)
+    back = next(
+        k
+        for k in range(8)
+        if np.array_equal(turn(turn(wide.frames, way), k), wide.frames)
+    )
+    assert (turned.found.orientation, turned.found.clearly, plain.found.clearly) == (
+        back,
+        True,
+        False,
+    )
     laid, stays = (estimate._as_laid(task, task.found) for task in (turned, plain))
     assert np.array_equal(laid.data.electrons, stays.data.electrons)
     x = vector(b.VALUES)
     got, want = (task.model.images(x)[0] for task in (laid, stays))
-    assert np.abs(got - want).max() < 1e-9 * want.max()  # sums of 1e3 terms, in an order of their own
+    assert (
+        np.abs(got - want).max() < 1e-9 * want.max()
+    )  # sums of 1e3 terms, in an order of their own
 
 
 def test_half_a_turn_that_noise_hides_is_said():
@@ -97,17 +136,34 @@ def test_half_a_turn_that_noise_hides_is_said():
 
 
 @pytest.mark.parametrize(
-    ("ends", "turned"), [((9000.0, 9500.0), False), ((9300.0, 9265.0), False), ((9300.0, 9250.0), True)]
+    ("ends", "turned"),
+    [((9000.0, 9500.0), False), ((9300.0, 9265.0), False), ((9300.0, 9250.0), True)],
 )
-def test_a_turn_is_taken_where_it_is_better_once_both_fits_have_gone_on(monkeypatch, ends, turned):
-    """Short fits put the turned frames 100 ahead; what counts is where both end, and 40 between these."""
+def test_a_turn_is_taken_where_it_is_better_once_both_fits_have_gone_on(
+    monkeypatch, ends, turned
+):
+    """Short fits put the turned frames 100 ahead; what counts is where both end, and 40
+    between these.
+    """
     shots = b.capture(b.electrons())
     plain = task_of(shots, b.lens())
-    tasks = [plain, dataclasses.replace(plain, found=dataclasses.replace(plain.found, orientation=1, clearly=True))]
+    tasks = [
+        plain,
+        dataclasses.replace(
+            plain, found=dataclasses.replace(plain.found, orientation=1, clearly=True)
+        ),
+    ]
     merit = {0: 9600.0, 1: 9500.0}
-    shorts = [types.SimpleNamespace(value=np.full(1, float(k)), merit=merit[k]) for k in merit]
-    monkeypatch.setattr(search, "_short", lambda task, few, begins: [shorts[task.found.orientation]])
+    shorts = [
+        types.SimpleNamespace(value=np.full(1, float(k)), merit=merit[k]) for k in merit
+    ]
+    monkeypatch.setattr(
+        search, "_short", lambda task, few, begins: [shorts[task.found.orientation]]
+    )
     monkeypatch.setattr(search, "starts", lambda task, **_: [])
-    gone_on = lambda images, data, begin, **_: types.SimpleNamespace(merit=ends[int(begin[0])])  # noqa: E731
+
+    def gone_on(images, data, begin, **_):
+        return types.SimpleNamespace(merit=ends[int(begin[0])])
+
     monkeypatch.setattr(search.leastsquares, "fit", gone_on)
     assert search.oriented(tasks).found.orientation == int(turned)

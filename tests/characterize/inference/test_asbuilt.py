@@ -1,4 +1,6 @@
-"""The reduced model against the sum over every pillar, its derivatives, and the fit of a hidden lens."""
+"""The reduced model against the sum over every pillar, its derivatives, and the fit of
+a hidden lens.
+"""
 
 import dataclasses
 import sys
@@ -67,15 +69,24 @@ def against_all_pillars(model, **more):
 
 
 def test_reduced_model_agrees_with_the_sum_over_every_pillar(model):
-    assert against_all_pillars(model) < 1e-3  # low-rank pillars 5e-4 in t, window operators 5e-4
+    assert (
+        against_all_pillars(model) < 1e-3
+    )  # low-rank pillars 5e-4 in t, window operators 5e-4
 
 
 def test_tilt_and_source_beside_the_axis_agree_too(model):
-    assert against_all_pillars(model, tilt_x_deg=0.3, source_x_um=5.0, source_y_um=-3.0, pinhole_um=6.0) < 2e-3
+    assert (
+        against_all_pillars(
+            model, tilt_x_deg=0.3, source_x_um=5.0, source_y_um=-3.0, pinhole_um=6.0
+        )
+        < 2e-3
+    )
 
 
 def test_uneven_light_agrees_with_the_sum_over_every_pillar(model):
-    """30 % more light at one rim, 20 % less at another: amplitudes, one by one, on the bench."""
+    """30 % more light at one rim, 20 % less at another: amplitudes, one by one, on the
+    bench.
+    """
     assert against_all_pillars(model, light_x=0.26, light_y=-0.22, light_r=0.15) < 1e-3
 
 
@@ -85,60 +96,96 @@ def test_low_rank_pillars_know_their_error():
     assert pillars.error < 1e-3
 
 
-SIDES = ("width_nm", "length_nm", "turn_deg")  # of rectangles, below: round pillars have none
+SIDES = (
+    "width_nm",
+    "length_nm",
+    "turn_deg",
+)  # of rectangles, below: round pillars have none
 FILMS = ("pedestal_nm", "cap_nm")  # of pillars in layers
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES, *FILMS)])
+@pytest.mark.parametrize(
+    "name", [n for n in NAMES if n not in ("bandwidth_nm", *SIDES, *FILMS)]
+)
 def test_derivatives_match_finite_differences(model, name):
-    x = vector(b.VALUES | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0} | GLASS)
+    x = vector(
+        b.VALUES
+        | {"pinhole_um": 8.0, "tilt_x_deg": 0.3, "source_x_um": 6.0, "log_gain": 10.0}
+        | GLASS
+    )
     slopes_are_differences(model, name, x)
 
 
 def slopes_are_differences(model, name, x):
-    # images are in single precision: of a wall, that acts little, its rounding would be 2 % of so small a difference
+    # images are in single precision: of a wall, that acts little, its rounding would be
+    # 2 % of so small a difference
     h = (0.3 if name == "sidewall_deg" else 0.1) * PARAMETERS[PLACE[name]].scale
     up, down = x.copy(), x.copy()
     up[PLACE[name]] += h
     down[PLACE[name]] -= h
     want = (model.images(up)[0] - model.images(down)[0]) / (2 * h)
     slope = model.images(x, [name])[1][0]
-    assert np.abs(slope - want).max() < 2e-2 * np.abs(want).max()  # operators of derivatives are cut at 3e-3 of all
+    assert (
+        np.abs(slope - want).max() < 2e-2 * np.abs(want).max()
+    )  # operators of derivatives are cut at 3e-3 of all
 
 
 @pytest.fixture(scope="module")
 def of_rectangles():
     """Slopes by sides and turn, and by edges beyond the size, as of some rectangle."""
     lens = dataclasses.replace(b.lens(), cell=Cell(0.4, shape=Rectangle(0.7)))
-    rows = np.vstack([b.RESPONSE.coefficients, [[0.1 + 12j, 70j], [0.2 + 7j, 30j], [-0.5 + 0.8j, 4j]]])
-    response = dataclasses.replace(b.RESPONSE, coefficients=rows, edges=np.array([[0.1 + 6j, 40j]]))
+    rows = np.vstack(
+        [
+            b.RESPONSE.coefficients,
+            [[0.1 + 12j, 70j], [0.2 + 7j, 30j], [-0.5 + 0.8j, 4j]],
+        ]
+    )
+    response = dataclasses.replace(
+        b.RESPONSE, coefficients=rows, edges=np.array([[0.1 + 6j, 40j]])
+    )
     return ForwardModel(lens, SETTING, response)
 
 
 @pytest.mark.parametrize("name", [*SIDES, "bias_nm", "bias_x_nm"])
-def test_derivatives_by_sides_edges_and_turn_match_finite_differences(of_rectangles, name):
-    x = vector(b.VALUES | {"log_gain": 10.0, "width_nm": 3.0, "length_nm": -2.0, "turn_deg": 0.7})
+def test_derivatives_by_sides_edges_and_turn_match_finite_differences(
+    of_rectangles, name
+):
+    x = vector(
+        b.VALUES
+        | {"log_gain": 10.0, "width_nm": 3.0, "length_nm": -2.0, "turn_deg": 0.7}
+    )
     slopes_are_differences(of_rectangles, name, x)
 
 
 def test_a_point_source_has_a_slope_by_its_size(model):
-    """Light changes as the square of the size: no slope at 0. That of 0.3 pixels is taken, twice the chord to there."""
+    """Light changes as the square of the size: no slope at 0. That of 0.3 pixels is
+    taken, twice the chord to there.
+    """
     x = vector(b.VALUES)
     slope = model.images(x, ["pinhole_um"])[1][0]
     for i, depth in enumerate(b.DEPTHS):
         size = 0.3 * 1.5 * depth * 1.004 / 112.0
-        chord = (model.images(vector(b.VALUES | {"pinhole_um": size}))[0] - model.images(x)[0])[i] / size
+        chord = (
+            model.images(vector(b.VALUES | {"pinhole_um": size}))[0]
+            - model.images(x)[0]
+        )[i] / size
         assert np.abs(slope[i] - 2 * chord).max() < 0.1 * np.abs(2 * chord).max()
 
 
 def test_a_point_source_is_not_thrown_to_the_bound_of_its_size():
-    """Without a slope at 0 a search jumps to 2 mm, and the size comes back with a sigma of 1e36."""
+    """Without a slope at 0 a search jumps to 2 mm, and the size comes back with a sigma
+    of 1e36.
+    """
     free = dataclasses.replace(USUAL, free=("pinhole_um",))
-    found = characterize.fit(b.capture(b.electrons(), seed=1), b.lens(), free, response=b.RESPONSE)
+    found = characterize.fit(
+        b.capture(b.electrons(), seed=1), b.lens(), free, response=b.RESPONSE
+    )
     i = found.names.index("pinhole_um")
     assert found.trusted
     assert found.value[i] < 4
-    assert 0.3 < found.sigma[i] < 10  # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
+    assert (
+        0.3 < found.sigma[i] < 10
+    )  # 0.45 um on the sensor, where a pixel of 1.5 um and its crosstalk blur too
 
 
 def test_hidden_lens_is_found_within_its_intervals(fitted):
@@ -147,11 +194,14 @@ def test_hidden_lens_is_found_within_its_intervals(fitted):
     assert 0.93 < fitted.chi2_per_dof < 1.07  # sqrt(2 / 1250) is 0.04
     names = [n for n in fitted.names if n != "log_gain"]
     z = [
-        (fitted.value[fitted.names.index(n)] - b.VALUES.get(n, 0.0)) / fitted.sigma[fitted.names.index(n)]
+        (fitted.value[fitted.names.index(n)] - b.VALUES.get(n, 0.0))
+        / fitted.sigma[fitted.names.index(n)]
         for n in names
     ]
     z = np.array(z) * fitted.sigma[[fitted.names.index(n) for n in names]]
-    z /= np.sqrt(np.diag(fitted.within_covariance))[[fitted.names.index(n) for n in names]]
+    z /= np.sqrt(np.diag(fitted.within_covariance))[
+        [fitted.names.index(n) for n in names]
+    ]
     assert np.abs(z).max() < 4
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
@@ -171,21 +221,31 @@ def test_degeneracies_are_named(fitted):
 def test_what_is_not_fitted_is_declared_and_nothing_is_found_where_nothing_is(fitted):
     assert "residuals lean" not in " ".join(fitted.cautions)
     assert "slopes of the pillars" not in " ".join(fitted.cautions)  # known to 8 %
-    assert any("glass" in words and "would be taken for" in words for words in fitted.degeneracies)
+    assert any(
+        "glass" in words and "would be taken for" in words
+        for words in fitted.degeneracies
+    )
 
 
 def test_orientation_of_a_symmetric_design_is_declared_unobservable(fitted):
-    assert any("orientation of the frames cannot be seen" in words for words in fitted.cautions)
+    assert any(
+        "orientation of the frames cannot be seen" in words for words in fitted.cautions
+    )
 
 
 def test_what_cannot_be_told_is_reckoned_with_beside_the_model(fitted):
-    """A plate of glass moves the stage zero, a source of some size the blur; the interval holds that of the model."""
+    """A plate of glass moves the stage zero, a source of some size the blur; the
+    interval holds that of the model.
+    """
     assert "a plate of glass in the beam" in fitted.most("stage_zero_um")
     assert "a source of finite size" in fitted.most("crosstalk_px")
     for name in fitted.names:
         low, high = fitted.within_model(name)
         i = fitted.names.index(name)
-        middle, more = float(fitted.value[i]), fitted.covariance[i, i] - fitted.within.covariance[i, i]
+        middle, more = (
+            float(fitted.value[i]),
+            fitted.covariance[i, i] - fitted.within.covariance[i, i],
+        )
         want = middle + np.hypot(high - middle, 1.959964 * np.sqrt(max(more, 0.0)))
         assert fitted.interval(name)[1] == pytest.approx(want, rel=1e-6)
         assert fitted.interval(name)[0] <= low
@@ -211,7 +271,9 @@ def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
     rng = np.random.default_rng(3)
     powers = rng.normal(size=(3, 4, 7)) + 1j * rng.normal(size=(3, 4, 7))
     solved = Solved(0.8471, np.linspace(0.071, 0.233, 7), powers)
-    built = dataclasses.replace(fitted, response=dataclasses.replace(fitted.response, solved=solved))
+    built = dataclasses.replace(
+        fitted, response=dataclasses.replace(fitted.response, solved=solved)
+    )
     built.save(tmp_path / "asbuilt.h5")
     read = AsBuilt.load(tmp_path / "asbuilt.h5").response.solved
     assert read.wavelength_um == 0.8471
@@ -220,7 +282,9 @@ def test_pillars_of_a_solver_come_back_too(fitted, tmp_path):
 
 
 def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path):
-    """The PSFs of a file are those of the fit, and of the hidden lens; a draw of the posterior gives others."""
+    """The PSFs of a file are those of the fit, and of the hidden lens; a draw of the
+    posterior gives others.
+    """
     fitted.save(tmp_path / "a.h5")
     again = AsBuilt.load(tmp_path / "a.h5")
     stack = again.psf()
@@ -234,19 +298,31 @@ def test_psfs_of_the_as_built_lens_hold_process_and_wave_front(fitted, tmp_path)
         depths_um=stack.depths_um,
         window_um=24.0,
         samples=stack.intensity.shape[-1],
-        offset_um=[b.VALUES[n] - fitted.value[fitted.names.index(n)] for n in ("decentre_x_um", "decentre_y_um")],
+        offset_um=[
+            b.VALUES[n] - fitted.value[fitted.names.index(n)]
+            for n in ("decentre_x_um", "decentre_y_um")
+        ],
     )
     found = stack.intensity[0]
-    assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(want.intensity)  # intervals of the fit
+    assert np.linalg.norm(found - want.intensity) < 0.03 * np.linalg.norm(
+        want.intensity
+    )  # intervals of the fit
     view = View((600.0,), ((0.0, 0.0), (0.05, 0.0)), 24.0, 48)
     draw = again.psf_stack(view, again.lens_samples(1, seed=2)[0])
     best = again.psf_stack(view)
     assert draw.intensity.shape == (2, 1, 48, 48)
-    assert 1e-4 < np.linalg.norm(draw.intensity - best.intensity) / np.linalg.norm(best.intensity) < 0.05
+    assert (
+        1e-4
+        < np.linalg.norm(draw.intensity - best.intensity)
+        / np.linalg.norm(best.intensity)
+        < 0.05
+    )
 
 
 def clipped(low, high):
-    """Standard deviation of a normal number that is set to ``low`` below it, and to ``high`` above it."""
+    """Standard deviation of a normal number that is set to ``low`` below it, and to
+    ``high`` above it.
+    """
     below, above = stats.norm.cdf(low), stats.norm.sf(high)
     mean = low * below + high * above + stats.norm.pdf(low) - stats.norm.pdf(high)
     inner = 1 - below - above + low * stats.norm.pdf(low) - high * stats.norm.pdf(high)
@@ -257,27 +333,46 @@ def test_samples_have_the_posterior_covariance_but_for_what_bounds_cut_off(fitte
     """A bias along x may be 2 sigma from its bound: 3 % of its spread lies on it."""
     count = 20000
     rows = asbuilt.usual(fitted.names, fitted.design)
-    low, high = (np.array([getattr(row, side) for row in rows]) - fitted.value for side in ("low", "high"))
-    reach = np.clip([low / fitted.sigma, high / fitted.sigma], -1e3, 1e3)  # no infinity times 0
+    low, high = (
+        np.array([getattr(row, side) for row in rows]) - fitted.value
+        for side in ("low", "high")
+    )
+    reach = np.clip(
+        [low / fitted.sigma, high / fitted.sigma], -1e3, 1e3
+    )  # no infinity times 0
     draws = fitted.samples(count, seed=0)
     want = fitted.sigma * clipped(*reach)
-    assert draws.std(0) == pytest.approx(want, rel=4 / np.sqrt(2 * count))  # 4 sigma of a standard deviation
+    assert draws.std(0) == pytest.approx(
+        want, rel=4 / np.sqrt(2 * count)
+    )  # 4 sigma of a standard deviation
     far = np.abs(reach).min(0) > 3  # there bounds take less than 0.005 of the variance
     assert far.sum() > 15
-    own = fitted.within_covariance + fitted.bench  # what the mask takes along is not drawn anew
-    for drawn, covariance in ((draws, fitted.covariance), (fitted.lens_samples(count, seed=3), own)):
+    own = (
+        fitted.within_covariance + fitted.bench
+    )  # what the mask takes along is not drawn anew
+    for drawn, covariance in (
+        (draws, fitted.covariance),
+        (fitted.lens_samples(count, seed=3), own),
+    ):
         sigma = np.sqrt(np.diag(covariance))
         unlike = (np.cov(drawn.T) - covariance) / np.outer(sigma, sigma)
-        assert np.abs(unlike[np.ix_(far, far)]).max() < 0.005 + 4 * np.sqrt(2 / count)  # 4 sigma of a variance
+        assert np.abs(unlike[np.ix_(far, far)]).max() < 0.005 + 4 * np.sqrt(
+            2 / count
+        )  # 4 sigma of a variance
     sigma = fitted.sigma
-    assert (np.linalg.eigvalsh((fitted.covariance - own) / np.outer(sigma, sigma)) > -1e-9).mean() > 0.5
+    assert (
+        np.linalg.eigvalsh((fitted.covariance - own) / np.outer(sigma, sigma)) > -1e-9
+    ).mean() > 0.5
 
 
 def test_as_built_lens_goes_through_the_psf_engine(fitted):
     lens = fitted.lens()
     grown = lens.diameters.diameter_um - b.lens().diameters.diameter_um
     inside = b.lens().diameters.diameter_um > 0
-    assert abs(grown[inside].mean() * 1e3 - fitted.value[fitted.names.index("bias_nm")]) < 1.0
+    assert (
+        abs(grown[inside].mean() * 1e3 - fitted.value[fitted.names.index("bias_nm")])
+        < 1.0
+    )
     stack = psf.psf_stack(
         lens.phase_rad(),
         lens.transmission(),
@@ -328,13 +423,22 @@ def test_what_is_never_fitted_is_stated_by_its_size_alone():
 
 
 def test_what_is_stated_is_not_reckoned_with():
-    """No glass, a point source, a mask of one field, a measured pixel: none of them widens an interval any more."""
+    """No glass, a point source, a mask of one field, a measured pixel: none of them
+    widens an interval any more.
+    """
     stated = {"glass_um": 0.0, "pinhole_um": 0.0, "pixel_sigma_um": 0.0}
     shots = b.capture(b.electrons())
     shots = dataclasses.replace(shots, about=shots.about | stated)
-    options = dataclasses.replace(USUAL, known=(Known("stitching_nm", 0.0), Known("sidewall_deg", 0.0)))
-    found = characterize.fit(shots, b.lens(), options, response=dataclasses.replace(b.RESPONSE, error=0.23))
-    assert "slopes of the pillars by height and index are known to 23% only" in found.cautions
+    options = dataclasses.replace(
+        USUAL, known=(Known("stitching_nm", 0.0), Known("sidewall_deg", 0.0))
+    )
+    found = characterize.fit(
+        shots, b.lens(), options, response=dataclasses.replace(b.RESPONSE, error=0.23)
+    )
+    assert (
+        "slopes of the pillars by height and index are known to 23% only"
+        in found.cautions
+    )
     assert found.causes
     for word in ("glass", "source of finite", "write field", "pixel", "side wall"):
         assert not any(word in cause for cause in found.causes), word
@@ -346,7 +450,9 @@ def test_effective_index_slopes_scale_as_a_waveguide():
     height, index, wall = found.at(d)[:3]
     k = 2 * np.pi / 0.85
     phase = b.lens().proxy.phase_rad(d, 0.85)
-    assert np.allclose(np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02)  # phase = k n_eff h
+    assert np.allclose(
+        np.diff(height.imag), np.diff(phase) / 0.7, rtol=0.02
+    )  # phase = k n_eff h
     assert (height.imag > k).all()  # guided: n_eff above that of air
     assert (index.imag > 0).all()
     assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light

@@ -1,4 +1,6 @@
-"""How far a valley is from a parabola, in closed form: two sigma either way, of what is left when another is held."""
+"""How far a valley is from a parabola, in closed form: two sigma either way, of what is
+left when another is held.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ from characterize.inference.posterior import Valley
 
 RNG = np.random.default_rng(13)
 SIGMA, BENT, SHAPE = 0.37, 0.07, (2, 5, 7)
-PICTURES = RNG.normal(size=(3, *SHAPE)) + 0.6 * RNG.normal(size=SHAPE)  # overlap: parameters are correlated
+PICTURES = RNG.normal(size=(3, *SHAPE)) + 0.6 * RNG.normal(
+    size=SHAPE
+)  # overlap: parameters are correlated
 CURVE = RNG.normal(size=SHAPE)
 MODE = np.array([0.0, 1.7, -0.4])
 
@@ -23,9 +27,16 @@ def model(x, jacobian):
 def valley(**bounds):
     everywhere = np.ones(SHAPE, bool)
     seen = model(MODE, False)[0] + SIGMA * RNG.uniform(-2, 2, SHAPE)
-    data = Data(seen, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15))
+    data = Data(
+        seen, everywhere, ~everywhere, np.full(SHAPE, SIGMA**2), np.full(SHAPE, 1e15)
+    )
     free = Prior.none(MODE)
-    return Valley(model, data, MODE, Prior(free.mean, free.sigma, bounds.get("low", free.low), free.high))
+    return Valley(
+        model,
+        data,
+        MODE,
+        Prior(free.mean, free.sigma, bounds.get("low", free.low), free.high),
+    )
 
 
 def test_a_quadratic_term_is_missed_by_four_times_itself_at_two_sigma():

@@ -21,12 +21,18 @@ def known(wide_nm):
     return {"bandwidth_nm": Known("bandwidth_nm", wide_nm, 0.2)}
 
 
-@pytest.mark.parametrize(("low_um", "high_um", "wide_nm"), [(0.84, 0.86, 14.0), (0.846, 0.853, 2.5), (0.85, 0.85, 0.9)])
+@pytest.mark.parametrize(
+    ("low_um", "high_um", "wide_nm"),
+    [(0.84, 0.86, 14.0), (0.846, 0.853, 2.5), (0.85, 0.85, 0.9)],
+)
 def test_a_spectrum_within_twice_the_library_is_quiet(low_um, high_um, wide_nm):
     assert verdict.colours(lens(low_um, high_um), known(wide_nm)) == []
 
 
-@pytest.mark.parametrize(("low_um", "high_um", "wide_nm"), [(0.84, 0.86, 15.1), (0.846, 0.853, 5.1), (0.85, 0.85, 1.1)])
+@pytest.mark.parametrize(
+    ("low_um", "high_um", "wide_nm"),
+    [(0.84, 0.86, 15.1), (0.846, 0.853, 5.1), (0.85, 0.85, 1.1)],
+)
 def test_a_wider_one_is_told(low_um, high_um, wide_nm):
     (words,) = verdict.colours(lens(low_um, high_um), known(wide_nm))
     assert f"from {850 - 2 * wide_nm:.0f} to {850 + 2 * wide_nm:.0f} nm" in words

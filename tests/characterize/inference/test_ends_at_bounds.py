@@ -1,4 +1,6 @@
-"""Ends of intervals where others sit on their bounds: against every way to hold them, one after the other."""
+"""Ends of intervals where others sit on their bounds: against every way to hold them,
+one after the other.
+"""
 
 import itertools
 
@@ -15,7 +17,9 @@ COUNT = 4
 
 
 def enumerated(curvature, gradient, low, high):
-    """The least between bounds: of all ways to hold each low, high or not at all, the least that stays inside."""
+    """The least between bounds: of all ways to hold each low, high or not at all, the
+    least that stays inside.
+    """
     best, lowest = None, np.inf
     for way in itertools.product((-1, 0, 1), repeat=len(low)):
         way = np.array(way)
@@ -26,15 +30,21 @@ def enumerated(curvature, gradient, low, high):
         pull = gradient + curvature @ step
         step[free] = -np.linalg.solve(curvature[np.ix_(free, free)], pull[free])
         value = step @ (curvature @ step / 2 + gradient)
-        if ((step >= low - ROUNDING) & (step <= high + ROUNDING)).all() and value < lowest:
+        if (
+            (step >= low - ROUNDING) & (step <= high + ROUNDING)
+        ).all() and value < lowest:
             best, lowest = step, value
     return best
 
 
 def drawn(seed, *, close=0.9):
-    """Columns that are nearly alike, so that all go together; data; bounds, some of them none or on the start."""
+    """Columns that are nearly alike, so that all go together; data; bounds, some of
+    them none or on the start.
+    """
     rng = np.random.default_rng([seed, 5])
-    mixed = np.linalg.cholesky(np.full((COUNT, COUNT), close) + (1 - close) * np.eye(COUNT))
+    mixed = np.linalg.cholesky(
+        np.full((COUNT, COUNT), close) + (1 - close) * np.eye(COUNT)
+    )
     columns = rng.standard_normal((12, COUNT)) @ mixed.T * rng.uniform(0.3, 3, COUNT)
     low, high = -rng.exponential(0.4, COUNT), rng.exponential(0.4, COUNT)
     low[rng.random(COUNT) < 0.25], high[rng.random(COUNT) < 0.25] = 0.0, np.inf
@@ -44,7 +54,9 @@ def drawn(seed, *, close=0.9):
 @pytest.mark.parametrize("seed", range(40))
 def test_least_between_bounds_is_the_best_of_all_ways_to_hold_them(seed):
     columns, target, low, high = drawn(seed)
-    high[seed % COUNT] = low[seed % COUNT] = 0.07 if seed % 3 == 0 else low[seed % COUNT]
+    high[seed % COUNT] = low[seed % COUNT] = (
+        0.07 if seed % 3 == 0 else low[seed % COUNT]
+    )
     curvature, gradient = columns.T @ columns, -columns.T @ target
     found = constrained.between(curvature, gradient, low, high)
     assert found == pytest.approx(enumerated(curvature, gradient, low, high), abs=1e-12)
@@ -53,7 +65,12 @@ def test_least_between_bounds_is_the_best_of_all_ways_to_hold_them(seed):
 
 def test_what_is_not_known_at_all_does_not_move():
     curvature = np.diag([2.0, 0.0, 1.0])
-    found = constrained.between(curvature, np.array([2.0, 0.0, -3.0]), np.full(3, -5.0), np.array([5.0, 5.0, 1.0]))
+    found = constrained.between(
+        curvature,
+        np.array([2.0, 0.0, -3.0]),
+        np.full(3, -5.0),
+        np.array([5.0, 5.0, 1.0]),
+    )
     assert found == pytest.approx([-1.0, 0.0, 1.0], abs=1e-12)
 
 
@@ -64,12 +81,25 @@ def valley(seed):
     curvature, gradient = columns.T @ columns, -columns.T @ target
     mode = enumerated(curvature, gradient, low, high)
     everywhere = np.ones((1, 3, 4), bool)
-    data = Data(target.reshape(1, 3, 4), everywhere, ~everywhere, np.ones((1, 3, 4)), np.full((1, 3, 4), 1e15))
+    data = Data(
+        target.reshape(1, 3, 4),
+        everywhere,
+        ~everywhere,
+        np.ones((1, 3, 4)),
+        np.full((1, 3, 4), 1e15),
+    )
 
     def model(x, jacobian):
-        return (columns @ x).reshape(1, 3, 4), columns.T.reshape(COUNT, 1, 3, 4) if jacobian else None
+        return (columns @ x).reshape(1, 3, 4), columns.T.reshape(
+            COUNT, 1, 3, 4
+        ) if jacobian else None
 
-    return Valley(model, data, mode, Prior(np.zeros(COUNT), wide, low, high)), (curvature, gradient, low, high)
+    return Valley(model, data, mode, Prior(np.zeros(COUNT), wide, low, high)), (
+        curvature,
+        gradient,
+        low,
+        high,
+    )
 
 
 def profile(i, place, curvature, gradient, low, high):
@@ -78,7 +108,9 @@ def profile(i, place, curvature, gradient, low, high):
     step = np.zeros(COUNT)
     step[i] = place
     pull = (gradient + curvature[:, i] * place)[others]
-    step[others] = enumerated(curvature[np.ix_(others, others)], pull, low[others], high[others])
+    step[others] = enumerated(
+        curvature[np.ix_(others, others)], pull, low[others], high[others]
+    )
     return step @ (curvature @ step + 2 * gradient)
 
 
@@ -86,7 +118,9 @@ def profile(i, place, curvature, gradient, low, high):
 def test_ends_reach_as_far_as_the_best_way_to_hold_the_others_lets_them(seed):
     about, problem = valley(seed)
     low, high = problem[2:]
-    held = (np.abs(about.mode - low) < ROUNDING) | (np.abs(about.mode - high) < ROUNDING)
+    held = (np.abs(about.mode - low) < ROUNDING) | (
+        np.abs(about.mode - high) < ROUNDING
+    )
     assert held.any()
     for i in range(COUNT):
         least = profile(i, about.mode[i], *problem)
@@ -103,4 +137,6 @@ def test_ends_reach_as_far_as_the_best_way_to_hold_the_others_lets_them(seed):
             assert found.lower is None
             assert found.place == pytest.approx(want, abs=1e-6 * about.sigma[i])
             for place, rise in found.seen:
-                assert rise == pytest.approx(profile(i, place, *problem) - least, abs=ROUNDING)
+                assert rise == pytest.approx(
+                    profile(i, place, *problem) - least, abs=ROUNDING
+                )

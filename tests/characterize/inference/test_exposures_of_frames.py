@@ -1,4 +1,6 @@
-"""Frames of unlike exposures: light behind them grows with the exposure, what nobody subtracted does not."""
+"""Frames of unlike exposures: light behind them grows with the exposure, what nobody
+subtracted does not.
+"""
 
 import dataclasses
 import sys
@@ -21,13 +23,23 @@ SETTING = Setting(np.array(DEPTHS), np.zeros((3, 2)), EXPOSURE, 1.5, 16, 16)
 PLANE = {"background_e": 60.0, "background_x_e": 9.0, "background_y_e": -14.0}
 
 
-@pytest.mark.parametrize(("dark_known", "glow"), [(True, EXPOSURE), (False, np.ones(3))])
-def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_subtracted(dark_known, glow):
-    """Pixel (3, 11) lies 3/8 of the way to the right edge, 5/8 to the upper one. Slopes by finite differences, which
+@pytest.mark.parametrize(
+    ("dark_known", "glow"), [(True, EXPOSURE), (False, np.ones(3))]
+)
+def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_subtracted(
+    dark_known, glow
+):
+    """Pixel (3, 11) lies 3/8 of the way to the right edge, 5/8 to the upper one. Slopes
+    by finite differences, which
     are exact of what is linear: to rounding of float64 differences of 60 electrons."""
     setting = dataclasses.replace(SETTING, dark_known=dark_known)
-    model, x = ForwardModel(b.lens(), setting, b.RESPONSE), vector(PLANE | {"log_gain": 12.0})
-    assert background(x, setting)[:, 3, 11] == pytest.approx(glow * (60 + 9 * 3 / 8 + 14 * 5 / 8))
+    model, x = (
+        ForwardModel(b.lens(), setting, b.RESPONSE),
+        vector(PLANE | {"log_gain": 12.0}),
+    )
+    assert background(x, setting)[:, 3, 11] == pytest.approx(
+        glow * (60 + 9 * 3 / 8 + 14 * 5 / 8)
+    )
     slopes = model.images(x, list(PLANE))[1]
     for name, slope in zip(PLANE, slopes, strict=True):
         step = np.zeros_like(x)
@@ -37,28 +49,44 @@ def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_su
 
 
 def shot(model):
-    """(x, data): 6000 electrons at the peak of the longest exposure, each frame by its own, shot and read noise."""
+    """(x, data): 6000 electrons at the peak of the longest exposure, each frame by its
+    own, shot and read noise.
+    """
     x = vector(b.VALUES | PLANE | {"log_gain": 1.0})
     longest = dataclasses.replace(model.setting, exposure=np.ones(3))
-    light = ForwardModel(b.lens(), longest, b.RESPONSE).images(x)[0] - background(x, longest)
+    light = ForwardModel(b.lens(), longest, b.RESPONSE).images(x)[0] - background(
+        x, longest
+    )
     scale = 6000 / light.max()
     y, across = ((np.arange(16) - 8) / 8 for _ in range(2))
-    electrons = EXPOSURE[:, None, None] * (scale * light + 60 + 9 * across - 14 * y[:, None])
+    electrons = EXPOSURE[:, None, None] * (
+        scale * light + 60 + 9 * across - 14 * y[:, None]
+    )
     electrons = electrons + np.random.default_rng(5).normal(0, np.sqrt(electrons + 9))
     everywhere = np.ones(electrons.shape, bool)
-    data = b.Data(electrons, everywhere, ~everywhere, np.full(electrons.shape, 9.0), np.ones(electrons.shape))
+    data = b.Data(
+        electrons,
+        everywhere,
+        ~everywhere,
+        np.full(electrons.shape, 9.0),
+        np.ones(electrons.shape),
+    )
     x[PLACE["log_gain"]] = 1.0 + np.log(scale)
     return x, data
 
 
 def test_a_fit_of_them_explains_the_frames_and_begins_at_their_background():
-    """Chi-square of 768 pixels is 1 to 0.05; of a background that is one for all frames it is 4.7."""
+    """Chi-square of 768 pixels is 1 to 0.05; of a background that is one for all frames
+    it is 4.7.
+    """
     model = ForwardModel(b.lens(), SETTING, b.RESPONSE)
     x, data = shot(model)
     found = SimpleNamespace(shift_px=np.zeros(2), stage_zero_um=0.0, distance_um=0.0)
     task = Task(model, data, x, {}, found)
     first = search.starts(task, biases_nm=(0.0,))[0]
-    assert first[PLACE["background_e"]] == pytest.approx(60, abs=12)  # a median: the blur's rim is in it
+    assert first[PLACE["background_e"]] == pytest.approx(
+        60, abs=12
+    )  # a median: the blur's rim is in it
     end = refine(task, x[[PLACE[name] for name in task.names]])
     assert end.chi2_per_dof == pytest.approx(1, abs=0.2)
     for name, value in PLANE.items():
@@ -78,7 +106,9 @@ def test_exposures_of_one_depth_are_not_made_one_where_nobody_says_what_is_count
     for capture, count, known in ((twice, 5, True), (blind, 10, False)):
         after, merged = prepare.merged(capture, clean(capture))
         assert len(after.frames) == len(merged.electrons) == count
-        assert any("fitted one by one" in words for words in merged.corrections) == (not known)
+        assert any("fitted one by one" in words for words in merged.corrections) == (
+            not known
+        )
         assert prepare.setting_of(after, 16)[0].dark_known == known
     alike = dataclasses.replace(blind, exposure_s=np.full(10, 2.0))
     assert len(prepare.merged(alike, clean(alike))[0].frames) == 5

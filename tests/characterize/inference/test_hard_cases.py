@@ -1,4 +1,6 @@
-"""Captures as benches really give them: right within the intervals, or refused with the cause named."""
+"""Captures as benches really give them: right within the intervals, or refused with the
+cause named.
+"""
 
 import dataclasses
 import functools
@@ -40,7 +42,9 @@ def right(result, **more):
     """All fitted parameters within 4.5 sigma of the truth, and 2 sigma in the mean."""
     truth = b.VALUES | more
     pairs = [(i, n) for i, n in enumerate(result.names) if n != "log_gain"]
-    z = np.array([(result.value[i] - truth.get(n, 0.0)) / result.sigma[i] for i, n in pairs])
+    z = np.array(
+        [(result.value[i] - truth.get(n, 0.0)) / result.sigma[i] for i, n in pairs]
+    )
     return result.trusted and np.abs(z).max() < 4.5 and np.sqrt((z**2).mean()) < 2
 
 
@@ -55,12 +59,21 @@ def test_shuffled_order_is_recovered():
     assert right(found)
 
 
-@pytest.mark.parametrize("wave", [(0.35, -0.37), pytest.param((0.32, 0.28), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "wave", [(0.35, -0.37), pytest.param((0.32, 0.28), marks=pytest.mark.slow)]
+)
 def test_opposite_astigmatism_is_not_mistaken_for_the_true_one(wave):
-    """Sources all near the focus: the lens with the opposite even aberrations gives nearly the same images."""
+    """Sources all near the focus: the lens with the opposite even aberrations gives
+    nearly the same images.
+    """
     depths = 560.0, 590.0, 620.0, 650.0
     values = dict(zip(("astigmatism_rad", "coma_x_rad"), wave, strict=True))
-    values |= {"bias_nm": -2.5, "bias_r_nm": -3.9, "height_nm": -2.5, "crosstalk_px": 0.2}
+    values |= {
+        "bias_nm": -2.5,
+        "bias_r_nm": -3.9,
+        "height_nm": -2.5,
+        "crosstalk_px": 0.2,
+    }
     known = tuple(Known(name, value) for name, value in values.items())
     truth = Truth(depths, parameter=known, camera=Camera(pixel_um=1.5, pixels=12))
     light = bench.irradiance(b.lens(), truth, b.RESPONSE)
@@ -113,7 +126,12 @@ def test_reversed_order_is_recovered():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("stage_zero_um", 60.0), ("stage_zero_um", -60.0), ("stage_scale", 0.02), ("stage_scale", -0.02)],
+    [
+        ("stage_zero_um", 60.0),
+        ("stage_zero_um", -60.0),
+        ("stage_scale", 0.02),
+        ("stage_scale", -0.02),
+    ],
 )
 def test_stage_errors_are_found(name, value):
     found = fit(b.capture(b.electrons(**{name: value})), options=Options(scan_um=100.0))
@@ -125,11 +143,15 @@ FAR = (15e3, 17e3, 20e3, 24e3, 28e3)
 
 @functools.lru_cache
 def far_lens(twist=False):
-    """0.4 mm wide, focused on 20 mm; with ``twist`` its image turns with depth (double helix)."""
+    """0.4 mm wide, focused on 20 mm; with ``twist`` its image turns with depth (double
+    helix).
+    """
     focus = profiles.Focus(0.85, 2000.0, 20e3)
     shape = profiles.DoubleHelix(3) if twist else None
     phase = design.phase_of(shape, focus, radius_um=200.0)
-    return design.make(phase, focus, aperture_um=400.0, cell=Cell(pitch_um=0.4), proxy=b.proxy())[0]
+    return design.make(
+        phase, focus, aperture_um=400.0, cell=Cell(pitch_um=0.4), proxy=b.proxy()
+    )[0]
 
 
 def far_shots(twist=False, **more):
@@ -144,15 +166,21 @@ def far_shots(twist=False, **more):
 @pytest.mark.slow
 @pytest.mark.parametrize("zero_um", [2000.0, -2000.0])
 def test_a_stage_zero_of_two_millimetres_is_found(zero_um):
-    found = characterize.fit(far_shots(stage_zero_um=zero_um), far_lens(), response=b.RESPONSE)
+    found = characterize.fit(
+        far_shots(stage_zero_um=zero_um), far_lens(), response=b.RESPONSE
+    )
     assert right(found, stage_zero_um=zero_um, background_x_e=0.0)
 
 
 @pytest.mark.slow
 def test_reversed_frames_of_a_twisting_image_are_put_in_order_and_not_mirrored():
-    """Its image turns with depth, so that reversing and mirroring are near twins; only one of them was done."""
+    """Its image turns with depth, so that reversing and mirroring are near twins; only
+    one of them was done.
+    """
     shots = far_shots(twist=True)
-    found = characterize.fit(frames_of(shots, shots.frames[::-1]), far_lens(True), response=b.RESPONSE)
+    found = characterize.fit(
+        frames_of(shots, shots.frames[::-1]), far_lens(True), response=b.RESPONSE
+    )
     assert any("order [4, 3, 2, 1, 0]" in words for words in found.cautions)
     assert right(found, stage_zero_um=0.0, background_x_e=0.0)
 
@@ -160,13 +188,21 @@ def test_reversed_frames_of_a_twisting_image_are_put_in_order_and_not_mirrored()
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [1, 2])
 def test_flipped_frames_of_an_asymmetric_lens_say_that_turn_and_mirror_are_alike(axis):
-    """x³ + y³ flipped is x³ + y³ turned, with x and y exchanged: named, since no frame can tell them apart."""
+    """x³ + y³ flipped is x³ + y³ turned, with x and y exchanged: named, since no frame
+    can tell them apart.
+    """
     shots = b.capture(b.electrons(strength_rad=8.0))
     found = fit_or_cause(frames_of(shots, np.flip(shots.frames, axis)), 8.0)
     assert not isinstance(found, str)
     assert any("frames fit the design only turned" in words for words in found.cautions)
-    assert any("mirrored" in words and "cannot be seen" in words for words in found.cautions)
-    names = [n for n in found.names if n in ("bias_nm", "bias_r_nm", "height_nm", "distance_um", "stage_zero_um")]
+    assert any(
+        "mirrored" in words and "cannot be seen" in words for words in found.cautions
+    )
+    names = [
+        n
+        for n in found.names
+        if n in ("bias_nm", "bias_r_nm", "height_nm", "distance_um", "stage_zero_um")
+    ]
     for name in names:  # what does not depend on the orientation is right
         low, high = found.interval(name)
         assert low - (high - low) < b.VALUES[name] < high + (high - low), name
@@ -180,12 +216,16 @@ def test_steep_background_and_vibration_are_found():
 
 
 def test_frames_off_the_chief_ray_hold_no_astigmatism_of_their_own():
-    """4 and 3 pixels off: held at the chief ray, windows gave -4.7 sigma of oblique astigmatism, 1.26 rms over all."""
+    """4 and 3 pixels off: held at the chief ray, windows gave -4.7 sigma of oblique
+    astigmatism, 1.26 rms over all.
+    """
     off = {"decentre_x_um": 6.3, "decentre_y_um": -4.6}
     found = fit(b.capture(b.electrons(**off)))
     sigma, truth = np.sqrt(np.diag(found.within_covariance)), b.VALUES | off
     z = [
-        (v - truth.get(n, 0.0)) / s for n, v, s in zip(found.names, found.value, sigma, strict=True) if n != "log_gain"
+        (v - truth.get(n, 0.0)) / s
+        for n, v, s in zip(found.names, found.value, sigma, strict=True)
+        if n != "log_gain"
     ]
     assert abs(z[found.names.index("oblique_astigmatism_rad")]) < 3
     assert np.sqrt(np.mean(np.square(z))) < 1.1
@@ -194,7 +234,10 @@ def test_frames_off_the_chief_ray_hold_no_astigmatism_of_their_own():
 @pytest.mark.slow
 def test_vibration_along_one_direction_is_refused_by_name():
     shaken = ndimage.gaussian_filter(b.electrons(), (0, 0.2, 0.9), mode="nearest")
-    with pytest.raises(FitError, match=r"residuals lean towards .*vibration or blur along one direction"):
+    with pytest.raises(
+        FitError,
+        match=r"residuals lean towards .*vibration or blur along one direction",
+    ):
         fit(b.capture(shaken))
 
 
@@ -215,16 +258,26 @@ def test_a_frame_shifted_by_a_pixel_is_refused():
 def test_a_fifth_of_the_pixels_saturated_is_right_or_refused_by_name():
     bright = b.electrons()
     found = fit_or_cause(b.capture(bright, full_well=np.quantile(bright, 0.8)))
-    assert "of the pixels are saturated" in found if isinstance(found, str) else right(found)
+    assert (
+        "of the pixels are saturated" in found
+        if isinstance(found, str)
+        else right(found)
+    )
 
 
 @pytest.mark.slow
 def test_turned_frames_of_an_asymmetric_lens_are_turned_back():
-    """x³ + y³ is the same after swapping x and y: a quarter turn is undone, a mirror image only said to be possible."""
+    """x³ + y³ is the same after swapping x and y: a quarter turn is undone, a mirror
+    image only said to be possible.
+    """
     shots = b.capture(b.electrons(strength_rad=8.0))
     found = fit(frames_of(shots, np.rot90(shots.frames, 1, axes=(1, 2))), 8.0)
-    assert any("frames fit the design only turned by 270" in words for words in found.cautions)
-    assert any("mirrored" in words and "cannot be seen" in words for words in found.cautions)
+    assert any(
+        "frames fit the design only turned by 270" in words for words in found.cautions
+    )
+    assert any(
+        "mirrored" in words and "cannot be seen" in words for words in found.cautions
+    )
     assert right(found)
 
 
@@ -232,20 +285,31 @@ def test_turned_frames_of_an_asymmetric_lens_are_turned_back():
 def test_turned_frames_of_a_round_lens_are_declared():
     shots = b.capture(b.electrons())
     found = fit(frames_of(shots, np.rot90(shots.frames, 1, axes=(1, 2))))
-    assert any("turned by 90" in words and "cannot be seen" in words for words in found.cautions)
+    assert any(
+        "turned by 90" in words and "cannot be seen" in words
+        for words in found.cautions
+    )
 
 
 @pytest.mark.slow
 def test_light_of_ten_nanometres_is_right_or_refused():
-    found = fit_or_cause(b.capture(b.electrons(bandwidth_nm=4.2)))  # 10 nm at half height
-    assert "chi-square" in found if isinstance(found, str) else right(found, bandwidth_nm=4.2)
+    found = fit_or_cause(
+        b.capture(b.electrons(bandwidth_nm=4.2))
+    )  # 10 nm at half height
+    assert (
+        "chi-square" in found
+        if isinstance(found, str)
+        else right(found, bandwidth_nm=4.2)
+    )
 
 
 @pytest.mark.slow
 def test_psf_cropped_at_half_width_is_right():
     shots = b.capture(b.electrons())
     found = fit(frames_of(shots, shots.frames[:, :, 4:12]))
-    edges = {"background_x_e": 0.5 * b.VALUES["background_x_e"]}  # of the narrower window
+    edges = {
+        "background_x_e": 0.5 * b.VALUES["background_x_e"]
+    }  # of the narrower window
     assert right(found, **edges)
 
 
@@ -265,14 +329,25 @@ def test_a_ghost_is_refused():
 @pytest.mark.slow
 def test_a_pinhole_four_times_as_stated_is_right_or_refused():
     shots = b.capture(b.electrons(pinhole_um=40.0))
-    found = fit_or_cause(dataclasses.replace(shots, about=shots.about | {"pinhole_um": 10.0}))
-    assert "chi-square" in found if isinstance(found, str) else right(found, pinhole_um=40.0)
+    found = fit_or_cause(
+        dataclasses.replace(shots, about=shots.about | {"pinhole_um": 10.0})
+    )
+    assert (
+        "chi-square" in found
+        if isinstance(found, str)
+        else right(found, pinhole_um=40.0)
+    )
 
 
 def test_exposures_of_one_depth_are_merged():
-    """A long exposure that clips and a short one of the same depth, stated as such, give what one good frame would."""
+    """A long exposure that clips and a short one of the same depth, stated as such,
+    give what one good frame would.
+    """
     bright = b.electrons()
-    long, short = (b.capture(bright * time, seed=i, full_well=5000.0) for i, time in ((1, 2.0), (2, 0.5)))
+    long, short = (
+        b.capture(bright * time, seed=i, full_well=5000.0)
+        for i, time in ((1, 2.0), (2, 0.5))
+    )
     shots = dataclasses.replace(
         long,
         frames=np.concatenate([long.frames, short.frames]),

@@ -1,4 +1,6 @@
-"""What frames can tell: combinations and their errors by hand, in the units of each parameter."""
+"""What frames can tell: combinations and their errors by hand, in the units of each
+parameter.
+"""
 
 import sys
 from pathlib import Path
@@ -28,29 +30,39 @@ def test_directions_are_in_typical_units():
 
 
 def test_a_combination_is_told_where_frames_halve_what_was_known():
-    """Values 4, 90 and 700 are known to 0.5, 0.105 and 0.038; a prior of 0.24 alone is halved by the latter two."""
+    """Values 4, 90 and 700 are known to 0.5, 0.105 and 0.038; a prior of 0.24 alone is
+    halved by the latter two.
+    """
     information = (TURN * [4.0, 90.0, 700.0]) @ TURN.T / np.outer(SCALE, SCALE)
     told = knowable.identifiable(NAMES, information, 0.24 * SCALE)
     assert [line.rsplit(" to ", 1)[1] for line in told] == ["0.038", "0.11"]
     largest = int(np.abs(TURN[:, 2]).argmax())
     assert f"{NAMES[largest]}/{SCALE[largest]:g}" in told[0].split(" to ")[0]
     assert len(knowable.identifiable(NAMES, information, np.full(3, np.inf))) == 3
-    assert len(knowable.identifiable(NAMES, information, 0.2 * SCALE)) == 1  # 0.105 is more than half of 0.2
+    assert (
+        len(knowable.identifiable(NAMES, information, 0.2 * SCALE)) == 1
+    )  # 0.105 is more than half of 0.2
 
 
 def turned(main, others):
     """(p, p) orthogonal, its last column along ``main``."""
-    return np.linalg.qr(np.column_stack([main, np.eye(len(main))[:, others]]))[0][:, ::-1]
+    return np.linalg.qr(np.column_stack([main, np.eye(len(main))[:, others]]))[0][
+        :, ::-1
+    ]
 
 
 @pytest.mark.parametrize(("ratio", "told"), [(0.49, True), (0.51, False)])
 def test_what_was_known_of_a_combination_adds_its_parts_as_variances(ratio, told):
-    """Of u = 0.6 bias - 0.8 distance: √((0.6 x 0.3)² + (0.8 x 0.7)²) before, in units; half of that is needed after."""
+    """Of u = 0.6 bias - 0.8 distance: √((0.6 x 0.3)² + (0.8 x 0.7)²) before, in units;
+    half of that is needed after.
+    """
     prior, along = np.array([0.3, 1.9, 0.7]), np.array([0.6, 0.0, -0.8])
     known = ratio * np.hypot(0.6 * 0.3, 0.8 * 0.7)
     turn = turned(along, [1, 0])
     values = np.array([0.1, 0.2, known**-2])
-    found = knowable.identifiable(NAMES, (turn * values) @ turn.T / np.outer(SCALE, SCALE), prior * SCALE)
+    found = knowable.identifiable(
+        NAMES, (turn * values) @ turn.T / np.outer(SCALE, SCALE), prior * SCALE
+    )
     assert len(found) == told
     assert all(line.endswith(f" to {known:.2g}") for line in found)
 
@@ -60,14 +72,19 @@ def test_a_combination_without_a_prior_is_told_however_little_is_known():
     for value in (0.04, 0.3):
         values, _ = knowable.directions(NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2)
         assert values == pytest.approx([value, 1.1, 2.3])
-        found = knowable.identifiable(NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2, np.full(3, np.inf))
+        found = knowable.identifiable(
+            NAMES, np.diag([value, 1.1, 2.3]) / SCALE**2, np.full(3, np.inf)
+        )
         assert found[-1].rsplit(" to ", 1)[1] == f"{value**-0.5:.2g}"
 
 
 @pytest.mark.parametrize(
     ("along", "parts"),
     [
-        ((0.16, -0.78, 0.05, 0.29, -0.53), (1, 4, 3)),  # the three largest, though a fourth is above 0.15
+        (
+            (0.16, -0.78, 0.05, 0.29, -0.53),
+            (1, 4, 3),
+        ),  # the three largest, though a fourth is above 0.15
         ((0.97, -0.19, 0.13, 0.03, 0.04), (0, 1)),  # none below 0.15
         ((-0.14, 0.02, 0.05, -0.17, 0.97), (4, 3)),
     ],
@@ -86,11 +103,15 @@ def test_the_words_of_a_combination_name_its_large_parts_first(along, parts):
 def test_pairs_beyond_nine_tenths_and_parameters_of_the_prior_are_named():
     sigma = np.array([0.3, 2.0, 5.0])
     correlation = np.array([[1, -0.91, 0.2], [-0.91, 1, 0.89], [0.2, 0.89, 1.0]])
-    words = knowable.degeneracies(NAMES, correlation * np.outer(sigma, sigma), np.array([0.37, 2.6, np.inf]))
+    words = knowable.degeneracies(
+        NAMES, correlation * np.outer(sigma, sigma), np.array([0.37, 2.6, np.inf])
+    )
     assert len(words) == 2
     assert "(correlation -0.910)" in words[0]
     assert "SEM" in words[0]
-    assert words[1].startswith("bias_nm comes from prior knowledge (0.37)")  # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
+    assert words[1].startswith(
+        "bias_nm comes from prior knowledge (0.37)"
+    )  # 0.3 is 0.81 of it; 2.0 is 0.77 of 2.6
 
 
 def test_the_gain_s_error_is_shared_by_all_that_is_counted_in_electrons():
@@ -98,7 +119,10 @@ def test_the_gain_s_error_is_shared_by_all_that_is_counted_in_electrons():
     own = np.diag([0.1, 2e-4, 0.5, 0.3])
     best = SimpleNamespace(value=np.array([1.3, 9.1, 21.0, -4.0]))
     found = SimpleNamespace(best=best, covariance=own)
-    for gain, relative in ((Gain(2.5, 0.1, 3.0), 0.04), (Gain(1.0, np.inf, 3.0, known=False), 1.0)):
+    for gain, relative in (
+        (Gain(2.5, 0.1, 3.0), 0.04),
+        (Gain(1.0, np.inf, 3.0, known=False), 1.0),
+    ):
         by_gain = relative * np.array([0.0, 1.0, 21.0, -4.0])
         want = own + by_gain[:, None] * by_gain
         assert estimate._with_gain(names, found, gain) == pytest.approx(want, rel=1e-12)
@@ -110,7 +134,9 @@ def asbuilt(**more):
     numbers = {
         "names": NAMES,
         "value": np.array([1.1, -3.0, 8.0]),
-        "covariance": np.array([[0.09, -0.15, 0.0], [-0.15, 4.0, 3.0], [0.0, 3.0, 25.0]]),
+        "covariance": np.array(
+            [[0.09, -0.15, 0.0], [-0.15, 4.0, 3.0], [0.0, 3.0, 25.0]]
+        ),
         "low": np.empty(0),
         "high": np.empty(0),
         "draws": np.empty((0, 0)),
@@ -125,12 +151,20 @@ def test_intervals_samples_and_correlation_of_a_posterior():
     found = asbuilt()
     assert found.sigma == pytest.approx([0.3, 2.0, 5.0])
     assert found.correlation[[0, 1, 0], [1, 2, 2]] == pytest.approx([-0.25, 0.3, 0.0])
-    assert found.interval("height_nm") == pytest.approx((-3.0 - 1.959964 * 2, -3.0 + 1.959964 * 2))
+    assert found.interval("height_nm") == pytest.approx(
+        (-3.0 - 1.959964 * 2, -3.0 + 1.959964 * 2)
+    )
     drawn = found.samples(60_000, seed=1)
     assert drawn.mean(0) == pytest.approx(found.value, abs=0.1)  # 5 / sqrt(6e4) = 0.02
-    error = np.abs(np.cov(drawn.T) - found.covariance) / np.outer(found.sigma, found.sigma)
+    error = np.abs(np.cov(drawn.T) - found.covariance) / np.outer(
+        found.sigma, found.sigma
+    )
     assert error.max() < 0.03  # sqrt(2 / 6e4) = 0.006
-    bent = asbuilt(low=np.array([0.1, -9.0, 2.0]), high=np.array([1.9, 7.0, 9.0]), draws=np.arange(12.0).reshape(4, 3))
+    bent = asbuilt(
+        low=np.array([0.1, -9.0, 2.0]),
+        high=np.array([1.9, 7.0, 9.0]),
+        draws=np.arange(12.0).reshape(4, 3),
+    )
     assert bent.interval("height_nm") == (-9.0, 7.0)
     again = bent.samples(10, seed=2)
     counts = [(again == row).all(1).sum() for row in bent.draws]

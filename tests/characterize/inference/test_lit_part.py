@@ -1,4 +1,6 @@
-"""A quick model looks at the part of a window where there is light, on fewer nodes; beside it images go straight on."""
+"""A quick model looks at the part of a window where there is light, on fewer nodes;
+beside it images go straight on.
+"""
 
 import dataclasses
 import sys
@@ -18,7 +20,12 @@ from characterize.model import PLACE, ForwardModel, Setting, detector, vector
 ROWS, COLUMNS = slice(9, 22), slice(6, 20)
 ANGLES = np.array([[0.0, 0.0], [0.11, -0.07]])
 SETTING = Setting(np.array([560.0, 650.0]), ANGLES, np.array([1.0, 1.3]), 1.5, 29, 28)
-HIDDEN = b.VALUES | {"background_e": 7.0, "background_x_e": 3.0, "distance_um": 1.3, "log_gain": 13.0}
+HIDDEN = b.VALUES | {
+    "background_e": 7.0,
+    "background_x_e": 3.0,
+    "distance_um": 1.3,
+    "log_gain": 13.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -31,24 +38,39 @@ def part(model):
     return model.quick(ROWS, COLUMNS)
 
 
-def test_a_part_of_the_window_has_the_light_of_the_whole_model_there_and_background_alone_beside(model, part):
-    """Fewer nodes hold what reaches the part: light to the percent of the brightest that few terms leave out."""
+def test_a_part_of_the_window_has_the_light_of_the_whole_model_there_and_background_alone_beside(
+    model, part
+):
+    """Fewer nodes hold what reaches the part: light to the percent of the brightest
+    that few terms leave out.
+    """
     x = vector(HIDDEN)
     want, got = model.images(x)[0], part.images(x)[0]
-    assert all(few.reduced.nodes < one.reduced.nodes for few, one in zip(part.groups, model.groups, strict=True))
+    assert all(
+        few.reduced.nodes < one.reduced.nodes
+        for few, one in zip(part.groups, model.groups, strict=True)
+    )
     assert np.abs(got - want)[:, ROWS, COLUMNS].max() < 0.01 * want.max()
     beside = np.ones(want.shape[1:], bool)
     beside[ROWS, COLUMNS] = False
     edge = (np.arange(28) - 14) / 14
-    plane = SETTING.exposure[:, None, None] * np.broadcast_to(7.0 + 3.0 * edge, want.shape)
+    plane = SETTING.exposure[:, None, None] * np.broadcast_to(
+        7.0 + 3.0 * edge, want.shape
+    )
     assert got[:, beside] == pytest.approx(plane[:, beside], abs=1e-9)
 
 
-@pytest.mark.parametrize(("lit", "most"), [((), 41), ((slice(4, 13), slice(4, 12)), 33)])
-def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has_it(lit, most):
-    """Defocus to either side: its light lands elsewhere, and would be shown again where nodes are fewer yet.
+@pytest.mark.parametrize(
+    ("lit", "most"), [((), 41), ((slice(4, 13), slice(4, 12)), 33)]
+)
+def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has_it(
+    lit, most
+):
+    """Defocus to either side: its light lands elsewhere, and would be shown again where
+    nodes are fewer yet.
 
-    Few terms leave 2 % of the field out where that is dim, and less than a percent of the brightest light.
+    Few terms leave 2 % of the field out where that is dim, and less than a percent of
+    the brightest light.
     """
     setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
     whole = ForwardModel(b.lens(), setting, b.RESPONSE)
@@ -63,12 +85,17 @@ def test_few_nodes_show_light_of_every_depth_where_the_sum_over_every_pillar_has
 
 
 def test_derivatives_of_a_part_are_differences_of_its_own_images(part):
-    names, x = ("bias_x_nm", "coma_y_rad", "decentre_x_um", "distance_um"), vector(HIDDEN)
+    names, x = (
+        ("bias_x_nm", "coma_y_rad", "decentre_x_um", "distance_um"),
+        vector(HIDDEN),
+    )
     slopes = part.images(x, names)[1]
     for name, step, got in zip(names, (0.2, 5e-3, 1e-2, 5e-2), slopes, strict=True):
         way = step * (np.arange(len(x)) == PLACE[name])
         want = (part.images(x + way)[0] - part.images(x - way)[0]) / (2 * step)
-        assert np.linalg.norm(got - want) < 0.06 * np.linalg.norm(want), name  # slopes of a quick model: 5 %
+        assert np.linalg.norm(got - want) < 0.06 * np.linalg.norm(want), (
+            name
+        )  # slopes of a quick model: 5 %
 
 
 def test_a_residual_phase_goes_along_to_fewer_nodes(model, part):
@@ -85,29 +112,50 @@ def test_a_residual_phase_goes_along_to_fewer_nodes(model, part):
 
 
 def test_places_of_a_part_are_those_of_the_same_pixels_in_the_whole():
-    """Two samples a pixel; of 3 to 7 of 11 rows, 2 to 5 of 8 columns, and a part of that."""
+    """Two samples a pixel; of 3 to 7 of 11 rows, 2 to 5 of 8 columns, and a part of
+    that.
+    """
     whole = detector.Grid(11, 8, 1.5, 2, 4, (0.7, -1.1))
     one = whole.part(slice(3, 8), slice(2, 6), 1)
     two = one.part(slice(1, 4), slice(1, 4), 3)
     for grid, rows, columns in ((one, (3, 8), (2, 6)), (two, (4, 7), (3, 6))):
         assert grid.margin == 1
-        for axis, every, (first, last) in zip(grid.axes_um(), whole.axes_um(), (rows, columns), strict=True):
-            assert axis == pytest.approx(every[2 * (first + 4 - 1) : 2 * (last + 4 + 1)], abs=1e-12)
+        for axis, every, (first, last) in zip(
+            grid.axes_um(), whole.axes_um(), (rows, columns), strict=True
+        ):
+            assert axis == pytest.approx(
+                every[2 * (first + 4 - 1) : 2 * (last + 4 + 1)], abs=1e-12
+            )
         y, x = grid.ends_um()
         assert y == pytest.approx((np.array([rows[0], rows[1] - 1]) - 5) * 1.5 - 1.1)
-        assert x == pytest.approx((np.array([columns[0], columns[1] - 1]) - 4) * 1.5 + 0.7)
+        assert x == pytest.approx(
+            (np.array([columns[0], columns[1] - 1]) - 4) * 1.5 + 0.7
+        )
 
 
-def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in_a_million(model):
-    """Two frames of a bright pixel, 900 electrons over 90, and of dim ones that tell 1e-6 and 1e-3 of what it does."""
+def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in_a_million(
+    model,
+):
+    """Two frames of a bright pixel, 900 electrons over 90, and of dim ones that tell
+    1e-6 and 1e-3 of what it does.
+    """
     x = vector({"background_e": 5.0, "background_x_e": 2.0})
-    plane = np.broadcast_to(5.0 + 2.0 * (np.arange(28) - 14) / 14, (2, 29, 28)) * SETTING.exposure[:, None, None]
+    plane = (
+        np.broadcast_to(5.0 + 2.0 * (np.arange(28) - 14) / 14, (2, 29, 28))
+        * SETTING.exposure[:, None, None]
+    )
     light = np.zeros((2, 29, 28))
     light[0, 12, 9], light[1, 14, 11] = 900.0, 900.0
     light[0, 20, 25] = 900.0 * 1e-3  # 1e-6 of what the bright one tells
     light[1, 8, 7] = 900.0 * 0.03
     noise = np.full(light.shape, 90.0)
-    data = Data(light, np.ones(light.shape, bool), np.zeros(light.shape, bool), noise, np.full(light.shape, 1e9))
+    data = Data(
+        light,
+        np.ones(light.shape, bool),
+        np.zeros(light.shape, bool),
+        noise,
+        np.full(light.shape, 1e9),
+    )
     assert lit_part(model, data, x, light + plane) == (slice(8, 15), slice(7, 12))
     usable = np.ones(light.shape, bool)
     usable[1, 8, 7] = False
@@ -116,28 +164,52 @@ def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in
 
 
 @pytest.mark.parametrize(
-    ("share", "taken"), [(7e-6, (slice(12, 15), slice(9, 12))), (8e-6, (slice(3, 26), slice(2, 25)))]
+    ("share", "taken"),
+    [(7e-6, (slice(12, 15), slice(9, 12))), (8e-6, (slice(3, 26), slice(2, 25)))],
 )
-def test_each_of_four_sides_may_hold_a_quarter_of_thirty_parts_in_a_million(model, share, taken):
-    """One dim pixel beyond each side of two bright ones, each with this share of all that light tells."""
+def test_each_of_four_sides_may_hold_a_quarter_of_thirty_parts_in_a_million(
+    model, share, taken
+):
+    """One dim pixel beyond each side of two bright ones, each with this share of all
+    that light tells.
+    """
     light = np.zeros((2, 29, 28))
     light[0, 12, 9], light[1, 14, 11] = 900.0, 900.0
-    dim = 900.0 * np.sqrt(2 * share / (1 - 4 * share))  # of all is told (1 - 4 share) by the two
-    light[0, 3, 10], light[1, 25, 10], light[1, 13, 2], light[0, 13, 24] = dim, dim, dim, dim
+    dim = 900.0 * np.sqrt(
+        2 * share / (1 - 4 * share)
+    )  # of all is told (1 - 4 share) by the two
+    light[0, 3, 10], light[1, 25, 10], light[1, 13, 2], light[0, 13, 24] = (
+        dim,
+        dim,
+        dim,
+        dim,
+    )
     noise = np.full(light.shape, 1e4)  # beside which the noise of the light is none
-    data = Data(light, np.ones(light.shape, bool), np.zeros(light.shape, bool), noise, np.full(light.shape, 1e9))
+    data = Data(
+        light,
+        np.ones(light.shape, bool),
+        np.zeros(light.shape, bool),
+        noise,
+        np.full(light.shape, 1e9),
+    )
     assert lit_part(model, data, vector({}), light) == taken
 
 
 def test_beside_the_part_images_go_straight_on_and_within_it_what_is_left_out_stays():
     rng = np.random.default_rng(4)
-    value, image, slopes = np.array([1.0, -2.0]), rng.normal(size=(3, 4, 5)), rng.normal(size=(2, 3, 4, 5))
+    value, image, slopes = (
+        np.array([1.0, -2.0]),
+        rng.normal(size=(3, 4, 5)),
+        rng.normal(size=(2, 3, 4, 5)),
+    )
     beside = np.zeros((4, 5), bool)
     beside[0], beside[2, 3] = True, True
     left = LeftOut(value, image, slopes, beside)
 
     def plain(x, jacobian):
-        rates = np.broadcast_to(np.array([2.0, -1.0])[:, None, None, None], (2, 3, 4, 5))
+        rates = np.broadcast_to(
+            np.array([2.0, -1.0])[:, None, None, None], (2, 3, 4, 5)
+        )
         return np.full((3, 4, 5), 2 * x[0] - x[1]), rates if jacobian else None
 
     x = np.array([1.3, -1.4])

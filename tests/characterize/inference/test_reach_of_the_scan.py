@@ -1,4 +1,6 @@
-"""How far distances are looked at before a fit: two sigma of what is known, no farther than the bounds."""
+"""How far distances are looked at before a fit: two sigma of what is known, no farther
+than the bounds.
+"""
 
 import sys
 from pathlib import Path
@@ -12,7 +14,9 @@ from characterize.inference import estimate
 from characterize.model import Known
 
 
-@pytest.mark.parametrize(("sigma", "reach"), [(37.0, 74.0), (None, 200.0), (310.0, 400.0)])
+@pytest.mark.parametrize(
+    ("sigma", "reach"), [(37.0, 74.0), (None, 200.0), (310.0, 400.0)]
+)
 def test_distances_are_scanned_over_two_sigma_within_the_bounds(sigma, reach):
     """Unknown to 100 um where nobody says; the bounds lie 400 um to either side."""
     known = {} if sigma is None else {"distance_um": Known("distance_um", 12.0, sigma)}

@@ -1,6 +1,8 @@
-"""Where intervals of a lens's frames end: the rise of -2 ln L there, by another minimiser over all other parameters.
+"""Where intervals of a lens's frames end: the rise of -2 ln L there, by another
+minimiser over all other parameters.
 
-Frames of a lens of 40 um at five depths, with every parameter that is fitted by default and usual priors; ends by quick
+Frames of a lens of 40 um at five depths, with every parameter that is fitted by default
+and usual priors; ends by quick
 images put right at the fit, rises by the whole model and SciPy's trust region.
 """
 
@@ -18,7 +20,13 @@ from characterize.inference import explore, posterior, search
 from characterize.inference.arrange import Arrangement
 from characterize.model import ForwardModel, vector
 
-JUDGED = ("bias_nm", "bias_r_nm", "distance_um", "stage_scale", "oblique_astigmatism_rad")
+JUDGED = (
+    "bias_nm",
+    "bias_r_nm",
+    "distance_um",
+    "stage_scale",
+    "oblique_astigmatism_rad",
+)
 HIDDEN = {name: value for name, value in b.VALUES.items() if name != "background_x_e"}
 
 
@@ -43,7 +51,9 @@ def fitted():
     about = search.Task(model, data, vector({}), {}, found)
     gain = search.starts(about, biases_nm=(0.0,))[0][search.PLACE["log_gain"]]
     begin = vector(HIDDEN | {"log_gain": float(gain)})
-    return about, search.refine(about, begin[[search.PLACE[name] for name in about.names]])
+    return about, search.refine(
+        about, begin[[search.PLACE[name] for name in about.names]]
+    )
 
 
 def rise(about, mode, i, place, begin):
@@ -59,7 +69,9 @@ def rise(about, mode, i, place, begin):
 
     def rest(x):
         pull = (x - prior.mean) / prior.sigma
-        return np.concatenate([((model(x, False)[0] - about.data.electrons) / noise).ravel(), pull])
+        return np.concatenate(
+            [((model(x, False)[0] - about.data.electrons) / noise).ravel(), pull]
+        )
 
     def slopes(z):
         pixels = (model(whole(z), True)[1] / noise).reshape(len(others), -1)
@@ -67,15 +79,26 @@ def rise(about, mode, i, place, begin):
 
     bounds = prior.low[others] / size, prior.high[others] / size
     inside = np.clip(begin[others] / size, bounds[0] + 1e-6, bounds[1] - 1e-6)
-    found = optimize.least_squares(lambda z: rest(whole(z)), inside, slopes, bounds, xtol=1e-6, ftol=1e-6, max_nfev=12)
+    found = optimize.least_squares(
+        lambda z: rest(whole(z)),
+        inside,
+        slopes,
+        bounds,
+        xtol=1e-6,
+        ftol=1e-6,
+        max_nfev=12,
+    )
     assert np.abs(rest(mode.value)).max() < 6  # no outliers, whose loss is another
     return 2 * found.cost - float((rest(mode.value) ** 2).sum())
 
 
 def test_the_misfit_has_risen_by_384_where_intervals_end(monkeypatch):
-    """Within 0.4 of 3.84 times chi-square a pixel: quick images are within 0.1 sigma of the whole model's out there, of
-    which the square's slope, 2 times 1.96, makes 0.4; ends were within 0.2. An end of a straight profile takes one
-    image or two, a bent one some more and slopes now and then: fewer than 4 and 1 for each of the 38.
+    """Within 0.4 of 3.84 times chi-square a pixel: quick images are within 0.1 sigma of
+    the whole model's out there, of
+    which the square's slope, 2 times 1.96, makes 0.4; ends were within 0.2. An end of a
+    straight profile takes one
+    image or two, a bent one some more and slopes now and then: fewer than 4 and 1 for
+    each of the 38.
     """
     about, mode = fitted()
     asked = Counted(monkeypatch)
@@ -89,5 +112,7 @@ def test_the_misfit_has_risen_by_384_where_intervals_end(monkeypatch):
         i, one = about.names.index(name), found.profiles[name]
         along = best.covariance[:, i] / best.covariance[i, i]
         for place in (one.low, one.high):
-            got = rise(about, best, i, place, best.value + along * (place - best.value[i]))
+            got = rise(
+                about, best, i, place, best.value + along * (place - best.value[i])
+            )
             assert got == pytest.approx(level, abs=0.4), name

@@ -1,4 +1,6 @@
-"""When two ends of a search are the same lens: distance in sigma of the end's own parabola."""
+"""When two ends of a search are the same lens: distance in sigma of the end's own
+parabola.
+"""
 
 import math
 from types import SimpleNamespace
@@ -23,13 +25,19 @@ def test_distance_of_two_ends_is_mahalanobis():
 
 
 def test_ends_are_kept_best_first_where_they_lie_a_sigma_apart_and_explain_as_much():
-    best, twin, other = end([1.0, 5.0], 10.0), end([1.05, 5.1], 10.5), end([2.0, 5.0], 11.0)
+    best, twin, other = (
+        end([1.0, 5.0], 10.0),
+        end([1.05, 5.1], 10.5),
+        end([2.0, 5.0], 11.0),
+    )
     far = end([-2.0, 5.0], 10.0 + search.MODES_WITHIN + 0.1)
     assert search.distinct([far, other, twin, best]) == [best, other]
 
 
 def test_a_wider_search_that_leaves_the_model_s_range_is_none(monkeypatch):
-    """From the one begin that it is given; faults that are no refusal of a fit are not hidden."""
+    """From the one begin that it is given; faults that are no refusal of a fit are not
+    hidden.
+    """
     asked = []
 
     def searched(task, begins):

@@ -1,4 +1,6 @@
-"""Pixels that are not as high as they are wide: where such frames come from is seen, and named before anything else."""
+"""Pixels that are not as high as they are wide: where such frames come from is seen,
+and named before anything else.
+"""
 
 import dataclasses
 import sys
@@ -16,22 +18,40 @@ from characterize.model import PLACE, ForwardModel, Setting, vector
 
 _DEPTHS = 420.0, 600.0, 1050.0
 _WIDE_UM, _FINE = 1.5, 10  # a pixel, and how many fine ones it is wide
-_PLACE = {"decentre_x_um": 0.8, "decentre_y_um": -0.4, "coma_x_rad": 0.3, "astigmatism_rad": -0.2}
+_PLACE = {
+    "decentre_x_um": 0.8,
+    "decentre_y_um": -0.4,
+    "coma_x_rad": 0.3,
+    "astigmatism_rad": -0.2,
+}
 
 
 def at_rows(share: float) -> np.ndarray:
-    """(5, 16, 16) light of pixels that lie ``share`` times as far apart each way, as wide as ever."""
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), share * _WIDE_UM, 16, 16, fill=1 / share)
+    """(5, 16, 16) light of pixels that lie ``share`` times as far apart each way, as
+    wide as ever.
+    """
+    setting = Setting(
+        np.array(b.DEPTHS),
+        np.zeros((5, 2)),
+        np.ones(5),
+        share * _WIDE_UM,
+        16,
+        16,
+        fill=1 / share,
+    )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
     return np.asarray(ForwardModel(b.lens(), setting, b.RESPONSE).images(x)[0])
 
 
 def test_they_lie_farther_apart_along_one_axis_alone():
-    """The middle column is that of pixels farther apart both ways, the middle row the one of pixels as they were.
+    """The middle column is that of pixels farther apart both ways, the middle row the
+    one of pixels as they were.
 
     Models of their own for each pitch: fields to 5e-4, light to twice that.
     """
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), _WIDE_UM, 16, 16)
+    setting = Setting(
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), _WIDE_UM, 16, 16
+    )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
     (tall,) = causes.seen_at(model, x, [np.diag([1.06, 1.0])])
@@ -43,9 +63,13 @@ def test_they_lie_farther_apart_along_one_axis_alone():
 
 
 def summed(rows: int) -> np.ndarray:
-    """(3, 16, 16) light of pixels as wide as 10 and as high as ``rows`` fine ones, the middle one about the axis."""
+    """(3, 16, 16) light of pixels as wide as 10 and as high as ``rows`` fine ones, the
+    middle one about the axis.
+    """
     count = 17 * max(_FINE, rows)
-    setting = Setting(np.array(_DEPTHS), np.zeros((3, 2)), np.ones(3), _WIDE_UM / _FINE, count, count)
+    setting = Setting(
+        np.array(_DEPTHS), np.zeros((3, 2)), np.ones(3), _WIDE_UM / _FINE, count, count
+    )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25 * _FINE})
     light = ForwardModel(b.lens(), setting, b.RESPONSE).images(x)[0]
     y, x0 = (count // 2 - 8 * side - side // 2 for side in (rows, _FINE))
@@ -54,7 +78,9 @@ def summed(rows: int) -> np.ndarray:
 
 
 def test_a_fit_that_knows_of_square_pixels_names_them_first():
-    """A tenth higher: sums of fine pixels, 10 wide and 11 high, of light that no interpolation touched; 6000 e."""
+    """A tenth higher: sums of fine pixels, 10 wide and 11 high, of light that no
+    interpolation touched; 6000 e.
+    """
     light = summed(11)
     light = light * (6000 / light.max())
     electrons = light + np.random.default_rng(4).normal(0, np.sqrt(light + 9))

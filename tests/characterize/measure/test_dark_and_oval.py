@@ -1,4 +1,6 @@
-"""Micrographs whose tops are darker than the ground, and pillars that are no discs: drawn by area, sizes known."""
+"""Micrographs whose tops are darker than the ground, and pillars that are no discs:
+drawn by area, sizes known.
+"""
 
 import json
 
@@ -14,19 +16,29 @@ PITCH, COUNT, FINE = 44.0, 4, 3
 
 
 def drawn(*, top, ground, rim, width, long=1.0, seed=3):
-    """(picture, (row, column) diameters of equal area): pillars turned at random, a rim of ``width`` inside them."""
+    """(picture, (row, column) diameters of equal area): pillars turned at random, a rim
+    of ``width`` inside them.
+    """
     rng = np.random.default_rng(seed)
     size = int(COUNT * PITCH)
     y, x = (np.indices((size * FINE,) * 2) + 0.5) / FINE
-    picture, diameter = np.full(y.shape, float(ground)), rng.uniform(20, 31, (COUNT, COUNT))
+    picture, diameter = (
+        np.full(y.shape, float(ground)),
+        rng.uniform(20, 31, (COUNT, COUNT)),
+    )
     for (j, i), wide in np.ndenumerate(diameter):
         turn = rng.uniform(0, np.pi)
         dy, dx = y - (j + 0.46) * PITCH, x - (i + 0.53) * PITCH  # no cell's middle
-        one, other = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+        one, other = (
+            dx * np.cos(turn) + dy * np.sin(turn),
+            dy * np.cos(turn) - dx * np.sin(turn),
+        )
         away = np.hypot(one / np.sqrt(long), other * np.sqrt(long))
         picture[away < wide / 2] = rim
         picture[away < wide / 2 - width] = top
-    picture = ndimage.gaussian_filter(picture.reshape(size, FINE, size, FINE).mean((1, 3)), 0.8)
+    picture = ndimage.gaussian_filter(
+        picture.reshape(size, FINE, size, FINE).mean((1, 3)), 0.8
+    )
     return picture + 0.03 * rng.standard_normal(picture.shape), diameter
 
 
@@ -36,9 +48,15 @@ def wrong_by(found, diameter):
     return found.diameter_nm - diameter[j, i]
 
 
-@pytest.mark.parametrize(("top", "ground", "stated"), [(0.2, 0.2, 0.0), (0.05, 0.3, PITCH)])
-def test_dark_tops_within_bright_rims_are_measured_at_their_outer_edge(top, ground, stated):
-    """Half of a rim 4 wide that blur and smoothing (0.8 and 1) lower is up to a pixel farther out, of all alike."""
+@pytest.mark.parametrize(
+    ("top", "ground", "stated"), [(0.2, 0.2, 0.0), (0.05, 0.3, PITCH)]
+)
+def test_dark_tops_within_bright_rims_are_measured_at_their_outer_edge(
+    top, ground, stated
+):
+    """Half of a rim 4 wide that blur and smoothing (0.8 and 1) lower is up to a pixel
+    farther out, of all alike.
+    """
     picture, diameter = drawn(top=top, ground=ground, rim=1.0, width=4.0)
     found = sem.measure(picture, sem.Micrograph(1.0, stated))
     assert found.lattice.kind == "square"
@@ -49,11 +67,15 @@ def test_dark_tops_within_bright_rims_are_measured_at_their_outer_edge(top, grou
     assert not (found.missing | found.collapsed | found.oval).any()
     wrong = wrong_by(found, diameter)
     assert 0 < wrong.mean() < 1
-    assert wrong.std() < 0.15  # noise: 0.03; diameters differ by 11, and a rim's peak with them
+    assert (
+        wrong.std() < 0.15
+    )  # noise: 0.03; diameters differ by 11, and a rim's peak with them
 
 
 @pytest.mark.parametrize(("long", "oval"), [(1.1, False), (1.25, True), (1.6, True)])
-def test_pillars_longer_than_wide_by_a_sixth_are_named_and_others_have_the_circle_of_their_area(long, oval):
+def test_pillars_longer_than_wide_by_a_sixth_are_named_and_others_have_the_circle_of_their_area(
+    long, oval
+):
     picture, diameter = drawn(top=0.8, ground=0.2, rim=1.0, width=3.0, long=long)
     found = sem.measure(picture, sem.Micrograph(1.0, PITCH))
     assert len(found.row) >= 9
@@ -69,16 +91,27 @@ def test_noise_makes_no_discs_oval():
     assert not sem.measure(noisy, sem.Micrograph(1.0, PITCH)).oval.any()
 
 
-def test_the_command_tells_of_oval_pillars_and_of_rims_too_thin_for_dark_tops(tmp_path, capsys):
+def test_the_command_tells_of_oval_pillars_and_of_rims_too_thin_for_dark_tops(
+    tmp_path, capsys
+):
     picture, _ = drawn(top=0.8, ground=0.2, rim=1.0, width=3.0, long=1.4)
     thin, _ = drawn(top=0.0, ground=0.6, rim=0.7, width=1.0)
     for name, of in (("oval", picture), ("thin", thin)):
         tifffile.imwrite(tmp_path / f"{name}.tif", of.astype(np.float32))
-        options = ["--pixel-nm", "3.1", "--pitch-nm", str(3.1 * PITCH), "-o", str(tmp_path / name)]
+        options = [
+            "--pixel-nm",
+            "3.1",
+            "--pitch-nm",
+            str(3.1 * PITCH),
+            "-o",
+            str(tmp_path / name),
+        ]
         assert cli.main(["measure", str(tmp_path / f"{name}.tif"), *options]) == 1
     said = capsys.readouterr().out
     assert "are oval, longer than wide by more than 15 %: not measured" in said
     assert "rims must stand out from the ground" in said
     told = json.loads((tmp_path / "oval" / "measure.json").read_text())
     assert told["oval"] == told["pillars"] >= 9
-    assert (tmp_path / "oval" / "pillars.csv").read_text().count(",oval") == told["oval"]
+    assert (tmp_path / "oval" / "pillars.csv").read_text().count(",oval") == told[
+        "oval"
+    ]

@@ -1,4 +1,6 @@
-"""Pictures as microscopes and image programs save them: the same grey values from every way of writing them."""
+"""Pictures as microscopes and image programs save them: the same grey values from every
+way of writing them.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +33,12 @@ def test_a_tiff_with_a_table_of_greys_holds_what_a_plain_one_holds(tmp_path, ste
 def test_a_table_of_other_colours_or_another_order_is_refused(tmp_path):
     coloured = RAMP * np.array([[1], [1], [0]], np.uint16)
     for table in (coloured, RAMP[:, ::-1].copy(), (RAMP / 257) ** 2):
-        tifffile.imwrite(tmp_path / "a.tif", GREY, photometric="palette", colormap=table.astype(np.uint16))
+        tifffile.imwrite(
+            tmp_path / "a.tif",
+            GREY,
+            photometric="palette",
+            colormap=table.astype(np.uint16),
+        )
         with pytest.raises(CaptureError, match="table of colours"):
             picture.read(tmp_path / "a.tif")
 
@@ -39,7 +46,9 @@ def test_a_table_of_other_colours_or_another_order_is_refused(tmp_path):
 def test_sixteen_bits_of_either_order_of_bytes_are_read(tmp_path):
     deep = GREY.astype(np.uint16) * 257 + 5
     for order in "<>":
-        tifffile.imwrite(tmp_path / "a.tif", deep, byteorder=order, photometric="minisblack")
+        tifffile.imwrite(
+            tmp_path / "a.tif", deep, byteorder=order, photometric="minisblack"
+        )
         assert np.array_equal(picture.read(tmp_path / "a.tif"), deep)
 
 
@@ -61,15 +70,22 @@ def test_a_strip_of_writing_below_is_left_out():
 
 
 def test_dark_gaps_of_a_clean_picture_are_no_strip():
-    """Gaps of nothing, six rows high, between rows of pillars that leave most of a row dark: all of it stays."""
+    """Gaps of nothing, six rows high, between rows of pillars that leave most of a row
+    dark: all of it stays.
+    """
     y, x = np.indices((60, 70))
     clean = np.where(np.hypot(y % 20 - 9.5, x % 20 - 9.5) < 7, 200, 0).astype(np.uint8)
     assert np.array_equal(picture.without_strip(clean), clean)
 
 
 def test_a_coloured_picture_and_a_stack_are_refused_by_name(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", COLOURS * np.array([1, 2, 3], np.uint8), photometric="rgb")
-    with pytest.raises(CaptureError, match=r"a.tif: in colours \(\d+% of the pixels are not grey\); save it in grey"):
+    tifffile.imwrite(
+        tmp_path / "a.tif", COLOURS * np.array([1, 2, 3], np.uint8), photometric="rgb"
+    )
+    with pytest.raises(
+        CaptureError,
+        match=r"a.tif: in colours \(\d+% of the pixels are not grey\); save it in grey",
+    ):
         picture.read(tmp_path / "a.tif")
     tifffile.imwrite(tmp_path / "b.tif", np.stack([GREY] * 5), photometric="minisblack")
     with pytest.raises(CaptureError, match="5 pictures; need one"):

@@ -1,4 +1,6 @@
-"""Lattices of any kind and pillars with bright rims or dark tops, found and laid on a design that is known."""
+"""Lattices of any kind and pillars with bright rims or dark tops, found and laid on a
+design that is known.
+"""
 
 import numpy as np
 import pytest
@@ -14,30 +16,55 @@ PIXEL, PITCH = 3.7, 310.0  # nm
 
 
 def picture(place_px, diameter_nm, shape, *, top=0.35, rim=1.0, gap=0.2, seed=0):
-    """Discs with a bright rim of 5 px and a top of its own, three samples a pixel side, blur and noise."""
+    """Discs with a bright rim of 5 px and a top of its own, three samples a pixel side,
+    blur and noise.
+    """
     over, reach = 3, 120
     fine = np.full((shape[0] * over + 2 * reach, shape[1] * over + 2 * reach), gap)
     for (row, column), size in zip(place_px, diameter_nm, strict=True):
         middle = [int(round((p + 0.5) * over)) + reach for p in (row, column)]
-        if min(middle) < reach or middle[0] > fine.shape[0] - reach or middle[1] > fine.shape[1] - reach:
+        if (
+            min(middle) < reach
+            or middle[0] > fine.shape[0] - reach
+            or middle[1] > fine.shape[1] - reach
+        ):
             continue
-        part = fine[middle[0] - reach : middle[0] + reach, middle[1] - reach : middle[1] + reach]
-        y, x = ((np.arange(-reach, reach) + m - reach + 0.5) / over - 0.5 for m in middle)
+        part = fine[
+            middle[0] - reach : middle[0] + reach, middle[1] - reach : middle[1] + reach
+        ]
+        y, x = (
+            (np.arange(-reach, reach) + m - reach + 0.5) / over - 0.5 for m in middle
+        )
         r = np.hypot(x[None] - column, y[:, None] - row) - size / 2 / PIXEL
         part[...] = np.where(r < 0, np.where(r > -5, rim, top), part)
-    image = fine[reach:-reach, reach:-reach].reshape(shape[0], over, shape[1], over).mean((1, 3))
+    image = (
+        fine[reach:-reach, reach:-reach]
+        .reshape(shape[0], over, shape[1], over)
+        .mean((1, 3))
+    )
     noise = 0.04 * np.random.default_rng(seed).standard_normal(shape)
     return 3000 * (ndimage.gaussian_filter(image, 1.2) + noise) + 500
 
 
 def lattice(turn_deg, angle_deg, ratio, shape, jitter=0.0, seed=0):
-    """Places of all sites in the picture for a lattice turned by ``turn_deg``, its vectors ``angle_deg`` apart."""
-    a = PITCH / PIXEL * np.array([np.sin(np.radians(turn_deg)), np.cos(np.radians(turn_deg))])
+    """Places of all sites in the picture for a lattice turned by ``turn_deg``, its
+    vectors ``angle_deg`` apart.
+    """
+    a = (
+        PITCH
+        / PIXEL
+        * np.array([np.sin(np.radians(turn_deg)), np.cos(np.radians(turn_deg))])
+    )
     b = (
         ratio
         * PITCH
         / PIXEL
-        * np.array([np.sin(np.radians(turn_deg + angle_deg)), np.cos(np.radians(turn_deg + angle_deg))])
+        * np.array(
+            [
+                np.sin(np.radians(turn_deg + angle_deg)),
+                np.cos(np.radians(turn_deg + angle_deg)),
+            ]
+        )
     )
     index = np.mgrid[-12:13, -12:13].reshape(2, -1).T
     place = np.array([11.3, 17.9]) + index[:, :1] * a + index[:, 1:] * b
@@ -47,7 +74,11 @@ def lattice(turn_deg, angle_deg, ratio, shape, jitter=0.0, seed=0):
 
 @pytest.mark.parametrize(
     ("turn", "angle", "ratio", "kind", "top"),
-    [(7.0, 90.0, 1.0, "square", 0.35), (3.0, 60.0, 1.0, "hexagonal", 0.9), (0.0, 90.0, 1.3, "rectangular", 0.35)],
+    [
+        (7.0, 90.0, 1.0, "square", 0.35),
+        (3.0, 60.0, 1.0, "hexagonal", 0.9),
+        (0.0, 90.0, 1.3, "rectangular", 0.35),
+    ],
 )
 def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
     shape = (330, 370)
@@ -60,7 +91,9 @@ def test_pillars_of_any_lattice_are_all_measured(turn, angle, ratio, kind, top):
     apart = np.linalg.norm(seen[:, None] - place[None], axis=2)
     assert apart.min(1).max() < 0.3  # pixels
     error_px = (found.diameter_nm - truth[apart.argmin(1)]) / PIXEL
-    assert abs(error_px.mean()) < 0.6  # blur of 1.2 px moves the half level of a rim 5 px wide by less
+    assert (
+        abs(error_px.mean()) < 0.6
+    )  # blur of 1.2 px moves the half level of a rim 5 px wide by less
     assert error_px.std() < 0.25
 
 
@@ -85,7 +118,10 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
     p = PITCH / PIXEL
     place = (np.mgrid[:n, :n].reshape(2, -1).T + 0.5) * p
     side = int(n * p)
-    found = sem.measure(picture(place, made.ravel(), (side, side), top=0.9), sem.Micrograph(PIXEL, PITCH))
+    found = sem.measure(
+        picture(place, made.ravel(), (side, side), top=0.9),
+        sem.Micrograph(PIXEL, PITCH),
+    )
     laid = overlay.overlay(found, DiameterMap(design * 1e-3, PITCH * 1e-3))
     assert laid.clearly
     where = overlay.numbered(found, laid).site
@@ -93,7 +129,9 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
     assert np.flatnonzero(laid.outlier).tolist() == [2 * n + 4]
     assert np.allclose(laid.designed_nm, part.ravel())
     for middle, bias, sigma, count in overlay.bias_table(laid, knots=3):
-        assert abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL  # edges of a blurred rim: as above
+        assert (
+            abs(bias - (-4.2 + 0.05 * (middle - 185))) < 0.6 * PIXEL
+        )  # edges of a blurred rim: as above
         assert 0 < sigma < 1.5
         assert count > 6
 
@@ -106,8 +144,12 @@ def test_a_micrograph_finds_its_place_on_the_mask_and_gives_its_bias_table():
         (Lattice("rectangular", 1.3), 90.0, 1.3, 3.0),
     ],
 )
-def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(design, angle_deg, ratio, turn_deg):
-    """Pillars are drawn by their place on the mask, in um from its first; the picture is that place turned."""
+def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(
+    design, angle_deg, ratio, turn_deg
+):
+    """Pillars are drawn by their place on the mask, in um from its first; the picture
+    is that place turned.
+    """
     mask = drawn(44, 60)
     if design.centred:
         mask *= np.indices(mask.shape).sum(0) % 2 == 0
@@ -115,16 +157,24 @@ def test_a_picture_of_any_lattice_finds_its_place_on_the_mask(design, angle_deg,
     shape = (420, 470)
     place = lattice(turn_deg, angle_deg, ratio, shape)
     turn = np.radians(turn_deg)
-    back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])  # (row, column) of the mask
+    back = np.array(
+        [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    )  # (row, column) of the mask
     steps_px = np.array(made.steps_um[::-1]) * 1e3 / PIXEL
-    index = np.rint((place - [11.3, 17.9]) @ back.T / steps_px).astype(int) + np.array([20, 22])
+    index = np.rint((place - [11.3, 17.9]) @ back.T / steps_px).astype(int) + np.array(
+        [20, 22]
+    )
     wide = mask[tuple(index.T)] - 3.1
     found = sem.measure(picture(place, wide, shape), sem.Micrograph(PIXEL, PITCH))
     laid = overlay.overlay(found, made)
     assert laid.clearly
-    apart = np.hypot(found.row[:, None] - place[:, 0], found.column[:, None] - place[:, 1])
+    apart = np.hypot(
+        found.row[:, None] - place[:, 0], found.column[:, None] - place[:, 1]
+    )
     assert np.array_equal(overlay.numbered(found, laid).site, index[apart.argmin(1)])
-    assert np.nanmean(laid.error_nm) == pytest.approx(-3.1, abs=0.6 * PIXEL)  # edges of a blurred rim: as below
+    assert np.nanmean(laid.error_nm) == pytest.approx(
+        -3.1, abs=0.6 * PIXEL
+    )  # edges of a blurred rim: as below
     assert overlay.scale(found, PIXEL, made) == pytest.approx(1.0, abs=1e-3)
     assert np.count_nonzero(laid.outlier) < 2
 
@@ -133,35 +183,65 @@ def test_a_picture_across_the_mask_is_refused():
     """Rows of a hexagonal lattice along y, where those of a mask run along x."""
     shape = (330, 370)
     place = lattice(30.0, 60.0, 1.0, shape)
-    found = sem.measure(picture(place, np.full(len(place), 180.0), shape), sem.Micrograph(PIXEL, PITCH))
-    made = DiameterMap(np.where(np.indices((44, 60)).sum(0) % 2, 0, 0.18), PITCH * 1e-3, Lattice("hexagonal"))
-    with pytest.raises(CaptureError, match="rows of this hexagonal lattice do not lie in the picture as on the mask"):
+    found = sem.measure(
+        picture(place, np.full(len(place), 180.0), shape), sem.Micrograph(PIXEL, PITCH)
+    )
+    made = DiameterMap(
+        np.where(np.indices((44, 60)).sum(0) % 2, 0, 0.18),
+        PITCH * 1e-3,
+        Lattice("hexagonal"),
+    )
+    with pytest.raises(
+        CaptureError,
+        match="rows of this hexagonal lattice do not lie in the picture as on the mask",
+    ):
         overlay.overlay(found, made)
-    with pytest.raises(CaptureError, match="the picture shows a hexagonal lattice, the design is square"):
+    with pytest.raises(
+        CaptureError,
+        match="the picture shows a hexagonal lattice, the design is square",
+    ):
         overlay.overlay(found, DiameterMap(np.full((44, 60), 0.18), PITCH * 1e-3))
 
 
 @pytest.mark.parametrize("level", [4000.0, 1e-9])
 @pytest.mark.parametrize("wave", [(0.0613, 0.1187), (0.117, -0.0342)])
 def test_a_wave_is_refined_to_a_thousandth_of_a_fringe(wave, level):
-    """Under a Hann window, from a quarter of a fringe away, whatever the unit of the picture. Steps end at 1e-3 of 0.3
+    """Under a Hann window, from a quarter of a fringe away, whatever the unit of the
+    picture. Steps end at 1e-3 of 0.3
     fringes; the wave's own mirror image moves the peak by less."""
     y, x = np.arange(90), np.arange(120)
-    hann = np.outer(np.sin(np.pi * (y + 0.5) / 90) ** 2, np.sin(np.pi * (x + 0.5) / 120) ** 2)
+    hann = np.outer(
+        np.sin(np.pi * (y + 0.5) / 90) ** 2, np.sin(np.pi * (x + 0.5) / 120) ** 2
+    )
     seen = level * hann * np.cos(2 * np.pi * (wave[0] * y[:, None] + wave[1] * x) + 0.7)
-    found = lattices._refined(seen, np.array([wave[0] + 0.25 / 120, wave[1] - 0.2 / 120]))
+    found = lattices._refined(
+        seen, np.array([wave[0] + 0.25 / 120, wave[1] - 0.2 / 120])
+    )
     assert found * 120 == pytest.approx(np.array(wave) * 120, abs=2e-3)
 
 
-@pytest.mark.parametrize(("stretch", "fits"), [(1.045, True), (1.055, False), (1 / 1.045, True), (1 / 1.055, False)])
-def test_a_picture_whose_sides_differ_by_a_twentieth_from_the_design_is_not_laid_on_it(stretch, fits):
+@pytest.mark.parametrize(
+    ("stretch", "fits"),
+    [(1.045, True), (1.055, False), (1 / 1.045, True), (1 / 1.055, False)],
+)
+def test_a_picture_whose_sides_differ_by_a_twentieth_from_the_design_is_not_laid_on_it(
+    stretch, fits
+):
     """Of a rectangle of 0.31 x 0.434 um; the scale of the picture is free."""
-    seen = lattices.Lattice(np.zeros(2), np.array([0.0, 71.0 * stretch]), np.array([1.4 * 71.0 / stretch, 0.0]))
-    design = DiameterMap(np.full((9, 9), 0.18), PITCH * 1e-3, lattice=Lattice("rectangular", 1.4))
+    seen = lattices.Lattice(
+        np.zeros(2),
+        np.array([0.0, 71.0 * stretch]),
+        np.array([1.4 * 71.0 / stretch, 0.0]),
+    )
+    design = DiameterMap(
+        np.full((9, 9), 0.18), PITCH * 1e-3, lattice=Lattice("rectangular", 1.4)
+    )
     if fits:
         assert overlay._steps(seen, design).tolist() == [[1, 0], [0, 1]]
     else:
-        with pytest.raises(CaptureError, match="do not lie in the picture as on the mask"):
+        with pytest.raises(
+            CaptureError, match="do not lie in the picture as on the mask"
+        ):
             overlay._steps(seen, design)
 
 
@@ -169,22 +249,30 @@ def test_a_longer_side_is_sought_up_to_two_and_a_half_pitches_and_no_wave_beyond
     """A row in three that is brighter is no lattice of its own."""
     rows, columns = np.indices((330, 370))
     for ratio in (2.4, 1.4):
-        wave = np.cos(2 * np.pi * columns / 20.0) + np.cos(2 * np.pi * rows / (20.0 * ratio))
+        wave = np.cos(2 * np.pi * columns / 20.0) + np.cos(
+            2 * np.pi * rows / (20.0 * ratio)
+        )
         wave = wave + (0.0 if ratio == 2.4 else 3.0) * np.cos(2 * np.pi * rows / 60.0)
         made = lattices.find(wave, 20.0)
         assert np.abs(made.a) == pytest.approx([0.0, 20.0], abs=0.05)
         assert np.abs(made.b) == pytest.approx([20.0 * ratio, 0.0], abs=0.1)
 
 
-@pytest.mark.parametrize(("longer", "found"), [(2.4, True), (2.7, True), (2.85, False), (4.0, False)])
+@pytest.mark.parametrize(
+    ("longer", "found"), [(2.4, True), (2.7, True), (2.85, False), (4.0, False)]
+)
 def test_the_longer_side_of_a_cell_is_two_and_a_half_pitches_at_most(longer, found):
     """A tenth of a stated pitch is left to doubt about it: 2.5 over 0.9 is 2.78."""
     row, column = np.mgrid[:400, :300]
-    seen = np.cos(2 * np.pi * column / 12.0 + 0.3) + 0.8 * np.cos(2 * np.pi * row / (12.0 * longer) - 1.1)
+    seen = np.cos(2 * np.pi * column / 12.0 + 0.3) + 0.8 * np.cos(
+        2 * np.pi * row / (12.0 * longer) - 1.1
+    )
     if not found:
         with pytest.raises(CaptureError, match=r"no lattice of pitch 12\.00 pixels"):
             lattices.find(seen, 12.0)
         return
     made = lattices.find(seen, 12.0)
-    assert np.abs(made.a - [0.0, 12.0]).max() < 0.05  # peaks of waves of 25 and of 13 turns, a hundredth of one
+    assert (
+        np.abs(made.a - [0.0, 12.0]).max() < 0.05
+    )  # peaks of waves of 25 and of 13 turns, a hundredth of one
     assert np.abs(made.b - [12.0 * longer, 0.0]).max() < 0.3

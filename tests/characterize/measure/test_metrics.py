@@ -1,4 +1,6 @@
-"""Metrics against closed forms: Gaussian beams, the Airy pattern, a diffraction-limited edge."""
+"""Metrics against closed forms: Gaussian beams, the Airy pattern, a diffraction-limited
+edge.
+"""
 
 import math
 
@@ -16,7 +18,10 @@ AXIS = (np.arange(129) - 64) * STEP
 def gauss(sx, sy=None, angle=0.0, x0=0.0, y0=0.0):
     sy = sx if sy is None else sy
     x, y = AXIS[None] - x0, AXIS[:, None] - y0
-    u, v = x * math.cos(angle) + y * math.sin(angle), -x * math.sin(angle) + y * math.cos(angle)
+    u, v = (
+        x * math.cos(angle) + y * math.sin(angle),
+        -x * math.sin(angle) + y * math.cos(angle),
+    )
     return np.exp(-(u**2) / (2 * sx**2) - v**2 / (2 * sy**2))
 
 
@@ -41,7 +46,13 @@ def test_airy_mtf_and_strehl():
     psf = (2 * special.j1(v) / v) ** 2
     found = metrics.mtf_of_psf(psf, step_um=STEP / 2)
     f = found.frequency_per_um
-    want = np.where(f < 1, 2 / math.pi * (np.arccos(np.minimum(f, 1)) - f * np.sqrt(np.maximum(1 - f**2, 0))), 0)
+    want = np.where(
+        f < 1,
+        2
+        / math.pi
+        * (np.arccos(np.minimum(f, 1)) - f * np.sqrt(np.maximum(1 - f**2, 0))),
+        0,
+    )
     assert np.abs(found.modulation - want).max() < 0.02  # rings outside the window
     assert abs(found.mtf50_per_um - 0.404) < 0.01
     assert abs(metrics.strehl(psf, psf) - 1) < 1e-12
@@ -60,7 +71,11 @@ def test_slanted_edge_gives_the_mtf_of_its_blur_and_pixel():
     edge = np.zeros((n, n))
     for dx in fine:
         for dy in fine:
-            edge += special.ndtr(((x + dx) + (y + dy) * math.tan(math.radians(5))) * math.cos(math.radians(5)) / sigma)
+            edge += special.ndtr(
+                ((x + dx) + (y + dy) * math.tan(math.radians(5)))
+                * math.cos(math.radians(5))
+                / sigma
+            )
     for image in (edge / 81, edge.T / 81):
         found = metrics.mtf_of_edge(100 + 800 * image, pixel_um=1.0)
         f = found.frequency_per_um
@@ -75,8 +90,12 @@ def test_efficiency_needs_its_aperture():
     image = gauss(2.0) * 60
     reference = np.full((129, 129), image.sum() * 2 / 129**2)
     radius = 2.0 * math.sqrt(2 * math.log(2))
-    found = metrics.focusing_efficiency(image, reference, step_um=STEP, aperture_um=2 * radius)
-    assert abs(found - 0.25) < 0.01  # half the light within the half-maximum circle, half the reference
+    found = metrics.focusing_efficiency(
+        image, reference, step_um=STEP, aperture_um=2 * radius
+    )
+    assert (
+        abs(found - 0.25) < 0.01
+    )  # half the light within the half-maximum circle, half the reference
 
 
 def test_through_focus_grows_with_defocus():

@@ -1,4 +1,6 @@
-"""Registration of shifted images and calibration of a camera on drawn boards, both with known truth."""
+"""Registration of shifted images and calibration of a camera on drawn boards, both with
+known truth.
+"""
 
 import cv2
 import numpy as np
@@ -47,9 +49,17 @@ def test_camera_is_calibrated_on_drawn_boards():
         to_um = np.array([[40e3 / 1600, 0, -20e3], [0, 30e3 / 1200, -15e3], [0, 0, 1]])
         place = np.column_stack([rotation[:, :2], [0, 0, far]])
         views.append(
-            cv2.warpPerspective(picture, matrix @ place @ to_um, (640, 480), borderValue=255, flags=cv2.INTER_AREA)
+            cv2.warpPerspective(
+                picture,
+                matrix @ place @ to_um,
+                (640, 480),
+                borderValue=255,
+                flags=cv2.INTER_AREA,
+            )
         )
-    found = register.calibrate([ndimage.gaussian_filter(v, 0.7) for v in views], **about)
+    found = register.calibrate(
+        [ndimage.gaussian_filter(v, 0.7) for v in views], **about
+    )
     assert found.views == 6
     assert found.rms_px < 0.5
     assert abs(found.matrix[0, 0] - 900) < 15

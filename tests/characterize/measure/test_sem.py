@@ -1,4 +1,6 @@
-"""Micrographs rendered with charging, noise and drift: diameters come back to a fraction of a pixel."""
+"""Micrographs rendered with charging, noise and drift: diameters come back to a
+fraction of a pixel.
+"""
 
 import numpy as np
 import pytest
@@ -13,11 +15,15 @@ ABOUT = sem.Micrograph(PIXEL, PITCH)
 
 
 def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5):
-    """Anti-aliased discs with a brighter rim, blur, a shade, dark streaks, scan drift and shot noise."""
+    """Anti-aliased discs with a brighter rim, blur, a shade, dark streaks, scan drift
+    and shot noise.
+    """
     random = np.random.default_rng(seed)
     n, p, over = len(diameters_nm), PITCH / PIXEL, 3
     size = int(n * p)
-    wander = drift_px * np.sin(np.arange(size * over) / (size * over) * 5)  # of the scan, line by line
+    wander = drift_px * np.sin(
+        np.arange(size * over) / (size * over) * 5
+    )  # of the scan, line by line
     axis = np.arange(size * over) / over + 0.5 / over - 0.5
     image = np.full((size * over, size * over), 0.25)
     for j, i in np.ndindex(n, n):
@@ -27,7 +33,9 @@ def render(diameters_nm, seed=0, missing=(), moved=(), noise=0.15, drift_px=1.5)
         rows = slice(int(j * p * over), int((j + 1) * p * over))
         columns = slice(max(int((i - 0.1) * p * over), 0), int((i + 1.5) * p * over))
         r = (
-            np.hypot(axis[None, columns] - wander[rows, None] - cx, axis[rows, None] - cy)
+            np.hypot(
+                axis[None, columns] - wander[rows, None] - cx, axis[rows, None] - cy
+            )
             - diameters_nm[j, i] / 2 / PIXEL
         )
         disc = np.where(r < 0, 0.8 + 0.1 * np.exp(-((r + 2) ** 2) / 4), 0.25)
@@ -55,7 +63,9 @@ def test_bias_below_0_3_px_and_repeatability_below_0_1_px():
     assert np.abs(error_px).max() < 1.0
     told_px = np.array([each.sigma_nm for each in found]) / PIXEL
     ratio = np.sqrt(error_px.var(0, ddof=1).mean() / (told_px**2).mean())
-    assert 0.5 < ratio < 1.3  # 48 degrees of freedom: 10 %; the bar takes four rays as one, which is on the safe side
+    assert (
+        0.5 < ratio < 1.3
+    )  # 48 degrees of freedom: 10 %; the bar takes four rays as one, which is on the safe side
 
 
 def test_missing_and_collapsed_pillars_are_named():
@@ -94,7 +104,9 @@ def test_scale_bar_gives_the_pixel():
 def test_calibrated_edge_bias_comes_off_both_sides():
     image = render(np.random.default_rng(4).uniform(160, 260, (4, 4)))
     plain = sem.measure(image, ABOUT).diameter_nm
-    calibrated = sem.measure(image, sem.Micrograph(PIXEL, PITCH, edge_bias_nm=3.7)).diameter_nm
+    calibrated = sem.measure(
+        image, sem.Micrograph(PIXEL, PITCH, edge_bias_nm=3.7)
+    ).diameter_nm
     assert plain - calibrated == pytest.approx(np.full(16, 7.4), abs=1e-9)
 
 
@@ -110,5 +122,8 @@ def test_summaries_of_the_diameters():
     assert known.value == pytest.approx(4.0)
     assert known.sigma == pytest.approx(np.sqrt((9 + 4 + 0 + 25) / 3) / 2)
     assert (
-        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where, no).bias(3.0).sigma == 0.05
+        sem.Diameters(zero, zero, four * 0 + 5, zero, no, no, *where, no)
+        .bias(3.0)
+        .sigma
+        == 0.05
     )  # never surer than this

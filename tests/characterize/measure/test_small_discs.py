@@ -1,4 +1,6 @@
-"""Diameters of discs that are not wide beside the picture's blur: area by exact chords, a blur of this file's own."""
+"""Diameters of discs that are not wide beside the picture's blur: area by exact chords,
+a blur of this file's own.
+"""
 
 import numpy as np
 import pytest
@@ -9,8 +11,13 @@ COUNT, STRIPS = 5, 16
 
 
 def covered(size, row, column, radius):
-    """(y, x) share of each pixel within a disc: lengths of its chords in strips of pixels, by Pythagoras."""
-    edges, strips = np.arange(size + 1) - 0.5, (np.arange(size * STRIPS) + 0.5) / STRIPS - 0.5
+    """(y, x) share of each pixel within a disc: lengths of its chords in strips of
+    pixels, by Pythagoras.
+    """
+    edges, strips = (
+        np.arange(size + 1) - 0.5,
+        (np.arange(size * STRIPS) + 0.5) / STRIPS - 0.5,
+    )
     half = np.sqrt(np.maximum(radius**2 - (strips - column) ** 2, 0))
     ends = np.clip(edges[:, None], row - half, row + half)
     return np.diff(ends, axis=0).reshape(size, size, STRIPS).mean(2)
@@ -22,18 +29,30 @@ def blurred(picture, sigma):
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     for _ in range(2):
         wide = np.pad(picture, ((reach, reach), (0, 0)), mode="edge")
-        parts = (w * wide[k : k + len(picture)] for k, w in enumerate(weights / weights.sum()))
+        parts = (
+            w * wide[k : k + len(picture)]
+            for k, w in enumerate(weights / weights.sum())
+        )
         picture = np.sum(list(parts), axis=0).T
     return picture
 
 
 def measured(diameter, blur, *, noise, rng, pitch=None):
-    """Errors of all diameters (p,) and what is told of them, of discs anywhere within their pixels."""
+    """Errors of all diameters (p,) and what is told of them, of discs anywhere within
+    their pixels.
+    """
     pitch = 2.5 * diameter + 0.3 if pitch is None else pitch
     size = int(COUNT * pitch)
-    places = rng.uniform(0.47, 0.53, (COUNT, COUNT, 2)) + np.stack(np.mgrid[:COUNT, :COUNT], -1)
-    flat = sum(covered(size, *(place * pitch - 0.5), diameter / 2) for place in places.reshape(-1, 2))
-    picture = 37.0 + 290.0 * (blurred(flat, blur) + noise * rng.standard_normal(flat.shape))
+    places = rng.uniform(0.47, 0.53, (COUNT, COUNT, 2)) + np.stack(
+        np.mgrid[:COUNT, :COUNT], -1
+    )
+    flat = sum(
+        covered(size, *(place * pitch - 0.5), diameter / 2)
+        for place in places.reshape(-1, 2)
+    )
+    picture = 37.0 + 290.0 * (
+        blurred(flat, blur) + noise * rng.standard_normal(flat.shape)
+    )
     found = sem.measure(picture, sem.Micrograph(1.0, pitch))
     whole = np.isfinite(found.diameter_nm)
     assert whole.sum() >= 19  # of 25, less those that the picture's edge cuts
@@ -43,7 +62,11 @@ def measured(diameter, blur, *, noise, rng, pitch=None):
 @pytest.mark.parametrize(
     ("diameter", "blur", "most"),
     [
-        (9.0, 2.0, 0.05),  # 0.5 too large where half of the lowered step was taken for half of the step
+        (
+            9.0,
+            2.0,
+            0.05,
+        ),  # 0.5 too large where half of the lowered step was taken for half of the step
         (9.0, 1.0, 0.02),
         (12.0, 2.5, 0.06),  # 0.5 too large
         (16.0, 2.0, 0.02),
@@ -52,41 +75,68 @@ def measured(diameter, blur, *, noise, rng, pitch=None):
     ],
 )
 def test_discs_in_a_wide_blur_are_as_large_as_they_are(diameter, blur, most):
-    """Mean of some twenty, noise of 1 %: 0.02 of each from it; the rest is neighbours' light in the gap."""
+    """Mean of some twenty, noise of 1 %: 0.02 of each from it; the rest is neighbours'
+    light in the gap.
+    """
     error, sigma = measured(diameter, blur, noise=0.01, rng=np.random.default_rng(7))
     assert abs(error.mean()) < most
     assert (np.abs(error) < 1.96 * sigma).mean() > 0.9  # of 25: two by chance
 
 
-@pytest.mark.parametrize(("diameter", "blur"), [(7.0, 2.0), (9.0, 2.0), (12.0, 2.0), (9.0, 1.0)])
+@pytest.mark.parametrize(
+    ("diameter", "blur"), [(7.0, 2.0), (9.0, 2.0), (12.0, 2.0), (9.0, 1.0)]
+)
 def test_errors_of_small_discs_hold_their_noise(diameter, blur):
-    """Noise of 10 % of the step in each pixel, which a radius of two blurs or less is read with several times."""
-    every = [measured(diameter, blur, noise=0.1, rng=np.random.default_rng(seed)) for seed in range(3)]
+    """Noise of 10 % of the step in each pixel, which a radius of two blurs or less is
+    read with several times.
+    """
+    every = [
+        measured(diameter, blur, noise=0.1, rng=np.random.default_rng(seed))
+        for seed in range(3)
+    ]
     score = np.concatenate([error / sigma for error, sigma in every])
-    assert (np.abs(score) < 1.96).mean() > 0.84  # of about 70: 2.6 % from chance, four times that
-    assert 0.7 < score.std() < 1.3  # 9 % from chance, and errors of which a picture's discs share one of its blur
+    assert (
+        np.abs(score) < 1.96
+    ).mean() > 0.84  # of about 70: 2.6 % from chance, four times that
+    assert (
+        0.7 < score.std() < 1.3
+    )  # 9 % from chance, and errors of which a picture's discs share one of its blur
 
 
 @pytest.mark.parametrize(("radius", "variance"), [(4.5, 4.0), (6.0, 1.7), (3.5, 0.8)])
 def test_a_disc_that_is_read_is_found_from_its_reading(radius, variance):
-    """The profile by a sum over the disc's area, smoothed by a sum: back come its blur and radius."""
+    """The profile by a sum over the disc's area, smoothed by a sum: back come its blur
+    and radius.
+    """
     reach, smooth = np.arange(0, 14, 0.125), 1.0
     step = 0.04
-    v, u = np.meshgrid(np.arange(-radius, radius, step) + step / 2, np.arange(-radius, radius, step) + step / 2)
+    v, u = np.meshgrid(
+        np.arange(-radius, radius, step) + step / 2,
+        np.arange(-radius, radius, step) + step / 2,
+    )
     inside = np.hypot(u, v) < radius
-    seen = [np.exp(-((r - u[inside]) ** 2 + v[inside] ** 2) / (2 * variance)).sum() for r in reach]
+    seen = [
+        np.exp(-((r - u[inside]) ** 2 + v[inside] ** 2) / (2 * variance)).sum()
+        for r in reach
+    ]
     seen = np.array(seen) * step**2 / (2 * np.pi * variance)
     weights = np.exp(-0.5 * ((reach[:, None] - reach) / smooth) ** 2)
-    weights[:, 0] += np.exp(-0.5 * ((reach[:, None] + 0.125 * np.arange(1, 64)) / smooth) ** 2).sum(
-        1
-    )  # as level as at 0
-    weights[:, -1] += np.exp(-0.5 * ((reach[:, None] - 14 - 0.125 * np.arange(64)) / smooth) ** 2).sum(1)
+    weights[:, 0] += np.exp(
+        -0.5 * ((reach[:, None] + 0.125 * np.arange(1, 64)) / smooth) ** 2
+    ).sum(1)  # as level as at 0
+    weights[:, -1] += np.exp(
+        -0.5 * ((reach[:, None] - 14 - 0.125 * np.arange(64)) / smooth) ** 2
+    ).sum(1)
     rays = np.repeat((weights @ seen / weights.sum(1))[:, None], radial.RAYS, 1)
     blur = radial.blur(reach, rays, smooth)
-    assert blur == pytest.approx(variance, rel=0.02)  # eight turns, each leaving a third
+    assert blur == pytest.approx(
+        variance, rel=0.02
+    )  # eight turns, each leaving a third
     inner, outer, rim = radial.plateaus(reach, rays)
     half = radial.falls(reach, rays, (inner + outer) / 2, rim)[0]
-    assert radial.unblurred(reach, half, variance, smooth)[0] == pytest.approx(radius, abs=0.01)  # steps of the sum
+    assert radial.unblurred(reach, half, variance, smooth)[0] == pytest.approx(
+        radius, abs=0.01
+    )  # steps of the sum
     rim_only = rays - 0.7 * np.exp(-((reach / (0.4 * radius)) ** 2))[:, None]
     assert np.isnan(radial.blur(reach, rim_only, smooth))  # a dark top
 

@@ -1,4 +1,6 @@
-"""Spots on pixels as wide as they are, with noise: Strehl ratio and encircled energy by sums over a pupil."""
+"""Spots on pixels as wide as they are, with noise: Strehl ratio and encircled energy by
+sums over a pupil.
+"""
 
 import math
 import sys
@@ -23,10 +25,16 @@ FINE = 7  # samples a pixel side
 
 
 def light(phase_rad, x_um, y_um):
-    """Focus of a pupil with this phase, by the sum over the pupil; 1 at the peak of a perfect one."""
+    """Focus of a pupil with this phase, by the sum over the pupil; 1 at the peak of a
+    perfect one.
+    """
     pupil = np.where(U**2 + V**2 <= 1, np.exp(1j * phase_rad), 0)
     k = 2 * math.pi * SINE / WAVE
-    field = np.exp(1j * k * np.outer(y_um, ACROSS)) @ pupil @ np.exp(1j * k * np.outer(ACROSS, x_um))
+    field = (
+        np.exp(1j * k * np.outer(y_um, ACROSS))
+        @ pupil
+        @ np.exp(1j * k * np.outer(ACROSS, x_um))
+    )
     return np.abs(field) ** 2 / np.abs(pupil).sum() ** 2
 
 
@@ -47,8 +55,12 @@ def capture(counts, pixel_um):
 
 @pytest.mark.parametrize(("pixel_um", "shape"), [(1.0, (31, 36)), (1.9, (24, 27))])
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.5, 0.5), (-0.31, 0.44)])
-def test_a_perfect_spot_has_a_strehl_ratio_of_one_wherever_it_falls_on_the_pixels(pixel_um, shape, place):
-    """Brightest pixels hold up to twice as much as others by place alone. 1 %: 64 samples across the pupil."""
+def test_a_perfect_spot_has_a_strehl_ratio_of_one_wherever_it_falls_on_the_pixels(
+    pixel_um, shape, place
+):
+    """Brightest pixels hold up to twice as much as others by place alone. 1 %: 64
+    samples across the pupil.
+    """
     spot = pixels(0 * U, shape, pixel_um, np.multiply(place, pixel_um))
     counts = 40 + 30000 * spot
     (found,) = frames.measure(capture(counts, pixel_um), design=DESIGN).frames
@@ -57,23 +69,33 @@ def test_a_perfect_spot_has_a_strehl_ratio_of_one_wherever_it_falls_on_the_pixel
 
 @pytest.mark.parametrize("place", [(11.3, 2.2), (-1.4, -12.7), (-13.6, 9.1)])
 def test_a_spot_near_the_border_of_its_frame_is_found_there(place):
-    """Two pixels from one border, or another: the Airy pattern is laid on from where the brightest pixel is."""
+    """Two pixels from one border, or another: the Airy pattern is laid on from where
+    the brightest pixel is.
+    """
     counts = 40 + 30000 * pixels(0 * U, (31, 36), 1.0, place)
     (found,) = frames.measure(capture(counts, 1.0), design=DESIGN).frames
-    assert found.strehl == pytest.approx(1, abs=0.02)  # less of the rings is seen: 1 % of the light
+    assert found.strehl == pytest.approx(
+        1, abs=0.02
+    )  # less of the rings is seen: 1 % of the light
 
 
 def test_a_second_spot_outside_the_core_does_not_move_the_pattern():
-    """Of 0.9, six and a half pixels off; the core ends five from the brightest. Beside a pattern laid on by hand."""
+    """Of 0.9, six and a half pixels off; the core ends five from the brightest. Beside
+    a pattern laid on by hand.
+    """
     core = pixels(0 * U, (33, 36), 1.0, (0.3, -0.2))
     image = core + 0.9 * pixels(0 * U, (33, 36), 1.0, (6.8, -0.2))
     ideal = frames.airy(DESIGN, capture(image, 1.0), image.shape, place_px=(0.3, -0.2))
     want = metrics.strehl(image, ideal - np.median(frames._rim(ideal)))
-    assert frames._strehl(image, DESIGN, capture(image, 1.0)) == pytest.approx(want, rel=2e-3)
+    assert frames._strehl(image, DESIGN, capture(image, 1.0)) == pytest.approx(
+        want, rel=2e-3
+    )
 
 
 def test_the_strehl_ratio_of_an_aberrated_spot_is_that_of_its_peak():
-    """0.6 rad of coma, a pixel of half the core: 0.03, as its peak is not quite as narrow as the perfect one."""
+    """0.6 rad of coma, a pixel of half the core: 0.03, as its peak is not quite as
+    narrow as the perfect one.
+    """
     fine = np.linspace(-1.5, 1.5, 121)
     want = light(COMA, fine, fine).max()
     for place in ((0.1, -0.4), (-0.45, 0.2)):
@@ -84,10 +106,13 @@ def test_the_strehl_ratio_of_an_aberrated_spot_is_that_of_its_peak():
 
 
 def test_noise_is_no_light_of_its_own():
-    """80 % of the light and the efficiency in a window 60 times as wide as the spot, 3 e of read noise, eight times.
+    """80 % of the light and the efficiency in a window 60 times as wide as the spot, 3
+    e of read noise, eight times.
 
-    Light within a circle is off by 3 sqrt(4000) = 190 e of 23 000: EE80 by 3 % each time (its slope there is 0.4 of
-    the light a radius); noise cut off at 0 would add 1.2 e a pixel, a fifth of the light.
+    Light within a circle is off by 3 sqrt(4000) = 190 e of 23 000: EE80 by 3 % each
+    time (its slope there is 0.4 of
+    the light a radius); noise cut off at 0 would add 1.2 e a pixel, a fifth of the
+    light.
     """
     rng = np.random.default_rng(3)
     shape, pixel = (61, 65), 1.7
@@ -97,16 +122,30 @@ def test_noise_is_no_light_of_its_own():
     for _ in range(8):
         noisy = rng.poisson(spot) + rng.normal(0, 3.0, shape)
         found.append(metrics.spot(noisy, step_um=pixel).ee80_um)
-        share.append(metrics.focusing_efficiency(noisy, 1.7 * spot.sum(), step_um=pixel, aperture_um=6 * pixel))
-    wide = math.hypot(1.21, 1 / math.sqrt(12))  # samples are taken as even over their pixels
-    assert np.mean(found) == pytest.approx(wide * pixel * math.sqrt(2 * math.log(5)), rel=0.02)
-    assert np.mean(share) == pytest.approx((1 - math.exp(-9 / 2 / wide**2)) / 1.7, rel=0.01)
+        share.append(
+            metrics.focusing_efficiency(
+                noisy, 1.7 * spot.sum(), step_um=pixel, aperture_um=6 * pixel
+            )
+        )
+    wide = math.hypot(
+        1.21, 1 / math.sqrt(12)
+    )  # samples are taken as even over their pixels
+    assert np.mean(found) == pytest.approx(
+        wide * pixel * math.sqrt(2 * math.log(5)), rel=0.02
+    )
+    assert np.mean(share) == pytest.approx(
+        (1 - math.exp(-9 / 2 / wide**2)) / 1.7, rel=0.01
+    )
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.5, 1.1, 2.6])
 def test_a_circle_takes_its_part_of_every_pixel(radius):
-    """Even light of 1 a pixel holds the area of the circle, in the middle of a pixel or not; 0.3 % of chords."""
+    """Even light of 1 a pixel holds the area of the circle, in the middle of a pixel or
+    not; 0.3 % of chords.
+    """
     even = np.ones((9, 11))
     for x0, y0 in ((0.0, 0.0), (0.41, -0.17)):
-        inside = metrics._within(even, np.arange(11) - 5 - x0, np.arange(9) - 4 - y0, radius)
+        inside = metrics._within(
+            even, np.arange(11) - 5 - x0, np.arange(9) - 4 - y0, radius
+        )
         assert inside == pytest.approx(math.pi * radius**2, rel=0.02)

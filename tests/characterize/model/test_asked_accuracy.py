@@ -1,4 +1,6 @@
-"""Accuracy that is asked for: more digits where the tolerance is tighter; slopes of a lens of one diameter."""
+"""Accuracy that is asked for: more digits where the tolerance is tighter; slopes of a
+lens of one diameter.
+"""
 
 import math
 import sys
@@ -15,17 +17,22 @@ from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap
 
 
-@pytest.mark.parametrize(("tolerance", "more"), [(5e-4 / math.e**2, 2.0), (5e-7, math.log(1e3)), (5e-3, 0.0)])
+@pytest.mark.parametrize(
+    ("tolerance", "more"), [(5e-4 / math.e**2, 2.0), (5e-7, math.log(1e3)), (5e-3, 0.0)]
+)
 def test_digits_are_counted_from_five_ten_thousandths_of_the_field(tolerance, more):
     assert kernel.digits(tolerance) == pytest.approx(more, abs=1e-12)
 
 
 def test_tables_hold_five_times_the_rounding_of_their_columns():
-    """Of 300 rows in single precision 6e-8 x 2 x sqrt(300) of the norm is rounding; a fifth of a tolerance may be left.
+    """Of 300 rows in single precision 6e-8 x 2 x sqrt(300) of the norm is rounding; a
+    fifth of a tolerance may be left.
     Just above that, what is found of a table of rank 7 is its range and no noise."""
     rng = np.random.default_rng(3)
     columns, rows = (rng.standard_normal((2, *shape)) for shape in ((300, 7), (7, 200)))
-    table = ((columns[0] + 1j * columns[1]) @ (rows[0] + 1j * rows[1])).astype(np.complex64)
+    table = ((columns[0] + 1j * columns[1]) @ (rows[0] + 1j * rows[1])).astype(
+        np.complex64
+    )
     least = 2.0**-23 * math.sqrt(300) * 5
     assert kernel.least_tolerance(table) == pytest.approx(least, rel=1e-9)
     left, right, _ = kernel.factors(table, 1.02 * least)
@@ -36,7 +43,9 @@ def test_tables_hold_five_times_the_rounding_of_their_columns():
 
 
 def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):
-    """Within a nanometre to either side, where the answer of a smooth pillar is its value and its slope."""
+    """Within a nanometre to either side, where the answer of a smooth pillar is its
+    value and its slope.
+    """
     only, asked = 0.1731, []
 
     def exact(cell, diameter_um, wavelength_um, wanted, table):
@@ -49,7 +58,9 @@ def test_slopes_of_a_lens_of_one_diameter_are_solved_about_it(monkeypatch):
     lens = b.row(diameters=DiameterMap(diameters, 0.4))
     found = pillar_slopes._solve(lens, 1e-4, ())
     assert only - 1.0001e-3 < min(asked) < only < max(asked) < only + 1.0001e-3
-    assert (found.low_um, found.high_um) == pytest.approx((only - 1e-3, only + 1e-3), abs=1e-9)
+    assert (found.low_um, found.high_um) == pytest.approx(
+        (only - 1e-3, only + 1e-3), abs=1e-9
+    )
     assert found.center_um == pytest.approx(only, abs=1e-9)
     assert found.coefficients[:, 0] == pytest.approx([2.3 + 1j, 5j, -1.7])
     assert found.coefficients[0, 1] == pytest.approx(40, rel=1e-6)

@@ -1,4 +1,6 @@
-"""From light to pixels: transfers as integrals over what blurs, places of fine samples, waves of known phase."""
+"""From light to pixels: transfers as integrals over what blurs, places of fine samples,
+waves of known phase.
+"""
 
 import math
 
@@ -14,7 +16,9 @@ F = np.hypot(FX, FY)
 
 
 def test_transfers_are_fourier_integrals_of_what_blurs():
-    """A pixel over its square; disc and ball, in projection, along the direction of the wave; a Gaussian."""
+    """A pixel over its square; disc and ball, in projection, along the direction of the
+    wave; a Gaussian.
+    """
     pixel, size = 2.3, 3.1
 
     def over(profile, reach, f):
@@ -34,13 +38,20 @@ def test_transfers_are_fourier_integrals_of_what_blurs():
     spread = detector.gauss(FY, FX, 0.9)[0]
     lit, glow = detector.disc(FY, FX, size)[0], detector.ball(FY, FX, size)
     for (i, j), f in np.ndenumerate(F):
-        one = over(lambda t: 1.0, pixel / 2, FX[0, j]) * over(lambda t: 1.0, pixel / 2, FY[i, 0])
+        one = over(lambda t: 1.0, pixel / 2, FX[0, j]) * over(
+            lambda t: 1.0, pixel / 2, FY[i, 0]
+        )
         assert box[i, j] == pytest.approx(one, rel=1e-9)
-        assert spread[i, j] == pytest.approx(over(lambda t: math.exp(-t * t / 1.62), 9.0, f), rel=1e-7)
+        assert spread[i, j] == pytest.approx(
+            over(lambda t: math.exp(-t * t / 1.62), 9.0, f), rel=1e-7
+        )
         assert lit[i, j] == pytest.approx(over(chord, size / 2, f), rel=1e-6)
         assert glow[i, j] == pytest.approx(over(slab, size / 2, f), rel=1e-7)
     zero = np.zeros((1, 1))
-    assert (detector.disc(zero, zero, size)[0], detector.disc(zero, zero, size)[1]) == (1, 0)
+    assert (detector.disc(zero, zero, size)[0], detector.disc(zero, zero, size)[1]) == (
+        1,
+        0,
+    )
     assert detector.ball(zero, zero, size) == pytest.approx(1, abs=1e-6)
 
 
@@ -56,21 +67,27 @@ def test_fine_samples_share_each_pixel_evenly(over):
     for axis, pixels in zip(grid.axes_um(), (5, 8), strict=True):
         assert len(axis) == (pixels + 6) * over
         centre = axis.reshape(-1, over).mean(1)
-        assert centre == pytest.approx((np.arange(pixels + 6) - pixels // 2 - 3) * 2.4, abs=1e-12)
+        assert centre == pytest.approx(
+            (np.arange(pixels + 6) - pixels // 2 - 3) * 2.4, abs=1e-12
+        )
         assert np.diff(axis) == pytest.approx(np.full(len(axis) - 1, 2.4 / over))
     assert grid.fine_um == pytest.approx(2.4 / over)
 
 
 @pytest.mark.parametrize("over", [1, 2, 3, 4])
 def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over):
-    """Waves that close on the grid: the pixel at (r, c) sees cos(2π f·place), turned and weakened by the transfer."""
+    """Waves that close on the grid: the pixel at (r, c) sees cos(2π f·place), turned
+    and weakened by the transfer.
+    """
     grid = Grid(6, 9, 1.7, over, margin=2)
     y, x = grid.axes_um()
     fy, fx = 2 / (10 * 1.7), 3 / (13 * 1.7)
     light = 5 + np.cos(2 * math.pi * (fx * x + fy * y[:, None]) + 0.4)
     gy, gx = grid.frequencies()
     assert gx.shape[1] == 13 * over // 2 + 1
-    transfer = np.exp(-2 * (gy**2 + 3 * gx**2)) * np.exp(-2j * math.pi * (gx * 0.31 - gy * 0.17))
+    transfer = np.exp(-2 * (gy**2 + 3 * gx**2)) * np.exp(
+        -2j * math.pi * (gx * 0.31 - gy * 0.17)
+    )
     seen = grid.sample(np.stack([light, 2 * light]), transfer)
     rows, columns = (np.arange(6) - 3) * 1.7, (np.arange(9) - 4) * 1.7
     moved = 2 * math.pi * (fx * (columns - 0.31) + fy * (rows[:, None] + 0.17)) + 0.4
@@ -80,35 +97,54 @@ def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over
 
 
 def test_sampling_is_fine_enough_at_twice_the_highest_frequency():
-    assert detector.fine_enough(2.0, 0.75) == 3  # 3 samples a pixel of 2: 1.5 a um, twice 0.75
+    assert (
+        detector.fine_enough(2.0, 0.75) == 3
+    )  # 3 samples a pixel of 2: 1.5 a um, twice 0.75
     assert detector.fine_enough(2.0, 0.76) == 4
     assert detector.fine_enough(2.0, 0.1) == 1
 
 
 @pytest.mark.parametrize("over", [1, 2, 3, 4])
 def test_sums_along_the_axes_are_the_transfer_and_its_derivative(over):
-    """Of light below the highest frequency of the samples, which is half in the sampling: rounding is left."""
+    """Of light below the highest frequency of the samples, which is half in the
+    sampling: rounding is left.
+    """
     grid, sigma = Grid(5, 8, 2.4, over, margin=3), 1.3
     light = np.fft.fft2(np.random.default_rng(over).random((2, 11 * over, 14 * over)))
     light[:, 11 * over // 2 if over % 2 == 0 else slice(0, 0)] = 0
     light[:, :, 7 * over] = 0
     light = np.fft.ifft2(light).real
     fy, fx = grid.frequencies()
-    square, (smooth, by_sigma) = detector.pixel(fy, fx, 2.4), detector.gauss(fy, fx, sigma)
+    square, (smooth, by_sigma) = (
+        detector.pixel(fy, fx, 2.4),
+        detector.gauss(fy, fx, sigma),
+    )
     plain, slope = grid.sums(sigma)
-    assert grid.sample(light, plain) == pytest.approx(grid.sample(light, square * smooth), abs=1e-13)
-    assert grid.sample(light, slope) == pytest.approx(grid.sample(light, square * by_sigma), abs=1e-13)
-    assert grid.sample(light, slope.times(3.0)) == pytest.approx(3 * grid.sample(light, slope), rel=1e-12)
+    assert grid.sample(light, plain) == pytest.approx(
+        grid.sample(light, square * smooth), abs=1e-13
+    )
+    assert grid.sample(light, slope) == pytest.approx(
+        grid.sample(light, square * by_sigma), abs=1e-13
+    )
+    assert grid.sample(light, slope.times(3.0)) == pytest.approx(
+        3 * grid.sample(light, slope), rel=1e-12
+    )
 
 
 def test_a_point_source_has_sums_and_a_small_disc_nearly_the_same():
     grid, shrink = Grid(6, 5, 2.4, 2), np.array([0.7, 1.2])
     light = np.random.default_rng(0).random((2, 20, 18))
-    light = np.fft.irfft2(np.fft.rfft2(light) * (np.hypot(*np.broadcast_arrays(*grid.frequencies())) < 0.3), (20, 18))
+    light = np.fft.irfft2(
+        np.fft.rfft2(light)
+        * (np.hypot(*np.broadcast_arrays(*grid.frequencies())) < 0.3),
+        (20, 18),
+    )
     point, slopes = detector.transfers(grid, 0.4, 0 * shrink, shrink, sized=False)
     small, others = detector.transfers(grid, 0.4, 1e-4 * shrink, shrink, sized=True)
     assert isinstance(point, detector.Sums)
     assert set(slopes) == {"crosstalk_px"}
-    assert grid.sample(light, point) == pytest.approx(grid.sample(light, small), abs=1e-9)
+    assert grid.sample(light, point) == pytest.approx(
+        grid.sample(light, small), abs=1e-9
+    )
     found = grid.sample(light, slopes["crosstalk_px"])
     assert found == pytest.approx(grid.sample(light, others["crosstalk_px"]), abs=1e-9)

@@ -1,4 +1,6 @@
-"""Windows and parts of them in numbers that are typed in, and transfers of every cause by differences."""
+"""Windows and parts of them in numbers that are typed in, and transfers of every cause
+by differences.
+"""
 
 import math
 from types import SimpleNamespace
@@ -13,13 +15,17 @@ GRID = Grid(7, 10, 2.4, 3, margin=4, middle_um=(5.5, -31.0), fill=0.7)
 
 
 def test_pixels_count_from_the_chief_ray_with_the_middle_one_at_half_their_number():
-    """Rows 0 to 6 about the fourth, columns 0 to 9 about the sixth; three samples a pixel."""
+    """Rows 0 to 6 about the fourth, columns 0 to 9 about the sixth; three samples a
+    pixel.
+    """
     y, x = GRID.ends_um()
     assert y == pytest.approx([-31.0 - 3 * 2.4, -31.0 + 3 * 2.4])
     assert x == pytest.approx([5.5 - 5 * 2.4, 5.5 + 4 * 2.4])
     fine_y, fine_x = GRID.axes_um()
     assert (len(fine_y), len(fine_x)) == ((7 + 8) * 3, (10 + 8) * 3)
-    assert fine_y[[0, -1]] == pytest.approx([-31.0 - 7 * 2.4 - 0.8, -31.0 + 7 * 2.4 + 0.8])
+    assert fine_y[[0, -1]] == pytest.approx(
+        [-31.0 - 7 * 2.4 - 0.8, -31.0 + 7 * 2.4 + 0.8]
+    )
     assert fine_x[[0, -1]] == pytest.approx([5.5 - 9 * 2.4 - 0.8, 5.5 + 8 * 2.4 + 0.8])
     assert (GRID.fine_um, GRID.wide_um) == pytest.approx((0.8, 0.7 * 2.4))
 
@@ -32,20 +38,39 @@ def test_the_square_that_holds_all_light_grows_by_twice_what_lies_far_off(near, 
 
 
 def test_a_part_of_a_window_sees_the_same_places():
-    """Rows 2 to 5 and columns 2 to 8; then of these rows 1 to 3: pixels and fine samples lie where they lay."""
+    """Rows 2 to 5 and columns 2 to 8; then of these rows 1 to 3: pixels and fine
+    samples lie where they lay.
+    """
     part = GRID.part(slice(2, 6), slice(2, 9), 2)
-    assert (part.rows, part.columns, part.margin, part.oversample, part.fill) == (4, 7, 2, 3, 0.7)
+    assert (part.rows, part.columns, part.margin, part.oversample, part.fill) == (
+        4,
+        7,
+        2,
+        3,
+        0.7,
+    )
     again = part.part(slice(1, 4), slice(0, 7), 9)
-    assert (again.rows, again.columns, again.margin) == (3, 7, 2)  # no more room than there was
-    rows, columns = ((np.arange(n) - n // 2) * 2.4 + at for n, at in ((7, -31.0), (10, 5.5)))
-    for one, r, c in ((part, slice(2, 6), slice(2, 9)), (again, slice(3, 6), slice(2, 9))):
+    assert (again.rows, again.columns, again.margin) == (
+        3,
+        7,
+        2,
+    )  # no more room than there was
+    rows, columns = (
+        (np.arange(n) - n // 2) * 2.4 + at for n, at in ((7, -31.0), (10, 5.5))
+    )
+    for one, r, c in (
+        (part, slice(2, 6), slice(2, 9)),
+        (again, slice(3, 6), slice(2, 9)),
+    ):
         y, x = one.ends_um()
         assert y == pytest.approx(rows[r][[0, -1]])
         assert x == pytest.approx(columns[c][[0, -1]])
         room = one.margin * 3
         assert one.axes_um()[0][room : room + 3].mean() == pytest.approx(rows[r][0])
         assert one.axes_um()[1][room : room + 3].mean() == pytest.approx(columns[c][0])
-    assert part.across_um(12.0) == pytest.approx((7 + 2) * 2.4 + 20.0 + 2 * (abs(y_centre(part)) - 12.0))
+    assert part.across_um(12.0) == pytest.approx(
+        (7 + 2) * 2.4 + 20.0 + 2 * (abs(y_centre(part)) - 12.0)
+    )
 
 
 def y_centre(part):
@@ -57,7 +82,11 @@ def y_centre(part):
 def test_sums_times_a_factor_are_theirs_once():
     rng = np.random.default_rng(2)
     pairs = tuple(
-        (rng.normal(size=(2, 5)).astype(np.float32), rng.normal(size=(3, 6)).astype(np.float32)) for _ in "ab"
+        (
+            rng.normal(size=(2, 5)).astype(np.float32),
+            rng.normal(size=(3, 6)).astype(np.float32),
+        )
+        for _ in "ab"
     )
     some, light = Sums(pairs), rng.normal(size=(5, 6))
     grid = Grid(2, 3, 1.0)
@@ -70,7 +99,9 @@ def test_sums_times_a_factor_are_theirs_once():
 
 @pytest.mark.parametrize("over", [2, 3])
 def test_transfers_are_pixel_blur_and_disc_and_move_with_each_of_them(over):
-    """Sizes of the images in two frames; a source's diameter d has images of shrink times d."""
+    """Sizes of the images in two frames; a source's diameter d has images of shrink
+    times d.
+    """
     grid = Grid(6, 5, 2.4, over, fill=0.7)
     shrink, diameter, crosstalk = np.array([0.7, 1.2]), 4.1, 0.4
     fy, fx = grid.frequencies()
@@ -80,16 +111,22 @@ def test_transfers_are_pixel_blur_and_disc_and_move_with_each_of_them(over):
         sizes = shrink * (diameter + growth)
         square = np.sinc(fx * wide) * np.sinc(fy * wide)
         smooth = np.exp(-2 * (np.pi * crosstalk * wide) ** 2 * (fx**2 + fy**2))
-        return np.stack([square * smooth * detector.disc(fy, fx, size)[0] for size in sizes])
+        return np.stack(
+            [square * smooth * detector.disc(fy, fx, size)[0] for size in sizes]
+        )
 
-    got, slopes = detector.transfers(grid, crosstalk, shrink * diameter, shrink, sized=True)
+    got, slopes = detector.transfers(
+        grid, crosstalk, shrink * diameter, shrink, sized=True
+    )
     assert got == pytest.approx(whole(), abs=1e-12)
     for name, moved in (
         ("crosstalk_px", lambda x: whole(crosstalk=crosstalk + x)),
         ("pinhole_um", lambda x: whole(diameter=diameter + x)),
         ("growth", lambda x: whole(growth=x)),
     ):
-        assert slopes[name] == pytest.approx((moved(1e-5) - moved(-1e-5)) / 2e-5, abs=1e-8), name
+        assert slopes[name] == pytest.approx(
+            (moved(1e-5) - moved(-1e-5)) / 2e-5, abs=1e-8
+        ), name
     assert set(slopes) == {"crosstalk_px", "pinhole_um", "growth"}
 
 
@@ -98,33 +135,53 @@ def test_a_point_that_is_sized_has_the_slope_of_three_tenths_of_a_pixel():
     grid, shrink = Grid(6, 5, 2.4, 2, fill=0.7), np.array([0.7, 1.2])
     fy, fx = grid.frequencies()
     got, slopes = detector.transfers(grid, 0.4, 0 * shrink, shrink, sized=True)
-    shared = np.sinc(fx * 1.68) * np.sinc(fy * 1.68) * np.exp(-2 * (np.pi * 0.4 * 1.68) ** 2 * (fx**2 + fy**2))
+    shared = (
+        np.sinc(fx * 1.68)
+        * np.sinc(fy * 1.68)
+        * np.exp(-2 * (np.pi * 0.4 * 1.68) ** 2 * (fx**2 + fy**2))
+    )
     assert got == pytest.approx(np.stack([shared] * 2), abs=1e-12)
     seen = detector.disc(fy, fx, 0.3 * 1.68)[1]
-    assert slopes["pinhole_um"] == pytest.approx(np.stack([shared * seen * s for s in shrink]), abs=1e-12)
+    assert slopes["pinhole_um"] == pytest.approx(
+        np.stack([shared * seen * s for s in shrink]), abs=1e-12
+    )
     assert not slopes["growth"].any()
-    plain, some = detector.transfers(grid, 0.4, 0 * shrink, shrink, sized=False, kind=np.float32)
+    plain, some = detector.transfers(
+        grid, 0.4, 0 * shrink, shrink, sized=False, kind=np.float32
+    )
     assert isinstance(plain, Sums)
     assert plain.pairs[0][0].dtype == np.float32
     assert set(some) == {"crosstalk_px"}
-    assert not isinstance(detector.transfers(grid, 0.4, 1.1 * shrink, shrink, sized=False)[0], Sums)
+    assert not isinstance(
+        detector.transfers(grid, 0.4, 1.1 * shrink, shrink, sized=False)[0], Sums
+    )
 
 
 def test_samples_are_as_fine_as_twice_the_highest_frequency_needs():
-    """2 sine / wavelength of intensity; a lens of radius 30 at 40 um: sine 0.6, 1.41 cycles a um."""
-    lens = SimpleNamespace(diameters=SimpleNamespace(radius_um=30.0), reduced_um=40.0, wavelength_um=0.85)
+    """2 sine / wavelength of intensity; a lens of radius 30 at 40 um: sine 0.6, 1.41
+    cycles a um.
+    """
+    lens = SimpleNamespace(
+        diameters=SimpleNamespace(radius_um=30.0), reduced_um=40.0, wavelength_um=0.85
+    )
     assert detector.oversampling(lens, 2.4) == math.ceil(2.4 * 2 * 1.2 / 0.85)
     assert detector.oversampling(lens, 0.3) == 1
     assert detector.fine_enough(2.0, 1.25) == 5
-    assert detector.fine_enough(2.0, 1.25 * (1 + 1e-10)) == 5  # rounding asks for no more
+    assert (
+        detector.fine_enough(2.0, 1.25 * (1 + 1e-10)) == 5
+    )  # rounding asks for no more
 
 
 def test_a_ball_and_a_disc_in_series_near_no_frequency():
-    """1 - u² / 8 of a disc, 1 - u² / 10 of a ball, u = pi f D; a disc's slope is -u² / 4 D."""
+    """1 - u² / 8 of a disc, 1 - u² / 10 of a ball, u = pi f D; a disc's slope is -u² /
+    4 D.
+    """
     f, size = 0.01, 3.1
     u = math.pi * f * size
     fy, fx = np.array([[0.6 * f]]), np.array([[0.8 * f]])
     value, slope = detector.disc(fy, fx, size)
     assert value[0, 0] == pytest.approx(1 - u**2 / 8 + u**4 / 192, rel=1e-8)
     assert slope[0, 0] == pytest.approx((-(u**2) / 4 + u**4 / 48) / size, rel=1e-4)
-    assert detector.ball(fy, fx, size)[0, 0] == pytest.approx(1 - u**2 / 10 + u**4 / 280, rel=1e-8)
+    assert detector.ball(fy, fx, size)[0, 0] == pytest.approx(
+        1 - u**2 / 10 + u**4 / 280, rel=1e-8
+    )

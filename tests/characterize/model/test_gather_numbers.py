@@ -1,4 +1,6 @@
-"""Nodes between even and Legendre's, and pillars looked up, mirrored and folded, by small cases."""
+"""Nodes between even and Legendre's, and pillars looked up, mirrored and folded, by
+small cases.
+"""
 
 import math
 
@@ -13,12 +15,23 @@ RNG = np.random.default_rng(3)
 
 
 def test_nodes_are_pulled_towards_even_ones():
-    """x = asin(pull t) / asin(pull) of Legendre's nodes: none is pulled by 0, all lie evenly in angle by 1."""
+    """x = asin(pull t) / asin(pull) of Legendre's nodes: none is pulled by 0, all lie
+    evenly in angle by 1.
+    """
     legendre = np.polynomial.legendre.leggauss(7)[0]
     for pull in (1e-4, 0.6, 0.97):
-        want = [optimize.brentq(lambda x, t=t, p=pull: math.sin(math.asin(p) * x) - p * t, -1, 1) for t in legendre]
-        assert gather.even(7, pull, -3.0, 11.0) == pytest.approx(4.0 + 7.0 * np.array(want), abs=1e-10)
-    assert gather.even(7, 1e-4, -3.0, 11.0) == pytest.approx(4.0 + 7.0 * legendre, abs=1e-7)
+        want = [
+            optimize.brentq(
+                lambda x, t=t, p=pull: math.sin(math.asin(p) * x) - p * t, -1, 1
+            )
+            for t in legendre
+        ]
+        assert gather.even(7, pull, -3.0, 11.0) == pytest.approx(
+            4.0 + 7.0 * np.array(want), abs=1e-10
+        )
+    assert gather.even(7, 1e-4, -3.0, 11.0) == pytest.approx(
+        4.0 + 7.0 * legendre, abs=1e-7
+    )
 
 
 def test_interpolation_from_pulled_nodes_is_exact_for_powers_of_their_sine():
@@ -33,24 +46,34 @@ def test_interpolation_from_pulled_nodes_is_exact_for_powers_of_their_sine():
         return np.sin(math.asin(pull) * (x - 4.0) / 7.0) / pull
 
     for degree in range(7):
-        assert weights @ sine(nodes) ** degree == pytest.approx(sine(places) ** degree, abs=1e-11)
+        assert weights @ sine(nodes) ** degree == pytest.approx(
+            sine(places) ** degree, abs=1e-11
+        )
     assert np.abs(weights @ sine(nodes) ** 7 - sine(places) ** 7).max() > 1e-4
 
 
 def test_the_pull_keeps_the_branch_as_far_as_the_tolerance_asks():
-    """Branches at ± 1 / pull = cosh(a) leave exp(-a n): a n is ln(1e5 / tolerance) + n / 60."""
+    """Branches at ± 1 / pull = cosh(a) leave exp(-a n): a n is ln(1e5 / tolerance) + n
+    / 60.
+    """
     for count, tolerance in ((40, 1e-3), (90, 1e-6)):
         found = gather.pull(count, tolerance)
-        assert math.acosh(1 / found) * count == pytest.approx(math.log(1e5 / tolerance) + count / 60, rel=1e-9)
+        assert math.acosh(1 / found) * count == pytest.approx(
+            math.log(1e5 / tolerance) + count / 60, rel=1e-9
+        )
         step = 1e-5
-        assert gather.density(count, tolerance) == pytest.approx(math.asin(found) / found, rel=1e-12)
+        assert gather.density(count, tolerance) == pytest.approx(
+            math.asin(found) / found, rel=1e-12
+        )
         # where nodes lie: dt / dx in the middle
         slope = math.sin(math.asin(found) * step) / found / step
         assert gather.density(count, tolerance) == pytest.approx(slope, rel=1e-6)
 
 
 @pytest.mark.parametrize(("axis", "alike"), [(None, True), (0, False), (1, False)])
-def test_both_mirrors_and_straight_light_are_needed_for_a_quarter_to_tell_all(axis, alike):
+def test_both_mirrors_and_straight_light_are_needed_for_a_quarter_to_tell_all(
+    axis, alike
+):
     quarter = RNG.uniform(0.1, 0.2, (3, 2))
     half = np.concatenate([quarter, quarter[::-1]])
     whole = np.concatenate([half, half[:, ::-1]], axis=1)
@@ -65,7 +88,9 @@ def test_both_mirrors_and_straight_light_are_needed_for_a_quarter_to_tell_all(ax
 
 
 @pytest.mark.parametrize(("count", "first"), [(5, 2), (6, 3)])
-def test_each_place_takes_the_weight_of_its_mirror_image_the_middle_one_its_own(count, first):
+def test_each_place_takes_the_weight_of_its_mirror_image_the_middle_one_its_own(
+    count, first
+):
     weights = np.arange(1.0, 2 * count + 1).reshape(count, 2) ** 2
     kept = weights.copy()
     found = gather.folded(weights, first)
@@ -79,7 +104,10 @@ def test_each_place_takes_the_weight_of_its_mirror_image_the_middle_one_its_own(
 
 def test_functions_of_a_pillar_stand_column_by_column_real_parts_first():
     table = np.array([[1 + 2j, 3 - 1j], [0.5 - 2j, 4j]])
-    place, turns = np.array([[0, 1, 1], [1, 0, 0]]), np.array([[1, 1j, -1], [2 - 1j, 0.5, 1j]])
+    place, turns = (
+        np.array([[0, 1, 1], [1, 0, 0]]),
+        np.array([[1, 1j, -1], [2 - 1j, 0.5, 1j]]),
+    )
     found = gather.lit(table, place, turns)
     assert found.shape == (3, 2, 4)
     for row, column in np.ndindex(2, 3):

@@ -1,4 +1,6 @@
-"""Arrays kept between runs: the same bits, never those of something else, never in the way."""
+"""Arrays kept between runs: the same bits, never those of something else, never in the
+way.
+"""
 
 import os
 import stat
@@ -9,7 +11,10 @@ import pytest
 
 from characterize.model import kept
 
-MADE = {"t": np.array([0.3 - 1.7j, 1 / 3]), "numbers": np.array([np.nan, -np.inf, 5e-324])}
+MADE = {
+    "t": np.array([0.3 - 1.7j, 1 / 3]),
+    "numbers": np.array([np.nan, -np.inf, 5e-324]),
+}
 
 
 @pytest.fixture
@@ -53,7 +58,9 @@ def test_a_damaged_file_is_made_anew_and_mended(home, place):
         content[i] ^= 0x5A
     path.write_bytes(content)
     again = asked()[0]
-    assert {name: value.tobytes() for name, value in again.items()} == {n: v.tobytes() for n, v in MADE.items()}
+    assert {name: value.tobytes() for name, value in again.items()} == {
+        n: v.tobytes() for n, v in MADE.items()
+    }
     path.write_bytes(b"")
     assert asked()[1] == 1
     assert asked()[1] == 0

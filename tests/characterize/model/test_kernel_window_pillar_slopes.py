@@ -1,4 +1,6 @@
-"""How many terms, samples and degrees the fast model takes: as many as its tolerance asks for, and hardly more."""
+"""How many terms, samples and degrees the fast model takes: as many as its tolerance
+asks for, and hardly more.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ POINT, WEIGHT = legendre.leggauss(400)
 
 
 def missed(slope, count):
-    """Root mean square over [-1, 1] of what ``count`` Legendre terms leave of exp(i slope t), by quadrature."""
+    """Root mean square over [-1, 1] of what ``count`` Legendre terms leave of exp(i
+    slope t), by quadrature.
+    """
     wave, rest = np.exp(1j * slope * POINT), 1.0
     for n in range(count):
         one = legendre.legval(POINT, np.eye(count)[n])
@@ -20,7 +24,9 @@ def missed(slope, count):
     return np.sqrt(max(rest, 0.0))
 
 
-@pytest.mark.parametrize(("slope", "tolerance"), [(3.7, 1e-3), (41.0, 1e-2), (0.4, 1e-4)])
+@pytest.mark.parametrize(
+    ("slope", "tolerance"), [(3.7, 1e-3), (41.0, 1e-2), (0.4, 1e-4)]
+)
 def test_legendre_terms_of_a_wave_leave_a_fiftieth_of_the_tolerance(slope, tolerance):
     """One more than needed is taken: two fewer are too few."""
     count = _terms(slope, tolerance)
@@ -44,7 +50,9 @@ def test_degrees_up_to_fourteen_are_tried():
 
 
 def test_a_degree_that_is_never_enough_comes_with_its_error():
-    """|x| by polynomials of degree n is missed by 0.28 / n (Bernstein), of which the held-out points see a part."""
+    """|x| by polynomials of degree n is missed by 0.28 / n (Bernstein), of which the
+    held-out points see a part.
+    """
     x = np.cos(np.pi * (np.arange(301) + 0.5) / 301)
     degree, error = pillar_slopes._degree(x, np.abs(x)[None], 1e-9)
     size = np.abs(np.abs(x) - np.abs(x).mean()).max()
@@ -57,7 +65,10 @@ def test_coarse_samples_carry_every_wave_of_the_band(tolerance):
     coarse, weights = _resampled(at[0], at[-1], len(at), band, tolerance)
     assert len(coarse) < len(at)
     waves = np.linspace(-0.97 * band, band, 23)
-    error = np.abs(weights @ np.exp(1j * coarse[:, None] * waves) - np.exp(1j * at[:, None] * waves))
+    error = np.abs(
+        weights @ np.exp(1j * coarse[:, None] * waves)
+        - np.exp(1j * at[:, None] * waves)
+    )
     assert np.sqrt((error**2).mean()) < tolerance
 
 

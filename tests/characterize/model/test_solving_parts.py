@@ -1,4 +1,6 @@
-"""Power series through solved amounts, and the bending energy of plates, on polynomials."""
+"""Power series through solved amounts, and the bending energy of plates, on
+polynomials.
+"""
 
 import numpy as np
 import pytest
@@ -16,18 +18,26 @@ def test_amounts_reach_beyond_the_bounds_of_a_fit():
     rows = [row for _, row in of_kind(Answers)]
     assert [row.name for _, row, _ in changes] == ["height_nm", "index"]
     assert [n for n, _, _ in changes] == [rows.index(row) for _, row, _ in changes]
-    assert changes[0][2] == pytest.approx(np.array([-1, -0.5, 0, 0.5, 1]) * 0.02996)  # 28 nm and 7 %, in um
-    assert changes[1][2] == pytest.approx(np.array([-1, -0.67, -0.33, 0, 0.33, 0.67, 1]) * 0.08025)
+    assert changes[0][2] == pytest.approx(
+        np.array([-1, -0.5, 0, 0.5, 1]) * 0.02996
+    )  # 28 nm and 7 %, in um
+    assert changes[1][2] == pytest.approx(
+        np.array([-1, -0.67, -0.33, 0, 0.33, 0.67, 1]) * 0.08025
+    )
 
 
 def test_series_go_through_what_was_solved():
-    """Quartics in height and sixth powers in the index come back; a cause that is not solved has t alone."""
+    """Quartics in height and sixth powers in the index come back; a cause that is not
+    solved has t alone.
+    """
     changes = solving._changes(0.85)
     t = RNG.normal(size=7) + 1j * RNG.normal(size=7)
     tall = RNG.normal(size=(4, 7)) * np.array([3.0, 40.0, 500.0, 9e3])[:, None]
     dense = RNG.normal(size=(6, 7)) * np.array([1j, 4j, 60.0, 900j, 1e4, 1e5j])[:, None]
     columns = [t + sum(tall[p] * a ** (p + 1) for p in range(4)) for a in changes[0][2]]
-    columns += [t + sum(dense[p] * a ** (p + 1) for p in range(6)) for a in changes[1][2]]
+    columns += [
+        t + sum(dense[p] * a ** (p + 1) for p in range(6)) for a in changes[1][2]
+    ]
     out = solving._powers(np.array(columns).T, changes)
     assert out.shape == (len(named(Answers)), 7, 7)
     assert out[:, 0] == pytest.approx(np.tile(t, (len(out), 1)), rel=1e-9)
@@ -38,19 +48,29 @@ def test_series_go_through_what_was_solved():
 
 
 def test_series_follow_a_resonance_that_moves_with_the_index(monkeypatch):
-    """Pillars near 0.23 um of the default cell, where t turns by a radian as n falls by a twentieth: by the solver.
+    """Pillars near 0.23 um of the default cell, where t turns by a radian as n falls by
+    a twentieth: by the solver.
 
-    The index alone is solved, between the first diameter and the last: a kept answer of all causes is not touched.
+    The index alone is solved, between the first diameter and the last: a kept answer of
+    all causes is not touched.
     """
     cell, wave = Cell(0.3, 0.7, Index(3.6)), 0.85
     index = [change for change in solving._changes(wave) if change[1].name == "index"]
     monkeypatch.setattr(solving, "_changes", lambda wavelength_um: index)
     table, off = solving._solved.__wrapped__(cell, wave, 0.2295, 0.2315), []
-    for d, amount in ((0.23060831, -0.04401585), (0.23126282, -0.06865947), (0.2297, 0.031)):
-        want = modal.solve(Cell(0.3, 0.7, Index(3.6 + amount)), d, wave, tolerance=1e-3).t
+    for d, amount in (
+        (0.23060831, -0.04401585),
+        (0.23126282, -0.06865947),
+        (0.2297, 0.031),
+    ):
+        want = modal.solve(
+            Cell(0.3, 0.7, Index(3.6 + amount)), d, wave, tolerance=1e-3
+        ).t
         got = np.polynomial.polynomial.polyval(amount, table.series(np.array(d))[1])
         off.append(abs(got - want))
-    assert max(off) < 0.04  # 0.03 of the polynomials, 4e-3 of two solves; 0.29 through three indices, 0.07 through five
+    assert (
+        max(off) < 0.04
+    )  # 0.03 of the polynomials, 4e-3 of two solves; 0.29 through three indices, 0.07 through five
 
 
 def test_bending_energy_is_the_mean_of_squared_second_derivatives():
@@ -60,11 +80,15 @@ def test_bending_energy_is_the_mean_of_squared_second_derivatives():
     inside = np.hypot(u, v) < 0.75
     shapes = np.stack([u**2 + 3 * u * v - 2 * v**2, u**2, u * v])
     want = np.array([[4 + 18 + 16, 4, 6], [4, 4, 0], [6, 0, 2]])
-    assert thinplate._bending(shapes, inside, t[1] - t[0]) == pytest.approx(want, rel=1e-9, abs=1e-9)
+    assert thinplate._bending(shapes, inside, t[1] - t[0]) == pytest.approx(
+        want, rel=1e-9, abs=1e-9
+    )
 
 
 def test_modes_leave_out_what_parameters_already_do():
-    """On the places where they are made they are at right angles to piston, tilts, defocus and every aberration."""
+    """On the places where they are made they are at right angles to piston, tilts,
+    defocus and every aberration.
+    """
     t = np.linspace(-1, 1, thinplate._GRID)
     u, v = np.meshgrid(t, t)
     inside = np.hypot(u, v) <= 1
@@ -81,5 +105,11 @@ def test_a_curve_along_the_diameters_is_what_single_solves_have():
     diameters = np.linspace(0.17, 0.19, 9)
     got = solving._along(cell, 0.85, diameters)
     for at in (1, 6):
-        assert abs(got[at] - modal.solve(cell, float(diameters[at]), 0.85, tolerance=1e-3).t) < 3e-3
+        assert (
+            abs(
+                got[at]
+                - modal.solve(cell, float(diameters[at]), 0.85, tolerance=1e-3).t
+            )
+            < 3e-3
+        )
     assert np.abs(got).min() > 0.5

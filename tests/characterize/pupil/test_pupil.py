@@ -1,4 +1,6 @@
-"""The generic pupil: Airy pattern in closed form, exact derivatives, recovery inside its interval."""
+"""The generic pupil: Airy pattern in closed form, exact derivatives, recovery inside
+its interval.
+"""
 
 import dataclasses
 import json
@@ -15,7 +17,16 @@ from characterize.pupil import fit as pupilfit
 from characterize.pupil.record import PupilModel, PupilSpec
 from metalens.ground.errors import CaptureError, FitError
 
-SPEC = PupilSpec(0.3, 0.5, 0.4, window=16, phase_order=4, amplitude_order=1, drift_order=1, model_error=0.0)
+SPEC = PupilSpec(
+    0.3,
+    0.5,
+    0.4,
+    window=16,
+    phase_order=4,
+    amplitude_order=1,
+    drift_order=1,
+    model_error=0.0,
+)
 Z = np.linspace(-8, 8, 5)
 BEADS = Path(__file__).parents[4] / "shared" / "captures" / "bead_stack"
 
@@ -32,27 +43,39 @@ def truth(model):
 
 
 def make(spec=SPEC):
-    return PupilModel(spec, Z, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order)
+    return PupilModel(
+        spec, Z, phase_order=spec.phase_order, amplitude_order=spec.amplitude_order
+    )
 
 
 def test_in_focus_without_aberration_it_is_the_airy_pattern():
     spec = dataclasses.replace(
-        SPEC, numerical_aperture=0.05, wavelength_um=0.5, pixel_um=1.0, window=24, model="scalar"
+        SPEC,
+        numerical_aperture=0.05,
+        wavelength_um=0.5,
+        pixel_um=1.0,
+        window=24,
+        model="scalar",
     )
-    model = PupilModel(spec, np.array([-1e-6, 0.0, 1e-6]), phase_order=2, amplitude_order=0)
+    model = PupilModel(
+        spec, np.array([-1e-6, 0.0, 1e-6]), phase_order=2, amplitude_order=0
+    )
     x = np.zeros(model.layout().size)
     x[-7] = 1e-3  # no blur
     image = model.images(x, False)[0][1]
     r = (np.arange(24) - 12) * 1.0
     v = np.maximum(2 * math.pi / 0.5 * 0.05 * np.abs(r), 1e-9)
     want = (2 * special.j1(v) / v) ** 2
-    assert np.abs(image[12] / image[12, 12] - want).max() < 4e-3  # rim of the disc on 30 nodes
+    assert (
+        np.abs(image[12] / image[12, 12] - want).max() < 4e-3
+    )  # rim of the disc on 30 nodes
     assert abs(image.sum() - 0.93) < 0.06  # the window holds about 93 % of the light
 
 
 def test_vector_and_scalar_agree_at_low_aperture():
     images = [
-        make(dataclasses.replace(SPEC, numerical_aperture=0.05, pixel_um=2.0, model=m)) for m in ("vector", "scalar")
+        make(dataclasses.replace(SPEC, numerical_aperture=0.05, pixel_um=2.0, model=m))
+        for m in ("vector", "scalar")
     ]
     a, b = (m.images(truth(m), False)[0] for m in images)
     assert np.abs(a - b).max() < 3e-3 * b.max()  # (NA)² terms
@@ -66,8 +89,12 @@ def test_derivatives_match_finite_differences(kind):
     for j, row in enumerate(jacobian):
         h = 1e-4 * max(abs(x[j]), 0.1)
         step = np.eye(len(x))[j] * h
-        want = (model.images(x + step, False)[0] - model.images(x - step, False)[0]) / (2 * h)
-        assert np.abs(row - want).max() < 3e-5 * np.abs(want).max(), model.names()[j]  # complex64 columns
+        want = (model.images(x + step, False)[0] - model.images(x - step, False)[0]) / (
+            2 * h
+        )
+        assert np.abs(row - want).max() < 3e-5 * np.abs(want).max(), model.names()[
+            j
+        ]  # complex64 columns
 
 
 def noisy(model, x, seed=1):
@@ -95,12 +122,16 @@ def test_a_known_pupil_is_found_within_its_interval():
 
 
 def wide(side=64, place=(40, 20)):
-    """The stack of a known pupil inside a larger frame, as a microscope gives it, in electrons."""
+    """The stack of a known pupil inside a larger frame, as a microscope gives it, in
+    electrons.
+    """
     model = make()
     small = 2 * (model.images(truth(model), False)[0] - 20)
     frames = np.full((len(Z), side, side), 300.0)
     first = [p - SPEC.window // 2 for p in place]
-    frames[:, first[0] : first[0] + SPEC.window, first[1] : first[1] + SPEC.window] += small
+    frames[:, first[0] : first[0] + SPEC.window, first[1] : first[1] + SPEC.window] += (
+        small
+    )
     return frames
 
 
@@ -108,12 +139,22 @@ def shots_of(frames, gain_e=20.0):
     n = len(frames)
     counts = np.round(np.random.default_rng(5).poisson(frames * gain_e) / gain_e)
     about = {"gain_e": gain_e, "read_noise_e": 0.1}
-    return capture.Capture(counts, np.arange(n) * 4.0, np.zeros((n, 2)), np.full(n, np.nan), ("",) * n, 16, about=about)
+    return capture.Capture(
+        counts,
+        np.arange(n) * 4.0,
+        np.zeros((n, 2)),
+        np.full(n, np.nan),
+        ("",) * n,
+        16,
+        about=about,
+    )
 
 
 @pytest.mark.parametrize("slope", [0.3, -0.5])
 def test_a_bead_on_a_steep_background_is_found_and_fitted(slope):
-    """Across the window the background changes by a share of the peak; across the frame by more than the peak."""
+    """Across the window the background changes by a share of the peak; across the frame
+    by more than the peak.
+    """
     frames = wide()
     light = frames.max() - 300
     ramp = slope * light * (np.arange(64) - 31.5) / SPEC.window
@@ -121,22 +162,36 @@ def test_a_bead_on_a_steep_background_is_found_and_fitted(slope):
     assert any("background plane" in words for words in found.cautions)
     assert found.held_out.ncc > 0.97
     bright = found.measured - np.median(found.measured)
-    assert np.linalg.norm(found.predicted - found.measured) < 0.2 * np.linalg.norm(bright)
+    assert np.linalg.norm(found.predicted - found.measured) < 0.2 * np.linalg.norm(
+        bright
+    )
 
 
 def test_shuffled_planes_are_refused():
     model = PupilModel(SPEC, np.linspace(-8, 8, 9), phase_order=4, amplitude_order=1)
     begun, first = truth(make()), make().layout().off.start
-    x = np.concatenate([begun[:first], np.zeros(9), [0.2], np.full(9, math.log(3e4)), np.full(9, 20.0)])
+    x = np.concatenate(
+        [begun[:first], np.zeros(9), [0.2], np.full(9, math.log(3e4)), np.full(9, 20.0)]
+    )
     frames = model.images(x, False)[0]
-    assert pupilfit.fit_pupil(shots_of(frames), dataclasses.replace(SPEC, step_um=2.0)).held_out.ncc > 0.97
+    assert (
+        pupilfit.fit_pupil(
+            shots_of(frames), dataclasses.replace(SPEC, step_um=2.0)
+        ).held_out.ncc
+        > 0.97
+    )
     with pytest.raises(FitError, match="the stack is shuffled"):
-        pupilfit.fit_pupil(shots_of(frames[[4, 0, 7, 2, 8, 5, 1, 6, 3]]), dataclasses.replace(SPEC, step_um=2.0))
+        pupilfit.fit_pupil(
+            shots_of(frames[[4, 0, 7, 2, 8, 5, 1, 6, 3]]),
+            dataclasses.replace(SPEC, step_um=2.0),
+        )
 
 
 def test_a_wrong_aperture_is_refused_with_the_share_of_light_missed():
     with pytest.raises(FitError, match="of the light beyond noise"):
-        pupilfit.fit_pupil(shots_of(wide()), dataclasses.replace(SPEC, numerical_aperture=0.12))
+        pupilfit.fit_pupil(
+            shots_of(wide()), dataclasses.replace(SPEC, numerical_aperture=0.12)
+        )
 
 
 def test_missing_wavelength_pixel_or_positions_are_refused():
@@ -180,7 +235,14 @@ def test_command_writes_a_pupil_file_and_a_page(tmp_path, fine_pictures):
         "numerical_aperture = 0.3\nwavelength_um = 0.5\npixel_um = 0.4\nstep_um = 4.0\nwindow = 16\nphase_order = 4\n"
         "amplitude_order = 1\ndrift_order = 1\n"
     )
-    words = ["fit", str(tmp_path / "stack.tif"), "--pupil", str(tmp_path / "pupil.toml"), "-o", str(tmp_path / "p.h5")]
+    words = [
+        "fit",
+        str(tmp_path / "stack.tif"),
+        "--pupil",
+        str(tmp_path / "pupil.toml"),
+        "-o",
+        str(tmp_path / "p.h5"),
+    ]
     assert main([*words, "--quiet"]) == 0
     assert store.load(tmp_path / "p.h5", "pupil").attributes["agreement_ncc"] > 0.99
     assert (tmp_path / "p.html").stat().st_size > 10000
@@ -197,7 +259,14 @@ def test_command_ends_with_1_where_a_fit_is_refused(tmp_path, capsys):
         "numerical_aperture = 0.3\nwavelength_um = 0.5\npixel_um = 0.4\nstep_um = 4.0\nwindow = 16\nphase_order = 4\n"
         "amplitude_order = 1\ndrift_order = 1\n"
     )
-    words = ["fit", str(tmp_path / "stack.tif"), "--pupil", str(tmp_path / "pupil.toml"), "-o", str(tmp_path / "p.h5")]
+    words = [
+        "fit",
+        str(tmp_path / "stack.tif"),
+        "--pupil",
+        str(tmp_path / "pupil.toml"),
+        "-o",
+        str(tmp_path / "p.h5"),
+    ]
     assert main([*words, "--quiet"]) == 1
     assert not (tmp_path / "p.h5").exists()
     capsys.readouterr()

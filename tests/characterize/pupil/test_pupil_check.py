@@ -1,4 +1,6 @@
-"""What a pupil fit is judged by, against formulas: agreement, light missed beyond noise, order of the planes."""
+"""What a pupil fit is judged by, against formulas: agreement, light missed beyond
+noise, order of the planes.
+"""
 
 import math
 
@@ -25,19 +27,30 @@ def data(images, usable=None, saturated=None):
 
 def test_agreement_counts_light_above_the_background_in_pixels_that_count():
     seen, told = RNG.uniform(20, 90, (3, 6, 7)), RNG.uniform(20, 90, (3, 6, 7))
-    usable, saturated = RNG.uniform(size=seen.shape) > 0.2, RNG.uniform(size=seen.shape) > 0.9
+    usable, saturated = (
+        RNG.uniform(size=seen.shape) > 0.2,
+        RNG.uniform(size=seen.shape) > 0.9,
+    )
     got = agree(told, data(seen, usable, saturated), 17.0)
     keep = usable & ~saturated
     a, b = told[keep], seen[keep]
-    centred = (a - a.mean()) @ (b - b.mean()) / math.sqrt(((a - a.mean()) ** 2).sum() * ((b - b.mean()) ** 2).sum())
+    centred = (
+        (a - a.mean())
+        @ (b - b.mean())
+        / math.sqrt(((a - a.mean()) ** 2).sum() * ((b - b.mean()) ** 2).sum())
+    )
     assert got.ncc == pytest.approx(centred, rel=1e-12)
-    assert got.nrmse == pytest.approx(math.sqrt(((a - b) ** 2).sum() / ((b - 17.0) ** 2).sum()), rel=1e-12)
+    assert got.nrmse == pytest.approx(
+        math.sqrt(((a - b) ** 2).sum() / ((b - 17.0) ** 2).sum()), rel=1e-12
+    )
     planes = [np.corrcoef(told[k][keep[k]], seen[k][keep[k]])[0, 1] for k in range(3)]
     assert got.plane_ncc == pytest.approx(np.mean(planes), rel=1e-12)
 
 
 def test_what_noise_explains_is_not_missed():
-    """Frames that are the same but for noise of 3: a prediction that errs by noise alone misses nothing."""
+    """Frames that are the same but for noise of 3: a prediction that errs by noise
+    alone misses nothing.
+    """
     light = np.zeros((9, 30, 32))
     light[:, 12:15, 9:20] = 400.0
     noisy = light + 11.0 + RNG.normal(0, 3.0, light.shape)
@@ -45,12 +58,16 @@ def test_what_noise_explains_is_not_missed():
     by_noise = 3.0 * math.sqrt(light.size) / length
     for beyond in (0.05, 0.2):
         nrmse = math.hypot(by_noise, beyond)
-        assert check.missed(nrmse, data(noisy), 11.0) == pytest.approx(beyond, rel=0.15)  # the noise to 1 %
+        assert check.missed(nrmse, data(noisy), 11.0) == pytest.approx(
+            beyond, rel=0.15
+        )  # the noise to 1 %
     assert check.missed(0.9 * by_noise, data(noisy), 11.0) == 0.0
 
 
 def waves(order):
-    """Planes that turn slowly from one picture into another; ``order`` is theirs in the stack."""
+    """Planes that turn slowly from one picture into another; ``order`` is theirs in the
+    stack.
+    """
     one, other = RNG.uniform(size=(2, 12, 13))
     turn = np.linspace(0, math.pi / 2, 12)[:, None, None]
     return (np.cos(turn) * one + np.sin(turn) * other)[order]
@@ -61,7 +78,9 @@ def test_planes_in_order_score_one_and_shuffled_ones_nothing():
     scores = [check.order_score(data(waves(RNG.permutation(12)))) for _ in range(40)]
     assert abs(np.mean(scores)) < 0.15  # one shuffle scatters by 0.3
     assert math.isnan(check.order_score(data(waves(np.arange(12))[:5])))
-    assert math.isnan(check.order_score(data(np.tile(RNG.uniform(size=(1, 9, 9)), (8, 1, 1)))))
+    assert math.isnan(
+        check.order_score(data(np.tile(RNG.uniform(size=(1, 9, 9)), (8, 1, 1))))
+    )
 
 
 def test_order_is_the_share_of_likeness_that_neighbours_have():
@@ -77,18 +96,34 @@ def test_order_is_the_share_of_likeness_that_neighbours_have():
 
 
 def test_noise_is_the_robust_scatter_of_steps_about_their_median():
-    """Light that grows by 5 from plane to plane while pixels swing by 2: steps of 5 ± 4, noise 1.4826 x 4 / √2."""
+    """Light that grows by 5 from plane to plane while pixels swing by 2: steps of 5 ±
+    4, noise 1.4826 x 4 / √2.
+    """
     chequer = np.where(np.add.outer(np.arange(20), np.arange(22)) % 2, 2.0, -2.0)
     planes = np.array([50 + 5.0 * k + (-1) ** k * chequer for k in range(6)])
-    by_noise = 1.4826 * 4 / math.sqrt(2) * math.sqrt(planes.size) / math.sqrt(((planes - 30) ** 2).sum())
-    assert check.missed(math.hypot(by_noise, 0.03), data(planes), 30.0) == pytest.approx(0.03, rel=1e-9)
+    by_noise = (
+        1.4826
+        * 4
+        / math.sqrt(2)
+        * math.sqrt(planes.size)
+        / math.sqrt(((planes - 30) ** 2).sum())
+    )
+    assert check.missed(
+        math.hypot(by_noise, 0.03), data(planes), 30.0
+    ) == pytest.approx(0.03, rel=1e-9)
 
 
-@pytest.mark.parametrize(("wider", "said"), [(1.08, ""), (1.25, "doubted"), (1.6, "refused")])
-def test_a_spot_predicted_too_wide_is_doubted_from_a_quarter_on_and_refused_from_a_half(wider, said):
-    """Gaussian spots of widths 1 and q overlap by 2q / (1 + q²): at its best brightness one misses |1 - q²| / (1 + q²).
+@pytest.mark.parametrize(
+    ("wider", "said"), [(1.08, ""), (1.25, "doubted"), (1.6, "refused")]
+)
+def test_a_spot_predicted_too_wide_is_doubted_from_a_quarter_on_and_refused_from_a_half(
+    wider, said
+):
+    """Gaussian spots of widths 1 and q overlap by 2q / (1 + q²): at its best brightness
+    one misses |1 - q²| / (1 + q²).
 
-    So does a wavelength or an aperture that is wrong by as much: 8 % is what right optics miss, 50 % are wrong ones.
+    So does a wavelength or an aperture that is wrong by as much: 8 % is what right
+    optics miss, 50 % are wrong ones.
     """
     y, x = np.mgrid[-24:25, -24:25]
 
@@ -101,5 +136,10 @@ def test_a_spot_predicted_too_wide_is_doubted_from_a_quarter_on_and_refused_from
     score = agree(told, data(planes), 0.0)
     share = check.missed(score.nrmse, data(planes), 0.0)
     assert share == pytest.approx((wider**2 - 1) / (wider**2 + 1), rel=1e-3)
-    assert any("misses" in words for words in check.problems(data(planes), score.ncc, share, "")) == (said == "refused")
-    assert any("misses" in words for words in check.doubts(share, "")) == (said == "doubted")
+    assert any(
+        "misses" in words
+        for words in check.problems(data(planes), score.ncc, share, "")
+    ) == (said == "refused")
+    assert any("misses" in words for words in check.doubts(share, "")) == (
+        said == "doubted"
+    )

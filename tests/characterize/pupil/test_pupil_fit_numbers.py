@@ -1,4 +1,6 @@
-"""Which planes a pupil is fitted to and judged by, where the light is looked for, and how large the window is."""
+"""Which planes a pupil is fitted to and judged by, where the light is looked for, and
+how large the window is.
+"""
 
 import dataclasses
 from types import SimpleNamespace
@@ -12,19 +14,36 @@ from characterize.pupil.judge import agree, spline
 from characterize.pupil.record import PupilModel, PupilSpec
 
 RNG = np.random.default_rng(8)
-SPEC = PupilSpec(0.3, 0.5, 0.4, window=16, phase_order=4, amplitude_order=2, drift_order=1, model_error=0.0)
+SPEC = PupilSpec(
+    0.3,
+    0.5,
+    0.4,
+    window=16,
+    phase_order=4,
+    amplitude_order=2,
+    drift_order=1,
+    model_error=0.0,
+)
 
 
 def data_of(light):
     everywhere = np.ones(light.shape, bool)
-    return Data(light, everywhere, ~everywhere, np.full(light.shape, 4.0), np.ones(light.shape))
+    return Data(
+        light, everywhere, ~everywhere, np.full(light.shape, 4.0), np.ones(light.shape)
+    )
 
 
-@pytest.mark.parametrize(("shape", "window"), [((12, 20), 12), ((30, 14), 14), ((30, 40), 16)])
+@pytest.mark.parametrize(
+    ("shape", "window"), [((12, 20), 12), ((30, 14), 14), ((30, 40), 16)]
+)
 def test_a_window_is_no_larger_than_the_frame(shape, window):
-    seen = SimpleNamespace(frames=np.zeros((3, *shape)), wavelength_um=0.7, pixel_um=0.2)
+    seen = SimpleNamespace(
+        frames=np.zeros((3, *shape)), wavelength_um=0.7, pixel_um=0.2
+    )
     assert pupilfit._complete(SPEC, seen).window == window
-    unknown = dataclasses.replace(SPEC, wavelength_um=float("nan"), pixel_um=float("nan"))
+    unknown = dataclasses.replace(
+        SPEC, wavelength_um=float("nan"), pixel_um=float("nan")
+    )
     made = pupilfit._complete(unknown, seen)
     assert (made.wavelength_um, made.pixel_um) == (0.7, 0.2)
     made = pupilfit._complete(SPEC, seen)
@@ -32,7 +51,9 @@ def test_a_window_is_no_larger_than_the_frame(shape, window):
 
 
 def spot(light, row, column, half, height, planes):
-    light[planes, row - half : row + half + 1, column - half : column + half + 1] += height
+    light[planes, row - half : row + half + 1, column - half : column + half + 1] += (
+        height
+    )
 
 
 @pytest.mark.parametrize(
@@ -40,8 +61,11 @@ def spot(light, row, column, half, height, planes):
     [(0, 4400.0, 1), (1, 290.0, 7), (0, 800.0, 7), (3, 270.0, 7)],
     ids=["flash of one plane", "weaker in all", "a hot pixel", "wide and even"],
 )
-def test_light_is_looked_for_in_the_brightest_three_planes_seen_through_a_pixel_of_blur(half, height, planes):
-    """A square of 3 pixels and 360 in three planes. One pixel keeps 0.16 of its height under the blur, a square of
+def test_light_is_looked_for_in_the_brightest_three_planes_seen_through_a_pixel_of_blur(
+    half, height, planes
+):
+    """A square of 3 pixels and 360 in three planes. One pixel keeps 0.16 of its height
+    under the blur, a square of
     three 0.78, one of seven all: 281 of it stand against
     233, 226, 127 and 270."""
     light = np.zeros((7, 31, 33))
@@ -55,8 +79,12 @@ def test_light_is_looked_for_in_the_brightest_three_planes_seen_through_a_pixel_
 def test_a_window_of_odd_size_has_its_middle_at_the_bead(window, first):
     light = np.full((4, 30, 41), 20.0)
     spot(light, 14, 20, 1, 500.0, slice(0, 4))
-    found, _, notes = pupilfit._crop(frames_of(light), dataclasses.replace(SPEC, window=window))
-    assert found.electrons == pytest.approx(light[:, first[0] :, first[1] :][:, :window, :window])
+    found, _, notes = pupilfit._crop(
+        frames_of(light), dataclasses.replace(SPEC, window=window)
+    )
+    assert found.electrons == pytest.approx(
+        light[:, first[0] :, first[1] :][:, :window, :window]
+    )
     assert notes == []
 
 
@@ -68,7 +96,9 @@ def frames_of(light):
 
 
 def test_a_bead_is_found_on_a_slope_that_is_brighter_and_its_background_is_the_least_fifth():
-    """20 electrons a pixel across, 800 in all, and a bead of 300; noise of 9 about the plane."""
+    """20 electrons a pixel across, 800 in all, and a bead of 300; noise of 9 about the
+    plane.
+    """
     x = np.tile(np.arange(41.0), (30, 1))
     noise = RNG.normal(0, 9, (30, 41))
     light = np.tile(100 + 20.0 * x + noise, (4, 1, 1))
@@ -85,11 +115,17 @@ def test_a_bead_is_found_on_a_slope_that_is_brighter_and_its_background_is_the_l
 
 
 def test_a_start_moves_to_a_bead_off_the_middle():
-    """Pixels of 0.4 um from row and column 8: 5 rows down are 2 um along y, 3 columns to the left -1.2 along x."""
+    """Pixels of 0.4 um from row and column 8: 5 rows down are 2 um along y, 3 columns
+    to the left -1.2 along x.
+    """
     light = np.full((4, 16, 16), 12.0)
     spot(light, 13, 5, 1, 90.0, slice(0, 4))
-    pupil = PupilModel(SPEC, np.array([-8.0, -3.0, 1.0, 6.0]), phase_order=4, amplitude_order=2)
-    phase, amplitude, dx, dy, *_ = pupil.layout().split(pupilfit._start(pupil, data_of(light), 0.0))
+    pupil = PupilModel(
+        SPEC, np.array([-8.0, -3.0, 1.0, 6.0]), phase_order=4, amplitude_order=2
+    )
+    phase, amplitude, dx, dy, *_ = pupil.layout().split(
+        pupilfit._start(pupil, data_of(light), 0.0)
+    )
     assert dx.tolist() == pytest.approx([-1.2, *[0] * (len(dx) - 1)])
     assert dy.tolist() == pytest.approx([2.0, *[0] * (len(dy) - 1)])
     assert not np.concatenate([phase, amplitude]).any()
@@ -110,18 +146,37 @@ def test_low_orders_from_three_starts_then_all_from_the_best(monkeypatch):
     model, solution = pupilfit._fit(spec, position, data_of(light))
     models, starts, settings = zip(*asked, strict=True)
     place = models[0].phase_indices.index((4, 0))
-    assert [float(start[place]) for start in starts[:3]] == pytest.approx([0.0, 0.8, -0.8])
+    assert [float(start[place]) for start in starts[:3]] == pytest.approx(
+        [0.0, 0.8, -0.8]
+    )
     assert {max(n for n, _ in each.phase_indices) for each in models[:3]} == {4}
-    assert [len(each.amplitude_indices) for each in models] == [0, 0, 0, len(model.amplitude_indices)]
+    assert [len(each.amplitude_indices) for each in models] == [
+        0,
+        0,
+        0,
+        len(model.amplitude_indices),
+    ]
     assert models[3] is model
     assert max(n for n, _ in model.phase_indices) == 5
-    whole, best = model.layout().split(starts[3]), models[1].layout().split(starts[1] + 0.02)
+    whole, best = (
+        model.layout().split(starts[3]),
+        models[1].layout().split(starts[1] + 0.02),
+    )
     for part, before in zip(whole[2:], best[2:], strict=True):
         assert part == pytest.approx(before)
     assert whole[0][: len(best[0])] == pytest.approx(best[0])
-    assert (model.layout().size, solution.value[0]) == (len(starts[3]), pytest.approx(starts[3][0] + 0.04))
+    assert (model.layout().size, solution.value[0]) == (
+        len(starts[3]),
+        pytest.approx(starts[3][0] + 0.04),
+    )
     for each in settings[:3]:
-        assert (each.iterations, each.step_tolerance, each.near, each.secant, each.finish) == (
+        assert (
+            each.iterations,
+            each.step_tolerance,
+            each.near,
+            each.secant,
+            each.finish,
+        ) == (
             12,
             1.0,
             1.0,
@@ -129,14 +184,27 @@ def test_low_orders_from_three_starts_then_all_from_the_best(monkeypatch):
             False,
         )
     last = settings[3]
-    assert (last.iterations, last.step_tolerance, last.near, last.secant, last.finish) == (60, 1.0, 2.0, True, True)
+    assert (
+        last.iterations,
+        last.step_tolerance,
+        last.near,
+        last.secant,
+        last.finish,
+    ) == (60, 1.0, 2.0, True, True)
 
 
 @pytest.mark.parametrize(
     ("count", "sparse", "seen"),
-    [(5, 2, [0, 2, 4]), (4, 2, [0, 1, 2, 3]), (7, 3, [0, 3, 6]), (6, 3, [0, 1, 2, 3, 4, 5])],
+    [
+        (5, 2, [0, 2, 4]),
+        (4, 2, [0, 1, 2, 3]),
+        (7, 3, [0, 3, 6]),
+        (6, 3, [0, 1, 2, 3, 4, 5]),
+    ],
 )
-def test_what_is_free_is_found_from_some_planes_where_there_are_twice_as_many(monkeypatch, count, sparse, seen):
+def test_what_is_free_is_found_from_some_planes_where_there_are_twice_as_many(
+    monkeypatch, count, sparse, seen
+):
     position = np.array([9.0, 7.0, 4.5, 1.0, -0.5, -3.0, -7.0])[:count]
     asked = {}
 
@@ -155,13 +223,18 @@ def test_what_is_free_is_found_from_some_planes_where_there_are_twice_as_many(mo
     assert asked["step_um"] == pytest.approx((position[0] - position[-1]) / (count - 1))
 
 
-@pytest.mark.parametrize(("sparse", "seen", "hidden"), [(2, [0, 2, 4, 6], [1, 3, 5]), (3, [0, 3, 6], [1, 2, 4, 5])])
+@pytest.mark.parametrize(
+    ("sparse", "seen", "hidden"),
+    [(2, [0, 2, 4, 6], [1, 3, 5]), (3, [0, 3, 6], [1, 2, 4, 5])],
+)
 @pytest.mark.parametrize("sigma_um", [0.0, 0.4])
 def test_planes_left_out_are_told_with_gains_and_levels_between_their_neighbours(
     monkeypatch, sparse, seen, hidden, sigma_um
 ):
-    """The stack is what a model of all planes makes of parameters whose gains and levels are linear between the planes
-    that are fitted: told exactly, whichever way the stage ran; stage errors begin at 0."""
+    """The stack is what a model of all planes makes of parameters whose gains and
+    levels are linear between the planes
+    that are fitted: told exactly, whichever way the stage ran; stage errors begin at 0.
+    """
     position = np.array([9.0, 7.0, 4.5, 1.0, -0.5, -3.0, -7.0])
     spec = dataclasses.replace(SPEC, stage_sigma_um=sigma_um)
     exact = dataclasses.replace(spec, stage_sigma_um=0.0)
@@ -170,7 +243,10 @@ def test_planes_left_out_are_told_with_gains_and_levels_between_their_neighbours
     n = len(seen)
     value[-2 * n : -n], value[-n:] = RNG.uniform(6, 7, n), RNG.uniform(10, 30, n)
     value[-2 * n - 1] = 0.3
-    gain, level = (np.interp(position, position[seen][::-1], part[::-1]) for part in (value[-2 * n : -n], value[-n:]))
+    gain, level = (
+        np.interp(position, position[seen][::-1], part[::-1])
+        for part in (value[-2 * n : -n], value[-n:])
+    )
     whole = PupilModel(exact, position, phase_order=4, amplitude_order=2)
     whole.span_um = fitted.span_um
     x = np.concatenate([value[: -2 * n], gain, level])
@@ -192,7 +268,9 @@ def test_planes_left_out_are_told_with_gains_and_levels_between_their_neighbours
     large = PupilModel(spec, position, phase_order=4, amplitude_order=2).layout()
     assert large.size == len(start)
     phase, amplitude, dx, dy, dz, blur, gains, levels = large.split(start)
-    assert np.concatenate([phase, amplitude, dx, dy, [blur]]) == pytest.approx(value[: -2 * n])
+    assert np.concatenate([phase, amplitude, dx, dy, [blur]]) == pytest.approx(
+        value[: -2 * n]
+    )
     assert not dz.any()
     assert (gains, levels) == (pytest.approx(gain), pytest.approx(level))
 

@@ -1,4 +1,6 @@
-"""Known masks and optics that are known roughly: formulas, recovery inside the interval, refusals by name."""
+"""Known masks and optics that are known roughly: formulas, recovery inside the
+interval, refusals by name.
+"""
 
 import dataclasses
 import math
@@ -11,7 +13,16 @@ from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilModel, PupilSpec, phase_mask
 from metalens.ground.errors import CaptureError, FitError
 
-SPEC = PupilSpec(0.32, 0.5, 0.4, window=20, phase_order=4, amplitude_order=1, drift_order=1, model_error=0.0)
+SPEC = PupilSpec(
+    0.32,
+    0.5,
+    0.4,
+    window=20,
+    phase_order=4,
+    amplitude_order=1,
+    drift_order=1,
+    model_error=0.0,
+)
 Z = np.linspace(-9, 9, 9)
 
 
@@ -40,8 +51,12 @@ def test_a_mask_is_read_where_it_is_turned_to_and_jumps_by_two_pi_are_none(tmp_p
     np.save(tmp_path / "m.npy", np.mod(9.0 * x + 2.0 * y * y, 2 * np.pi))
     u, v = np.array([0.31, -0.52, 0.7]), np.array([-0.44, 0.23, 0.6])
     found = phase_mask(tmp_path / "m.npy", u, v)
-    assert np.abs(found - np.exp(1j * (9 * u + 2 * v * v))).max() < 2e-3  # curvature over a pixel: 40 * 0.005² / 8
-    turned = phase_mask(tmp_path / "m.npy", u, v, turn_rad=math.pi / 2)  # what lay along +x lies along +y
+    assert (
+        np.abs(found - np.exp(1j * (9 * u + 2 * v * v))).max() < 2e-3
+    )  # curvature over a pixel: 40 * 0.005² / 8
+    turned = phase_mask(
+        tmp_path / "m.npy", u, v, turn_rad=math.pi / 2
+    )  # what lay along +x lies along +y
     assert np.abs(turned - np.exp(1j * (9 * v + 2 * u * u))).max() < 2e-3
 
 
@@ -58,7 +73,11 @@ def test_a_known_mask_explains_what_few_orders_do_not(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("free", "wrong"), [(("numerical_aperture",), {"numerical_aperture": 0.29}), (("step_um",), {"step_um": 2.0})]
+    ("free", "wrong"),
+    [
+        (("numerical_aperture",), {"numerical_aperture": 0.29}),
+        (("step_um",), {"step_um": 2.0}),
+    ],
 )
 def test_optics_known_roughly_are_found_within_three_sigma(free, wrong):
     truth = {"numerical_aperture": 0.32, "step_um": Z[1] - Z[0]}
@@ -67,7 +86,9 @@ def test_optics_known_roughly_are_found_within_three_sigma(free, wrong):
     ((name, value, sigma),) = found.optics
     assert name == free[0]
     assert abs(value - truth[name]) < max(3 * sigma, 0.004 * truth[name])
-    assert sigma < 0.015 * truth[name]  # of the step 1.3 %: nine planes that each stand off by a tenth of it
+    assert (
+        sigma < 0.015 * truth[name]
+    )  # of the step 1.3 %: nine planes that each stand off by a tenth of it
     assert abs(value - wrong[name]) > 0.05 * truth[name]
     assert found.held_out.ncc > found.between.ncc
     assert any(f"{name} = " in words for words in found.cautions)

@@ -1,4 +1,6 @@
-"""Zernike polynomials: orthonormal over the disc by an exact quadrature, a few of them as polynomials by hand."""
+"""Zernike polynomials: orthonormal over the disc by an exact quadrature, a few of them
+as polynomials by hand.
+"""
 
 import numpy as np
 import pytest
@@ -31,5 +33,7 @@ def test_some_by_hand_at_a_point_off_both_axes():
         (4, 0): np.sqrt(5) * (6 * r2**2 - 6 * r2 + 1),
         (4, 2): np.sqrt(10) * (4 * r2 - 3) * (0.09 - 0.25),
     }
-    assert zernike.basis(list(want), x, y)[:, 0] == pytest.approx(list(want.values()), abs=1e-13)
+    assert zernike.basis(list(want), x, y)[:, 0] == pytest.approx(
+        list(want.values()), abs=1e-13
+    )
     assert zernike.basis([], x, y).shape == (0, 1)

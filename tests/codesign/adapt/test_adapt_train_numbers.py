@@ -1,4 +1,6 @@
-"""Training on part by part, by lenses and frames that are names: which lens trains, which judges, what is kept when."""
+"""Training on part by part, by lenses and frames that are names: which lens trains,
+which judges, what is kept when.
+"""
 
 import sys
 from dataclasses import replace
@@ -24,16 +26,22 @@ CONFIG = RetrainConfig(draws=3, judge=2, seed=6, test_batches=4)
 def test_lenses_that_judge_are_none_that_train(monkeypatch, truth):
     asked = []
     monkeypatch.setattr(
-        retraining.built, "posterior", lambda result, count, *, seed: asked.append((count, seed)) or iter("abcde")
+        retraining.built,
+        "posterior",
+        lambda result, count, *, seed: asked.append((count, seed)) or iter("abcde"),
     )
     made = SimpleNamespace(stack=lambda x=None: f"lens {x}")
-    found = retraining.lenses(made, SimpleNamespace(parameters=lambda: "fit"), CONFIG, truth)
+    found = retraining.lenses(
+        made, SimpleNamespace(parameters=lambda: "fit"), CONFIG, truth
+    )
     assert asked == [(5, 6)]
     assert (found.nominal, found.best) == ("lens None", "lens fit")
     assert found.drawn == ("lens a", "lens b", "lens c")
     assert found.judges == (("lens truth",) if truth else ("lens d", "lens e"))
     assert found.known is (truth is not None)
-    assert retraining.jobs(found) == (("nominal", "retrained", "known") if truth else ("nominal", "retrained"))
+    assert retraining.jobs(found) == (
+        ("nominal", "retrained", "known") if truth else ("nominal", "retrained")
+    )
 
 
 def test_a_job_trains_on_its_own_lenses(monkeypatch):
@@ -46,7 +54,9 @@ def test_a_job_trains_on_its_own_lenses(monkeypatch):
 def test_a_job_is_kept_at_every_so_many_steps_and_at_its_end(monkeypatch):
     kept = []
     monkeypatch.setattr(
-        retraining.checkpoint, "save", lambda path, state, *, settings: kept.append((state["trainer"], settings))
+        retraining.checkpoint,
+        "save",
+        lambda path, state, *, settings: kept.append((state["trainer"], settings)),
     )
     at = SimpleNamespace(inner=SimpleNamespace(steps=107))
 
@@ -63,7 +73,9 @@ def test_a_job_is_kept_at_every_so_many_steps_and_at_its_end(monkeypatch):
     assert [step for step, _ in kept] == [40, 80, 107]
 
 
-def test_statistics_are_measured_on_training_frames_through_the_lenses_in_turn(monkeypatch):
+def test_statistics_are_measured_on_training_frames_through_the_lenses_in_turn(
+    monkeypatch,
+):
     asked = []
 
     def frames(going, scenes, count, *, stack):
@@ -71,7 +83,9 @@ def test_statistics_are_measured_on_training_frames_through_the_lenses_in_turn(m
         return SimpleNamespace(frames=f"frames {len(asked)}")
 
     scenes = SimpleNamespace(margin=5, batch=lambda number, size: (number, size))
-    going = SimpleNamespace(scenes=scenes, light=SimpleNamespace(stacks=("a", "b", "c")))
+    going = SimpleNamespace(
+        scenes=scenes, light=SimpleNamespace(stacks=("a", "b", "c"))
+    )
     monkeypatch.setattr(retraining.assess, "frames", frames)
     monkeypatch.setattr(retraining, "network", lambda going: "net")
     told = []
@@ -86,9 +100,13 @@ def test_statistics_are_measured_on_training_frames_through_the_lenses_in_turn(m
 
 def test_test_frames_are_rendered_once_in_batches_of_the_run():
     streams = []
-    scenes = SimpleNamespace(margin=5, stream=2, batch=lambda number, size: (number, size))
+    scenes = SimpleNamespace(
+        margin=5, stream=2, batch=lambda number, size: (number, size)
+    )
     run = SimpleNamespace(scenes=lambda stream: streams.append(stream) or scenes)
-    source = SimpleNamespace(run=run, settings=SimpleNamespace(inner=SimpleNamespace(batch=12)))
+    source = SimpleNamespace(
+        run=run, settings=SimpleNamespace(inner=SimpleNamespace(batch=12))
+    )
     held = retraining.held(source, CONFIG)
     assert streams == [2]  # those of the test, which no training sees
     assert held.batches == ((0, 12), (1, 12), (2, 12), (3, 12))
@@ -97,7 +115,11 @@ def test_test_frames_are_rendered_once_in_batches_of_the_run():
 
 def test_an_error_is_the_mean_over_as_many_lenses_as_judge(monkeypatch):
     """Two of three: 1 and 4 mm, 0.5 and 0.9 of overlap; the first reason that there is."""
-    by_lens = {"a": (1.0, 0.5, ""), "b": (4.0, 0.9, "too coarse"), "c": (70.0, 0.0, "never seen")}
+    by_lens = {
+        "a": (1.0, 0.5, ""),
+        "b": (4.0, 0.9, "too coarse"),
+        "c": (70.0, 0.0, "never seen"),
+    }
     asked = []
 
     def frames(going, scenes, count, *, stack):
@@ -108,12 +130,22 @@ def test_an_error_is_the_mean_over_as_many_lenses_as_judge(monkeypatch):
         error, iou, above = by_lens[seen]
         return Accuracy(torch.full((3, 3), error), torch.full((3,), iou), above)
 
-    monkeypatch.setattr(retraining, "settle", lambda going, source: asked.append("settled"))
+    monkeypatch.setattr(
+        retraining, "settle", lambda going, source: asked.append("settled")
+    )
     monkeypatch.setattr(retraining.assess, "frames", frames)
-    monkeypatch.setattr(retraining.assess, "predict", lambda net, member, seen, inner: None)
+    monkeypatch.setattr(
+        retraining.assess, "predict", lambda net, member, seen, inner: None
+    )
     monkeypatch.setattr(retraining.reading, "accuracy", accuracy)
     going = SimpleNamespace(model=SimpleNamespace(net="net"), inner="inner")
-    found = retraining.judge(going, SimpleNamespace(architecture="member"), CONFIG, ("a", "b", "c"), frames="frames")
+    found = retraining.judge(
+        going,
+        SimpleNamespace(architecture="member"),
+        CONFIG,
+        ("a", "b", "c"),
+        frames="frames",
+    )
     assert asked == ["settled", ("frames", 4), ("frames", 4)]
     assert found.error_mm.tolist() == [[2.5] * 3] * 3
     assert found.iou.tolist() == pytest.approx([0.7] * 3)
@@ -122,26 +154,41 @@ def test_an_error_is_the_mean_over_as_many_lenses_as_judge(monkeypatch):
 
 def errors(*frames):
     """Frames of one error along all axes."""
-    return Accuracy(torch.tensor(frames)[:, None].expand(len(frames), 3), torch.ones(len(frames)))
+    return Accuracy(
+        torch.tensor(frames)[:, None].expand(len(frames), 3), torch.ones(len(frames))
+    )
 
 
 def test_the_bar_of_a_gap_is_of_differences_frame_by_frame():
-    """Differences 0.2, 0.6, 1.0, 1.4 over 0.8: squares 0.36, 0.04, 0.04, 0.36 over 3, of the mean of four. A gap of
+    """Differences 0.2, 0.6, 1.0, 1.4 over 0.8: squares 0.36, 0.04, 0.04, 0.36 over 3,
+    of the mean of four. A gap of
     twice its bar is none; of what is above that 0.5 of 0.8 is won back."""
     nominal, before = errors(1.0, 2.0, 0.5, 4.0), errors(1.2, 2.6, 1.5, 5.4)
-    told = Outcome(errors(9.0), nominal, before, replace(before, error_mm=before.error_mm - 0.5), None)
+    told = Outcome(
+        errors(9.0),
+        nominal,
+        before,
+        replace(before, error_mm=before.error_mm - 0.5),
+        None,
+    )
     sigma = (0.8 / 3 / 4) ** 0.5
     assert told.gap_mm == pytest.approx(0.8, rel=1e-6)
     assert told.gap_sigma_mm == pytest.approx(sigma, rel=1e-6)
     assert retraining.gap_sigma_mm(nominal, before) == pytest.approx(sigma, rel=1e-6)
     assert told.recovered == pytest.approx(0.625, rel=1e-5)
     alike = errors(1.0, 1.0)
-    assert Outcome(alike, alike, alike, alike, None).recovered is None  # no gap and no bar
+    assert (
+        Outcome(alike, alike, alike, alike, None).recovered is None
+    )  # no gap and no bar
 
 
-@pytest.mark.parametrize(("share", "counted"), [(1.2, False), (1.98, False), (2.02, True)])
+@pytest.mark.parametrize(
+    ("share", "counted"), [(1.2, False), (1.98, False), (2.02, True)]
+)
 def test_a_gap_counts_from_two_of_its_bars_on(share, counted):
-    """Differences of a gap -+ 0.3 over 10 frames: a bar of 0.3 sqrt(10 / 9) / sqrt(10) = 0.1."""
+    """Differences of a gap -+ 0.3 over 10 frames: a bar of 0.3 sqrt(10 / 9) / sqrt(10)
+    = 0.1.
+    """
     nominal = errors(*[1.0] * 10)
     before = errors(*(1.0 + 0.1 * share + 0.3 * (-1) ** k for k in range(10)))
     told = Outcome(nominal, nominal, before, nominal, None)
@@ -150,7 +197,11 @@ def test_a_gap_counts_from_two_of_its_bars_on(share, counted):
 
 
 def test_what_is_wrong_with_images_is_told_of_the_made_lens_first():
-    plain, bad, worse = errors(1.0), replace(errors(1.0), above="made"), replace(errors(1.0), above="designed")
+    plain, bad, worse = (
+        errors(1.0),
+        replace(errors(1.0), above="made"),
+        replace(errors(1.0), above="designed"),
+    )
     assert Outcome(worse, plain, plain, bad, None).above == "made"
     assert Outcome(worse, plain, plain, plain, None).above == "designed"
     assert Outcome(plain, plain, plain, plain, None).above == ""
@@ -160,7 +211,9 @@ def test_seeds_lie_apart_by_a_prime_and_weights_move_to_the_end():
     """7919 a retraining, the first one included; the batch is the run's."""
     run = InnerConfig(seed=5, batch=12, weights=Schedule(3e-3, 0.25, 0.75, clip=0.4))
     for seed, want in ((0, 7_924), (1, 15_843), (6, 55_438)):
-        made = retraining.fine_tuning(run, RetrainConfig(seed=seed, steps=33, rate=7e-4))
+        made = retraining.fine_tuning(
+            run, RetrainConfig(seed=seed, steps=33, rate=7e-4)
+        )
         assert (made.seed, made.steps, made.batch) == (want, 33, 12)
         assert made.weights == Schedule(7e-4, 0.0, 1.0, clip=0.4)
         assert made.optics == made.pitch == Schedule(0.0)
@@ -170,9 +223,15 @@ def test_without_frames_the_run_s_own_test_frames_judge(monkeypatch):
     seen = []
     monkeypatch.setattr(retraining, "settle", lambda going, source: None)
     monkeypatch.setattr(retraining, "held", lambda source, config: "held")
-    monkeypatch.setattr(retraining.assess, "frames", lambda going, scenes, count, *, stack: seen.append(scenes))
+    monkeypatch.setattr(
+        retraining.assess,
+        "frames",
+        lambda going, scenes, count, *, stack: seen.append(scenes),
+    )
     monkeypatch.setattr(retraining.assess, "predict", lambda *about: None)
-    monkeypatch.setattr(retraining.reading, "accuracy", lambda answers, shown: errors(1.0, 2.0))
+    monkeypatch.setattr(
+        retraining.reading, "accuracy", lambda answers, shown: errors(1.0, 2.0)
+    )
     going = SimpleNamespace(model=SimpleNamespace(net="net"), inner="inner")
     retraining.judge(going, SimpleNamespace(architecture="member"), CONFIG, ("a",))
     assert seen == ["held"]

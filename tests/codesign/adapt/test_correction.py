@@ -1,4 +1,6 @@
-"""The next mask: closed forms where the process errs in one way, the layout's own reading of the table, real gain."""
+"""The next mask: closed forms where the process errs in one way, the layout's own
+reading of the table, real gain.
+"""
 
 import sys
 from pathlib import Path
@@ -25,7 +27,9 @@ table_nm = [[80, -6.0], [120, -3.5], [180, -1.0], [260, 0.5], [340, 1.0]]
 def _plan(old=None, **values):
     lens = m.small()
     none = correction.present_bias(None)
-    return correction.propose(lens, vector(values), response=sensitivity(lens), old=old or none)
+    return correction.propose(
+        lens, vector(values), response=sensitivity(lens), old=old or none
+    )
 
 
 def test_a_constant_bias_becomes_a_constant_table():
@@ -45,8 +49,14 @@ def test_what_height_takes_from_the_phase_the_diameters_give_back():
     lens, x = m.small(), vector({"height_nm": -12.0})
     response = sensitivity(lens)
     plan = _plan(height_nm=-12.0)
-    now = np.angle(transmission(lens.proxy, response, plan.wanted_um, 0.85, state(x).answers()))
-    meant = np.angle(transmission(lens.proxy, response, plan.designed_um, 0.85, state(vector()).answers()))
+    now = np.angle(
+        transmission(lens.proxy, response, plan.wanted_um, 0.85, state(x).answers())
+    )
+    meant = np.angle(
+        transmission(
+            lens.proxy, response, plan.designed_um, 0.85, state(vector()).answers()
+        )
+    )
     off = np.angle(np.exp(1j * (now - meant)))
     assert np.ptp(off) < 2e-3  # one piston for all; 4001 table nodes leave 1e-3
     assert np.abs(plan.wanted_um - plan.designed_um).max() > 5e-4
@@ -56,18 +66,23 @@ def test_the_layout_draws_what_the_table_means(tmp_path):
     plan = _plan(bias_nm=5.0, height_nm=-8.0)
     correction.write(tmp_path, plan)
     made = processes.load(tmp_path / "bias.toml")
-    assert np.allclose(made.bias.drawn_nm(plan.designed_um * 1e3), plan.drawn_nm, atol=2e-3)  # 3 decimals in the file
+    assert np.allclose(
+        made.bias.drawn_nm(plan.designed_um * 1e3), plan.drawn_nm, atol=2e-3
+    )  # 3 decimals in the file
     (tmp_path / "other.toml").write_text('[bias]\ncsv = "bias.csv"\n')
     assert processes.load(tmp_path / "other.toml").bias.table_nm == made.bias.table_nm
 
 
-@pytest.mark.parametrize("text", [OLD, "[bias]\ncurve_nm = [-3.0, 1.5]\n", "", "[bias]\ncsv = 'b.csv'\n"])
+@pytest.mark.parametrize(
+    "text", [OLD, "[bias]\ncurve_nm = [-3.0, 1.5]\n", "", "[bias]\ncsv = 'b.csv'\n"]
+)
 def test_the_present_bias_is_read_as_the_layout_reads_it(tmp_path, text):
     (tmp_path / "b.csv").write_text("# measured\ndrawn,bias\n90,-4\n200,1\n")
     (tmp_path / "p.toml").write_text(text)
     drawn = np.linspace(60, 400, 50)
     assert np.allclose(
-        correction.present_bias(tmp_path / "p.toml").at(drawn), processes.load(tmp_path / "p.toml").bias.at(drawn)
+        correction.present_bias(tmp_path / "p.toml").at(drawn),
+        processes.load(tmp_path / "p.toml").bias.at(drawn),
     )
 
 
@@ -80,10 +95,14 @@ def test_no_process_file_and_nonsense_in_it_are_refused(tmp_path):
 
 
 def test_a_true_correction_gives_the_designed_lens_back():
-    """With the fit equal to the truth, table and map leave aberrations and distance; the spacer leaves aberrations."""
+    """With the fit equal to the truth, table and map leave aberrations and distance;
+    the spacer leaves aberrations.
+    """
     made = built.MadeLens(m.small(), m.OPTICS)
     x = vector({k: v for k, v in m.TRUE.items() if k != "coma_x_rad"})
-    plan = correction.propose(m.small(), x, response=made.response, old=correction.present_bias(None))
+    plan = correction.propose(
+        m.small(), x, response=made.response, old=correction.present_bias(None)
+    )
     before, table, mapped, placed = correction.next_lenses(made, plan, x, x)
     goal = made.stack()
     errors = [built.psf_error(p.stack, goal) for p in (before, table, mapped, placed)]

@@ -1,4 +1,6 @@
-"""Training on for the lens as built: what is refused and why, resume bit for bit, who is judged on what."""
+"""Training on for the lens as built: what is refused and why, resume bit for bit, who
+is judged on what.
+"""
 
 import math
 import sys
@@ -49,11 +51,16 @@ def _accuracy(error, n=50):
 
 
 def test_bars_of_a_gap_and_of_an_accuracy():
-    """Frames that both cases share: their common scatter takes no part in the bar of the gap."""
+    """Frames that both cases share: their common scatter takes no part in the bar of
+    the gap.
+    """
     generator = torch.Generator().manual_seed(5)
     shared = torch.rand(4000, 1, generator=generator) * 3
     own = torch.randn(4000, 3, generator=generator) * torch.tensor([0.3, 0.6, 0.9])
-    better = Accuracy((shared + torch.tensor([1.0, 2.0, 6.0])).expand(4000, 3), torch.full((4000,), 0.75))
+    better = Accuracy(
+        (shared + torch.tensor([1.0, 2.0, 6.0])).expand(4000, 3),
+        torch.full((4000,), 0.75),
+    )
     worse = Accuracy(better.error_mm + 0.21 + own, better.iou)
     told = Outcome(better, better, worse, better, None)
     assert told.gap_mm == pytest.approx(0.21, abs=4 * 0.374 / math.sqrt(4000))
@@ -62,15 +69,22 @@ def test_bars_of_a_gap_and_of_an_accuracy():
     assert better.axial_mm - better.lateral_mm == pytest.approx(4.5, rel=1e-5)
     assert better.slip_mm == pytest.approx(4.5, abs=0.05)
     low, high = better.interval_mm()
-    assert high - low == pytest.approx(2 * 1.96 * 3 / math.sqrt(12) / math.sqrt(4000), rel=0.1)  # 1000 draws: 3 %
+    assert high - low == pytest.approx(
+        2 * 1.96 * 3 / math.sqrt(12) / math.sqrt(4000), rel=0.1
+    )  # 1000 draws: 3 %
     assert set(told.rows()) == {"designed", "nominal", "before", "after"}
     assert told.rows()["after"]["iou"] == 0.75
 
 
 @pytest.mark.parametrize(("gap", "counted"), [(0.019, False), (0.021, True)])
 def test_a_gap_within_two_of_its_errors_is_no_gap(gap, counted):
-    scatter = torch.tensor([0.1, -0.1]).repeat(50)[:, None].expand(100, 3) * math.sqrt(99 / 100)  # bar of 0.01
-    nominal, before = Accuracy(torch.ones(100, 3), torch.ones(100)), Accuracy(1 + gap + scatter, torch.ones(100))
+    scatter = torch.tensor([0.1, -0.1]).repeat(50)[:, None].expand(100, 3) * math.sqrt(
+        99 / 100
+    )  # bar of 0.01
+    nominal, before = (
+        Accuracy(torch.ones(100, 3), torch.ones(100)),
+        Accuracy(1 + gap + scatter, torch.ones(100)),
+    )
     told = Outcome(nominal, nominal, before, nominal, None)
     assert told.gap_sigma_mm == pytest.approx(0.01, rel=1e-5)
     assert (told.recovered is not None) == counted
@@ -82,11 +96,20 @@ def test_share_won_back_is_that_of_the_gap():
     assert told.gap_mm == pytest.approx(0.5)
     assert told.recovered == pytest.approx(0.9)
     assert replace(told, before=_accuracy(0.4)).recovered is None
-    scattered = Accuracy(0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50))
+    scattered = Accuracy(
+        0.4 + 0.1 * (torch.arange(150.0).reshape(50, 3) % 2 - 0.48), torch.ones(50)
+    )
     assert replace(told, before=scattered).gap_mm > 0
-    assert replace(told, before=scattered).recovered is None  # a gap of 2.0 um, with a standard error of 2.4 um
+    assert (
+        replace(told, before=scattered).recovered is None
+    )  # a gap of 2.0 um, with a standard error of 2.4 um
     assert list(told.rows()) == ["designed", "nominal", "before", "after", "known"]
-    assert list(replace(told, known=None).rows()) == ["designed", "nominal", "before", "after"]
+    assert list(replace(told, known=None).rows()) == [
+        "designed",
+        "nominal",
+        "before",
+        "after",
+    ]
 
 
 def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
@@ -95,7 +118,9 @@ def test_interval_of_the_error_covers_the_mean_as_often_as_it_says():
     for _ in range(200):
         low, high = reading.bootstrap(rng.exponential(1.0, 200), draws=200)
         hits += low <= 1.0 <= high
-    assert 0.88 <= hits / 200 <= 0.99  # 95 %, with the spread of 200 trials and the bootstrap's own bias
+    assert (
+        0.88 <= hits / 200 <= 0.99
+    )  # 95 %, with the spread of 200 trials and the bootstrap's own bias
 
 
 def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(found):
@@ -105,28 +130,45 @@ def test_the_judge_is_the_truth_where_it_is_known_and_never_a_draw_of_training(f
     assert torch.equal(found.judges[0].intensity, true.intensity)
     blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), SHORT)
     assert not blind.known
-    assert not any(torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn)
+    assert not any(
+        torch.equal(blind.judges[0].intensity, d.intensity) for d in blind.drawn
+    )
 
 
 def test_draws_judge_where_the_truth_is_not_known_and_every_frame_counts_once(folder):
-    """As on a real bench: the error of a frame is its mean over the lenses, so one lens and three compare."""
+    """As on a real bench: the error of a frame is its mean over the lenses, so one lens
+    and three compare.
+    """
     config = replace(SHORT, judge=3)
     source = retraining.load(folder)
     blind = retraining.lenses(MadeLens(m.small(), m.SEEN), m.asbuilt(), config)
     going = retraining.trainer(source, config, (blind.nominal,))
-    told = retraining.outcome(source, config, blind, {"nominal": going, "retrained": going})
+    told = retraining.outcome(
+        source, config, blind, {"nominal": going, "retrained": going}
+    )
     assert told.known is None
     assert told.gap_sigma_mm > 0
     frames = retraining.held(source, config)
-    apart = [retraining.judge(going, source, config, (one,), frames=frames) for one in blind.judges]
+    apart = [
+        retraining.judge(going, source, config, (one,), frames=frames)
+        for one in blind.judges
+    ]
     assert len(apart) == 3
-    assert told.before.error_mm.shape == apart[0].error_mm.shape == (source.settings.inner.batch, 3)
+    assert (
+        told.before.error_mm.shape
+        == apart[0].error_mm.shape
+        == (source.settings.inner.batch, 3)
+    )
     mean = sum(one.error_mm for one in apart) / 3
     assert torch.allclose(told.before.error_mm, mean, rtol=1e-6, atol=0)
-    assert told.before.slip_mm == pytest.approx(sum(one.slip_mm for one in apart) / 3, rel=1e-6)
+    assert told.before.slip_mm == pytest.approx(
+        sum(one.slip_mm for one in apart) / 3, rel=1e-6
+    )
 
 
-def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(folder, found, monkeypatch):
+def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(
+    folder, found, monkeypatch
+):
     """Of the made lens first: its images are those that the network was trained for."""
     asked = []
 
@@ -137,31 +179,50 @@ def test_what_is_wrong_with_the_images_that_judge_comes_with_their_case(folder, 
     monkeypatch.setattr(formed, "above", above)
     source = retraining.load(folder)
     going = retraining.trainer(source, SHORT, (found.nominal,))
-    told = retraining.outcome(source, SHORT, found, {"nominal": going, "retrained": going, "known": going})
+    told = retraining.outcome(
+        source, SHORT, found, {"nominal": going, "retrained": going, "known": going}
+    )
     cases = (told.designed, told.nominal, told.before, told.after, told.known)
     numbers = [int(case.above.split()[1]) for case in cases]
-    assert numbers == sorted(numbers)  # cases are judged in their order, each after its batch statistics
+    assert numbers == sorted(
+        numbers
+    )  # cases are judged in their order, each after its batch statistics
     assert len(set(numbers)) == 5
     assert told.above == told.after.above
-    assert replace(told, after=replace(told.after, above="")).above == told.designed.above
+    assert (
+        replace(told, after=replace(told.after, above="")).above == told.designed.above
+    )
 
 
 def test_a_job_stopped_and_resumed_ends_bit_for_bit_the_same(folder, found, tmp_path):
     source = retraining.load(folder)
     whole = retraining.job(source, SHORT, found, "retrained")
     list(retraining.train(whole, tmp_path / "whole", SHORT))
-    first = retraining.train(retraining.job(source, SHORT, found, "retrained"), tmp_path / "part", SHORT, every=1)
+    first = retraining.train(
+        retraining.job(source, SHORT, found, "retrained"),
+        tmp_path / "part",
+        SHORT,
+        every=1,
+    )
     next(first), next(first)  # the checkpoint of step 1 is written
     second = retraining.job(source, SHORT, found, "retrained")
     list(retraining.train(second, tmp_path / "part", SHORT))
-    for a, b in zip(whole.model.net.state_dict().values(), second.model.net.state_dict().values(), strict=True):
+    for a, b in zip(
+        whole.model.net.state_dict().values(),
+        second.model.net.state_dict().values(),
+        strict=True,
+    ):
         assert torch.equal(a, b)
     before = source.run.trainer.model.net.state_dict()
-    assert any(not torch.equal(before[n], v) for n, v in whole.model.net.state_dict().items())
+    assert any(
+        not torch.equal(before[n], v) for n, v in whole.model.net.state_dict().items()
+    )
 
 
 def test_a_job_trains_where_its_run_is_placed(folder, found):
-    """On the played device its losses are the processor's, and its frames are imaged there."""
+    """On the played device its losses are the processor's, and its frames are imaged
+    there.
+    """
     plain = retraining.job(retraining.load(folder), SHORT, found, "retrained")
     want = next(plain.run(until=1))
     source = retraining.load(folder)
@@ -173,20 +234,26 @@ def test_a_job_trains_where_its_run_is_placed(folder, found):
     assert {"convolution_backward", "_fft_r2c"} <= done
     assert told.loss == pytest.approx(want.loss, rel=1e-5)
     list(plain.run(until=1))
-    assert judged.slip_mm == pytest.approx(retraining.judge(plain, source, SHORT, found.judges).slip_mm, rel=1e-3)
+    assert judged.slip_mm == pytest.approx(
+        retraining.judge(plain, source, SHORT, found.judges).slip_mm, rel=1e-3
+    )
 
 
 def test_only_weights_move(folder, found):
     source = retraining.load(folder)
     going = retraining.job(source, SHORT, found, "known")
     list(going.run())
-    assert torch.equal(going.model.coefficients_rad, source.run.trainer.model.coefficients_rad)
+    assert torch.equal(
+        going.model.coefficients_rad, source.run.trainer.model.coefficients_rad
+    )
     assert torch.equal(going.model.log_pitch, source.run.trainer.model.log_pitch)
 
 
 def test_the_whole_story_in_one_call(folder):
     told = codesign.retrain(folder, m.asbuilt(), config=SHORT, truth=TRUTH)
-    assert all(np.isfinite(v).all() for row in told.rows().values() for v in row.values())
+    assert all(
+        np.isfinite(v).all() for row in told.rows().values() for v in row.values()
+    )
     assert told.known is not None
 
 
@@ -206,8 +273,13 @@ def test_half_written_runs_are_named(folder, tmp_path, name, message):
         retraining.load(tmp_path)
 
 
-def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder, tmp_path):
-    with pytest.raises(TrainingError, match=r"is no run folder: .* give the folder that `metalens codesign"):
+def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(
+    folder, tmp_path
+):
+    with pytest.raises(
+        TrainingError,
+        match=r"is no run folder: .* give the folder that `metalens codesign",
+    ):
         retraining.load(tmp_path)
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -222,16 +294,23 @@ def test_no_run_and_a_result_that_is_cut_or_of_another_version_are_named(folder,
 def test_a_retraining_is_no_run_and_said_to_be_none(folder, tmp_path, take_up):
     for name in ("retrain.toml", "result.json"):
         (tmp_path / name).write_text("{}")
-    with pytest.raises(TrainingError, match=r"holds a retraining, no run: .* give the folder that `metalens codesign"):
+    with pytest.raises(
+        TrainingError,
+        match=r"holds a retraining, no run: .* give the folder that `metalens codesign",
+    ):
         take_up(tmp_path)
 
 
 def test_a_run_of_another_network_is_read_and_not_retrained(tmp_path):
     source = retraining.load(m.finished_baseline(tmp_path / "run"))
     assert source.architecture.resolution == 1.0
-    with pytest.raises(TrainingError, match="trained a NVGaze; only elastic networks are retrained"):
+    with pytest.raises(
+        TrainingError, match="trained a NVGaze; only elastic networks are retrained"
+    ):
         retraining.network(source.run.trainer)
-    with pytest.raises(TrainingError, match="no network of 7 MMACs; its budgets are none"):
+    with pytest.raises(
+        TrainingError, match="no network of 7 MMACs; its budgets are none"
+    ):
         retraining.load(tmp_path / "run", budget_mmacs=7.0)
 
 
@@ -239,7 +318,9 @@ def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
     d = m.small().diameters
     other = np.where(d.diameter_um > 0, np.clip(d.diameter_um + 0.003, 0, 0.33), 0)
     foreign = replace(m.small(), diameters=DiameterMap(other, d.pitch_um))
-    with pytest.raises(FitError, match=r"another lens: designed diameters differ by up to 3\.0 nm"):
+    with pytest.raises(
+        FitError, match=r"another lens: designed diameters differ by up to 3\.0 nm"
+    ):
         retraining.check_lens(m.small(), m.asbuilt(made=foreign))
     wider = replace(m.small(), diameters=DiameterMap(d.diameter_um[1:], d.pitch_um))
     with pytest.raises(FitError, match="another lens"):
@@ -251,17 +332,29 @@ def test_a_fit_of_another_lens_or_a_refused_one_is_refused():
 
 
 def test_a_made_lens_images_truly_as_its_pillars_do(found):
-    """The image through the lens plane on axis has the PSFs of the made lens: an engine of its own gave those.
+    """The image through the lens plane on axis has the PSFs of the made lens: an engine
+    of its own gave those.
 
-    Budget: 3 % of the image's tolerance, and the squares of a sample that its PSFs are averaged over, 5 %.
+    Budget: 3 % of the image's tolerance, and the squares of a sample that its PSFs are
+    averaged over, 5 %.
     """
     settings = replace(m.SEEN, image="true", image_tolerance=0.1)
     made = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.judges[0])
     other = formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.nominal)
-    assert made is formed.imager(settings, torch.zeros(0), 43, margin=4, made=found.judges[0])
-    centres = [image.stack[tuple(n // 2 for n in image.stack.shape[:2])] for image in (made, other)]
-    moved, told = (float((a - b).norm() / b.norm()) for a, b in (centres, _units(found.judges[0], found.nominal)))
-    assert moved == pytest.approx(told, rel=0.35)  # depths differ: the image places its own nodes
+    assert made is formed.imager(
+        settings, torch.zeros(0), 43, margin=4, made=found.judges[0]
+    )
+    centres = [
+        image.stack[tuple(n // 2 for n in image.stack.shape[:2])]
+        for image in (made, other)
+    ]
+    moved, told = (
+        float((a - b).norm() / b.norm())
+        for a, b in (centres, _units(found.judges[0], found.nominal))
+    )
+    assert moved == pytest.approx(
+        told, rel=0.35
+    )  # depths differ: the image places its own nodes
     bare = Stack(found.nominal.intensity, found.nominal.depths_um)
     with pytest.raises(TrainingError, match="PSFs on axis alone"):
         formed.imager(settings, torch.zeros(0), 43, margin=4, made=bare)

@@ -1,4 +1,6 @@
-"""What a run that is taken up holds: its rows in order, its network, and how far another lens may be off."""
+"""What a run that is taken up holds: its rows in order, its network, and how far
+another lens may be off.
+"""
 
 import json
 import sys
@@ -38,11 +40,18 @@ def folder(tmp_path, monkeypatch):
     """A run of three networks; what reads its checkpoint gives names."""
     for name in ("run.toml", "checkpoint.safetensors", "lens.h5"):
         (tmp_path / name).write_text("")
-    rows = [{"budget_mmacs": b, "architecture": a} for a, b in (("third", 9.0), ("first", 2.0), ("second", 4.5))]
+    rows = [
+        {"budget_mmacs": b, "architecture": a}
+        for a, b in (("third", 9.0), ("first", 2.0), ("second", 4.5))
+    ]
     written(tmp_path, rows)
     monkeypatch.setattr(source.runs, "load", lambda path: f"settings of {path.name}")
-    monkeypatch.setattr(source.runs, "resume", lambda path, settings: (path.name, settings))
-    monkeypatch.setattr(source, "architecture_of", lambda entry, run, folder: f"{entry} network")
+    monkeypatch.setattr(
+        source.runs, "resume", lambda path, settings: (path.name, settings)
+    )
+    monkeypatch.setattr(
+        source, "architecture_of", lambda entry, run, folder: f"{entry} network"
+    )
     return tmp_path
 
 
@@ -52,12 +61,18 @@ def test_without_a_budget_the_largest_network_is_taken(folder):
     assert found.run == ("checkpoint.safetensors", "settings of run.toml")
     assert found.made is None
     for budget, name in ((2.0, "first"), (4.5, "second"), (9.0, "third")):
-        assert source.load(folder, budget_mmacs=budget).architecture == f"{name} network"
-    with pytest.raises(TrainingError, match=r"no network of 3 MMACs; its budgets are 2, 4\.5, 9"):
+        assert (
+            source.load(folder, budget_mmacs=budget).architecture == f"{name} network"
+        )
+    with pytest.raises(
+        TrainingError, match=r"no network of 3 MMACs; its budgets are 2, 4\.5, 9"
+    ):
         source.load(folder, budget_mmacs=3.0)
 
 
-@pytest.mark.parametrize("name", ["run.toml", "checkpoint.safetensors", "lens.h5", "result.json"])
+@pytest.mark.parametrize(
+    "name", ["run.toml", "checkpoint.safetensors", "lens.h5", "result.json"]
+)
 def test_one_missing_file_of_four_is_a_half_written_run(folder, name):
     (folder / name).unlink()
     with pytest.raises(TrainingError, match=f"half-written run: {name} missing"):
@@ -67,18 +82,30 @@ def test_one_missing_file_of_four_is_a_half_written_run(folder, name):
 def test_an_architecture_is_read_as_it_was_written_without_its_error_and_cost():
     space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
     run = SimpleNamespace(
-        trainer=SimpleNamespace(model=SimpleNamespace(net=None)), settings=SimpleNamespace(space=space)
+        trainer=SimpleNamespace(model=SimpleNamespace(net=None)),
+        settings=SimpleNamespace(space=space),
     )
     chosen = smallest(space)
-    told = {name: list(v) if isinstance(v := getattr(chosen, name), tuple) else v for name in chosen.__slots__}
-    assert source.architecture_of({**told, "error": 0.3, "macs": 7e6}, run, Path("x")) == chosen
-    with pytest.raises(TrainingError, match=r"x/result\.json: its network is of another version"):
+    told = {
+        name: list(v) if isinstance(v := getattr(chosen, name), tuple) else v
+        for name in chosen.__slots__
+    }
+    assert (
+        source.architecture_of({**told, "error": 0.3, "macs": 7e6}, run, Path("x"))
+        == chosen
+    )
+    with pytest.raises(
+        TrainingError, match=r"x/result\.json: its network is of another version"
+    ):
         source.architecture_of({**told, "colour": 3}, run, Path("x"))
     with pytest.raises(TrainingError, match="its network is of another version"):
         source.architecture_of(None, run, Path("x"))
 
 
-@pytest.mark.parametrize(("off_um", "same"), [(0.9e-6, True), (-0.9e-6, True), (1.1e-6, False), (-1.1e-6, False)])
+@pytest.mark.parametrize(
+    ("off_um", "same"),
+    [(0.9e-6, True), (-0.9e-6, True), (1.1e-6, False), (-1.1e-6, False)],
+)
 def test_diameters_of_one_lens_agree_to_a_picometre(off_um, same):
     lens = m.small()
     d = lens.diameters
@@ -89,7 +116,9 @@ def test_diameters_of_one_lens_agree_to_a_picometre(off_um, same):
     if same:
         source.check_lens(lens, fitted)
     else:
-        with pytest.raises(FitError, match=r"designed diameters differ by up to 0\.0 nm"):
+        with pytest.raises(
+            FitError, match=r"designed diameters differ by up to 0\.0 nm"
+        ):
             source.check_lens(lens, fitted)
 
 
@@ -97,9 +126,16 @@ def test_a_lens_of_another_pitch_or_distance_is_another():
     lens = m.small()
     d = lens.diameters
     with pytest.raises(FitError, match=r"pitch 0\.41 um"):
-        source.check_lens(lens, m.asbuilt(made=replace(lens, diameters=DiameterMap(d.diameter_um, 0.41))))
+        source.check_lens(
+            lens,
+            m.asbuilt(made=replace(lens, diameters=DiameterMap(d.diameter_um, 0.41))),
+        )
     far = SimpleNamespace(
-        design=SimpleNamespace(diameters=d, sensor_distance_um=lens.sensor_distance_um + 0.5), trusted=True, problems=()
+        design=SimpleNamespace(
+            diameters=d, sensor_distance_um=lens.sensor_distance_um + 0.5
+        ),
+        trusted=True,
+        problems=(),
     )
     with pytest.raises(FitError, match=r"distances are 300\.0 and 300\.5 um"):
         source.check_lens(lens, far)
@@ -117,7 +153,15 @@ def test_a_lens_of_another_pitch_or_distance_is_another():
 
 def test_how_a_network_is_trained_on():
     usual = RetrainConfig()
-    told = (usual.steps, usual.rate, usual.draws, usual.judge, usual.test_batches, usual.seed, usual.budget_mmacs)
+    told = (
+        usual.steps,
+        usual.rate,
+        usual.draws,
+        usual.judge,
+        usual.test_batches,
+        usual.seed,
+        usual.budget_mmacs,
+    )
     assert told == (200, 1.5e-3, 8, 4, 16, 0, 0.0)
     assert RetrainConfig(steps=1, draws=1, judge=1, test_batches=1, seed=0, rate=1e-12)
     for name in ("steps", "draws", "judge", "test_batches"):

@@ -26,7 +26,9 @@ def table(x):
 def test_a_narrow_posterior_is_used_and_its_spread_told():
     found = sure.judge(m.asbuilt(sigma=0.3), table)
     assert found.usable
-    assert np.allclose(found.sigma_nm, 0.3 * KNOTS, rtol=0.5)  # 24 draws: 15 % is one sigma
+    assert np.allclose(
+        found.sigma_nm, 0.3 * KNOTS, rtol=0.5
+    )  # 24 draws: 15 % is one sigma
 
 
 def test_a_wide_posterior_is_refused_with_what_would_settle_it():
@@ -37,14 +39,26 @@ def test_a_wide_posterior_is_refused_with_what_would_settle_it():
 
 
 def test_what_nobody_stated_refuses_and_is_named():
-    """Sharp within the model; a leaning wall and the index move the bias by 3 and 2.6 nm, light by nothing of note."""
+    """Sharp within the model; a leaning wall and the index move the bias by 3 and 2.6
+    nm, light by nothing of note.
+    """
     sharp = m.asbuilt(sigma=0.1)
     i = sharp.names.index("bias_nm")
-    causes = ("another refractive index", "uneven illumination", "a side wall that leans about half height")
+    causes = (
+        "another refractive index",
+        "uneven illumination",
+        "a side wall that leans about half height",
+    )
     by_cause = np.zeros((3, len(sharp.names)))
     by_cause[:, i] = 2.6, 0.05, 3.0
     whole = sharp.covariance + by_cause.T @ by_cause
-    open_ = replace(sharp, covariance=whole, within=WithinModel(sharp.covariance), causes=causes, by_cause=by_cause)
+    open_ = replace(
+        sharp,
+        covariance=whole,
+        within=WithinModel(sharp.covariance),
+        causes=causes,
+        by_cause=by_cause,
+    )
     found = sure.judge(open_, table)
     assert not found.usable
     assert found.words.index("cross-section") < found.words.index("ellipsometry")
@@ -52,7 +66,9 @@ def test_what_nobody_stated_refuses_and_is_named():
         assert words not in found.words
     assert found.sigma_nm == pytest.approx(np.hypot(2.6, 3.0) * KNOTS, rel=0.5)
     kept = replace(open_, bench=np.zeros_like(whole)).lens_samples(400, seed=1)[:, i]
-    assert kept.std() == pytest.approx(0.1, rel=0.15)  # both go with the lens: its light is as sharp as before
+    assert kept.std() == pytest.approx(
+        0.1, rel=0.15
+    )  # both go with the lens: its light is as sharp as before
 
 
 def test_two_lenses_that_fit_alike_are_wide_however_sharp_each_is():
@@ -65,7 +81,8 @@ def test_two_lenses_that_fit_alike_are_wide_however_sharp_each_is():
 
 
 def test_a_map_is_judged_apart_from_the_table():
-    """The mean bias to 0.1 nm, a bow of the diameters to 5: half of it, 2.5 nm, at axis and rim, where -0.5 and 0.5 of
+    """The mean bias to 0.1 nm, a bow of the diameters to 5: half of it, 2.5 nm, at axis
+    and rim, where -0.5 and 0.5 of
     it are taken off; half-way -0.25."""
     sharp = m.asbuilt(sigma=0.1)
     i = sharp.names.index("bias_r_nm")
@@ -74,7 +91,9 @@ def test_a_map_is_judged_apart_from_the_table():
     bowed = replace(sharp, covariance=covariance)
     assert sure.judge(bowed, table).usable
     found = sure.judge(bowed, correction.uneven_nm, part=sure.MAP)
-    assert found.sigma_nm == pytest.approx([2.5] + [1.25] * 8 + [2.5] * 8, rel=0.45)  # 24 draws: 15 % is one sigma
+    assert found.sigma_nm == pytest.approx(
+        [2.5] + [1.25] * 8 + [2.5] * 8, rel=0.45
+    )  # 24 draws: 15 % is one sigma
     assert "what varies over the lens open" in found.words
     assert "bias_r_nm" in found.words
     assert "height_nm" not in found.words

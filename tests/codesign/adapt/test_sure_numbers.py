@@ -1,4 +1,6 @@
-"""What leaves a correction open, by a table that is a straight line of typed-in slopes: thresholds at their edges."""
+"""What leaves a correction open, by a table that is a straight line of typed-in slopes:
+thresholds at their edges.
+"""
 
 import statistics
 from types import SimpleNamespace
@@ -10,7 +12,11 @@ from codesign.adapt import sure
 from metalens.ground.errors import ConfigError
 
 NAMES = ("bias_nm", "focus_um", "height_nm")  # the second is none that a table follows
-SLOPES = {"bias_nm": (0.4, 1.7, -0.9), "focus_um": (50.0, 50.0, 50.0), "height_nm": (-0.2, -0.6, 0.3)}
+SLOPES = {
+    "bias_nm": (0.4, 1.7, -0.9),
+    "focus_um": (50.0, 50.0, 50.0),
+    "height_nm": (-0.2, -0.6, 0.3),
+}
 
 
 def table(x):
@@ -29,7 +35,9 @@ def fit(by_cause=((0.0, 0.0, 0.0),), causes=("a side wall",), within=None):
 
 
 def words(found, wide_nm, part=sure.TABLE):
-    """Of the second knot, the widest: slopes 1.7 along the bias and -0.6 along the height."""
+    """Of the second knot, the widest: slopes 1.7 along the bias and -0.6 along the
+    height.
+    """
     return sure._settled(found, table, np.array([0.9, 3.9, 2.0]), (part, wide_nm))
 
 
@@ -37,8 +45,12 @@ def words(found, wide_nm, part=sure.TABLE):
     ([[0.5, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 1.3]], (1.7**2 * 0.5 + 0.6**2 * 1.3) ** 0.5),
     ([[0.5, 0.0, 0.3], [0.0, 9.0, 0.0], [0.3, 0.0, 1.3]], (1.445 - 2 * 1.02 * 0.3 + 0.468) ** 0.5),
 ])  # fmt: skip
-def test_what_frames_leave_is_by_the_slopes_at_the_widest_knot_and_their_covariance(covariance, own):
-    """Frames are asked for where that is above seven tenths of what is allowed, whatever the focus does."""
+def test_what_frames_leave_is_by_the_slopes_at_the_widest_knot_and_their_covariance(
+    covariance, own
+):
+    """Frames are asked for where that is above seven tenths of what is allowed,
+    whatever the focus does.
+    """
     found = fit([[1.0, 0.0, 0.0]], within=covariance)
     assert "both sides of focus" in words(found, own / 0.7 * 0.999)
     told = words(found, own / 0.7 * 1.001)
@@ -47,28 +59,43 @@ def test_what_frames_leave_is_by_the_slopes_at_the_widest_knot_and_their_covaria
 
 
 def test_a_cause_moves_all_that_it_moves_together_at_most_by_the_sum():
-    """1.7 x 0.8 + 0.6 x 0.5 = 1.66 nm: a fifth of 8.3. A cause is named above that and a quarter of the worst."""
+    """1.7 x 0.8 + 0.6 x 0.5 = 1.66 nm: a fifth of 8.3. A cause is named above that and
+    a quarter of the worst.
+    """
     one = fit([[0.8, 99.0, 0.5]])
     assert words(one, 8.29).startswith("the side wall by a cross-section")
     assert "side wall" not in words(one, 8.31)
-    assert words(one, 8.31).startswith("frames at source depths on both sides of focus")  # nothing else to ask for
+    assert words(one, 8.31).startswith(
+        "frames at source depths on both sides of focus"
+    )  # nothing else to ask for
     for share, named in ((0.249, False), (0.251, True)):
-        two = fit([[0.8, 0.0, 0.5], [0.0, 0.0, share * 1.66 / 0.6]], ("a side wall", "another refractive index"))
+        two = fit(
+            [[0.8, 0.0, 0.5], [0.0, 0.0, share * 1.66 / 0.6]],
+            ("a side wall", "another refractive index"),
+        )
         assert ("ellipsometry" in words(two, 0.01)) == named
-    both = fit([[0.3, 0.0, 0.1], [0.8, 0.0, 0.5]], ("a side wall", "another refractive index"))
+    both = fit(
+        [[0.3, 0.0, 0.1], [0.8, 0.0, 0.5]], ("a side wall", "another refractive index")
+    )
     told = words(both, 0.4)
-    assert told.index("ellipsometry") < told.index("cross-section")  # 1.66 and 0.57 nm, of at least 0.415
+    assert told.index("ellipsometry") < told.index(
+        "cross-section"
+    )  # 1.66 and 0.57 nm, of at least 0.415
 
 
 def test_causes_that_go_by_one_way_are_told_once_and_no_cause_asks_for_frames():
-    twice = fit([[0.8, 0.0, 0.5], [0.7, 0.0, 0.5]], ("glass in the beam", "a tilt of the glass"))
+    twice = fit(
+        [[0.8, 0.0, 0.5], [0.7, 0.0, 0.5]], ("glass in the beam", "a tilt of the glass")
+    )
     assert words(twice, 0.4).count("the glass in the beam") == 1
     none = fit(np.zeros((0, 3)), ())
     assert words(none, 4.0).startswith("frames at source depths")
 
 
 def test_of_the_map_only_its_own_names_count():
-    """A table's slopes are none of the map's: nothing is left that its own frames could settle."""
+    """A table's slopes are none of the map's: nothing is left that its own frames could
+    settle.
+    """
     found = fit([[0.8, 0.0, 0.5]])
     assert words(found, 4.0, sure.MAP).startswith("frames at source depths")
 
@@ -79,7 +106,9 @@ def drawn(wide):
     return 5.0 + wide * (rows - rows.mean()) / statistics.stdev(rows)
 
 
-@pytest.mark.parametrize(("about", "limit", "seed"), [({}, 2.0, 5), ({"wide_nm": 0.7, "seed": 9}, 0.7, 9)])
+@pytest.mark.parametrize(
+    ("about", "limit", "seed"), [({}, 2.0, 5), ({"wide_nm": 0.7, "seed": 9}, 0.7, 9)]
+)
 def test_a_spread_up_to_what_is_allowed_is_a_table(about, limit, seed):
     for share, usable in ((0.999, True), (1.001, False)):
         asked = []
@@ -91,11 +120,16 @@ def test_a_spread_up_to_what_is_allowed_is_a_table(about, limit, seed):
         told = sure.judge(found, table, **about)
         assert asked == [(24, seed)]
         assert told.usable is usable
-        assert told.sigma_nm == pytest.approx(limit * share * np.array([0.4, 1.7, 0.9]) / 1.7, rel=1e-9)
+        assert told.sigma_nm == pytest.approx(
+            limit * share * np.array([0.4, 1.7, 0.9]) / 1.7, rel=1e-9
+        )
         assert told.table_nm[:, 2] == pytest.approx(-0.9 * rows, rel=1e-12)
         if not usable:
             wide = f"{limit:.1f} nm (1 sigma, at most {limit:g} allowed; bias_nm 1.25 to 2.75, height_nm -9 to 4.5)"
-            assert f"the posterior leaves the bias table open by {wide}. Settle it by " in told.words
+            assert (
+                f"the posterior leaves the bias table open by {wide}. Settle it by "
+                in told.words
+            )
 
 
 def test_a_spread_of_just_what_is_allowed_is_a_table():

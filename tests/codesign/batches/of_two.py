@@ -1,4 +1,6 @@
-"""What each of two processes does, and one alone: ``torchrun --nproc-per-node=2 -m ...of_two FOLDER``."""
+"""What each of two processes does, and one alone: ``torchrun --nproc-per-node=2 -m
+...of_two FOLDER``.
+"""
 
 import os
 import sys
@@ -19,27 +21,48 @@ from metalens.ground.errors import TrainingError
 from metalens.image.scene import Frames
 from metalens.image.sensor import Sensor
 
-SHAPES, KINDS = ((2, 3), (4,), (), (3, 1, 2)), (torch.float32, torch.float64, torch.float32, torch.float32)
+SHAPES, KINDS = (
+    ((2, 3), (4,), (), (3, 1, 2)),
+    (torch.float32, torch.float64, torch.float32, torch.float32),
+)
 ITEMS = [3, 4, 5, 6, 7]
 
 
 def trained():
-    """Gradient of the lens, weights of the first layer and the loss after one step of four frames."""
+    """Gradient of the lens, weights of the first layer and the loss after one step of
+    four frames.
+    """
     scenes = EyeScenes(SceneConfig(pixels=48, margin=8), 24.0, 2000.0, 3)
     optics = OpticsConfig(
-        aperture_mm=0.4, depth_count=4, sample_um=24.0, window_samples=9, polynomials=6, image="uniform"
+        aperture_mm=0.4,
+        depth_count=4,
+        sample_um=24.0,
+        window_samples=9,
+        polynomials=6,
+        image="uniform",
     )
     space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
-    config = InnerConfig(steps=1, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0)
+    config = InnerConfig(
+        steps=1, batch=4, seed=1, optics=Schedule(0.02, 0.0, 1.0), optics_weight=0.0
+    )
     member = Architecture((2,) * 5, (3,) * 10, (3,) * 10, 0.25, 1.0)
     made = inner.model(optics, pitch_um=24.0, seed=1, space=space)
-    trainer = Trainer(config, optics, Sensor(24.0), PoolScenes(fill(scenes, 12), 8, 0.2, 1), made, architecture=member)
+    trainer = Trainer(
+        config,
+        optics,
+        Sensor(24.0),
+        PoolScenes(fill(scenes, 12), 8, 0.2, 1),
+        made,
+        architecture=member,
+    )
     records = list(trainer.run())
     return made.coefficients_rad.grad, made.net.stem.weight.detach(), records[-1].loss
 
 
 def searched():
-    """A search by a made-up error, as text, and how many candidates this process judged."""
+    """A search by a made-up error, as text, and how many candidates this process
+    judged.
+    """
     judged = []
 
     def error(architecture):
@@ -47,7 +70,12 @@ def searched():
         return sum(architecture.kernels) / 7 + abs(architecture.width - 1.0)
 
     history = evolution.search(
-        Space(), Plan(8, 3, 40, together=4), error, lambda a: 1e6 * sum(a.depths), budget=1e9, seed=5
+        Space(),
+        Plan(8, 3, 40, together=4),
+        error,
+        lambda a: 1e6 * sum(a.depths),
+        budget=1e9,
+        seed=5,
     )
     return evolution.dumps(evolution.Search(history)), len(judged)
 
@@ -55,13 +83,21 @@ def searched():
 def gradients(rank):
     """Of a process, of shapes and dtypes of their own."""
     draw = torch.Generator().manual_seed(3 + rank)
-    return [torch.randn(s, generator=draw, dtype=kind) for s, kind in zip(SHAPES, KINDS, strict=True)]
+    return [
+        torch.randn(s, generator=draw, dtype=kind)
+        for s, kind in zip(SHAPES, KINDS, strict=True)
+    ]
 
 
 def averaged():
     """Gradients after they were averaged, between two parameters that have none."""
-    parameters = [torch.nn.Parameter(g.clone()) for g in (torch.zeros(7), *gradients(0), torch.zeros(2))]
-    for parameter, grad in zip(parameters[1:-1], gradients(parallel.rank()), strict=True):
+    parameters = [
+        torch.nn.Parameter(g.clone())
+        for g in (torch.zeros(7), *gradients(0), torch.zeros(2))
+    ]
+    for parameter, grad in zip(
+        parameters[1:-1], gradients(parallel.rank()), strict=True
+    ):
         parameter.grad = grad
     parallel.average(parameters)
     return [parameter.grad for parameter in parameters]
@@ -72,19 +108,30 @@ def batch(count):
     draw = torch.Generator().manual_seed(9)
     frames = Frames(*(torch.rand(count, 2, 4, 4, generator=draw) for _ in range(3)))
     pose = Pose(*(torch.rand(count, 2, generator=draw) for _ in Pose.__slots__))
-    return Batch(frames, torch.rand(count, 4, 4, generator=draw), torch.rand(count, 3, generator=draw), pose)
+    return Batch(
+        frames,
+        torch.rand(count, 4, 4, generator=draw),
+        torch.rand(count, 3, generator=draw),
+        pose,
+    )
 
 
 def normal():
     """Values, weights and biases to normalise, and the weights of a loss of the result."""
     draw = torch.Generator().manual_seed(0)
-    x, loss = (torch.randn(4, 3, 5, 6, generator=draw, dtype=torch.float64) for _ in range(2))
-    weight, bias = (torch.rand(3, generator=draw, dtype=torch.float64) + more for more in (0.5, 0.0))
+    x, loss = (
+        torch.randn(4, 3, 5, 6, generator=draw, dtype=torch.float64) for _ in range(2)
+    )
+    weight, bias = (
+        torch.rand(3, generator=draw, dtype=torch.float64) + more for more in (0.5, 0.0)
+    )
     return x, weight, bias, loss
 
 
 def normalised():
-    """This process's half of the values, normalised, and the gradient of the whole loss to them."""
+    """This process's half of the values, normalised, and the gradient of the whole loss
+    to them.
+    """
     x, weight, bias, loss = normal()
     half = slice(2 * parallel.rank(), 2 * parallel.rank() + 2)
     mine = x[half].requires_grad_()

@@ -19,11 +19,26 @@ ROOT = Path(__file__).parents[3]
 def two(tmp_path_factory):
     """What each of two processes found."""
     folder = tmp_path_factory.mktemp("two")
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    # a process that the transport ends (SIGABRT, once in 100s of runs) begins again; other numbers fail all the same
-    command = [*launcher, "--max-restarts=2", "-m", "tests.codesign.batches.of_two", str(folder)]
+    launcher = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node=2",
+    ]
+    # a process that the transport ends (SIGABRT, once in 100s of runs) begins again;
+    # other numbers fail all the same
+    command = [
+        *launcher,
+        "--max-restarts=2",
+        "-m",
+        "tests.codesign.batches.of_two",
+        str(folder),
+    ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, cwd=ROOT
+    )
     assert done.returncode == 0, done.stderr
     return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in (0, 1)]
 
@@ -32,8 +47,11 @@ def test_two_processes_train_as_one_to_rounding(two):
     one = of_two.trained()
     assert float(one[0].norm()) > 1e-3
     for found in (each["trained"] for each in two):
-        # one step: Adam divides by a gradient's own size, so that in the next rounding of the smallest ones is all
-        assert float((found[0] - one[0]).norm() / one[0].norm()) < 2e-4  # single precision through lens and net
+        # one step: Adam divides by a gradient's own size, so that in the next rounding
+        # of the smallest ones is all
+        assert (
+            float((found[0] - one[0]).norm() / one[0].norm()) < 2e-4
+        )  # single precision through lens and net
         assert float((found[1] - one[1]).norm() / one[1].norm()) < 2e-3
         assert found[2] == pytest.approx(one[2], rel=1e-5)
 
@@ -44,8 +62,13 @@ def test_processes_share_the_candidates_of_a_search_and_find_the_same(two):
 
 
 def test_gradients_are_means_over_processes_each_in_its_place(two):
-    """Shapes and dtypes of their own, and parameters without a gradient before and after."""
-    want = [(a + b) / 2 for a, b in zip(of_two.gradients(0), of_two.gradients(1), strict=True)]
+    """Shapes and dtypes of their own, and parameters without a gradient before and
+    after.
+    """
+    want = [
+        (a + b) / 2
+        for a, b in zip(of_two.gradients(0), of_two.gradients(1), strict=True)
+    ]
     for found in (each["averaged"] for each in two):
         assert found[0] is found[-1] is None
         torch.testing.assert_close(found[1:-1], want)
@@ -56,9 +79,13 @@ def test_every_process_takes_its_frames_with_their_pose_and_its_share_of_the_wor
     for rank, found in enumerate(two):
         mine, rows = found["part"], slice(3 * rank, 3 * rank + 3)
         for name in type(whole.frames).__slots__:
-            assert torch.equal(getattr(mine.frames, name), getattr(whole.frames, name)[rows])
+            assert torch.equal(
+                getattr(mine.frames, name), getattr(whole.frames, name)[rows]
+            )
         for name in Pose.__slots__:
-            assert torch.equal(getattr(mine.pose, name), getattr(whole.pose, name)[rows])
+            assert torch.equal(
+                getattr(mine.pose, name), getattr(whole.pose, name)[rows]
+            )
         assert torch.equal(mine.mask, whole.mask[rows])
         assert torch.equal(mine.slip_mm, whole.slip_mm[rows])
         assert found["mean"] == [2.0, -1.0]
@@ -70,10 +97,14 @@ def test_every_process_takes_its_frames_with_their_pose_and_its_share_of_the_wor
 def test_normalisation_over_processes_is_that_of_torch_in_one(two):
     """Values and gradients: every process's loss depends on every process's values."""
     x, weight, bias, loss = of_two.normal()
-    want = torch.nn.functional.batch_norm(x.requires_grad_(), None, None, weight, bias, training=True)
+    want = torch.nn.functional.batch_norm(
+        x.requires_grad_(), None, None, weight, bias, training=True
+    )
     (slope,) = torch.autograd.grad((want * loss).sum(), x)
     for at, expected in ((0, want.detach()), (1, slope)):
-        torch.testing.assert_close(torch.cat([each["normalised"][at] for each in two]), expected)
+        torch.testing.assert_close(
+            torch.cat([each["normalised"][at] for each in two]), expected
+        )
 
 
 def test_a_lost_process_is_named_with_the_way_on(two):

@@ -1,4 +1,6 @@
-"""Flat frames: exact for one surface, close to two sheets, exact gradients in the kernels; pools draw from the seed."""
+"""Flat frames: exact for one surface, close to two sheets, exact gradients in the
+kernels; pools draw from the seed.
+"""
 
 import numpy as np
 import pytest
@@ -13,8 +15,17 @@ from codesign.optics.stack import OpticsConfig
 from metalens.ground.errors import SceneError, TrainingError
 from metalens.image import scene
 
-SCENES = EyeScenes(SceneConfig(pixels=64, margin=8, slip_mm=(2.0, 1.5, 3.0)), 18.0, 2000.0, 3)
-OPTICS = OpticsConfig(aperture_mm=0.5, depth_count=12, sample_um=18.0, window_samples=17, polynomials=0, focus_mm=28.0)
+SCENES = EyeScenes(
+    SceneConfig(pixels=64, margin=8, slip_mm=(2.0, 1.5, 3.0)), 18.0, 2000.0, 3
+)
+OPTICS = OpticsConfig(
+    aperture_mm=0.5,
+    depth_count=12,
+    sample_um=18.0,
+    window_samples=17,
+    polynomials=0,
+    focus_mm=28.0,
+)
 
 
 def _imager(size=80, margin=8):
@@ -23,33 +34,51 @@ def _imager(size=80, margin=8):
 
 
 def test_one_surface_is_imaged_as_the_two_sheet_formula_does():
-    """A single opaque sheet needs no division: only 8 bits of light and the rounded coverage of 1 are left."""
+    """A single opaque sheet needs no division: only 8 bits of light and the rounded
+    coverage of 1 are left.
+    """
     generator = torch.Generator().manual_seed(0)
     light = (torch.rand(2, 80, 80, generator=generator) * 255).round() / 255
     depth = (15_000 + 15_000 * torch.rand(2, 80, 80, generator=generator)).round()
     zero = torch.zeros_like(light)
     sheets = scene.Frames(
-        torch.stack([zero, light], 1), torch.stack([zero, zero + 1], 1), torch.stack([zero + 20_000, depth], 1)
+        torch.stack([zero, light], 1),
+        torch.stack([zero, zero + 1], 1),
+        torch.stack([zero + 20_000, depth], 1),
     )
     one = flattened(sheets, torch.ones(2))
     imager = _imager()
     got = irradiance(one, imager, margin=8)
     blurred = torch.fft.irfft2(
-        (torch.fft.rfft2(scene.weight_maps(imager.psf, depth) * light) * imager.transfer[:, None]).sum(0), s=(80, 80)
+        (
+            torch.fft.rfft2(scene.weight_maps(imager.psf, depth) * light)
+            * imager.transfer[:, None]
+        ).sum(0),
+        s=(80, 80),
     )
-    assert float((got - blurred[:, 8:-8, 8:-8]).abs().max()) < 2e-4  # one code of 4096, and float32
+    assert (
+        float((got - blurred[:, 8:-8, 8:-8]).abs().max()) < 2e-4
+    )  # one code of 4096, and float32
 
 
 def test_eyes_as_one_surface_are_near_their_two_sheets():
     made = SCENES.rendered(0, 8)
     exact = irradiance(made.frames, _imager(), margin=8)
-    quick = irradiance(flattened(made.frames, SCENES.states(0, 8).scale), _imager(), margin=8)
+    quick = irradiance(
+        flattened(made.frames, SCENES.states(0, 8).scale), _imager(), margin=8
+    )
     error = (quick - exact).norm() / (exact - exact.mean((1, 2), keepdim=True)).norm()
-    assert float(error) < 0.05  # of the contrast: occlusion at the lids, where the sheets are millimetres apart
+    assert (
+        float(error) < 0.05
+    )  # of the contrast: occlusion at the lids, where the sheets are millimetres apart
 
 
 def test_spare_rows_continue_the_border():
-    constant = Flat(np.full((1, 67, 67), 100, np.uint8), np.full((1, 67, 67), 20_000, np.uint16), np.ones(1))
+    constant = Flat(
+        np.full((1, 67, 67), 100, np.uint8),
+        np.full((1, 67, 67), 20_000, np.uint16),
+        np.ones(1),
+    )
     imager = _imager(67, margin=0)
     assert imager.shape[0] > 67
     inside = irradiance(constant, imager, margin=0)
@@ -67,14 +96,23 @@ def test_gradient_in_the_phase_agrees_with_a_finite_difference():
 
     def value(coefficients):
         made = optics.stack(settings, coefficients)
-        return (irradiance(frames, optics.prepared(settings, made, 80, margin=8), margin=8) * weight).sum()
+        return (
+            irradiance(frames, optics.prepared(settings, made, 80, margin=8), margin=8)
+            * weight
+        ).sum()
 
-    at = 0.3 * torch.randn(6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    way = torch.randn(6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    at = 0.3 * torch.randn(
+        6, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    way = torch.randn(
+        6, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    )
     slope = torch.autograd.functional.jvp(value, at, way)[1]
     step = 5e-3
     ahead, behind = (float(value(at + s * way)) for s in (step, -step))
-    assert float(slope) == pytest.approx((ahead - behind) / (2 * step), rel=0.02)  # what the kept kernels do not show
+    assert float(slope) == pytest.approx(
+        (ahead - behind) / (2 * step), rel=0.02
+    )  # what the kept kernels do not show
 
 
 def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_path):
@@ -86,7 +124,9 @@ def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_
     batch = draws.batch(1, 4)
     assert np.array_equal(batch.frames.light, same.frames.light)
     assert torch.equal(batch.slip_mm, same.slip_mm)
-    seen = np.concatenate([draws.batch(step, 4).frames.light.sum((1, 2)) for step in range(3)])
+    seen = np.concatenate(
+        [draws.batch(step, 4).frames.light.sum((1, 2)) for step in range(3)]
+    )
     assert sorted(seen) == sorted(made.light.astype(int).sum((1, 2)))
     other = draws.batch(4, 4)
     assert not np.array_equal(other.frames.light, batch.frames.light)
@@ -95,15 +135,24 @@ def test_a_pool_gives_the_same_batch_for_a_step_and_every_frame_once_a_pass(tmp_
 def test_slippage_of_a_pool_is_that_of_the_renderer_at_its_scale():
     made = pool.fill(SCENES, 4)
     states = SCENES.states(0, 4)
-    batch = PoolScenes(made, 8, 0.0, seed=1).rows(np.arange(4), np.random.default_rng(0))
-    torch.testing.assert_close(batch.slip_mm.double(), states.slip_um * 1e-3, rtol=1e-6, atol=1e-6)
+    batch = PoolScenes(made, 8, 0.0, seed=1).rows(
+        np.arange(4), np.random.default_rng(0)
+    )
+    torch.testing.assert_close(
+        batch.slip_mm.double(), states.slip_um * 1e-3, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_scaled_depth_has_nothing_to_do_with_the_size_of_what_is_seen():
     depth = torch.linspace(18_000, 24_000, 4000, dtype=torch.float64)
     factor = decoupled(depth, (18_000.0, 24_000.0), 0.4, np.random.default_rng(0))
-    assert abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05  # 3 / sqrt(4000)
-    assert torch.equal(decoupled(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)), torch.ones(4000).double())
+    assert (
+        abs(float(torch.corrcoef(torch.stack([depth, depth * factor]))[0, 1])) < 0.05
+    )  # 3 / sqrt(4000)
+    assert torch.equal(
+        decoupled(depth, (18_000.0, 24_000.0), 0.0, np.random.default_rng(0)),
+        torch.ones(4000).double(),
+    )
 
 
 def test_pools_too_small_and_fields_of_psfs_are_refused():
@@ -111,7 +160,9 @@ def test_pools_too_small_and_fields_of_psfs_are_refused():
         PoolScenes(pool.fill(SCENES, 2), 8, 0.2, seed=1).batch(0, 4)
     made = optics.stack(OPTICS, torch.zeros(0, dtype=torch.float64)).intensity
     field = scene.uniform_imager(
-        scene.basis(made[None, None].expand(2, 2, -1, -1, -1), OPTICS.depths_um), (80, 80), margin=8
+        scene.basis(made[None, None].expand(2, 2, -1, -1, -1), OPTICS.depths_um),
+        (80, 80),
+        margin=8,
     )
     frames = flattened(SCENES.rendered(0, 1).frames, torch.ones(1))
     with pytest.raises(SceneError, match="one PSF for the whole image"):
@@ -122,14 +173,20 @@ def test_pools_too_small_and_fields_of_psfs_are_refused():
 
 
 def test_frames_of_another_device_are_weighed_by_the_depth_of_every_pixel():
-    """Tensors that a device would hold, against the loop of the processor: depths from before the nearest plane to
+    """Tensors that a device would hold, against the loop of the processor: depths from
+    before the nearest plane to
     behind the farthest, scales of their own."""
     random = np.random.default_rng(7)
     light = random.integers(0, 256, (2, 80, 80)).astype(np.uint8)
     depth = random.integers(9_000, 60_000, (2, 80, 80)).astype(np.uint16)
     frames, imager = Flat(light, depth, np.array([1.0, 0.83])), _imager()
-    want, got = irradiance(frames, imager, margin=8), flat._elsewhere(frames, imager, margin=8)
+    want, got = (
+        irradiance(frames, imager, margin=8),
+        flat._elsewhere(frames, imager, margin=8),
+    )
     contrast = (want - want.mean((1, 2), keepdim=True)).norm()
-    assert float((got - want).norm() / contrast) < 1e-3  # single precision, and a pixel between two codes of 4096
+    assert (
+        float((got - want).norm() / contrast) < 1e-3
+    )  # single precision, and a pixel between two codes of 4096
     near = Flat(light, np.full_like(depth, 16_000), frames.scale)
     assert float((irradiance(near, imager, margin=8) - want).norm() / contrast) > 0.05

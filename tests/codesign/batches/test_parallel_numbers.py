@@ -1,4 +1,6 @@
-"""Three processes played by three threads that sum in step: parts, means and statistics of unlike numbers."""
+"""Three processes played by three threads that sum in step: parts, means and statistics
+of unlike numbers.
+"""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +21,11 @@ class Group:
     """A group of processes whose members are threads."""
 
     def __init__(self, count=COUNT):
-        self.mine, self.gate, self.given = threading.local(), threading.Barrier(count), [None] * count
+        self.mine, self.gate, self.given = (
+            threading.local(),
+            threading.Barrier(count),
+            [None] * count,
+        )
 
     def is_initialized(self):
         return True
@@ -59,11 +65,23 @@ def together(monkeypatch):
 def batch(size):
     """Frames whose every number tells its row."""
     rows = torch.arange(float(size))
-    frames = Frames(*(rows[:, None, None, None] + k * torch.ones(size, 2, 4, 5) for k in (0.1, 0.2, 0.3)))
-    pose = Pose(
-        rows[:, None] + torch.ones(3), rows[:, None] + torch.ones(3) / 2, rows[:, None, None] + torch.ones(2, 2)
+    frames = Frames(
+        *(
+            rows[:, None, None, None] + k * torch.ones(size, 2, 4, 5)
+            for k in (0.1, 0.2, 0.3)
+        )
     )
-    return Batch(frames, rows[:, None, None] * torch.ones(size, 4, 5), rows[:, None] * torch.ones(3) * 0.7, pose)
+    pose = Pose(
+        rows[:, None] + torch.ones(3),
+        rows[:, None] + torch.ones(3) / 2,
+        rows[:, None, None] + torch.ones(2, 2),
+    )
+    return Batch(
+        frames,
+        rows[:, None, None] * torch.ones(size, 4, 5),
+        rows[:, None] * torch.ones(3) * 0.7,
+        pose,
+    )
 
 
 @pytest.mark.parametrize("posed", [True, False])
@@ -84,12 +102,23 @@ def test_a_batch_falls_into_parts_in_the_order_of_ranks(together, posed):
 
 
 def test_gradients_and_numbers_are_means_over_the_three(together):
-    """Gradients of 1, 10 and 100 times a pattern have 37 times it for a mean; a parameter without one stays without."""
-    shapes = [((2, 3), torch.float32), ((4,), torch.float64), ((3, 1, 2), torch.float32)]
-    patterns = [torch.arange(1.0, 1 + torch.Size(s).numel(), dtype=kind).view(s) for s, kind in shapes]
+    """Gradients of 1, 10 and 100 times a pattern have 37 times it for a mean; a
+    parameter without one stays without.
+    """
+    shapes = [
+        ((2, 3), torch.float32),
+        ((4,), torch.float64),
+        ((3, 1, 2), torch.float32),
+    ]
+    patterns = [
+        torch.arange(1.0, 1 + torch.Size(s).numel(), dtype=kind).view(s)
+        for s, kind in shapes
+    ]
 
     def work(rank):
-        parameters = [torch.nn.Parameter(torch.zeros_like(p)) for p in (*patterns, patterns[0])]
+        parameters = [
+            torch.nn.Parameter(torch.zeros_like(p)) for p in (*patterns, patterns[0])
+        ]
         for parameter, pattern in zip(parameters, patterns, strict=False):
             parameter.grad = pattern * 10**rank
         parallel.average(parameters)
@@ -119,33 +148,52 @@ def test_work_is_dealt_out_in_turn_and_told_to_all(together):
     done = [[] for _ in range(COUNT)]
 
     def work(rank):
-        return parallel.each(lambda item: done[rank].append(item) or 2.5 * item, [3, 4, 5, 6, 7, 8, 9])
+        return parallel.each(
+            lambda item: done[rank].append(item) or 2.5 * item, [3, 4, 5, 6, 7, 8, 9]
+        )
 
     assert together(work) == [[7.5, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5]] * COUNT
     assert done == [[3, 6, 9], [4, 7], [5, 8]]
-    assert together(lambda rank: parallel.each(lambda item: item + 0.5, [1, 2, 4]), 2) == [[1.5, 2.5, 4.5]] * 2
+    assert (
+        together(lambda rank: parallel.each(lambda item: item + 0.5, [1, 2, 4]), 2)
+        == [[1.5, 2.5, 4.5]] * 2
+    )
 
 
 def test_statistics_of_a_layer_and_their_gradients_are_those_of_all_frames(together):
-    """Against torch on the joined frames; an epsilon that is no rounding of the variances beside."""
+    """Against torch on the joined frames; an epsilon that is no rounding of the
+    variances beside.
+    """
     draw = torch.Generator().manual_seed(4)
     x = 3 + 2 * torch.randn(6, 4, 3, 5, generator=draw, dtype=torch.float64)
-    weight, bias, pull = (torch.randn(s, generator=draw, dtype=torch.float64) for s in (4, 4, x.shape))
+    weight, bias, pull = (
+        torch.randn(s, generator=draw, dtype=torch.float64) for s in (4, 4, x.shape)
+    )
     for about in ({}, {"epsilon": 0.3}):
         whole, w = x.clone().requires_grad_(), weight.clone().requires_grad_()
-        want = torch.nn.functional.batch_norm(whole, None, None, w, bias, training=True, eps=about.get("epsilon", 1e-5))
+        want = torch.nn.functional.batch_norm(
+            whole, None, None, w, bias, training=True, eps=about.get("epsilon", 1e-5)
+        )
         slope, steepness = torch.autograd.grad((want * pull).sum(), (whole, w))
 
         def work(rank, about=about):
             rows = slice(2 * rank, 2 * rank + 2)
             mine, w = x[rows].clone().requires_grad_(), weight.clone().requires_grad_()
             got = parallel.batch_norm(mine, w, bias, **about)
-            return got.detach(), *torch.autograd.grad((got * pull[rows]).sum(), (mine, w))
+            return got.detach(), *torch.autograd.grad(
+                (got * pull[rows]).sum(), (mine, w)
+            )
 
         parts = together(work)
-        torch.testing.assert_close(torch.cat([p[0] for p in parts]), want.detach(), rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(torch.cat([p[1] for p in parts]), slope, rtol=1e-9, atol=1e-9)
-        torch.testing.assert_close(sum(p[2] for p in parts), steepness, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            torch.cat([p[0] for p in parts]), want.detach(), rtol=1e-9, atol=1e-9
+        )
+        torch.testing.assert_close(
+            torch.cat([p[1] for p in parts]), slope, rtol=1e-9, atol=1e-9
+        )
+        torch.testing.assert_close(
+            sum(p[2] for p in parts), steepness, rtol=1e-9, atol=1e-9
+        )
 
 
 def test_one_process_alone_asks_nobody(monkeypatch):
@@ -162,14 +210,18 @@ def test_one_process_alone_asks_nobody(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("world", "begun", "joins"), [("2", False, True), ("1", False, False), ("3", True, False), (None, False, False)]
+    ("world", "begun", "joins"),
+    [("2", False, True), ("1", False, False), ("3", True, False), (None, False, False)],
 )
 def test_only_several_processes_join_and_once(monkeypatch, world, begun, joins):
     asked = []
     monkeypatch.setattr(
         parallel,
         "dist",
-        SimpleNamespace(is_initialized=lambda: begun, init_process_group=lambda kind: asked.append(kind)),
+        SimpleNamespace(
+            is_initialized=lambda: begun,
+            init_process_group=lambda kind: asked.append(kind),
+        ),
     )
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     if world:
@@ -181,8 +233,16 @@ def test_only_several_processes_join_and_once(monkeypatch, world, begun, joins):
 @pytest.mark.parametrize("count", [1, 2])
 def test_waiting_is_for_others(monkeypatch, count):
     waited = []
-    about = {"is_initialized": lambda: True, "get_world_size": lambda: count, "barrier": lambda: waited.append("wait")}
-    monkeypatch.setattr(parallel, "dist", SimpleNamespace(**about, destroy_process_group=lambda: waited.append("part")))
+    about = {
+        "is_initialized": lambda: True,
+        "get_world_size": lambda: count,
+        "barrier": lambda: waited.append("wait"),
+    }
+    monkeypatch.setattr(
+        parallel,
+        "dist",
+        SimpleNamespace(**about, destroy_process_group=lambda: waited.append("part")),
+    )
     parallel.wait()
     assert waited == ["wait"] * (count - 1)
     parallel.leave()

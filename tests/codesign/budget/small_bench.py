@@ -1,4 +1,6 @@
-"""Small lenses before few pixels, as benches of a budget; shared by the tests beside it."""
+"""Small lenses before few pixels, as benches of a budget; shared by the tests beside
+it.
+"""
 
 import functools
 from dataclasses import replace
@@ -17,13 +19,17 @@ from metalens.made import Printed, Spread
 from metalens.pillars.proxy import Proxy
 
 SLOPE = 55.0  # rad a um: phase of a pillar over its diameter, a straight line
-CELL = Cell(pitch_um=0.30, height_um=0.5, pillar=Index(1.7))  # solved fast; its phase is not that of the proxy
+CELL = Cell(
+    pitch_um=0.30, height_um=0.5, pillar=Index(1.7)
+)  # solved fast; its phase is not that of the proxy
 FOCUS = Focus(0.85, 300.0, 3000.0)
 PROXY = Proxy(
     np.array([[0.145 * SLOPE, 0.065 * SLOPE]]), np.array([[0.9, -0.03]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
 )  # fmt: skip
 SETTING = TaskSetting(scenes=2, pixels=16, margin=3, pitch_um=4.1)
-FRAMES = ExperimentConfig(subjects=1, grid=(4, 3), share=0.5, axial_mm=(-2.5,), lateral_mm=(1.5,), hidden=0)
+FRAMES = ExperimentConfig(
+    subjects=1, grid=(4, 3), share=0.5, axial_mm=(-2.5,), lateral_mm=(1.5,), hidden=0
+)
 GIVEN = Given(
     Numerics(4, 1, 1e-3, 1e-2), mask=Printed(spread=Spread.only(bias_nm=1.3, gradient_nm=0.9), diameter_step_nm=4.0),
     frames=FRAMES, draws=3,
@@ -40,10 +46,21 @@ ROWS = Neighbours(
 
 @functools.cache
 def lens(*, films: bool = False) -> Lens:
-    """A hyperbolic lens of 48 um at f/6: bare, or between cover glass and filter with rows of unlike pillars."""
-    focus = replace(FOCUS, layers=Layers((Film(Index(1.45), 200.0),), (Film(Index(1.52), 45.0),))) if films else FOCUS
+    """A hyperbolic lens of 48 um at f/6: bare, or between cover glass and filter with
+    rows of unlike pillars.
+    """
+    focus = (
+        replace(
+            FOCUS,
+            layers=Layers((Film(Index(1.45), 200.0),), (Film(Index(1.52), 45.0),)),
+        )
+        if films
+        else FOCUS
+    )
     wanted = design.phase_of(None, focus, radius_um=24.0)
-    made = design.make(wanted, focus, aperture_um=48.0, cell=CELL, proxy=PROXY, profile="hyperbolic")[0]
+    made = design.make(
+        wanted, focus, aperture_um=48.0, cell=CELL, proxy=PROXY, profile="hyperbolic"
+    )[0]
     return replace(made, neighbours=ROWS) if films else made
 
 

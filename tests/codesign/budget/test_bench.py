@@ -1,4 +1,6 @@
-"""The bench of a small lens and its estimator: what is seen, by which optics, and what it is compared with."""
+"""The bench of a small lens and its estimator: what is seen, by which optics, and what
+it is compared with.
+"""
 
 import math
 import sys
@@ -28,17 +30,27 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
     """The eyes are seen as behind the films: 300 um less 45 of an index of 1.52."""
     bench = make()
     line = bench.given.fwhm_nm > 0
-    assert bench.setting.sensor_distance_um == pytest.approx(300.0 - line * 45.0 * (1 - 1 / 1.52))
+    assert bench.setting.sensor_distance_um == pytest.approx(
+        300.0 - line * 45.0 * (1 - 1 / 1.52)
+    )
     assert bench.finest == Numerics(8, 7 if line else 1, 1e-5, 1e-4)
     near, far = bench.eyes.depths_um
-    assert (bench.window.near_um, bench.window.far_um, bench.window.pitch_um) == (near, far, 4.1)
+    assert (bench.window.near_um, bench.window.far_um, bench.window.pitch_um) == (
+        near,
+        far,
+        4.1,
+    )
     lens, source = bench.lens, Source(850.0, 24.0) if line else None
-    wave = gathered(lens, *bench.aperture.maps(bench.aperture.designed()), window_um=7 * 4.1)
+    wave = gathered(
+        lens, *bench.aperture.maps(bench.aperture.designed()), window_um=7 * 4.1
+    )
     want = device(
         wave, Grid((16, 16), 4.1, (near, far), 3, 7), layers=lens.layers, distance_um=300.0, spectrum=source
     ).whole  # fmt: skip
     assert image_difference(bench.device.whole, want) < 1e-6
-    assert bench.device.whole.energy.numpy() == pytest.approx(want.energy.numpy(), rel=1e-6)
+    assert bench.device.whole.energy.numpy() == pytest.approx(
+        want.energy.numpy(), rel=1e-6
+    )
     assert bench.reader.image.numpy() == pytest.approx(
         task.electrons(bench.eyes.anchor, want, bench.setting).numpy(), rel=1e-5
     )
@@ -47,9 +59,17 @@ def test_a_bench_looks_at_its_eyes_through_the_device_and_has_twice_the_depths(m
 def test_finest_settings_end_at_64_depths_and_are_never_coarser_than_a_setting_of_their_own():
     coarse = finest_of(Numerics(12, 3, 1e-3, 1e-2), fwhm_nm=30.0)
     fine = finest_of(Numerics(40, 3, 2e-5, 3e-4), fwhm_nm=0.0)
-    for got, want in ((coarse, Numerics(24, 9, 1e-5, 1e-4)), (fine, Numerics(64, 1, 2e-6, 3e-5))):
-        assert (got.depth_count, got.wavelength_count) == (want.depth_count, want.wavelength_count)
-        assert (got.psf_tolerance, got.basis_tolerance) == pytest.approx((want.psf_tolerance, want.basis_tolerance))
+    for got, want in (
+        (coarse, Numerics(24, 9, 1e-5, 1e-4)),
+        (fine, Numerics(64, 1, 2e-6, 3e-5)),
+    ):
+        assert (got.depth_count, got.wavelength_count) == (
+            want.depth_count,
+            want.wavelength_count,
+        )
+        assert (got.psf_tolerance, got.basis_tolerance) == pytest.approx(
+            (want.psf_tolerance, want.basis_tolerance)
+        )
 
 
 @pytest.mark.parametrize(
@@ -60,10 +80,14 @@ def test_finest_settings_end_at_64_depths_and_are_never_coarser_than_a_setting_o
     ],
 )  # fmt: skip
 def test_a_reader_of_another_lens_is_refused_beyond_two_per_cent(off, refused):
-    """Sensor distance, wavelength and aperture of the run against those of the lens, in its units."""
+    """Sensor distance, wavelength and aperture of the run against those of the lens, in
+    its units.
+    """
     lens = small.lens()
     aperture = 2e-3 * lens.diameters.radius_um
-    its = OpticsConfig(aperture / off[2], 0.3 / off[0], 850.0 / off[1], 3.0, polynomials=0)
+    its = OpticsConfig(
+        aperture / off[2], 0.3 / off[0], 850.0 / off[1], 3.0, polynomials=0
+    )
     if refused:
         with pytest.raises(LensError, match="trained before another lens"):
             same_lens(lens, its)
@@ -76,7 +100,12 @@ def rendered(setting, states, lit):
     camera = Camera(3 * (setting.pixels + 2 * setting.margin), setting.pitch_um / 3)
     rig = Rig(sensor_distance_um=setting.sensor_distance_um)
     fine = render(states, rig=rig, camera=camera, exposed=lit).frames
-    return averaged(*(v.numpy().astype(float) for v in (fine.radiance, fine.coverage, fine.depth_um)))
+    return averaged(
+        *(
+            v.numpy().astype(float)
+            for v in (fine.radiance, fine.coverage, fine.depth_um)
+        )
+    )
 
 
 def averaged(radiance, coverage, depth):
@@ -99,29 +128,41 @@ def test_views_are_of_both_sides_of_every_unknown_at_the_exposure_of_the_still_e
             cases.append((seen, task.shifted(states, unknown, sign * steps[unknown])))
     for seen, moved in cases:
         want = rendered(bench.setting, moved, states)
-        for got, plain in zip((seen.radiance, seen.coverage, seen.depth_um), want, strict=True):
+        for got, plain in zip(
+            (seen.radiance, seen.coverage, seen.depth_um), want, strict=True
+        ):
             assert got.numpy() == pytest.approx(plain, rel=1e-5, abs=1e-6 * plain.max())
 
 
 def test_other_exposures_and_states_are_those_given():
     setting = replace(small.SETTING, pixels=6, margin=1, scenes=1)
     states = setting.states
-    darker = replace(states, slip_um=states.slip_um + torch.tensor([0.0, 0.0, -6000.0], dtype=states.slip_um.dtype))
+    darker = replace(
+        states,
+        slip_um=states.slip_um
+        + torch.tensor([0.0, 0.0, -6000.0], dtype=states.slip_um.dtype),
+    )
     moved = task.shifted(states, 0, 0.02)
     seen = task.views(setting, moved, exposed=darker)
     want = rendered(setting, moved, darker)[0]
-    assert seen.anchor.radiance.numpy() == pytest.approx(want, rel=1e-5, abs=1e-6 * want.max())
+    assert seen.anchor.radiance.numpy() == pytest.approx(
+        want, rel=1e-5, abs=1e-6 * want.max()
+    )
     other = rendered(setting, moved, moved)[0]
     assert np.abs(other - want).max() > 0.02 * want.max()  # the exposure differs
 
 
 def test_a_pixel_has_the_depth_of_what_covers_it_or_of_nothing_where_nothing_does():
-    light, cover = (torch.from_numpy(RNG.uniform(0, 1, (1, 2, 12, 12))) for _ in range(2))
+    light, cover = (
+        torch.from_numpy(RNG.uniform(0, 1, (1, 2, 12, 12))) for _ in range(2)
+    )
     depth = torch.from_numpy(RNG.uniform(15e3, 30e3, (1, 2, 12, 12)))
     cover[0, 0, :3, :3] = 0  # nothing covers the first pixel of the near sheet
     got = task.pixels_of(Frames(light, cover, depth))
     for found, want in zip(
-        (got.radiance, got.coverage, got.depth_um), averaged(light.numpy(), cover.numpy(), depth.numpy()), strict=True
+        (got.radiance, got.coverage, got.depth_um),
+        averaged(light.numpy(), cover.numpy(), depth.numpy()),
+        strict=True,
     ):
         assert found.numpy() == pytest.approx(want)
 
@@ -129,7 +170,14 @@ def test_a_pixel_has_the_depth_of_what_covers_it_or_of_nothing_where_nothing_doe
 def test_every_unknown_is_moved_alone_by_its_step():
     """Gaze, slippage, size, then every trait that varies."""
     still = small.SETTING.states
-    places = [("gaze_rad", 0), ("gaze_rad", 1), ("slip_um", 0), ("slip_um", 1), ("slip_um", 2), ("scale", None)]
+    places = [
+        ("gaze_rad", 0),
+        ("gaze_rad", 1),
+        ("slip_um", 0),
+        ("slip_um", 1),
+        ("slip_um", 2),
+        ("scale", None),
+    ]
     places += [("traits", list(POPULATION).index(name)) for name in task.TRAITS]
     assert len(places) == len(task.NAMES) - 1
     for unknown, (field, column) in enumerate(places):
@@ -140,7 +188,9 @@ def test_every_unknown_is_moved_alone_by_its_step():
             want = torch.zeros_like(off)
             if name == field:
                 want[... if column is None else (slice(None), column)] = amount
-            assert off.numpy() == pytest.approx(want.numpy(), abs=1e-3 if name in ("slip_um", "traits") else 1e-6)
+            assert off.numpy() == pytest.approx(
+                want.numpy(), abs=1e-3 if name in ("slip_um", "traits") else 1e-6
+            )
 
 
 def test_steps_and_priors_are_those_of_the_population():
@@ -149,7 +199,9 @@ def test_steps_and_priors_are_those_of_the_population():
     assert steps[:6] == pytest.approx((3.4906585e-4, 3.4906585e-4, 5, 5, 5, 1e-3))
     assert widths[:6] == (0.18, 0.13, 1200.0, 900.0, 2000.0, 0.12)
     assert widths[-1] == 0.3
-    assert steps[6:] == pytest.approx([0.005 * POPULATION[name].sd for name in task.TRAITS])
+    assert steps[6:] == pytest.approx(
+        [0.005 * POPULATION[name].sd for name in task.TRAITS]
+    )
     assert widths[6:-1] == tuple(POPULATION[name].sd for name in task.TRAITS)
 
 
@@ -170,21 +222,27 @@ def test_a_mean_gaze_error_is_of_angles_over_eyes():
 
 
 def test_an_estimate_at_rest_balances_the_image_and_what_was_known_before():
-    """Where D' W (I / (1 + b) - I(x)) = P x: an eye moved by 0.3 mrad and 3 um, of 1.01 times the light.
+    """Where D' W (I / (1 + b) - I(x)) = P x: an eye moved by 0.3 mrad and 3 um, of 1.01
+    times the light.
 
-    Three steps leave an eighth of what the prior pulls: images bend a little with the eye.
+    Three steps leave an eighth of what the prior pulls: images bend a little with the
+    eye.
     """
     bench = small.bare()
     setting, states, optics = bench.setting, bench.setting.states, bench.device.whole
     moved = task.shifted(task.shifted(states, 1, 3e-4), 2, 3.0)
-    image = 1.01 * task.electrons(task.views(setting, moved, exposed=states).anchor, optics, setting)
+    image = 1.01 * task.electrons(
+        task.views(setting, moved, exposed=states).anchor, optics, setting
+    )
     found = task.settle(image, optics, states, setting, seen=bench.eyes, steps=3)
     there = states
     for unknown in range(len(task.NAMES) - 1):
         there = task.shifted(there, unknown, found[:, unknown])
     about = task.linear(task.views(setting, there, exposed=states), optics, setting)
     left = about.shift(image / (1 + found[:, -1:])).numpy()
-    prior = np.einsum("skl,sl->sk", about.covariance.numpy(), found.numpy() / np.square(task.priors()))
+    prior = np.einsum(
+        "skl,sl->sk", about.covariance.numpy(), found.numpy() / np.square(task.priors())
+    )
     size = np.sqrt(np.einsum("skk->sk", about.covariance.numpy()))
     assert np.abs((left - prior) / size).max() < 0.2 * np.abs(prior / size).max()
     assert np.abs(prior / size).max() < 0.1 * np.abs(found.numpy() / size).max()

@@ -26,10 +26,14 @@ FOCUS = Focus(0.85, 2000.0, 20_000.0)
 
 @pytest.fixture(scope="module")
 def lens():
-    coefficients = np.polynomial.Chebyshev.interpolate(lambda d: 55 * d, 2, domain=[0.08, 0.21]).coef[None]
+    coefficients = np.polynomial.Chebyshev.interpolate(
+        lambda d: 55 * d, 2, domain=[0.08, 0.21]
+    ).coef[None]
     proxy = Proxy(coefficients, np.array([[0.9]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
     wanted = design.phase_of(None, FOCUS, radius_um=40.0)
-    return design.make(wanted, FOCUS, aperture_um=80.0, cell=CELL, proxy=proxy, profile="hyperbolic")[0]
+    return design.make(
+        wanted, FOCUS, aperture_um=80.0, cell=CELL, proxy=proxy, profile="hyperbolic"
+    )[0]
 
 
 def test_the_table_gives_the_phase_of_every_pillar(lens):
@@ -37,7 +41,9 @@ def test_the_table_gives_the_phase_of_every_pillar(lens):
     phase, level = aperture.maps(aperture.designed())
     built = lens.diameters.diameter_um > 0
     turn = np.angle(np.exp(1j * (phase.numpy() - lens.phase_rad())))[built]
-    assert np.abs(turn).max() < 55 * aperture.step_um  # half a place of the table, in rad, and float32
+    assert (
+        np.abs(turn).max() < 55 * aperture.step_um
+    )  # half a place of the table, in rad, and float32
     assert (level.numpy()[~built] == 0).all()
     assert aperture.share.sum() == pytest.approx(1)
 
@@ -45,8 +51,12 @@ def test_the_table_gives_the_phase_of_every_pillar(lens):
 def test_a_bias_moves_every_pillar_along_its_curve(lens):
     aperture = Aperture(lens)
     built = lens.diameters.diameter_um > 0
-    middle = built & (lens.diameters.diameter_um > 0.09) & (lens.diameters.diameter_um < 0.2)
-    still, moved = (aperture.maps(aperture.designed(), bias_um=b)[0].numpy() for b in (None, 0.004))
+    middle = (
+        built & (lens.diameters.diameter_um > 0.09) & (lens.diameters.diameter_um < 0.2)
+    )
+    still, moved = (
+        aperture.maps(aperture.designed(), bias_um=b)[0].numpy() for b in (None, 0.004)
+    )
     change = np.angle(np.exp(1j * (moved - still)))[middle]
     assert change == pytest.approx(55 * 0.004, abs=2 * 55 * aperture.step_um)
 
@@ -54,16 +64,22 @@ def test_a_bias_moves_every_pillar_along_its_curve(lens):
 def test_the_same_optics_do_not_differ_and_finer_ones_agree(lens):
     aperture, window = Aperture(lens), Window(15e3, 30e3, 18.0)
     maps = aperture.maps(aperture.designed())
-    found = [kernels(lens, maps, Numerics(n, 1, 1e-4, 1e-4), window) for n in (4, 8, 16)]
+    found = [
+        kernels(lens, maps, Numerics(n, 1, 1e-4, 1e-4), window) for n in (4, 8, 16)
+    ]
     assert psf_difference(found[2], found[2], window) == 0
     coarse, fine = (psf_difference(f, found[2], window) for f in found[:2])
-    assert fine < coarse / 2  # linear interpolation between depths: a quarter for twice the depths
+    assert (
+        fine < coarse / 2
+    )  # linear interpolation between depths: a quarter for twice the depths
 
 
 def test_rounding_to_nothing_changes_nothing(lens):
     aperture = Aperture(lens)
     table = aperture.designed()
-    fine, coarse = (np.abs(aperture.rounded(table, s) - table).max() for s in (1e-6, 5e-3))
+    fine, coarse = (
+        np.abs(aperture.rounded(table, s) - table).max() for s in (1e-6, 5e-3)
+    )
     assert fine < 1e-3
     assert 0.05 < coarse < 55 * 2.6e-3  # half of 5 nm at 55 rad a um
 
@@ -76,7 +92,9 @@ def test_the_total_is_the_root_of_the_squares_of_what_counts():
         Entry("reader", math.nan, math.nan, math.nan, ""),
     ]
     found = total(rows)
-    assert (found.phase_rad, found.psf, found.gaze_rad) == pytest.approx((3.0, 1.0, 5e-3))
+    assert (found.phase_rad, found.psf, found.gaze_rad) == pytest.approx(
+        (3.0, 1.0, 5e-3)
+    )
     assert found.method.endswith("without reader")
 
 
@@ -85,34 +103,56 @@ def test_files_come_back_as_they_were(tmp_path):
         Entry("mask grid", 0.1, 0.2, 1e-4, "rounded", counted=False),
         Entry("sensor noise", math.nan, math.nan, 1e-3, "bound"),
     ]
-    command_budget.save(tmp_path / "b.h5", rows, command_budget.store.Provenance(config="x = 1\n"))
-    assert [str(r) for r in command_budget.load(tmp_path / "b.h5")] == [str(r) for r in rows]
+    command_budget.save(
+        tmp_path / "b.h5", rows, command_budget.store.Provenance(config="x = 1\n")
+    )
+    assert [str(r) for r in command_budget.load(tmp_path / "b.h5")] == [
+        str(r) for r in rows
+    ]
     with pytest.raises(StoreError):
         command_budget.load(tmp_path / "absent.h5")
     assert "mask grid" in command_budget.text(rows)
-    budget_page.write(tmp_path / "b.html", [*rows, Entry("all links", 0.1, 0.2, 1e-3, "sum")])
+    budget_page.write(
+        tmp_path / "b.html", [*rows, Entry("all links", 0.1, 0.2, 1e-3, "sum")]
+    )
     assert "sensor noise" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
 
 def test_a_budget_of_pillars_that_answer_x_and_y_apart_says_of_which_light_it_is(lens):
     assert command_budget.of_light(lens) == ""
-    rectangles = replace(lens, cell=Cell(lens.cell.pitch_um, lens.cell.height_um, shape=Rectangle(0.6)))
+    rectangles = replace(
+        lens, cell=Cell(lens.cell.pitch_um, lens.cell.height_um, shape=Rectangle(0.6))
+    )
     told = command_budget.of_light(rectangles)
-    assert told == "of light along x: these pillars (rectangle 1:0.6 on a square lattice) answer x and y apart"
+    assert (
+        told
+        == "of light along x: these pillars (rectangle 1:0.6 on a square lattice) answer x and y apart"
+    )
 
 
 def test_spread_and_run_are_read_or_refused(tmp_path):
-    (tmp_path / "p.toml").write_text("[spread]\nbias_nm = 2.0\n[rules]\ndiameter_step_nm = 5\n")
-    assert of_process(tmp_path / "p.toml") == Printed(spread=Spread(bias_nm=2.0), diameter_step_nm=5.0)
+    (tmp_path / "p.toml").write_text(
+        "[spread]\nbias_nm = 2.0\n[rules]\ndiameter_step_nm = 5\n"
+    )
+    assert of_process(tmp_path / "p.toml") == Printed(
+        spread=Spread(bias_nm=2.0), diameter_step_nm=5.0
+    )
     (tmp_path / "q.toml").write_text("[spread]\nbais_nm = 2.0\n")
     with pytest.raises(ConfigError, match="bias_nm"):
         of_process(tmp_path / "q.toml")
 
 
 def test_the_sum_stands_beside_what_was_measured():
-    rows = [Entry(MEASURED, math.nan, math.nan, 4e-3, "", counted=False), Entry(TOTAL, 0.0, 0.0, 5e-3, "")]
+    rows = [
+        Entry(MEASURED, math.nan, math.nan, 4e-3, "", counted=False),
+        Entry(TOTAL, 0.0, 0.0, 5e-3, ""),
+    ]
     assert command_budget.summary(rows) == pytest.approx(
-        {"gaze_error_deg": math.degrees(5e-3), "measured_deg": math.degrees(4e-3), "closure": 1.25}
+        {
+            "gaze_error_deg": math.degrees(5e-3),
+            "measured_deg": math.degrees(4e-3),
+            "closure": 1.25,
+        }
     )
     assert set(command_budget.summary(rows[1:])) == {"gaze_error_deg"}
 
@@ -135,6 +175,8 @@ def test_the_whole_budget_of_a_small_lens(lens):
     assert math.isnan(found.pop("reader").gaze_rad)
     assert all(r.gaze_rad >= 0 and r.method for r in found.values())
     assert not found["field"].counted
-    assert found["neighbours"].method.startswith("rows of 6, 5 unlike pillars")  # turned by more than this lens does
+    assert found["neighbours"].method.startswith(
+        "rows of 6, 5 unlike pillars"
+    )  # turned by more than this lens does
     # 2 nm of rounding: uniform within 1 nm, at 55 rad a um
     assert found["mask grid"].phase_rad == pytest.approx(55e-3 / math.sqrt(3), rel=0.2)

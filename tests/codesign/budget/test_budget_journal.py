@@ -1,4 +1,6 @@
-"""Work that is interrupted goes on where it stopped, however often, and ends in the same numbers."""
+"""Work that is interrupted goes on where it stopped, however often, and ends in the
+same numbers.
+"""
 
 import math
 
@@ -9,7 +11,9 @@ from metalens.ground.errors import StoreError
 
 
 def parts(path, title, *, until=99):
-    """Three parts of work that dies at number ``until``; the values, and which were computed."""
+    """Three parts of work that dies at number ``until``; the values, and which were
+    computed.
+    """
     computed, journal = [], Journal(path, title)
 
     def work(k):

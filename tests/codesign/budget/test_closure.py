@@ -1,4 +1,6 @@
-"""The budget of a trained reader closes: its links add up to what the virtual experiment measures."""
+"""The budget of a trained reader closes: its links add up to what the virtual
+experiment measures.
+"""
 
 import math
 import sys
@@ -24,14 +26,22 @@ from metalens.cli import main
 from metalens.ground.errors import LensError
 
 FRAMES = ExperimentConfig(
-    subjects=2, grid=(4, 3), share=0.3, axial_mm=(-2.5, 3.0), lateral_mm=(1.5,), hidden=0, people=9
+    subjects=2,
+    grid=(4, 3),
+    share=0.3,
+    axial_mm=(-2.5, 3.0),
+    lateral_mm=(1.5,),
+    hidden=0,
+    people=9,
 )
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     folder = tmp_path_factory.mktemp("closure") / "run"
-    m.finished_run(folder, m.TINY.replace("batch = 8", "batch = 48"))  # a subject's frames are read at once
+    m.finished_run(
+        folder, m.TINY.replace("batch = 8", "batch = 48")
+    )  # a subject's frames are read at once
     return retraining.load(folder)
 
 
@@ -39,7 +49,9 @@ def source(tmp_path_factory):
 def before(source):
     """The run's own lens as a bench, read by its network."""
     setting = TaskSetting(scenes=1, pixels=8, margin=2, pitch_um=3.0)
-    return bench(m.small(), Given(Numerics(2, 1, 1e-2, 1e-1), run=source, frames=FRAMES), setting)
+    return bench(
+        m.small(), Given(Numerics(2, 1, 1e-2, 1e-1), run=source, frames=FRAMES), setting
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +60,9 @@ def reading(before):
 
 
 def test_the_links_add_up_to_what_the_experiment_measures(source, before, reading):
-    """A reader trained on one PSF before the whole field; the experiment is computed beside it, by its own loop."""
+    """A reader trained on one PSF before the whole field; the experiment is computed
+    beside it, by its own loop.
+    """
     rows = list(reading.path())
     names = [row.link for row in rows]
     assert names == [
@@ -63,12 +77,22 @@ def test_the_links_add_up_to_what_the_experiment_measures(source, before, readin
     assert change.gaze_rad < 1e-7
     assert change.psf == 0
     (seen,) = links.measured(before)
-    assert (seen.link, seen.counted, seen.gaze_rad) == (MEASURED, False, pytest.approx(math.radians(found.gaze(AXIAL))))
+    assert (seen.link, seen.counted, seen.gaze_rad) == (
+        MEASURED,
+        False,
+        pytest.approx(math.radians(found.gaze(AXIAL))),
+    )
     assert f"{FRAMES.frames} frames" in seen.method
     rows = {row.link: row for row in links.device(before)}
     smooth = before.device.image(wave=reading.true.wave, layers=reading.true.layers)
-    assert rows["pillars on a lattice"].psf == pytest.approx(image_difference(before.device.whole, smooth), rel=1e-6)
-    assert rows["pillars on a lattice"].gaze_rad == reading.turned(before.device.whole, smooth) > 0
+    assert rows["pillars on a lattice"].psf == pytest.approx(
+        image_difference(before.device.whole, smooth), rel=1e-6
+    )
+    assert (
+        rows["pillars on a lattice"].gaze_rad
+        == reading.turned(before.device.whole, smooth)
+        > 0
+    )
 
 
 def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
@@ -84,7 +108,10 @@ def test_a_cause_that_the_reader_knows_is_shown_and_not_counted(source):
 
 
 def test_the_reader_of_another_lens_is_refused(source):
-    run = replace(source.run.settings, optics=replace(source.run.settings.optics, sensor_distance_mm=0.4))
+    run = replace(
+        source.run.settings,
+        optics=replace(source.run.settings.optics, sensor_distance_mm=0.4),
+    )
     kept, source.run.settings = source.run.settings, run
     try:
         with pytest.raises(LensError, match=r"0\.4 mm.*lens file"):
@@ -95,15 +122,32 @@ def test_the_reader_of_another_lens_is_refused(source):
 
 def test_the_reader_of_another_lens_takes_no_part_in_a_plan(tmp_path, capsys):
     m.finished_run(tmp_path / "run")
-    words = ["plan", "--gaze-error", "1deg", "--run", str(tmp_path / "run"), "--config", str(tmp_path / "plan.toml")]
-    (tmp_path / "plan.toml").write_text("aperture_mm = 0.12\nsensor_distance_mm = 0.4\n")
+    words = [
+        "plan",
+        "--gaze-error",
+        "1deg",
+        "--run",
+        str(tmp_path / "run"),
+        "--config",
+        str(tmp_path / "plan.toml"),
+    ]
+    (tmp_path / "plan.toml").write_text(
+        "aperture_mm = 0.12\nsensor_distance_mm = 0.4\n"
+    )
     assert main([*words, "-o", str(tmp_path / "plan")]) == 2
-    assert "0.3 mm, 850 nm, 0.12 mm there and 0.4 mm, 850 nm, 0.12 mm in the plan" in capsys.readouterr().err
+    assert (
+        "0.3 mm, 850 nm, 0.12 mm there and 0.4 mm, 850 nm, 0.12 mm in the plan"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "plan").exists()
 
 
-def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(source, before):
-    """NA 0.2: both polarisations change the flux by some 1e-4; the lattice adds the noise of its cells."""
+def test_pillars_image_as_their_smooth_phase_and_polarisation_is_small_at_a_small_aperture(
+    source, before
+):
+    """NA 0.2: both polarisations change the flux by some 1e-4; the lattice adds the
+    noise of its cells.
+    """
     made, settings = before.device, source.run.settings.optics
     smooth = made.image(wave=formed.wave_of(settings, torch.zeros(0)))
     assert image_difference(made.whole, smooth) < 0.1

@@ -1,4 +1,6 @@
-"""Lines of the error budget by Pythagorean numbers: what adds, what does not count, what is not known."""
+"""Lines of the error budget by Pythagorean numbers: what adds, what does not count,
+what is not known.
+"""
 
 import math
 
@@ -17,7 +19,9 @@ def test_squares_add_of_what_counts_and_is_known():
         Entry("three", 12e-3, 0.24, -15e-3, "so"),
     ]
     told = total(links)
-    assert (told.phase_rad, told.psf, told.gaze_rad) == pytest.approx((13e-3, 0.25, 17e-3), rel=1e-12)
+    assert (told.phase_rad, told.psf, told.gaze_rad) == pytest.approx(
+        (13e-3, 0.25, 17e-3), rel=1e-12
+    )
     assert (told.link, told.counted) == ("all links", True)
     assert told.method == "root of the sum of squares; without two"
     assert total(links[:1]).method == "root of the sum of squares"

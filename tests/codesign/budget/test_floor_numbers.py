@@ -1,4 +1,6 @@
-"""What settings may add to what none of them changes: Pythagorean numbers, and the very edge of a goal."""
+"""What settings may add to what none of them changes: Pythagorean numbers, and the very
+edge of a goal.
+"""
 
 import math
 from types import SimpleNamespace
@@ -25,7 +27,9 @@ def test_a_goal_of_85_leaves_84_above_a_floor_of_13():
 def test_a_goal_at_the_floor_is_refused_with_its_largest_link(links):
     """0.013 rad are 0.7448 degrees, 0.012 are 0.6875."""
     least = math.hypot(5e-3, 12e-3)
-    with pytest.raises(ConfigError, match=r"errs by 0\.745 deg, most of it fixation with 0\.688 deg"):
+    with pytest.raises(
+        ConfigError, match=r"errs by 0\.745 deg, most of it fixation with 0\.688 deg"
+    ):
         floor.allowance_rad(least, links)
     assert floor.allowance_rad(least * (1 + 1e-9), links) > 0
 

@@ -1,4 +1,6 @@
-"""The linear estimator: moves of the eye are read as themselves, other optics as nothing but an error."""
+"""The linear estimator: moves of the eye are read as themselves, other optics as
+nothing but an error.
+"""
 
 import math
 
@@ -18,7 +20,9 @@ def _optics(sigma_px):
     line = torch.exp(-(grid**2) / (2 * sigma_px**2))
     psf = line[:, None] * line
     stack = torch.stack([psf / psf.sum()] * 3)
-    return scene.basis(stack, torch.tensor([10e3, 20e3, 40e3], dtype=torch.float64), tolerance=1e-6)
+    return scene.basis(
+        stack, torch.tensor([10e3, 20e3, 40e3], dtype=torch.float64), tolerance=1e-6
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +40,24 @@ def test_the_same_image_is_no_error(eyes, reader):
     assert 0 < math.degrees(reader.noise_rad) < 1
 
 
-@pytest.mark.parametrize(("unknown", "amount"), [(0, math.radians(0.1)), (1, math.radians(-0.1)), (4, 80.0)])
+@pytest.mark.parametrize(
+    ("unknown", "amount"), [(0, math.radians(0.1)), (1, math.radians(-0.1)), (4, 80.0)]
+)
 def test_a_moved_eye_is_read_as_moved(eyes, reader, unknown, amount):
-    """The answer to an image of the moved eye is the move, less what the prior and the other unknowns hold back."""
+    """The answer to an image of the moved eye is the move, less what the prior and the
+    other unknowns hold back.
+    """
     states = SETTING.states
-    moved = task.views(SETTING, task.shifted(states, unknown, amount), exposed=states).anchor
+    moved = task.views(
+        SETTING, task.shifted(states, unknown, amount), exposed=states
+    ).anchor
     image = task.electrons(moved, _optics(0.8), SETTING)
-    if unknown < 2:  # slip along the axis is confounded with size and anatomy, the gaze is not
-        assert reader.shift(image)[:, unknown].tolist() == pytest.approx([amount] * 2, rel=0.35)
+    if (
+        unknown < 2
+    ):  # slip along the axis is confounded with size and anatomy, the gaze is not
+        assert reader.shift(image)[:, unknown].tolist() == pytest.approx(
+            [amount] * 2, rel=0.35
+        )
     settled = task.settle(image, _optics(0.8), states, SETTING, seen=eyes, steps=3)
     assert (settled[:, unknown] * amount > 0).all()
 
@@ -63,6 +77,9 @@ def test_brighter_light_is_not_read_as_gaze(reader):
 
 def test_other_optics_shift_the_answer_in_proportion(eyes, reader):
     """First order: twice the change of blur, twice the error."""
-    small, large = (reader.shift(task.electrons(eyes.anchor, _optics(s), SETTING)) for s in (0.8 * 1.005, 0.8 * 1.01))
+    small, large = (
+        reader.shift(task.electrons(eyes.anchor, _optics(s), SETTING))
+        for s in (0.8 * 1.005, 0.8 * 1.01)
+    )
     assert task.gaze_rms(large) == pytest.approx(2 * task.gaze_rms(small), rel=0.1)
     assert task.gaze_rms(small) > 0

@@ -1,4 +1,6 @@
-"""``metalens evaluate optics`` from lens files to tables, numbers and pictures; refusals leave nothing."""
+"""``metalens evaluate optics`` from lens files to tables, numbers and pictures;
+refusals leave nothing.
+"""
 
 import json
 import math
@@ -11,7 +13,14 @@ from metalens.cell.record import Cell, Index
 from metalens.design.profiles import Focus
 from metalens.pillars.proxy import Proxy
 
-IDEAL = Proxy(np.array([[0.0, 3 * math.pi]]), np.array([[1.0]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+IDEAL = Proxy(
+    np.array([[0.0, 3 * math.pi]]),
+    np.array([[1.0]]),
+    (0.08, 0.32),
+    (0.85, 0.85),
+    1e-6,
+    1e-6,
+)
 CELL = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
 TOML = """[axial]
 depths_mm = [1.6, 2.6]
@@ -49,40 +58,74 @@ def test_lenses_to_tables_numbers_and_pictures(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 20000.0)
     (tmp_path / "o.toml").write_text(TOML)
-    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml"), "--reader"]
+    words = [
+        str(tmp_path / "a.h5"),
+        str(tmp_path / "b.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+        "--reader",
+    ]
     assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 0
     shown = capsys.readouterr().out
     assert "Read by the reference reader: 64 frames of 32 pixels of 12 µm" in shown
     assert "paper: proposed" in shown
     assert "image error" in shown
-    assert 0 < json.loads((tmp_path / "out" / "optics.json").read_text())["lenses"]["b"]["image_error"] < 0.3
+    assert (
+        0
+        < json.loads((tmp_path / "out" / "optics.json").read_text())["lenses"]["b"][
+            "image_error"
+        ]
+        < 0.3
+    )
     assert "95 % interval over the scenes" in shown
     values = json.loads((tmp_path / "out" / "optics.json").read_text())
     assert values["lenses"]["a"]["scene_ratios"]["gaze"] == [1.0, 1.0, 1.0]
     assert np.shape(values["lenses"]["b"]["information_per_mm2"]) == (2, 2, 3)
     energy = values["lenses"]["a"]["encircled_energy"][0]
-    assert max(energy) > max(values["lenses"]["b"]["encircled_energy"][0])  # b is focused far behind this range
+    assert max(energy) > max(
+        values["lenses"]["b"]["encircled_energy"][0]
+    )  # b is focused far behind this range
     read = values["reader"]["lenses"]
     assert set(read) == {"a", "b"}
-    assert all(0 <= one["covered"] <= 1 and one["axial_low_mm"] < one["axial_mm"] for one in read.values())
+    assert all(
+        0 <= one["covered"] <= 1 and one["axial_low_mm"] < one["axial_mm"]
+        for one in read.values()
+    )
     assert "90 % interval" in (tmp_path / "out" / "tables.txt").read_text()
     field = values["lenses"]["b"]["field"]
     assert field["angles_deg"] == [-6.0, 0.0, 11.0]
-    assert field["chief_um"][2][0] == pytest.approx(600.0 * math.tan(math.radians(11.0)), abs=0.01)
+    assert field["chief_um"][2][0] == pytest.approx(
+        600.0 * math.tan(math.radians(11.0)), abs=0.01
+    )
     assert np.shape(field["mtf"]) == (3, 2, 2)
     assert "T at 60 / mm" in shown
     assert "distortion / %" in shown
-    for name in ("axial.png", "slices.png", "scenes.png", "field.png", "mtf.png", "report.html"):
+    for name in (
+        "axial.png",
+        "slices.png",
+        "scenes.png",
+        "field.png",
+        "mtf.png",
+        "report.html",
+    ):
         assert (tmp_path / "out" / name).stat().st_size > 2000
 
 
-def test_an_error_above_what_is_aimed_at_ends_1_and_is_told_in_both_outputs(tmp_path, capsys):
+def test_an_error_above_what_is_aimed_at_ends_1_and_is_told_in_both_outputs(
+    tmp_path, capsys
+):
     """No sum in floating point keeps 1e-17; the files are there all the same."""
     made(tmp_path / "a.h5", 20000.0)
     small = TOML.replace("[axial]", "[axial]\ntolerance = 1e-17")
     small = small.replace("count = 2\npixels = 32", "count = 1\npixels = 24")
     (tmp_path / "o.toml").write_text(small.replace("count = 3", "count = 1"))
-    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "-o", str(tmp_path / "out")]
+    words = [
+        str(tmp_path / "a.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+        "-o",
+        str(tmp_path / "out"),
+    ]
     assert cli.main(["evaluate", "optics", *words]) == 1
     assert "\n  FAILED: a: the PSFs' error " in (shown := capsys.readouterr().out)
     (told,) = json.loads((tmp_path / "out" / "optics.json").read_text())["failures"]
@@ -94,7 +137,12 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
     made(tmp_path / "a.h5", 2000.0)
     made(tmp_path / "b.h5", 2000.0, distance_um=700.0)
     (tmp_path / "o.toml").write_text(TOML)
-    words = [str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "--config", str(tmp_path / "o.toml")]
+    words = [
+        str(tmp_path / "a.h5"),
+        str(tmp_path / "b.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+    ]
     assert cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")]) == 2
     assert "sensor distance" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -102,19 +150,42 @@ def test_lenses_of_different_sensor_distances_are_refused(tmp_path, capsys):
 
 def test_a_deflector_is_told_to_have_no_focus(tmp_path, capsys):
     focus, wave = Focus(0.85, 600.0, 2000.0), 2 * math.pi / 0.85
-    found = design.make(lambda x, y: 0.11 * wave * x + 0 * y[:, None], focus, aperture_um=60.0, cell=CELL, proxy=IDEAL)
+    found = design.make(
+        lambda x, y: 0.11 * wave * x + 0 * y[:, None],
+        focus,
+        aperture_um=60.0,
+        cell=CELL,
+        proxy=IDEAL,
+    )
     lens.save(tmp_path / "prism.h5", found[0])
     (tmp_path / "o.toml").write_text(TOML)
-    words = [str(tmp_path / "prism.h5"), "--config", str(tmp_path / "o.toml"), "--scenes", "1"]
+    words = [
+        str(tmp_path / "prism.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+        "--scenes",
+        "1",
+    ]
     cli.main(["evaluate", "optics", *words, "-o", str(tmp_path / "out")])
     shown = capsys.readouterr()
     assert "prism brings no light together in one bright spot" in shown.out + shown.err
 
 
-def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(tmp_path, capsys):
+def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(
+    tmp_path, capsys
+):
     made(tmp_path / "a.h5", 2000.0)
-    (tmp_path / "o.toml").write_text(TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0"))
-    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "--reader", "-o", str(tmp_path / "out")]
+    (tmp_path / "o.toml").write_text(
+        TOML.replace("frames = 64", "frames = 64\nfwhm_nm = 30.0")
+    )
+    words = [
+        str(tmp_path / "a.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+        "--reader",
+        "-o",
+        str(tmp_path / "out"),
+    ]
     assert cli.main(["evaluate", "optics", *words]) == 2
     assert (
         "the pillars are known at 850 nm alone, and 1 of it lies beyond: sweep a library over it"
@@ -124,11 +195,22 @@ def test_light_that_the_library_of_the_lens_does_not_hold_is_refused_by_name(tmp
 
 
 @pytest.mark.parametrize(
-    "bad", ["[scenes]\ncount = 0\n", "[axial]\ndepths_mm = [26.0, 16.0]\n", "[reader]\nframes = 5\n"]
+    "bad",
+    [
+        "[scenes]\ncount = 0\n",
+        "[axial]\ndepths_mm = [26.0, 16.0]\n",
+        "[reader]\nframes = 5\n",
+    ],
 )
 def test_bad_settings_are_refused(tmp_path, capsys, bad):
     made(tmp_path / "a.h5", 2000.0)
     (tmp_path / "o.toml").write_text(bad)
-    words = [str(tmp_path / "a.h5"), "--config", str(tmp_path / "o.toml"), "-o", str(tmp_path / "out")]
+    words = [
+        str(tmp_path / "a.h5"),
+        "--config",
+        str(tmp_path / "o.toml"),
+        "-o",
+        str(tmp_path / "out"),
+    ]
     assert cli.main(["evaluate", "optics", *words]) == 2
     assert "need" in capsys.readouterr().err

@@ -35,7 +35,9 @@ def meet(event, arguments):
 sys.addaudithook(meet)
 main(sys.argv[1:])
 """
-TRUTH = "depths_um = [3000.0]\n" + "".join(f'[[parameter]]\nname = "{n}"\nvalue = {v}\n' for n, v in m.TRUE.items())
+TRUTH = "depths_um = [3000.0]\n" + "".join(
+    f'[[parameter]]\nname = "{n}"\nvalue = {v}\n' for n, v in m.TRUE.items()
+)
 SHORT = ["--steps", "2", "--draws", "2", "--judge", "1", "--test-batches", "1"]
 
 
@@ -50,7 +52,16 @@ def folder(tmp_path_factory):
 
 
 def _command(folder, *words, record="asbuilt.h5", out="out"):
-    return ["retrain", folder / "run", "--asbuilt", folder / record, "-o", folder / out, *SHORT, *words]
+    return [
+        "retrain",
+        folder / "run",
+        "--asbuilt",
+        folder / record,
+        "-o",
+        folder / out,
+        *SHORT,
+        *words,
+    ]
 
 
 def _retrain(folder, *words, **files):
@@ -67,7 +78,9 @@ def told(folder):
 
 @pytest.fixture(scope="module")
 def bowed(folder):
-    """The same of a lens whose truth nobody knows and whose bow is known to 5 nm, all else to 0.1: ``bowed``."""
+    """The same of a lens whose truth nobody knows and whose bow is known to 5 nm, all
+    else to 0.1: ``bowed``.
+    """
     made = m.asbuilt()
     covariance = made.covariance.copy()
     covariance[made.names.index("bias_r_nm")] *= 2500.0  # on the diagonal alone
@@ -90,28 +103,56 @@ def test_files_report_and_rules_of_overwriting(folder, told, capsys, monkeypatch
 
     assert _retrain(folder, *truth) == 2
     assert "exists; give --force" in capsys.readouterr().err
-    with monkeypatch.context() as patched:  # images that miss what the run asks for, of every lens that judges
-        patched.setattr(formed, "above", lambda settings, image: "the image's error is too large")
-        assert _retrain(folder, *truth, "--resume") == 1  # everything is there: the same story again
-    assert capsys.readouterr().out.endswith("\n  FAILED: the image's error is too large\n")
+    with (
+        monkeypatch.context() as patched
+    ):  # images that miss what the run asks for, of every lens that judges
+        patched.setattr(
+            formed, "above", lambda settings, image: "the image's error is too large"
+        )
+        assert (
+            _retrain(folder, *truth, "--resume") == 1
+        )  # everything is there: the same story again
+    assert capsys.readouterr().out.endswith(
+        "\n  FAILED: the image's error is too large\n"
+    )
     assert (folder / "out" / "retrained.safetensors").read_bytes() == kept
     assert _retrain(folder, *truth, "--resume", "--rate", "0.5") == 2
     assert "settings.rate: 0.0015 -> 0.5" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the_same_bytes(folder, monkeypatch):
-    words = ["retrain", str(folder / "run"), "--asbuilt", str(folder / "asbuilt.h5"), "-o", "out", *SHORT, "--quiet"]
+def test_killed_while_the_nominal_networks_file_was_written_a_resume_ends_in_the_same_bytes(
+    folder, monkeypatch
+):
+    words = [
+        "retrain",
+        str(folder / "run"),
+        "--asbuilt",
+        str(folder / "asbuilt.h5"),
+        "-o",
+        "out",
+        *SHORT,
+        "--quiet",
+    ]
     for name in ("whole", "killed"):
         (folder / name).mkdir()
     monkeypatch.chdir(folder / "whole")
     assert main(words) == 0
     monkeypatch.chdir(folder / "killed")
-    assert subprocess.run([sys.executable, "-c", DIES, *words], check=False).returncode == -signal.SIGKILL
-    assert [path.name[:20] for path in Path("out.unfinished").glob(".*.part")] == [".nominal.safetensors"]
+    assert (
+        subprocess.run([sys.executable, "-c", DIES, *words], check=False).returncode
+        == -signal.SIGKILL
+    )
+    assert [path.name[:20] for path in Path("out.unfinished").glob(".*.part")] == [
+        ".nominal.safetensors"
+    ]
     assert main([*words, "--resume"]) == 0
     whole, resumed = (
-        {path.name: path.read_bytes() for path in (folder / name / "out").iterdir() if path.name != "manifest.json"}
+        {
+            path.name: path.read_bytes()
+            for path in (folder / name / "out").iterdir()
+            if path.name != "manifest.json"
+        }
         for name in ("whole", "killed")
     )  # the manifest has the words of the command, --resume among them
     assert resumed == whole
@@ -130,7 +171,10 @@ def test_a_baseline_is_refused_before_the_work(folder, capsys):
         *SHORT,
     ]
     assert main(words) == 2
-    assert "trained a NVGaze; only elastic networks are retrained" in capsys.readouterr().err
+    assert (
+        "trained a NVGaze; only elastic networks are retrained"
+        in capsys.readouterr().err
+    )
     assert not list(folder.glob("none*"))
 
 
@@ -157,13 +201,28 @@ def test_where_the_map_alone_is_open_the_table_is_written(folder, bowed):
     assert "what varies over the lens" in bowed["map_refused"]
     assert (folder / "bowed" / "bias.toml").exists()
     assert not (folder / "bowed" / "lens_corrected.h5").exists()
-    assert "No lens_corrected.h5 is written" in (folder / "bowed" / "report.html").read_text()
+    assert (
+        "No lens_corrected.h5 is written"
+        in (folder / "bowed" / "report.html").read_text()
+    )
 
 
 @pytest.mark.slow
-def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(folder, capsys):
+def test_a_correction_that_the_posterior_leaves_open_is_said_and_not_written(
+    folder, capsys
+):
     asbuilt.save(folder / "wide.h5", m.asbuilt(sigma=5.0))
-    assert _retrain(folder, "--json", "--truth", str(folder / "truth.toml"), record="wide.h5", out="open") == 0
+    assert (
+        _retrain(
+            folder,
+            "--json",
+            "--truth",
+            str(folder / "truth.toml"),
+            record="wide.h5",
+            out="open",
+        )
+        == 0
+    )
     told = json.loads(capsys.readouterr().out)
     assert "no correction" in told["correction_refused"]
     assert not (folder / "open" / "bias.toml").exists()
@@ -179,40 +238,73 @@ LOOK += ["--axial-mm", "2.5", "--lateral-mm", "1.5"]
 
 def _shown(folder, *runs, out):
     places = [str(folder / run) for run in runs]
-    return main(["evaluate", "experiment", *places, "-o", str(folder / out), *LOOK, "--json", "--force"])
+    return main(
+        [
+            "evaluate",
+            "experiment",
+            *places,
+            "-o",
+            str(folder / out),
+            *LOOK,
+            "--json",
+            "--force",
+        ]
+    )
 
 
 @pytest.mark.usefixtures("told")
-def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(folder, capsys):
-    """What the run read through its design, the unwarned and the retrained network read through the lens as made."""
+def test_a_retrained_network_is_shown_to_the_experiment_before_the_lens_as_made(
+    folder, capsys
+):
+    """What the run read through its design, the unwarned and the retrained network read
+    through the lens as made.
+    """
     assert _shown(folder, "run", "out/nominal.safetensors", "out", out="shown") == 0
     seen = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in seen["runs"]] == ["run", "out nominal", "out"]
     assert list(seen["lenses"].values()) == ["as designed", "as made", "as made"]
-    assert "out: through the lens as made" in (folder / "shown" / "report.html").read_text()
+    assert (
+        "out: through the lens as made"
+        in (folder / "shown" / "report.html").read_text()
+    )
     made, plain = retrained.load(folder / "out"), retrained.load(folder / "run")
     design = lens.load_plain(folder / "run" / "lens.h5")
     response = asbuilt.load(folder / "asbuilt.h5").response
     true = config.load(folder / "truth.toml", Truth)
-    wanted = MadeLens(design, made.settings.optics, response=response).stack(true.vector())
+    wanted = MadeLens(design, made.settings.optics, response=response).stack(
+        true.vector()
+    )
     assert torch.equal(made.made.intensity, wanted.intensity)
     assert plain.made is None
     kept = load_file(folder / "out" / "retrained.safetensors")
     before = plain.run.trainer.model.net.state_dict()
-    moved = {n: w for n, w in made.run.trainer.model.net.state_dict().items() if not torch.equal(w, before[n])}
+    moved = {
+        n: w
+        for n, w in made.run.trainer.model.net.state_dict().items()
+        if not torch.equal(w, before[n])
+    }
     assert moved
-    assert all(torch.equal(weights, kept[f"/trainer/net/{name}"]) for name, weights in moved.items())
+    assert all(
+        torch.equal(weights, kept[f"/trainer/net/{name}"])
+        for name, weights in moved.items()
+    )
     through = [experiment.ready(source, image="true") for source in (plain, made)]
     assert not torch.equal(through[0].stack, through[1].stack)
 
 
 @pytest.mark.usefixtures("bowed")
-def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(folder, tmp_path, capsys):
+def test_a_retraining_whose_run_or_fit_is_another_now_is_not_shown(
+    folder, tmp_path, capsys
+):
     for name in ("run", "bowed", "bowed.h5"):
-        (shutil.copytree if (folder / name).is_dir() else shutil.copy)(folder / name, tmp_path / name)
+        (shutil.copytree if (folder / name).is_dir() else shutil.copy)(
+            folder / name, tmp_path / name
+        )
     assert retrained.lens_of(tmp_path / "bowed") == "as fitted"
     assert _shown(tmp_path, "bowed/known.safetensors", out="shown") == 2
-    assert "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err
+    assert (
+        "it holds nominal.safetensors, retrained.safetensors" in capsys.readouterr().err
+    )
     asbuilt.save(tmp_path / "bowed.h5", m.asbuilt(sigma=0.2))
     assert _shown(tmp_path, "bowed", out="shown") == 2
     assert "bowed.h5 is not what it was retrained from" in capsys.readouterr().err

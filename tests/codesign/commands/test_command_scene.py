@@ -20,8 +20,13 @@ def test_scene_writes_sheet_layers_and_labels(tmp_path):
     assert len(lines) == 7
     assert len(lines[0].split(",")) == len(lines[1].split(","))
     layers = store.load(tmp_path / "out" / "layers.h5", "layers").arrays
-    assert np.abs(layers["coverage"].sum(0) - 1).max() < 1e-5  # opaque scene, cut without loss
-    assert np.diff(np.unique(layers["depth_um"])).max() <= 500 * (1 + 1e-5) or len(layers["depth_um"]) < 3
+    assert (
+        np.abs(layers["coverage"].sum(0) - 1).max() < 1e-5
+    )  # opaque scene, cut without loss
+    assert (
+        np.diff(np.unique(layers["depth_um"])).max() <= 500 * (1 + 1e-5)
+        or len(layers["depth_um"]) < 3
+    )
     assert store.load(tmp_path / "out" / "scene.h5", "scene").provenance.seed == 4
 
 
@@ -29,7 +34,18 @@ def test_variety_changes_the_frames_and_is_reproducible(tmp_path):
     sheets = []
     for name, variety in (("bare", 1.0), ("worn", 2.5), ("again", 2.5)):
         (tmp_path / "scene.toml").write_text(TOML + f"variety = {variety}\n")
-        assert cli.main(["scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / name), "--quiet"]) == 0
+        assert (
+            cli.main(
+                [
+                    "scene",
+                    str(tmp_path / "scene.toml"),
+                    "-o",
+                    str(tmp_path / name),
+                    "--quiet",
+                ]
+            )
+            == 0
+        )
         sheets.append((tmp_path / name / "sheet.png").read_bytes())
     assert sheets[0] != sheets[1] == sheets[2]
 

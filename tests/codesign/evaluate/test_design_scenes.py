@@ -1,4 +1,6 @@
-"""Eq. 6 on rendered triplets: the quick path gives the images of the exact one, and its gradient is right."""
+"""Eq. 6 on rendered triplets: the quick path gives the images of the exact one, and its
+gradient is right.
+"""
 
 import pytest
 import torch
@@ -13,9 +15,15 @@ from metalens.image import scene
 from metalens.image.pupil import Pupil
 
 PUPIL = Pupil(nodes=96)
-SETTINGS = Fisher(objective="scenes", scenes=1, grids=(4,), iterations=2, starts=1, zones=(0,), encircled=0.0).about(
-    Focus(0.85, 2000.0, 20e3), PUPIL.radius_um
-)
+SETTINGS = Fisher(
+    objective="scenes",
+    scenes=1,
+    grids=(4,),
+    iterations=2,
+    starts=1,
+    zones=(0,),
+    encircled=0.0,
+).about(Focus(0.85, 2000.0, 20e3), PUPIL.radius_um)
 SMALL = Scenes(count=1, pitch_um=22.0, pixels=48, window_um=154.0)
 
 
@@ -30,7 +38,9 @@ def test_images_from_spectra_are_those_of_the_imager(objective):
     optics = scene.with_kernels(objective.optics, kernels)
     quick = scene.image_spectra(objective.sources[0], optics, (48, 48))
     exact = scene.image(objective.frames[0], optics)
-    assert float((quick - exact).abs().max() / exact.max()) < 1e-5  # the same sums in another order, float32
+    assert (
+        float((quick - exact).abs().max() / exact.max()) < 1e-5
+    )  # the same sums in another order, float32
 
 
 def test_gradient_of_eq_6_agrees_with_differences(objective):
@@ -40,9 +50,13 @@ def test_gradient_of_eq_6_agrees_with_differences(objective):
     point = phase.clone().requires_grad_(True)
     slope = torch.autograd.grad(objective.loss(point, 20e3, None)[0], point)[0]
     step = 0.02
-    high, low = (float(objective.loss(phase + s * way, 20e3, None)[0]) for s in (step, -step))
+    high, low = (
+        float(objective.loss(phase + s * way, 20e3, None)[0]) for s in (step, -step)
+    )
     got = float((slope * way).sum())
-    assert got == pytest.approx((high - low) / (2 * step), rel=0.02, abs=1e-4)  # float32 images, third derivative
+    assert got == pytest.approx(
+        (high - low) / (2 * step), rel=0.02, abs=1e-4
+    )  # float32 images, third derivative
 
 
 def test_a_sharp_lens_loses_less_than_a_blurred_one(objective):

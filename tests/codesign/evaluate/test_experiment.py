@@ -1,4 +1,6 @@
-"""The virtual experiment: geometry of stimuli and slippage, a regressor that is fitted honestly, and its command."""
+"""The virtual experiment: geometry of stimuli and slippage, a regressor that is fitted
+honestly, and its command.
+"""
 
 import json
 import sys
@@ -32,7 +34,13 @@ SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, p
 
 def test_looks_points_people_and_noise_are_drawn_apart():
     """Of the same seed and number no two draws are alike."""
-    streams = experiment.LOOKS, experiment.POINTS, experiment.PEOPLE, experiment.NOISE, 2 * experiment.NOISE
+    streams = (
+        experiment.LOOKS,
+        experiment.POINTS,
+        experiment.PEOPLE,
+        experiment.NOISE,
+        2 * experiment.NOISE,
+    )
     drawn = [np.random.default_rng([7, 3, one]).random(4).tolist() for one in streams]
     assert len({tuple(one) for one in drawn}) == len(streams)
 
@@ -46,9 +54,19 @@ def folder(tmp_path_factory):
 
 def _trial(config, subjects):
     stimuli, slips = config.stimuli_deg, config.slips_mm
-    state, point = (g.ravel() for g in np.meshgrid(np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"))
-    one = [Trial(np.full(len(state), s), point, state, stimuli[point], slips[state]) for s in range(subjects)]
-    return Trial(*(np.concatenate([getattr(t, f) for t in one]) for f in Trial.__slots__))
+    state, point = (
+        g.ravel()
+        for g in np.meshgrid(
+            np.arange(len(slips)), np.arange(len(stimuli)), indexing="ij"
+        )
+    )
+    one = [
+        Trial(np.full(len(state), s), point, state, stimuli[point], slips[state])
+        for s in range(subjects)
+    ]
+    return Trial(
+        *(np.concatenate([getattr(t, f) for t in one]) for f in Trial.__slots__)
+    )
 
 
 def test_the_paper_s_counts():
@@ -75,7 +93,9 @@ def test_subjects_look_at_the_stimuli_and_slip_as_told(folder):
     x, y = np.radians(trial.stimulus_deg).T
     wanted = np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)
     for found, want in zip((right, down, out), wanted, strict=True):
-        assert np.abs(found - want).max() < 1e-6  # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
+        assert (
+            np.abs(found - want).max() < 1e-6
+        )  # kappa added to the gaze alone leaves 0.4 degrees, 7e-3
     other, _ = experiment.states_of(SMALL, 2, scenes)
     assert float(other.trait("size")[0]) != float(states.trait("size")[0])
 
@@ -85,11 +105,15 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
     x = rng.uniform(-1, 1, (70, 5))
 
     def target(v):
-        return np.stack([np.tanh(v[:, 0] + 0.5 * v[:, 2]), v[:, 1] * (1 + 0.3 * v[:, 4])], 1)
+        return np.stack(
+            [np.tanh(v[:, 0] + 0.5 * v[:, 2]), v[:, 1] * (1 + 0.3 * v[:, 4])], 1
+        )
 
     made = regressor.fit(x, target(x), penalty=1e-5)
     new = rng.uniform(-0.8, 0.8, (200, 5))
-    assert np.abs(made(new) - target(new)).mean() < 0.02  # of a range of 2: two tanh terms and a product
+    assert (
+        np.abs(made(new) - target(new)).mean() < 0.02
+    )  # of a range of 2: two tanh terms and a product
     inside, outside = rng.standard_normal((6, 3)), rng.standard_normal((4, 2))
     slope = regressor._jacobian(inside, outside, x)
     for k, (array, place) in enumerate(((inside, (2, 1)), (outside, (3, 0)))):
@@ -97,7 +121,9 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
         up[place] += 1e-6
         down[place] -= 1e-6
         pair = [(a, outside) if k == 0 else (inside, a) for a in (up, down)]
-        difference = (regressor._forward(*pair[0], x) - regressor._forward(*pair[1], x)).ravel() / 2e-6
+        difference = (
+            regressor._forward(*pair[0], x) - regressor._forward(*pair[1], x)
+        ).ravel() / 2e-6
         column = np.ravel_multi_index(place, array.shape) + (inside.size if k else 0)
         assert np.abs(slope[:, column] - difference).max() < 1e-8
     with pytest.raises(TrainingError, match="2 points"):
@@ -105,20 +131,31 @@ def test_a_regressor_finds_a_smooth_map_and_has_the_gradient_it_says():
 
 
 def test_perfect_reading_leaves_little_gaze_error_and_slippage_unseen_leaves_much():
-    """The mean eye, a sphere: the pupil's image moves with gaze and slip; only a slip that is read tells them apart."""
+    """The mean eye, a sphere: the pupil's image moves with gaze and slip; only a slip
+    that is read tells them apart.
+    """
     config, rig = ExperimentConfig(subjects=2), Rig()
     trial = _trial(config, 2)
-    person = personal.fit(np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0)
+    person = personal.fit(
+        np.zeros((3, 2)), np.zeros((3, 3)), np.zeros((3, 2)), rig=rig, hidden=0
+    )
     s, c = np.sin(rig.elevation_rad), np.cos(rig.elevation_rad)
     axes = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, -s, -c]])
-    direction = torch.from_numpy(personal.direction(np.radians(trial.stimulus_deg)) @ axes)
+    direction = torch.from_numpy(
+        personal.direction(np.radians(trial.stimulus_deg)) @ axes
+    )
     pupil = pupil_of(direction, torch.from_numpy(-trial.slip_mm), person.mean).numpy()
     for slip, low, high in ((trial.slip_mm, 0.0, 0.5), (0 * trial.slip_mm, 1.5, 20.0)):
-        predicted, judged = experiment.calibrated(Readings(pupil, slip), trial, config, personal.Sphere(rig))
+        predicted, judged = experiment.calibrated(
+            Readings(pupil, slip), trial, config, personal.Sphere(rig)
+        )
         error = personal.angle_deg(predicted, trial.stimulus_deg)[judged]
         assert low <= error.mean() < high
     assert judged.mean() == pytest.approx(39 / 49)
-    assert all(len(np.unique(trial.stimulus[~judged & (trial.subject == s)])) == 10 for s in (0, 1))
+    assert all(
+        len(np.unique(trial.stimulus[~judged & (trial.subject == s)])) == 10
+        for s in (0, 1)
+    )
 
 
 def test_spread_points_reach_the_corners():
@@ -130,7 +167,9 @@ def test_spread_points_reach_the_corners():
     assert gaps.max() < 10.0  # of a field of 35 x 25 degrees
 
 
-@pytest.mark.parametrize("change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}])
+@pytest.mark.parametrize(
+    "change", [{"subjects": 0}, {"grid": (1, 7)}, {"share": 0.01}, {"share": 1.0}]
+)
 def test_impossible_experiments_are_refused(change):
     with pytest.raises(ConfigError, match="subject"):
         replace(SMALL, **change)
@@ -148,27 +187,40 @@ def test_settings_below_what_they_can_be_are_named(name, value):
 
 def test_an_eye_that_would_slip_into_the_lens_is_refused():
     scenes = EyeScenes(SceneConfig(), 9.0, 2000.0, 0)
-    with pytest.raises(ConfigError, match=r"axial_mm \(-21.0,\): the eye stands 21 mm before the lens"):
+    with pytest.raises(
+        ConfigError, match=r"axial_mm \(-21.0,\): the eye stands 21 mm before the lens"
+    ):
         experiment.states_of(replace(SMALL, axial_mm=(-21.0,)), 0, scenes)
 
 
-@pytest.mark.parametrize(("axial", "words"), [((-9.5,), "11.5 to 21 mm"), ((2.5, 19.5), "21 to 40.5 mm")])
+@pytest.mark.parametrize(
+    ("axial", "words"), [((-9.5,), "11.5 to 21 mm"), ((2.5, 19.5), "21 to 40.5 mm")]
+)
 def test_eyes_that_slip_to_where_images_hold_no_depth_are_refused(folder, axial, words):
     source = retraining.load(folder / "run")
-    with pytest.raises(ConfigError, match=rf"{words} before the lens, where the run's images hold optics.depths_mm"):
+    with pytest.raises(
+        ConfigError,
+        match=rf"{words} before the lens, where the run's images hold optics.depths_mm",
+    ):
         next(experiment.experiment([source], replace(SMALL, axial_mm=axial)))
 
 
-def test_a_network_of_others_reads_the_experiment_by_sphere_and_has_no_overlap(tmp_path):
+def test_a_network_of_others_reads_the_experiment_by_sphere_and_has_no_overlap(
+    tmp_path,
+):
     source = retraining.load(m.finished_baseline(tmp_path / "run"))
     config = replace(SMALL, subjects=2, hidden=0, axial_mm=(2.5,), lateral_mm=())
     *_, (_, (found,)) = experiment.experiment([source], config)
-    assert isinstance(experiment.calibrator(source, experiment.ready(source), config), personal.Sphere)
+    assert isinstance(
+        experiment.calibrator(source, experiment.ready(source), config), personal.Sphere
+    )
     told = command.summary([found], config)
     (row,) = told["runs"]
     assert row["iou"] is None
     assert "iou_interval" not in row
-    assert row["slip_mm"] == pytest.approx(np.abs(found.slip_mm - found.trial.slip_mm).mean(), rel=1e-9)
+    assert row["slip_mm"] == pytest.approx(
+        np.abs(found.slip_mm - found.trial.slip_mm).mean(), rel=1e-9
+    )
     assert command.table(told).splitlines()[1].split()[-1] == "-"
     assert experiment_plots.samples(source, config, subjects=1).startswith(b"\x89PNG")
 
@@ -195,47 +247,75 @@ def test_the_command_writes_numbers_and_figures_once(folder, capsys):
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [r["name"] for r in told["runs"]] == ["run 1", "run 2"]
-    assert all(r["ratio"] == 1.0 for r in told["ratios"])  # the same run twice, the same noise
+    assert all(
+        r["ratio"] == 1.0 for r in told["ratios"]
+    )  # the same run twice, the same noise
     first = told["runs"][0]
     assert first["trained_to_mm"] == [2.0, 1.5, 3.5]
-    assert first["beyond_training_mm"] == [[-5, 0, 0], [-2.5, 0, 0], [0, 0, -5], [0, 0, 5]]
-    assert "(0, 0, 5) mm lie outside of what it saw" in (out / "report.html").read_text()
-    assert {p.name for p in out.iterdir()} >= {"experiment.json", "samples.png", "ambiguity.png", "errors.png"}
+    assert first["beyond_training_mm"] == [
+        [-5, 0, 0],
+        [-2.5, 0, 0],
+        [0, 0, -5],
+        [0, 0, 5],
+    ]
+    assert (
+        "(0, 0, 5) mm lie outside of what it saw" in (out / "report.html").read_text()
+    )
+    assert {p.name for p in out.iterdir()} >= {
+        "experiment.json",
+        "samples.png",
+        "ambiguity.png",
+        "errors.png",
+    }
     one, two = (people_file.load(out / f"people_{n}.h5") for n in (1, 2))
     assert np.array_equal(one.model.mean, two.model.mean)  # the same run twice
     assert main(words) == 2
     assert "give --force" in capsys.readouterr().err
     assert main([*words[:4], "-o", str(folder / "twins"), "--names", "a", "a"]) == 2
     assert "names a, a: two are alike" in capsys.readouterr().err
-    assert main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
+    assert (
+        main(["evaluate", "experiment", str(folder), "-o", str(folder / "other")]) == 2
+    )
     assert "is no run folder" in capsys.readouterr().err
 
 
 def test_slippage_beyond_training_is_told_apart():
-    """Errors of 0.2 mm where training saw the slip and of 0.7 mm beyond, to either side and along either axis."""
+    """Errors of 0.2 mm where training saw the slip and of 0.7 mm beyond, to either side
+    and along either axis.
+    """
     config = replace(SMALL, subjects=1, axial_mm=(-3.0, 1.5, 2.5), lateral_mm=(-4.0,))
     trial = _trial(config, 1)
-    off = np.where((trial.slip_mm[:, 2] == -3.0) | (trial.slip_mm[:, 0] == -4.0), 0.7, -0.2)
+    off = np.where(
+        (trial.slip_mm[:, 2] == -3.0) | (trial.slip_mm[:, 0] == -4.0), 0.7, -0.2
+    )
     read = trial.slip_mm + np.stack([0 * off, 0 * off, off], 1)
     blank = np.zeros((len(off), 2))
-    made = experiment.Result("a", 1.0, trial, read, blank, off, off, blank, off, (3.9, 1.0, 2.5))
+    made = experiment.Result(
+        "a", 1.0, trial, read, blank, off, off, blank, off, (3.9, 1.0, 2.5)
+    )
     found = command._beyond(made)
     assert found["beyond_training_mm"] == [[-4.0, 0.0, 0.0], [0.0, 0.0, -3.0]]
     assert found["slip_axial_within_mm"] == pytest.approx(0.2)
     assert found["slip_axial_beyond_mm"] == pytest.approx(0.7)
     said = command._of_reach({"name": "a", **found})
-    assert said.startswith("a: trained on slippage up to (3.9, 1, 2.5) mm; (-4, 0, 0), (0, 0, -3) mm lie outside")
+    assert said.startswith(
+        "a: trained on slippage up to (3.9, 1, 2.5) mm; (-4, 0, 0), (0, 0, -3) mm lie outside"
+    )
     assert command._beyond(replace(made, reach_mm=(4.0, 0.0, 3.0))) == {}
 
 
 def test_places_that_cover_a_plane_are_each_the_farthest_from_all_before():
-    places = np.array([[0.0, 0.0], [1.0, 0.2], [9.0, 1.0], [8.0, 7.0], [0.5, 6.0], [4.6, 3.6]])
+    places = np.array(
+        [[0.0, 0.0], [1.0, 0.2], [9.0, 1.0], [8.0, 7.0], [0.5, 6.0], [4.6, 3.6]]
+    )
     assert experiment.spread(places, 5, first=1).tolist() == [1, 3, 2, 4, 5]
     assert experiment.spread(places, 1, first=4).tolist() == [4]
 
 
 def test_slippage_is_told_from_where_its_wearer_calibrated():
-    """Two subjects read off by constants of their own and by (0.1, -0.2, 0.3) mm on judged frames alone."""
+    """Two subjects read off by constants of their own and by (0.1, -0.2, 0.3) mm on
+    judged frames alone.
+    """
     trial = _trial(SMALL, 2)
     judged = trial.stimulus % 3 > 0
     off = np.array([[0.5, 0.0, -0.7], [-0.4, 0.9, 0.2]])[trial.subject]
@@ -251,7 +331,9 @@ def test_slippage_is_told_from_where_its_wearer_calibrated():
 
 
 def _turned(place, about_x, about_y):
-    """A place as a camera sees it that is turned about x, then about y, z away from the lens."""
+    """A place as a camera sees it that is turned about x, then about y, z away from the
+    lens.
+    """
     cos, sin = np.cos(about_x), np.sin(about_x)
     first = np.array([[1, 0, 0], [0, cos, sin], [0, -sin, cos]])
     cos, sin = np.cos(about_y), np.sin(about_y)
@@ -259,7 +341,9 @@ def _turned(place, about_x, about_y):
 
 
 def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(folder):
-    """Read exactly, it errs by a constant of the subject: where the eye stands before the turned camera."""
+    """Read exactly, it errs by a constant of the subject: where the eye stands before
+    the turned camera.
+    """
     source = retraining.load(folder / "run")
     config = replace(SMALL, subjects=2, people=2, axial_mm=(2.5,), lateral_mm=(-5.0,))
     *_, (_, (found,)) = experiment.experiment([source], config)
@@ -267,33 +351,55 @@ def test_what_a_camera_sees_of_slippage_is_off_by_its_own_turn_on_the_mount(fold
     for subject in range(2):
         states, _ = experiment.states_of(config, subject, source.run.scenes(9))
         off = _turned(place, *states.mount_rad[0].tolist()) - place
-        assert 0.02 < np.linalg.norm(off[:2]) < 0.55  # up to 1 degree about either axis at 21 mm
+        assert (
+            0.02 < np.linalg.norm(off[:2]) < 0.55
+        )  # up to 1 degree about either axis at 21 mm
         mine = found.trial.subject == subject
-        assert (found.visible_mm - found.trial.slip_mm)[mine] == pytest.approx(np.tile(off, (mine.sum(), 1)), abs=1e-9)
-        assert found.slip_visible_mm[mine] == pytest.approx(np.tile(np.abs(off), (mine.sum(), 1)), abs=1e-9)
+        assert (found.visible_mm - found.trial.slip_mm)[mine] == pytest.approx(
+            np.tile(off, (mine.sum(), 1)), abs=1e-9
+        )
+        assert found.slip_visible_mm[mine] == pytest.approx(
+            np.tile(np.abs(off), (mine.sum(), 1)), abs=1e-9
+        )
     (row,) = command.summary([found], config)["runs"]
-    assert row["slip_visible_mm"] == pytest.approx(np.abs(found.visible_mm - found.trial.slip_mm).mean(), rel=1e-9)
+    assert row["slip_visible_mm"] == pytest.approx(
+        np.abs(found.visible_mm - found.trial.slip_mm).mean(), rel=1e-9
+    )
 
 
 def test_an_axis_that_is_read_becomes_gaze_by_what_people_share():
-    """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and pupil are told nothing."""
+    """All misread the axis by 0.1 deg/mm² of slippage: others tell it, where sphere and
+    pupil are told nothing.
+    """
     rng, config = np.random.default_rng(3), ExperimentConfig(subjects=2)
     trial = _trial(config, 2)
 
     def misread(gaze, slip, kappa):
-        return gaze + kappa + 0.1 * slip[:, [0]] * slip[:, [2]] + 0.1 * slip[:, [2]] ** 2
+        return (
+            gaze + kappa + 0.1 * slip[:, [0]] * slip[:, [2]] + 0.1 * slip[:, [2]] ** 2
+        )
 
     person = np.repeat(np.arange(12), 20)
     gaze, slip = rng.uniform(-17, 17, (240, 2)), rng.uniform(-5, 5, (240, 3))
     pupil = rng.normal(0, 0.3, (240, 2))
-    theirs = Readings(pupil, slip, misread(gaze, slip, rng.normal(5, 2, (12, 2))[person]))
+    theirs = Readings(
+        pupil, slip, misread(gaze, slip, rng.normal(5, 2, (12, 2))[person])
+    )
     people = shared.learn(theirs, gaze, person)
-    axis = misread(trial.stimulus_deg, trial.slip_mm, np.array([[3.0, -1.0], [7.0, 4.0]])[trial.subject])
+    axis = misread(
+        trial.stimulus_deg,
+        trial.slip_mm,
+        np.array([[3.0, -1.0], [7.0, 4.0]])[trial.subject],
+    )
     read = Readings(np.zeros((len(axis), 2)), trial.slip_mm, axis)
     predicted, judged = experiment.calibrated(read, trial, config, people)
     assert personal.angle_deg(predicted, trial.stimulus_deg)[judged].mean() < 0.05
-    alone, _ = experiment.calibrated(read, trial, config, personal.Sphere(Rig(), hidden=0))
-    assert personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5  # the pupil tells nothing here
+    alone, _ = experiment.calibrated(
+        read, trial, config, personal.Sphere(Rig(), hidden=0)
+    )
+    assert (
+        personal.angle_deg(alone, trial.stimulus_deg)[judged].mean() > 5
+    )  # the pupil tells nothing here
 
 
 def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder):
@@ -305,7 +411,9 @@ def test_people_who_calibrated_before_are_read_through_the_run_s_own_lens(folder
     assert found.model.mean.shape == (36, 2)
     assert np.isfinite(found.model.mean).all()
     assert np.array_equal(found.model.mean, again.model.mean)
-    assert not np.allclose(found.middle, dim.middle, rtol=1e-3)  # in the light of the experiment
+    assert not np.allclose(
+        found.middle, dim.middle, rtol=1e-3
+    )  # in the light of the experiment
 
 
 @pytest.mark.parametrize("people", [0, 1])

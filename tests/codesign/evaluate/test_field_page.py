@@ -1,4 +1,6 @@
-"""The designer's page of ``metalens evaluate optics``: what is asked for, what stands in tables, what is refused."""
+"""The designer's page of ``metalens evaluate optics``: what is asked for, what stands
+in tables, what is refused.
+"""
 
 import json
 import math
@@ -13,7 +15,9 @@ from tests.metalens.aberrations.hyperbolic import made
 
 
 def typed(**changes):
-    """Two angles, two frequencies, no two values alike; the second angle has no chief ray."""
+    """Two angles, two frequencies, no two values alike; the second angle has no chief
+    ray.
+    """
     given = {
         "angles_deg": np.array([-4.0, 9.0]), "depth_um": 21e3, "sensor_distance_um": 2000.0,
         "chief_um": np.array([[-140.256, 0.1], [math.nan] * 2]), "distortion": np.array([-0.01234, math.nan]),
@@ -30,18 +34,49 @@ def typed(**changes):
 def test_every_number_stands_under_its_name_with_its_unit():
     fields, curves = field_page.tables({"mine": typed()})
     rows = [dict(zip(fields.head, row, strict=False)) for row in fields.rows]
-    assert list(fields.rows[0]) == ["mine", "-4", "-140.26", "-1.23", "-12.3", "-5.7", "-13.6", "-6.9", "0.00", "0.987"]
-    assert list(fields.rows[1]) == ["", "9", "–", "–", "–", "–", "7.9", "8.8", "6.25", "–"]
+    assert list(fields.rows[0]) == [
+        "mine",
+        "-4",
+        "-140.26",
+        "-1.23",
+        "-12.3",
+        "-5.7",
+        "-13.6",
+        "-6.9",
+        "0.00",
+        "0.987",
+    ]
+    assert list(fields.rows[1]) == [
+        "",
+        "9",
+        "–",
+        "–",
+        "–",
+        "–",
+        "7.9",
+        "8.8",
+        "6.25",
+        "–",
+    ]
     assert rows[0]["vignetting / %"] == "0.00"
     assert fields.head[3:6] == ("distortion / %", "close rays T / µm", "S / µm")
     assert "21 mm" in fields.caption
     assert "mine: the chief ray of (9, 0) degrees is lost." in fields.caption
-    assert curves.head == ("lens", "angle / °", "T at 37 / mm", "S at 37 / mm", "T at 74 / mm", "S at 74 / mm")
+    assert curves.head == (
+        "lens",
+        "angle / °",
+        "T at 37 / mm",
+        "S at 37 / mm",
+        "T at 74 / mm",
+        "S at 74 / mm",
+    )
     assert list(curves.rows[1]) == ["", "9", "0.410", "0.530", "0.220", "0.340"]
 
 
 def test_numbers_that_are_not_there_are_null_in_the_file():
-    found = json.loads(json.dumps(field_page.values(typed(depth_um=math.inf)), allow_nan=False))
+    found = json.loads(
+        json.dumps(field_page.values(typed(depth_um=math.inf)), allow_nan=False)
+    )
     assert found["distortion"] == [-0.01234, None]
     assert found["close_um"][1] == [None, None]
     assert found["depth_um"] is None
@@ -53,8 +88,12 @@ def test_pictures_of_lenses_with_and_without_chief_rays():
     both = {"a": typed(), "b": typed(mtf=typed().mtf / 2)}
     for image in (field_page.picture(both), field_page.mtf_picture(both)):
         assert image[:4] == b"\x89PNG"
-    assert field_page.mtf_picture(both) != field_page.mtf_picture({"a": typed(), "b": typed()})
-    assert field_page.picture(both) != field_page.picture({"a": typed(), "b": typed(distortion=np.array([0.3, 0.2]))})
+    assert field_page.mtf_picture(both) != field_page.mtf_picture(
+        {"a": typed(), "b": typed()}
+    )
+    assert field_page.picture(both) != field_page.picture(
+        {"a": typed(), "b": typed(distortion=np.array([0.3, 0.2]))}
+    )
 
 
 def test_what_is_left_out_is_of_the_first_lens_and_the_other_angles():
@@ -62,7 +101,10 @@ def test_what_is_left_out_is_of_the_first_lens_and_the_other_angles():
     found = FieldSetting().of(second, first, (0.0, 3.0))
     assert found.angles_deg.tolist() == [0.0, 3.0]
     assert found.depth_um == 1900.0
-    assert found.frequencies_per_mm.tolist() == over_field(first, (0.0,)).frequencies_per_mm.tolist()
+    assert (
+        found.frequencies_per_mm.tolist()
+        == over_field(first, (0.0,)).frequencies_per_mm.tolist()
+    )
     asked = FieldSetting((-2.0,), (55.0,), 1.3).of(second, first, (0.0, 3.0))
     want = over_field(second, (-2.0,), depth_um=1300.0, frequencies=(55.0,))
     assert asked.depth_um == 1300.0

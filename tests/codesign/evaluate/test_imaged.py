@@ -1,4 +1,6 @@
-"""Rendered eyes through a lens: the same eyes, the same light, and PSFs at the angles of the sensor's rim."""
+"""Rendered eyes through a lens: the same eyes, the same light, and PSFs at the angles
+of the sensor's rim.
+"""
 
 import math
 import sys
@@ -36,39 +38,60 @@ LENS = design.make(
 @pytest.fixture(scope="module")
 def found():
     states = dataset.states_at(torch.arange(2), 5)
-    return imaged.imaged(LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera))
+    return imaged.imaged(
+        LENS, CAMERA, RIG, lambda camera, rig: render(states, rig=rig, camera=camera)
+    )
 
 
 def test_the_scene_is_what_a_pinhole_at_the_lens_sees(found):
     """Without the margin that is blurred in: the rays of a camera of that size alone."""
     rig = replace(RIG, sensor_distance_um=LENS.sensor_distance_um)
-    plain = render(dataset.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA).pinhole().numpy()
-    # samples of wider frames have the same rays; a tenth of a per cent of them lie on edges that round otherwise
+    plain = (
+        render(dataset.states_at(torch.arange(2), 5), rig=rig, camera=CAMERA)
+        .pinhole()
+        .numpy()
+    )
+    # samples of wider frames have the same rays; a tenth of a per cent of them lie on
+    # edges that round otherwise
     assert np.mean(np.abs(found.scene - plain) > 1e-4) < 2e-3
 
 
 def test_the_image_has_the_light_of_the_scene_and_less_of_its_detail(found):
     assert found.image.sum() == pytest.approx(float(found.scene.sum()), rel=1e-5)
-    step = [float(np.abs(np.diff(one, axis=-1)).mean()) for one in (found.scene, found.image)]
+    step = [
+        float(np.abs(np.diff(one, axis=-1)).mean())
+        for one in (found.scene, found.image)
+    ]
     assert step[1] < 0.8 * step[0]
     assert 0 < found.error < 0.3
 
 
 def test_psfs_are_those_of_the_middle_and_the_rim(found):
-    """The outermost samples, those that are blurred into the frame included, lie 300 um behind the lens."""
+    """The outermost samples, those that are blurred into the frame included, lie 300 um
+    behind the lens.
+    """
     beside = 48  # samples of 3 um: half a window of 288 um
     rim = math.degrees(math.atan((24 + 2 * beside - 1) / 2 * 3.0 / 300.0))
     assert found.x_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert found.y_deg.tolist() == pytest.approx([-rim, 0, rim], abs=1e-9)
     assert np.all(np.diff(found.depth_um) > 0)
-    assert found.psf.shape == (3, 3, 3, 97, 97)  # first, middle and last; 288 um about a sample
-    # a lens that is alike to both sides: left and right PSFs are each other's mirror images, to the nodes' own error
+    assert found.psf.shape == (
+        3,
+        3,
+        3,
+        97,
+        97,
+    )  # first, middle and last; 288 um about a sample
+    # a lens that is alike to both sides: left and right PSFs are each other's mirror
+    # images, to the nodes' own error
     left, right = found.psf[1, 1, 0], found.psf[1, 1, 2][:, ::-1]
     assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(left)
 
 
 def test_behind_films_samples_show_the_directions_of_the_reduced_distance():
-    """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field angles alike."""
+    """60 um of index 1.5 in the 300 um to the sensor: 280 um of air; scene and field
+    angles alike.
+    """
     behind = replace(LENS, layers=Layers(behind=(Film(Index(1.5), 60.0),)))
     states, seen = dataset.states_at(torch.arange(1), 5), []
 
@@ -103,24 +126,38 @@ def test_the_command_images_through_a_lens_file(tmp_path, capsys):
     assert cli.main([*words, "--fwhm-nm", "20"]) == 2
     assert "need 0 or more, and --lens" in capsys.readouterr().err
     assert cli.main([*words, "--lens", str(tmp_path / "lens.h5"), "--quiet"]) == 0
-    assert {"image.h5", "image.png", "scene.h5"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"image.h5", "image.png", "scene.h5"} <= {
+        path.name for path in (tmp_path / "out").iterdir()
+    }
 
 
 def test_light_that_the_pillars_are_not_known_for_is_told_and_no_error():
-    """A diode of 20 nm, pillars known to 9.5 nm below its middle and 12 nm above: two tails of a normal distribution,
-    in points 0.25 nm apart, of which silicon weighs the blue by 4 % more. The image's wavelengths lie within."""
+    """A diode of 20 nm, pillars known to 9.5 nm below its middle and 12 nm above: two
+    tails of a normal distribution,
+    in points 0.25 nm apart, of which silicon weighs the blue by 4 % more. The image's
+    wavelengths lie within."""
     known = replace(LENS, proxy=replace(m.PROXY, wavelengths_um=(0.8405, 0.862)))
     deviation = 20.0 / math.sqrt(8 * math.log(2))
     tails = sum(math.erfc(away / deviation / math.sqrt(2)) / 2 for away in (9.5, 12))
     states = dataset.states_at(torch.arange(1), 5)
-    made = imaged.imaged(known, Camera(16, 9.0), RIG, lambda c, rig: render(states, rig=rig, camera=c), fwhm_nm=20.0)
+    made = imaged.imaged(
+        known,
+        Camera(16, 9.0),
+        RIG,
+        lambda c, rig: render(states, rig=rig, camera=c),
+        fwhm_nm=20.0,
+    )
     assert made.parts["unknown"] == pytest.approx(tails, rel=0.05)
-    assert made.light.startswith(f"; {made.parts['unknown']:.2g} of the light lies beyond 840.5 to 862 nm")
+    assert made.light.startswith(
+        f"; {made.parts['unknown']:.2g} of the light lies beyond 840.5 to 862 nm"
+    )
     assert made.error < made.parts["unknown"] / 3
 
 
 def test_an_image_above_its_aim_ends_1_and_says_what_does_it(tmp_path, capsys):
-    """A lens of 4 um at 300 um: its rim bends a tenth of the light further than the windows reach."""
+    """A lens of 4 um at 300 um: its rim bends a tenth of the light further than the
+    windows reach.
+    """
     focus = Focus(0.85, 300.0, 3000.0)
     phase = design.phase_of(None, focus, radius_um=2.0)
     tiny, _ = design.make(phase, focus, aperture_um=4.0, cell=m.CELL, proxy=m.PROXY)
@@ -134,8 +171,17 @@ def test_an_image_above_its_aim_ends_1_and_says_what_does_it(tmp_path, capsys):
 
 
 def test_a_frame_that_sees_behind_the_lens_is_refused_with_its_angle():
-    """12 samples of 9 um and 16 at each side: 198 um from the axis, 77 degrees at 46 um, past the face's edge."""
+    """12 samples of 9 um and 16 at each side: 198 um from the axis, 77 degrees at 46
+    um, past the face's edge.
+    """
     near = replace(LENS, sensor_distance_um=46.0)
     states = dataset.states_at(torch.arange(1), 0)
-    with pytest.raises(SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"):
-        imaged.imaged(near, Camera(12, 9.0), Rig(), lambda camera, rig: render(states, rig=rig, camera=camera))
+    with pytest.raises(
+        SceneError, match="reaches to 77 degrees through a lens 46 um before its sensor"
+    ):
+        imaged.imaged(
+            near,
+            Camera(12, 9.0),
+            Rig(),
+            lambda camera, rig: render(states, rig=rig, camera=camera),
+        )

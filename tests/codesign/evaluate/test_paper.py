@@ -1,4 +1,6 @@
-"""The paper beside ours: transcription against the paper's own text, ratios, and what is said of what is missing."""
+"""The paper beside ours: transcription against the paper's own text, ratios, and what
+is said of what is missing.
+"""
 
 import json
 import re
@@ -20,7 +22,9 @@ RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
 
 
 def test_every_number_stands_in_the_paper(shared):
-    text = "\n".join(path.read_text(encoding="utf-8") for path in (shared / "paper").glob("*.txt"))
+    text = "\n".join(
+        path.read_text(encoding="utf-8") for path in (shared / "paper").glob("*.txt")
+    )
     numbers = set(re.findall(r"\d+\.\d+|\d+", text.replace(",", "")))
     known = {float(n) for n in numbers}
     for claim in paper.claims():
@@ -37,24 +41,44 @@ def test_ratios_are_those_of_the_numbers_beside_them():
     for claim in paper.claims():
         found = RATIO.match(claim.note)
         if claim.unit == "ratio" and found:
-            assert claim.value == pytest.approx(float(found[1]) / float(found[2]), abs=6e-4), claim
+            assert claim.value == pytest.approx(
+                float(found[1]) / float(found[2]), abs=6e-4
+            ), claim
             checked += 1
     assert checked >= 15
 
 
 def test_all_of_the_paper_is_there_once():
     places = {claim.place for claim in paper.claims()}
-    wanted = {"Table 1", "Table 2", "Table 3", "Fig. 5", "Fig. 7", "Fig. 8a", "Fig. 8b", "Fig. 10", "Fig. 11", "15 dB"}
+    wanted = {
+        "Table 1",
+        "Table 2",
+        "Table 3",
+        "Fig. 5",
+        "Fig. 7",
+        "Fig. 8a",
+        "Fig. 8b",
+        "Fig. 10",
+        "Fig. 11",
+        "15 dB",
+    }
     assert wanted <= places
     keys = [claim.key for claim in paper.claims()]
     assert len(keys) == len(set(keys))
 
 
-def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angles(tmp_path):
-    """Information summed over the channels of its first row; scenes with their own intervals."""
+def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angles(
+    tmp_path,
+):
+    """Information summed over the channels of its first row; scenes with their own
+    intervals.
+    """
 
     def lens(scene, *angles):
-        return {"scene_ratios": {"axial": scene}, "information_per_mm2": [[one, [9.0, 7.0]] for one in angles]}
+        return {
+            "scene_ratios": {"axial": scene},
+            "information_per_mm2": [[one, [9.0, 7.0]] for one in angles],
+        }
 
     told = {
         "angles_deg": [0, 12.5], "normalisation": "light",
@@ -66,7 +90,9 @@ def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angle
     path = tmp_path / "optics.json"
     path.write_text(json.dumps(told))
     found = paper.of_optics(path)
-    assert found["scenes/axial/proposed"] == Measured(1.7, 1.4, 2.3, "same states, images of equal light")
+    assert found["scenes/axial/proposed"] == Measured(
+        1.7, 1.4, 2.3, "same states, images of equal light"
+    )
     assert found["information/0/proposed"].value == pytest.approx(8.0 / 2.0)
     assert found["information/12.5/proposed"].value == pytest.approx(3.5 / 5.0)
     assert found["information/12.5/hyperbolic"].value == 1
@@ -76,7 +102,10 @@ def test_measurements_of_optics_are_ratios_to_the_hyperbolic_lens_at_equal_angle
 
 
 def test_what_was_not_measured_says_how_to_and_what_was_has_a_ratio():
-    told = {line.claim.key: line for line in paper.lines({"iou/proposed": Measured(0.47, 0.4, 0.5, "here")})}
+    told = {
+        line.claim.key: line
+        for line in paper.lines({"iou/proposed": Measured(0.47, 0.4, 0.5, "here")})
+    }
     assert told["iou/proposed"].ratio == pytest.approx(0.5)
     assert told["iou/proposed"].words()[3] == "0.47 [0.4, 0.5]"
     missing = told["gaze_axial/ratio"].words()
@@ -85,15 +114,30 @@ def test_what_was_not_measured_says_how_to_and_what_was_has_a_ratio():
 
 
 def _experiment(path, axial):
-    row = {"mmacs": 2.0, "gaze_axial_deg": axial, "gaze_lateral_deg": 1.0, "slip_mm": 0.4, "iou": 0.9}
+    row = {
+        "mmacs": 2.0,
+        "gaze_axial_deg": axial,
+        "gaze_lateral_deg": 1.0,
+        "slip_mm": 0.4,
+        "iou": 0.9,
+    }
     rows = [
         {**row, "name": "proposed", "iou_interval": [0.8, 1.0]},
         {**row, "name": "hyperbolic", "gaze_axial_deg": 2.0},
     ]
-    ratio = {"quantity": "gaze_axial_deg", "against": "hyperbolic", "ratio": axial / 2, "interval": [0.1, 0.9]}
+    ratio = {
+        "quantity": "gaze_axial_deg",
+        "against": "hyperbolic",
+        "ratio": axial / 2,
+        "interval": [0.1, 0.9],
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {"subjects": 3, "frames": 9, "seed": 0}
-    path.write_text(json.dumps({"first": "proposed", "settings": about, "runs": rows, "ratios": [ratio]}))
+    path.write_text(
+        json.dumps(
+            {"first": "proposed", "settings": about, "runs": rows, "ratios": [ratio]}
+        )
+    )
 
 
 def test_measurements_are_collected_from_their_files(tmp_path):
@@ -110,7 +154,12 @@ def test_equal_budgets_and_equal_accuracy_of_two_runs():
     def rows(*pairs):
         return [{"budget_mmacs": b, "mmacs": b, "axial_slip_mm": e} for b, e in pairs]
 
-    found = paper.of_runs({"proposed": rows((2.0, 0.5), (8.0, 0.3)), "hyperbolic": rows((2.0, 1.0), (8.0, 0.5))})
+    found = paper.of_runs(
+        {
+            "proposed": rows((2.0, 0.5), (8.0, 0.3)),
+            "hyperbolic": rows((2.0, 1.0), (8.0, 0.5)),
+        }
+    )
     assert found["fig8a/error"].value == 0.5
     assert found["fig8a/compute"].value == 0.25
     assert paper.of_runs({"proposed": rows((2.0, 0.5))}) == {}
@@ -118,7 +167,9 @@ def test_equal_budgets_and_equal_accuracy_of_two_runs():
 
 def test_files_of_other_versions_are_named(tmp_path):
     (tmp_path / "old.json").write_text('{"runs": []}')
-    with pytest.raises(StoreError, match="ratios, settings missing: made by another version"):
+    with pytest.raises(
+        StoreError, match="ratios, settings missing: made by another version"
+    ):
         paper.of_experiment(tmp_path / "old.json")
     (tmp_path / "cut.json").write_text('{"runs": [')
     with pytest.raises(StoreError, match="not a JSON file"):
@@ -140,10 +191,20 @@ def test_the_command_lists_claims_and_overwrites_only_by_force(tmp_path, capsys)
 
 @pytest.mark.slow
 def test_one_command_measures_and_compares(tmp_path, capsys):
-    text = m.TINY.replace("[optics]", "[optics]\nimage_tolerance = 0.5")  # a toy's PSFs change from pixel to pixel
+    text = m.TINY.replace(
+        "[optics]", "[optics]\nimage_tolerance = 0.5"
+    )  # a toy's PSFs change from pixel to pixel
     for name in ("a", "b"):
         m.finished_run(tmp_path / name, text)
-    words = ["evaluate", "paper", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(tmp_path / "out"), "--json"]
+    words = [
+        "evaluate",
+        "paper",
+        str(tmp_path / "a"),
+        str(tmp_path / "b"),
+        "-o",
+        str(tmp_path / "out"),
+        "--json",
+    ]
     assert main([*words, "--subjects", "2", "--scenes", "2"]) == 0
     told = {line["key"]: line for line in json.loads(capsys.readouterr().out)["lines"]}
     assert told["gaze_axial/ratio"]["ours"]["value"] == 1.0  # the same run twice

@@ -1,4 +1,6 @@
-"""Claims of the paper beside typed measurements: cells of the table, and what each file is read for."""
+"""Claims of the paper beside typed measurements: cells of the table, and what each file
+is read for.
+"""
 
 import json
 import math
@@ -44,7 +46,10 @@ def test_pictures_are_looked_for_by_name_and_numbers_are_no_pictures(tmp_path):
     for name in (first, number.key.replace("/", "-")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
-    told = {line.claim.key: line for line in paper.lines({number.key: Measured(3.0)}, tmp_path)}
+    told = {
+        line.claim.key: line
+        for line in paper.lines({number.key: Measured(3.0)}, tmp_path)
+    }
     assert told[shown[0].key].picture == first
     assert told[shown[1].key].picture == ""
     assert told[number.key].ours == Measured(3.0)
@@ -52,8 +57,12 @@ def test_pictures_are_looked_for_by_name_and_numbers_are_no_pictures(tmp_path):
     assert [line.picture for line in paper.lines({}) if line.picture] == []
 
 
-def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyperbolic_lens(tmp_path):
-    """Quantities without an interval have none; a network without a mask has no overlap."""
+def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyperbolic_lens(
+    tmp_path,
+):
+    """Quantities without an interval have none; a network without a mask has no
+    overlap.
+    """
     run = {"name": "proposed", "mmacs": 3.14159, "slip_mm": 0.31, "slip_mm_interval": [0.2, 0.45], "iou": None,
            "gaze_axial_deg": 1.7, "gaze_axial_deg_interval": [1.1, 2.9], "gaze_lateral_deg": 0.6}  # fmt: skip
     ratios = [
@@ -67,7 +76,9 @@ def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyper
     (tmp_path / "e.json").write_text(json.dumps(told))
     found = paper.of_experiment(tmp_path / "e.json")
     words = "6 synthetic subjects, 3.1 MMACs, seed 11"
-    assert set(found) == {f"{k}/proposed" for k in ("slip", "gaze_axial", "gaze_lateral")} | {
+    assert set(found) == {
+        f"{k}/proposed" for k in ("slip", "gaze_axial", "gaze_lateral")
+    } | {
         "slip/ratio",
         "gaze_lateral/ratio",
     }
@@ -77,9 +88,11 @@ def test_an_experiment_gives_every_quantity_of_every_run_and_ratios_to_the_hyper
     assert lateral.value == 0.6
     assert math.isnan(lateral.low)
     assert math.isnan(lateral.high)
-    assert (found["slip/ratio"].value, found["slip/ratio"].low, found["slip/ratio"].high) == pytest.approx(
-        (0.4, 0.3, 0.7)
-    )
+    assert (
+        found["slip/ratio"].value,
+        found["slip/ratio"].low,
+        found["slip/ratio"].high,
+    ) == pytest.approx((0.4, 0.3, 0.7))
     assert found["gaze_lateral/ratio"].value == 0.7
 
 
@@ -88,14 +101,20 @@ def test_dim_light_is_ours_over_ours_and_theirs_over_ours(tmp_path):
 
     def written(name, **errors):
         (tmp_path / name).write_text(
-            json.dumps({"runs": [{"name": n, "gaze_axial_deg": v} for n, v in errors.items()]})
+            json.dumps(
+                {"runs": [{"name": n, "gaze_axial_deg": v} for n, v in errors.items()]}
+            )
         )
         return tmp_path / name
 
     bright = written("a", proposed=1.2, hyperbolic=1.1, double_helix=2.0)
-    found = paper.of_dim(bright, written("b", proposed=1.8, hyperbolic=2.7, double_helix=4.5))
+    found = paper.of_dim(
+        bright, written("b", proposed=1.8, hyperbolic=2.7, double_helix=4.5)
+    )
     values = {key: one.value for key, one in found.items()}
-    assert values == pytest.approx({"dim/proposed": 1.5, "dim/hyperbolic": 1.5, "dim/double_helix": 2.5})
+    assert values == pytest.approx(
+        {"dim/proposed": 1.5, "dim/hyperbolic": 1.5, "dim/double_helix": 2.5}
+    )
     assert set(paper.of_dim(bright, written("c", proposed=1.8, double_helix=0.9))) == {
         "dim/proposed",
         "dim/double_helix",
@@ -108,7 +127,9 @@ def rows(*pairs):
 
 
 def test_equal_errors_are_enough_and_what_is_never_reached_is_left_out():
-    """Their best, 0.4 mm at 6.3 MMACs and dearer again: ours has just that at 2.1 and less at 4.2."""
+    """Their best, 0.4 mm at 6.3 MMACs and dearer again: ours has just that at 2.1 and
+    less at 4.2.
+    """
     theirs = rows((2.0, 1.9, 0.8), (9.0, 8.8, 0.4), (7.0, 6.3, 0.4))
     ours = rows((3.0, 2.1, 0.4), (9.0, 4.2, 0.3), (2.0, 1.6, 0.41), (7.0, 6.1, 0.2))
     found = paper.of_runs({"proposed": ours, "hyperbolic": theirs})
@@ -116,16 +137,25 @@ def test_equal_errors_are_enough_and_what_is_never_reached_is_left_out():
     assert found["fig8a/error"].value == pytest.approx(0.41 / 0.8)
     worse = paper.of_runs({"proposed": rows((2.0, 1.6, 0.41)), "hyperbolic": theirs})
     assert set(worse) == {"fig8a/error"}
-    assert paper.of_runs({"proposed": rows((2.5, 2.1, 0.4)), "hyperbolic": theirs}) == {}
+    assert (
+        paper.of_runs({"proposed": rows((2.5, 2.1, 0.4)), "hyperbolic": theirs}) == {}
+    )
     unread = [*theirs, {"budget_mmacs": 1.0, "mmacs": 0.9}]
-    assert paper.of_runs({"proposed": ours, "hyperbolic": unread})["fig8a/error"].value == pytest.approx(0.41 / 0.8)
+    assert paper.of_runs({"proposed": ours, "hyperbolic": unread})[
+        "fig8a/error"
+    ].value == pytest.approx(0.41 / 0.8)
 
 
-def test_information_is_summed_over_depths_of_unbinned_pixels_beside_the_hyperbolic_lens(tmp_path):
+def test_information_is_summed_over_depths_of_unbinned_pixels_beside_the_hyperbolic_lens(
+    tmp_path,
+):
     """7 and 9 over 3 and 1 at 5 degrees; binned ones stand beside and are not read."""
 
     def lens(first, second, scenes):
-        return {"information_per_mm2": [[first, [0.5, 0.1]], [second, [0.2, 0.9]]], "scene_ratios": scenes}
+        return {
+            "information_per_mm2": [[first, [0.5, 0.1]], [second, [0.2, 0.9]]],
+            "scene_ratios": scenes,
+        }
 
     told = {
         "angles_deg": [0.0, 5.0], "normalisation": "energy",
@@ -138,8 +168,15 @@ def test_information_is_summed_over_depths_of_unbinned_pixels_beside_the_hyperbo
     found = paper.of_optics(tmp_path / "o.json")
     assert found["information/5/mine"].value == pytest.approx(4.0)
     assert found["information/0/mine"].value == pytest.approx(0.3)
-    assert found["information/5/mine"].conditions == "honest I(z), energy normalisation, pixels not binned"
-    assert (found["scenes/slip/mine"].value, found["scenes/slip/mine"].low, found["scenes/slip/mine"].high) == (
+    assert (
+        found["information/5/mine"].conditions
+        == "honest I(z), energy normalisation, pixels not binned"
+    )
+    assert (
+        found["scenes/slip/mine"].value,
+        found["scenes/slip/mine"].low,
+        found["scenes/slip/mine"].high,
+    ) == (
         1.6,
         1.5,
         1.8,

@@ -1,4 +1,6 @@
-"""Table 2 and Fig. 8b from finished runs: what each run counts as, ratios with a known answer, gaze of two networks."""
+"""Table 2 and Fig. 8b from finished runs: what each run counts as, ratios with a known
+answer, gaze of two networks.
+"""
 
 import functools
 import json
@@ -30,25 +32,43 @@ def folder(tmp_path_factory):
 
 def _result(path, **entries):
     path.mkdir(parents=True)
-    rows = [{"budget_mmacs": b, "mmacs": b, "axial_slip_mm": e} for b, e in entries.pop("rows", ((2.0, 1.0),))]
+    rows = [
+        {"budget_mmacs": b, "mmacs": b, "axial_slip_mm": e}
+        for b, e in entries.pop("rows", ((2.0, 1.0),))
+    ]
     (path / "result.json").write_text(json.dumps({"rows": rows, **entries}))
     return path
 
 
 def test_compute_of_a_frozen_part_is_that_at_its_own_best_error():
     ours = [{"mmacs": 2.0, "axial_slip_mm": 0.9}, {"mmacs": 6.0, "axial_slip_mm": 0.5}]
-    fixed = [{"mmacs": 4.0, "axial_slip_mm": 1.2}, {"mmacs": 14.0, "axial_slip_mm": 0.9}]
+    fixed = [
+        {"mmacs": 4.0, "axial_slip_mm": 1.2},
+        {"mmacs": 14.0, "axial_slip_mm": 0.9},
+    ]
     better = [{"mmacs": 9.0, "axial_slip_mm": 0.4}]
     found = paper_runs.of_ablations(ours, {"optics": fixed, "pitch": better})
-    assert found["fig8b/optics"].value == 7.0  # 14 MMACs for 0.9 mm, which 2 MMACs of ours reach
+    assert (
+        found["fig8b/optics"].value == 7.0
+    )  # 14 MMACs for 0.9 mm, which 2 MMACs of ours reach
     assert "0.90 mm" in found["fig8b/optics"].conditions
     assert "fig8b/pitch" not in found  # ours never gets there: no number is made up
     assert {claim.key for claim in paper.claims()} >= {"fig8b/optics", "fig8b/pitch"}
 
 
 def test_lenses_are_compared_at_the_largest_tolerance_of_their_runs(monkeypatch):
-    told = {Path("a/run.toml"): 0.04, Path("b/run.toml"): 0.11, Path("c/run.toml"): 0.07}
-    monkeypatch.setattr(runs, "load", lambda path: SimpleNamespace(optics=SimpleNamespace(image_tolerance=told[path])))
+    told = {
+        Path("a/run.toml"): 0.04,
+        Path("b/run.toml"): 0.11,
+        Path("c/run.toml"): 0.07,
+    }
+    monkeypatch.setattr(
+        runs,
+        "load",
+        lambda path: SimpleNamespace(
+            optics=SimpleNamespace(image_tolerance=told[path])
+        ),
+    )
     assert paper_runs.image_tolerance([Path("a"), Path("b"), Path("c")]) == 0.11
 
 
@@ -58,7 +78,9 @@ def test_runs_are_told_apart_by_what_they_wrote(tmp_path):
     three = _result(tmp_path / "c", network="nvgaze", frozen=["pitch"])
     assert [part for part, _ in paper_runs.frozen_rows((one, two, three))] == ["optics"]
     again = _result(tmp_path / "d", network="supernet", frozen=["optics"])
-    with pytest.raises(TrainingError, match="both have optics frozen; give one of them"):
+    with pytest.raises(
+        TrainingError, match="both have optics frozen; give one of them"
+    ):
         list(paper_runs.frozen_rows((one, again)))
     with pytest.raises(TrainingError, match="no finished run"):
         paper_runs.kind_of(tmp_path)
@@ -69,21 +91,48 @@ def test_networks_of_the_table_have_their_claims():
     told = {"x": {"network": "supernet", "rows": [row, {**row, "personal_deg": 1.0}]}}
     told |= {name: {"network": name, "rows": [row]} for name in paper_runs.TABLE_2}
     found = paper_runs.of_gaze(told)
-    assert set(found) == {claim.key for claim in paper.claims() if claim.place == "Table 2"}
+    assert set(found) == {
+        claim.key for claim in paper.claims() if claim.place == "Table 2"
+    }
     assert found["table2/proposed_efficient"].value == 1.5
     assert found["table2/proposed_accurate"].value == 1.0
 
 
-def test_gaze_of_both_kinds_of_network_stands_in_the_table(folder, tmp_path, monkeypatch):
+def test_gaze_of_both_kinds_of_network_stands_in_the_table(
+    folder, tmp_path, monkeypatch
+):
     other, page = m.finished_baseline(tmp_path / "nvgaze"), tmp_path / "page"
-    monkeypatch.setattr(paper_runs, "gaze", functools.partial(paper_runs.gaze, people=3, each=20))
-    monkeypatch.setattr(command_paper, "_measure", lambda options, at: command_paper._measure_gaze(options, at / GAZE))
-    arguments = ["evaluate", "paper", str(folder), "--others", str(other), "-o", str(page), "--quiet"]
+    monkeypatch.setattr(
+        paper_runs, "gaze", functools.partial(paper_runs.gaze, people=3, each=20)
+    )
+    monkeypatch.setattr(
+        command_paper,
+        "_measure",
+        lambda options, at: command_paper._measure_gaze(options, at / GAZE),
+    )
+    arguments = [
+        "evaluate",
+        "paper",
+        str(folder),
+        "--others",
+        str(other),
+        "-o",
+        str(page),
+        "--quiet",
+    ]
     assert main(arguments) == 0
     for entry in json.loads((page / GAZE).read_text()).values():
         (row,) = entry["rows"]
         assert all(0 < row[key] <= 180 for key in KEYS)
-        assert row["personal_floor_deg"] < row["personal_deg"]  # an untrained network knows less than the truth
+        assert (
+            row["personal_floor_deg"] < row["personal_deg"]
+        )  # an untrained network knows less than the truth
     told = json.loads((page / "paper.json").read_text())
-    measured = {line["key"] for line in told if line["place"] == "Table 2" and line["ours"]}
-    assert measured == {"table2/nvgaze", "table2/proposed_efficient", "table2/proposed_accurate"}
+    measured = {
+        line["key"] for line in told if line["place"] == "Table 2" and line["ours"]
+    }
+    assert measured == {
+        "table2/nvgaze",
+        "table2/proposed_efficient",
+        "table2/proposed_accurate",
+    }

@@ -1,4 +1,6 @@
-"""A virtual experiment's points, groups of frames and errors, by numbers that are typed in."""
+"""A virtual experiment's points, groups of frames and errors, by numbers that are typed
+in.
+"""
 
 import math
 
@@ -9,10 +11,29 @@ from codesign.evaluate.shown import AXIAL, LATERAL, ExperimentConfig, Result, Tr
 from metalens.ground.errors import ConfigError
 
 SLIP_MM = np.array(
-    [[0, 0, 0], [-3, 0, 0], [0, 0, 2], [0, 1, 2], [0, 4, 0], [0, 0, 5], [2, 0, 5], [0, 0, math.nan]], float
+    [
+        [0, 0, 0],
+        [-3, 0, 0],
+        [0, 0, 2],
+        [0, 1, 2],
+        [0, 4, 0],
+        [0, 0, 5],
+        [2, 0, 5],
+        [0, 0, math.nan],
+    ],
+    float,
 )
 READ_MM = SLIP_MM + np.array(
-    [[1, -2, 3], [4, 1, -1], [2, 2, 7], [0, 0, 1], [-5, 3, 2], [6, 1, 1], [1, 1, 1], [1, 2, 3]]
+    [
+        [1, -2, 3],
+        [4, 1, -1],
+        [2, 2, 7],
+        [0, 0, 1],
+        [-5, 3, 2],
+        [6, 1, 1],
+        [1, 1, 1],
+        [1, 2, 3],
+    ]
 )
 GAZE_DEG = np.array([math.nan, math.nan, 0.25, 4.0, math.nan, 2.75, math.nan, 8.0])
 SUBJECT = np.array([3, 3, 3, 3, 5, 5, 7, 7])
@@ -30,9 +51,17 @@ def test_a_share_is_of_all_points_of_an_oblong_grid():
         assert len(ExperimentConfig(grid=grid, share=0.17).stimuli_deg) == 18
         with pytest.raises(ConfigError, match="3 or more stimuli"):
             ExperimentConfig(grid=grid, share=0.05)
-    config = ExperimentConfig(subjects=3, grid=(2, 9), axial_mm=(1.0, 2.0, 4.0), lateral_mm=(-3.0,))
+    config = ExperimentConfig(
+        subjects=3, grid=(2, 9), axial_mm=(1.0, 2.0, 4.0), lateral_mm=(-3.0,)
+    )
     assert config.frames == 3 * 18 * (1 + 3 + 1)
-    assert config.slips_mm.tolist() == [[0, 0, 0], [-3, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 4]]
+    assert config.slips_mm.tolist() == [
+        [0, 0, 0],
+        [-3, 0, 0],
+        [0, 0, 1],
+        [0, 0, 2],
+        [0, 0, 4],
+    ]
 
 
 def test_groups_hold_frames_that_slip_along_one_axis_and_the_origin():
@@ -53,7 +82,16 @@ def test_errors_of_slippage_are_beside_those_of_the_frames_that_calibrated():
     assert found.slip_error_mm == pytest.approx(np.abs(error), nan_ok=True)
     assert found.slip_visible_mm == pytest.approx(np.abs(error + 1), nan_ok=True)
     assert np.isnan(result().slip_visible_mm).all()
-    assert found.within.tolist() == [True, False, True, True, False, False, False, False]
+    assert found.within.tolist() == [
+        True,
+        False,
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
     calibrated = {3: error[:2].mean(0), 5: error[4], 7: error[6]}
     want = np.array(
         [np.full(3, math.nan) if math.isnan(g) else np.abs(e - calibrated[s])
@@ -66,9 +104,13 @@ def test_means_of_a_subject_leave_out_what_is_unknown():
     found = result()
     assert found.per_subject(GAZE_DEG) == pytest.approx([(0.25 + 4.0) / 2, 2.75, 8.0])
     axial = found.trial.group(AXIAL)
-    assert found.per_subject(GAZE_DEG, axial) == pytest.approx([0.25, 2.75, math.nan], nan_ok=True)
+    assert found.per_subject(GAZE_DEG, axial) == pytest.approx(
+        [0.25, 2.75, math.nan], nan_ok=True
+    )
     lateral = found.trial.group(LATERAL)
-    assert found.per_subject(READ_MM[:, 0], lateral) == pytest.approx([1.0, math.nan, math.nan], nan_ok=True)
+    assert found.per_subject(READ_MM[:, 0], lateral) == pytest.approx(
+        [1.0, math.nan, math.nan], nan_ok=True
+    )
 
 
 def test_points_span_the_field_across_and_down():

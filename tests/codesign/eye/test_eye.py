@@ -1,4 +1,6 @@
-"""The eye's geometry against closed forms: Listing's law, refraction at the cornea, projection, population limits."""
+"""The eye's geometry against closed forms: Listing's law, refraction at the cornea,
+projection, population limits.
+"""
 
 import math
 from dataclasses import replace
@@ -19,9 +21,14 @@ FRONTAL = Rig(elevation_rad=0.0, aim_um=(0.0, 0.0))
 def mean_states(n=1, **changes):
     """The mean subject, looking straight ahead, nothing slipped."""
     still = eye.draw(n, 0)
-    traits = torch.tensor([[t.mean for t in POPULATION.values()]] * n, dtype=torch.float64)
+    traits = torch.tensor(
+        [[t.mean for t in POPULATION.values()]] * n, dtype=torch.float64
+    )
     zero = torch.zeros(n, dtype=torch.float64)
-    pair, triple = torch.zeros(n, 2, dtype=torch.float64), torch.zeros(n, 3, dtype=torch.float64)
+    pair, triple = (
+        torch.zeros(n, 2, dtype=torch.float64),
+        torch.zeros(n, 3, dtype=torch.float64),
+    )
     base = States(traits, still.textures, pair, zero, triple, pair, zero + 1, zero + 1)
     return replace(base, **changes)
 
@@ -32,7 +39,9 @@ def pack(states, rig=FRONTAL):
 
 def test_same_seed_same_states_and_limits_hold():
     a, b = eye.draw(200, 7), eye.draw(200, 7)
-    assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in States.__slots__)
+    assert all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in States.__slots__
+    )
     for name, trait in POPULATION.items():
         values = a.trait(name)
         assert float(values.min()) >= trait.low
@@ -40,8 +49,10 @@ def test_same_seed_same_states_and_limits_hold():
 
 
 def test_people_are_cut_where_few_of_them_are():
-    """A limit lies 1.5 to 5.3 deviations from the mean, so a draw's mean is the trait's: the longer tail of a normal
-    cut at 1.5 and never moves it by 0.14 of a deviation. A thousand draws tell it to 0.03, four times that."""
+    """A limit lies 1.5 to 5.3 deviations from the mean, so a draw's mean is the
+    trait's: the longer tail of a normal
+    cut at 1.5 and never moves it by 0.14 of a deviation. A thousand draws tell it to
+    0.03, four times that."""
     drawn = eye.draw(1000, 3)
     for name, trait in POPULATION.items():
         values = drawn.trait(name).double().numpy()
@@ -49,27 +60,40 @@ def test_people_are_cut_where_few_of_them_are():
             assert trait.low == trait.mean == trait.high
             assert (values == trait.mean).all()
             continue
-        below, above = (trait.mean - trait.low) / trait.sd, (trait.high - trait.mean) / trait.sd
+        below, above = (
+            (trait.mean - trait.low) / trait.sd,
+            (trait.high - trait.mean) / trait.sd,
+        )
         assert min(below, above) > 1.5 - 1e-9
         assert max(below, above) < 5.3
         assert abs(values.mean() - trait.mean) < (0.14 + 4 * 0.032) * trait.sd, name
         assert 0.75 * trait.sd < values.std() < 1.12 * trait.sd, name
 
 
-@pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.3, 0.0), (0.2, -0.3), (0.0, 1.2), (2.0, 1.0)])
+@pytest.mark.parametrize(
+    "gaze", [(0.0, 0.0), (0.3, 0.0), (0.2, -0.3), (0.0, 1.2), (2.0, 1.0)]
+)
 def test_listing_turns_by_the_shortest_way(gaze):
-    """Axes stay orthonormal, the axis makes the stated angle, and the rotation has no part about the primary axis."""
+    """Axes stay orthonormal, the axis makes the stated angle, and the rotation has no
+    part about the primary axis.
+    """
     p = pack(mean_states(gaze_rad=torch.tensor([gaze], dtype=torch.float64)))[0]
     axes = torch.stack([p[k : k + 3] for k in (model.IRIS_X, model.IRIS_Y, model.AXIS)])
-    face = torch.stack([p[k : k + 3] for k in (model.FACE_X, model.FACE_Y, model.FACE_Z)])
+    face = torch.stack(
+        [p[k : k + 3] for k in (model.FACE_X, model.FACE_Y, model.FACE_Z)]
+    )
     assert torch.allclose(axes @ axes.mT, torch.eye(3, dtype=torch.float64), atol=1e-12)
-    assert float(axes[2] @ face[2]) == pytest.approx(math.cos(math.hypot(*gaze)), abs=1e-12)
+    assert float(axes[2] @ face[2]) == pytest.approx(
+        math.cos(math.hypot(*gaze)), abs=1e-12
+    )
     turn = face @ axes.mT  # rotation in face coordinates
     assert float(turn[0, 1] - turn[1, 0]) == pytest.approx(0, abs=1e-12)
 
 
 def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
-    """Paraxial closed form for one surface: 1/s' = n/s - (n-1)/R, magnification n s' / s... seen on the axis."""
+    """Paraxial closed form for one surface: 1/s' = n/s - (n-1)/R, magnification n s' /
+    s... seen on the axis.
+    """
     p = pack(mean_states())
     radius = torch.tensor([[[10.0, 0.0]]], dtype=torch.float64)  # um: paraxial
     tangent = float(landmarks.iris_to_camera(p, radius)[0, 0, 0])
@@ -87,7 +111,9 @@ def test_pupil_is_seen_nearer_and_larger_through_the_cornea():
 
 
 def test_refracted_rays_obey_snell_at_the_cornea():
-    p = pack(mean_states(gaze_rad=torch.tensor([[0.35, 0.2]], dtype=torch.float64)), Rig())
+    p = pack(
+        mean_states(gaze_rad=torch.tensor([[0.35, 0.2]], dtype=torch.float64)), Rig()
+    )
     target = torch.tensor([[[1500.0, -700.0]]], dtype=torch.float64)
     t = landmarks.iris_to_camera(p, target)[0, 0].numpy()
     d = np.array([*t, 1.0]) / math.hypot(*t, 1.0)
@@ -97,7 +123,10 @@ def test_refracted_rays_obey_snell_at_the_cornea():
     b = ball @ d
     hit = (b - math.sqrt(b**2 - ball @ ball + value[model.CORNEA_R] ** 2)) * d
     normal = (hit - ball) / value[model.CORNEA_R]
-    x, y = value[model.IRIS_X : model.IRIS_X + 3], value[model.IRIS_Y : model.IRIS_Y + 3]
+    x, y = (
+        value[model.IRIS_X : model.IRIS_X + 3],
+        value[model.IRIS_Y : model.IRIS_Y + 3],
+    )
     point = centre + value[model.PUPIL_D] * axis + 1500.0 * x - 700.0 * y
     inner = (point - hit) / np.linalg.norm(point - hit)
     assert np.linalg.norm(np.cross(normal, d)) == pytest.approx(
@@ -107,11 +136,19 @@ def test_refracted_rays_obey_snell_at_the_cornea():
 
 
 def test_slip_to_plus_x_moves_landmarks_by_the_pinhole_law():
-    still, moved = mean_states(), mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64))
+    still, moved = (
+        mean_states(),
+        mean_states(slip_um=torch.tensor([[500.0, 0.0, 0.0]], dtype=torch.float64)),
+    )
     camera = Camera()
-    a, b = (camera.position_px(landmarks.landmark_points(pack(s)), FRONTAL)[0] for s in (still, moved))
+    a, b = (
+        camera.position_px(landmarks.landmark_points(pack(s)), FRONTAL)[0]
+        for s in (still, moved)
+    )
     apex = landmarks.NAMES.index("corneal apex")
-    assert float(b[apex, 0] - a[apex, 0]) == pytest.approx(500 / (21000 - 3600) * 2000 / 9, rel=1e-9)
+    assert float(b[apex, 0] - a[apex, 0]) == pytest.approx(
+        500 / (21000 - 3600) * 2000 / 9, rel=1e-9
+    )
     assert float((b - a)[:, 1].abs().max()) < 1e-9
 
 
@@ -119,7 +156,9 @@ def test_visual_axis_is_kappa_from_the_optic_axis():
     states = mean_states()
     optic, visual = eye.directions(states, FRONTAL)
     want = math.hypot(math.tan(math.radians(5)), math.tan(math.radians(1.5)))
-    assert float(torch.linalg.cross(optic, visual).norm() / (optic * visual).sum()) == pytest.approx(want, rel=1e-9)
+    assert float(
+        torch.linalg.cross(optic, visual).norm() / (optic * visual).sum()
+    ) == pytest.approx(want, rel=1e-9)
     assert float(visual[0, 0]) < 0  # towards the nose, at -x
 
 
@@ -128,9 +167,14 @@ def test_gradient_of_the_parameters_is_exact():
 
     def packed(gaze, slip):
         p = pack(replace(states, gaze_rad=gaze, slip_um=slip), Rig())
-        return torch.cat([p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1)  # edge and exposure are held
+        return torch.cat(
+            [p[:, : model.EDGE], p[:, model.UPPER : model.SKEW]], 1
+        )  # edge and exposure are held
 
-    held = states.gaze_rad.clone().requires_grad_(True), states.slip_um.clone().requires_grad_(True)
+    held = (
+        states.gaze_rad.clone().requires_grad_(True),
+        states.slip_um.clone().requires_grad_(True),
+    )
     assert torch.autograd.gradcheck(packed, held, atol=1e-4, rtol=1e-5)
 
 
@@ -150,7 +194,9 @@ def test_motion_ranges_hold():
 
 
 def test_a_parameter_that_is_left_out_or_filled_twice_is_refused():
-    """Parameters stand at the indices that the picture reads, whatever their order here."""
+    """Parameters stand at the indices that the picture reads, whatever their order
+    here.
+    """
     filled = {place: torch.full((3, 1), float(place)) for place in range(model.COUNT)}
     row = eye._row(dict(reversed(filled.items())))
     assert row[1].tolist() == list(range(model.COUNT))

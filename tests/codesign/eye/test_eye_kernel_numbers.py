@@ -1,7 +1,10 @@
-"""The compiled picture of one plane, one sphere and one lamp: ray by ray in closed form, over tiles and beyond them.
+"""The compiled picture of one plane, one sphere and one lamp: ray by ray in closed
+form, over tiles and beyond them.
 
-Pictures of texture are even, so what is left is a lit plane (the face), a lit ball (the globe, its cornea turned away)
-and the soft edge of a lid between them. 37 columns are two tiles and five lanes, six rows a tile and a half.
+Pictures of texture are even, so what is left is a lit plane (the face), a lit ball (the
+globe, its cornea turned away)
+and the soft edge of a lid between them. 37 columns are two tiles and five lanes, six
+rows a tile and a half.
 """
 
 import numpy as np
@@ -51,7 +54,9 @@ def shine(point, normal, d):
     total, v = 0.0, LAMP - point
     for way in (v / np.sqrt(v @ v + 1e6), np.array([1.0, 0.0, 0.0])):
         half = way - d
-        total += (1 + 125 * (1 - max(half @ normal, 0) ** 2 / (half @ half + 1e-3))) ** -2
+        total += (
+            1 + 125 * (1 - max(half @ normal, 0) ** 2 / (half @ half + 1e-3))
+        ) ** -2
     return total
 
 
@@ -64,7 +69,11 @@ def seen(u, w, centre=CENTRE, plane=PLACE, lid=0.0):
     t = np.clip(0.5 + upper / 3_000, 0, 1)
     share = t * t * (3 - 2 * t)
     normal = OUT / np.sqrt(1 + 1e-6)
-    skin = 0.52 * (1 - 0.25 / (1 + ((upper + 250) / 260) ** 2)) * (1 - 0.42 / (1 + ((upper + 1e6) / 260) ** 2))
+    skin = (
+        0.52
+        * (1 - 0.25 / (1 + ((upper + 250) / 260) ** 2))
+        * (1 - 0.42 / (1 + ((upper + 1e6) / 260) ** 2))
+    )
     near = skin * lit(face, normal, 0.35) * 1.7
     along = centre @ d
     far = along - np.sqrt(max(12_000**2 - centre @ centre + along**2, 1e6))
@@ -85,24 +94,39 @@ def rendered(frames, scale):
     light, cover, depth = (np.full(shape, np.nan, np.float32) for _ in range(3))
     pupil = np.full((len(frames), 1, *shape[2:]), np.nan, np.float32)
     given = (np.array(a, np.float32) for a in (frames, scale))
-    kernel.render(*given, BANK, U.astype(np.float32), W.astype(np.float32), light, cover, depth, pupil)
+    kernel.render(
+        *given,
+        BANK,
+        U.astype(np.float32),
+        W.astype(np.float32),
+        light,
+        cover,
+        depth,
+        pupil,
+    )
     return light, cover, depth, pupil
 
 
 def test_a_plane_a_ball_and_the_edge_of_a_lid_are_lit_by_one_lamp():
-    """Frames of which the first is half face, half eye, the second face alone, the third eye alone, as large as their
-    scales: depths are multiplied by them. float32: a fifth of a micrometre per 10 mm of depth, and 5e-4 of the light
+    """Frames of which the first is half face, half eye, the second face alone, the
+    third eye alone, as large as their
+    scales: depths are multiplied by them. float32: a fifth of a micrometre per 10 mm of
+    depth, and 5e-4 of the light
     where a ray grazes the ball and the root of a difference halves the digits.
     Tiles in which there is no eye have no depth of it."""
     lids, scale = (0.0, -1e6, 1e6), (1.0, 1.25, 0.8)
-    light, cover, depth, pupil = rendered([parameters(UPPER=lid) for lid in lids], scale)
+    light, cover, depth, pupil = rendered(
+        [parameters(UPPER=lid) for lid in lids], scale
+    )
     for k, lid in enumerate(lids):
         near, far, share, front, back = picture(lid=lid)
         np.testing.assert_allclose(cover[k], [1 - share, share], atol=1e-5)
         np.testing.assert_allclose(light[k], [near, far], rtol=5e-4, atol=1e-5)
         np.testing.assert_allclose(depth[k, 0], scale[k] * front, rtol=2e-5)
         shown = share > 1e-6
-        np.testing.assert_allclose(depth[k, 1][shown], scale[k] * back[shown], rtol=2e-5)
+        np.testing.assert_allclose(
+            depth[k, 1][shown], scale[k] * back[shown], rtol=2e-5
+        )
     assert not light[1, 1].any()
     assert not depth[1, 1].any()
     assert not light[2, 0].any()
@@ -110,7 +134,9 @@ def test_a_plane_a_ball_and_the_edge_of_a_lid_are_lit_by_one_lamp():
 
 
 def test_the_pupil_is_seen_at_its_image_on_the_axis_of_an_eye_that_looks_along_a_ray():
-    """The cornea's apex is 34 - 12.8 mm away, the pupil 3.5 mm behind it: 1/s' = 1.376/3.5 - 0.376/7.7 per mm."""
+    """The cornea's apex is 34 - 12.8 mm away, the pupil 3.5 mm behind it: 1/s' =
+    1.376/3.5 - 0.376/7.7 per mm.
+    """
     row, column = 4, 19
     d = np.array([U[column], W[row], 1.0])
     d /= np.linalg.norm(d)
@@ -123,7 +149,9 @@ def test_the_pupil_is_seen_at_its_image_on_the_axis_of_an_eye_that_looks_along_a
     virtual = 1 / (1.376 / 3_500 - 0.376 / 7_700)
     assert pupil[0, 0, row, column] == pytest.approx(1, abs=1e-4)
     assert cover[0, 1].min() == pytest.approx(1, abs=1e-6)
-    assert depth[0, 1, row, column] == pytest.approx(1.1 * (21_200 + virtual) * d[2], rel=2e-5)
+    assert depth[0, 1, row, column] == pytest.approx(
+        1.1 * (21_200 + virtual) * d[2], rel=2e-5
+    )
     assert light[0, 1, row, column] >= 1.7 * 0.03 * 0.99
     reach = np.hypot(*(34_000 * np.array(np.meshgrid(U - U[column], W - W[row]))))
     assert not pupil[0, 0][reach > 6_000].any()
@@ -137,7 +165,8 @@ MOVES = [
 
 
 def test_two_tangents_are_the_limits_of_differences():
-    """Lid, eye and face moved by micrometres: slopes of the closed form, taken over 2 um in double precision; in
+    """Lid, eye and face moved by micrometres: slopes of the closed form, taken over 2
+    um in double precision; in
     float32 to 1e-3 of the largest. On the rim of the ball depth has no slope."""
     packed = []
     for lid in (0.0, 700.0):
@@ -148,7 +177,13 @@ def test_two_tangents_are_the_limits_of_differences():
                 tangent[place : place + len(values)] = values
         packed.append([parameters(UPPER=lid), *tangents])
     out = np.full((2, 15, len(W), len(U)), np.nan, np.float32)
-    kernel.differentiate(np.array(packed, np.float32), BANK, U.astype(np.float32), W.astype(np.float32), out)
+    kernel.differentiate(
+        np.array(packed, np.float32),
+        BANK,
+        U.astype(np.float32),
+        W.astype(np.float32),
+        out,
+    )
     for k, lid in enumerate((0.0, 700.0)):
         want = picture(lid=lid)
         shown = want[2] > 1e-6
@@ -168,9 +203,13 @@ def test_two_tangents_are_the_limits_of_differences():
             found = out[k, 5 * at : 5 * at + 5]
             for part in range(4):
                 room = 1e-3 * np.abs(slope[part]).max() + 1e-9
-                np.testing.assert_allclose(found[part], slope[part], rtol=2e-3, atol=room)
+                np.testing.assert_allclose(
+                    found[part], slope[part], rtol=2e-3, atol=room
+                )
             inner = shown & (ball_depth() > 4_000)
-            np.testing.assert_allclose(found[4][inner], slope[4][inner], rtol=2e-3, atol=1e-4)
+            np.testing.assert_allclose(
+                found[4][inner], slope[4][inner], rtol=2e-3, atol=1e-4
+            )
 
 
 def ball_depth():
@@ -181,7 +220,9 @@ def ball_depth():
 
 
 def test_rays_of_a_tile_run_along_its_rows_and_its_rim_is_repeated():
-    """A tile of two rows of 16 from row 2 and column 5 of a frame of three rows and eight columns."""
+    """A tile of two rows of 16 from row 2 and column 5 of a frame of three rows and
+    eight columns.
+    """
     u, w, x = np.arange(10.0, 18.0), np.array([0.1, 0.2, 0.3]), np.zeros(80)
     kernel._aim.py_func(u, w, 2, 5, x, 40, 2)
     row = [15, 16, *[17] * 14]
@@ -191,7 +232,9 @@ def test_rays_of_a_tile_run_along_its_rows_and_its_rim_is_repeated():
 
 @pytest.mark.parametrize(("row", "column"), [(1, 2), (0, 4), (2, 19)])
 def test_the_part_of_a_tile_that_lies_in_the_frame_is_put_there(row, column):
-    """Two rows of 16 lanes from lane 3 into plane (1, 0) of frames of three rows and twenty columns."""
+    """Two rows of 16 lanes from lane 3 into plane (1, 0) of frames of three rows and
+    twenty columns.
+    """
     x, out = np.arange(3.0, 43.0), np.full((2, 2, 3, 20), -1.0)
     kernel._put.py_func(x, 3, 2, out, 1, 0, row, column)
     want = np.full((2, 2, 3, 20), -1.0)
@@ -205,5 +248,8 @@ def test_the_part_of_a_tile_that_lies_in_the_frame_is_put_there(row, column):
 def test_least_and_most_of_the_lanes_of_a_name():
     x = np.array([-9.0, 4.0, 2.0, 7.0, 3.0, 11.0])
     for first, value in ((1, (2, 7)), (2, (2, 7))):
-        assert (kernel._least.py_func(x, first, 3), kernel._most.py_func(x, first, 3)) == value
+        assert (
+            kernel._least.py_func(x, first, 3),
+            kernel._most.py_func(x, first, 3),
+        ) == value
     assert (kernel._least.py_func(x, 0, 6), kernel._most.py_func(x, 0, 6)) == (-9, 11)

@@ -1,4 +1,6 @@
-"""Lashes over an opening of straight margins: where strokes may lie follows from their draws."""
+"""Lashes over an opening of straight margins: where strokes may lie follows from their
+draws.
+"""
 
 import numpy as np
 import pytest
@@ -6,21 +8,38 @@ import torch
 
 from codesign.eye.hair import lashes
 
-SIZE, TOP, BOTTOM, LEFT, RIGHT = 120, 44, 79, 25, 96  # rows TOP ... BOTTOM, columns LEFT ... RIGHT of the opening
-LONG = (0.12 + 0.2 * 0.4) * (RIGHT - LEFT + 1)  # of a lash of the upper lid, pixels, times 0.4 to 1.2
+SIZE, TOP, BOTTOM, LEFT, RIGHT = (
+    120,
+    44,
+    79,
+    25,
+    96,
+)  # rows TOP ... BOTTOM, columns LEFT ... RIGHT of the opening
+LONG = (0.12 + 0.2 * 0.4) * (
+    RIGHT - LEFT + 1
+)  # of a lash of the upper lid, pixels, times 0.4 to 1.2
 
 
 def drawn(sink, rise):
     """Rows that have a stroke, and the picture."""
     opening = torch.zeros(SIZE, SIZE)
     opening[TOP : BOTTOM + 1, LEFT : RIGHT + 1] = 1
-    picture = lashes(opening, np.array([0.37, 0.4, sink, rise, 0.9, *[0.0] * 7])).numpy()
+    picture = lashes(
+        opening, np.array([0.37, 0.4, sink, rise, 0.9, *[0.0] * 7])
+    ).numpy()
     return np.flatnonzero(picture.any(1)), picture
 
 
 def test_lashes_that_neither_sink_nor_rise_lie_on_the_margins():
     rows, picture = drawn(0.0, 0.0)
-    assert set(rows) <= {TOP - 1, TOP, TOP + 1, BOTTOM - 1, BOTTOM, BOTTOM + 1}  # a soft stroke of one pixel
+    assert set(rows) <= {
+        TOP - 1,
+        TOP,
+        TOP + 1,
+        BOTTOM - 1,
+        BOTTOM,
+        BOTTOM + 1,
+    }  # a soft stroke of one pixel
     assert {TOP, BOTTOM} <= set(rows)
     assert 110 / 255 - 0.01 < picture.max() <= 1.0
 
@@ -29,7 +48,9 @@ def test_lashes_that_rise_lie_outside_and_those_of_the_lower_lid_are_half_as_lon
     rows, _ = drawn(0.0, 0.7)
     reach = 1.4 * 0.7 * LONG
     assert not set(rows) & set(range(TOP + 2, BOTTOM - 1))
-    assert TOP - rows.min() == pytest.approx(1.1 * reach, abs=0.1 * reach + 1)  # the longest of 92: 1.0 to 1.2
+    assert TOP - rows.min() == pytest.approx(
+        1.1 * reach, abs=0.1 * reach + 1
+    )  # the longest of 92: 1.0 to 1.2
     assert rows.max() - BOTTOM == pytest.approx(0.55 * reach, abs=0.05 * reach + 1)
 
 
@@ -43,7 +64,9 @@ def test_lashes_that_sink_cross_the_eye():
 
 
 def test_lashes_lean_outward():
-    """Beyond the opening at both ends, and in the mean farther from its middle than their roots are."""
+    """Beyond the opening at both ends, and in the mean farther from its middle than
+    their roots are.
+    """
     _, picture = drawn(0.0, 0.9)
     far, middle = picture[: TOP - 6], (LEFT + RIGHT + 1) // 2
     assert far[:, :LEFT].sum() > 0
@@ -51,7 +74,9 @@ def test_lashes_lean_outward():
     columns = np.arange(SIZE)
     for half in (slice(0, middle), slice(middle, SIZE)):
         at = float((far[:, half] * columns[half]).sum() / far[:, half].sum())
-        assert abs(at - middle) > 18 + 2  # roots: 18 in the mean; leant by 1.4 / 72 of that, times 14 pixels of length
+        assert (
+            abs(at - middle) > 18 + 2
+        )  # roots: 18 in the mean; leant by 1.4 / 72 of that, times 14 pixels of length
 
 
 def test_no_lashes_without_an_opening_and_the_same_from_the_same_draws():

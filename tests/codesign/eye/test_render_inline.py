@@ -1,4 +1,6 @@
-"""Model code as loops over lanes: run as plain Python in float64, it gives what the model gives; textures as pairs."""
+"""Model code as loops over lanes: run as plain Python in float64, it gives what the
+model gives; textures as pairs.
+"""
 
 import ast
 import math
@@ -18,11 +20,15 @@ SLOTS = {name: k * LANES for k, name in enumerate(render_kernel.NAMES)}
 
 
 def _plain(bank):
-    """The operations of a pass as plain functions of Python floats; samples are kept whole in place of coordinates."""
+    """The operations of a pass as plain functions of Python floats; samples are kept
+    whole in place of coordinates.
+    """
     kept = {}
 
     def placed(index, u, v, x, at, words, to):
-        kept[at] = float(render_ops.tex(bank, torch.tensor(index), torch.tensor(u), torch.tensor(v)))
+        kept[at] = float(
+            render_ops.tex(bank, torch.tensor(index), torch.tensor(u), torch.tensor(v))
+        )
 
     def step(x):
         return float(render_ops.step(torch.tensor(x, dtype=torch.float64)))
@@ -68,27 +74,41 @@ def test_a_pass_computes_what_the_model_computes():
     ):
         _run(source, x, p, bank)
         for lane in range(LANES):
-            values = [torch.tensor(x[SLOTS[name] + lane], dtype=torch.float64) for name in names]
-            want = function([torch.tensor(v, dtype=torch.float64) for v in p], bank, *values)
+            values = [
+                torch.tensor(x[SLOTS[name] + lane], dtype=torch.float64)
+                for name in names
+            ]
+            want = function(
+                [torch.tensor(v, dtype=torch.float64) for v in p], bank, *values
+            )
             assert x[SLOTS[out] + lane] == pytest.approx(float(want), rel=1e-12)
 
 
 def test_lines_that_a_loop_can_spare_are_left_out():
     code = render_inline.loops(render_kernel.WHITE, SLOTS, lanes=LANES, dual=False)
     first = code.split("look_up")[0]
-    assert "fetch(x, {} + lane)".format(SLOTS["lower"]) not in first  # the tear film needs no texture coordinate
+    assert (
+        "fetch(x, {} + lane)".format(SLOTS["lower"]) not in first
+    )  # the tear film needs no texture coordinate
     assert code.count("for lane in range") == 2
 
 
 def test_every_name_of_a_pass_is_assigned_once():
     code = render_inline.loops(render_kernel.SKIN, SLOTS, lanes=LANES, dual=True)
     loop = ast.parse(code).body[0].body[-1]
-    names = [ast.unparse(line.targets[0]) for line in loop.body if isinstance(line, ast.Assign)]
+    names = [
+        ast.unparse(line.targets[0])
+        for line in loop.body
+        if isinstance(line, ast.Assign)
+    ]
     assert len(names) == len(set(names))
 
 
 def test_pairs_hold_every_texture_pixel_with_its_right_neighbour():
-    bank, pairs = textures.bank(0), textures.pairs(0).reshape(-1, textures.SIZE, textures.SIZE)
+    bank, pairs = (
+        textures.bank(0),
+        textures.pairs(0).reshape(-1, textures.SIZE, textures.SIZE),
+    )
     steps = np.round(bank * textures.STEPS)
     np.testing.assert_array_equal((pairs << 16) >> 16, steps)
     np.testing.assert_array_equal(pairs >> 16, np.roll(steps, -1, axis=2))

@@ -1,4 +1,6 @@
-"""Frames against the float64 twin, derivatives against exact ones, labels against masks, states at the limits."""
+"""Frames against the float64 twin, derivatives against exact ones, labels against
+masks, states at the limits.
+"""
 
 import math
 import os
@@ -26,14 +28,18 @@ def _p(states, camera=SMALL):
 def test_compiled_frames_agree_with_the_twin():
     out = renderer.render(STATES, camera=SMALL)
     light, cover, depth, pupil = renderer.twin(_p(STATES), Rig(), SMALL)
-    assert float((light - out.frames.radiance).abs().max()) < 1e-3  # float32 on edges a pixel wide
+    assert (
+        float((light - out.frames.radiance).abs().max()) < 1e-3
+    )  # float32 on edges a pixel wide
     assert float((cover - out.frames.coverage).abs().max()) < 1e-3
     assert float(((depth - out.frames.depth_um) * (cover > 0)).abs().max()) < 0.5  # um
     assert float((pupil - out.pupil).abs().max()) < 1e-3
 
 
 def test_the_compiled_loops_are_found_again_in_the_cache():
-    """Its key holds what a loop closes over: numbers are the same in every process, compiled functions are not."""
+    """Its key holds what a loop closes over: numbers are the same in every process,
+    compiled functions are not.
+    """
     for loop in (kernel.frames, kernel.tangents):
         closed = loop.py_func.__closure__
         assert len(closed) >= 5
@@ -72,11 +78,18 @@ sys.stdout.buffer.write(frames.coverage.numpy().tobytes())
 
 
 @pytest.mark.slow
-def test_the_process_that_compiles_the_loop_and_the_next_one_give_the_same_bytes(tmp_path):
-    """The first once ran functions that the second found optimised once more: 1e-5 of a coverage between them."""
+def test_the_process_that_compiles_the_loop_and_the_next_one_give_the_same_bytes(
+    tmp_path,
+):
+    """The first once ran functions that the second found optimised once more: 1e-5 of a
+    coverage between them.
+    """
     told = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     words = [sys.executable, "-c", RENDER]
-    first, second = (subprocess.run(words, env=told, capture_output=True, check=True).stdout for _ in range(2))
+    first, second = (
+        subprocess.run(words, env=told, capture_output=True, check=True).stdout
+        for _ in range(2)
+    )
     assert len(first) == 4 * 2 * 24 * 24 * 4
     assert first == second
 
@@ -86,19 +99,30 @@ def test_compiled_derivatives_agree_with_exact_ones():
     got = renderer.sensitivities(STATES, motions, camera=SMALL)
     p, *along = renderer.parameter_tangents(STATES, motions, rig=Rig(), camera=SMALL)
     for part, tangent in zip((got.first, got.second), along, strict=True):
-        _, want = torch.func.jvp(lambda q: renderer.twin(q, Rig(), SMALL)[:2], (p,), (tangent,))
+        _, want = torch.func.jvp(
+            lambda q: renderer.twin(q, Rig(), SMALL)[:2], (p,), (tangent,)
+        )
         assert float((part.radiance - want[0]).norm() / want[0].norm()) < 1e-3
         assert float((part.coverage - want[1]).norm() / want[1].norm()) < 1e-3
 
 
 def test_twin_derivative_is_the_limit_of_differences_and_usual_steps_are_not():
-    """Differences at a step of half a degree are wrong by a fifth and more, since edges move by pixels."""
-    p, along, _ = renderer.parameter_tangents(STATES, ("gaze_x", "slip_z"), rig=Rig(), camera=SMALL)
-    _, exact = torch.func.jvp(lambda q: renderer.twin(q, Rig(), SMALL)[0], (p,), (along,))
+    """Differences at a step of half a degree are wrong by a fifth and more, since edges
+    move by pixels.
+    """
+    p, along, _ = renderer.parameter_tangents(
+        STATES, ("gaze_x", "slip_z"), rig=Rig(), camera=SMALL
+    )
+    _, exact = torch.func.jvp(
+        lambda q: renderer.twin(q, Rig(), SMALL)[0], (p,), (along,)
+    )
 
     def difference(step):
         moved = replace(STATES, gaze_rad=STATES.gaze_rad + torch.tensor([step, 0.0]))
-        return (renderer.twin(_p(moved), Rig(), SMALL)[0] - renderer.twin(p, Rig(), SMALL)[0]) / step
+        return (
+            renderer.twin(_p(moved), Rig(), SMALL)[0]
+            - renderer.twin(p, Rig(), SMALL)[0]
+        ) / step
 
     def error(step):
         return float((difference(step) - exact).norm() / exact.norm())
@@ -108,14 +132,20 @@ def test_twin_derivative_is_the_limit_of_differences_and_usual_steps_are_not():
 
 
 def test_a_pupil_smaller_than_a_pixel_is_seen_as_whole_as_it_is():
-    """The same eyes on pixels sixty times as wide: of pupils of less than one pixel nearly all is visible still."""
+    """The same eyes on pixels sixty times as wide: of pupils of less than one pixel
+    nearly all is visible still.
+    """
     coarse = Camera(pixels=5, pitch_um=600.0)
     wide = replace(
-        STATES, gaze_rad=torch.zeros(4, 2, dtype=torch.float64), slip_um=torch.zeros(4, 3, dtype=torch.float64)
+        STATES,
+        gaze_rad=torch.zeros(4, 2, dtype=torch.float64),
+        slip_um=torch.zeros(4, 3, dtype=torch.float64),
     )
     out = renderer.render(wide, rig=Rig(elevation_rad=0.0), camera=coarse)
     area = out.pupil.sum((-1, -2))
-    assert float(area.max()) < 0.8 < float(out.labels.visible.min())  # pixels are sampled, not integrated: 0.85
+    assert (
+        float(area.max()) < 0.8 < float(out.labels.visible.min())
+    )  # pixels are sampled, not integrated: 0.85
 
 
 def test_nothing_is_seen_behind_closed_lids():
@@ -130,10 +160,14 @@ def test_nothing_is_seen_behind_closed_lids():
 def test_mask_is_centred_on_the_refracted_outline():
     frontal = Rig(elevation_rad=0.0, aim_um=(500.0, 300.0))
     wide = replace(
-        STATES, gaze_rad=torch.zeros(4, 2, dtype=torch.float64), slip_um=torch.zeros(4, 3, dtype=torch.float64)
+        STATES,
+        gaze_rad=torch.zeros(4, 2, dtype=torch.float64),
+        slip_um=torch.zeros(4, 3, dtype=torch.float64),
     )
     labels = renderer.render(wide, rig=frontal, camera=Camera()).labels
-    assert float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4  # oblique refraction: under 0.4 px
+    assert (
+        float((labels.centroid_px - labels.pupil_px).norm(dim=1).max()) < 0.4
+    )  # oblique refraction: under 0.4 px
     assert float(labels.visible.min()) > 0.97
 
 
@@ -148,7 +182,9 @@ def test_scale_changes_depth_and_labels_but_not_the_image():
 
 def test_same_states_same_frames_alone_or_in_a_batch():
     whole = renderer.render(STATES, camera=SMALL).pinhole()
-    alone = torch.cat([renderer.render(STATES[k : k + 1], camera=SMALL).pinhole() for k in range(4)])
+    alone = torch.cat(
+        [renderer.render(STATES[k : k + 1], camera=SMALL).pinhole() for k in range(4)]
+    )
     assert torch.equal(whole, alone)
 
 
@@ -156,14 +192,18 @@ def extremes(count, seed):
     """States far beyond any population: every limit of the renderer is met."""
     rng = np.random.default_rng(seed)
     base = eye.draw(count, seed)
-    gaze = rng.choice([0, 0.1, math.pi / 2, math.pi, -math.pi / 2, 2.5], (count, 2)) * rng.choice(
-        [1, 1, 1.001], (count, 2)
-    )
+    gaze = rng.choice(
+        [0, 0.1, math.pi / 2, math.pi, -math.pi / 2, 2.5], (count, 2)
+    ) * rng.choice([1, 1, 1.001], (count, 2))
     slip = rng.choice([0.0, 1e3, -2e4, 5e4, -4e4, 1e6], (count, 3))
     traits = base.traits.clone()
     names = list(POPULATION)
-    traits[:, names.index("pupil_radius_um")] = torch.from_numpy(rng.choice([500.0, 4500.0, 1900.0], count))
-    traits[:, names.index("exposure")] = torch.from_numpy(rng.choice([0.0, 0.5, 1e4], count))
+    traits[:, names.index("pupil_radius_um")] = torch.from_numpy(
+        rng.choice([500.0, 4500.0, 1900.0], count)
+    )
+    traits[:, names.index("exposure")] = torch.from_numpy(
+        rng.choice([0.0, 0.5, 1e4], count)
+    )
     aperture = torch.from_numpy(rng.choice([0.0, 0.05, 1.0, 3.0], count))
     return States(
         traits, base.textures, torch.from_numpy(gaze), base.torsion_rad, torch.from_numpy(slip), 30 * base.mount_rad,
@@ -177,9 +217,18 @@ def _fuzz(count):
         states = extremes(min(500, count - start), start)
         out = renderer.render(states, camera=camera)
         rates = renderer.sensitivities(states, camera=camera)
-        checked = [out.frames.radiance, out.frames.coverage, out.frames.depth_um, out.pupil]
+        checked = [
+            out.frames.radiance,
+            out.frames.coverage,
+            out.frames.depth_um,
+            out.pupil,
+        ]
         checked += [getattr(out.labels, name) for name in renderer.Labels.__slots__]
-        checked += [f for part in (rates.first, rates.second) for f in (part.radiance, part.coverage, part.depth_um)]
+        checked += [
+            f
+            for part in (rates.first, rates.second)
+            for f in (part.radiance, part.coverage, part.depth_um)
+        ]
         assert all(bool(torch.isfinite(value).all()) for value in checked)
 
 
@@ -202,7 +251,9 @@ def test_a_hundred_thousand_extreme_states_stay_finite():
     ],
 )
 def test_hidden_pupils_have_empty_masks_or_thin_ones(name, change):
-    states = replace(STATES, **{k: torch.tensor(v, dtype=torch.float64) for k, v in change.items()})
+    states = replace(
+        STATES, **{k: torch.tensor(v, dtype=torch.float64) for k, v in change.items()}
+    )
     out = renderer.render(states, camera=SMALL)
     assert bool(torch.isfinite(out.pinhole()).all()), name
     assert float(out.labels.visible.max()) < 0.9 or name == "grazing cornea"

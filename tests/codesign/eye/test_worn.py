@@ -1,4 +1,6 @@
-"""What frames wear, on frames made by hand: factors, bands, movements in closed form; none at variety 1; seeded."""
+"""What frames wear, on frames made by hand: factors, bands, movements in closed form;
+none at variety 1; seeded.
+"""
 
 import math
 from dataclasses import replace
@@ -19,7 +21,9 @@ SCENES = EyeScenes(SceneConfig(pixels=48, margin=4, variety=2.0), 24.0, 2000.0, 
 
 
 def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
-    """One frame: the eye in the rows of ``opening``, a pupil of 8 x 10 pixels in it, skin 4 mm before it."""
+    """One frame: the eye in the rows of ``opening``, a pupil of 8 x 10 pixels in it,
+    skin 4 mm before it.
+    """
     cover = torch.zeros(1, 2, N, N)
     cover[:, 1, opening[0] : opening[1]] = 1
     cover[:, 0] = 1 - cover[:, 1]
@@ -28,16 +32,37 @@ def scene(skin=0.5, eye=0.3, opening=(20, 40), left=30):
     depth[:, 0] = 16e3
     pupil = torch.zeros(1, N, N)
     pupil[:, 26:34, left : left + 10] = 1
-    one, three = torch.zeros(1, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+    one, three = (
+        torch.zeros(1, dtype=torch.float64),
+        torch.zeros(1, 3, dtype=torch.float64),
+    )
     place = torch.tensor([[34.5, 29.5]], dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, three, place, place, one + 0.9, torch.zeros(1, 9, 2))
+    labels = Labels(
+        three,
+        three,
+        three,
+        three,
+        three,
+        three,
+        place,
+        place,
+        one + 0.9,
+        torch.zeros(1, 9, 2),
+    )
     return Rendered(Frames(light, cover, depth), pupil, labels)
 
 
 def put_on(made, draws=None, **size):
     """The frame with some causes of these sizes, placed by ``draws``."""
-    all_of = {name: np.zeros(1) for name in wear.CAUSES} | {name: np.array([v]) for name, v in size.items()}
-    return wear.dressed(made, wear.Worn(all_of, np.full((1, 12), 0.3) if draws is None else np.array([draws])))
+    all_of = {name: np.zeros(1) for name in wear.CAUSES} | {
+        name: np.array([v]) for name, v in size.items()
+    }
+    return wear.dressed(
+        made,
+        wear.Worn(
+            all_of, np.full((1, 12), 0.3) if draws is None else np.array([draws])
+        ),
+    )
 
 
 def test_light_that_falls_off_is_a_plane_through_1_in_the_middle():
@@ -46,13 +71,19 @@ def test_light_that_falls_off_is_a_plane_through_1_in_the_middle():
     line = (torch.arange(N) + 0.5) / N - 0.5
     angle = 6.283 * draws[7]
     plane = 1 + 0.8 * (line[None] * math.cos(angle) + line[:, None] * math.sin(angle))
-    torch.testing.assert_close(out.pinhole()[0], scene().pinhole()[0] * plane, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        out.pinhole()[0], scene().pinhole()[0] * plane, rtol=1e-5, atol=1e-6
+    )
     assert torch.equal(out.pupil, scene().pupil)
 
 
 def test_a_shadow_takes_its_share_far_inside_and_nothing_far_outside():
     draws = np.full(12, 0.0)
-    draws[8], draws[9], draws[10] = 0.25, 0.0, 0.6  # edge along x, 6 % below the middle, 2 % wide
+    draws[8], draws[9], draws[10] = (
+        0.25,
+        0.0,
+        0.6,
+    )  # edge along x, 6 % below the middle, 2 % wide
     out = put_on(scene(), draws, shade=0.6)
     ratio = (out.pinhole() / scene().pinhole())[0]
     assert ratio[-1].tolist() == pytest.approx([0.4] * N, abs=1e-4)
@@ -91,12 +122,22 @@ def test_glints_lie_on_the_eye_at_their_distance_from_the_pupil():
 
 def test_a_rim_hides_what_is_behind_it_and_stands_nearer():
     draws = np.full(12, 0.3)
-    draws[6], draws[7] = 1.0, 0.0  # a wide circle whose right side is 0.351 frames right of the middle
+    draws[6], draws[7] = (
+        1.0,
+        0.0,
+    )  # a wide circle whose right side is 0.351 frames right of the middle
     before = scene(left=50)
     out = put_on(before, draws, rim=0.08)
     cover = out.frames.coverage[0]
     torch.testing.assert_close(cover.sum(0), torch.ones(N, N), rtol=0, atol=1e-5)
-    assert torch.nonzero(cover[1, 31] < 0.5)[:, 0].tolist() == [54, 55, 56, 57, 58, 59]  # centres in 54.46 … 59.58
+    assert torch.nonzero(cover[1, 31] < 0.5)[:, 0].tolist() == [
+        54,
+        55,
+        56,
+        57,
+        58,
+        59,
+    ]  # centres in 54.46 … 59.58
     hidden = (cover[1] < 0.5) & (before.frames.coverage[0, 1] > 0.5)
     assert out.frames.depth_um[0, 0][hidden].unique().tolist() == [14e3]  # 0.7 of 20 mm
     assert float((out.pupil[0] - before.pupil[0] * cover[1]).abs().max()) < 1e-5
@@ -107,20 +148,26 @@ def test_a_rim_hides_what_is_behind_it_and_stands_nearer():
 
 
 def test_a_rim_stands_before_the_eye_that_is_seen_however_little():
-    """The renderer leaves the depth of the eye at 0 where skin hides it: most of the frame here."""
+    """The renderer leaves the depth of the eye at 0 where skin hides it: most of the
+    frame here.
+    """
     made = scene(opening=(28, 34))
     made.frames.depth_um[:, 1, :28] = 0
     made.frames.depth_um[:, 1, 34:] = 0
     out = put_on(made, rim=0.1)
     there = out.frames.depth_um[0, 0] != made.frames.depth_um[0, 0]
     assert bool(there.any())
-    assert out.frames.depth_um[0, 0][there].unique().tolist() == pytest.approx([0.7 * 20e3])
+    assert out.frames.depth_um[0, 0][there].unique().tolist() == pytest.approx(
+        [0.7 * 20e3]
+    )
 
 
 def test_dressed_frames_have_a_depth_wherever_they_are_seen():
     made = SCENES.rendered(4, 8)  # a rim is among them
     flat = flattened(made.frames, torch.ones(8))
-    assert flat.depth_um.min() > 4000  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
+    assert (
+        flat.depth_um.min() > 4000
+    )  # the nearest skin that the rig can see, at the widest slip and tilt, is at 6 mm
 
 
 def test_mirrored_windows_add_light_and_hide_nothing():
@@ -134,15 +181,22 @@ def test_mirrored_windows_add_light_and_hide_nothing():
 
 @pytest.mark.parametrize(("length", "angle"), [(6.0, 0.0), (9.0, 0.7), (7.5, 2.2)])
 def test_a_movement_spreads_by_its_length_along_its_way(length, angle):
-    """A line of length L has the variance L² / 12; bilinear taps add t (1 - t) <= 1/4 an axis."""
+    """A line of length L has the variance L² / 12; bilinear taps add t (1 - t) <= 1/4
+    an axis.
+    """
     kernel = wear.line_kernel(length, angle).double().numpy()
     place = np.arange(len(kernel)) - len(kernel) // 2
     x, y = np.meshgrid(place, place)
     assert kernel.sum() == pytest.approx(1, abs=1e-6)
     assert (kernel * x).sum() == pytest.approx(0, abs=1e-6)
     assert (kernel * y).sum() == pytest.approx(0, abs=1e-6)
-    along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
-    assert -0.01 <= (kernel * along**2).sum() - length**2 / 12 <= 0.25  # 32 places of the line: 0.1 % less
+    along, across = (
+        x * math.cos(angle) + y * math.sin(angle),
+        y * math.cos(angle) - x * math.sin(angle),
+    )
+    assert (
+        -0.01 <= (kernel * along**2).sum() - length**2 / 12 <= 0.25
+    )  # 32 places of the line: 0.1 % less
     assert 0 <= (kernel * across**2).sum() <= 0.25
 
 
@@ -161,12 +215,17 @@ def test_nothing_is_worn_up_to_variety_1_and_the_share_of_the_record_at_2():
     on = wear.drawn(2000, 2.0, np.random.default_rng(0))
     for name, cause in wear.CAUSES.items():
         size = on.size[name][on.size[name] != 0]
-        assert len(size) / 2000 == pytest.approx(cause.share, abs=4 * math.sqrt(0.25 / 2000))
+        assert len(size) / 2000 == pytest.approx(
+            cause.share, abs=4 * math.sqrt(0.25 / 2000)
+        )
         assert cause.low <= size.min() < size.max() <= cause.high
         assert cause.unit
         assert cause.what
     more = wear.drawn(2000, 3.0, np.random.default_rng(0))
-    assert all(np.array_equal(more.size[name][size != 0], size[size != 0]) for name, size in on.size.items())
+    assert all(
+        np.array_equal(more.size[name][size != 0], size[size != 0])
+        for name, size in on.size.items()
+    )
 
 
 def test_scenes_wear_by_their_variety_and_from_their_seed():
@@ -175,7 +234,14 @@ def test_scenes_wear_by_their_variety_and_from_their_seed():
     assert torch.equal(bare.rendered(2, 6).pinhole(), plain.pinhole())
     one, again = SCENES.rendered(2, 6), SCENES.rendered(2, 6)
     assert torch.equal(one.pinhole(), again.pinhole())
-    torch.testing.assert_close(SCENES.batch(2, 6).slip_mm.double() * 1e3, one.labels.slip_um, rtol=1e-6, atol=1e-3)
+    torch.testing.assert_close(
+        SCENES.batch(2, 6).slip_mm.double() * 1e3,
+        one.labels.slip_um,
+        rtol=1e-6,
+        atol=1e-3,
+    )
     assert float((one.frames.coverage.sum(1) - 1).abs().max()) < 1e-4
-    undressed = renderer.render(SCENES.states(2, 6), rig=SCENES.rig, camera=SCENES.camera)
+    undressed = renderer.render(
+        SCENES.states(2, 6), rig=SCENES.rig, camera=SCENES.camera
+    )
     assert not torch.equal(one.pinhole(), undressed.pinhole())

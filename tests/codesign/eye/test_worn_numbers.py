@@ -1,4 +1,6 @@
-"""Every number of what frames wear, pixel by pixel: loops over float64 from the words of the docstrings."""
+"""Every number of what frames wear, pixel by pixel: loops over float64 from the words
+of the docstrings.
+"""
 
 import math
 
@@ -15,9 +17,13 @@ N, FRAME = 40, 1  # pixels; the second of two frames wears, the first must stay 
 PLACE = (23.5, 17.5)  # x, y of the pupil, not in the middle
 ROUND = 2e-6  # float32 of amounts below 2, some ten operations
 RNG = np.random.default_rng(11)
-OPENING = np.clip(RNG.uniform(-0.4, 1.4, (N, N)), 0, 1).astype(np.float32)  # share of the eye in each pixel
+OPENING = np.clip(RNG.uniform(-0.4, 1.4, (N, N)), 0, 1).astype(
+    np.float32
+)  # share of the eye in each pixel
 LIGHT = RNG.uniform(0.2, 0.8, (2, N, N)).astype(np.float32)
-DRAWS = np.array([0.68, 0.83, 0.27, 0.41, 0.58, 0.76, 0.36, 0.19, 0.68, 0.47, 0.23, 0.77])
+DRAWS = np.array(
+    [0.68, 0.83, 0.27, 0.41, 0.58, 0.76, 0.36, 0.19, 0.68, 0.47, 0.23, 0.77]
+)
 LINE = (np.arange(N) + 0.5) / N - 0.5
 X, Y = LINE[None, :], LINE[:, None]
 
@@ -30,13 +36,29 @@ def scene():
     depth[:, 1] = torch.linspace(21e3, 25e3, N)
     pupil = torch.from_numpy(OPENING.copy())[None].repeat(2, 1, 1)
     two = torch.zeros(2, dtype=torch.float64)
-    three, place = torch.zeros(2, 3, dtype=torch.float64), torch.tensor([PLACE] * 2, dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, three, place, place, two + 0.8, torch.zeros(2, 9, 2))
+    three, place = (
+        torch.zeros(2, 3, dtype=torch.float64),
+        torch.tensor([PLACE] * 2, dtype=torch.float64),
+    )
+    labels = Labels(
+        three,
+        three,
+        three,
+        three,
+        three,
+        three,
+        place,
+        place,
+        two + 0.8,
+        torch.zeros(2, 9, 2),
+    )
     return Rendered(Frames(light, cover, depth), pupil, labels)
 
 
 def put_on(draws=DRAWS, **size):
-    """(light, coverage, depth, pupil) of the frame that wears, float64; the other frame is as it was."""
+    """(light, coverage, depth, pupil) of the frame that wears, float64; the other frame
+    is as it was.
+    """
     made = scene()
     sizes = {name: np.zeros(2) for name in wear.CAUSES}
     for name, value in size.items():
@@ -44,7 +66,9 @@ def put_on(draws=DRAWS, **size):
     out = wear.dressed(made, wear.Worn(sizes, np.stack([np.zeros(12), draws])))
     for name in Frames.__slots__:
         assert torch.equal(getattr(out.frames, name)[0], getattr(made.frames, name)[0])
-    sheets = (getattr(out.frames, name)[FRAME].double().numpy() for name in Frames.__slots__)
+    sheets = (
+        getattr(out.frames, name)[FRAME].double().numpy() for name in Frames.__slots__
+    )
     return *sheets, out.pupil[FRAME].double().numpy()
 
 
@@ -84,9 +108,16 @@ def test_sizes_are_even_over_their_range_and_twice_the_variety_is_twice_the_shar
         for name, cause in wear.CAUSES.items():
             size = got.size[name][got.size[name] != 0]
             share = min(times * cause.share, 1.0)
-            assert len(size) / count == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / count) + 1e-9)
-            middle, sigma = (cause.low + cause.high) / 2, (cause.high - cause.low) / math.sqrt(12)
-            assert size.mean() == pytest.approx(middle, abs=4.5 * sigma / math.sqrt(len(size)))
+            assert len(size) / count == pytest.approx(
+                share, abs=4 * math.sqrt(share * (1 - share) / count) + 1e-9
+            )
+            middle, sigma = (
+                (cause.low + cause.high) / 2,
+                (cause.high - cause.low) / math.sqrt(12),
+            )
+            assert size.mean() == pytest.approx(
+                middle, abs=4.5 * sigma / math.sqrt(len(size))
+            )
 
 
 def largest(cover, row, up, down):
@@ -107,7 +138,11 @@ def test_a_liner_takes_its_opacity_of_the_skin_within_its_width(side, below):
 
 def test_a_darkened_lid_is_a_mean_over_a_square_of_half_its_height():
     draws = DRAWS.copy()
-    draws[2] = 0.66  # 0.06 + 0.06 x 0.66 of 40 pixels: 3.98, four rows; the mean over 2 reach + 1 = 3 pixels
+    draws[2] = (
+        # 0.06 + 0.06 x 0.66 of 40 pixels: 3.98, four rows; the mean over 2 reach + 1 =
+        # 3 pixels
+        0.66
+    )
     light = put_on(draws, lid_shadow=0.55)[0]
     near = np.stack([largest(OPENING, row, 4, 0) for row in range(N)])
     wide = np.pad(near, 1, mode="edge")
@@ -122,9 +157,13 @@ def test_glints_are_lorentzian_spots_about_the_pupil():
     for k in range(4):  # 1 + int(4 x 0.76)
         turn = 6.283 * 0.41 + 1.7 * k
         apart, size = 0.02 + 0.07 * 0.58, 0.005 + 0.035 * ((0.36 + 0.37 * k) % 1) ** 2
-        away = (X - px - apart * math.cos(turn)) ** 2 + (Y - py - apart * math.sin(turn)) ** 2
+        away = (X - px - apart * math.cos(turn)) ** 2 + (
+            Y - py - apart * math.sin(turn)
+        ) ** 2
         added += 0.9 * OPENING / (1 + (away / size**2) ** 2)
-    assert light[1] == pytest.approx(LIGHT[1] + added, abs=5 * ROUND)  # (away / size²)² amplifies float32 near a spot
+    assert light[1] == pytest.approx(
+        LIGHT[1] + added, abs=5 * ROUND
+    )  # (away / size²)² amplifies float32 near a spot
     assert np.array_equal(light[0], LIGHT[0].astype(float))
 
 
@@ -132,7 +171,9 @@ def test_a_gradient_is_a_plane_and_stays_above_a_tenth():
     turn = 6.283 * 0.19
     plane = 1 + 2 * 1.3 * (X * math.cos(turn) + Y * math.sin(turn))
     assert plane.min() < 0
-    assert put_on(gradient=1.3)[0] == pytest.approx(LIGHT * np.maximum(plane, 0.1), abs=ROUND)
+    assert put_on(gradient=1.3)[0] == pytest.approx(
+        LIGHT * np.maximum(plane, 0.1), abs=ROUND
+    )
 
 
 def test_a_shade_is_a_soft_edge():
@@ -143,13 +184,18 @@ def test_a_shade_is_a_soft_edge():
 
 
 def test_mirrored_windows_are_rounded_boxes_that_lean():
-    """Their number, places and halves from the draws; both sheets have them as far as they are seen."""
+    """Their number, places and halves from the draws; both sheets have them as far as
+    they are seen.
+    """
     light, cover, depth, _ = put_on(reflection=0.45)
     added = np.zeros((N, N))
     lean = 0.6 * (0.76 - 0.5)
     for k in range(3):  # 1 + int(3 x 0.68)
         at_x, at_y = (0.83 + 0.61 * k) % 1 - 0.5, (0.27 + 0.43 * k) % 1 - 0.5
-        half_x, half_y = 0.02 + 0.1 * ((0.41 + 0.29 * k) % 1), 0.02 + 0.08 * ((0.58 + 0.53 * k) % 1)
+        half_x, half_y = (
+            0.02 + 0.1 * ((0.41 + 0.29 * k) % 1),
+            0.02 + 0.08 * ((0.58 + 0.53 * k) % 1),
+        )
         u, v = (X - at_x) + lean * (Y - at_y), (Y - at_y) - lean * (X - at_x)
         added += 0.45 / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
     was = scene().frames
@@ -175,8 +221,12 @@ def test_a_rim_is_an_arc_that_hides_and_shines():
     assert light[1] == pytest.approx(LIGHT[1] * (1 - band), abs=near)
     assert cover[0] == pytest.approx(open_[0] * (1 - band) + band, abs=near)
     assert cover[1] == pytest.approx(open_[1] * (1 - band), abs=near)
-    assert pupil == pytest.approx(was.pupil[FRAME].double().numpy() * (1 - band), abs=near)
-    middle = float(np.sort(was.frames.depth_um[FRAME, 1].numpy().ravel())[N * N // 2 - 1])  # torch: the lower of two
+    assert pupil == pytest.approx(
+        was.pupil[FRAME].double().numpy() * (1 - band), abs=near
+    )
+    middle = float(
+        np.sort(was.frames.depth_um[FRAME, 1].numpy().ravel())[N * N // 2 - 1]
+    )  # torch: the lower of two
     assert depth[0][np.abs(band - 0.5) > near] == pytest.approx(
         np.where(band > 0.5, 0.7 * middle, 15e3)[np.abs(band - 0.5) > near], rel=1e-6
     )
@@ -184,7 +234,9 @@ def test_a_rim_is_an_arc_that_hides_and_shines():
 
 
 def test_a_movement_averages_along_its_line_and_depths_by_what_is_covered():
-    """Correlation with the kernel of the line: 0.0775 of 40 pixels at 3.1416 x 0.77 rad."""
+    """Correlation with the kernel of the line: 0.0775 of 40 pixels at 3.1416 x 0.77
+    rad.
+    """
     kernel = wear.line_kernel(0.0775 * N, 3.1416 * 0.77).double().numpy()
     assert kernel.shape == (5, 5)
     light, cover, depth, pupil = put_on(movement=0.0775)
@@ -192,12 +244,18 @@ def test_a_movement_averages_along_its_line_and_depths_by_what_is_covered():
 
     def moved(picture):
         wide = np.pad(picture, 2, mode="edge")
-        return sum(kernel[i, j] * wide[i : i + N, j : j + N] for i in range(5) for j in range(5))
+        return sum(
+            kernel[i, j] * wide[i : i + N, j : j + N]
+            for i in range(5)
+            for j in range(5)
+        )
 
     before = was.frames.coverage[FRAME].double().numpy()
     for sheet in (0, 1):
         kept = np.maximum(before[sheet], 1e-6)
-        assert light[sheet] == pytest.approx(moved(LIGHT[sheet].astype(float)), abs=ROUND)
+        assert light[sheet] == pytest.approx(
+            moved(LIGHT[sheet].astype(float)), abs=ROUND
+        )
         assert cover[sheet] == pytest.approx(moved(before[sheet]), abs=ROUND)
         far = was.frames.depth_um[FRAME, sheet].double().numpy()
         assert depth[sheet] == pytest.approx(moved(kept * far) / moved(kept), rel=2e-6)
@@ -205,14 +263,18 @@ def test_a_movement_averages_along_its_line_and_depths_by_what_is_covered():
 
 
 def test_a_line_of_five_pixels_weighs_its_pixels_by_what_of_it_lies_in_each():
-    """Taps of a straight horizontal line of 3 pixels: triangles of half a pixel about each end, whole between.
+    """Taps of a straight horizontal line of 3 pixels: triangles of half a pixel about
+    each end, whole between.
 
-    A point at u gives 1 - |u - k| to the pixels k beside it; over [-1.5, 1.5] that is 1 / 3 each to -1, 0 and 1 less
+    A point at u gives 1 - |u - k| to the pixels k beside it; over [-1.5, 1.5] that is 1
+    / 3 each to -1, 0 and 1 less
     1 / 8 / 3 at both ends, which the outermost pixels take.
     """
     row = wear.line_kernel(3.0, 0.0).double().numpy()
     assert row.shape == (5, 5)
-    assert row[2] == pytest.approx(np.array([1 / 8, 7 / 8, 1, 7 / 8, 1 / 8]) / 3, abs=2e-3)  # 32 places: 1 / 32² of it
+    assert row[2] == pytest.approx(
+        np.array([1 / 8, 7 / 8, 1, 7 / 8, 1 / 8]) / 3, abs=2e-3
+    )  # 32 places: 1 / 32² of it
     assert np.abs(np.delete(row, 2, 0)).max() == 0
     column = wear.line_kernel(3.0, math.pi / 2).double().numpy()
     assert column == pytest.approx(row.T, abs=1e-6)
@@ -221,17 +283,41 @@ def test_a_line_of_five_pixels_weighs_its_pixels_by_what_of_it_lies_in_each():
 
 def test_labels_follow_the_mask():
     was, after = torch.zeros(2, 5, 5), torch.zeros(2, 5, 5)
-    was[0, 1:4, 1:4], after[0, 1, 2], after[0, 3, 3] = 0.1, 0.3, 0.15  # less than a pixel in all
+    was[0, 1:4, 1:4], after[0, 1, 2], after[0, 3, 3] = (
+        0.1,
+        0.3,
+        0.15,
+    )  # less than a pixel in all
     was[1, 2, 2] = 1.0
     place = torch.tensor([[9.0, 8.0], [7.0, 6.0]], dtype=torch.float64)
-    two, three = torch.tensor([0.8, 0.6], dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
-    labels = Labels(three, three, three, three, three, three, place, place, two, torch.zeros(2, 9, 2))
+    two, three = (
+        torch.tensor([0.8, 0.6], dtype=torch.float64),
+        torch.zeros(2, 3, dtype=torch.float64),
+    )
+    labels = Labels(
+        three,
+        three,
+        three,
+        three,
+        three,
+        three,
+        place,
+        place,
+        two,
+        torch.zeros(2, 9, 2),
+    )
     got = wear._labels(labels, was, after)
     assert got.visible.tolist() == pytest.approx([0.8 * 0.45 / 0.9, 0.0])
     assert got.centroid_px[0].tolist() == pytest.approx([3.5 / 1.5, 2.5 / 1.5])
-    assert got.centroid_px[1].tolist() == [7.0, 6.0]  # nothing is left: where the pupil is
+    assert got.centroid_px[1].tolist() == [
+        7.0,
+        6.0,
+    ]  # nothing is left: where the pupil is
     grown = wear._labels(labels, after, was)
-    assert grown.visible.tolist() == [1.0, 0.6]  # not above 1; of nothing before, as it was
+    assert grown.visible.tolist() == [
+        1.0,
+        0.6,
+    ]  # not above 1; of nothing before, as it was
 
 
 def test_corners_of_another_camera_are_darker_by_the_square_of_their_distance():
@@ -239,7 +325,11 @@ def test_corners_of_another_camera_are_darker_by_the_square_of_their_distance():
     light, cover, depth, pupil = put_on(vignette=0.6)
     plain, *rest = put_on()
     line = (np.arange(plain.shape[-1]) + 0.5) / plain.shape[-1] - 0.5
-    assert light == pytest.approx(plain * (1 - 0.6 * 2 * (line[None] ** 2 + line[:, None] ** 2)), rel=1e-5, abs=1e-7)
+    assert light == pytest.approx(
+        plain * (1 - 0.6 * 2 * (line[None] ** 2 + line[:, None] ** 2)),
+        rel=1e-5,
+        abs=1e-7,
+    )
     for now, was in zip((cover, depth, pupil), rest, strict=True):
         assert np.array_equal(now, was)
 
@@ -251,7 +341,9 @@ def test_the_brightest_pixels_are_at_one_white():
     assert seen.sum(0) == pytest.approx(np.minimum(level, white), rel=1e-4)
     bright = level > white
     assert bright.any()
-    assert seen[:, bright] / seen.sum(0)[bright] == pytest.approx(plain[:, bright] / level[bright], rel=1e-4)
+    assert seen[:, bright] / seen.sum(0)[bright] == pytest.approx(
+        plain[:, bright] / level[bright], rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("log_gamma", [-0.5, 0.4])
@@ -261,14 +353,20 @@ def test_a_tone_curve_is_a_power_between_black_and_white(log_gamma):
     white, gamma = np.quantile(level, 0.99), math.exp(log_gamma)
     inside = level > 1e-3 * white
     assert inside.any()
-    assert seen.sum(0)[inside] == pytest.approx(white * (level[inside] / white) ** gamma, rel=1e-4)
+    assert seen.sum(0)[inside] == pytest.approx(
+        white * (level[inside] / white) ** gamma, rel=1e-4
+    )
 
 
 def test_light_of_the_retina_fills_the_pupil_and_stray_light_everything():
     before, was = put_on(), scene().frames
     lit, seen = put_on(retina=0.21), put_on(veil=0.13)
-    assert lit[0][1] == pytest.approx(LIGHT[1] + 0.21 * OPENING, abs=ROUND)  # the scene's pupil is its opening
-    assert seen[0] == pytest.approx(LIGHT + 0.13 * was.coverage[FRAME].double().numpy(), abs=ROUND)
+    assert lit[0][1] == pytest.approx(
+        LIGHT[1] + 0.21 * OPENING, abs=ROUND
+    )  # the scene's pupil is its opening
+    assert seen[0] == pytest.approx(
+        LIGHT + 0.13 * was.coverage[FRAME].double().numpy(), abs=ROUND
+    )
     assert np.array_equal(lit[0][0], LIGHT[0].astype(float))
     for now in (lit, seen):
         assert all(np.array_equal(now[k], before[k]) for k in (1, 2, 3))
@@ -278,33 +376,55 @@ def test_dark_places_of_the_skin_are_ellipses_of_which_every_other_is_striped():
     light, *rest = put_on(patch=0.8)
     dark = np.zeros((N, N))
     for k in range(3):  # 1 + int(3 x 0.76)
-        at_x, at_y = 1.1 * ((0.36 + 0.38 * k) % 1 - 0.5), 1.1 * ((0.19 + 0.71 * k) % 1 - 0.5)
-        half_x, half_y = 0.05 + 0.2 * ((0.68 + 0.57 * k) % 1), 0.05 + 0.2 * ((0.47 + 0.23 * k) % 1)
+        at_x, at_y = (
+            1.1 * ((0.36 + 0.38 * k) % 1 - 0.5),
+            1.1 * ((0.19 + 0.71 * k) % 1 - 0.5),
+        )
+        half_x, half_y = (
+            0.05 + 0.2 * ((0.68 + 0.57 * k) % 1),
+            0.05 + 0.2 * ((0.47 + 0.23 * k) % 1),
+        )
         turn = 3.1416 * ((0.23 + 0.47 * k) % 1)
         u = (X - at_x) * math.cos(turn) + (Y - at_y) * math.sin(turn)
         v = (Y - at_y) * math.cos(turn) - (X - at_x) * math.sin(turn)
         hair = 0.75 + 0.25 * np.sin(80 * v + 12 * u) if k != 1 else 1.0
-        dark = np.maximum(dark, hair / (1 + ((u / half_x) ** 2 + (v / half_y) ** 2) ** 2))
-    assert light[0] == pytest.approx(LIGHT[0] * (1 - 0.8 * dark), abs=1e-5)  # 80 v of float32 places: 80 x 6e-8
+        dark = np.maximum(
+            dark, hair / (1 + ((u / half_x) ** 2 + (v / half_y) ** 2) ** 2)
+        )
+    assert light[0] == pytest.approx(
+        LIGHT[0] * (1 - 0.8 * dark), abs=1e-5
+    )  # 80 v of float32 places: 80 x 6e-8
     assert np.array_equal(light[1], LIGHT[1].astype(float))
-    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+    assert all(
+        np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True)
+    )
 
 
 def test_lashes_darken_both_sheets_by_one_factor_and_leave_the_outline():
     light, *rest = put_on(overhang=0.7)
     factor = light / LIGHT
     assert factor[0] == pytest.approx(factor[1], rel=1e-5)
-    assert factor.min() == pytest.approx(0.3, abs=0.03)  # where lashes of full darkness (110 to 255 of 255) lie
+    assert factor.min() == pytest.approx(
+        0.3, abs=0.03
+    )  # where lashes of full darkness (110 to 255 of 255) lie
     assert factor.max() == 1.0
-    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+    assert all(
+        np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True)
+    )
 
 
 def test_a_deep_socket_darkens_the_eye_and_a_dark_iris_is_a_share_of_its_albedo():
     light, *rest = put_on(socket=0.35)
-    assert light == pytest.approx(LIGHT * np.array([1.0, 0.65])[:, None, None], abs=ROUND)
-    assert all(np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True))
+    assert light == pytest.approx(
+        LIGHT * np.array([1.0, 0.65])[:, None, None], abs=ROUND
+    )
+    assert all(
+        np.array_equal(now, was) for now, was in zip(rest, put_on()[1:], strict=True)
+    )
     states = draw(3, 4)
-    sizes = {name: np.zeros(3) for name in wear.CAUSES} | {"iris": np.array([0.0, 0.23, 0.41])}
+    sizes = {name: np.zeros(3) for name in wear.CAUSES} | {
+        "iris": np.array([0.0, 0.23, 0.41])
+    }
     found = wear.pigmented(states, wear.Worn(sizes, np.zeros((3, 12))))
     want = states.trait("iris") * torch.tensor([1.0, 0.23, 0.41], dtype=torch.float64)
     assert torch.equal(found.trait("iris"), want)
@@ -313,13 +433,18 @@ def test_a_deep_socket_darkens_the_eye_and_a_dark_iris_is_a_share_of_its_albedo(
 
 @pytest.mark.parametrize(("length", "angle"), [(4.6, 0.37), (3.3, 2.2), (0.7, -0.9)])
 def test_a_slanted_line_gives_each_pixel_the_tent_about_it(length, angle):
-    """1 - |u| along x times the same along y, of 32 places along the line through the middle."""
+    """1 - |u| along x times the same along y, of 32 places along the line through the
+    middle.
+    """
     kernel = wear.line_kernel(length, angle).double().numpy()
     reach = math.ceil(length / 2)
     assert kernel.shape == (2 * reach + 1, 2 * reach + 1)
     pixel = np.arange(-reach, reach + 1)
     along = ((np.arange(32) + 0.5) / 32 - 0.5) * length
-    x, y = (np.maximum(1 - np.abs(along[:, None] * f(angle) - pixel), 0) for f in (math.cos, math.sin))
+    x, y = (
+        np.maximum(1 - np.abs(along[:, None] * f(angle) - pixel), 0)
+        for f in (math.cos, math.sin)
+    )
     assert kernel == pytest.approx(np.einsum("kj,ki->ij", x, y) / 32, abs=1e-7)
 
 
@@ -334,18 +459,26 @@ def test_two_windows_are_mirrored_where_a_draw_says_two():
     three, two = put_on(reflection=0.45)[0], put_on(draws, reflection=0.45)[0]
     k = 2
     at_x, at_y = (0.83 + 0.61 * k) % 1 - 0.5, (0.27 + 0.43 * k) % 1 - 0.5
-    half_x, half_y = 0.02 + 0.1 * ((0.41 + 0.29 * k) % 1), 0.02 + 0.08 * ((0.58 + 0.53 * k) % 1)
+    half_x, half_y = (
+        0.02 + 0.1 * ((0.41 + 0.29 * k) % 1),
+        0.02 + 0.08 * ((0.58 + 0.53 * k) % 1),
+    )
     lean = 0.6 * (0.76 - 0.5)
     u, v = (X - at_x) + lean * (Y - at_y), (Y - at_y) - lean * (X - at_x)
     third = 0.45 / (1 + (u / half_x) ** 6 + (v / half_y) ** 6)
-    assert three - two == pytest.approx(third * scene().frames.coverage[FRAME].double().numpy(), abs=2e-5)
+    assert three - two == pytest.approx(
+        third * scene().frames.coverage[FRAME].double().numpy(), abs=2e-5
+    )
 
 
 def test_a_soft_picture_is_the_mean_over_a_square_of_its_width():
     picture = torch.from_numpy(RNG.uniform(0, 1, (9, 12)))
     got = wear._soft(picture, 6.0).numpy()  # three to each side
     wide = np.pad(picture.numpy(), 3, mode="edge")
-    assert got == pytest.approx(sum(wide[i : i + 9, j : j + 12] for i in range(7) for j in range(7)) / 49, rel=1e-9)
+    assert got == pytest.approx(
+        sum(wide[i : i + 9, j : j + 12] for i in range(7) for j in range(7)) / 49,
+        rel=1e-9,
+    )
 
 
 def test_a_rim_before_closed_lids_lies_before_the_skin():
@@ -353,5 +486,7 @@ def test_a_rim_before_closed_lids_lies_before_the_skin():
     made = scene()
     made.frames.depth_um[:, 1] = 0.0
     sizes = {name: np.zeros(2) for name in wear.CAUSES} | {"rim": np.array([0.0, 0.09])}
-    depth = wear.dressed(made, wear.Worn(sizes, np.stack([np.zeros(12), DRAWS]))).frames.depth_um[FRAME, 0]
+    depth = wear.dressed(
+        made, wear.Worn(sizes, np.stack([np.zeros(12), DRAWS]))
+    ).frames.depth_um[FRAME, 0]
     assert sorted(set(depth.flatten().tolist())) == pytest.approx([0.7 * 15e3, 15e3])

@@ -1,4 +1,6 @@
-"""What people have in common in a file: every number where it was, and every odd one named."""
+"""What people have in common in a file: every number where it was, and every odd one
+named.
+"""
 
 from dataclasses import replace
 
@@ -10,15 +12,25 @@ from codesign.gaze.shared import Mixed, People
 from metalens.ground.errors import StoreError
 
 RNG = np.random.default_rng(1)
-MODEL = Mixed(RNG.normal(size=(36, 2)), RNG.uniform(0.1, 2, (36, 2)), np.array([0.3, 0.7]))
+MODEL = Mixed(
+    RNG.normal(size=(36, 2)), RNG.uniform(0.1, 2, (36, 2)), np.array([0.3, 0.7])
+)
 PEOPLE = People(MODEL, RNG.normal(size=7), RNG.uniform(0.5, 3, 7))
 
 
 def test_a_file_holds_every_number_in_its_place(tmp_path):
     people_file.save(tmp_path / "p.h5", PEOPLE)
     again = people_file.load(tmp_path / "p.h5")
-    parts = [(again.model.mean, MODEL.mean), (again.model.variance, MODEL.variance), (again.model.noise, MODEL.noise)]
-    for got, want in (*parts, (again.middle, PEOPLE.middle), (again.spread, PEOPLE.spread)):
+    parts = [
+        (again.model.mean, MODEL.mean),
+        (again.model.variance, MODEL.variance),
+        (again.model.noise, MODEL.noise),
+    ]
+    for got, want in (
+        *parts,
+        (again.middle, PEOPLE.middle),
+        (again.spread, PEOPLE.spread),
+    ):
         assert np.array_equal(got, want)
 
 
@@ -30,7 +42,8 @@ def changed(name, value):
 
 @pytest.mark.parametrize("name", ["variance", "noise", "spread"])
 @pytest.mark.parametrize(
-    ("odd", "read"), [(0.0, False), (-0.2, False), (1e-12, True), (np.nan, False), (np.inf, False)]
+    ("odd", "read"),
+    [(0.0, False), (-0.2, False), (1e-12, True), (np.nan, False), (np.inf, False)],
 )
 def test_what_spreads_is_above_zero_everywhere(tmp_path, name, odd, read):
     """One number of many, by a picounit above nothing or at it."""
@@ -40,7 +53,9 @@ def test_what_spreads_is_above_zero_everywhere(tmp_path, name, odd, read):
     if read:
         assert people_file.load(tmp_path / "p.h5")
     else:
-        with pytest.raises(StoreError, match=f"p.h5: {name} of a shape or value that no people have"):
+        with pytest.raises(
+            StoreError, match=f"p.h5: {name} of a shape or value that no people have"
+        ):
             people_file.load(tmp_path / "p.h5")
 
 

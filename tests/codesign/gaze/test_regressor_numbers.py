@@ -1,4 +1,6 @@
-"""The regressor of one hidden layer: its slopes by differences, its scales, and what it starts from."""
+"""The regressor of one hidden layer: its slopes by differences, its scales, and what it
+starts from.
+"""
 
 import numpy as np
 import pytest
@@ -14,9 +16,14 @@ def test_an_answer_is_tanh_of_standardised_features_brought_back_to_targets():
     """One feature of mean 3 and spread 2, two neurons, two targets, by hand."""
     inside = np.array([[0.5, -1.0], [0.2, 0.3]])
     outside = np.array([[2.0, -0.4], [1.5, 0.7], [-0.1, 0.6]])
-    made = Regressor(inside, outside, np.array([[3.0], [2.0]]), np.array([[10.0, -20.0], [4.0, 0.5]]))
+    made = Regressor(
+        inside, outside, np.array([[3.0], [2.0]]), np.array([[10.0, -20.0], [4.0, 0.5]])
+    )
     one, other = np.tanh(0.5 * 1.5 + 0.2), np.tanh(-1.5 + 0.3)
-    want = [10 + 4 * (2 * one + 1.5 * other - 0.1), -20 + 0.5 * (-0.4 * one + 0.7 * other + 0.6)]
+    want = [
+        10 + 4 * (2 * one + 1.5 * other - 0.1),
+        -20 + 0.5 * (-0.4 * one + 0.7 * other + 0.6),
+    ]
     assert made(np.array([[6.0]]))[0] == pytest.approx(want, rel=1e-12)
 
 
@@ -30,7 +37,9 @@ def test_exact_slopes_are_those_of_differences():
         return regressor._forward(v[:20].reshape(4, 5), v[20:].reshape(6, 2), x).ravel()
 
     v = np.concatenate([inside.ravel(), outside.ravel()])
-    want = np.stack([(at(v + e) - at(v - e)) / (2 * step) for e in np.eye(32) * step], 1)
+    want = np.stack(
+        [(at(v + e) - at(v - e)) / (2 * step) for e in np.eye(32) * step], 1
+    )
     assert got == pytest.approx(want, abs=1e-8)  # step^2, and rounding over the step
 
 
@@ -44,16 +53,25 @@ def test_a_steady_feature_and_a_steady_target_keep_their_value():
     assert made.targets[0] == pytest.approx([-0.65, -3.0])
     assert made.features[1, 0] == pytest.approx(x[:, 0].std())
     assert made(x)[:, 1] == pytest.approx([-3.0] * 9, abs=1e-8)
-    assert made(x)[:, 0] == pytest.approx(y[:, 0], abs=0.01)  # tanh of a straight line under a penalty of 1e-6
+    assert made(x)[:, 0] == pytest.approx(
+        y[:, 0], abs=0.01
+    )  # tanh of a straight line under a penalty of 1e-6
 
 
 def loss(made, x, y, penalty):
-    unit = np.tanh(x @ made.inside[:-1] + made.inside[-1]) @ made.outside[:-1] + made.outside[-1]
-    return ((unit - y) ** 2).sum() + penalty * len(x) * ((made.inside**2).sum() + (made.outside**2).sum())
+    unit = (
+        np.tanh(x @ made.inside[:-1] + made.inside[-1]) @ made.outside[:-1]
+        + made.outside[-1]
+    )
+    return ((unit - y) ** 2).sum() + penalty * len(x) * (
+        (made.inside**2).sum() + (made.outside**2).sum()
+    )
 
 
 def test_the_search_starts_from_small_weights_of_its_seed_and_an_answer_of_nothing():
-    """With one evaluation the start is what is kept: normal numbers times 0.3, outer weights 0."""
+    """With one evaluation the start is what is kept: normal numbers times 0.3, outer
+    weights 0.
+    """
     x, y = RNG.normal(size=(20, 3)), RNG.normal(size=(20, 2))
     for about, seed, hidden in (({}, 0, 10), ({"seed": 6, "hidden": 4}, 6, 4)):
         made = regressor.fit(x, y, steps=1, **about)
@@ -66,10 +84,16 @@ def test_the_search_starts_from_small_weights_of_its_seed_and_an_answer_of_nothi
 
 @pytest.mark.parametrize("penalty", [0.02, None])
 def test_at_the_end_no_way_leads_down(penalty):
-    """Squared errors of standardised points plus the penalty of a point times the squared weights: 30 ways of 1e-3."""
+    """Squared errors of standardised points plus the penalty of a point times the
+    squared weights: 30 ways of 1e-3.
+    """
     x = RNG.normal(size=(25, 2)) * [3.0, 0.2] + [5.0, -1.0]
-    y = np.stack([np.sin(x[:, 0]), x[:, 1] * x[:, 0], x[:, 1]], 1) + 0.1 * RNG.normal(size=(25, 3))
-    made = regressor.fit(x, y, hidden=2, steps=5_000, **({} if penalty is None else {"penalty": penalty}))
+    y = np.stack([np.sin(x[:, 0]), x[:, 1] * x[:, 0], x[:, 1]], 1) + 0.1 * RNG.normal(
+        size=(25, 3)
+    )
+    made = regressor.fit(
+        x, y, hidden=2, steps=5_000, **({} if penalty is None else {"penalty": penalty})
+    )
     units = [(a - a.mean(0)) / a.std(0) for a in (x, y)]
     price = 3e-4 if penalty is None else penalty
     least = loss(made, *units, price)
@@ -84,5 +108,7 @@ def test_at_the_end_no_way_leads_down(penalty):
 def test_three_points_are_enough_and_two_are_not():
     x, y = np.array([[0.1], [0.5], [1.2]]), np.array([[1.0], [2.0], [2.5]])
     assert regressor.fit(x, y, hidden=2)(x).shape == (3, 1)
-    with pytest.raises(TrainingError, match="a regressor from 2 points, need 3 or more"):
+    with pytest.raises(
+        TrainingError, match="a regressor from 2 points, need 3 or more"
+    ):
         regressor.fit(x[:2], y[:2])

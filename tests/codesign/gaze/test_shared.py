@@ -1,4 +1,6 @@
-"""What people share: variances in closed form, shrunk offsets, a person found from fewer points than terms."""
+"""What people share: variances in closed form, shrunk offsets, a person found from
+fewer points than terms.
+"""
 
 from dataclasses import replace
 
@@ -11,26 +13,38 @@ from metalens.ground.errors import StoreError, TrainingError
 
 
 def test_variances_of_a_balanced_layout_are_those_of_the_analysis_of_variance():
-    """Offsets alone, m frames of each of k people: greatest likelihood is σ² = MSW and τ² = (SSB / k - MSW) / m."""
+    """Offsets alone, m frames of each of k people: greatest likelihood is σ² = MSW and
+    τ² = (SSB / k - MSW) / m.
+    """
     rng = np.random.default_rng(4)
     k, m = 7, 5
     person = np.repeat(np.arange(k), m)
-    answers = np.array([3.0, -1.0]) + rng.normal(0, [2.0, 0.9], (k, 2))[person] + rng.normal(0, [0.7, 0.4], (k * m, 2))
-    found = shared.mixed(np.ones((k * m, 1)), answers, person, first=np.array([4.0]), rounds=400)
+    answers = (
+        np.array([3.0, -1.0])
+        + rng.normal(0, [2.0, 0.9], (k, 2))[person]
+        + rng.normal(0, [0.7, 0.4], (k * m, 2))
+    )
+    found = shared.mixed(
+        np.ones((k * m, 1)), answers, person, first=np.array([4.0]), rounds=400
+    )
     means = answers.reshape(k, m, 2).mean(1)
     within = ((answers - means[person]) ** 2).sum(0) / (k * (m - 1))
     between = m * ((means - means.mean(0)) ** 2).sum(0) / k
     assert found.noise == pytest.approx(within, rel=1e-5)
     assert found.variance[0] == pytest.approx((between - within) / m, rel=1e-5)
     assert found.mean[0] == pytest.approx(answers.mean(0), rel=1e-9)
-    new = np.array([[1.0, 2.0], [1.8, 0.4], [2.9, 1.1]])  # of another person: drawn to the mean by σ² / (σ² + 3 τ²)
+    new = np.array(
+        [[1.0, 2.0], [1.8, 0.4], [2.9, 1.1]]
+    )  # of another person: drawn to the mean by σ² / (σ² + 3 τ²)
     pull = within / (within + 3 * found.variance[0])
     want = (1 - pull) * new.mean(0) + pull * found.mean[0]
     assert found.own(np.ones((3, 1)), new)[0] == pytest.approx(want, rel=1e-6)
 
 
 def test_unlike_answers_keep_their_own_variances_and_terms():
-    """Two slopes, unequal numbers of frames: against the likelihood itself, which no step away may raise."""
+    """Two slopes, unequal numbers of frames: against the likelihood itself, which no
+    step away may raise.
+    """
     rng = np.random.default_rng(8)
     sizes = (9, 4, 12, 6, 8, 5)
     person = np.repeat(np.arange(6), sizes)
@@ -43,7 +57,10 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
     def likelihood(k, mean, variance, noise):
         total = 0.0
         for p in range(6):
-            x, y = design[person == p], answers[person == p, k] - design[person == p] @ mean
+            x, y = (
+                design[person == p],
+                answers[person == p, k] - design[person == p] @ mean,
+            )
             cov = noise * np.eye(len(x)) + x @ np.diag(variance) @ x.T
             total -= 0.5 * (np.linalg.slogdet(cov)[1] + y @ np.linalg.solve(cov, y))
         return total
@@ -54,29 +71,45 @@ def test_unlike_answers_keep_their_own_variances_and_terms():
         for place in range(5):
             for way in (0.98, 1.02):
                 tried = [np.array(v, dtype=float, ndmin=1) for v in given]
-                which, inside = (0, place) if place < 2 else (1, place - 2) if place < 4 else (2, 0)
+                which, inside = (
+                    (0, place) if place < 2 else (1, place - 2) if place < 4 else (2, 0)
+                )
                 tried[which][inside] *= way
                 assert likelihood(k, tried[0], tried[1], tried[2][0]) < best + 1e-6
 
 
 def test_it_begins_from_one_line_for_all_and_the_spread_given():
-    """Before any round: least squares over everybody, its residual's variance, the first variances for both answers."""
+    """Before any round: least squares over everybody, its residual's variance, the
+    first variances for both answers.
+    """
     rng = np.random.default_rng(9)
     design = np.stack([np.ones(11), rng.normal(0, 1, 11)], 1)
     answers = rng.normal([3.0, -40.0], [0.4, 2.5], (11, 2))
-    found = shared.mixed(design, answers, np.arange(11) % 3, first=np.array([4.0, 0.25]), rounds=0)
+    found = shared.mixed(
+        design, answers, np.arange(11) % 3, first=np.array([4.0, 0.25]), rounds=0
+    )
     line = np.linalg.solve(design.T @ design, design.T @ answers)
     assert found.mean == pytest.approx(line, rel=1e-9)
     assert found.variance == pytest.approx(np.array([[4.0, 4.0], [0.25, 0.25]]))
     left = answers - design @ line
-    assert found.noise == pytest.approx((left**2).sum(0) / 11, rel=1e-9)  # the line holds a constant: its mean is 0
+    assert found.noise == pytest.approx(
+        (left**2).sum(0) / 11, rel=1e-9
+    )  # the line holds a constant: its mean is 0
 
 
 def test_people_who_do_not_differ_keep_a_variance_above_zero():
-    """Answers on one line, without noise: every variance falls to 1e-9 deg² and its covariance, and nothing is nan."""
+    """Answers on one line, without noise: every variance falls to 1e-9 deg² and its
+    covariance, and nothing is nan.
+    """
     design = np.stack([np.ones(12), np.linspace(-1, 1, 12)], 1)
     line = np.array([[2.0, -3.0], [0.5, 4.0]])
-    found = shared.mixed(design, design @ line, np.arange(12) % 4, first=np.array([25.0, 1.0]), rounds=300)
+    found = shared.mixed(
+        design,
+        design @ line,
+        np.arange(12) % 4,
+        first=np.array([25.0, 1.0]),
+        rounds=300,
+    )
     for part in (found.variance, found.noise):
         assert (part >= 1e-9).all()
         assert (part < 1e-5).all()
@@ -84,13 +117,22 @@ def test_people_who_do_not_differ_keep_a_variance_above_zero():
 
 
 def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatch):
-    """Offsets of people are given 5 degrees to begin with, every other term 1; a reading spread by 0.02 counts as one
+    """Offsets of people are given 5 degrees to begin with, every other term 1; a
+    reading spread by 0.02 counts as one
     spread by 4, and one that never changes as nothing."""
     rng = np.random.default_rng(10)
-    axis, pupil, slip = rng.normal(3, 4, (80, 2)), rng.normal(-1, 0.02, (80, 2)), rng.normal(0.5, 1.5, (80, 3))
+    axis, pupil, slip = (
+        rng.normal(3, 4, (80, 2)),
+        rng.normal(-1, 0.02, (80, 2)),
+        rng.normal(0.5, 1.5, (80, 3)),
+    )
     slip[:, 1] = 0.25
     asked = []
-    monkeypatch.setattr(shared, "mixed", lambda *given, first: asked.append((*given, first)) or shared.Mixed(*given))
+    monkeypatch.setattr(
+        shared,
+        "mixed",
+        lambda *given, first: asked.append((*given, first)) or shared.Mixed(*given),
+    )
     read = Readings(pupil, slip, axis)
     people = shared.learn(read, axis + 7.0, np.arange(80) % 4)
     ((design, answers, person, first),) = asked
@@ -106,19 +148,34 @@ def test_readings_are_in_units_of_their_spread_and_kappa_differs_most(monkeypatc
 
 
 def _read(rng, people, each, common):
-    """Gaze of people whose axis is misread by kappa, a gain, and by what a slippage of each does to all alike."""
+    """Gaze of people whose axis is misread by kappa, a gain, and by what a slippage of
+    each does to all alike.
+    """
     person = np.repeat(np.arange(people), each)
-    gaze, slip = rng.uniform(-17, 17, (len(person), 2)), rng.uniform(-5, 5, (len(person), 3))
+    gaze, slip = (
+        rng.uniform(-17, 17, (len(person), 2)),
+        rng.uniform(-5, 5, (len(person), 3)),
+    )
     kappa = rng.normal([5.0, -1.5], 2.0, (people, 2))[person]
     gain = rng.normal(1.0, 0.05, people)[person]
-    axis = gain[:, None] * gaze + kappa + common * np.stack([slip[:, 0] * slip[:, 2], slip[:, 2] ** 2], 1)
+    axis = (
+        gain[:, None] * gaze
+        + kappa
+        + common * np.stack([slip[:, 0] * slip[:, 2], slip[:, 2] ** 2], 1)
+    )
     pupil = 0.03 * gaze + 0.1 * slip[:, :2] + 0.01 * rng.normal(0, 1, gaze.shape)
-    return Readings(pupil, slip, axis + 0.2 * rng.normal(0, 1, gaze.shape)), gaze, person
+    return (
+        Readings(pupil, slip, axis + 0.2 * rng.normal(0, 1, gaze.shape)),
+        gaze,
+        person,
+    )
 
 
 def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
-    """36 terms, ten frames: what all misread alike is known from others, kappa and gain are found. 0.2 degrees each way
-    are noise, 0.25 in the mean angle; ten points leave sqrt(1 + 4 / 10) of that, and twice that is the bar."""
+    """36 terms, ten frames: what all misread alike is known from others, kappa and gain
+    are found. 0.2 degrees each way
+    are noise, 0.25 in the mean angle; ten points leave sqrt(1 + 4 / 10) of that, and
+    twice that is the bar."""
     rng = np.random.default_rng(1)
     people = shared.learn(*_read(rng, 32, 40, 0.2))
     read, gaze, _ = _read(rng, 1, 210, 0.2)
@@ -127,7 +184,9 @@ def test_a_person_of_ten_frames_is_read_as_well_as_noise_allows():
     assert error < 2 * 0.25 * np.sqrt(1.4)
     off = read.axis_deg - gaze
     raw = off[10:] - off[:10].mean(0)
-    assert np.linalg.norm(raw, axis=1).mean() > 2.0  # 0.2 deg/mm² of products up to 25 mm²
+    assert (
+        np.linalg.norm(raw, axis=1).mean() > 2.0
+    )  # 0.2 deg/mm² of products up to 25 mm²
 
 
 def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_path):
@@ -135,10 +194,17 @@ def test_people_are_read_from_a_file_as_they_were_and_odd_ones_are_refused(tmp_p
     people_file.save(tmp_path / "p.h5", people)
     again = people_file.load(tmp_path / "p.h5")
     read, gaze, _ = _read(np.random.default_rng(7), 1, 8, 0.1)
-    assert np.array_equal(again.person(read[:5], gaze[:5])(read), people.person(read[:5], gaze[:5])(read))
-    for odd in (replace(people, spread=0 * people.spread), replace(people, middle=people.middle[:3])):
+    assert np.array_equal(
+        again.person(read[:5], gaze[:5])(read), people.person(read[:5], gaze[:5])(read)
+    )
+    for odd in (
+        replace(people, spread=0 * people.spread),
+        replace(people, middle=people.middle[:3]),
+    ):
         people_file.save(tmp_path / "odd.h5", odd)
-        with pytest.raises(StoreError, match=r"(spread|middle) of a shape or value that no people have"):
+        with pytest.raises(
+            StoreError, match=r"(spread|middle) of a shape or value that no people have"
+        ):
             people_file.load(tmp_path / "odd.h5")
 
 
@@ -146,7 +212,10 @@ def test_too_few_people_frames_or_points_are_refused():
     rng = np.random.default_rng(2)
     with pytest.raises(TrainingError, match="40 frames of 1 people"):
         shared.learn(*_read(rng, 1, 40, 0.0))
-    with pytest.raises(TrainingError, match="36 frames of 4 people tell not how people differ in 36 terms"):
+    with pytest.raises(
+        TrainingError,
+        match="36 frames of 4 people tell not how people differ in 36 terms",
+    ):
         shared.learn(*_read(rng, 4, 9, 0.0))
     people = shared.learn(*_read(rng, 6, 20, 0.0))
     read, gaze, _ = _read(rng, 1, 2, 0.0)

@@ -1,4 +1,6 @@
-"""Blocks, choices and neighbours of architectures in a space of unlike numbers, by hand."""
+"""Blocks, choices and neighbours of architectures in a space of unlike numbers, by
+hand.
+"""
 
 from dataclasses import replace
 
@@ -18,31 +20,56 @@ SPACE = Space(
     widths=(1.0, 0.5),
     resolution=(0.4, 0.8),
 )
-ONE = Architecture((2, 3), (3, 5, 7, 5, 3, 7), (2, 4, 6, 6, 2, 4), width=0.5, resolution=0.6)
+ONE = Architecture(
+    (2, 3), (3, 5, 7, 5, 3, 7), (2, 4, 6, 6, 2, 4), width=0.5, resolution=0.6
+)
 
 
 @pytest.mark.parametrize(
     ("channels", "rounded"),
-    [(1, 8), (8, 8), (11.9, 16), (12, 16), (17, 16), (17.7, 16), (17.8, 24), (20, 24), (35, 32), (36, 40)],
+    [
+        (1, 8),
+        (8, 8),
+        (11.9, 16),
+        (12, 16),
+        (17, 16),
+        (17.7, 16),
+        (17.8, 24),
+        (20, 24),
+        (35, 32),
+        (36, 40),
+    ],
 )
 def test_channels_are_multiples_of_eight_that_lose_a_tenth_at_most(channels, rounded):
-    """12 and more of 8 to 16 go up; 11.9 would lose a third as 8, and 17.8 more than a tenth as 16."""
+    """12 and more of 8 to 16 go up; 11.9 would lose a third as 8, and 17.8 more than a
+    tenth as 16.
+    """
     assert nets.divisible(channels) == rounded
     assert rounded >= 0.9 * channels
     assert nets.divisible(21, 10) == 20
 
 
 def test_blocks_take_their_slot_of_the_deepest_stage():
-    """Half as wide: 20, 24 and 50 channels are 16 (not 8 of 10), 16 (12) and 24 (25); hidden ones are e times the
+    """Half as wide: 20, 24 and 50 channels are 16 (not 8 of 10), 16 (12) and 24 (25);
+    hidden ones are e times the
     inputs, a quarter of them squeeze."""
     first, second = nets.blocks(SPACE, ONE)
-    assert first == [Block(3, 16, 32, 16, 2, 0, "relu"), Block(5, 16, 64, 16, 1, 0, "relu")]
+    assert first == [
+        Block(3, 16, 32, 16, 2, 0, "relu"),
+        Block(5, 16, 64, 16, 1, 0, "relu"),
+    ]
     assert second == [
         Block(5, 16, 96, 24, 1, 24, "hardswish"),
         Block(3, 24, 48, 24, 1, 16, "hardswish"),
         Block(7, 24, 96, 24, 1, 24, "hardswish"),
     ]
-    assert [block.residual for block in (*first, *second)] == [False, True, False, True, True]
+    assert [block.residual for block in (*first, *second)] == [
+        False,
+        True,
+        False,
+        True,
+        True,
+    ]
     assert nets.stem_channels(SPACE, ONE) == 16
     assert nets.stem_channels(SPACE, replace(ONE, width=1.0)) == 24
 
@@ -52,7 +79,10 @@ def test_the_largest_the_smallest_and_their_slots():
     assert nets.largest(SPACE) == Architecture((3, 3), (7,) * 6, (6,) * 6, 1.0, 0.8)
     assert nets.smallest(SPACE) == Architecture((1, 1), (3,) * 6, (2,) * 6, 0.5, 0.4)
     assert nets.resolutions(SPACE) == (0.4, 0.5, 0.6, 0.7, 0.8)
-    assert nets.resolutions(replace(SPACE, resolution=(0.35, 0.5))) in ((0.35, 0.45), (0.35, 0.45, 0.55))
+    assert nets.resolutions(replace(SPACE, resolution=(0.35, 0.5))) in (
+        (0.35, 0.45),
+        (0.35, 0.45, 0.55),
+    )
 
 
 def test_idle_slots_are_the_least_choice():
@@ -83,15 +113,20 @@ def test_a_stranger_to_the_space_is_named(change, said):
 
 @pytest.mark.parametrize("rate", [0.15, 0.6])
 def test_neighbours_change_each_entry_as_often_as_told_and_one_at_least(rate):
-    """A kernel that is drawn anew is another in two of three draws: 1000 of them, to 4 sigma of 0.5 / √1000, beside
+    """A kernel that is drawn anew is another in two of three draws: 1000 of them, to 4
+    sigma of 0.5 / √1000, beside
     the few neighbours that were drawn once more as nothing had changed."""
     generator = np.random.default_rng(4)
     made = [nets.mutate(SPACE, ONE, generator, rate=rate) for _ in range(250)]
     assert all(nets.active(SPACE, one) != nets.active(SPACE, ONE) for one in made)
     assert all(nets.check(SPACE, one) for one in made)
     used = [0, 1, 3, 4]
-    changed = np.mean([[one.kernels[k] != ONE.kernels[k] for k in used] for one in made])
-    same = (1 - 2 / 3 * rate) ** 10 * (1 - rate / 2) * (1 - 0.8 * rate)  # two depths, eight slots, width, resolution
+    changed = np.mean(
+        [[one.kernels[k] != ONE.kernels[k] for k in used] for one in made]
+    )
+    same = (
+        (1 - 2 / 3 * rate) ** 10 * (1 - rate / 2) * (1 - 0.8 * rate)
+    )  # two depths, eight slots, width, resolution
     assert changed == pytest.approx(2 / 3 * rate / (1 - same), abs=4 * 0.5 / 1000**0.5)
     assert {one.width for one in made} == {0.5, 1.0}
     assert {one.resolution for one in made} == set(nets.resolutions(SPACE))
@@ -102,7 +137,11 @@ def test_members_are_drawn_evenly_over_every_choice():
     made = [nets.sample(SPACE, generator) for _ in range(300)]
     assert all(nets.check(SPACE, one) for one in made)
     for name, choices in (("depths", 3), ("kernels", 3), ("expansions", 3)):
-        counts = np.unique([getattr(one, name)[1] for one in made], return_counts=True)[1]
-        assert counts == pytest.approx(np.full(choices, 300 / choices), abs=4 * (300 * 2 / 9) ** 0.5)  # 4 sigma
+        counts = np.unique([getattr(one, name)[1] for one in made], return_counts=True)[
+            1
+        ]
+        assert counts == pytest.approx(
+            np.full(choices, 300 / choices), abs=4 * (300 * 2 / 9) ** 0.5
+        )  # 4 sigma
     widths = np.unique([one.width for one in made], return_counts=True)[1]
     assert widths == pytest.approx([150, 150], abs=4 * 75**0.5)

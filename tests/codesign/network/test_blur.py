@@ -1,4 +1,6 @@
-"""The blur branch against Fourier transforms of cut-out windows, closed forms of depth and blur, and its own count."""
+"""The blur branch against Fourier transforms of cut-out windows, closed forms of depth
+and blur, and its own count.
+"""
 
 import math
 
@@ -12,11 +14,15 @@ from codesign.network.supernet import Prediction, SlicedNorm
 
 
 def _frames(count=2, size=64, seed=4):
-    return torch.randn(count, 1, size, size, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(
+        count, 1, size, size, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def test_power_is_that_of_the_windows_own_fourier_transform():
-    """The referee cuts the windows out and transforms them; a window of 16 pixels has just these frequencies."""
+    """The referee cuts the windows out and transforms them; a window of 16 pixels has
+    just these frequencies.
+    """
     frames = _frames()
     power, mean = windows.spectra(frames)
     weight = np.hanning(33)[1::2]  # sin² at the pixels' middles
@@ -25,15 +31,23 @@ def test_power_is_that_of_the_windows_own_fourier_transform():
         cut = frames[1, 0, 8 * row : 8 * row + 16, 8 * column : 8 * column + 16].numpy()
         want = np.abs(np.fft.fft2(cut * weight)) ** 2
         for fx, fy in ((0, 3), (5, -2), (8, 7), (1, 0)):
-            got = float(power[1, fx * windows.ROWS + fy + windows.WAVES - 1, row, column])
-            assert got == pytest.approx(want[fy, fx], rel=1e-4, abs=1e-5)  # float32 sums of 256 terms
-        assert float(mean[1, 0, row, column]) == pytest.approx((cut * weight).sum() / weight.sum(), rel=1e-4, abs=1e-6)
+            got = float(
+                power[1, fx * windows.ROWS + fy + windows.WAVES - 1, row, column]
+            )
+            assert got == pytest.approx(
+                want[fy, fx], rel=1e-4, abs=1e-5
+            )  # float32 sums of 256 terms
+        assert float(mean[1, 0, row, column]) == pytest.approx(
+            (cut * weight).sum() / weight.sum(), rel=1e-4, abs=1e-6
+        )
 
 
 def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
-    """10 and 6.4 waves a frame along x and y: the same place and height of the peak on 64 and on 96 pixels.
+    """10 and 6.4 waves a frame along x and y: the same place and height of the peak on
+    64 and on 96 pixels.
 
-    A pixel samples the wave here, so the height differs by the number of pixels in a window alone: (96 / 64)².
+    A pixel samples the wave here, so the height differs by the number of pixels in a
+    window alone: (96 / 64)².
     """
     found = []
     for size in (64, 96):
@@ -42,11 +56,15 @@ def test_a_wave_looks_the_same_on_coarse_and_on_fine_pixels():
         found.append(windows.spectra(wave[None, None].float())[0][0, :, 3, 4])
     assert int(found[0].argmax()) == int(found[1].argmax())
     top = int(found[0].argmax())
-    assert float(found[1][top] / found[0][top]) == pytest.approx((96 / 64) ** 2, rel=0.01)
+    assert float(found[1][top] / found[0][top]) == pytest.approx(
+        (96 / 64) ** 2, rel=0.01
+    )
 
 
 def test_waves_beyond_nyquist_are_left_out_on_few_pixels():
-    power, _ = windows.spectra(_frames(size=24))  # 6 pixels a window: 3 periods and no more
+    power, _ = windows.spectra(
+        _frames(size=24)
+    )  # 6 pixels a window: 3 periods and no more
     grid = power.reshape(2, windows.COLUMNS, windows.ROWS, blur.GRID, blur.GRID)
     assert bool((grid[:, :4, windows.WAVES - 1 - 3 : windows.WAVES + 3] > 0).all())
     assert not bool(grid[:, 4:].any())
@@ -58,20 +76,30 @@ def test_the_count_is_that_of_a_counted_pass(size):
     branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         depth, features = branch(_frames(1, size))
-    assert counter.get_total_flops() // 2 == blur.macs(size) - windows.STEP_MACS  # sums of slices: it counts them not
+    assert (
+        counter.get_total_flops() // 2 == blur.macs(size) - windows.STEP_MACS
+    )  # sums of slices: it counts them not
     assert depth.shape == (1, 2, blur.GRID, blur.GRID)
     assert features.shape == (1, blur.SLIP_FEATURES)
 
 
 def test_the_depth_of_a_window_is_read_from_it_and_two_more_around_it_a_block():
     torch.manual_seed(2)
-    rounding = 3e-7  # ten of single precision at answers of 0.4; the least that a window is told moves it by 1e-5
+    # ten of single precision at answers of 0.4; the least that a window is told moves
+    # it by 1e-5
+    rounding = 3e-7
     branch = blur.BlurBranch(SlicedNorm(blur.FEATURES)).eval()
     frames = _frames(2, 64)
     changed = frames.clone()
-    changed[..., :5, -5:] += 1.0  # with what steps of brightness reach: seen by the upper right window alone
+    changed[..., :5, -5:] += (
+        1.0  # with what steps of brightness reach: seen by the upper right window alone
+    )
     with torch.no_grad():
-        assert bool(((branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > rounding).all())  # all tell all, and
+        assert bool(
+            (
+                (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > rounding
+            ).all()
+        )  # all tell all, and
         for block in branch.together[1::2]:
             block.give.weight.zero_()
         moved = (branch(changed)[0] - branch(frames)[0]).abs().amax((0, 1)) > rounding
@@ -83,7 +111,9 @@ def test_the_depth_of_a_window_is_read_from_it_and_two_more_around_it_a_block():
 
 
 def test_a_block_adds_to_a_window_what_its_mixed_neighbours_tell():
-    """A gatherer of ones and a mixer of -0.5: x - hardswish(sum of the 5 x 5 windows around + 0.3) / 2."""
+    """A gatherer of ones and a mixer of -0.5: x - hardswish(sum of the 5 x 5 windows
+    around + 0.3) / 2.
+    """
     block = blur.Around(3)
     with torch.no_grad():
         block.gather.weight.fill_(1.0)
@@ -95,15 +125,23 @@ def test_a_block_adds_to_a_window_what_its_mixed_neighbours_tell():
         got = block(x)
     around = torch.full_like(x, 0.3)
     around[0, 1, 0:5, 1:6] += 0.7
-    torch.testing.assert_close(got, x - 0.5 * around * (around + 3) / 6, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(
+        got, x - 0.5 * around * (around + 3) / 6, rtol=1e-6, atol=1e-7
+    )
 
 
 def test_all_windows_tell_each_their_mean_and_their_spread():
-    """One window of 49 is 0.7: mean 0.7 / 49, variance 0.49 (1/49 - 1/49²), by layers of one and two."""
+    """One window of 49 is 0.7: mean 0.7 / 49, variance 0.49 (1/49 - 1/49²), by layers
+    of one and two.
+    """
     block = blur.Overall(2)
     with torch.no_grad():
-        block.take.weight.copy_(torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]]))
-        block.take.bias.copy_(torch.tensor([4.0, 5.0]))  # beyond 3 hardswish is its argument
+        block.take.weight.copy_(
+            torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]])
+        )
+        block.take.bias.copy_(
+            torch.tensor([4.0, 5.0])
+        )  # beyond 3 hardswish is its argument
         block.give.weight.copy_(torch.tensor([[1.0, 0.0], [0.0, 3.0]]))
         block.give.bias.copy_(torch.tensor([0.1, 0.2]))
         x = torch.zeros(1, 2, blur.GRID, blur.GRID)
@@ -122,25 +160,39 @@ def test_windows_that_are_all_alike_have_slopes():
 
 def test_windows_hold_the_vergence_under_them():
     depth = torch.full((1, 64, 96), 25e3)
-    depth[:, :8] = 12.5e3  # the first 8 rows, which a quarter of the first row of windows' weight sees … and no other
+    depth[:, :8] = (
+        # the first 8 rows, which a quarter of the first row of windows' weight sees …
+        # and no other
+        12.5e3
+    )
     got = blur.window_vergence(depth)
     assert got.shape == (1, blur.GRID, blur.GRID)
-    far, near = ((1e3 / z - blur.VERGENCE_PER_M) / blur.VERGENCE_UNIT_PER_M for z in (25.0, 12.5))
+    far, near = (
+        (1e3 / z - blur.VERGENCE_PER_M) / blur.VERGENCE_UNIT_PER_M for z in (25.0, 12.5)
+    )
     assert torch.allclose(got[:, 1:], torch.full_like(got[:, 1:], far), atol=1e-5)
-    assert float(got[0, 0, 2]) == pytest.approx((far + near) / 2, abs=1e-5)  # half of a symmetric weight
+    assert float(got[0, 0, 2]) == pytest.approx(
+        (far + near) / 2, abs=1e-5
+    )  # half of a symmetric weight
     assert float(blur.depth_mm(torch.tensor(near))) == pytest.approx(12.5, rel=1e-6)
 
 
 def test_depth_loss_is_least_at_the_truth_and_at_the_true_spread():
-    """The mean of 0.5 e² / s² + log s over errors of spread S is least at s = S, where it is 0.5 + log S."""
+    """The mean of 0.5 e² / s² + log s over errors of spread S is least at s = S, where
+    it is 0.5 + log S.
+    """
     miss = 0.37 * torch.randn(200_000, 1, 1, generator=torch.Generator().manual_seed(2))
     truth = torch.full_like(miss, 1.3)
 
     def loss(spread, shift=0.0):
-        told = torch.stack([truth + miss + shift, torch.full_like(miss, math.log(spread))], 1)
+        told = torch.stack(
+            [truth + miss + shift, torch.full_like(miss, math.log(spread))], 1
+        )
         return float(losses.depth(told, truth))
 
-    assert loss(0.37) == pytest.approx(0.5 + math.log(0.37), abs=0.005)  # 2e5 draws: 0.0016
+    assert loss(0.37) == pytest.approx(
+        0.5 + math.log(0.37), abs=0.005
+    )  # 2e5 draws: 0.0016
     assert loss(0.37) < min(loss(0.3), loss(0.45), loss(0.37, 0.2))
 
 
@@ -148,7 +200,11 @@ def test_the_uncertainty_moves_nothing_but_itself():
     slip = torch.tensor([[0.4, -0.2, 1.1]], requires_grad=True)
     spread = torch.tensor([[-0.3, 0.1, 0.4]], requires_grad=True)
     found = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip, None, spread)
-    given = torch.zeros(1, 7, 7), torch.tensor([[0.3, 0.9, -2.0]]), torch.tensor([0.5, 0.7, 3.0])
+    given = (
+        torch.zeros(1, 7, 7),
+        torch.tensor([[0.3, 0.9, -2.0]]),
+        torch.tensor([0.5, 0.7, 3.0]),
+    )
     value = losses.reading(found, *given, depth_weight=0.5)
     value.backward()
     assert slip.grad is None or not bool(slip.grad.any())
@@ -156,11 +212,24 @@ def test_the_uncertainty_moves_nothing_but_itself():
     want = 0.1 / 3 * (1 - miss**2 * torch.exp(-2 * spread.detach()))
     assert torch.allclose(spread.grad, want, rtol=1e-5)
     plain = Prediction(torch.zeros(1, 4, 4), torch.zeros(1, 2), slip)
-    assert float(losses.reading(plain, torch.zeros(1, 7, 7), slip.detach(), torch.ones(3), depth_weight=0.5)) == 0
+    assert (
+        float(
+            losses.reading(
+                plain,
+                torch.zeros(1, 7, 7),
+                slip.detach(),
+                torch.ones(3),
+                depth_weight=0.5,
+            )
+        )
+        == 0
+    )
 
 
 def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():
-    """A disc of radius 0.2 of the frame: its logits on 16 cells agree with themselves, at 64 pixels with the disc."""
+    """A disc of radius 0.2 of the frame: its logits on 16 cells agree with themselves,
+    at 64 pixels with the disc.
+    """
 
     def disc(size):
         place = (torch.arange(size) + 0.5) / size - 0.5
@@ -168,9 +237,15 @@ def test_the_mask_is_scored_at_the_pixels_that_are_asked_for():
 
     coarse, fine = 40 * disc(16)[None], (disc(64) > 0).float()[None]
     assert float(losses.overlap(coarse, fine)) > 0.9
-    assert float(losses.overlap(coarse, fine, pixels=64)) > 0.97  # a smooth edge is interpolated well within a cell
-    shifted = 40 * torch.roll(disc(16), 1, 1)[None]  # one cell of 16: of a disc of radius r, shifted by d: closed form
+    assert (
+        float(losses.overlap(coarse, fine, pixels=64)) > 0.97
+    )  # a smooth edge is interpolated well within a cell
+    shifted = (
+        40 * torch.roll(disc(16), 1, 1)[None]
+    )  # one cell of 16: of a disc of radius r, shifted by d: closed form
     r, d = 0.2, 1 / 16
     both = 2 * r**2 * math.acos(d / (2 * r)) - d / 2 * math.sqrt(4 * r**2 - d**2)
     want = both / (2 * math.pi * r**2 - both)
-    assert float(losses.overlap(shifted, fine, pixels=64)) == pytest.approx(want, abs=0.02)  # pixels of the rim
+    assert float(losses.overlap(shifted, fine, pixels=64)) == pytest.approx(
+        want, abs=0.02
+    )  # pixels of the rim

@@ -1,4 +1,6 @@
-"""The cost model equals counted forward passes, published counts, and its own finite differences."""
+"""The cost model equals counted forward passes, published counts, and its own finite
+differences.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from metalens.ground.errors import ConfigError
 def _counted(net, architecture, size):
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, size, size), architecture)
-    return counter.get_total_flops() // 2 + windows.STEP_MACS  # steps are sums of slices, which it does not count
+    return (
+        counter.get_total_flops() // 2 + windows.STEP_MACS
+    )  # steps are sums of slices, which it does not count
 
 
 def test_count_equals_a_counted_forward_pass_for_24_subnets():
@@ -25,13 +29,17 @@ def test_count_equals_a_counted_forward_pass_for_24_subnets():
         architecture = sample(net.space, generator)
         size = int(generator.integers(54, 120))
         scaled = round(size * architecture.resolution)
-        assert int(cost.network(net.space, architecture).at(scaled)) == _counted(net, architecture, size)
+        assert int(cost.network(net.space, architecture).at(scaled)) == _counted(
+            net, architecture, size
+        )
 
 
 def test_published_counts_of_mobilenet_v3():
     assert mobilenet_v3.counted("large") / 1e6 == pytest.approx(216.6, abs=0.05)
     assert mobilenet_v3.counted("small") / 1e6 == pytest.approx(56.5, abs=0.05)
-    without = mobilenet_v3.counted("large", classes=0)  # the last row of Table 1: 1280 channels to 1000 classes
+    without = mobilenet_v3.counted(
+        "large", classes=0
+    )  # the last row of Table 1: 1280 channels to 1000 classes
     assert mobilenet_v3.counted("large") - without == 1280 * 1000
 
 
@@ -42,25 +50,37 @@ def test_continuous_count_has_the_gradient_of_its_finite_difference(size):
     value = cost.macs_of_size(space, largest(space), at)
     value.backward()
     step = 1e-6
-    ahead, behind = (float(cost.macs_of_size(space, largest(space), size + s)) for s in (step, -step))
-    # at an integer the curvature jumps: the difference is off by that times the step, 1e-4 of the mean slope
+    ahead, behind = (
+        float(cost.macs_of_size(space, largest(space), size + s)) for s in (step, -step)
+    )
+    # at an integer the curvature jumps: the difference is off by that times the step,
+    # 1e-4 of the mean slope
     mean_slope = 2 * float(value.detach()) / size
-    assert float(at.grad) == pytest.approx((ahead - behind) / (2 * step), rel=1e-4, abs=1e-4 * mean_slope)
+    assert float(at.grad) == pytest.approx(
+        (ahead - behind) / (2 * step), rel=1e-4, abs=1e-4 * mean_slope
+    )
     if size == round(size):
-        assert float(value.detach()) == float(cost.network(space, largest(space)).at(int(size)))
+        assert float(value.detach()) == float(
+            cost.network(space, largest(space)).at(int(size))
+        )
 
 
 def test_the_gradient_in_the_pitch_is_that_of_its_finite_difference():
     pitch = torch.tensor(5.31, dtype=torch.float64, requires_grad=True)
     cost.macs(largest(Space()), pitch, window_um=1152.0).backward()
-    ahead, behind = (float(cost.macs(largest(Space()), 5.31 + s, window_um=1152.0)) for s in (1e-6, -1e-6))
+    ahead, behind = (
+        float(cost.macs(largest(Space()), 5.31 + s, window_um=1152.0))
+        for s in (1e-6, -1e-6)
+    )
     assert float(pitch.grad) == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
 
 
 @pytest.mark.parametrize("low", [64, 100, 217])
 def test_more_pixels_never_cost_less(low):
     sizes = np.linspace(low, low + 3, 61)
-    counts = np.array([float(cost.macs_of_size(Space(), smallest(Space()), s)) for s in sizes])
+    counts = np.array(
+        [float(cost.macs_of_size(Space(), smallest(Space()), s)) for s in sizes]
+    )
     assert (np.diff(counts) >= -1e-6 * counts[0]).all()
 
 
@@ -68,6 +88,8 @@ def test_cost_falls_with_pitch_and_impossible_pitch_is_refused():
     space = Space()
     sizes = [cost.input_size(1200.0, pitch, 1.0) for pitch in (3.0, 6.0, 12.0)]
     counts = [float(cost.macs_of_size(space, smallest(space), s)) for s in sizes]
-    assert counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85  # heads and windows of the blur are no pixels
+    assert (
+        counts[0] > 3.5 * counts[1] > 3.5**2 * counts[2] * 0.85
+    )  # heads and windows of the blur are no pixels
     with pytest.raises(ConfigError, match=r"leaves 12\.0 pixels"):
         cost.input_size(1200.0, 100.0, 1.0)

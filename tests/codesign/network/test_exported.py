@@ -1,4 +1,6 @@
-"""An exported graph against the network it was made of: the same numbers in the units that it says, for any batch."""
+"""An exported graph against the network it was made of: the same numbers in the units
+that it says, for any batch.
+"""
 
 import copy
 import dataclasses
@@ -23,11 +25,15 @@ def net():
 
 
 def _frames(count, size, seed=1):
-    return torch.randn(count, 1, size, size, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(
+        count, 1, size, size, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def _angles_deg(axis, elevation):
-    """By the camera's place below the face: its z points to the face, which is turned about x by the elevation."""
+    """By the camera's place below the face: its z points to the face, which is turned
+    about x by the elevation.
+    """
     x, y, z = axis.T / np.linalg.norm(axis, axis=1)
     down = np.cos(elevation) * y - np.sin(elevation) * z
     out = -np.sin(elevation) * y - np.cos(elevation) * z
@@ -53,14 +59,18 @@ def graphs(net, tmp_path_factory):
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(graphs, case):
-    """Levels of a sensor, 512 with a spread of 90, in place of standardised frames; batches of one and three."""
+    """Levels of a sensor, 512 with a spread of 90, in place of standardised frames;
+    batches of one and three.
+    """
     onnxruntime = pytest.importorskip("onnxruntime")
     _, size = case
     chosen, net, path = graphs[case]
     session = onnxruntime.InferenceSession(path)
     for count in (1, 3):
         plain = _frames(count, size, seed=count)
-        plain = (plain - plain.mean((2, 3), keepdim=True)) / plain.std((2, 3), keepdim=True)
+        plain = (plain - plain.mean((2, 3), keepdim=True)) / plain.std(
+            (2, 3), keepdim=True
+        )
         found = session.run(None, {"frames": (512 + 90 * plain).numpy()})
         with torch.no_grad():
             want = net(plain, chosen)
@@ -75,12 +85,17 @@ def test_a_graph_gives_the_network_s_answers_in_lengths_and_angles(graphs, case)
         }
         assert [value.name for value in session.get_outputs()] == list(told)
         for value, (name, expected) in zip(found, told.items(), strict=True):
-            # float32 through 40 layers in another order; an axis of untrained weights is 0.1 long: ten times in degrees
-            assert np.abs(value - expected).max() < (3e-3 if name == "axis_deg" else 3e-4), name
+            # float32 through 40 layers in another order; an axis of untrained weights
+            # is 0.1 long: ten times in degrees
+            assert np.abs(value - expected).max() < (
+                3e-3 if name == "axis_deg" else 3e-4
+            ), name
     assert session.get_outputs()[5].shape == ["batch", 2]
 
 
-def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(graphs, tmp_path):
+def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(
+    graphs, tmp_path
+):
     import onnx
 
     chosen, net, path = graphs[CASES[0]]
@@ -88,10 +103,22 @@ def test_a_file_says_what_it_holds_and_leaves_out_what_nothing_trained(graphs, t
     exported.write(tmp_path / "bare", Subnet(net, chosen), bare, size=61, pitch_um=30.0)
     whole, cut = (onnx.load(name) for name in (path, tmp_path / "bare"))
     onnx.checker.check_model(whole, full_check=True)
-    assert [v.name for v in cut.graph.output] == ["mask_logits", "pupil_mm", "slip_mm", "slip_sd_mm"]
-    assert {v.name: v.doc_string[-2:] for v in whole.graph.output if v.name.endswith("_mm")} == dict.fromkeys(
-        ["pupil_mm", "slip_mm", "slip_sd_mm"], "mm"
-    ) | {"points_mm": "mm"}
+    assert [v.name for v in cut.graph.output] == [
+        "mask_logits",
+        "pupil_mm",
+        "slip_mm",
+        "slip_sd_mm",
+    ]
+    assert {
+        v.name: v.doc_string[-2:] for v in whole.graph.output if v.name.endswith("_mm")
+    } == dict.fromkeys(["pupil_mm", "slip_mm", "slip_sd_mm"], "mm") | {
+        "points_mm": "mm"
+    }
     assert whole.graph.output[5].doc_string.endswith("deg")
     about = {p.key: float(p.value) for p in whole.metadata_props}
-    assert about == {"pixels": 61, "pitch_um": 30.0, "frame_mm": 1.87, "elevation_rad": 0.6}
+    assert about == {
+        "pixels": 61,
+        "pitch_um": 30.0,
+        "frame_mm": 1.87,
+        "elevation_rad": 0.6,
+    }

@@ -1,4 +1,6 @@
-"""What an exported graph says, before it is one: standardised frames in, lengths and angles out."""
+"""What an exported graph says, before it is one: standardised frames in, lengths and
+angles out.
+"""
 
 import math
 from types import SimpleNamespace
@@ -40,7 +42,9 @@ def told(scale=SCALE, frames=None):
 
 
 def test_frames_come_to_mean_nothing_and_deviation_one_whatever_their_unit():
-    """Deviations of 25 pixels are over 24; an even frame is divided by 1e-6 at least and stays even."""
+    """Deviations of 25 pixels are over 24; an even frame is divided by 1e-6 at least
+    and stays even.
+    """
     plain = torch.rand(2, 1, 5, 5, dtype=torch.float64)
     _, (shown, member) = told(frames=800 + 90 * plain)
     assert member == "member"
@@ -55,19 +59,29 @@ def test_frames_come_to_mean_nothing_and_deviation_one_whatever_their_unit():
 
 
 def test_answers_are_lengths_in_mm_and_angles_of_the_face_in_degrees():
-    """The camera looks along z, the face's normal is turned up from the way to it by 0.35: across is the angle of
+    """The camera looks along z, the face's normal is turned up from the way to it by
+    0.35: across is the angle of
     right and out, down that below the level plane."""
     found, _ = told()
     assert found["mask_logits"][0, 2, 1].item() == pytest.approx(-0.3)
     assert found["pupil_mm"][1].tolist() == pytest.approx([0.34, -0.17])
     assert found["slip_mm"][1].tolist() == pytest.approx([1.0, -0.75, 0.625])
-    assert found["slip_sd_mm"][0].tolist() == pytest.approx([2.0, 3 * math.e, 5 / math.e])
-    assert found["points_mm"][0, 9].tolist() == pytest.approx([1.7 * (0.6 - 1 / 19), 1.7 * 0.6])
+    assert found["slip_sd_mm"][0].tolist() == pytest.approx(
+        [2.0, 3 * math.e, 5 / math.e]
+    )
+    assert found["points_mm"][0, 9].tolist() == pytest.approx(
+        [1.7 * (0.6 - 1 / 19), 1.7 * 0.6]
+    )
     x, y, z = AXIS
     down = math.cos(0.35) * y - math.sin(0.35) * z
     out = -math.sin(0.35) * y - math.cos(0.35) * z
-    want = [math.degrees(math.atan2(x, out)), math.degrees(math.asin(down / math.hypot(x, y, z)))]
-    assert found["axis_deg"][0].tolist() == pytest.approx(want, rel=1e-5)  # single precision
+    want = [
+        math.degrees(math.atan2(x, out)),
+        math.degrees(math.asin(down / math.hypot(x, y, z))),
+    ]
+    assert found["axis_deg"][0].tolist() == pytest.approx(
+        want, rel=1e-5
+    )  # single precision
 
 
 @pytest.mark.parametrize(

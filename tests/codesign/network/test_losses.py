@@ -1,4 +1,6 @@
-"""Losses: closed values at the ends, finite on empty masks, gradients by finite differences."""
+"""Losses: closed values at the ends, finite on empty masks, gradients by finite
+differences.
+"""
 
 import math
 
@@ -18,7 +20,9 @@ def test_dice_is_zero_for_the_right_mask_and_nearly_one_for_its_complement():
     mask = _mask()
     assert float(losses.dice(200 * (mask - 0.5), mask)) < 1e-12
     wrong = float(losses.dice(-200 * (mask - 0.5), mask))
-    assert wrong == pytest.approx(1 - 1 / (16 * 16 + 1), abs=1e-9)  # no overlap: only the smoothing is left
+    assert wrong == pytest.approx(
+        1 - 1 / (16 * 16 + 1), abs=1e-9
+    )  # no overlap: only the smoothing is left
 
 
 def test_all_blink_batch_is_finite_with_finite_gradient():
@@ -27,13 +31,22 @@ def test_all_blink_batch_is_finite_with_finite_gradient():
     loss.backward()
     assert torch.isfinite(loss)
     assert torch.isfinite(logits.grad).all()
-    assert float(losses.overlap(torch.full((3, 16, 16), -9.0), torch.zeros(3, 16, 16)).min()) == 1
+    assert (
+        float(
+            losses.overlap(torch.full((3, 16, 16), -9.0), torch.zeros(3, 16, 16)).min()
+        )
+        == 1
+    )
 
 
 def test_gradients_agree_with_finite_differences():
     generator = torch.Generator().manual_seed(0)
-    logits = torch.randn(2, 8, 8, generator=generator, dtype=torch.float64, requires_grad=True)
-    slip = torch.randn(2, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    logits = torch.randn(
+        2, 8, 8, generator=generator, dtype=torch.float64, requires_grad=True
+    )
+    slip = torch.randn(
+        2, 3, generator=generator, dtype=torch.float64, requires_grad=True
+    )
     scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     truth = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     mask = _mask()
@@ -57,7 +70,9 @@ def test_overlap_of_half_a_mask():
 
 
 def test_slip_is_counted_in_units_of_its_scale():
-    """Off by 0.1 and 0.5 units: half the square over the knee below it, straight beyond; no scale is 1."""
+    """Off by 0.1 and 0.5 units: half the square over the knee below it, straight
+    beyond; no scale is 1.
+    """
     truth, scale = torch.tensor([[0.8, -2.1, 3.3]]), torch.tensor([0.4, 0.7, 3.0])
     predicted = truth / scale + torch.tensor([[0.1, 0.0, -0.5]])
     want = (0.1**2 / 2 / 0.3 + (0.5 - 0.3 / 2)) / 3
@@ -66,11 +81,17 @@ def test_slip_is_counted_in_units_of_its_scale():
 
 def test_place_is_the_distance_from_the_centroid_of_each_mask():
     mask = torch.zeros(2, 10, 20)
-    mask[0, 2:4, 5:9] = 0.5  # centroid: x (7 / 20 - 1/2) = -0.15, y (3 / 10 - 1/2) = -0.2
-    centre = torch.tensor([[-0.15 + 0.1, -0.2 - 0.002], [0.3, 0.3]])  # the second is empty: it takes no part
+    mask[0, 2:4, 5:9] = (
+        0.5  # centroid: x (7 / 20 - 1/2) = -0.15, y (3 / 10 - 1/2) = -0.2
+    )
+    centre = torch.tensor(
+        [[-0.15 + 0.1, -0.2 - 0.002], [0.3, 0.3]]
+    )  # the second is empty: it takes no part
     want = ((0.1 / 0.02 - 0.15) + (0.1**2 / 2 / 0.3)) / 2
     assert float(losses.place(centre, mask)) == pytest.approx(want, rel=1e-4)
-    mask[1, 9, 19] = 0.75  # one covered pixel is a mask: x = 19.5 / 20 - 1/2, y = 9.5 / 10 - 1/2
+    mask[1, 9, 19] = (
+        0.75  # one covered pixel is a mask: x = 19.5 / 20 - 1/2, y = 9.5 / 10 - 1/2
+    )
     both = want + ((0.475 - 0.3) / 0.02 - 0.15 + (0.45 - 0.3) / 0.02 - 0.15) / 2
     assert float(losses.place(centre, mask)) == pytest.approx(both / 2, rel=1e-4)
 
@@ -79,48 +100,86 @@ def test_task_adds_mask_and_twice_the_slip():
     from codesign.network.supernet import Prediction
 
     generator = torch.Generator().manual_seed(3)
-    logits, slip = torch.randn(2, 8, 8, generator=generator), torch.randn(2, 3, generator=generator)
-    mask, truth, scale = _mask().float(), torch.tensor([[0.3, -0.9, 2.0]] * 2), torch.tensor([0.4, 0.7, 3.0])
+    logits, slip = (
+        torch.randn(2, 8, 8, generator=generator),
+        torch.randn(2, 3, generator=generator),
+    )
+    mask, truth, scale = (
+        _mask().float(),
+        torch.tensor([[0.3, -0.9, 2.0]] * 2),
+        torch.tensor([0.4, 0.7, 3.0]),
+    )
     kinds = {"mask_logits": logits, "slip": slip}
-    names = Prediction.__dataclass_fields__ if hasattr(Prediction, "__dataclass_fields__") else Prediction._fields
+    names = (
+        Prediction.__dataclass_fields__
+        if hasattr(Prediction, "__dataclass_fields__")
+        else Prediction._fields
+    )
     found = Prediction(**{n: kinds.get(n, torch.zeros(2, 2)) for n in names})
-    fine = torch.nn.functional.interpolate(logits[:, None], scale_factor=2, mode="bilinear", align_corners=False)[:, 0]
+    fine = torch.nn.functional.interpolate(
+        logits[:, None], scale_factor=2, mode="bilinear", align_corners=False
+    )[:, 0]
     bce = torch.nn.functional.binary_cross_entropy_with_logits(fine, mask)
     want = losses.dice(fine, mask) + bce + 2 * losses.slip(slip, truth, scale)
-    assert float(losses.task(found, mask, truth, scale, slip_weight=2.0)) == pytest.approx(float(want), rel=1e-6)
+    assert float(
+        losses.task(found, mask, truth, scale, slip_weight=2.0)
+    ) == pytest.approx(float(want), rel=1e-6)
 
 
 def test_dice_of_a_half_covered_mask_in_closed_form():
     logits = torch.full((1, 4, 6), 0.0, dtype=torch.float64)  # one half everywhere
     mask = torch.zeros(1, 4, 6, dtype=torch.float64)
     mask[0, :, :2] = 1
-    assert float(losses.dice(logits, mask, smooth=3.0)) == pytest.approx(1 - (2 * 4 + 3) / (12 + 8 + 3), rel=1e-12)
+    assert float(losses.dice(logits, mask, smooth=3.0)) == pytest.approx(
+        1 - (2 * 4 + 3) / (12 + 8 + 3), rel=1e-12
+    )
 
 
 def test_masks_are_held_to_the_finer_grid_of_the_two():
-    """An edge at a third of a cell: no logit of that cell costs less than the entropy of a third; on pixels it can."""
+    """An edge at a third of a cell: no logit of that cell costs less than the entropy
+    of a third; on pixels it can.
+    """
     mask = torch.zeros(1, 12, 12, dtype=torch.float64)
     mask[0, :, :7] = 1  # cells of three pixels: the third holds one of them
-    steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(1, 4, 4)  # 0 at x = 7 pixels
+    steep = 30 * (7 / 3 - 0.5 - torch.arange(4, dtype=torch.float64)).expand(
+        1, 4, 4
+    )  # 0 at x = 7 pixels
     assert float(losses.segmentation(steep, mask)) < 0.1
     entropy = (math.log(3) + 2 * math.log(3 / 2)) / 3 / 4  # of one column of four
-    assert float(losses.segmentation(steep, torch.nn.functional.avg_pool2d(mask, 3))) > entropy > 0.15
+    assert (
+        float(losses.segmentation(steep, torch.nn.functional.avg_pool2d(mask, 3)))
+        > entropy
+        > 0.15
+    )
 
 
 def test_landmarks_in_the_image_and_the_axis_are_held_to_in_their_units():
-    """Off by 0.002 of the image (under the knee of 0.005), by 0.1 (beyond), outside; by 0.01 and 0.2 of the axis."""
+    """Off by 0.002 of the image (under the knee of 0.005), by 0.1 (beyond), outside; by
+    0.01 and 0.2 of the axis.
+    """
     from codesign.network.supernet import Prediction
 
     points = torch.tensor([[[0.1, -0.4], [0.2, 0.3], [0.1, 0.51]]])
     axis = torch.tensor([[0.2, -0.7, -0.66]])
     told = points + torch.tensor([[[0.002, 0.0], [0.0, 0.1], [3.0, 3.0]]])
     turned = axis + torch.tensor([[0.01, 0.0, -0.2]])
-    found = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3), points=told, axis=turned)
-    seen = (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2  # two coordinates, two points inside
+    found = Prediction(
+        torch.zeros(1, 0, 0),
+        torch.zeros(1, 2),
+        torch.zeros(1, 3),
+        points=told,
+        axis=turned,
+    )
+    seen = (
+        (0.04**2 / 2 / 0.1 + (2.0 - 0.05)) / 2 / 2
+    )  # two coordinates, two points inside
     looked = (0.1**2 / 2 / 0.3 + (2.0 - 0.15)) / 3
     got = losses.pose(found, axis, points, axis_weight=0.7, point_weight=3.0)
     assert float(got) == pytest.approx(0.7 * looked + 3.0 * seen, rel=1e-5)
     nothing = Prediction(torch.zeros(1, 0, 0), torch.zeros(1, 2), torch.zeros(1, 3))
-    assert float(losses.pose(nothing, axis, points, axis_weight=0.7, point_weight=3.0)) == 0
+    assert (
+        float(losses.pose(nothing, axis, points, axis_weight=0.7, point_weight=3.0))
+        == 0
+    )
     away = losses.pose(found, axis, points + 2, axis_weight=0.0, point_weight=3.0)
     assert float(away) == 0  # no landmark in the image: finite

@@ -1,4 +1,6 @@
-"""Statistics of a norm that are measured for one network: means over batches of each channel's own."""
+"""Statistics of a norm that are measured for one network: means over batches of each
+channel's own.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ from codesign.network.supernet import SlicedNorm
 
 
 def test_measured_statistics_are_means_over_batches_and_variances_without_bias():
-    """Of five channels three are in use. By numpy, divided by one less than the number of values."""
+    """Of five channels three are in use. By numpy, divided by one less than the number
+    of values.
+    """
     norm, draw = SlicedNorm(5), np.random.default_rng(4)
     norm.measuring = True
     batches = [draw.normal(2.3, 1.7, (n, 3, 2, 3)) for n in (1, 2, 4)]

@@ -10,16 +10,28 @@ from codesign.network.supernet import Supernet, recalibrate
 
 
 def test_a_batch_is_normalised_by_the_means_of_all_so_far():
-    """By numpy: means of x and x^2 over three batches of equal weight, whatever their size."""
+    """By numpy: means of x and x^2 over three batches of equal weight, whatever their
+    size.
+    """
     norm, draw = RunningNorm(3), np.random.default_rng(4)
-    level, width = np.array([2.3, -4.6, 0.7])[:, None, None], np.array([1.7, 0.02, 3.1])[:, None, None]
-    batches = [level + width * draw.normal(0.4 * i, 1.0, (n, 3, 2, 5)) for i, n in enumerate((1, 4, 2))]
+    level, width = (
+        np.array([2.3, -4.6, 0.7])[:, None, None],
+        np.array([1.7, 0.02, 3.1])[:, None, None],
+    )
+    batches = [
+        level + width * draw.normal(0.4 * i, 1.0, (n, 3, 2, 5))
+        for i, n in enumerate((1, 4, 2))
+    ]
     for one in batches:
         out = norm(torch.tensor(one, dtype=torch.float32))
     mean = np.mean([one.mean((0, 2, 3)) for one in batches], axis=0)
     square = np.mean([(one**2).mean((0, 2, 3)) for one in batches], axis=0)
-    want = (batches[-1] - mean[:, None, None]) / np.sqrt(square - mean**2 + EPSILON)[:, None, None]
-    assert out.detach().numpy() == pytest.approx(want, abs=1e-5)  # of 30 spreads, in single precision: 2e-6
+    want = (batches[-1] - mean[:, None, None]) / np.sqrt(square - mean**2 + EPSILON)[
+        :, None, None
+    ]
+    assert out.detach().numpy() == pytest.approx(
+        want, abs=1e-5
+    )  # of 30 spreads, in single precision: 2e-6
 
 
 def test_old_batches_fade_by_a_hundredth_a_batch():
@@ -27,17 +39,23 @@ def test_old_batches_fade_by_a_hundredth_a_batch():
     for value, count in ((3.7, REACH), (-1.1, 37)):
         for _ in range(count):
             norm(torch.full((2, 1, 3, 1), value))
-    assert float(norm.mean) == pytest.approx(-1.1 + 4.8 * (1 - 1 / REACH) ** 37, rel=1e-5)
+    assert float(norm.mean) == pytest.approx(
+        -1.1 + 4.8 * (1 - 1 / REACH) ** 37, rel=1e-5
+    )
 
 
 def test_what_all_frames_of_a_batch_have_in_common_is_kept():
-    """Batch normalisation would give the same for both: how deep a batch lies as a whole would be lost."""
+    """Batch normalisation would give the same for both: how deep a batch lies as a
+    whole would be lost.
+    """
     norm, draw = RunningNorm(2), torch.Generator().manual_seed(5)
     for _ in range(60):
         norm(torch.randn(4, 2, 3, 3, generator=draw))
     batch = torch.randn(4, 2, 3, 3, generator=draw)
     there = norm(batch + 0.8).mean() - norm(batch).mean()
-    assert float(there) == pytest.approx(0.8, abs=0.05)  # 1/61 of it is taken off; 2160 samples of the variance: 2 %
+    assert float(there) == pytest.approx(
+        0.8, abs=0.05
+    )  # 1/61 of it is taken off; 2160 samples of the variance: 2 %
 
 
 def test_neither_evaluation_nor_frames_that_are_not_finite_move_the_means():

@@ -1,4 +1,6 @@
-"""Weight sharing by slices, calibration of batch statistics, and subnets that equal their supernet."""
+"""Weight sharing by slices, calibration of batch statistics, and subnets that equal
+their supernet.
+"""
 
 import dataclasses
 import itertools
@@ -43,11 +45,17 @@ def test_a_subnet_equals_its_slice_of_the_supernet(net):
     with torch.no_grad():
         whole, cut = net(_frames(), chosen), Subnet(net, chosen)(_frames())
     for a, b in zip((whole.mask_logits, whole.centre, whole.slip), cut, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)  # single precision, laid out otherwise in memory
-    assert sum(p.numel() for p in Subnet(net, chosen).parameters()) < sum(p.numel() for p in net.parameters())
+        torch.testing.assert_close(
+            a, b, rtol=1e-4, atol=1e-5
+        )  # single precision, laid out otherwise in memory
+    assert sum(p.numel() for p in Subnet(net, chosen).parameters()) < sum(
+        p.numel() for p in net.parameters()
+    )
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning")
+@pytest.mark.filterwarnings(
+    "ignore:.*torch.jit:DeprecationWarning", "ignore::torch.jit.TracerWarning"
+)
 def test_torchscript_export_gives_equal_outputs(net):
     chosen = arch.smallest(SPACE)
     recalibrate(net, chosen, [_frames(size=96)])
@@ -108,7 +116,9 @@ def test_mutation_stays_in_the_space_and_changes_the_network(seed):
 
 
 def test_a_foreign_architecture_is_refused_by_name():
-    odd = dataclasses.replace(arch.smallest(SPACE), kernels=(4, *arch.smallest(SPACE).kernels[1:]))
+    odd = dataclasses.replace(
+        arch.smallest(SPACE), kernels=(4, *arch.smallest(SPACE).kernels[1:])
+    )
     with pytest.raises(ConfigError, match=r"kernels\[0\] is 4"):
         arch.check(SPACE, odd)
     with pytest.raises(ConfigError, match="resolution is 2"):

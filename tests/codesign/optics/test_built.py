@@ -1,4 +1,6 @@
-"""PSFs of made lenses on training's samples: against the sum over every pillar, with all symmetries broken."""
+"""PSFs of made lenses on training's samples: against the sum over every pillar, with
+all symmetries broken.
+"""
 
 import dataclasses
 import sys
@@ -23,7 +25,9 @@ X = vector(m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e"
 
 
 def _engine(x, settings):
-    """The same PSFs from every pillar, integrated over samples whose light is low-passed to their grid."""
+    """The same PSFs from every pillar, integrated over samples whose light is
+    low-passed to their grid.
+    """
     lens, known = m.small(), built.of_lens(x)
     t = made.pillars(lens, sensitivity(lens), known)
     samples, window = 8 * 15, 45.0
@@ -40,42 +44,73 @@ def _engine(x, settings):
     waves = np.cos(2 * np.pi * m_ / window * (place[:, None] - fine)[..., None])
     rows = settings.sample_um / window * (1 + 2 * (waves * kept).sum(-1))
     light = found.energy_um2 / (float((lens.diameters.diameter_um > 0).sum()) * 0.16)
-    return Stack(torch.as_tensor(rows @ (found.intensity * light[:, None, None]) @ rows.T), settings.depths_um)
+    return Stack(
+        torch.as_tensor(rows @ (found.intensity * light[:, None, None]) @ rows.T),
+        settings.depths_um,
+    )
 
 
 @pytest.mark.parametrize("x", [vector(), X], ids=["design", "made"])
 def test_psfs_agree_with_the_sum_over_every_pillar(x):
     got, want = built.MadeLens(m.small(), m.OPTICS).stack(x), _engine(x, m.OPTICS)
-    assert built.psf_error(got, want) < 6e-3  # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
+    assert (
+        built.psf_error(got, want) < 6e-3
+    )  # rim cells of the pupil, and light of other orders: 2e-3 on wide lenses
     assert (
         got.intensity.sum((1, 2)) / want.intensity.sum((1, 2)) - 1
     ).abs().max() < 0.02  # half a pitch at the rim is 1.3 % of the light
     far = built.MadeLens(m.small(), m.OPTICS).stack()
-    assert x is not X or built.psf_error(far, want) > 0.05  # the errors of this lens are far above the tolerance
+    assert (
+        x is not X or built.psf_error(far, want) > 0.05
+    )  # the errors of this lens are far above the tolerance
 
 
 def test_every_pillar_can_be_asked_as_it_was_made():
-    """By which the true image of a made lens tells what cells of pillars leave out of it."""
+    """By which the true image of a made lens tells what cells of pillars leave out of
+    it.
+    """
     known = built.of_lens(X)
     want = made.pillars(m.small(), sensitivity(m.small()), known)
-    got = built.MadeLens(m.small(), m.OPTICS).stack(X).plane.wave.answer(0.85, 0.0).numpy()
-    assert np.abs(got - want).max() < 4e-4  # half a step of the table, 5e-6 um of 79 rad/um
+    got = (
+        built.MadeLens(m.small(), m.OPTICS)
+        .stack(X)
+        .plane.wave.answer(0.85, 0.0)
+        .numpy()
+    )
+    assert (
+        np.abs(got - want).max() < 4e-4
+    )  # half a step of the table, 5e-6 um of 79 rad/um
 
 
 def test_a_tilt_of_the_bias_to_plus_x_moves_the_light_along_x_alone():
-    """Phase grows with the diameter: a lens thicker at +x delays the light there and bends it to +x."""
+    """Phase grows with the diameter: a lens thicker at +x delays the light there and
+    bends it to +x.
+    """
     settings = dataclasses.replace(m.OPTICS, window_samples=15)
-    light = built.MadeLens(m.small(), settings).stack(vector({"bias_x_nm": 10.0})).intensity.double()
+    light = (
+        built.MadeLens(m.small(), settings)
+        .stack(vector({"bias_x_nm": 10.0}))
+        .intensity.double()
+    )
     axis = (torch.arange(15, dtype=torch.float64) - 7) * 3.0
     x, y = ((light.sum(d) * axis).sum(1) / light.sum((1, 2)) for d in (1, 2))
-    slope = 3 * np.pi * 2 / 0.24 * 10e-3 / 2  # rad at the rim: phase is 3 turns over 0.24 um of diameter ...
+    slope = (
+        3 * np.pi * 2 / 0.24 * 10e-3 / 2
+    )  # rad at the rim: phase is 3 turns over 0.24 um of diameter ...
     expected = slope / 60.0 / (2 * np.pi / 0.85) * 300.0
     assert abs(y).max() < 0.02
     assert x.min() > 0.3 * expected > 0
 
 
 def test_only_what_the_lens_keeps_enters():
-    bench = vector({"stage_zero_um": 300.0, "wavelength_nm": 2.0, "crosstalk_px": 1.0, "log_gain": 3.0})
+    bench = vector(
+        {
+            "stage_zero_um": 300.0,
+            "wavelength_nm": 2.0,
+            "crosstalk_px": 1.0,
+            "log_gain": 3.0,
+        }
+    )
     made_lens = built.MadeLens(m.small(), m.OPTICS)
     assert torch.equal(made_lens.stack(bench).intensity, made_lens.stack().intensity)
 
@@ -93,4 +128,6 @@ def test_the_design_matches_the_smooth_lens_of_training():
     """Pillars against the phase they were made for: two ways to the same samples."""
     got = built.MadeLens(m.small(), m.OPTICS).stack()
     want = optics.stack(m.OPTICS, torch.zeros(0))
-    assert built.psf_error(got, want) < 0.25  # the grids of both windows cut the band at different harmonics
+    assert (
+        built.psf_error(got, want) < 0.25
+    )  # the grids of both windows cut the band at different harmonics

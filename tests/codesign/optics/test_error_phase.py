@@ -1,4 +1,6 @@
-"""Phases of a lens assembled wrong: by the paths of light, and how much light the haze takes."""
+"""Phases of a lens assembled wrong: by the paths of light, and how much light the haze
+takes.
+"""
 
 import math
 
@@ -17,19 +19,33 @@ SETTINGS = optics.OpticsConfig()
 
 def phase(**amounts):
     """Over the lens, with its places in units of its radius."""
-    x, y = (c.double() / SETTINGS.pupil.radius_um for c in (optics._seen(SETTINGS).x_um, optics._seen(SETTINGS).y_um))
+    x, y = (
+        c.double() / SETTINGS.pupil.radius_um
+        for c in (optics._seen(SETTINGS).x_um, optics._seen(SETTINGS).y_um)
+    )
     inside = torch.hypot(x, y) <= 1
-    return optics._error_phase(SETTINGS, LensError(amounts))[inside], x[inside], y[inside]
+    return (
+        optics._error_phase(SETTINGS, LensError(amounts))[inside],
+        x[inside],
+        y[inside],
+    )
 
 
 def test_a_sensor_too_far_is_the_change_of_the_path_to_it():
-    """k (sqrt(r² + z²) - z) at z + 13 um less that at z; the quadratic of it errs by (3/4) (r/z)² of itself."""
+    """k (sqrt(r² + z²) - z) at z + 13 um less that at z; the quadratic of it errs by
+    (3/4) (r/z)² of itself.
+    """
     got, x, y = phase(focus_um=13.0)
-    r2, z = (x**2 + y**2) * SETTINGS.pupil.radius_um**2, SETTINGS.pupil.sensor_distance_um
+    r2, z = (
+        (x**2 + y**2) * SETTINGS.pupil.radius_um**2,
+        SETTINGS.pupil.sensor_distance_um,
+    )
     path = [r2 / (torch.sqrt(r2 + d**2) + d) for d in (z, z + 13.0)]
     want = 2 * math.pi / SETTINGS.pupil.wavelength_um * (path[1] - path[0])
     steep = (SETTINGS.pupil.radius_um / z) ** 2
-    assert float((got - want).abs().max()) < (0.8 * steep + 1.2 * 13 / z) * float(want.abs().max())
+    assert float((got - want).abs().max()) < (0.8 * steep + 1.2 * 13 / z) * float(
+        want.abs().max()
+    )
     assert float(want.abs().max()) > 1e-2
 
 
@@ -44,60 +60,97 @@ def test_haze_takes_the_share_of_marechal_and_spreads_it_over_the_shadow():
     light = torch.rand(2, 5, 5, dtype=torch.float64)
     got = optics.hazy(SETTINGS, light, 0.31)
     kept = math.exp(-0.31)
-    haze = (1 - kept) * SETTINGS.sample_um**2 / (math.pi * (1e3 * SETTINGS.aperture_mm / 2) ** 2)
+    haze = (
+        (1 - kept)
+        * SETTINGS.sample_um**2
+        / (math.pi * (1e3 * SETTINGS.aperture_mm / 2) ** 2)
+    )
     assert torch.allclose(got, kept * light + haze)
 
 
 def test_variance_of_a_bowed_bias_by_plain_quadrature():
     """c00 <b²> + 2 <b> c0·a + a·c·a over the disc, the means by rings of equal area."""
-    state = LensError({"bias_nm": 2.3, "gradient_nm": 3.1, "bow_nm": -1.7, "height_nm": 4.0}, 0.7).state()
+    state = LensError(
+        {"bias_nm": 2.3, "gradient_nm": 3.1, "bow_nm": -1.7, "height_nm": 4.0}, 0.7
+    ).state()
     radius = np.sqrt((np.arange(400) + 0.5) / 400)[:, None]
     turn = 2 * np.pi * np.arange(64) / 64
     bias = state.bias_um(radius * np.cos(turn), radius * np.sin(turn))
     c, answers = lens_errors._answers()[1], state.answers()
-    want = c[0, 0] * (bias**2).mean() + 2 * bias.mean() * c[0, 1:] @ answers + answers @ c[1:, 1:] @ answers
-    assert lens_errors.variance_rad2(state) == pytest.approx(want, rel=1e-4)  # rings: 1 / 400² of the curvature
+    want = (
+        c[0, 0] * (bias**2).mean()
+        + 2 * bias.mean() * c[0, 1:] @ answers
+        + answers @ c[1:, 1:] @ answers
+    )
+    assert lens_errors.variance_rad2(state) == pytest.approx(
+        want, rel=1e-4
+    )  # rings: 1 / 400² of the curvature
 
 
 def test_errors_are_correlated_as_they_are_said_to_be():
     """The first three entries of the five that vary."""
     said = (1.0, 0.3, -0.6, 0.3, 1.0, 0.2, -0.6, 0.2, 1.0)
-    errors = LensErrors(focus_um=1.7, tilt_waves=0.3, astigmatism_waves=0.08, bias_nm=2.9, index=0.01, correlation=said)
+    errors = LensErrors(
+        focus_um=1.7,
+        tilt_waves=0.3,
+        astigmatism_waves=0.08,
+        bias_nm=2.9,
+        index=0.01,
+        correlation=said,
+    )
     size = np.array([1.7, 0.3, 0.08])
     found = errors.covariance
-    assert found[:3, :3] == pytest.approx(np.reshape(said, (3, 3)) * size[:, None] * size, rel=1e-12)
+    assert found[:3, :3] == pytest.approx(
+        np.reshape(said, (3, 3)) * size[:, None] * size, rel=1e-12
+    )
     rest = dict(zip(lens_errors.ENTRIES, np.diag(found), strict=True))
     assert (rest["bias_nm"], rest["index"]) == pytest.approx((2.9**2, 1e-4))
     assert np.count_nonzero(found) == 9 + 2
     generator = torch.Generator().manual_seed(5)
     drawn = [errors.draw(generator) for _ in range(3000)]
-    values = np.array([[one.amounts.get(name, 0.0) for name in lens_errors.ENTRIES] for one in drawn])
+    values = np.array(
+        [[one.amounts.get(name, 0.0) for name in lens_errors.ENTRIES] for one in drawn]
+    )
     scale = np.sqrt(np.maximum(np.diag(found), 1e-30))
-    assert np.abs((np.cov(values.T) - found) / np.outer(scale, scale)).max() < 0.11  # four sigma of √(2 / 3000)
+    assert (
+        np.abs((np.cov(values.T) - found) / np.outer(scale, scale)).max() < 0.11
+    )  # four sigma of √(2 / 3000)
     turn = np.array([one.turn_rad for one in drawn])
     assert turn.min() > 0
     assert turn.max() < 2 * math.pi
-    assert turn.mean() == pytest.approx(math.pi, abs=0.14)  # four sigma of 2π / √12 / √3000
+    assert turn.mean() == pytest.approx(
+        math.pi, abs=0.14
+    )  # four sigma of 2π / √12 / √3000
     assert turn.std() == pytest.approx(2 * math.pi / math.sqrt(12), rel=0.05)
 
 
 def test_a_wave_front_bends_by_what_the_bias_differs_from_that_on_the_axis():
-    """By the mean of d phase / d diameter over a turn of phases, here the turn over the range that it takes."""
+    """By the mean of d phase / d diameter over a turn of phases, here the turn over the
+    range that it takes.
+    """
     state = LensError({"bias_nm": 6.0, "gradient_nm": 3.1, "bow_nm": -1.7}, 0.7).state()
-    u, v = torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64), torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64)
+    u, v = (
+        torch.tensor([0.0, 0.8, -0.3], dtype=torch.float64),
+        torch.tensor([0.0, 0.1, 0.55], dtype=torch.float64),
+    )
     turn, lens = TURN.phase_rad, np.linspace(*TURN.domain_um, 40_001)
     phase = np.asarray(turn(lens, WAVELENGTH_UM))
     inside = phase - phase[0] <= 2 * math.pi
     rate = np.gradient(phase, lens)[inside]
-    mean = np.trapezoid(rate, phase[inside]) / (2 * math.pi)  # phases fill the turn evenly
+    mean = np.trapezoid(rate, phase[inside]) / (
+        2 * math.pi
+    )  # phases fill the turn evenly
     bias = state.bias_um(u.numpy(), v.numpy())
     got = lens_errors.wave_front_rad(state, u, v).numpy()
     assert got[0] == pytest.approx(0, abs=1e-12)
-    assert got == pytest.approx(mean * (bias - bias[0]), rel=0.01, abs=1e-12)  # 400 phases of the turn
+    assert got == pytest.approx(
+        mean * (bias - bias[0]), rel=0.01, abs=1e-12
+    )  # 400 phases of the turn
 
 
 def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have():
-    """phase = k n_eff h: a height off by d turns each by d / h of its phase. Phases fill a turn evenly, so about what
+    """phase = k n_eff h: a height off by d turns each by d / h of its phase. Phases
+    fill a turn evenly, so about what
     they share they scatter by 2π / √12 of d / h (400 phases of the turn: 0.3 %)."""
     state = LensError({"height_nm": 8.0}).state()
     want = (2 * math.pi / math.sqrt(12) * 8e-3 / DEFAULT_CELL.height_um) ** 2
@@ -105,9 +158,13 @@ def test_taller_pillars_turn_in_proportion_to_the_phase_that_they_have():
 
 
 def test_the_phases_that_training_takes_are_those_of_the_solver():
-    """The fit's 1e-3 rad and the solver's 1e-4 over the diameters that training looks at, both ends among them."""
+    """The fit's 1e-3 rad and the solver's 1e-4 over the diameters that training looks
+    at, both ends among them.
+    """
     low, high = TURN.domain_um
-    solve = engines.smooth(DEFAULT_CELL, Light(WAVELENGTH_UM), (low, high), tolerance=1e-3, engine="modal")
+    solve = engines.smooth(
+        DEFAULT_CELL, Light(WAVELENGTH_UM), (low, high), tolerance=1e-3, engine="modal"
+    )
     diameter = low + (high - low) * np.array([0.0, 0.11, 0.31, 0.5, 0.73, 0.9, 1.0])
     told = np.exp(1j * np.asarray(TURN.phase_rad(diameter, WAVELENGTH_UM)))
     assert np.abs(np.angle([solve(float(d)).t for d in diameter] / told)).max() < 1.1e-3

@@ -1,4 +1,6 @@
-"""The true image of training against the other PSF engine, its finite differences, and refusals by name."""
+"""The true image of training against the other PSF engine, its finite differences, and
+refusals by name.
+"""
 
 import math
 from dataclasses import replace
@@ -24,7 +26,9 @@ SMALL = OpticsConfig(
     aperture_mm=0.3, sensor_distance_mm=2.0, focus_mm=30.0, polynomials=9, depths_mm=(16.0, 30.0), depth_count=6,
     sample_um=12.0, window_samples=11, image="true", image_tolerance=0.3,
 )  # fmt: skip
-BENT = torch.tensor([0.4, -0.3, 0.6, 0.9, -0.5, 0.2, 0.3, -0.2, 0.1], dtype=torch.float64)
+BENT = torch.tensor(
+    [0.4, -0.3, 0.6, 0.9, -0.5, 0.2, 0.3, -0.2, 0.1], dtype=torch.float64
+)
 FRAME, MARGIN = 32, 5
 
 
@@ -34,20 +38,30 @@ def whole():
 
 
 def test_on_the_axis_it_holds_the_psfs_of_the_other_engine(whole):
-    """Both transfer functions over the window; the field's PSFs are averaged once more, over the source's sample."""
+    """Both transfer functions over the window; the field's PSFs are averaged once more,
+    over the source's sample.
+    """
     middle = [len(axis) // 2 for axis in (whole.plan.y_um, whole.plan.x_um)]
     assert abs(float(whole.plan.x_um[middle[1]])) < 1e-9
     at = replace(SMALL, image="uniform")
     for k in (0, len(whole.plan.depths_um) // 2):
         depth = float(whole.plan.depths_um[k]) * 1e-3
-        one = stack.stack(replace(at, depths_mm=(depth, depth * 1.0001), depth_count=2), BENT).intensity[0]
+        one = stack.stack(
+            replace(at, depths_mm=(depth, depth * 1.0001), depth_count=2), BENT
+        ).intensity[0]
         f = np.fft.fftfreq(SMALL.window_samples)
         box = np.sinc(f)[:, None] * np.sinc(f)
         want = np.fft.fft2(one.numpy() / float(one.sum())) * box
         got = np.fft.fft2(whole.stack[middle[0], middle[1], k].numpy())
-        low = (np.abs(f)[:, None] < 0.35) & (np.abs(f) < 0.35)  # beyond, what the other engine cuts off folds in
-        assert np.abs(got - want)[low].max() < 0.06  # of 1; the window's edge cuts 2 % here, of either's own ringing
-        assert np.abs(got - want.conj())[low].max() > 0.1  # a mirrored lens is not this one
+        low = (np.abs(f)[:, None] < 0.35) & (
+            np.abs(f) < 0.35
+        )  # beyond, what the other engine cuts off folds in
+        assert (
+            np.abs(got - want)[low].max() < 0.06
+        )  # of 1; the window's edge cuts 2 % here, of either's own ringing
+        assert (
+            np.abs(got - want.conj())[low].max() > 0.1
+        )  # a mirrored lens is not this one
 
 
 def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
@@ -75,20 +89,28 @@ def test_the_gradient_of_all_draws_is_that_of_a_finite_difference(whole):
     points = len(whole.plan.y_um) * len(whole.plan.x_um)
     terms = [term(optics, whole.plan, ready.light.grad, p, 0) for p in range(points)]
     torch.stack(terms).mean().backward()
-    way = torch.tensor([0.3, 0.5, -0.2, 0.4, 0.1, -0.6, 0.2, 0.1, -0.3], dtype=torch.float64)
+    way = torch.tensor(
+        [0.3, 0.5, -0.2, 0.4, 0.1, -0.6, 0.2, 0.1, -0.3], dtype=torch.float64
+    )
     with torch.no_grad():
         want = float(image(BENT + 2e-3 * way) - image(BENT - 2e-3 * way)) / 4e-3
-    assert float(moving.grad @ way) == pytest.approx(want, rel=0.02)  # float32 images: 1e-3 of a difference of 4e-3
+    assert float(moving.grad @ way) == pytest.approx(
+        want, rel=0.02
+    )  # float32 images: 1e-3 of a difference of 4e-3
 
     few = BENT.clone().requires_grad_()
     with pytest.raises(ValueError, match="no field points were drawn"):
         ready.pass_on(SMALL, few)
     pairs = drawn(whole.plan, 60, torch.Generator().manual_seed(1))
     replace(ready, pairs=pairs).pass_on(SMALL, few)
-    assert float((few.grad - moving.grad).norm()) < 0.6 * float(moving.grad.norm())  # 60 draws of 25 points
+    assert float((few.grad - moving.grad).norm()) < 0.6 * float(
+        moving.grad.norm()
+    )  # 60 draws of 25 points
 
 
-def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_were_drawn(whole):
+def test_a_moving_lens_is_imaged_as_one_that_stands_and_asks_for_the_nodes_that_were_drawn(
+    whole,
+):
     pairs = drawn(whole.plan, 3, torch.Generator().manual_seed(4))
     ready = formed.live(SMALL, whole, pairs)
     assert ready.ready.asked == set(pairs[0].tolist())
@@ -104,7 +126,9 @@ def _frames(made):
     seen = trial(made.grid)
     spare = made.grid.spare
     part = slice(spare, spare + FRAME)
-    return Frames(*(getattr(seen, n)[..., part, part].contiguous() for n in Frames.__slots__))
+    return Frames(
+        *(getattr(seen, n)[..., part, part].contiguous() for n in Frames.__slots__)
+    )
 
 
 def test_flat_frames_take_the_true_image_as_one_sheet(whole):
@@ -117,9 +141,19 @@ def test_flat_frames_take_the_true_image_as_one_sheet(whole):
     got = flat.irradiance(frames, whole, margin=MARGIN)
     light = torch.from_numpy(frames.light / 255.0).float()
     cover = torch.ones(2, 1, FRAME, FRAME)
-    depth = torch.tensor([18_000.0, 22_000.0])[:, None, None, None].expand(2, 2, FRAME, FRAME).contiguous()
-    one = Frames(torch.cat([light[:, None], 0 * cover], 1), torch.cat([cover, 0 * cover], 1), depth)
-    assert torch.allclose(got, whole(one), atol=2e-5)  # as a near sheet it comes to the same
+    depth = (
+        torch.tensor([18_000.0, 22_000.0])[:, None, None, None]
+        .expand(2, 2, FRAME, FRAME)
+        .contiguous()
+    )
+    one = Frames(
+        torch.cat([light[:, None], 0 * cover], 1),
+        torch.cat([cover, 0 * cover], 1),
+        depth,
+    )
+    assert torch.allclose(
+        got, whole(one), atol=2e-5
+    )  # as a near sheet it comes to the same
 
 
 def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
@@ -127,9 +161,14 @@ def test_a_filter_takes_its_share_of_the_light_and_narrows_the_line():
     assert formed.source_of(wide).fwhm_nm == pytest.approx(24.0)  # 3-4-5: 30 * 40 / 50
     assert wide.passed == pytest.approx(0.8)
     assert formed.source_of(SMALL) is None
-    whole = formed.imager(replace(wide, polynomials=0, image_tolerance=0.4), torch.zeros(0), 20, margin=5)
+    whole = formed.imager(
+        replace(wide, polynomials=0, image_tolerance=0.4), torch.zeros(0), 20, margin=5
+    )
     bare = formed.imager(
-        replace(wide, polynomials=0, image_tolerance=0.4, fwhm_nm=24.0, filter_nm=0.0), torch.zeros(0), 20, margin=5
+        replace(wide, polynomials=0, image_tolerance=0.4, fwhm_nm=24.0, filter_nm=0.0),
+        torch.zeros(0),
+        20,
+        margin=5,
     )
     lit = torch.ones(1, 2, 20, 20) * torch.tensor([0.0, 1.0])[None, :, None, None]
     frames = Frames(lit, lit, torch.full((1, 2, 20, 20), 20e3))
@@ -155,16 +194,22 @@ def test_psfs_of_one_chief_ray_cannot_stand_for_the_field():
     made = stack.stack(replace(SMALL, image="uniform"), BENT)
     with pytest.raises(TrainingError, match="cannot stand for the field"):
         formed.imager(SMALL, BENT, FRAME, margin=MARGIN, made=made)
-    one = formed.imager(replace(SMALL, image="uniform"), BENT, FRAME, margin=MARGIN, made=made)
+    one = formed.imager(
+        replace(SMALL, image="uniform"), BENT, FRAME, margin=MARGIN, made=made
+    )
     assert isinstance(one, UniformImager)
 
 
 def test_one_psf_is_the_more_wrong_the_more_the_lens_and_the_field_bend_it(whole):
-    """One PSF's image is brighter than the true one, too, by 2 to 3 % in both: most of what errs of the round lens."""
+    """One PSF's image is brighter than the true one, too, by 2 to 3 % in both: most of
+    what errs of the round lens.
+    """
     assert isinstance(whole, Imager)
     far = formed.apart(SMALL, 3 * BENT, FRAME, margin=MARGIN)
     still = replace(SMALL, polynomials=0, focus_mm=22.0)
-    near = formed.apart(still, torch.zeros(0), 20, margin=5)  # a round lens over half of the field
+    near = formed.apart(
+        still, torch.zeros(0), 20, margin=5
+    )  # a round lens over half of the field
     assert 0.02 < near < far < 1.0
 
 
@@ -175,10 +220,14 @@ def test_made_lenses_differ_and_lose_light_to_haze():
     plain = formed.imager(loose, BENT, 20, margin=5)
     assert torch.allclose(made.stack.sum((-2, -1)), torch.ones(()), atol=1e-4)
     kept = math.exp(-variance_rad2(error.state()))
-    shadow = (11 * 12.0) ** 2 / (math.pi * 150.0**2)  # of the window in the shadow of the aperture
+    shadow = (11 * 12.0) ** 2 / (
+        math.pi * 150.0**2
+    )  # of the window in the shadow of the aperture
     ratio = float(made.energy.mean() / plain.energy.mean())
     assert kept < 0.99
-    assert ratio == pytest.approx(kept + (1 - kept) * shadow, rel=0.01)  # of 0.977 in the window, 1 was taken
+    assert ratio == pytest.approx(
+        kept + (1 - kept) * shadow, rel=0.01
+    )  # of 0.977 in the window, 1 was taken
     assert math.isfinite(made.error)
 
 
@@ -186,18 +235,23 @@ def test_a_stop_in_the_settings_is_in_the_image_and_in_the_pictures_of_psfs():
     """A hole of half the width, nearly on the pillars, sends on a quarter of the light."""
     glass = (Film(Index(1.45), 300.0),)
     open_, stopped = (
-        replace(SMALL, polynomials=0, layers=Layers(front=glass, stop=s)) for s in (None, Stop(75.0, 300.0))
+        replace(SMALL, polynomials=0, layers=Layers(front=glass, stop=s))
+        for s in (None, Stop(75.0, 300.0))
     )
     none = torch.zeros(0)
     lit = [stack.stack(s, none).intensity.sum((1, 2)) for s in (open_, stopped)]
     near = (
         1 - 300 / 1.45 / (float(stopped.depths_um[0]) - 300 + 300 / 1.45)
     ) ** -2  # the shadow is wider than the hole
-    assert float(lit[1][0] / lit[0][0]) == pytest.approx(0.25 * near, rel=0.03)  # of the light beyond the window
+    assert float(lit[1][0] / lit[0][0]) == pytest.approx(
+        0.25 * near, rel=0.03
+    )  # of the light beyond the window
     through = [formed.optics_of(s, none) for s in (open_, stopped)]
     assert [plane.layers.stop for plane in through] == [None, Stop(75.0, 300.0)]
     assert through[0].wave.focus.layers.front == glass
     image = formed.imager(stopped, none, FRAME, margin=MARGIN)
     middle = image.energy[len(image.plan.y_um) // 2, len(image.plan.x_um) // 2]
-    assert float(middle.min()) > 0.85  # of the light on the stop; the rest is bent beyond the window
+    assert (
+        float(middle.min()) > 0.85
+    )  # of the light on the stop; the rest is bent beyond the window
     assert float(middle.max()) < 1.02

@@ -1,4 +1,6 @@
-"""Which lens planes of training have a phase beside the focusing one, and the width of filtered light."""
+"""Which lens planes of training have a phase beside the focusing one, and the width of
+filtered light.
+"""
 
 import dataclasses
 import math
@@ -16,7 +18,9 @@ ABOUT = {"aperture_mm": 0.3, "sensor_distance_mm": 2.0, "polynomials": 0}
 
 def factor(coefficients, **more):
     wave = formed.wave_of(OpticsConfig(**ABOUT | more), coefficients)
-    x, y = (torch.tensor(v, dtype=torch.float64) for v in ([[31.0, -70.0]], [[12.0, 55.0]]))
+    x, y = (
+        torch.tensor(v, dtype=torch.float64) for v in ([[31.0, -70.0]], [[12.0, 55.0]])
+    )
     return wave.factor(x, y, 0.85, 0.0)
 
 
@@ -25,7 +29,11 @@ def test_a_bare_hyperbolic_lens_has_no_phase_of_its_own():
 
 
 def test_rings_sectors_and_polynomials_have_one():
-    for more in ({"zones": 2}, {"parts": 3, "apart_um": 40.0}, {"foci_mm": (18.0, 26.0)}):
+    for more in (
+        {"zones": 2},
+        {"parts": 3, "apart_um": 40.0},
+        {"foci_mm": (18.0, 26.0)},
+    ):
         made = factor(NONE, **more)
         assert made is not None
         assert float((made - 1).abs().max()) > 0.01
@@ -42,11 +50,14 @@ class Told:
     patches: tuple[Any, ...] = ()
 
 
-@pytest.mark.parametrize(("filter_nm", "width_nm", "passed"), [(40.0, 24.0, 0.8), (0.0, 30.0, 1.0)])
+@pytest.mark.parametrize(
+    ("filter_nm", "width_nm", "passed"), [(40.0, 24.0, 0.8), (0.0, 30.0, 1.0)]
+)
 def test_the_imager_is_asked_for_the_frame_the_light_and_the_field_of_the_settings(
     monkeypatch, filter_nm, width_nm, passed
 ):
-    """40 samples of 7 um with margins of 6; a line of 30 nm behind a filter of 40 nm is one of 24 nm, of
+    """40 samples of 7 um with margins of 6; a line of 30 nm behind a filter of 40 nm is
+    one of 24 nm, of
     which four fifths pass."""
     formed._still.cache_clear()
 
@@ -67,12 +78,20 @@ def test_the_imager_is_asked_for_the_frame_the_light_and_the_field_of_the_settin
     assert (grid.margin, grid.window) == (6, 13)
     assert made.about["field"] == (pytest.approx(math.radians(9.0)), 0.0)
     assert made.about["tolerance"] == 0.07
-    assert (made.about["spectrum"].peak_nm, made.about["spectrum"].fwhm_nm) == (843.0, pytest.approx(width_nm))
-    assert made.energy.tolist() == pytest.approx([0.7 * passed, 0.2 * passed, 0.9 * passed])
+    assert (made.about["spectrum"].peak_nm, made.about["spectrum"].fwhm_nm) == (
+        843.0,
+        pytest.approx(width_nm),
+    )
+    assert made.energy.tolist() == pytest.approx(
+        [0.7 * passed, 0.2 * passed, 0.9 * passed]
+    )
     for patch in made.patches:
         assert patch.energy.tolist() == pytest.approx([0.4 * passed, 0.5 * passed])
 
 
 def test_unfiltered_light_has_the_width_of_its_line_and_none_is_one_wavelength():
-    assert formed.source_of(OpticsConfig(**ABOUT, image="true", fwhm_nm=30.0)).fwhm_nm == 30.0
+    assert (
+        formed.source_of(OpticsConfig(**ABOUT, image="true", fwhm_nm=30.0)).fwhm_nm
+        == 30.0
+    )
     assert formed.source_of(OpticsConfig(**ABOUT, image="true")) is None

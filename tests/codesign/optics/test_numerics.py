@@ -1,4 +1,6 @@
-"""A lens as places in a table of diameters; PSFs that differ by a known share; a line of a few wavelengths."""
+"""A lens as places in a table of diameters; PSFs that differ by a known share; a line
+of a few wavelengths.
+"""
 
 import math
 from types import SimpleNamespace
@@ -24,7 +26,9 @@ class Line:
         return 0.9 - d
 
 
-DIAMETER = np.array([[0.0, 0.12, 0.18, 0.21], [0.24, 0.18, 0.0, 0.15], [0.3, 0.12, 0.27, 0.18]])
+DIAMETER = np.array(
+    [[0.0, 0.12, 0.18, 0.21], [0.24, 0.18, 0.0, 0.15], [0.3, 0.12, 0.27, 0.18]]
+)
 LENS = SimpleNamespace(
     diameters=DiameterMap(DIAMETER, 0.4), proxy=Line(), wavelength_um=0.8, source_distance_um=900.0,
     sensor_distance_um=70.0,
@@ -41,12 +45,24 @@ def test_every_pillar_finds_its_diameter_in_the_table():
     assert aperture.diameter_um[[0, -1]] == pytest.approx([0.12 - 0.012, 0.3 + 0.012])
     assert aperture.step_um == pytest.approx((0.18 + 0.024) / 8191)
     there = DIAMETER > 0
-    assert np.abs(aperture.diameter_um[aperture.place[there]] - DIAMETER[there]).max() <= aperture.step_um / 2
+    assert (
+        np.abs(aperture.diameter_um[aperture.place[there]] - DIAMETER[there]).max()
+        <= aperture.step_um / 2
+    )
     assert (aperture.place[~there] == -1).all()
     assert aperture.share.sum() == pytest.approx(1)
-    assert aperture.share[aperture.place[1, 1]] == pytest.approx(3 / 10)  # of ten pillars, three are 0.18 um wide
-    wide = SimpleNamespace(**{**vars(LENS), "diameters": DiameterMap(np.where(DIAMETER == 0.3, 0.395, DIAMETER), 0.4)})
-    assert Aperture(wide).diameter_um[-1] == pytest.approx(0.999 * 0.4)  # no wider than the pitch
+    assert aperture.share[aperture.place[1, 1]] == pytest.approx(
+        3 / 10
+    )  # of ten pillars, three are 0.18 um wide
+    wide = SimpleNamespace(
+        **{
+            **vars(LENS),
+            "diameters": DiameterMap(np.where(DIAMETER == 0.3, 0.395, DIAMETER), 0.4),
+        }
+    )
+    assert Aperture(wide).diameter_um[-1] == pytest.approx(
+        0.999 * 0.4
+    )  # no wider than the pitch
 
 
 def test_maps_take_phase_and_level_of_the_changed_diameter():
@@ -66,7 +82,9 @@ def test_maps_take_phase_and_level_of_the_changed_diameter():
 def test_a_table_of_rounded_diameters_stands_in_steps():
     aperture = Aperture(LENS)
     made = aperture.rounded(table_of(aperture), 0.01)
-    want = np.clip(np.rint(aperture.diameter_um / 0.01) * 0.01, *aperture.diameter_um[[0, -1]])
+    want = np.clip(
+        np.rint(aperture.diameter_um / 0.01) * 0.01, *aperture.diameter_um[[0, -1]]
+    )
     assert np.abs(made) == pytest.approx(0.3 + want, abs=1e-5)
     assert np.angle(made) == pytest.approx(5 * want, abs=1e-5)
 
@@ -74,16 +92,24 @@ def test_a_table_of_rounded_diameters_stands_in_steps():
 def test_the_designed_table_is_the_proxys_and_holds_at_its_ends():
     aperture = Aperture(LENS)
     inside = np.clip(aperture.diameter_um, 0.1, 0.27)
-    assert aperture.designed() == pytest.approx((0.9 - inside) * np.exp(7.2j * inside), rel=1e-12)
+    assert aperture.designed() == pytest.approx(
+        (0.9 - inside) * np.exp(7.2j * inside), rel=1e-12
+    )
 
 
 def test_light_is_turned_by_both_sides():
-    """From 900 um in front to 70 um behind: the sines add up; nothing in front of a collimated beam."""
+    """From 900 um in front to 70 um behind: the sines add up; nothing in front of a
+    collimated beam.
+    """
     sine = Aperture(LENS).turn_sine()
     r = 0.4 * math.hypot(1.5, 1.0)  # the corner of 3 x 4 sites
-    assert sine[0, 0] == pytest.approx(r / math.hypot(r, 70) + r / math.hypot(r, 900), rel=1e-9)
+    assert sine[0, 0] == pytest.approx(
+        r / math.hypot(r, 70) + r / math.hypot(r, 900), rel=1e-9
+    )
     far = SimpleNamespace(**{**vars(LENS), "source_distance_um": math.inf})
-    assert Aperture(far).turn_sine()[0, 0] == pytest.approx(r / math.hypot(r, 70), rel=1e-9)
+    assert Aperture(far).turn_sine()[0, 0] == pytest.approx(
+        r / math.hypot(r, 70), rel=1e-9
+    )
 
 
 def test_depths_are_even_in_their_inverse():
@@ -105,7 +131,9 @@ def test_a_line_is_few_wavelengths_of_the_diode():
 
 
 def test_bases_that_differ_by_a_picture_differ_by_its_length():
-    """PSFs 0.8 a + 0.6 b beside a: relative to the second, mean over depths between the nodes."""
+    """PSFs 0.8 a + 0.6 b beside a: relative to the second, mean over depths between the
+    nodes.
+    """
     a, b = torch.zeros(2, 1, 3, 5, dtype=torch.float64)
     a[0, 1, 2], b[0, 0, 4] = 1.0, 1.0
     depths = torch.tensor([15e3, 40e3], dtype=torch.float64)
@@ -116,8 +144,14 @@ def test_bases_that_differ_by_a_picture_differ_by_its_length():
         return PsfBasis(kernels, weights, depths, 0.0, 0.0)
 
     window = Window(15e3, 40e3)
-    found = numerics.psf_difference(made((0.8, 0.6), (0.8, 0.6)), made((1.0, 0.0), (1.0, 0.0)), window)
+    found = numerics.psf_difference(
+        made((0.8, 0.6), (0.8, 0.6)), made((1.0, 0.0), (1.0, 0.0)), window
+    )
     assert found == pytest.approx(math.hypot(0.2, 0.6), rel=1e-9)
-    found = numerics.psf_difference(made((2.0, 0.0), (2.0, 1.0)), made((2.0, 0.0), (2.0, 0.0)), window, depths=9)
+    found = numerics.psf_difference(
+        made((2.0, 0.0), (2.0, 1.0)), made((2.0, 0.0), (2.0, 0.0)), window, depths=9
+    )
     share = np.linspace(0, 1, 9)  # of the far node, in 1/z
-    assert found == pytest.approx(math.sqrt(np.mean((share / 2) ** 2)), rel=1e-3)  # steps of the table
+    assert found == pytest.approx(
+        math.sqrt(np.mean((share / 2) ** 2)), rel=1e-3
+    )  # steps of the table

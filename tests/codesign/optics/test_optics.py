@@ -1,4 +1,6 @@
-"""The optics that training moves: they are those of the full lens, their gradients are exact, their errors physical."""
+"""The optics that training moves: they are those of the full lens, their gradients are
+exact, their errors physical.
+"""
 
 import math
 from dataclasses import replace
@@ -28,18 +30,30 @@ SMALL = OpticsConfig(
 
 
 def _coefficients(scale=0.5):
-    return scale * torch.randn(SMALL.polynomials, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    return scale * torch.randn(
+        SMALL.polynomials,
+        generator=torch.Generator().manual_seed(4),
+        dtype=torch.float64,
+    )
 
 
 def _on_samples(fine, settings):
-    """Fine intensities integrated over samples and low-passed to the grid of the samples, by two plain sums."""
+    """Fine intensities integrated over samples and low-passed to the grid of the
+    samples, by two plain sums.
+    """
     period, step = settings.pupil.period_um, settings.sample_um
     edge = period / (2 * step)
     top = math.floor(edge + 0.5)
     number = torch.arange(-top, top + 1, dtype=torch.float64)
     frequency, kept = number / period, (edge - number.abs() + 0.5).clamp(0, 1)
-    from_x = (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2) * step / settings.fine
-    to_x = (torch.arange(settings.window_samples) - (settings.window_samples - 1) / 2) * step
+    from_x = (
+        (torch.arange(fine.shape[-1], dtype=torch.float64) - (fine.shape[-1] - 1) / 2)
+        * step
+        / settings.fine
+    )
+    to_x = (
+        torch.arange(settings.window_samples) - (settings.window_samples - 1) / 2
+    ) * step
     waves = torch.cos(2 * math.pi * frequency * (to_x[:, None, None] - from_x[:, None]))
     taps = (kept * torch.sinc(frequency * step) * waves).sum(-1) * step / period
     return taps @ fine @ taps.mT
@@ -58,10 +72,14 @@ def test_stack_is_the_intensity_of_the_pupil_on_samples_of_the_image():
     )
     want = _on_samples(fine.double(), wide)
     got = optics.stack(wide, coefficients).intensity
-    assert float((got - want).norm() / want.norm()) < 1e-3  # light outside the window of the reference
+    assert (
+        float((got - want).norm() / want.norm()) < 1e-3
+    )  # light outside the window of the reference
 
 
-@pytest.mark.parametrize(("zones", "angle_deg"), [(0, 0.0), (3, 0.0), (0, 12.0), (3, -12.0)])
+@pytest.mark.parametrize(
+    ("zones", "angle_deg"), [(0, 0.0), (3, 0.0), (0, 12.0), (3, -12.0)]
+)
 def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     settings = replace(SMALL, zones=zones, angle_deg=angle_deg)
     coefficients = _coefficients()
@@ -88,7 +106,8 @@ def test_psfs_are_those_of_the_pillar_lens_by_the_full_engine(zones, angle_deg):
     quick = quick / quick.sum((1, 2), keepdim=True)
     pixels = pixels / pixels.sum((1, 2), keepdim=True)
     error = ((quick - pixels).norm(dim=(1, 2)) / pixels.norm(dim=(1, 2))).max()
-    # first order in the window's size: k x³ / (2 d²) tan = 2e-2 at the window's edge, where little light falls;
+    # first order in the window's size: k x³ / (2 d²) tan = 2e-2 at the window's edge,
+    # where little light falls;
     # and the rim in 64 nodes against 500 pillars
     assert float(error) < 0.03
 
@@ -97,7 +116,9 @@ def test_polynomials_are_orthonormal_over_the_aperture():
     terms, mix = optics._polynomials(SMALL.pupil, 12)
     x, y = coordinates(SMALL.pupil)
     inside = torch.hypot(x, y) <= 100.0
-    products = torch.einsum("nk,mk->nm", terms[:, inside], terms[:, inside]) / inside.sum()
+    products = (
+        torch.einsum("nk,mk->nm", terms[:, inside], terms[:, inside]) / inside.sum()
+    )
     assert torch.allclose(products, torch.eye(12, dtype=torch.float64), atol=1e-10)
     assert mix.shape == (12, 12)
 
@@ -109,38 +130,61 @@ def test_gradient_agrees_with_a_finite_difference(angle_deg):
     weight = torch.randn(3, 17, 17, generator=torch.Generator().manual_seed(5))
     value = (optics.stack(settings, coefficients).intensity * weight).sum()
     (gradient,) = torch.autograd.grad(value, coefficients)
-    direction = torch.randn(12, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    direction = torch.randn(
+        12, generator=torch.Generator().manual_seed(6), dtype=torch.float64
+    )
     step = 1e-3
     ahead, behind = (
-        float((optics.stack(settings, coefficients.detach() + s * direction).intensity.double() * weight).sum())
+        float(
+            (
+                optics.stack(
+                    settings, coefficients.detach() + s * direction
+                ).intensity.double()
+                * weight
+            ).sum()
+        )
         for s in (step, -step)
     )
-    # the intensity is float32: 1e-7 / 1e-3 of rounding, and the third derivative times step²
-    assert float(gradient @ direction) == pytest.approx((ahead - behind) / (2 * step), rel=3e-3)
+    # the intensity is float32: 1e-7 / 1e-3 of rounding, and the third derivative times
+    # step²
+    assert float(gradient @ direction) == pytest.approx(
+        (ahead - behind) / (2 * step), rel=3e-3
+    )
 
 
 def test_a_shifted_sensor_is_a_shifted_focus():
-    """A longer sensor distance d + e is in focus for 1/z = 1/z0 + e/d² (paraxial): the error phase does that."""
+    """A longer sensor distance d + e is in focus for 1/z = 1/z0 + e/d² (paraxial): the
+    error phase does that.
+    """
     shifted = 2.0
     vergence = 1 / 20_000.0 + shifted / 400.0**2
     error = LensError({"focus_um": shifted})
     with_error = optics.stack(SMALL, torch.zeros(12), error=error).intensity
     peaks = [
-        float(optics.stack(replace(SMALL, focus_mm=1e-3 / v), torch.zeros(12)).intensity[0].max())
+        float(
+            optics.stack(replace(SMALL, focus_mm=1e-3 / v), torch.zeros(12))
+            .intensity[0]
+            .max()
+        )
         for v in (vergence, 2 / 20_000.0 - vergence)
     ]
     same, opposite = (abs(float(with_error[0].max()) - p) for p in peaks)
-    assert same < 0.02 * float(with_error[0].max()) < opposite  # fourth order in the aperture is left
+    assert (
+        same < 0.02 * float(with_error[0].max()) < opposite
+    )  # fourth order in the aperture is left
 
 
 def test_astigmatism_and_tilt_keep_the_light_and_break_the_symmetry():
     plain = optics.stack(SMALL, torch.zeros(12)).intensity[1]
     bent = optics.stack(
-        SMALL, torch.zeros(12), error=LensError({"tilt_waves": 0.3, "astigmatism_waves": 0.3})
+        SMALL,
+        torch.zeros(12),
+        error=LensError({"tilt_waves": 0.3, "astigmatism_waves": 0.3}),
     ).intensity[1]
     assert torch.allclose(plain, plain.mT, atol=1e-6)
     assert not torch.allclose(bent, bent.mT, atol=1e-3)
-    # the light within the window, of which the ripples of the low-pass at its edge are 1 %
+    # the light within the window, of which the ripples of the low-pass at its edge are
+    # 1 %
     assert float(bent.sum()) == pytest.approx(float(plain.sum()), abs=0.02)
 
 
@@ -156,13 +200,29 @@ def test_lost_optics_and_impossible_settings_are_refused():
 def test_lens_errors_have_the_covariance_that_was_asked_for():
     correlation = np.eye(5)
     correlation[3, 4] = correlation[4, 3] = -0.6
-    spread = LensErrors(2.0, 0.1, 0.0, 4.0, 8.0, gradient_nm=3.0, correlation=tuple(correlation.ravel()))
-    assert lens_errors.ENTRIES[:5] == ("focus_um", "tilt_waves", "astigmatism_waves", "bias_nm", "height_nm")
+    spread = LensErrors(
+        2.0, 0.1, 0.0, 4.0, 8.0, gradient_nm=3.0, correlation=tuple(correlation.ravel())
+    )
+    assert lens_errors.ENTRIES[:5] == (
+        "focus_um",
+        "tilt_waves",
+        "astigmatism_waves",
+        "bias_nm",
+        "height_nm",
+    )
     generator = torch.Generator().manual_seed(0)
     errors = [spread.draw(generator).amounts for _ in range(4000)]
-    drawn = np.array([[one.get(name, 0.0) for name in lens_errors.ENTRIES] for one in errors])
+    drawn = np.array(
+        [[one.get(name, 0.0) for name in lens_errors.ENTRIES] for one in errors]
+    )
     scale = np.outer(spread.deviations, spread.deviations) + 1e-12
-    assert np.abs((np.cov(drawn.T) - spread.covariance) / np.sqrt(np.outer(*[np.diag(scale)] * 2))).max() < 0.06
+    assert (
+        np.abs(
+            (np.cov(drawn.T) - spread.covariance)
+            / np.sqrt(np.outer(*[np.diag(scale)] * 2))
+        ).max()
+        < 0.06
+    )
     assert LensErrors().draw(generator) is None
     bad = np.full((5, 5), -0.9) + 1.9 * np.eye(5)
     with pytest.raises(ConfigError, match="positive semi-definite"):
@@ -173,7 +233,9 @@ def test_lens_errors_have_the_covariance_that_was_asked_for():
 
 def test_a_bias_of_the_diameters_sends_light_straight_on():
     plain = optics.stack(SMALL, torch.zeros(12)).intensity
-    hazy = optics.stack(SMALL, torch.zeros(12), error=LensError({"bias_nm": 20.0})).intensity
+    hazy = optics.stack(
+        SMALL, torch.zeros(12), error=LensError({"bias_nm": 20.0})
+    ).intensity
     lost = 1 - math.exp(-7.797e-4 * 400)  # rad²/nm², of the default cell: below
     window = (SMALL.window_samples * SMALL.sample_um) ** 2 / (math.pi * 100.0**2)
     want = (1 - lost) * plain.sum((1, 2)) + lost * window
@@ -182,16 +244,24 @@ def test_a_bias_of_the_diameters_sends_light_straight_on():
 
 @pytest.mark.slow
 def test_phase_variances_are_those_of_the_default_cell():
-    """Derivatives of the phase by diameter and height, over diameters whose phases fill a turn evenly."""
+    """Derivatives of the phase by diameter and height, over diameters whose phases fill
+    a turn evenly.
+    """
     from metalens import library
 
     cell = library.DEFAULT_CELL
     low, high = (
-        library.proxy_of(library.sweep(replace(cell, height_um=h), wavelengths_um=(0.85,)))
+        library.proxy_of(
+            library.sweep(replace(cell, height_um=h), wavelengths_um=(0.85,))
+        )
         for h in (cell.height_um, cell.height_um + 0.01)
     )
     turn = np.linspace(0, 2 * math.pi, 400, endpoint=False)
-    diameters = np.asarray(low.diameter_um(low.phase_rad(np.array([low.domain_um[0]]), 0.85)[0] + turn, 0.85))
+    diameters = np.asarray(
+        low.diameter_um(
+            low.phase_rad(np.array([low.domain_um[0]]), 0.85)[0] + turn, 0.85
+        )
+    )
     by_diameter = low.dphase_ddiameter(diameters, 0.85) * 1e-3
     by_height = (high.phase_rad(diameters, 0.85) - low.phase_rad(diameters, 0.85)) / 10
     rates = np.stack([by_diameter, by_height])

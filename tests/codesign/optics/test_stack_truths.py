@@ -1,4 +1,6 @@
-"""Settings of the trained optics and what follows from them, by the formulas of their docstrings."""
+"""Settings of the trained optics and what follows from them, by the formulas of their
+docstrings.
+"""
 
 import math
 from dataclasses import replace
@@ -21,7 +23,9 @@ OWN = OpticsConfig(
 
 
 def test_a_filter_before_a_line_passes_its_share():
-    """Two Gaussians about one wavelength: w / sqrt(w² + s²) of the light, 10 of 26; without a filter all."""
+    """Two Gaussians about one wavelength: w / sqrt(w² + s²) of the light, 10 of 26;
+    without a filter all.
+    """
     assert OWN.passed == pytest.approx(10 / 26)
     assert OpticsConfig().passed == 1.0
 
@@ -32,7 +36,9 @@ def test_depths_are_even_in_their_inverse():
 
 
 def test_samples_of_the_intensity_show_its_finest_detail():
-    """wavelength / (4 NA) apart or less, NA the sine of the rim: 0.926 um here, so 7.6 of them in 7 um, odd: 9."""
+    """wavelength / (4 NA) apart or less, NA the sine of the rim: 0.926 um here, so 7.6
+    of them in 7 um, odd: 9.
+    """
     sine = 350 / math.hypot(350, 1600)
     assert 0.79 / (4 * sine) == pytest.approx(0.924, abs=2e-3)
     need = math.ceil(7.0 / (0.79 / (4 * sine)))
@@ -40,9 +46,15 @@ def test_samples_of_the_intensity_show_its_finest_detail():
 
 
 def test_the_pupil_has_the_nodes_that_the_window_asks_for():
-    """A twentieth more than the period of the nodes' spacing in sines, an even number; 64 at least."""
+    """A twentieth more than the period of the nodes' spacing in sines, an even number;
+    64 at least.
+    """
     pupil = OWN.pupil
-    assert (pupil.radius_um, pupil.sensor_distance_um, pupil.wavelength_um) == (350.0, 1600.0, pytest.approx(0.79))
+    assert (pupil.radius_um, pupil.sensor_distance_um, pupil.wavelength_um) == (
+        350.0,
+        1600.0,
+        pytest.approx(0.79),
+    )
     width = 21 * 7.0 * 1.05
     assert pupil.period_um >= width * (1 - 1e-9)
     assert pupil.period_um < width * (1 + 3 / pupil.nodes)
@@ -51,11 +63,19 @@ def test_the_pupil_has_the_nodes_that_the_window_asks_for():
 
 
 def test_start_and_focus_carry_lengths_in_micrometres():
-    made = OpticsConfig(aperture_mm=0.7, foci_mm=(15.0, 22.5), focus_mm=17.0, sensor_distance_mm=1.6, wavelength_nm=790)
+    made = OpticsConfig(
+        aperture_mm=0.7,
+        foci_mm=(15.0, 22.5),
+        focus_mm=17.0,
+        sensor_distance_mm=1.6,
+        wavelength_nm=790,
+    )
     assert made.start.radius_um == pytest.approx(350.0)
     assert made.start.foci_um == pytest.approx((15e3, 22.5e3))
     for focus in (made.focus, made.start.focus):
-        assert (focus.wavelength_um, focus.sensor_distance_um) == pytest.approx((0.79, 1600.0))
+        assert (focus.wavelength_um, focus.sensor_distance_um) == pytest.approx(
+            (0.79, 1600.0)
+        )
         assert focus.source_distance_um == pytest.approx(17000.0)
 
 
@@ -64,15 +84,19 @@ def test_kernels_are_of_psfs_of_sum_one():
     light = light * torch.tensor([0.3, 1.0, 2.7])[:, None, None]
     made = Stack(light, torch.tensor([1e4, 2e4, 3e4], dtype=torch.float64)).basis(1e-9)
     back = torch.einsum(
-        "dr,ryx->dyx", torch.as_tensor(made.weights)[0, 0].double(), torch.as_tensor(made.kernels).double()
+        "dr,ryx->dyx",
+        torch.as_tensor(made.weights)[0, 0].double(),
+        torch.as_tensor(made.kernels).double(),
     )
     want = light / light.sum((1, 2), keepdim=True)
     assert back.numpy() == pytest.approx(want.numpy(), abs=1e-6)
 
 
 def test_light_of_the_stack_is_that_of_the_pupil_by_plain_sums():
-    """Rayleigh's quadratic lens seen at two depths: |Σ light of the nodes exp(i f x)|² over whole samples, by sums over
-    all frequencies that a sample's grid can show; the share of the light of the aperture."""
+    """Rayleigh's quadratic lens seen at two depths: |Σ light of the nodes exp(i f x)|²
+    over whole samples, by sums over
+    all frequencies that a sample's grid can show; the share of the light of the
+    aperture."""
     made = optics.stack(OWN, torch.zeros(0)).intensity.double().numpy()
     want = summed(OWN, 0.0)
     scale = want.sum() / made[4].sum()
@@ -87,28 +111,45 @@ def summed(settings, phase_rad):
     nodes = light.shape[0]
     edge = pupil.period_um / 14.0
     most = math.floor(edge + 0.5)
-    auto = np.fft.fft2(np.abs(np.fft.fft2(light, s=(3 * nodes, 3 * nodes))) ** 2) / (3 * nodes) ** 2
+    auto = (
+        np.fft.fft2(np.abs(np.fft.fft2(light, s=(3 * nodes, 3 * nodes))) ** 2)
+        / (3 * nodes) ** 2
+    )
     harmonic = np.arange(-most, most + 1)
-    sinc = np.sinc(harmonic / pupil.period_um * 7.0) * np.clip(edge - np.abs(harmonic) + 0.5, 0, 1)
+    sinc = np.sinc(harmonic / pupil.period_um * 7.0) * np.clip(
+        edge - np.abs(harmonic) + 0.5, 0, 1
+    )
     place = (np.arange(21) - 10) * 7.0
     wave = np.exp(2j * np.pi * np.outer(place, harmonic) / pupil.period_um) * sinc
     kept = auto[np.ix_(harmonic, harmonic)]
-    given = np.pi * (350.0 / 1600 / (2 * pupil.edge / nodes)) ** 2  # nodes of the aperture, as its area
-    given *= 1 - 2 * math.sqrt(2) * 147.0 / (3 * 2 * math.pi / 0.79 * pupil.edge * pupil.period_um**2)
+    given = (
+        np.pi * (350.0 / 1600 / (2 * pupil.edge / nodes)) ** 2
+    )  # nodes of the aperture, as its area
+    given *= 1 - 2 * math.sqrt(2) * 147.0 / (
+        3 * 2 * math.pi / 0.79 * pupil.edge * pupil.period_um**2
+    )
     return (wave @ kept @ wave.T).real * (7.0 / pupil.period_um) ** 2 / given
 
 
 @pytest.mark.parametrize(
     ("aperture_mm", "distance_mm", "samples", "sample_um", "within"),
-    [(0.3, 2.2, 33, 3.0, 1e-3), (0.5, 4.0, 31, 3.3, 1e-3), (0.5, 4.0, 15, 6.0, 1e-3), (0.3, 2.2, 21, 9.0, 2e-3)],
+    [
+        (0.3, 2.2, 33, 3.0, 1e-3),
+        (0.5, 4.0, 31, 3.3, 1e-3),
+        (0.5, 4.0, 15, 6.0, 1e-3),
+        (0.3, 2.2, 21, 9.0, 2e-3),
+    ],
 )
 def test_a_window_holds_what_a_round_aperture_sends_to_its_samples(
     aperture_mm, distance_mm, samples, sample_um, within
 ):
-    """(2 / π) (acos ρ - ρ √(1 - ρ²)), ρ = λ f / 2 NA, times the samples' sinc, over frequencies to 1 / (2 samples).
+    """(2 / π) (acos ρ - ρ √(1 - ρ²)), ρ = λ f / 2 NA, times the samples' sinc, over
+    frequencies to 1 / (2 samples).
 
-    0.95 to 0.99 of the light. Nodes across the rim counted by their squares it is 1e-2 too bright; with the last
-    harmonic whole, or left out, 1e-2 off where samples are coarse. The first samples are so fine that nodes have
+    0.95 to 0.99 of the light. Nodes across the rim counted by their squares it is 1e-2
+    too bright; with the last
+    harmonic whole, or left out, 1e-2 off where samples are coarse. The first samples
+    are so fine that nodes have
     fewer harmonics than they show.
     """
     settings = OpticsConfig(
@@ -119,7 +160,13 @@ def test_a_window_holds_what_a_round_aperture_sends_to_its_samples(
     node, weight = np.polynomial.legendre.leggauss(200)
     f, weight = (node + 1) / (4 * sample_um), weight / (4 * sample_um)
     place = (np.arange(samples) - (samples - 1) / 2) * sample_um
-    row = 2 * np.cos(2 * np.pi * np.outer(place, f)).sum(0) * np.sinc(f * sample_um) * sample_um * weight
+    row = (
+        2
+        * np.cos(2 * np.pi * np.outer(place, f)).sum(0)
+        * np.sinc(f * sample_um)
+        * sample_um
+        * weight
+    )
     sine = aperture_mm / 2 / math.hypot(aperture_mm / 2, distance_mm)
     rho = np.clip(0.85 * np.hypot(f[:, None], f) / (2 * sine), 0, 1)
     want = float(row @ (2 / np.pi * (np.arccos(rho) - rho * np.sqrt(1 - rho**2))) @ row)
@@ -128,22 +175,35 @@ def test_a_window_holds_what_a_round_aperture_sends_to_its_samples(
 
 BENT = replace(OWN, polynomials=4, zones=2)
 RAD = torch.tensor([0.7, -0.4, 0.5, 1.1], dtype=torch.float64)
-WRONG = LensError({"tilt_waves": 0.2, "astigmatism_waves": -0.13, "bias_nm": 4.0, "gradient_nm": 9.0}, 0.7)
+WRONG = LensError(
+    {"tilt_waves": 0.2, "astigmatism_waves": -0.13, "bias_nm": 4.0, "gradient_nm": 9.0},
+    0.7,
+)
 
 
 def by_hand(x, y, *, wrong=False):
-    """Phase on top of the hyperbolic one at places over the radius: terms made orthonormal on the pupil's nodes."""
+    """Phase on top of the hyperbolic one at places over the radius: terms made
+    orthonormal on the pupil's nodes.
+    """
     nodes = [c.numpy() / 350 for c in coordinates(BENT.pupil)]
     inside = np.hypot(*nodes) <= 1
-    raw = np.stack(families.terms(*map(torch.from_numpy, nodes), 4, "free"))[:, inside].T
+    raw = np.stack(families.terms(*map(torch.from_numpy, nodes), 4, "free"))[
+        :, inside
+    ].T
     mix = np.linalg.inv(np.linalg.qr(raw)[1]) * math.sqrt(len(raw))
     assert (raw @ mix).T @ (raw @ mix) / len(raw) == pytest.approx(np.eye(4), abs=1e-9)
-    total = np.tensordot(mix @ RAD.numpy(), np.stack(families.terms(*map(torch.from_numpy, (x, y)), 4, "free")), 1)
+    total = np.tensordot(
+        mix @ RAD.numpy(),
+        np.stack(families.terms(*map(torch.from_numpy, (x, y)), 4, "free")),
+        1,
+    )
     ring = np.ceil(2 * (x**2 + y**2)).clip(1, 2)
     total += (2 * ring - 1) * np.arctan2(y, x)  # a double helix of two rings
     if wrong:
         total += 2 * np.pi * (0.2 * (x**2 + y**2) * x - 0.13 * (x**2 - y**2))
-        total += lens_errors.wave_front_rad(WRONG.state(), *map(torch.from_numpy, (x, y))).numpy()
+        total += lens_errors.wave_front_rad(
+            WRONG.state(), *map(torch.from_numpy, (x, y))
+        ).numpy()
     return total
 
 
@@ -152,13 +212,15 @@ def test_the_phase_at_pillars_is_that_of_the_polynomials_over_the_radius():
     x, y = np.array([-0.8, 0.35, 0.1, 0.62]), np.array([0.55, -0.2, 0.05])
     across, down = np.meshgrid(x, y)
     places = torch.from_numpy(350 * across), torch.from_numpy(350 * down)
-    assert optics.phase_at(BENT, RAD, *places).numpy() == pytest.approx(by_hand(across, down), rel=1e-9)
+    assert optics.phase_at(BENT, RAD, *places).numpy() == pytest.approx(
+        by_hand(across, down), rel=1e-9
+    )
     made = optics.phase_at(BENT, RAD, *places, error=WRONG).numpy()
     assert made == pytest.approx(by_hand(across, down, wrong=True), rel=1e-9)
     whole = optics.phase_of(BENT, RAD.numpy())(350 * x, 350 * y)
-    assert whole - profiles.hyperbolic(350 * x, 350 * y[:, None], BENT.focus) == pytest.approx(
-        by_hand(across, down), rel=1e-9
-    )
+    assert whole - profiles.hyperbolic(
+        350 * x, 350 * y[:, None], BENT.focus
+    ) == pytest.approx(by_hand(across, down), rel=1e-9)
     plain = replace(BENT, polynomials=0, zones=0)
     assert not optics.phase_at(plain, RAD[:0], *places).any()
     assert optics.phase_of(plain, np.zeros(0))(350 * x, 350 * y) == pytest.approx(
@@ -167,7 +229,10 @@ def test_the_phase_at_pillars_is_that_of_the_polynomials_over_the_radius():
 
 
 def test_a_lens_made_wrong_has_the_light_of_its_bent_phase_and_the_haze_of_its_pillars():
-    x, y = (c.numpy().astype(float) / 350 for c in torch.broadcast_tensors(*coordinates(BENT.pupil)))
+    x, y = (
+        c.numpy().astype(float) / 350
+        for c in torch.broadcast_tensors(*coordinates(BENT.pupil))
+    )
     phase = np.where(np.hypot(x, y) <= 1, by_hand(x, y, wrong=True), 0.0)
     kept = math.exp(-lens_errors.variance_rad2(WRONG.state()))
     assert kept < 0.99

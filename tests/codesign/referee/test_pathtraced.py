@@ -1,4 +1,6 @@
-"""The path-traced referee: shapes where the renderer sees them, light of known amount, refusals without Mitsuba."""
+"""The path-traced referee: shapes where the renderer sees them, light of known amount,
+refusals without Mitsuba.
+"""
 
 import sys
 
@@ -20,14 +22,18 @@ STATES = eye.draw(2, 5)
 
 def test_without_mitsuba_the_referee_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(SceneError, match=r"pip install 'metalens-toolchain\[referee\]'"):
+    with pytest.raises(
+        SceneError, match=r"pip install 'metalens-toolchain\[referee\]'"
+    ):
         pathtraced.start()
     with pytest.raises(SceneError, match="2 or more"):
         pathtraced.compare(STATES, samples=1)
 
 
 def test_noise_of_the_halves_does_not_count_as_error():
-    """Two noisy copies of the truth: the error of the truth is 0 on average, that of 10 % more is 10 %."""
+    """Two noisy copies of the truth: the error of the truth is 0 on average, that of 10
+    % more is 10 %.
+    """
     rng = np.random.default_rng(0)
     truth = rng.uniform(0.2, 0.8, (200, 200))
     halves = truth * (1 + 0.5 * rng.standard_normal((2, 200, 200)))
@@ -39,13 +45,17 @@ def test_noise_of_the_halves_does_not_count_as_error():
 
 
 def test_shapes_lie_on_the_surfaces_that_rays_meet():
-    """Points of the meshes against the closed forms of sphere, plane and limbus, and against the renderer's depth."""
+    """Points of the meshes against the closed forms of sphere, plane and limbus, and
+    against the renderer's depth.
+    """
     p = pathtraced._parameters(STATES, Rig(), CAMERA)
     bank = pathtraced._bank()
     centre, axis = p[:3].numpy(), p[model.AXIS : model.AXIS + 3].numpy()
     globe, _, white = traced_shapes._globe(p, bank)
     assert np.ptp(np.linalg.norm(1e3 * globe - centre, axis=1)) < 1e-6
-    assert float((1e3 * globe - centre).dot(axis).max()) == pytest.approx(float(p[model.LIMBUS_D]), rel=1e-9)
+    assert float((1e3 * globe - centre).dot(axis).max()) == pytest.approx(
+        float(p[model.LIMBUS_D]), rel=1e-9
+    )
     assert 0 < white.min() < white.max() < 1
     iris, _, brown = traced_shapes._iris(p, bank)
     height = (1e3 * iris - centre).dot(axis).reshape(-1, 513)
@@ -53,7 +63,9 @@ def test_shapes_lie_on_the_surfaces_that_rays_meet():
     assert brown.min() > 0
     face, triangles, _ = traced_shapes._face(p, bank, Rig(), CAMERA)
     depth = renderer.render(STATES[:1], camera=CAMERA).frames.depth_um[0, 0]
-    assert 1e3 * face[:, 2].min() < float(depth.min())  # the mesh is wider than the frame
+    assert 1e3 * face[:, 2].min() < float(
+        depth.min()
+    )  # the mesh is wider than the frame
     assert triangles.max() < len(face)
 
 
@@ -64,11 +76,15 @@ def test_regions_do_not_overlap_and_cover_the_frame():
 
 
 def test_skin_and_iris_are_as_bright_as_traced_ones(tmp_path):
-    """No factor is fitted: albedos and lamps are the model's. Left are shadows and light between surfaces."""
+    """No factor is fitted: albedos and lamps are the model's. Left are shadows and
+    light between surfaces.
+    """
     pytest.importorskip("mitsuba")
     made = pathtraced.compare(STATES, camera=CAMERA, samples=256)
     assert made.ratio("skin") == pytest.approx(1, abs=0.1)
-    assert made.ratio("iris") == pytest.approx(1, abs=0.2)  # noise of few paths through the cornea: 3 %
+    assert made.ratio("iris") == pytest.approx(
+        1, abs=0.2
+    )  # noise of few paths through the cornea: 3 %
     assert made.error() < 0.3
     dark = made.regions["pupil"]
     assert made.traced[dark].mean() < 0.3 * made.traced[made.regions["iris"]].mean()
@@ -78,14 +94,20 @@ def test_skin_and_iris_are_as_bright_as_traced_ones(tmp_path):
 
 
 def test_a_mirrored_scene_would_be_noticed():
-    """Against the frame flipped left to right the error is far larger: axes agree between both programs."""
+    """Against the frame flipped left to right the error is far larger: axes agree
+    between both programs.
+    """
     pytest.importorskip("mitsuba")
     made = pathtraced.compare(STATES, camera=CAMERA, samples=64)
-    assert made.error() < 0.7 * min(made.error(image=made.ours[:, ::-1]), made.error(image=made.ours[::-1]))
+    assert made.error() < 0.7 * min(
+        made.error(image=made.ours[:, ::-1]), made.error(image=made.ours[::-1])
+    )
 
 
 def test_ambient_light_on_white_skin_is_the_models():
-    """Integral of the sky over the hemisphere of a normal: ambient (0.6 - 0.4 n.down), whatever the normal."""
+    """Integral of the sky over the hemisphere of a normal: ambient (0.6 - 0.4 n.down),
+    whatever the normal.
+    """
     p = pathtraced._parameters(STATES, Rig(), CAMERA)
     rng = np.random.default_rng(0)
     way = rng.standard_normal((200_000, 3))

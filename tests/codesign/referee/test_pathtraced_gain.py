@@ -1,4 +1,6 @@
-"""Traced light is counted in the renderer's unit: that of the lamp times the camera's gain."""
+"""Traced light is counted in the renderer's unit: that of the lamp times the camera's
+gain.
+"""
 
 from types import SimpleNamespace
 
@@ -14,7 +16,10 @@ def test_light_is_multiplied_by_the_gain(monkeypatch):
     light = np.random.default_rng(1).uniform(0, 1, (4, 5, 3))
     p = np.zeros(model.COUNT)
     p[model.GAIN] = 1.7
-    fake = SimpleNamespace(load_dict=lambda scene: scene, render=lambda scene, *, spp, seed: light + spp + 100 * seed)
+    fake = SimpleNamespace(
+        load_dict=lambda scene: scene,
+        render=lambda scene, *, spp, seed: light + spp + 100 * seed,
+    )
     monkeypatch.setattr(pathtraced, "start", lambda: fake)
     monkeypatch.setattr(pathtraced, "_parameters", lambda *_: p)
     monkeypatch.setattr(pathtraced, "build", lambda *_, **__: {})
@@ -31,7 +36,9 @@ def test_paths_are_shared_by_two_halves_of_their_own_seeds(monkeypatch):
         asked.append((samples, seed))
         return np.full((camera.pixels, camera.pixels), 1.0 + seed)
 
-    monkeypatch.setattr(pathtraced, "start", lambda: SimpleNamespace(variant=lambda: "none"))
+    monkeypatch.setattr(
+        pathtraced, "start", lambda: SimpleNamespace(variant=lambda: "none")
+    )
     monkeypatch.setattr(pathtraced, "trace", trace)
     made = pathtraced.compare(population.draw(1, 5), camera=Camera(16, 90.0), samples=7)
     assert asked == [(3, 0), (3, 1)]

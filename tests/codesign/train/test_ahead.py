@@ -1,4 +1,6 @@
-"""Frames formed beside the step: in order, once, on a thread that torch's others make room for; the same numbers."""
+"""Frames formed beside the step: in order, once, on a thread that torch's others make
+room for; the same numbers.
+"""
 
 import threading
 
@@ -47,7 +49,11 @@ def test_one_thread_of_torch_stays_one_thread(threads):
 
 def test_without_workers_a_step_has_all_threads_and_does_its_own_work(threads):
     threads(2)
-    with Ahead(lambda step: (step, threading.current_thread(), torch.get_num_threads()), end=9, workers=0) as going:
+    with Ahead(
+        lambda step: (step, threading.current_thread(), torch.get_num_threads()),
+        end=9,
+        workers=0,
+    ) as going:
         assert going.take(4) == (4, threading.main_thread(), 2)
         with going.beside():
             assert torch.get_num_threads() == 2
@@ -63,7 +69,9 @@ def test_what_goes_wrong_beside_the_step_is_raised_in_it(threads):
 
 
 def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
-    """Two workers: both steps beyond the one asked for wait for each other, so they must run at the same time."""
+    """Two workers: both steps beyond the one asked for wait for each other, so they
+    must run at the same time.
+    """
     threads(4)
     done, both = [], threading.Barrier(2)
 
@@ -80,7 +88,9 @@ def test_several_begin_at_once_each_step_once_and_in_its_place(threads):
     assert sorted(done) == [3, 4, 5]
 
 
-def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(monkeypatch):
+def test_renderers_beside_a_gpu_are_half_of_the_cores_shared_by_its_processes(
+    monkeypatch,
+):
     monkeypatch.setattr(ahead, "cores", lambda: 12)
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
     assert ahead.renderers(torch.device("cpu")) == 0

@@ -1,4 +1,6 @@
-"""How many steps are begun beside the one that is asked for, and how many threads are left: at the very ends."""
+"""How many steps are begun beside the one that is asked for, and how many threads are
+left: at the very ends.
+"""
 
 import threading
 
@@ -16,10 +18,17 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("count", "workers", "beside"), [(2, 1, 1), (2, 2, 1), (2, 5, 1), (5, 2, 3), (3, 0, 3)])
-def test_the_work_takes_its_threads_from_the_step_and_leaves_one(threads, count, workers, beside):
+@pytest.mark.parametrize(
+    ("count", "workers", "beside"),
+    [(2, 1, 1), (2, 2, 1), (2, 5, 1), (5, 2, 3), (3, 0, 3)],
+)
+def test_the_work_takes_its_threads_from_the_step_and_leaves_one(
+    threads, count, workers, beside
+):
     threads(count)
-    with Ahead(lambda step: threading.current_thread().name, end=9, workers=workers) as going:
+    with Ahead(
+        lambda step: threading.current_thread().name, end=9, workers=workers
+    ) as going:
         assert going.take(3).startswith("ahead") == (workers > 0)
         with going.beside():
             assert torch.get_num_threads() == beside
@@ -28,7 +37,9 @@ def test_the_work_takes_its_threads_from_the_step_and_leaves_one(threads, count,
 
 
 @pytest.mark.parametrize(("end", "begun"), [(99, [6, 7]), (7, [6]), (6, []), (3, [])])
-def test_as_many_steps_are_begun_as_there_are_workers_and_none_from_the_end_on(threads, end, begun):
+def test_as_many_steps_are_begun_as_there_are_workers_and_none_from_the_end_on(
+    threads, end, begun
+):
     """A step beyond the end that is asked for is done all the same."""
     threads(4)
     with Ahead(lambda step: 10 * step, end=end, workers=2) as going:
@@ -37,9 +48,12 @@ def test_as_many_steps_are_begun_as_there_are_workers_and_none_from_the_end_on(t
 
 
 @pytest.mark.parametrize(
-    ("cores", "processes", "count"), [(1, "1", 1), (2, "1", 1), (4, "1", 2), (31, "2", 7), (40, "1", 8)]
+    ("cores", "processes", "count"),
+    [(1, "1", 1), (2, "1", 1), (4, "1", 2), (31, "2", 7), (40, "1", 8)],
 )
-def test_one_thread_at_least_and_eight_at_most_render_for_a_process(monkeypatch, cores, processes, count):
+def test_one_thread_at_least_and_eight_at_most_render_for_a_process(
+    monkeypatch, cores, processes, count
+):
     monkeypatch.setattr(ahead, "cores", lambda: cores)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
     assert ahead.renderers(torch.device("cuda")) == count

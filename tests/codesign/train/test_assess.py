@@ -33,7 +33,10 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
     off = torch.tensor([[0.1, -0.3, 0.7], [-0.2, 0.1, -0.4], [0.3, 0.8, 0.1]])
     scale = torch.tensor([0.5, 2.0, 4.0])
     logits, mask = -torch.ones(3, 5, 5), torch.zeros(3, 5, 5)
-    logits[0, :2], mask[0, 1:3] = 1.0, 1.0  # 10 and 10 pixels, 5 of them shared: 5 of 15
+    logits[0, :2], mask[0, 1:3] = (
+        1.0,
+        1.0,
+    )  # 10 and 10 pixels, 5 of them shared: 5 of 15
     logits[1, 0], mask[1, 0] = 1.0, 1.0
     seen = Seen(torch.zeros(3, 1, 5, 5), mask, truth, batch=2)
     net = Typed((truth + off) / scale, logits)
@@ -46,7 +49,9 @@ def test_answers_are_scaled_and_errors_are_means_over_frames(monkeypatch):
 
 
 def test_standard_deviations_come_in_millimetres(monkeypatch):
-    """exp of the logarithm times the scale of each axis; two batches in a row; depths as they are told."""
+    """exp of the logarithm times the scale of each axis; two batches in a row; depths
+    as they are told.
+    """
     log_sd = torch.tensor([[-1.0, 0.3, 0.5], [0.2, -0.4, 1.1], [0.0, 0.7, -2.0]])
     depth = torch.arange(3 * 2 * 4.0).reshape(3, 2, 2, 2)
     scale = torch.tensor([0.5, 2.0, 4.0])
@@ -55,16 +60,25 @@ def test_standard_deviations_come_in_millimetres(monkeypatch):
         def forward(self, frames, architecture):
             part = slice(self.at, self.at + len(frames))
             found = super().forward(frames, architecture)
-            return Prediction(found.mask_logits, found.centre, found.slip, depth[part], log_sd[part])
+            return Prediction(
+                found.mask_logits, found.centre, found.slip, depth[part], log_sd[part]
+            )
 
-    seen = Seen(torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2)
+    seen = Seen(
+        torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
+    )
     net = Sure(torch.ones(3, 3), -torch.ones(3, 5, 5))
-    got = assess.predict(net, None, seen, SimpleNamespace(slip_scale_mm=tuple(scale.tolist())))
+    got = assess.predict(
+        net, None, seen, SimpleNamespace(slip_scale_mm=tuple(scale.tolist()))
+    )
     assert torch.allclose(got.slip_sd_mm, torch.exp(log_sd) * scale)
     assert torch.allclose(got.slip_mm, scale.expand(3, 3))
     assert torch.equal(got.depth, depth)
     plain = assess.predict(
-        Typed(torch.ones(3, 3), -torch.ones(3, 5, 5)), None, seen, SimpleNamespace(slip_scale_mm=(1.0,) * 3)
+        Typed(torch.ones(3, 3), -torch.ones(3, 5, 5)),
+        None,
+        seen,
+        SimpleNamespace(slip_scale_mm=(1.0,) * 3),
     )
     assert plain.slip_sd_mm is None
     assert plain.depth is None
@@ -77,7 +91,9 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
             axis = torch.tensor([[0.3, -0.4, 1.2]]).expand(len(frames), 3)
             return Prediction(found.mask_logits, found.centre, found.slip, axis=axis)
 
-    seen = Seen(torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2)
+    seen = Seen(
+        torch.zeros(3, 1, 5, 5), torch.zeros(3, 5, 5), torch.zeros(3, 3), batch=2
+    )
     told = [
         assess.predict(
             Turned(torch.ones(3, 3), -torch.ones(3, 5, 5)),
@@ -91,11 +107,24 @@ def test_an_axis_is_a_unit_vector_and_none_where_nothing_trained_it():
     assert told[1] is None
 
 
-@pytest.mark.parametrize(("frames", "used"), [(1, [1]), (2, [2]), (5, [2]), (8, [2, 2]), (10, [2, 2])])
-def test_batch_statistics_come_from_the_first_half_of_the_batches(monkeypatch, frames, used):
+@pytest.mark.parametrize(
+    ("frames", "used"), [(1, [1]), (2, [2]), (5, [2]), (8, [2, 2]), (10, [2, 2])]
+)
+def test_batch_statistics_come_from_the_first_half_of_the_batches(
+    monkeypatch, frames, used
+):
     told = []
-    monkeypatch.setattr(assess, "recalibrate", lambda net, architecture, batches: told.extend(map(len, batches)))
-    seen = Seen(torch.zeros(frames, 1, 5, 5), torch.zeros(frames, 5, 5), torch.zeros(frames, 3), batch=2)
+    monkeypatch.setattr(
+        assess,
+        "recalibrate",
+        lambda net, architecture, batches: told.extend(map(len, batches)),
+    )
+    seen = Seen(
+        torch.zeros(frames, 1, 5, 5),
+        torch.zeros(frames, 5, 5),
+        torch.zeros(frames, 3),
+        batch=2,
+    )
     net = Typed(torch.zeros(frames, 3), -torch.ones(frames, 5, 5))
     assess.assess(net, None, seen, SimpleNamespace(slip_scale_mm=(1.0, 1.0, 1.0)))
     assert told == used

@@ -19,10 +19,18 @@ class Settings:
 
 
 leaf = st.one_of(
-    st.none(), st.booleans(), st.integers(-(2**70), 2**70), st.floats(allow_nan=False), st.text(max_size=8)
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.floats(allow_nan=False),
+    st.text(max_size=8),
 )
 tree = st.recursive(
-    leaf, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=4), inner, max_size=3))
+    leaf,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    ),
 )
 
 
@@ -48,7 +56,11 @@ def test_optimiser_continues_bit_for_bit(tmp_path):
 
     net, optimiser = fresh()
     step(net, optimiser, 3)
-    state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "random": torch.get_rng_state()}
+    state = {
+        "net": net.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "random": torch.get_rng_state(),
+    }
     checkpoint.save(tmp_path / "c", state, settings=Settings())
     step(net, optimiser, 4)
     other, other_optimiser = fresh()
@@ -79,7 +91,9 @@ class Later(Settings):
 
 
 def test_settings_that_an_older_run_did_not_know_stand_at_their_defaults(tmp_path):
-    """A run goes on where a later release added settings, and is refused where these are used."""
+    """A run goes on where a later release added settings, and is refused where these
+    are used.
+    """
     checkpoint.save(tmp_path / "c", {"a": 1}, settings=Settings(rate=0.3))
     assert checkpoint.load(tmp_path / "c", settings=Later(rate=0.3)) == {"a": 1}
     for used, told in (
@@ -128,7 +142,9 @@ def _exported(path, size):
 
 @pytest.mark.parametrize("write", [_checkpointed, _exported])
 def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, write):
-    """A file-size limit stands for the disk: the write fails part-way, as on a full one."""
+    """A file-size limit stands for the disk: the write fails part-way, as on a full
+    one.
+    """
     import resource
     import signal
 
@@ -149,11 +165,17 @@ def test_a_full_disk_is_named_and_leaves_the_old_file(tmp_path, write):
 
 
 def test_a_networks_file_is_the_same_at_every_writing(tmp_path):
-    """Two entries about the tensors came in an order drawn by chance: one of two contents, each as often."""
+    """Two entries about the tensors came in an order drawn by chance: one of two
+    contents, each as often.
+    """
     net, found = torch.nn.Linear(5, 3), set()
     for _ in range(24):  # all alike by chance: 2^-23
         checkpoint.save_network(tmp_path / "n.safetensors", net)
         found.add((tmp_path / "n.safetensors").read_bytes())
     assert len(found) == 1
     told = info.network(tmp_path / "n.safetensors")
-    assert (told["kind"], told["version"], told["arrays"]["weight"]) == ("subnet", "1", "F32 (3, 5)")
+    assert (told["kind"], told["version"], told["arrays"]["weight"]) == (
+        "subnet",
+        "1",
+        "F32 (3, 5)",
+    )

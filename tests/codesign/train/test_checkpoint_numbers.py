@@ -34,18 +34,30 @@ def test_a_file_says_its_kind_its_version_and_where_every_tensor_stands(tmp_path
     assert list(back["b"]) == [7]
 
 
-@pytest.mark.parametrize(("kind", "version"), [("checkpoint", 9), ("checkpoint", 11), ("subnet", 10), (None, 10)])
+@pytest.mark.parametrize(
+    ("kind", "version"),
+    [("checkpoint", 9), ("checkpoint", 11), ("subnet", 10), (None, 10)],
+)
 def test_another_kind_or_version_is_refused(tmp_path, kind, version):
-    checkpoint._write(tmp_path / "c", {}, "about", json.dumps({"kind": kind, "version": version}))
+    checkpoint._write(
+        tmp_path / "c", {}, "about", json.dumps({"kind": kind, "version": version})
+    )
     with pytest.raises(TrainingError, match="need 'checkpoint' version 10"):
         checkpoint.load(tmp_path / "c", settings=Settings())
 
 
 def test_a_setting_that_holds_an_equals_sign_is_compared_whole():
-    told = checkpoint.difference('steps = 10\nname = "a = b = c"\n', Settings(name="a = b = d"))
+    told = checkpoint.difference(
+        'steps = 10\nname = "a = b = c"\n', Settings(name="a = b = d")
+    )
     assert told == 'name: "a = b = c" -> "a = b = d"'
-    assert checkpoint.difference('steps = 10\nname = "a = b"\n', Settings(name="a = b")) == ""
-    assert checkpoint.difference('name = "x"\n', Settings(name="x")) == ""  # what is not known stands at its default
+    assert (
+        checkpoint.difference('steps = 10\nname = "a = b"\n', Settings(name="a = b"))
+        == ""
+    )
+    assert (
+        checkpoint.difference('name = "x"\n', Settings(name="x")) == ""
+    )  # what is not known stands at its default
     assert checkpoint.difference("width = 3\n", Settings()) == "width: 3 -> absent"
 
 
@@ -73,6 +85,6 @@ def test_settings_of_one_name_in_two_tables_are_two_and_defaults_that_are_made_a
     told = checkpoint.difference("steps = 3\n", now).splitlines()
     assert told == ["one.steps: 4 -> 6", "sides: [5, 7] -> [5, 8]"]
     assert checkpoint.difference("steps = 3\n", Nested()) == ""
-    assert checkpoint.difference("steps = 3\n[one]\nsteps = 6\n[other]\nsteps = 9\n", now) == (
-        "other.steps: 9 -> 4\nsides: [5, 7] -> [5, 8]"
-    )
+    assert checkpoint.difference(
+        "steps = 3\n[one]\nsteps = 6\n[other]\nsteps = 9\n", now
+    ) == ("other.steps: 9 -> 4\nsides: [5, 7] -> [5, 8]")

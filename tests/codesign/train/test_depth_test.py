@@ -1,4 +1,6 @@
-"""Tests on blur alone: ambiguous frames hold no other cue, and a network that ignores its PSF is found out."""
+"""Tests on blur alone: ambiguous frames hold no other cue, and a network that ignores
+its PSF is found out.
+"""
 
 from dataclasses import replace
 
@@ -18,7 +20,14 @@ from metalens.ground.errors import TrainingError
 from metalens.image.sensor import Sensor
 
 SCENES = EyeScenes(SceneConfig(pixels=64, margin=8), 18.0, 2000.0, 0, TEST)
-OPTICS = OpticsConfig(depth_count=12, sample_um=18.0, window_samples=17, polynomials=0, focus_mm=33.0, image="uniform")
+OPTICS = OpticsConfig(
+    depth_count=12,
+    sample_um=18.0,
+    window_samples=17,
+    polynomials=0,
+    focus_mm=33.0,
+    image="uniform",
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +39,15 @@ def pairs():
 def trainer():
     config = InnerConfig(steps=1, batch=8)
     made = inner.model(OPTICS, pitch_um=18.0, seed=0)
-    return Trainer(config, OPTICS, Sensor(18.0, 18.0, 1e5, 0.0, 2e5, 0.0, 16), SCENES, made)
+    return Trainer(
+        config, OPTICS, Sensor(18.0, 18.0, 1e5, 0.0, 2e5, 0.0, 16), SCENES, made
+    )
 
 
 class Blurmeter(Supernet):
-    """Predicts the axial slippage from the contrast of fine detail: it sees nothing but blur."""
+    """Predicts the axial slippage from the contrast of fine detail: it sees nothing but
+    blur.
+    """
 
     def forward(self, frames, architecture):
         fine = (frames[..., 1:] - frames[..., :-1]).square().mean((1, 2, 3))
@@ -48,7 +61,11 @@ class Ruler(Supernet):
     def forward(self, frames, architecture):
         x = torch.arange(frames.shape[-1], dtype=frames.dtype)
         place = (frames.square() * x).sum((1, 2, 3)) / frames.square().sum((1, 2, 3))
-        return Prediction(frames[:, 0], torch.zeros(len(place), 2), torch.stack([0 * place, 0 * place, place / 10], 1))
+        return Prediction(
+            frames[:, 0],
+            torch.zeros(len(place), 2),
+            torch.stack([0 * place, 0 * place, place / 10], 1),
+        )
 
 
 def test_pairs_share_the_pupil_and_depth_has_nothing_to_do_with_the_picture(pairs):
@@ -57,7 +74,9 @@ def test_pairs_share_the_pupil_and_depth_has_nothing_to_do_with_the_picture(pair
     assert float((first - second).norm(dim=1).max()) <= 0.1
     slips = labels.slip_um
     assert float((slips[::2] - slips[1::2]).norm(dim=1).min()) > 100
-    many = ambiguity.ambiguous(replace(SCENES, settings=replace(SCENES.settings, scale=0.3)), 24, seed=5).states
+    many = ambiguity.ambiguous(
+        replace(SCENES, settings=replace(SCENES.settings, scale=0.3)), 24, seed=5
+    ).states
     depth = 21e3 + many.slip_um[:, 2]
     assert abs(np.corrcoef(depth, depth * many.scale)[0, 1]) < 0.45  # 3 / sqrt(48)
     assert float((many.scale - 1).abs().max()) < 0.3 + 1e-9
@@ -73,19 +92,28 @@ def test_displaced_frames_differ_in_depth_alone(pairs):
     plain, moved = pairs.batch(0, 4), Displaced(pairs, 1000.0).batch(0, 4)
     assert torch.equal(plain.frames.radiance, moved.frames.radiance)
     assert torch.equal(plain.slip_mm, moved.slip_mm)
-    torch.testing.assert_close(moved.frames.depth_um - plain.frames.depth_um, torch.full((4, 2, 80, 80), 1000.0))
+    torch.testing.assert_close(
+        moved.frames.depth_um - plain.frames.depth_um,
+        torch.full((4, 2, 80, 80), 1000.0),
+    )
     scale = pairs.states.scale[:4]
     flat = flattened(plain.frames, scale)
     far = displaced(flat, 1000.0)
     change = (far.depth_um.astype(float) - flat.depth_um) * flat.scale[:, None, None]
-    assert np.abs(change - 1000.0).max() < 1.3  # a um of rounding before and after, times the scale
+    assert (
+        np.abs(change - 1000.0).max() < 1.3
+    )  # a um of rounding before and after, times the scale
 
 
 def test_the_response_to_psf_depth_tells_a_blurmeter_from_a_ruler(pairs, trainer):
-    """Beyond its focus, a hyperbolic lens blurs more as things come nearer: the blurmeter follows, the ruler not."""
+    """Beyond its focus, a hyperbolic lens blurs more as things come nearer: the
+    blurmeter follows, the ruler not.
+    """
     found = {}
     for kind in (Blurmeter, Ruler):
-        found[kind] = depth_response(trainer, pairs, kind(), smallest(Supernet().space), batches=2)
+        found[kind] = depth_response(
+            trainer, pairs, kind(), smallest(Supernet().space), batches=2
+        )
     assert found[Blurmeter].frames == 16
     assert found[Blurmeter].mean > 5 * found[Blurmeter].standard_error > 0
     per_blur = found[Blurmeter].mean / _spread(trainer, pairs, Blurmeter())
@@ -95,4 +123,8 @@ def test_the_response_to_psf_depth_tells_a_blurmeter_from_a_ruler(pairs, trainer
 
 def _spread(trainer, pairs, net):
     seen = assess.frames(trainer, pairs, 2)
-    return float(assess.predict(net, smallest(net.space), seen, trainer.inner).slip_mm[:, 2].std())
+    return float(
+        assess.predict(net, smallest(net.space), seen, trainer.inner)
+        .slip_mm[:, 2]
+        .std()
+    )

@@ -1,4 +1,6 @@
-"""Regularised evolution: finds the optimum of a known landscape, keeps the budget, goes on exactly after a stop."""
+"""Regularised evolution: finds the optimum of a known landscape, keeps the budget, goes
+on exactly after a stop.
+"""
 
 import dataclasses
 
@@ -19,7 +21,9 @@ PLAN = Plan(population=12, tournament=4, rounds=200)
 
 
 def _distance(architecture):
-    """Entries that differ from a hidden target, over the slots that the target uses: zero only at the target."""
+    """Entries that differ from a hidden target, over the slots that the target uses:
+    zero only at the target.
+    """
     used = [j < d for d in TARGET.depths for j in range(max(SPACE.depths))]
     pairs = zip(architecture.kernels, TARGET.kernels, used, strict=True)
     return float(
@@ -34,7 +38,11 @@ def _count(architecture):
 
 
 def _run(plan=PLAN, budget=1e12, start=None, evaluate=_distance):
-    return list(evolution.evolve(SPACE, plan, evaluate, _count, budget=budget, seed=1, start=start))
+    return list(
+        evolution.evolve(
+            SPACE, plan, evaluate, _count, budget=budget, seed=1, start=start
+        )
+    )
 
 
 def test_evolution_descends_a_known_landscape_below_random_search():
@@ -46,7 +54,10 @@ def test_evolution_descends_a_known_landscape_below_random_search():
 
 def test_no_candidate_is_beyond_the_budget():
     budget = 3 * _count(arch.smallest(SPACE))
-    assert max(c.macs for c in _run(budget=budget, plan=Plan(8, 2, 40))[-1].history) <= budget
+    assert (
+        max(c.macs for c in _run(budget=budget, plan=Plan(8, 2, 40))[-1].history)
+        <= budget
+    )
 
 
 def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
@@ -56,10 +67,14 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_stopped():
 
 
 def test_candidates_born_together_do_not_know_of_each_other():
-    """Four at once: the population of the first four births is the same as one at a time, and rounds are kept."""
+    """Four at once: the population of the first four births is the same as one at a
+    time, and rounds are kept.
+    """
     one, four = _run(plan=Plan(8, 3, 30)), _run(plan=Plan(8, 3, 30, together=4))
     assert [len(s.history) for s in four] == [4, 8, 12, 16, 20, 24, 28, 30]
-    assert four[1].history == one[7].history  # the first population is drawn, whoever is judged when
+    assert (
+        four[1].history == one[7].history
+    )  # the first population is drawn, whoever is judged when
     middle = evolution.loads(evolution.dumps(four[3]), SPACE)
     assert _run(plan=Plan(8, 3, 30, together=4), start=middle)[-1] == four[-1]
     with pytest.raises(TrainingError, match="together = 0"):
@@ -101,7 +116,8 @@ def test_pareto_set_is_what_no_other_beats(points):
     front = evolution.pareto(candidates)
     for member in front:
         assert not any(
-            (c.error < member.error and c.macs <= member.macs) or (c.error <= member.error and c.macs < member.macs)
+            (c.error < member.error and c.macs <= member.macs)
+            or (c.error <= member.error and c.macs < member.macs)
             for c in candidates
         )
     for c in candidates:
@@ -118,29 +134,44 @@ def test_foreign_state_is_refused():
 
 @pytest.mark.parametrize("share", [0.01, 0.03, 0.1, 0.3, 0.9])
 def test_the_largest_network_uses_its_budget(share):
-    """A finer pitch or a smaller budget takes resolution first, then depth and width; one pixel more may cost a third,
+    """A finer pitch or a smaller budget takes resolution first, then depth and width;
+    one pixel more may cost a third,
     where it adds a row to every late feature map.
     """
     budget = share * _at_resolution(arch.largest(SPACE))
     made, least = evolution.ends(SPACE, _at_resolution, budget)
     assert 0.65 * budget < _at_resolution(made) <= budget
-    assert len(set(made.kernels)) == len(set(made.expansions)) == len(set(made.depths)) == 1
+    assert (
+        len(set(made.kernels))
+        == len(set(made.expansions))
+        == len(set(made.depths))
+        == 1
+    )
     assert _at_resolution(least) <= budget
     assert least.resolution >= made.resolution
-    assert dataclasses.replace(least, resolution=SPACE.resolution[0]) == arch.smallest(SPACE)
+    assert dataclasses.replace(least, resolution=SPACE.resolution[0]) == arch.smallest(
+        SPACE
+    )
 
 
 def test_a_whole_search_is_the_end_of_its_states_and_public():
     import codesign
 
     plan = Plan(4, 2, 12)
-    assert codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1) == _run(plan)[-1].history
+    assert (
+        codesign.search(SPACE, plan, _distance, _count, budget=1e12, seed=1)
+        == _run(plan)[-1].history
+    )
 
 
 def test_a_search_begins_with_the_networks_that_every_step_trains():
     budget = 20 * _at_resolution(arch.smallest(SPACE))
-    found = evolution.search(SPACE, Plan(2, 1, 2), _distance, _at_resolution, budget=budget, seed=1)
-    trained = evolution.sandwich(SPACE, _at_resolution, budget, np.random.default_rng(0), subnets=0)
+    found = evolution.search(
+        SPACE, Plan(2, 1, 2), _distance, _at_resolution, budget=budget, seed=1
+    )
+    trained = evolution.sandwich(
+        SPACE, _at_resolution, budget, np.random.default_rng(0), subnets=0
+    )
     assert [c.architecture for c in found] == trained
 
 
@@ -153,7 +184,9 @@ def test_a_network_is_fitted_by_resolution_alone():
     assert evolution.fitted(space, top, count, 2 * count(top)) == top
     budget = 0.4 * count(top)
     made = evolution.fitted(space, top, count, budget)
-    assert 0.95 * budget < count(made) <= budget  # steps of a hundredth of the range, and of whole pixels
+    assert (
+        0.95 * budget < count(made) <= budget
+    )  # steps of a hundredth of the range, and of whole pixels
     assert dataclasses.replace(made, resolution=1.0) == top
     least = evolution.fitted(space, top, count, 1.0)
     assert least.resolution == pytest.approx(space.resolution[0])
@@ -163,7 +196,9 @@ def test_a_network_is_fitted_by_resolution_alone():
 def test_members_of_a_step_keep_the_budget_where_anything_does(share):
     space, count = SPACE, _at_resolution
     budget = share * count(arch.largest(space))
-    members = evolution.sandwich(space, count, budget, np.random.default_rng(1), subnets=6)
+    members = evolution.sandwich(
+        space, count, budget, np.random.default_rng(1), subnets=6
+    )
     assert len(members) == 8
     if budget >= count(arch.smallest(space)):
         assert all(count(a) <= budget for a in members)

@@ -38,7 +38,9 @@ def test_half_widths_are_the_conformal_quantile_of_misses_in_their_own_units():
     """Nine frames: for a share of 0.6 the 6th of the sorted ratios, of ceil(0.6 x 10)."""
     ratio = [0.9, 0.1, 2.5, 0.4, 1.7, 0.3, 1.1, 3.2, 0.6]
     sd = [0.5, 2.0, 0.25, 1.5, 0.4, 3.0, 0.8, 0.3, 1.2]
-    answers = typed([r * s * (-1) ** k for k, (r, s) in enumerate(zip(ratio, sd, strict=True))], sd)
+    answers = typed(
+        [r * s * (-1) ** k for k, (r, s) in enumerate(zip(ratio, sd, strict=True))], sd
+    )
     assert finish.widths(answers, SEEN, share=0.6) == pytest.approx(1.1)
     assert finish.widths(answers, SEEN, share=0.61) == pytest.approx(1.7)
     assert finish.widths(answers, SEEN) == pytest.approx(3.2)  # 0.9 x 10: the last
@@ -47,7 +49,9 @@ def test_half_widths_are_the_conformal_quantile_of_misses_in_their_own_units():
 
 
 def test_half_widths_from_other_frames_cover_nine_in_ten():
-    """Errors of any law, here with heavy tails: over many draws the share covered is 0.9 or a little more."""
+    """Errors of any law, here with heavy tails: over many draws the share covered is
+    0.9 or a little more.
+    """
     generator = torch.Generator().manual_seed(3)
     covered = []
     for _ in range(400):
@@ -61,8 +65,12 @@ def test_half_widths_from_other_frames_cover_nine_in_ten():
 
 def test_coverage_counts_frames_within_their_own_interval():
     answers = typed([0.9, -0.3, 0.2, -4.0], [0.5, 0.1, 0.4, 2.0])
-    row = finish.told("dim_", answers, SimpleNamespace(slip_mm=torch.zeros(4, 3), vergence=None), 1.9)
-    assert row == pytest.approx({"dim_axial_coverage_90": 0.5, "dim_axial_interval_mm": 1.9 * 3.0 / 4})
+    row = finish.told(
+        "dim_", answers, SimpleNamespace(slip_mm=torch.zeros(4, 3), vergence=None), 1.9
+    )
+    assert row == pytest.approx(
+        {"dim_axial_coverage_90": 0.5, "dim_axial_interval_mm": 1.9 * 3.0 / 4}
+    )
     assert finish.told("", answers, SEEN, None) == {}
     assert finish.told("", typed([0.1], None), SEEN, 1.9) == {}
 
@@ -70,15 +78,21 @@ def test_coverage_counts_frames_within_their_own_interval():
 def test_depths_of_windows_err_in_millimetres():
     """Vergences of 45 + 8 v per metre: told 0.5 and -1 where 0 and -0.25 are true."""
     told, truth = torch.tensor([0.5, -1.0]), torch.tensor([0.0, -0.25])
-    answers = SimpleNamespace(slip_sd_mm=None, depth=torch.stack([told, torch.full((2,), 9.0)], 1))
+    answers = SimpleNamespace(
+        slip_sd_mm=None, depth=torch.stack([told, torch.full((2,), 9.0)], 1)
+    )
     row = finish.told("", answers, SimpleNamespace(vergence=truth), None)
     want = (abs(1e3 / 49 - 1e3 / 45) + abs(1e3 / 37 - 1e3 / 43)) / 2
     assert row["window_depth_mm"] == pytest.approx(want, rel=1e-5)
 
 
 @pytest.mark.parametrize(("tests", "pairs"), [(33, 41), (3, 0)])
-def test_an_end_is_read_on_as_many_frames_as_are_asked_for_and_on_none_that_it_learned_from(monkeypatch, tests, pairs):
-    """Batch statistics from eight batches of training at most; the response to depth from a quarter of the tests."""
+def test_an_end_is_read_on_as_many_frames_as_are_asked_for_and_on_none_that_it_learned_from(
+    monkeypatch, tests, pairs
+):
+    """Batch statistics from eight batches of training at most; the response to depth
+    from a quarter of the tests.
+    """
     asked, told = [], {}
 
     def frames(trainer, scenes, batches):
@@ -86,7 +100,12 @@ def test_an_end_is_read_on_as_many_frames_as_are_asked_for_and_on_none_that_it_l
         return SimpleNamespace(of=scenes, slip_mm=torch.zeros(2, 3), vergence=None)
 
     def predict(net, architecture, seen, inner):
-        return SimpleNamespace(slip_mm=torch.ones(2, 3), slip_sd_mm=None, depth=None, iou=torch.tensor([0.4, 0.6]))
+        return SimpleNamespace(
+            slip_mm=torch.ones(2, 3),
+            slip_sd_mm=None,
+            depth=None,
+            iou=torch.tensor([0.4, 0.6]),
+        )
 
     def response(trainer, scenes, net, architecture, *, batches):
         told.update(scenes=scenes, batches=batches)
@@ -94,29 +113,52 @@ def test_an_end_is_read_on_as_many_frames_as_are_asked_for_and_on_none_that_it_l
 
     net = torch.nn.Linear(1, 1)
     trainer = SimpleNamespace(
-        scenes="training", model=SimpleNamespace(net=net, pitch_um=torch.tensor(7.2)), inner=SimpleNamespace(batch=8)
+        scenes="training",
+        model=SimpleNamespace(net=net, pitch_um=torch.tensor(7.2)),
+        inner=SimpleNamespace(batch=8),
     )
     best = SimpleNamespace(architecture=SimpleNamespace(resolution=0.75))
     monkeypatch.setattr(finish, "_chosen", lambda run: [(None, best)])
     monkeypatch.setattr(finish, "_tuned", lambda run, architecture, i: trainer)
-    monkeypatch.setattr(finish, "recalibrate", lambda net, architecture, parts: told.update(learned=parts))
+    monkeypatch.setattr(
+        finish,
+        "recalibrate",
+        lambda net, architecture, parts: told.update(learned=parts),
+    )
     monkeypatch.setattr(finish.assess, "frames", frames)
     monkeypatch.setattr(finish.assess, "parts", lambda seen: seen.of)
     monkeypatch.setattr(finish.assess, "predict", predict)
-    monkeypatch.setattr(finish.ambiguity, "ambiguous", lambda scenes, count, seed: [scenes, seed] * count)
+    monkeypatch.setattr(
+        finish.ambiguity,
+        "ambiguous",
+        lambda scenes, count, seed: [scenes, seed] * count,
+    )
     monkeypatch.setattr(finish, "depth_response", response)
     settings = SimpleNamespace(
-        test_batches=tests, validation_batches=5, ambiguity_pairs=pairs, inner=SimpleNamespace(seed=17, batch=8)
+        test_batches=tests,
+        validation_batches=5,
+        ambiguity_pairs=pairs,
+        inner=SimpleNamespace(seed=17, batch=8),
     )
     run = SimpleNamespace(
-        settings=settings, trainer=trainer, scenes=lambda stream: f"stream {stream}", macs=lambda architecture: 2.5e6
+        settings=settings,
+        trainer=trainer,
+        scenes=lambda stream: f"stream {stream}",
+        macs=lambda architecture: 2.5e6,
     )
     (row,) = finish.finish(run)
     test, apart = (f"stream {stream}" for stream in (finish.TEST, finish.VALIDATION))
     ambiguous = [([test, 17] * pairs, 2 * pairs // 8)] if pairs else []
     assert asked == [(test, tests), *ambiguous, ("training", min(8, tests)), (apart, 5)]
-    assert told == {"learned": "training", "scenes": [test, 17] * pairs or test, "batches": max(1, tests // 4)}
+    assert told == {
+        "learned": "training",
+        "scenes": [test, 17] * pairs or test,
+        "batches": max(1, tests // 4),
+    }
     assert (row["mmacs"], row["effective_pitch_um"]) == pytest.approx((2.5, 9.6))
-    assert (row["depth_response_mm_per_mm"], row["depth_response_error"]) == (0.71, 0.05)
+    assert (row["depth_response_mm_per_mm"], row["depth_response_error"]) == (
+        0.71,
+        0.05,
+    )
     assert row["axial_slip_mm"] == row["lateral_slip_mm"] == 1.0
     assert ("ambiguous_iou" in row) is (pairs > 0)

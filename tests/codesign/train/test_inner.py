@@ -1,4 +1,6 @@
-"""The inner loop: bit-identical from a seed and after a stop, moves only what is scheduled, survives bad gradients."""
+"""The inner loop: bit-identical from a seed and after a stop, moves only what is
+scheduled, survives bad gradients.
+"""
 
 import math
 from dataclasses import replace
@@ -24,7 +26,9 @@ SIZE = 48
 
 
 class Discs:
-    """A dark pupil on a rough iris at a depth that the slip changes: the smallest scene with all labels."""
+    """A dark pupil on a rough iris at a depth that the slip changes: the smallest scene
+    with all labels.
+    """
 
     margin = 4
 
@@ -34,13 +38,24 @@ class Discs:
         texture = torch.rand(size, full, full, generator=generator) * 0.5 + 0.4
         slip = torch.randn(size, 3, generator=generator)
         x = torch.arange(full, dtype=torch.float32) - (full - 1) / 2
-        pupil = (torch.hypot(x - 4 * slip[:, :1, None], (x - 4 * slip[:, 1:2]).unsqueeze(-1)) < 8).float()
+        pupil = (
+            torch.hypot(x - 4 * slip[:, :1, None], (x - 4 * slip[:, 1:2]).unsqueeze(-1))
+            < 8
+        ).float()
         light = texture * (1 - 0.9 * pupil)
         radiance = torch.stack([torch.zeros_like(light), light], 1)
         coverage = torch.stack([torch.zeros_like(light), torch.ones_like(light)], 1)
-        depth = (20_000 + 2000 * slip[:, 2]).clamp(14_500, 29_000)[:, None, None, None].expand_as(radiance)
+        depth = (
+            (20_000 + 2000 * slip[:, 2])
+            .clamp(14_500, 29_000)[:, None, None, None]
+            .expand_as(radiance)
+        )
         inside = slice(self.margin, -self.margin)
-        return Batch(Frames(radiance, coverage, depth.contiguous()), pupil[:, inside, inside], slip)
+        return Batch(
+            Frames(radiance, coverage, depth.contiguous()),
+            pupil[:, inside, inside],
+            slip,
+        )
 
 
 def _trainer(config=None, *, optics=OPTICS, architecture=None):
@@ -51,7 +66,11 @@ def _trainer(config=None, *, optics=OPTICS, architecture=None):
 
 def _weights(trainer):
     state = trainer.model
-    return [*state.net.state_dict().values(), state.coefficients_rad.detach(), state.log_pitch.detach()]
+    return [
+        *state.net.state_dict().values(),
+        state.coefficients_rad.detach(),
+        state.log_pitch.detach(),
+    ]
 
 
 def _equal(a, b):
@@ -98,37 +117,57 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole, stop, tmp_path):
 
 def test_optics_and_pitch_move_only_inside_their_schedules():
     trainer = _trainer(MOVING)
-    trainer.model.log_pitch.register_hook(lambda slope: slope.abs() + 0.1)  # it begins at its coarsest
+    trainer.model.log_pitch.register_hook(
+        lambda slope: slope.abs() + 0.1
+    )  # it begins at its coarsest
     list(trainer.run(until=5))
-    lens, pitch = trainer.model.coefficients_rad.detach().clone(), float(trainer.model.log_pitch.detach())
+    lens, pitch = (
+        trainer.model.coefficients_rad.detach().clone(),
+        float(trainer.model.log_pitch.detach()),
+    )
     assert float(lens.abs().max()) > 0
     assert pitch != math.log(10.0)
     list(trainer.run())
-    torch.testing.assert_close(trainer.model.coefficients_rad.detach(), lens, rtol=0, atol=0)
+    torch.testing.assert_close(
+        trainer.model.coefficients_rad.detach(), lens, rtol=0, atol=0
+    )
     assert float(trainer.model.log_pitch.detach()) == pitch
 
 
 def test_a_budget_drives_the_pitch_up():
     space = Space(resolution=(0.6, 1.0))  # which leaves room for pixels up to 16 um
     member = replace(smallest(space), resolution=1.0)
-    start_um = SIZE * OPTICS.sample_um / 40.5  # 40 and 41 pixels differ in cost: between others the count is flat
+    start_um = (
+        SIZE * OPTICS.sample_um / 40.5
+    )  # 40 and 41 pixels differ in cost: between others the count is flat
     pitch_um = []
     for weight in (0.0, 100.0):
         made = inner.model(OPTICS, pitch_um=start_um, seed=2, space=space)
         config = replace(MOVING, budget_mmacs=0.7, budget_weight=weight)
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
-        assert min(record.mmacs for record in trainer.run()) > 1.05 * config.budget_mmacs  # or nothing would drive
+        assert (
+            min(record.mmacs for record in trainer.run()) > 1.05 * config.budget_mmacs
+        )  # or nothing would drive
         assert trainer.pitch_held_um is None
         pitch_um.append(float(trainer.model.pitch_um.detach()))
-    assert pitch_um[1] > 1.01 * start_um  # Adam's steps have the size of the rate: 0.03 in all
+    assert (
+        pitch_um[1] > 1.01 * start_um
+    )  # Adam's steps have the size of the rate: 0.03 in all
     assert pitch_um[1] > 1.005 * pitch_um[0]
 
 
 def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
-    """Driven hard to either side: a budget far below every network, and a slope that asks for ever finer pixels."""
-    fast = replace(MOVING, steps=40, pitch=Schedule(0.5), optics=Schedule(0.0), budget_mmacs=1e-3)
+    """Driven hard to either side: a budget far below every network, and a slope that
+    asks for ever finer pixels.
+    """
+    fast = replace(
+        MOVING, steps=40, pitch=Schedule(0.5), optics=Schedule(0.0), budget_mmacs=1e-3
+    )
     space = Space(resolution=(0.6, 1.0))
-    for budget, limit in ((1e-3, SIZE * OPTICS.sample_um * 0.6 / 16), (0.0, OPTICS.sample_um)):
+    for budget, limit in (
+        (1e-3, SIZE * OPTICS.sample_um * 0.6 / 16),
+        (0.0, OPTICS.sample_um),
+    ):
         made = inner.model(OPTICS, pitch_um=10.0, seed=2, space=space)
         if not budget:
             made.log_pitch.register_hook(lambda slope: torch.ones_like(slope))
@@ -137,7 +176,9 @@ def test_the_pitch_stays_between_the_samples_of_the_image_and_sixteen_pixels():
         trainer = Trainer(config, OPTICS, SENSOR, Discs(), made, architecture=member)
         records = list(trainer.run(until=20))
         assert records[-1].pitch_um == pytest.approx(limit, rel=1e-9)
-        assert trainer.pitch_held_um == pytest.approx(limit, rel=1e-9)  # and it says that it was held
+        assert trainer.pitch_held_um == pytest.approx(
+            limit, rel=1e-9
+        )  # and it says that it was held
 
 
 def test_budgets_of_a_run_are_trained_in_turn():
@@ -155,20 +196,29 @@ def test_a_bad_gradient_is_skipped_and_counted():
     hook = trainer.model.net.stem.weight.register_hook(lambda g: g * float("nan"))
     record = next(trainer.run())
     assert record.skipped == 1
-    assert all(torch.equal(a, b) for a, b in zip(before, _weights(trainer), strict=True))
+    assert all(
+        torch.equal(a, b) for a, b in zip(before, _weights(trainer), strict=True)
+    )
     hook.remove()
     assert list(trainer.run())[-1].skipped == 1
 
 
 def test_only_bad_gradients_end_the_run_with_the_cause():
-    trainer = _trainer(InnerConfig(steps=6, batch=2, patience=3), architecture=smallest(Space()))
+    trainer = _trainer(
+        InnerConfig(steps=6, batch=2, patience=3), architecture=smallest(Space())
+    )
     trainer.model.net.stem.weight.register_hook(lambda g: g * float("inf"))
-    with pytest.raises(TrainingError, match=r"no finite gradient in 3 steps up to step 2; not finite: weights"):
+    with pytest.raises(
+        TrainingError,
+        match=r"no finite gradient in 3 steps up to step 2; not finite: weights",
+    ):
         list(trainer.run())
 
 
 def test_lens_errors_are_drawn_anew_each_step_and_belong_to_the_step():
-    optics = replace(OPTICS, spread=LensErrors(focus_um=5.0, tilt_waves=0.1, astigmatism_waves=0.1))
+    optics = replace(
+        OPTICS, spread=LensErrors(focus_um=5.0, tilt_waves=0.1, astigmatism_waves=0.1)
+    )
     trainer = _trainer(optics=optics)
     first = trainer._lens_error()
     assert first == trainer._lens_error()
@@ -185,7 +235,9 @@ def test_the_optics_loss_falls_along_its_own_gradient():
     (slope,) = torch.autograd.grad(start, coefficients)
     assert float(slope.norm()) > 0
     step = (0.05 / float(slope.norm())) * slope
-    after = formation.depth_loss(lens.stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4)
+    after = formation.depth_loss(
+        lens.stack(OPTICS, (coefficients - step).detach()), OPTICS, energy=0.4
+    )
     assert float(after) < float(start.detach())
 
 
@@ -214,38 +266,58 @@ class Hard(Discs):
 
 @pytest.mark.parametrize("kind", ["blink", "border"])
 def test_batches_of_blinks_and_pupils_at_the_border_train_on(kind):
-    config = InnerConfig(steps=2, batch=2, subnets=0, optics=Schedule(0.02, 0.0, 1.0), patience=1)
+    config = InnerConfig(
+        steps=2, batch=2, subnets=0, optics=Schedule(0.02, 0.0, 1.0), patience=1
+    )
     made = inner.model(OPTICS, pitch_um=9.0, seed=0)
-    records = list(Trainer(config, OPTICS, SENSOR, Hard(kind), made, architecture=smallest(Space())).run())
+    records = list(
+        Trainer(
+            config, OPTICS, SENSOR, Hard(kind), made, architecture=smallest(Space())
+        ).run()
+    )
     assert records[-1].skipped == 0
     assert all(math.isfinite(r.loss) for r in records)
     assert float(made.coefficients_rad.detach().abs().max()) > 0
 
 
 def test_a_spike_of_the_loss_moves_nothing_farther_than_its_clip():
-    """Labels a million times too large for one batch. A first large gradient moves Adam by 0.37 / sqrt(0.33), 0.64 of
-    the rate, an element; in turned axes, whose sums of squares are the same, that holds of the root mean square."""
+    """Labels a million times too large for one batch. A first large gradient moves Adam
+    by 0.37 / sqrt(0.33), 0.64 of
+    the rate, an element; in turned axes, whose sums of squares are the same, that holds
+    of the root mean square."""
     trainer = _trainer(InnerConfig(steps=6, batch=2), architecture=smallest(Space()))
     list(trainer.run(until=2))
     before = [p.detach().clone() for p in trainer.model.net.parameters()]
     plain = trainer.scenes.batch
-    trainer.scenes.batch = lambda step, size: replace(plain(step, size), slip_mm=1e6 * plain(step, size).slip_mm)
+    trainer.scenes.batch = lambda step, size: replace(
+        plain(step, size), slip_mm=1e6 * plain(step, size).slip_mm
+    )
     record = next(trainer.run())
     assert record.loss > 1e4
     pairs = zip(before, trainer.model.net.parameters(), strict=True)
     longest = max(float((a - b.detach()).square().mean().sqrt()) for a, b in pairs)
-    assert 0 < longest < trainer.inner.weights.rate  # with what is left of the momentum before
+    assert (
+        0 < longest < trainer.inner.weights.rate
+    )  # with what is left of the momentum before
 
 
 def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
-    """Of a scalar in float64, whose count has its shape and another dtype; a kernel's moments take its order."""
+    """Of a scalar in float64, whose count has its shape and another dtype; a kernel's
+    moments take its order.
+    """
     pitch = torch.tensor(2.5, dtype=torch.float64, requires_grad=True)
-    kernel = torch.rand(4, 3, 2, 2).contiguous(memory_format=torch.channels_last).requires_grad_()
+    kernel = (
+        torch.rand(4, 3, 2, 2)
+        .contiguous(memory_format=torch.channels_last)
+        .requires_grad_()
+    )
     optimiser = torch.optim.AdamW([pitch, kernel])
     (pitch**2 + kernel.square().sum()).backward()
     optimiser.step()
     before = optimiser.state[pitch]["step"].clone()
-    moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel]["exp_avg"].contiguous()
+    moment = optimiser.state[kernel]["exp_avg"] = optimiser.state[kernel][
+        "exp_avg"
+    ].contiguous()
     moving.laid_out(optimiser)
     step, after = optimiser.state[pitch]["step"], optimiser.state[kernel]["exp_avg"]
     assert (step.dtype, float(step)) == (before.dtype, 1.0)
@@ -254,8 +326,13 @@ def test_laying_out_moments_leaves_the_count_of_steps_as_it_is():
 
 
 def test_only_the_weights_of_the_network_decay():
-    """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would shrink."""
-    decay = {name: made.param_groups[0]["weight_decay"] for name, made in _trainer().optimisers.items()}
+    """Optics and pixel pitch have units: drawn to 0, a pitch without a gradient would
+    shrink.
+    """
+    decay = {
+        name: made.param_groups[0]["weight_decay"]
+        for name, made in _trainer().optimisers.items()
+    }
     assert decay == {"weights": 0.01, "reading": 0.01, "optics": 0.0, "pitch": 0.0}
 
 
@@ -263,13 +340,21 @@ def test_what_has_no_rate_now_keeps_its_value_and_its_moments():
     """A group that rests is not stepped by nothing: its optimiser knows of no gradient."""
     trainer = _trainer()
     for optimiser in trainer.optimisers.values():
-        for parameter in (p for group in optimiser.param_groups for p in group["params"]):
+        for parameter in (
+            p for group in optimiser.param_groups for p in group["params"]
+        ):
             parameter.grad = torch.full_like(parameter, 0.3)
     moves, *rest = trainer.optimisers
     assert rest
-    before = {name: [p.detach().clone() for p in trainer.groups[name][1]] for name in trainer.groups}
+    before = {
+        name: [p.detach().clone() for p in trainer.groups[name][1]]
+        for name in trainer.groups
+    }
     trainer._apply(dict.fromkeys(trainer.groups, 0.0) | {moves: 1e-3}, finite=True)
     for name in trainer.optimisers:
-        alike = [torch.equal(p, old) for p, old in zip(trainer.groups[name][1], before[name], strict=True)]
+        alike = [
+            torch.equal(p, old)
+            for p, old in zip(trainer.groups[name][1], before[name], strict=True)
+        ]
         assert all(alike) if name in rest else not any(alike)
         assert bool(trainer.optimisers[name].state) == (name == moves)

@@ -1,4 +1,6 @@
-"""Event files: checksums by known answers, and every record read back by an independent reader of the format."""
+"""Event files: checksums by known answers, and every record read back by an independent
+reader of the format.
+"""
 
 import struct
 
@@ -20,7 +22,10 @@ def _records(content):
             (content[12 : 12 + length], content[12 + length : 16 + length]),
         ):
             crc = crc32c(data)
-            assert struct.unpack("<I", mark)[0] == ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+            assert (
+                struct.unpack("<I", mark)[0]
+                == ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+            )
         yield content[12 : 12 + length]
         content = content[16 + length :]
 
@@ -60,7 +65,9 @@ def test_events_read_back_as_they_were_written(tmp_path):
     png = report.png(figure)
     Journal(tmp_path).scalars(300, {"loss": 0.5, "pitch": 9.25})
     Journal(tmp_path).picture(301, "psf", png)
-    version, scalars, picture = (_fields(r) for r in _records((tmp_path / EVENTS).read_bytes()))
+    version, scalars, picture = (
+        _fields(r) for r in _records((tmp_path / EVENTS).read_bytes())
+    )
     assert dict(version)[3] == b"brain.Event:2"
     assert dict(scalars)[2] == 300
     values = [dict(_fields(v)) for _, v in _fields(dict(scalars)[5])]
@@ -72,7 +79,9 @@ def test_events_read_back_as_they_were_written(tmp_path):
 
 
 def test_tensorboard_itself_reads_them(tmp_path):
-    loader = pytest.importorskip("tensorboard.backend.event_processing.event_file_loader")
+    loader = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_file_loader"
+    )
     Journal(tmp_path).scalars(7, {"loss": 0.25})
     events = list(loader.EventFileLoader(str(tmp_path / EVENTS)).Load())
     assert events[-1].step == 7

@@ -1,4 +1,6 @@
-"""Killed at twenty random steps, a run ends in the same bytes as one that nobody touched; two whole runs are equal."""
+"""Killed at twenty random steps, a run ends in the same bytes as one that nobody
+touched; two whole runs are equal.
+"""
 
 import os
 import signal
@@ -36,7 +38,9 @@ bias_nm = 3.0
 
 
 def _train(settings, path, die_at=None):
-    """Train in a process of its own, from the checkpoint where there is one; whether it came to its end."""
+    """Train in a process of its own, from the checkpoint where there is one; whether it
+    came to its end.
+    """
     child = os.fork()
     if child == 0:
         going = run.resume(path, settings) if path.exists() else run.start(settings)

@@ -1,4 +1,6 @@
-"""The true image while a lens trains: formed anew in time, resumed bit for bit, refused where it cannot be."""
+"""The true image while a lens trains: formed anew in time, resumed bit for bit, refused
+where it cannot be.
+"""
 
 from dataclasses import replace
 
@@ -66,7 +68,9 @@ def _never(step):
 def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monkeypatch):
     made = []
 
-    def imaged(settings, coefficients, frame, *, margin, device, error=None, made_of=made):
+    def imaged(
+        settings, coefficients, frame, *, margin, device, error=None, made_of=made
+    ):
         made_of.append(float(coefficients[0]))
         return formed_once
 
@@ -78,11 +82,16 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
     formed_once = formed.imager(settings, place, 30, margin=5)
     assert isinstance(formed_once, Imager)
     monkeypatch.setattr(formed, "imager", imaged)
-    monkeypatch.setattr(formed, "live", lambda settings, whole, pairs: formed.Live(place, whole, pairs))
+    monkeypatch.setattr(
+        formed, "live", lambda settings, whole, pairs: formed.Live(place, whole, pairs)
+    )
     light = Light(settings, (), refresh=3, draws=2, seed=0, draw=_never)
     for step, moved in enumerate((0.0, 0.0, 1.0, 2.0, 3.0, 4.0)):
         light.at(step, place + moved, 30, 5, live=step > 0)
-    assert made == [0.0, 2.0]  # at first; then at step 3, as it had waited; at step 4 it is imaged as at step 3
+    assert made == [
+        0.0,
+        2.0,
+    ]  # at first; then at step 3, as it had waited; at step 4 it is imaged as at step 3
     light.at(6, place + 4.0, 30, 5, live=False)
     light.at(7, place + 4.0, 30, 5, live=False)
     assert made == [0.0, 2.0, 4.0]  # at rest once, as it is
@@ -94,7 +103,9 @@ def test_a_lens_is_imaged_anew_when_it_waited_or_came_to_rest_and_not_else(monke
 
 
 def _passes_on_what_it_asked_for(monkeypatch, light, place, whole):
-    """The nodes whose light is asked for are those that the gradient is passed on from; others at every step."""
+    """The nodes whose light is asked for are those that the gradient is passed on from;
+    others at every step.
+    """
     asked, passed, steps = [], [], (9, 10, 11, 9)
 
     def live(settings, imaged, pairs):
@@ -133,13 +144,19 @@ def test_a_run_through_the_true_image_moves_its_lens_and_resumes_bit_for_bit(tmp
     assert torch.equal(run.coefficients(whole), run.coefficients(going))
     assert float(run.coefficients(whole).abs().max()) > 1e-3
     with pytest.raises(TrainingError, match=r'optics\.image: "true" -> "uniform"'):
-        run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, image="uniform")))
+        run.resume(
+            tmp_path / "part",
+            replace(settings, optics=replace(settings.optics, image="uniform")),
+        )
     one = replace(settings, optics=replace(settings.optics, image="uniform"))
     run.save(tmp_path / "one", run.start(one))
     with pytest.raises(TrainingError, match=r'optics\.image: "uniform" -> "true"'):
         run.resume(tmp_path / "one", settings)
     with pytest.raises(TrainingError, match=r"optics\.fwhm_nm: 0\.0 -> 30\.0"):
-        run.resume(tmp_path / "part", replace(settings, optics=replace(settings.optics, fwhm_nm=30.0)))
+        run.resume(
+            tmp_path / "part",
+            replace(settings, optics=replace(settings.optics, fwhm_nm=30.0)),
+        )
     pixel = replace(settings.run, pitch_um=settings.run.pitch_um * 1.5)
     with pytest.raises(TrainingError, match=r"run\.pitch_um: "):
         run.resume(tmp_path / "part", replace(settings, run=pixel))
@@ -184,7 +201,9 @@ def threads():
     torch.set_num_threads(before)
 
 
-def test_a_still_lens_trains_to_the_same_bits_on_two_threads_after_a_stop(tmp_path, threads):
+def test_a_still_lens_trains_to_the_same_bits_on_two_threads_after_a_stop(
+    tmp_path, threads
+):
     path = tmp_path / "r.toml"
     path.write_text(STILL, "utf-8")
     settings, found = run.load(path), []

@@ -1,4 +1,6 @@
-"""Rates of what training moves, over the part of the run in which it moves; the pitch between its bounds."""
+"""Rates of what training moves, over the part of the run in which it moves; the pitch
+between its bounds.
+"""
 
 import math
 
@@ -28,7 +30,9 @@ def test_rates_warm_up_over_a_tenth_and_fall_as_a_cosine(inside, share):
     assert (made.at(0.2999), made.at(0.8), made.at(0.95)) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("pitch", "held", "then"), [(3.1, 4.5, 4.5), (61.0, 40.0, 40.0), (17.0, None, 17.0)])
+@pytest.mark.parametrize(
+    ("pitch", "held", "then"), [(3.1, 4.5, 4.5), (61.0, 40.0, 40.0), (17.0, None, 17.0)]
+)
 def test_the_pitch_is_brought_back_between_its_bounds(pitch, held, then):
     log = torch.nn.Parameter(torch.tensor(math.log(pitch), dtype=torch.float64))
     made = moving.Model(None, torch.nn.Parameter(torch.zeros(2)), log)

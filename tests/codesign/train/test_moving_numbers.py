@@ -1,4 +1,6 @@
-"""What training moves, at its very ends: bounds of the pitch, gradients that are no numbers, moments in memory."""
+"""What training moves, at its very ends: bounds of the pitch, gradients that are no
+numbers, moments in memory.
+"""
 
 import math
 
@@ -32,15 +34,20 @@ def test_a_group_moves_over_the_whole_run_and_at_a_clip_of_one_where_nothing_is_
     assert plain.at(0.0) == pytest.approx(0.02 * 0.01, rel=1e-12)
     assert plain.at(1.0) == 0.0
     assert plain.at(0.5) == pytest.approx(0.01, rel=1e-12)  # half-way down the cosine
-    assert plain.at(0.05) == pytest.approx(0.02 * 0.51 * math.cos(0.025 * math.pi) ** 2, rel=1e-12)
+    assert plain.at(0.05) == pytest.approx(
+        0.02 * 0.51 * math.cos(0.025 * math.pi) ** 2, rel=1e-12
+    )
 
 
-@pytest.mark.parametrize(("network", "kind"), [("supernet", "Supernet"), ("popovic", "Baseline")])
+@pytest.mark.parametrize(
+    ("network", "kind"), [("supernet", "Supernet"), ("popovic", "Baseline")]
+)
 def test_a_fresh_model_is_a_network_of_its_seed_and_a_lens_without_phase(network, kind):
     space = Space(widths=(0.25,), depths=(2,), expansions=(3,), kernels=(3,))
     settings = OpticsConfig(aperture_mm=0.3, polynomials=5)
     one, same, other = (
-        moving.model(settings, pitch_um=8.3, seed=seed, space=space, network=network) for seed in (4, 4, 5)
+        moving.model(settings, pitch_um=8.3, seed=seed, space=space, network=network)
+        for seed in (4, 4, 5)
     )
     assert isinstance(one.net, Supernet) == (kind == "Supernet")
     if kind == "Supernet":
@@ -54,7 +61,14 @@ def test_a_fresh_model_is_a_network_of_its_seed_and_a_lens_without_phase(network
 
 
 @pytest.mark.parametrize(
-    ("odd", "well"), [(3.0, True), (-3e38, True), (math.inf, False), (-math.inf, False), (math.nan, False)]
+    ("odd", "well"),
+    [
+        (3.0, True),
+        (-3e38, True),
+        (math.inf, False),
+        (-math.inf, False),
+        (math.nan, False),
+    ],
 )
 def test_one_gradient_that_is_no_number_is_enough(odd, well):
     parameters = [torch.nn.Parameter(torch.zeros(2, 3)) for _ in range(3)]
@@ -66,7 +80,9 @@ def test_one_gradient_that_is_no_number_is_enough(odd, well):
 
 
 def test_moments_lie_as_their_parameters_and_what_is_no_moment_stays():
-    weight = torch.nn.Parameter(torch.zeros(3, 4, 5, 2).to(memory_format=torch.channels_last))
+    weight = torch.nn.Parameter(
+        torch.zeros(3, 4, 5, 2).to(memory_format=torch.channels_last)
+    )
     scalar = torch.nn.Parameter(torch.zeros(()))
     optimiser = torch.optim.Adam([weight, scalar], lr=0.1)
     values = torch.arange(120.0).view(3, 4, 5, 2)

@@ -1,4 +1,6 @@
-"""Noise of frames: shares of one batch between ranks, its variance, and seeds that belong to stream and number."""
+"""Noise of frames: shares of one batch between ranks, its variance, and seeds that
+belong to stream and number.
+"""
 
 from types import SimpleNamespace
 
@@ -9,7 +11,13 @@ import torch
 from codesign.train import assess, formation
 from metalens.image import Sensor
 
-CHIP = Sensor(pitch_um=6.0, base_pitch_um=3.0, exposure_e=900.0, full_well_e=700.0, read_noise_e=4.0)
+CHIP = Sensor(
+    pitch_um=6.0,
+    base_pitch_um=3.0,
+    exposure_e=900.0,
+    full_well_e=700.0,
+    read_noise_e=4.0,
+)
 
 
 def test_ranks_take_their_parts_of_one_draw(monkeypatch):
@@ -19,19 +27,29 @@ def test_ranks_take_their_parts_of_one_draw(monkeypatch):
     def made(rank, ranks, size):
         monkeypatch.setattr(formation.parallel, "rank", lambda: rank)
         monkeypatch.setattr(formation.parallel, "ranks", lambda: ranks)
-        return formation._normal(mean[:size], CHIP, torch.Generator().manual_seed(8), reads)
+        return formation._normal(
+            mean[:size], CHIP, torch.Generator().manual_seed(8), reads
+        )
 
     whole = torch.cat([made(k, 3, 3) for k in range(3)])
-    draw = torch.randn((9, 4, 5), generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    assert whole.numpy() == pytest.approx((500 + draw * np.sqrt(500 + 16)).numpy(), rel=1e-6)
+    draw = torch.randn(
+        (9, 4, 5), generator=torch.Generator().manual_seed(8), dtype=torch.float64
+    )
+    assert whole.numpy() == pytest.approx(
+        (500 + draw * np.sqrt(500 + 16)).numpy(), rel=1e-6
+    )
 
 
 def test_electrons_have_the_variance_of_light_and_reads_up_to_the_full_well():
     """Wells of (6 / 3)² x 700 e; the read noise of a pixel made of 2.25 reads."""
     mean = torch.tensor([[[300.0, 9000.0]]], dtype=torch.float64).expand(20_000, 1, 2)
-    got = formation._normal(mean, CHIP, torch.Generator().manual_seed(1), torch.tensor(2.25))[:, 0].numpy()
+    got = formation._normal(
+        mean, CHIP, torch.Generator().manual_seed(1), torch.tensor(2.25)
+    )[:, 0].numpy()
     assert got.mean(0) == pytest.approx([300, 2800], rel=3e-3)
-    assert got.var(0) == pytest.approx([300 + 36, 2800 + 36], rel=0.04)  # 20000 draws: 1 %
+    assert got.var(0) == pytest.approx(
+        [300 + 36, 2800 + 36], rel=0.04
+    )  # 20000 draws: 1 %
 
 
 def test_seeds_of_judged_frames_are_of_their_stream_and_number(monkeypatch):
@@ -55,5 +73,11 @@ def test_seeds_of_judged_frames_are_of_their_stream_and_number(monkeypatch):
         model=SimpleNamespace(coefficients_rad=None, pitch_um=torch.tensor(1.0)),
     )  # fmt: skip
     for stream in (0, 4):
-        assess.frames(trainer, SimpleNamespace(batch=lambda number, size: batch, margin=1, stream=stream), 3)
-    assert seeds == [1_000_003 + k for k in range(3)] + [5_000_015 + k for k in range(3)]
+        assess.frames(
+            trainer,
+            SimpleNamespace(batch=lambda number, size: batch, margin=1, stream=stream),
+            3,
+        )
+    assert seeds == [1_000_003 + k for k in range(3)] + [
+        5_000_015 + k for k in range(3)
+    ]

@@ -1,4 +1,6 @@
-"""What a run shows at its end: frames and answers in the units that they are told in, the first ones."""
+"""What a run shows at its end: frames and answers in the units that they are told in,
+the first ones.
+"""
 
 from types import SimpleNamespace
 
@@ -20,7 +22,9 @@ def random(*shape):
 SEEN = SimpleNamespace(
     frames=random(FRAMES, 2, PIXELS, PIXELS),
     slip_mm=random(FRAMES, 3),
-    mask=torch.rand(FRAMES, 2 * PIXELS, 2 * PIXELS, generator=DRAW, dtype=torch.float64),
+    mask=torch.rand(
+        FRAMES, 2 * PIXELS, 2 * PIXELS, generator=DRAW, dtype=torch.float64
+    ),
     vergence=random(FRAMES, 3, 3),
 )
 
@@ -32,7 +36,11 @@ def end(*, mask=True, depth=True, interval=True):
         mask=random(FRAMES, COARSE, COARSE) if mask else None,
         depth=random(FRAMES, 2, 3, 3) if depth else None,
     )
-    return SimpleNamespace(seen=SEEN, answers=answers, interval_mm=random(FRAMES).abs() if interval else None)
+    return SimpleNamespace(
+        seen=SEEN,
+        answers=answers,
+        interval_mm=random(FRAMES).abs() if interval else None,
+    )
 
 
 def depth_um(vergence):
@@ -57,18 +65,32 @@ def test_answers_of_all_networks_stand_beside_the_truth_in_micrometres():
     blocks = SEEN.mask[:3].numpy().reshape(3, PIXELS, 2, PIXELS, 2).mean((2, 4))
     assert found["pupil"] == pytest.approx(blocks, rel=1e-6)
     for n, one in enumerate(ends):
-        assert found["told_slip_um"][n] == pytest.approx(1e3 * one.answers.slip_mm[:3].numpy(), rel=1e-6)
-        assert found["interval_um"][n] == pytest.approx(1e3 * one.interval_mm[:3].numpy(), rel=1e-6)
+        assert found["told_slip_um"][n] == pytest.approx(
+            1e3 * one.answers.slip_mm[:3].numpy(), rel=1e-6
+        )
+        assert found["interval_um"][n] == pytest.approx(
+            1e3 * one.interval_mm[:3].numpy(), rel=1e-6
+        )
         for k in range(3):
             logits = between(one.answers.mask[k].numpy(), PIXELS)
-            assert found["told_pupil"][n, k] == pytest.approx(1 / (1 + np.exp(-logits)), rel=1e-6)
-        assert found["told_window_um"][n] == pytest.approx(depth_um(one.answers.depth[:3, 0].numpy()), rel=1e-5)
-    assert found["window_um"] == pytest.approx(depth_um(SEEN.vergence[:3].numpy()), rel=1e-5)
+            assert found["told_pupil"][n, k] == pytest.approx(
+                1 / (1 + np.exp(-logits)), rel=1e-6
+            )
+        assert found["told_window_um"][n] == pytest.approx(
+            depth_um(one.answers.depth[:3, 0].numpy()), rel=1e-5
+        )
+    assert found["window_um"] == pytest.approx(
+        depth_um(SEEN.vergence[:3].numpy()), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("less", "gone"),
-    [({"mask": False}, {"pupil", "told_pupil"}), ({"depth": False}, {"window_um", "told_window_um"}), ({}, set())],
+    [
+        ({"mask": False}, {"pupil", "told_pupil"}),
+        ({"depth": False}, {"window_um", "told_window_um"}),
+        ({}, set()),
+    ],
 )
 def test_what_one_network_does_not_tell_is_left_out_and_no_interval_is_nan(less, gone):
     whole = pictures.answered([end(), end()], 9)

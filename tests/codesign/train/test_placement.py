@@ -12,13 +12,22 @@ from metalens.ground.errors import ConfigError
 from tests.elsewhere import AWAY, elsewhere
 
 GPU = torch.cuda.is_available()
-SMALL = {"scenes": {"pixels": 64, "margin": 8, "pool": 16}, "inner": {"steps": 4, "batch": 8}, "sensor": {"bits": 16}}
-TRUE = {"optics": {"image_tolerance": 0.4}, "scenes": {"pixels": 32}}  # few nodes of the true image over the field
+SMALL = {
+    "scenes": {"pixels": 64, "margin": 8, "pool": 16},
+    "inner": {"steps": 4, "batch": 8},
+    "sensor": {"bits": 16},
+}
+TRUE = {
+    "optics": {"image_tolerance": 0.4},
+    "scenes": {"pixels": 32},
+}  # few nodes of the true image over the field
 
 
 def _going(change=None, frozen=()):
     small = config.merged(run.preset_table("smoke"), SMALL)
-    table = config.merged(config.merged(small, {"run": {"frozen": list(frozen)}}), change or {})
+    table = config.merged(
+        config.merged(small, {"run": {"frozen": list(frozen)}}), change or {}
+    )
     return run.start(config.from_table(table, run.RunConfig, where="a test"))
 
 
@@ -34,7 +43,9 @@ def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
 
 
 def test_a_network_computes_where_its_parameters_are():
-    """A device without numbers stands for a GPU: nothing of an answer may be formed on the processor."""
+    """A device without numbers stands for a GPU: nothing of an answer may be formed on
+    the processor.
+    """
     net = _going().trainer.model.net.eval().to("meta")
     answer = net(torch.empty(2, 1, 64, 64, device="meta"), largest(net.space))
     parts = [getattr(answer, name) for name in answer.__slots__]
@@ -42,8 +53,12 @@ def test_a_network_computes_where_its_parameters_are():
 
 
 def test_frames_and_gradients_pass_through_an_attended_network():
-    """On the processor nothing is moved, and every number stays; the second step is of what the first one moved."""
-    plain, attended = (_going({"optics": {"image": "uniform"}}).trainer for _ in range(2))
+    """On the processor nothing is moved, and every number stays; the second step is of
+    what the first one moved.
+    """
+    plain, attended = (
+        _going({"optics": {"image": "uniform"}}).trainer for _ in range(2)
+    )
     placement.attend(attended.model.net, torch.device("cpu"))
     for one, other in zip(plain.run(until=2), attended.run(until=2), strict=True):
         assert one == other
@@ -53,13 +68,29 @@ def test_frames_and_gradients_pass_through_an_attended_network():
 @pytest.mark.parametrize(
     ("change", "frozen"),
     [
-        ({"inner": {name: {"rate": 5e-3, "start": 0.0} for name in ("optics", "pitch")}, **TRUE}, ()),
-        ({"optics": {"image": "uniform"}}, ("optics", "pitch")),  # flat frames of a pool, a step ahead
-        ({"scenes": {"pool": 0}, "network": "popovic"}, ("optics",)),  # frames of two sheets, a step ahead
+        (
+            {
+                "inner": {
+                    name: {"rate": 5e-3, "start": 0.0} for name in ("optics", "pitch")
+                },
+                **TRUE,
+            },
+            (),
+        ),
+        (
+            {"optics": {"image": "uniform"}},
+            ("optics", "pitch"),
+        ),  # flat frames of a pool, a step ahead
+        (
+            {"scenes": {"pool": 0}, "network": "popovic"},
+            ("optics",),
+        ),  # frames of two sheets, a step ahead
     ],
 )
 def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
-    """Images, pixels, network, losses and the way back to lens and pitch: nothing of it is for the processor alone."""
+    """Images, pixels, network, losses and the way back to lens and pitch: nothing of it
+    is for the processor alone.
+    """
     plain, moved = _going(change, frozen).trainer, _going(change, frozen).trainer
     (want,) = plain.run(until=1)
     with elsewhere() as done:
@@ -68,35 +99,52 @@ def test_a_step_elsewhere_is_that_of_the_processor(change, frozen):
         there = {name: p.cpu() for name, p in moved.model.net.named_parameters()}
     assert {"convolution", "convolution_backward", "_fft_r2c"} <= done
     for name in ("loss", "task", "optics", "pitch_um", "mmacs"):
-        assert getattr(found, name) == pytest.approx(getattr(want, name), rel=1e-5), name
+        assert getattr(found, name) == pytest.approx(getattr(want, name), rel=1e-5), (
+            name
+        )
     names = {"optics": "coefficients_rad", "pitch": "log_pitch"}
     for part in names.keys() - set(frozen):
-        one, other = (getattr(trainer.model, names[part]).grad for trainer in (plain, moved))
-        assert float((one - other).norm()) <= 5e-2 * float(one.norm()), part  # a count that falls the other way: 1e-2
+        one, other = (
+            getattr(trainer.model, names[part]).grad for trainer in (plain, moved)
+        )
+        assert float((one - other).norm()) <= 5e-2 * float(one.norm()), (
+            part
+        )  # a count that falls the other way: 1e-2
     for name, p in plain.model.net.named_parameters():
         assert there[name].shape == p.shape
 
 
 def test_what_a_run_ends_with_is_formed_where_it_trained():
     """Fine-tuning, test frames and the test of depth, beside the processor's."""
-    change = {"network": "popovic", "run": {"finetune_steps": 1}, "test_batches": 1, "ambiguity_pairs": 8}
+    change = {
+        "network": "popovic",
+        "run": {"finetune_steps": 1},
+        "test_batches": 1,
+        "ambiguity_pairs": 8,
+    }
     plain, moved = _going(change), _going(change)
     (want,) = finish.finish(plain)
     with elsewhere() as done:
         placement.place(moved.trainer, AWAY)
         (found,) = finish.finish(moved)
     assert {"convolution_backward", "_fft_r2c"} <= done  # trained on, and imaged
-    # a difference of readings, of a network that knows no depth yet: what single counts that fall the other way leave
+    # a difference of readings, of a network that knows no depth yet: what single counts
+    # that fall the other way leave
     near = {"depth_response_mm_per_mm": 1e-4}
     for name in want.keys() - {"architecture", "budget_mmacs"}:
-        assert found[name] == pytest.approx(want[name], rel=1e-3, abs=near.get(name, 1e-5)), name
+        assert found[name] == pytest.approx(
+            want[name], rel=1e-3, abs=near.get(name, 1e-5)
+        ), name
 
 
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
 def test_a_gpu_trains_to_the_same_losses_and_resumes():
     plain, moved = _going().trainer, _going().trainer
     placement.place(moved, placement.device_of("cuda"))
-    losses = [(a.loss, b.loss) for a, b in zip(plain.run(until=2), moved.run(until=2), strict=True)]
+    losses = [
+        (a.loss, b.loss)
+        for a, b in zip(plain.run(until=2), moved.run(until=2), strict=True)
+    ]
     again = _going().trainer
     again.restore(moved.state())
     placement.place(again, placement.device_of("cuda"))

@@ -12,7 +12,12 @@ def test_on_the_processor_nothing_is_taken_to_a_device():
     moved = []
     optimiser = SimpleNamespace(state_dict=dict, load_state_dict=moved.append)
     was = torch.backends.cudnn.deterministic
-    place(SimpleNamespace(model=SimpleNamespace(net=net), optimisers={"weights": optimiser}), torch.device("cpu"))
+    place(
+        SimpleNamespace(
+            model=SimpleNamespace(net=net), optimisers={"weights": optimiser}
+        ),
+        torch.device("cpu"),
+    )
     assert not moved
     assert not net._forward_pre_hooks
     assert not net._forward_hooks

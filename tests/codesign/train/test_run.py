@@ -1,4 +1,6 @@
-"""A whole run at the smallest size: presets, stop and resume bit for bit, search within budgets, refusals by name."""
+"""A whole run at the smallest size: presets, stop and resume bit for bit, search within
+budgets, refusals by name.
+"""
 
 import gc
 import json
@@ -59,8 +61,13 @@ def settings(tmp_path):
 
 
 def test_runs_of_several_seeds_hold_one_pool_of_frames_between_them(settings):
-    """Nine runs of an experiment held nine pools of a gigabyte; a pool that went is rendered again, the same."""
-    going = [run.start(replace(settings, inner=replace(settings.inner, seed=seed))) for seed in (31, 32)]
+    """Nine runs of an experiment held nine pools of a gigabyte; a pool that went is
+    rendered again, the same.
+    """
+    going = [
+        run.start(replace(settings, inner=replace(settings.inner, seed=seed)))
+        for seed in (31, 32)
+    ]
     first, other, again = (going[i].trainer.scenes.batch(1, 2) for i in (0, 1, 0))
     gc.collect()
     assert sum(isinstance(held, Pool) for held in gc.get_objects()) <= 1
@@ -76,7 +83,9 @@ def _end(going, path):
 
 
 def test_frames_are_those_of_the_run_s_own_camera(settings):
-    """1.0 mm in the file are 1000 um to the scenes, of training and of any other stream."""
+    """1.0 mm in the file are 1000 um to the scenes, of training and of any other
+    stream.
+    """
     going = run.start(replace(settings, scenes=replace(settings.scenes, pool=0)))
     for scenes in (going.trainer.scenes, going.scenes(5)):
         assert scenes.sensor_distance_um == pytest.approx(1000.0)
@@ -101,7 +110,9 @@ def test_every_preset_is_a_valid_run_whose_psfs_fit_its_margin(tmp_path, name):
     assert found.scenes.pool * side**2 * 3 < 4e9  # bytes of the pool
 
 
-def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(settings, tmp_path):
+def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_within_budget(
+    settings, tmp_path
+):
     whole = run.start(settings)
     rows = _end(whole, tmp_path / "whole")
 
@@ -109,14 +120,18 @@ def test_a_run_stopped_in_training_and_in_search_ends_bit_for_bit_the_same_withi
     steps = run.train(first, tmp_path / "part")
     next(steps), next(steps)
     second = run.resume(tmp_path / "part", settings)
-    assert second.trainer.step == 1  # the checkpoint of the second step is written after the record is taken
+    assert (
+        second.trainer.step == 1
+    )  # the checkpoint of the second step is written after the record is taken
     list(run.train(second, tmp_path / "part"))
     births = run.search(second, tmp_path / "part")
     next(births), next(births)
     third = run.resume(tmp_path / "part", settings)
     assert _end(third, tmp_path / "part") == rows
     for a, b in zip(
-        whole.trainer.model.net.state_dict().values(), third.trainer.model.net.state_dict().values(), strict=True
+        whole.trainer.model.net.state_dict().values(),
+        third.trainer.model.net.state_dict().values(),
+        strict=True,
     ):
         assert torch.equal(a, b)
     assert torch.equal(run.coefficients(whole), run.coefficients(third))
@@ -143,21 +158,39 @@ def test_changed_settings_and_unfinished_runs_are_refused(settings, tmp_path):
             "[optics]\ndepths_mm = [17.9, 50.0]",
             r"optics.depths_mm = \(17.9, 50.0\) does not hold the eyes, 17.5 to 24.5",
         ),
-        ("[optics]\ndepths_mm = [12.0, 24.4]", "does not hold the eyes, 17.5 to 24.5 mm"),
+        (
+            "[optics]\ndepths_mm = [12.0, 24.4]",
+            "does not hold the eyes, 17.5 to 24.5 mm",
+        ),
         ("[scenes]\ndepth_sd_mm = 3.0", "does not hold the eyes, 11.5 to 30.5 mm"),
-        ("[scenes]\nslip_mm = [2.0, 1.5, 9.5]", "does not hold the eyes, 11.5 to 30.5 mm"),
+        (
+            "[scenes]\nslip_mm = [2.0, 1.5, 9.5]",
+            "does not hold the eyes, 11.5 to 30.5 mm",
+        ),
         ("[inner]\nstps = 3", "unknown key 'inner.stps'; did you mean 'steps'"),
         ("[run]\nbudgets_mmacs = []", "budgets_mmacs"),
         ("[run]\nbudgets_mmacs = [4.0, 2.0, 4]", "two are alike"),
         ("[scenes]\npool = 3", "need a pool of a batch or more"),
         ("[run]\nfrozen = ['lens']", "frozen"),
         ("network = 'resnet'", "network"),
-        ("[optics]\nwavelength_nm = 0.94", r"need 5e8 or less; check the units in .*wavelength_nm=0.94,"),
-        ("[optics]\nsensor_distance_mm = 2000.0", r"need 5e8 or less; check the units in .*sensor_distance_mm=2000.0,"),
-        ("[optics]\ndepth_count = 1000000", r"need 5e8 or less; check the units in .*depth_count=1000000,"),
+        (
+            "[optics]\nwavelength_nm = 0.94",
+            r"need 5e8 or less; check the units in .*wavelength_nm=0.94,",
+        ),
+        (
+            "[optics]\nsensor_distance_mm = 2000.0",
+            r"need 5e8 or less; check the units in .*sensor_distance_mm=2000.0,",
+        ),
+        (
+            "[optics]\ndepth_count = 1000000",
+            r"need 5e8 or less; check the units in .*depth_count=1000000,",
+        ),
         ("[inner]\nenergy = 1.5", "inner.energy is 1.5, need at most 1"),
         ("[optics.spread]\nfocus_um = -1.0", "standard deviations of 0 or more"),
-        ("[optics.spread]\ncorrelation = [1.0, 0.2]", "correlation has 2 entries, need k x k"),
+        (
+            "[optics.spread]\ncorrelation = [1.0, 0.2]",
+            "correlation has 2 entries, need k x k",
+        ),
     ],
 )
 def test_bad_configs_are_refused_by_name(tmp_path, change, message):
@@ -171,15 +204,25 @@ def test_budget_below_the_smallest_network_is_refused_at_the_start(settings):
         run.start(replace(settings, run=replace(settings.run, budgets_mmacs=(0.01,))))
 
 
-def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_budget(settings):
-    """From the pitch that the refusal names it begins; asked for finer pixels, it is held where the budget ends."""
+def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_budget(
+    settings,
+):
+    """From the pitch that the refusal names it begins; asked for finer pixels, it is
+    held where the budget ends.
+    """
 
     def of(pitch_um):
-        optics, scenes = replace(settings.optics, sample_um=4.5), replace(settings.scenes, pixels=192, pool=0)
+        optics, scenes = (
+            replace(settings.optics, sample_um=4.5),
+            replace(settings.scenes, pixels=192, pool=0),
+        )
         budgets = replace(settings.run, budgets_mmacs=(1.6,), pitch_um=pitch_um)
         return replace(settings, optics=optics, scenes=scenes, run=budgets)
 
-    with pytest.raises(TrainingError, match=r"at run.pitch_um = 9: raise run.budgets_mmacs, or begin with") as no:
+    with pytest.raises(
+        TrainingError,
+        match=r"at run.pitch_um = 9: raise run.budgets_mmacs, or begin with",
+    ) as no:
         run.start(of(9.0))
     named = float(str(no.value).split(" = ")[-1].split(" ")[0])
     with pytest.raises(TrainingError, match="below the smallest network"):
@@ -188,17 +231,25 @@ def test_a_moving_pitch_begins_and_stays_where_the_smallest_network_keeps_its_bu
     going = run.start(of(named + 2.0))
     made = going.trainer.model
     assert named - 0.01 < made.finest_um <= named
-    made.log_pitch.data.fill_(math.log(made.finest_um / 2))  # where no network keeps the budget
+    made.log_pitch.data.fill_(
+        math.log(made.finest_um / 2)
+    )  # where no network keeps the budget
     going.trainer.optimisers.clear()
     going.trainer._apply({"pitch": 0.1}, finite=True)
     assert going.trainer.pitch_held_um == made.finest_um
     least = smallest(settings.space)
-    assert going.macs(least) <= 1.6e6 < going.counted(least, 0.98 * made.finest_um)  # two rows of pixels more
-    assert "beyond the budget of 1.6 MMACs" in command_codesign._of_pitch(going, made.finest_um)
+    assert (
+        going.macs(least) <= 1.6e6 < going.counted(least, 0.98 * made.finest_um)
+    )  # two rows of pixels more
+    assert "beyond the budget of 1.6 MMACs" in command_codesign._of_pitch(
+        going, made.finest_um
+    )
 
 
 def test_the_finest_pitch_is_where_the_count_meets_the_budget():
-    """A count of 700 / pitch^2, in closed form; none where the coarsest is beyond the budget or no coarser one is."""
+    """A count of 700 / pitch^2, in closed form; none where the coarsest is beyond the
+    budget or no coarser one is.
+    """
 
     def count(pitch_um):
         return 700 / pitch_um**2
@@ -210,7 +261,9 @@ def test_the_finest_pitch_is_where_the_count_meets_the_budget():
 
 
 def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
-    """A pitch that does not divide the image and a resolution that does not divide the pixels, by torch's counter."""
+    """A pitch that does not divide the image and a resolution that does not divide the
+    pixels, by torch's counter.
+    """
     pitch = 1.07 * settings.run.pitch_um
     going = run.start(replace(settings, run=replace(settings.run, pitch_um=pitch)))
     net = going.trainer.model.net.eval()
@@ -218,30 +271,49 @@ def test_what_runs_for_a_frame_is_counted_in_whole_pixels(settings):
     pixels = math.ceil(settings.scenes.pixels * settings.optics.sample_um / pitch)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         net(torch.zeros(1, 1, pixels, pixels), chosen)
-    assert going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS  # taken by slices: not counted
+    assert (
+        going.macs(chosen) == counter.get_total_flops() // 2 + windows.STEP_MACS
+    )  # taken by slices: not counted
 
 
 @pytest.mark.parametrize(("pitch_um", "said"), [(17.0, 1), (18.0, 0)])
-def test_pixels_finer_than_the_samples_of_the_image_are_told(tmp_path, capsys, pitch_um, said):
-    text = TINY.replace("budgets_mmacs = [2.0]", f"budgets_mmacs = [2.0]\npitch_um = {pitch_um}")
+def test_pixels_finer_than_the_samples_of_the_image_are_told(
+    tmp_path, capsys, pitch_um, said
+):
+    text = TINY.replace(
+        "budgets_mmacs = [2.0]", f"budgets_mmacs = [2.0]\npitch_um = {pitch_um}"
+    )
     (tmp_path / "run.toml").write_text(text)
-    assert cli.main(["codesign", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")]) == 0
+    assert (
+        cli.main(["codesign", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out")])
+        == 0
+    )
     words = f"run.pitch_um = {pitch_um:g} is finer than the samples of the image, optics.sample_um = 18"
     assert capsys.readouterr().out.count(words) == said
 
 
 @pytest.mark.parametrize("pitch_um", [18.3, 19.7, 21.1])
-def test_no_network_that_is_found_takes_more_than_its_budget(settings, tmp_path, pitch_um):
-    """Pixels that do not divide the image: 47.2, 43.9 and 40.9 of them; a budget that whole resolution is beyond."""
+def test_no_network_that_is_found_takes_more_than_its_budget(
+    settings, tmp_path, pitch_um
+):
+    """Pixels that do not divide the image: 47.2, 43.9 and 40.9 of them; a budget that
+    whole resolution is beyond.
+    """
     budgets = replace(settings.run, budgets_mmacs=(1.8, 2.3), pitch_um=pitch_um)
-    still = replace(settings.inner, pitch=replace(settings.inner.pitch, rate=0.0), steps=1)
-    rows = _end(run.start(replace(settings, run=budgets, inner=still)), tmp_path / "run")
+    still = replace(
+        settings.inner, pitch=replace(settings.inner.pitch, rate=0.0), steps=1
+    )
+    rows = _end(
+        run.start(replace(settings, run=budgets, inner=still)), tmp_path / "run"
+    )
     for row in rows:
         assert 0.9 * row["budget_mmacs"] < row["mmacs"] <= row["budget_mmacs"]
 
 
 def test_frozen_parts_stay_and_a_frozen_architecture_is_uniform(settings, tmp_path):
-    going = run.start(replace(settings, run=replace(settings.run, frozen=("optics", "architecture"))))
+    going = run.start(
+        replace(settings, run=replace(settings.run, frozen=("optics", "architecture")))
+    )
     rows = _end(going, tmp_path / "c")
     assert not run.coefficients(going).any()
     assert [len(s.history) for s in going.searches] == [1]
@@ -261,7 +333,9 @@ def test_baselines_run_from_the_same_config(settings, tmp_path, network):
 
 
 def test_fine_tuning_moves_weights_alone_and_repeats_after_a_resume(settings, tmp_path):
-    tuned = replace(settings, run=replace(settings.run, finetune_steps=2), ambiguity_pairs=2)
+    tuned = replace(
+        settings, run=replace(settings.run, finetune_steps=2), ambiguity_pairs=2
+    )
     going = run.start(tuned)
     rows = _end(going, tmp_path / "c")
     plain = finish(run.resume(tmp_path / "c", tuned))
@@ -292,23 +366,49 @@ def test_killed_after_any_step_or_birth_the_command_ends_in_the_same_bytes(tmp_p
     (tmp_path / "run.toml").write_text(TINY)
 
     def start(folder, *words):
-        command = [sys.executable, "-m", "metalens", "codesign", "run.toml", "-o", folder, *words]
-        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        command = [
+            sys.executable,
+            "-m",
+            "metalens",
+            "codesign",
+            "run.toml",
+            "-o",
+            folder,
+            *words,
+        ]
+        return subprocess.Popen(
+            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
 
     def end(child):
         child.communicate()
         return child.returncode
 
     def begin():
-        resumable = (tmp_path / "killed.unfinished" / command_codesign.CHECKPOINT).exists()
+        resumable = (
+            tmp_path / "killed.unfinished" / command_codesign.CHECKPOINT
+        ).exists()
         return start("killed", "--resume" if resumable else "--force")
 
     assert end(start("whole")) == 0
-    for lines in (0, 1, 1, 2):  # what it says before it is killed: nothing, a step, the other step, births
+    for lines in (
+        0,
+        1,
+        1,
+        2,
+    ):  # what it says before it is killed: nothing, a step, the other step, births
         child = begin()
         assert all(child.stdout.readline() for _ in range(lines))
         os.kill(child.pid, signal.SIGKILL)
         assert end(child) == -signal.SIGKILL
     assert end(begin()) == 0
-    for name in ("result.json", "log.jsonl", "checkpoint.safetensors", "lens.h5", "subnet_2.safetensors"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes(), name
+    for name in (
+        "result.json",
+        "log.jsonl",
+        "checkpoint.safetensors",
+        "lens.h5",
+        "subnet_2.safetensors",
+    ):
+        assert (tmp_path / "whole" / name).read_bytes() == (
+            tmp_path / "killed" / name
+        ).read_bytes(), name

@@ -1,4 +1,6 @@
-"""Parts put together: doses that share no datatype, names that differ, units, room between parts."""
+"""Parts put together: doses that share no datatype, names that differ, units, room
+between parts.
+"""
 
 import math
 from pathlib import Path
@@ -27,29 +29,61 @@ def part(name, doses, *, box=(-1000, -500, 2000, 900), corrected=False, cell="SH
 def test_two_doses_never_share_a_datatype_and_one_dose_has_one():
     first = part("A", {(1, 0): 1.27, (1, 1): 1.31})
     second = part("B", {(1, 0): 1.31, (1, 1): 1.4, (1, 2): 1.27}, cell="OTHER")
-    made = joined.die("TOP", [joined.Placing(p, (At(),)) for p in (first, second)], kept=frozenset({(1, 2), (10, 0)}))
-    assert made.doses == {(1, 0): 1.27, (1, 1): 1.31, (1, 3): 1.4}  # 1/2 means something else
+    made = joined.die(
+        "TOP",
+        [joined.Placing(p, (At(),)) for p in (first, second)],
+        kept=frozenset({(1, 2), (10, 0)}),
+    )
+    assert made.doses == {
+        (1, 0): 1.27,
+        (1, 1): 1.31,
+        (1, 3): 1.4,
+    }  # 1/2 means something else
     assert set(made.cells["SHAPE"].polygons) == {(1, 0), (1, 1)}
     assert set(made.cells["OTHER"].polygons) == {(1, 1), (1, 3), (1, 0)}
 
 
 def test_cells_of_one_name_are_told_apart_and_placed_where_they_were():
     inner = CellContent("X", {(2, 0): [np.array([[0, 0], [5, 0], [5, 7]])]})
-    placed = Placed(("X",), *(np.array([v], np.int32) for v in (0, 11, -3)), np.array([5], np.uint8))
-    one = parts.Part("A", "Y", {"X": inner, "Y": CellContent("Y", placed=placed)}, {(2, 0): 1.0}, {}, {}, np.zeros(4))
+    placed = Placed(
+        ("X",), *(np.array([v], np.int32) for v in (0, 11, -3)), np.array([5], np.uint8)
+    )
+    one = parts.Part(
+        "A",
+        "Y",
+        {"X": inner, "Y": CellContent("Y", placed=placed)},
+        {(2, 0): 1.0},
+        {},
+        {},
+        np.zeros(4),
+    )
     two = part("B", {(1, 0): 1.0}, cell="X")
     at = At(x_um=2.5, y_um=-1.25, turn_deg=90.0, columns=3, step_um=(10.0, 20.0))
-    made = joined.die("TOP", [joined.Placing(two, (At(),)), joined.Placing(one, (at,))], kept=frozenset())
+    made = joined.die(
+        "TOP",
+        [joined.Placing(two, (At(),)), joined.Placing(one, (at,))],
+        kept=frozenset(),
+    )
     assert set(made.cells) == {"TOP", "X", "X_2", "Y"}
     assert made.cells["Y"].placed.children == ("X_2",)
     (_, copies) = made.copies["TOP"]
-    assert (copies.child, copies.x, copies.y, copies.turn) == ("Y", 2500, -1250, QUARTERS[1])
+    assert (copies.child, copies.x, copies.y, copies.turn) == (
+        "Y",
+        2500,
+        -1250,
+        QUARTERS[1],
+    )
     assert (copies.columns, copies.rows, copies.across) == (3, 1, (10_000, 0))
 
 
 def test_into_keeps_the_cells_and_numbers_of_the_file():
     chip = part("INTO", {(1, 0): 1.0}, cell="CHIP")
-    made = joined.die("NAME", [joined.Placing(part("A", {(1, 0): 1.3}), (At(),))], kept=frozenset(), into=chip)
+    made = joined.die(
+        "NAME",
+        [joined.Placing(part("A", {(1, 0): 1.3}), (At(),))],
+        kept=frozenset(),
+        into=chip,
+    )
     assert set(made.cells) == {"CHIP", "SHAPE"}
     assert set(made.cells["CHIP"].polygons) == {(1, 0)}
     assert set(made.cells["SHAPE"].polygons) == {(1, 1)}
@@ -57,8 +91,13 @@ def test_into_keeps_the_cells_and_numbers_of_the_file():
 
 
 def content(unit_nm, shape, place=(0, 0)):
-    top = Placed(("P",), *(np.array([v], np.int32) for v in (0, *place)), np.zeros(1, np.uint8))
-    cells = {"P": CellContent("P", {(9, 1): [np.array(shape)]}), "T": CellContent("T", placed=top)}
+    top = Placed(
+        ("P",), *(np.array([v], np.int32) for v in (0, *place)), np.zeros(1, np.uint8)
+    )
+    cells = {
+        "P": CellContent("P", {(9, 1): [np.array(shape)]}),
+        "T": CellContent("T", placed=top),
+    }
     return MaskContent("GDSII", unit_nm, cells)
 
 
@@ -75,9 +114,13 @@ def test_another_database_unit_is_brought_to_nanometres_or_refused():
 @pytest.mark.parametrize("away", [69, 70])
 def test_the_gap_between_parts_is_that_of_the_rule(away):
     one, two = part("A", {(1, 0): 1.0}), part("B", {(1, 0): 1.0})
-    # A from -1 to 2 um along x; B turned by a quarter: from -0.9 to 0.5 um about its middle
+    # A from -1 to 2 um along x; B turned by a quarter: from -0.9 to 0.5 um about its
+    # middle
     x = 2.0 + 0.9 + away / 1000
-    placed = [joined.Placing(one, (At(),)), joined.Placing(two, (At(x_um=x, y_um=0.1, turn_deg=90.0),))]
+    placed = [
+        joined.Placing(one, (At(),)),
+        joined.Placing(two, (At(x_um=x, y_um=0.1, turn_deg=90.0),)),
+    ]
     found = apart.check(placed, PLAIN)
     assert len(found) == (away < 70)
     if found:
@@ -101,8 +144,14 @@ def test_backscatter_reaches_as_far_as_its_error_function_says():
     assert apart.reach_um(PLAIN) == 0
 
     def check(away, corrected):
-        one, two = part("A", {(1, 0): 1.0}, corrected=corrected), part("B", {(1, 0): 1.0})
-        return apart.check([joined.Placing(one, (At(),)), joined.Placing(two, (At(x_um=3 + away),))], BEAM)
+        one, two = (
+            part("A", {(1, 0): 1.0}, corrected=corrected),
+            part("B", {(1, 0): 1.0}),
+        )
+        return apart.check(
+            [joined.Placing(one, (At(),)), joined.Placing(two, (At(x_um=3 + away),))],
+            BEAM,
+        )
 
     assert not check(reach + 0.01, True)
     (found,) = check(reach - 0.01, True)
@@ -112,23 +161,37 @@ def test_backscatter_reaches_as_far_as_its_error_function_says():
 
 
 def test_impossible_places_are_refused():
-    with pytest.raises(ProcessError, match="step_um is missing for 2 columns and 1 rows"):
+    with pytest.raises(
+        ProcessError, match="step_um is missing for 2 columns and 1 rows"
+    ):
         At(columns=2)
-    many = joined.Placing(part("A", {(1, 0): 1.0}), (At(columns=4001, step_um=(9.0, 9.0)),))
+    many = joined.Placing(
+        part("A", {(1, 0): 1.0}), (At(columns=4001, step_um=(9.0, 9.0)),)
+    )
     with pytest.raises(ProcessError, match="4001 copies of A on a die"):
         apart.check([many], PLAIN)
 
 
 def test_a_disc_is_sliced_so_that_its_corners_stay_free():
     turn = np.linspace(0, 2 * np.pi, 401)[:-1]
-    disc = np.rint(100_000 * np.column_stack([np.cos(turn), np.sin(turn)])).astype(np.int64)
+    disc = np.rint(100_000 * np.column_stack([np.cos(turn), np.sin(turn)])).astype(
+        np.int64
+    )
     shapes = {"D": CellContent("D", {(2, 0): [disc]})}
     made = parts.of_file(
-        "D", Path("d.gds"), MaskContent("GDSII", 1.0, shapes), PLAIN, cell="", relative_dose=1.0, keep_top=False
+        "D",
+        Path("d.gds"),
+        MaskContent("GDSII", 1.0, shapes),
+        PLAIN,
+        cell="",
+        relative_dose=1.0,
+        keep_top=False,
     ).boxes[parts.APERTURE]
     assert len(made) == 40  # slices of 5 um
     held = (made[:, 0] <= disc[:, None, 0]) & (disc[:, None, 0] <= made[:, 2])
     held &= (made[:, 1] <= disc[:, None, 1]) & (disc[:, None, 1] <= made[:, 3])
     assert held.any(1).all()  # nothing of it sticks out
     corner = np.hypot(np.abs(made[:, [0, 2]]).max(1), np.abs(made[:, [1, 3]]).min(1))
-    assert corner.max() <= 100_002  # each slice is no wider than the disc at its edge nearer to the middle
+    assert (
+        corner.max() <= 100_002
+    )  # each slice is no wider than the disc at its edge nearer to the middle

@@ -1,4 +1,6 @@
-"""Lattices of an assembly that are never all in memory: written, read by sums, and told apart where they differ."""
+"""Lattices of an assembly that are never all in memory: written, read by sums, and told
+apart where they differ.
+"""
 
 import dataclasses
 
@@ -12,7 +14,12 @@ from layout.gdsii import assemble as gdsii_assemble
 from layout.mask import Lattice
 from layout.oasis import assemble as oasis_assemble
 
-NAMES = ("THIN", "", "WIDER_ONE", "MIDST")  # of unequal length; the second class has no cell and does not occur
+NAMES = (
+    "THIN",
+    "",
+    "WIDER_ONE",
+    "MIDST",
+)  # of unequal length; the second class has no cell and does not occur
 
 
 def assembly(block):
@@ -23,17 +30,35 @@ def assembly(block):
     }
     cells |= {"LENS": CellContent("LENS"), "TOP": CellContent("TOP")}
     sites = Sites(Lattice.of("OWN", block, pitch=410, x0=-7001, y0=9003), NAMES)
-    copies = {"TOP": (Copies("LENS", 500, -300, QUARTERS[5], columns=3, rows=2, across=(20_000, 0), up=(0, 30_000)),)}
+    copies = {
+        "TOP": (
+            Copies(
+                "LENS",
+                500,
+                -300,
+                QUARTERS[5],
+                columns=3,
+                rows=2,
+                across=(20_000, 0),
+                up=(0, 30_000),
+            ),
+        )
+    }
     return Assembly("LIB", cells, copies, sites={"LENS": sites})
 
 
 @pytest.mark.parametrize(
     ("write", "read"),
-    [(gdsii_assemble.write, layout.read_gdsii), (oasis_assemble.write, layout.read_oasis)],
+    [
+        (gdsii_assemble.write, layout.read_gdsii),
+        (oasis_assemble.write, layout.read_oasis),
+    ],
     ids=["gds", "oas"],
 )
 @pytest.mark.parametrize("keep", [None, 5])
-def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(tmp_path, write, read, keep):
+def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(
+    tmp_path, write, read, keep
+):
     block = np.random.default_rng(4).choice([0, 1, 3, 4], (37, 300)).astype(np.uint8)
     made = assembly(block)
     write(made, tmp_path / "m")
@@ -42,7 +67,10 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(tmp_path, writ
     if keep is None:
         row, column = np.nonzero(block == 3)
         x, y = content.sites("LENS")["WIDER_ONE"]
-        wanted = {(-7001 + 410 * c, 9003 - 410 * r) for r, c in zip(row.tolist(), column.tolist(), strict=True)}
+        wanted = {
+            (-7001 + 410 * c, 9003 - 410 * r)
+            for r, c in zip(row.tolist(), column.tolist(), strict=True)
+        }
         assert set(zip(x.tolist(), y.tolist(), strict=True)) == wanted
     swapped, lost = block.copy(), block.copy()
     swapped[5, 7:9] = block[5, 9], 4 - block[5, 9] // 2
@@ -51,5 +79,8 @@ def test_every_site_is_written_and_a_moved_or_missing_one_is_seen(tmp_path, writ
         assert not np.array_equal(other, block)
         found = readback.differences(assembly(other), content)
         assert any("cell LENS: copies of" in text for text in found), found
-    moved = dataclasses.replace(made, copies={"TOP": (dataclasses.replace(made.copies["TOP"][0], turn=QUARTERS[4]),)})
+    moved = dataclasses.replace(
+        made,
+        copies={"TOP": (dataclasses.replace(made.copies["TOP"][0], turn=QUARTERS[4]),)},
+    )
     assert readback.differences(moved, content)

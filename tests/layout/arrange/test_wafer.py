@@ -1,4 +1,6 @@
-"""Step and repeat: dies counted again by points along the edge of the wafer, arrays that hold each die once."""
+"""Step and repeat: dies counted again by points along the edge of the wafer, arrays
+that hold each die once.
+"""
 
 import math
 
@@ -13,7 +15,9 @@ from metalens.ground.errors import ProcessError
 
 
 def edge(wafer, count=4000):
-    """(n, 2) points along the edge of a wafer, um: circle, chord of the flat, and the notch down to its tip."""
+    """(n, 2) points along the edge of a wafer, um: circle, chord of the flat, and the
+    notch down to its tip.
+    """
     radius = 500 * wafer.diameter_mm
     angle = 2 * math.pi * np.arange(count) / count
     points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -21,21 +25,34 @@ def edge(wafer, count=4000):
         half = 500 * wafer.flat_mm
         low = -math.sqrt(radius**2 - half**2)
         points = points[points[:, 1] >= low]
-        points = np.concatenate([points, np.column_stack([np.linspace(-half, half, 801), np.full(801, low)])])
+        points = np.concatenate(
+            [
+                points,
+                np.column_stack([np.linspace(-half, half, 801), np.full(801, low)]),
+            ]
+        )
     if wafer.notch_mm:
         points = np.concatenate([points, [[0.0, -radius + 1000 * wafer.notch_mm]]])
     return points
 
 
 def counted(wafer, box, reach=40):
-    """Dies whose every corner lies on the wafer and that are as far from all points of its edge as they must."""
+    """Dies whose every corner lies on the wafer and that are as far from all points of
+    its edge as they must.
+    """
     points, found = edge(wafer), set()
     radius = 500 * wafer.diameter_mm
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):
-            x, y = i * wafer.pitch_um[0] + wafer.offset_um[0], j * wafer.pitch_um[1] + wafer.offset_um[1]
+            x, y = (
+                i * wafer.pitch_um[0] + wafer.offset_um[0],
+                j * wafer.pitch_um[1] + wafer.offset_um[1],
+            )
             left, bottom, right, top = x + box[0], y + box[1], x + box[2], y + box[3]
-            if max(math.hypot(u, v) for u in (left, right) for v in (bottom, top)) > radius:
+            if (
+                max(math.hypot(u, v) for u in (left, right) for v in (bottom, top))
+                > radius
+            ):
                 continue
             if wafer.flat_mm and bottom < -chord_um(wafer):
                 continue
@@ -52,41 +69,78 @@ BOX = (-2100.0, -1300.0, 1900.0, 1700.0)  # not about its middle
 @pytest.mark.parametrize(
     "wafer",
     [
-        Wafer((4600.0, 3350.0), diameter_mm=50.8, edge_exclusion_mm=2.0, flat_mm=15.88, offset_um=(710.0, 1290.0)),
-        Wafer((4310.0, 3470.0), diameter_mm=76.2, edge_exclusion_mm=4.3, notch_mm=1.1, offset_um=(350.0, 900.0)),
+        Wafer(
+            (4600.0, 3350.0),
+            diameter_mm=50.8,
+            edge_exclusion_mm=2.0,
+            flat_mm=15.88,
+            offset_um=(710.0, 1290.0),
+        ),
+        Wafer(
+            (4310.0, 3470.0),
+            diameter_mm=76.2,
+            edge_exclusion_mm=4.3,
+            notch_mm=1.1,
+            offset_um=(350.0, 900.0),
+        ),
         Wafer((4000.0, 3000.0), diameter_mm=40.0, edge_exclusion_mm=0.0),
     ],
 )
 def test_dies_are_those_that_keep_away_from_every_point_of_the_edge(wafer):
-    # points lie 40 um apart at most: the distance of a die is found to 40^2 / 8 / 2000 um, 0.1 um
-    assert {tuple(pair) for pair in dies(wafer, BOX).index.tolist()} == counted(wafer, BOX)
+    # points lie 40 um apart at most: the distance of a die is found to 40^2 / 8 / 2000
+    # um, 0.1 um
+    assert {tuple(pair) for pair in dies(wafer, BOX).index.tolist()} == counted(
+        wafer, BOX
+    )
 
 
 def test_a_flat_takes_a_row_and_a_notch_one_die():
-    plain = Wafer((5000.0, 5000.0), diameter_mm=100.0, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0))
+    plain = Wafer(
+        (5000.0, 5000.0),
+        diameter_mm=100.0,
+        edge_exclusion_mm=2.0,
+        offset_um=(0.0, 1000.0),
+    )
     box = (-2500.0, -2500.0, 2500.0, 2500.0)
     whole = {tuple(pair) for pair in dies(plain, box).index.tolist()}
-    flat = Wafer((5000.0, 5000.0), flat_mm=32.5, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0))
+    flat = Wafer(
+        (5000.0, 5000.0), flat_mm=32.5, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
+    )
     cut = {tuple(pair) for pair in dies(flat, box).index.tolist()}
-    # the chord lies sqrt(50^2 - 16.25^2) = 47.28 mm below the middle: rows that end above -45.28 mm stay
+    # the chord lies sqrt(50^2 - 16.25^2) = 47.28 mm below the middle: rows that end
+    # above -45.28 mm stay
     lowest = min(j for _, j in whole)
     assert lowest * 5000 + 1000 - 2500 == -46500
     assert whole - cut == {(i, j) for i, j in whole if j == lowest}
-    notch = Wafer((5000.0, 5000.0), notch_mm=1.6, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0))
-    assert whole - {tuple(pair) for pair in dies(notch, box).index.tolist()} == {(0, lowest)}  # tip at -48.4 mm
+    notch = Wafer(
+        (5000.0, 5000.0), notch_mm=1.6, edge_exclusion_mm=2.0, offset_um=(0.0, 1000.0)
+    )
+    assert whole - {tuple(pair) for pair in dies(notch, box).index.tolist()} == {
+        (0, lowest)
+    }  # tip at -48.4 mm
 
 
 def test_dies_that_touch_a_mark_are_left_out():
     box = (-2000.0, -1500.0, 2000.0, 1500.0)
     free = Wafer((4000.0, 3000.0), diameter_mm=40.0)
-    taken = Wafer((4000.0, 3000.0), diameter_mm=40.0, mark_um=400.0, marks=(Mark(8.1, 3.0), Mark(-6.0, 0.2)))
+    taken = Wafer(
+        (4000.0, 3000.0),
+        diameter_mm=40.0,
+        mark_um=400.0,
+        marks=(Mark(8.1, 3.0), Mark(-6.0, 0.2)),
+    )
     gone = {tuple(p) for p in dies(free, box).index.tolist()} - {
         tuple(p) for p in dies(taken, box, around_marks_um=30.0).index.tolist()
     }
-    # 8.1 mm lies in column 2 (6 to 10 mm), 3 mm in row 1 (1.5 to 4.5); -6 mm on the border of columns -2 and -1
+    # 8.1 mm lies in column 2 (6 to 10 mm), 3 mm in row 1 (1.5 to 4.5); -6 mm on the
+    # border of columns -2 and -1
     assert gone == {(2, 1), (-2, 0), (-1, 0)}
-    with pytest.raises(ProcessError, match=r"mark at \(19\.5, 0\) mm is off the usable wafer"):
-        refuse_marks_off(Wafer((4000.0, 3000.0), diameter_mm=40.0, marks=(Mark(19.5, 0.0),)))
+    with pytest.raises(
+        ProcessError, match=r"mark at \(19\.5, 0\) mm is off the usable wafer"
+    ):
+        refuse_marks_off(
+            Wafer((4000.0, 3000.0), diameter_mm=40.0, marks=(Mark(19.5, 0.0),))
+        )
 
 
 @given(
@@ -96,20 +150,35 @@ def test_dies_that_touch_a_mark_are_left_out():
 )
 def test_arrays_hold_every_die_once_at_its_place(diameter, pitch, offset):
     wafer = Wafer(
-        tuple(map(float, pitch)), diameter_mm=diameter, edge_exclusion_mm=1.0, offset_um=tuple(map(float, offset))
+        tuple(map(float, pitch)),
+        diameter_mm=diameter,
+        edge_exclusion_mm=1.0,
+        offset_um=tuple(map(float, offset)),
     )
     found = dies(wafer, (-1000.0, -600.0, 1000.0, 600.0))
     copies = stepped("DIE", found, units_per_um=1000.0)
-    there = [tuple(p) for one in copies for p in zip(*(v.tolist() for v in one.places()), strict=True)]
-    assert sorted(there) == sorted((round(1000 * x), round(1000 * y)) for x, y in found.place_um.tolist())
+    there = [
+        tuple(p)
+        for one in copies
+        for p in zip(*(v.tolist() for v in one.places()), strict=True)
+    ]
+    assert sorted(there) == sorted(
+        (round(1000 * x), round(1000 * y)) for x, y in found.place_um.tolist()
+    )
     assert len(copies) <= 2 * len(set(found.index[:, 1].tolist()))
 
 
 def test_what_does_not_fit_is_refused_by_key():
-    with pytest.raises(ProcessError, match=r"wafer\.pitch_um is 3000 along y, but a die is 3000\.500 um long"):
+    with pytest.raises(
+        ProcessError,
+        match=r"wafer\.pitch_um is 3000 along y, but a die is 3000\.500 um long",
+    ):
         dies(Wafer((5000.0, 3000.0)), (-1.0, -1500.25, 1.0, 1500.25))
     with pytest.raises(ProcessError, match=r"no die of 70000 x 70000 um fits"):
-        dies(Wafer((70000.0, 70000.0), diameter_mm=98.0), (-35000.0, -35000.0, 35000.0, 35000.0))
+        dies(
+            Wafer((70000.0, 70000.0), diameter_mm=98.0),
+            (-35000.0, -35000.0, 35000.0, 35000.0),
+        )
     with pytest.raises(ProcessError, match="whole nanometres"):
         Wafer((5000.0005, 3000.0))
     with pytest.raises(ProcessError, match=r"flat_mm = 10\.0 and notch_mm = 1\.0"):

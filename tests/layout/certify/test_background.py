@@ -30,9 +30,12 @@ def test_pixels_give_the_sum_over_all_masses(range_um):
     image = np.zeros((raster.rows, raster.columns), np.float32)
     raster.put(x, y, mass, image)
     found = raster.take(x[::37], y[::37], raster.blurred(image))
-    # splines of four pixels a range: 3e-4, and 1e-3 where the range is hardly wider than the pitch
+    # splines of four pixels a range: 3e-4, and 1e-3 where the range is hardly wider
+    # than the pitch
     error = 1.2e-3 if range_um < 3 * 0.41 else 4e-4
-    assert found == pytest.approx(direct(x, y, mass, (x[::37], y[::37]), range_um), rel=error)
+    assert found == pytest.approx(
+        direct(x, y, mass, (x[::37], y[::37]), range_um), rel=error
+    )
 
 
 def test_a_band_of_pixels_is_the_same_as_all_of_them():
@@ -44,17 +47,33 @@ def test_a_band_of_pixels_is_the_same_as_all_of_them():
     for raster in (whole, whole.between(low, high)):
         image = np.zeros((raster.rows, raster.columns), np.float32)
         near = (y > low - raster.halo_um) & (y < high + raster.halo_um)
-        raster.put(*(v[near] if raster is not whole else v for v in (x, y, mass)), image)
+        raster.put(
+            *(v[near] if raster is not whole else v for v in (x, y, mass)), image
+        )
         images.append(raster.take(x[here], y[here], raster.blurred(image)))
     assert whole.between(low, high).rows < whole.rows
-    assert images[1] == pytest.approx(images[0], rel=2e-6)  # float32, and what lies 4.5 ranges away
+    assert images[1] == pytest.approx(
+        images[0], rel=2e-6
+    )  # float32, and what lies 4.5 ranges away
 
 
 def test_lattices_and_lists_hold_the_same_pillars_each_in_one_strip():
     rng = np.random.default_rng(1)
     parts = [
-        Lattice.of("A", rng.integers(0, 4, (300, 500)).astype(np.uint8), pitch=410, x0=-90_003, y0=61_007),
-        Lattice.of("B", rng.integers(0, 4, (40, 30)).astype(np.uint8), pitch=650, x0=150_001, y0=90_000),
+        Lattice.of(
+            "A",
+            rng.integers(0, 4, (300, 500)).astype(np.uint8),
+            pitch=410,
+            x0=-90_003,
+            y0=61_007,
+        ),
+        Lattice.of(
+            "B",
+            rng.integers(0, 4, (40, 30)).astype(np.uint8),
+            pitch=650,
+            x0=150_001,
+            y0=90_000,
+        ),
     ]
     kinds = np.array([-1, 2, -1, 0], np.int32)
     centre = np.array([[0.001, 0.002], [0.0, 0.0], [-0.003, 0.0]])
@@ -73,10 +92,17 @@ def test_lattices_and_lists_hold_the_same_pillars_each_in_one_strip():
 
 
 def test_at_the_rim_of_an_image_its_last_nine_pixels_go_on():
-    """Quadratic splines hold any plane, in the middle of pixels, on the rim and half a pixel beyond it."""
+    """Quadratic splines hold any plane, in the middle of pixels, on the rim and half a
+    pixel beyond it.
+    """
     y, x = np.mgrid[:7, :9]
     image = 2.0 + 0.3 * x - 0.7 * y
-    u, v = (a.ravel() for a in np.meshgrid([-0.5, 0.0, 0.4, 3.2, 7.6, 8.0, 8.5], [-0.5, 0.1, 2.7, 5.5, 6.0, 6.5]))
+    u, v = (
+        a.ravel()
+        for a in np.meshgrid(
+            [-0.5, 0.0, 0.4, 3.2, 7.6, 8.0, 8.5], [-0.5, 0.1, 2.7, 5.5, 6.0, 6.5]
+        )
+    )
     found = np.empty(len(u))
     background._take(1.7 + 0.25 * u, -3.1 + 0.25 * v, 1.7, -3.1, 0.25, image, found)
     assert found == pytest.approx(2.0 + 0.3 * u - 0.7 * v, abs=1e-12)

@@ -1,4 +1,6 @@
-"""Pixels of wide Gaussians by hand: where they lie, the weights of a spline, a blur as two sums."""
+"""Pixels of wide Gaussians by hand: where they lie, the weights of a spline, a blur as
+two sums.
+"""
 
 import math
 
@@ -24,7 +26,12 @@ def test_a_raster_holds_its_box_and_two_pixels_around():
 @pytest.mark.parametrize(
     ("low", "high", "first", "end"),
     [
-        (10.0, 12.0, 39, 86),  # (10 - 9.5 + 20) / 0.5 = 41, less 2; (12 + 9.5 + 20) / 0.5 = 83, and 3
+        (
+            10.0,
+            12.0,
+            39,
+            86,
+        ),  # (10 - 9.5 + 20) / 0.5 = 41, less 2; (12 + 9.5 + 20) / 0.5 = 83, and 3
         (10.2, 12.2, 39, 86),
         (-19.0, 12.0, 0, 86),
         (10.0, 29.0, 39, 100),
@@ -33,20 +40,32 @@ def test_a_raster_holds_its_box_and_two_pixels_around():
 )
 def test_rows_between_two_heights_hold_the_reach_of_the_kernel(low, high, first, end):
     some = Raster(RANGE, -7.0, -20.0, 100, 31).between(low, high)
-    assert (some.rows, some.columns, some.left_um, some.range_um) == (end - first, 31, -7.0, RANGE)
+    assert (some.rows, some.columns, some.left_um, some.range_um) == (
+        end - first,
+        31,
+        -7.0,
+        RANGE,
+    )
     assert some.bottom_um == pytest.approx(-20 + 0.5 * first, rel=1e-15)
 
 
 def spline(off):
-    """Quadratic: on the pixels one before, at and after, for a place ``off`` pixels after a middle."""
+    """Quadratic: on the pixels one before, at and after, for a place ``off`` pixels
+    after a middle.
+    """
     return np.array([(1 - 2 * off) ** 2 / 8, 3 / 4 - off**2, (1 + 2 * off) ** 2 / 8])
 
 
-@pytest.mark.parametrize(("u", "v"), [(5.0, 3.0), (4.75, 3.4), (5.4, 2.5), (1.0, 1.0), (7.0, 5.0), (7.4, 5.4)])
+@pytest.mark.parametrize(
+    ("u", "v"),
+    [(5.0, 3.0), (4.75, 3.4), (5.4, 2.5), (1.0, 1.0), (7.0, 5.0), (7.4, 5.4)],
+)
 def test_a_mass_goes_to_nine_pixels_by_two_splines(u, v):
     """Places in pixels, of 7 rows and 9 columns; a half goes on to the next one."""
     raster, image = Raster(RANGE, -4.1, 1.2, 7, 9), np.zeros((7, 9))
-    raster.put(np.array([-4.1 + 0.5 * u]), np.array([1.2 + 0.5 * v]), np.array([3.7]), image)
+    raster.put(
+        np.array([-4.1 + 0.5 * u]), np.array([1.2 + 0.5 * v]), np.array([3.7]), image
+    )
     want = np.zeros((7, 9))
     i, j = math.floor(u + 0.5 + 1e-9), math.floor(v + 0.5 + 1e-9)
     want[j - 1 : j + 2, i - 1 : i + 2] = 3.7 * np.outer(spline(v - j), spline(u - i))
@@ -56,12 +75,16 @@ def test_a_mass_goes_to_nine_pixels_by_two_splines(u, v):
 @pytest.mark.parametrize(("u", "v"), [(0.4, 3.0), (7.6, 3.0), (5.0, 0.4), (5.0, 5.6)])
 def test_a_mass_off_the_raster_is_passed_over(u, v):
     raster, image = Raster(RANGE, -4.1, 1.2, 7, 9), np.zeros((7, 9))
-    raster.put(np.array([-4.1 + 0.5 * u]), np.array([1.2 + 0.5 * v]), np.array([3.7]), image)
+    raster.put(
+        np.array([-4.1 + 0.5 * u]), np.array([1.2 + 0.5 * v]), np.array([3.7]), image
+    )
     assert not image.any()
 
 
 def test_one_pixel_becomes_a_gaussian_that_is_a_squared_pixel_narrower():
-    """16 - 1 squared pixels of 0.5 um, cut 16 pixels away, of unit mass to what is cut off: erfc(16 / sqrt(15))."""
+    """16 - 1 squared pixels of 0.5 um, cut 16 pixels away, of unit mass to what is cut
+    off: erfc(16 / sqrt(15)).
+    """
     raster, image = Raster(RANGE, 0.0, 0.0, 41, 47), np.zeros((41, 47))
     image[18, 22] = 2.5
     got = raster.blurred(image)
@@ -83,7 +106,15 @@ def test_a_blur_is_a_sum_along_rows_and_one_across_them(taps, first, end):
     reach = taps // 2
 
     def matrix(n):
-        return np.array([[kernel[b - a + reach] if abs(b - a) <= reach else 0.0 for b in range(n)] for a in range(n)])
+        return np.array(
+            [
+                [
+                    kernel[b - a + reach] if abs(b - a) <= reach else 0.0
+                    for b in range(n)
+                ]
+                for a in range(n)
+            ]
+        )
 
     want = np.full((11, 8), 7.0)
     want[first:end] = (matrix(11) @ image @ matrix(8).T)[first:end]
@@ -91,7 +122,9 @@ def test_a_blur_is_a_sum_along_rows_and_one_across_them(taps, first, end):
 
 
 def test_a_mass_on_and_off_the_pixels_exposes_as_its_gaussian_does():
-    """Both splines widen by what the kernel lacks: exp(-r² / 4) / (4 pi), to 1e-3 within a range and a half."""
+    """Both splines widen by what the kernel lacks: exp(-r² / 4) / (4 pi), to 1e-3
+    within a range and a half.
+    """
     raster = Raster.over((-9.0, -8.0, 9.0, 8.0), RANGE)
     image = np.zeros((raster.rows, raster.columns))
     raster.put(np.array([0.37]), np.array([-0.81]), np.array([1.9]), image)

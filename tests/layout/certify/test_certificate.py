@@ -1,4 +1,6 @@
-"""The certificate of written files: against the direct sum over all shapes, and against faults put in on purpose."""
+"""The certificate of written files: against the direct sum over all shapes, and against
+faults put in on purpose.
+"""
 
 import functools
 import tempfile
@@ -36,16 +38,27 @@ def lens_map(n=61, pitch=0.4):
 @functools.cache
 def written(process, furnished=True):
     """The mask as files: the plan, what a reader finds, and its dose table."""
-    plan = build.prepare(lens_map(), process, furniture="die" if furnished else "none").plan
+    plan = build.prepare(
+        lens_map(), process, furniture="die" if furnished else "none"
+    ).plan
     with tempfile.TemporaryDirectory() as folder:
         layout.write_oasis(plan, Path(folder) / "m.oas")
         doses.write(plan, process, Path(folder) / "doses.csv")
-        return plan, layout.read_oasis(Path(folder) / "m.oas"), doses.read(Path(folder) / "doses.csv")
+        return (
+            plan,
+            layout.read_oasis(Path(folder) / "m.oas"),
+            doses.read(Path(folder) / "doses.csv"),
+        )
 
 
 @pytest.mark.parametrize(
     "third",
-    [{}, {"gamma_um": 0.45, "nu": 0.12}, {"alpha_um": 0.055}, {"alpha_um": 0.03, "gamma_um": 0.16, "nu": 0.3}],
+    [
+        {},
+        {"gamma_um": 0.45, "nu": 0.12},
+        {"alpha_um": 0.055},
+        {"alpha_um": 0.03, "gamma_um": 0.16, "nu": 0.3},
+    ],
 )
 def test_exposures_are_those_of_the_direct_sum(third):
     process = Process(exposure=Exposure(**{**BEAM, **third}, correct=False))
@@ -56,7 +69,9 @@ def test_exposures_are_those_of_the_direct_sum(third):
     point = exposure.point_exposure(process.exposure)
     wide, dose = found.drawn_nm * 1e-3, np.full(len(centres), table[1, 0])
     exact = rims.at_edges(centres, wide, dose, point, which=which)
-    assert found.exposure[which] * 0.5 == pytest.approx(exact, rel=2e-3)  # neighbours as Gaussians of their moment
+    assert found.exposure[which] * 0.5 == pytest.approx(
+        exact, rel=2e-3
+    )  # neighbours as Gaussians of their moment
 
 
 def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
@@ -68,7 +83,10 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
     assert found.survey.worst_nm < 1.0
     assert found.survey.ok
     test = found.exposure[~found.judged]
-    assert (test.min(), test.max()) == (pytest.approx(0.8, abs=0.01), pytest.approx(1.2, abs=0.012))
+    assert (test.min(), test.max()) == (
+        pytest.approx(0.8, abs=0.01),
+        pytest.approx(1.2, abs=0.012),
+    )
 
 
 def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
@@ -81,12 +99,16 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     more = certify(content, {**table, layer: 1.05 * table[layer]}, process).survey
     assert not more.ok
     assert more.worst_exposure > 0.03
-    less = certify(content, {k: v for k, v in table.items() if k != layer}, process).survey
+    less = certify(
+        content, {k: v for k, v in table.items() if k != layer}, process
+    ).survey
     assert less.undosed == (layer,)
     assert not less.ok
 
 
-@pytest.mark.parametrize("third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)]
+)
 def test_the_edges_of_marks_and_labels_are_judged(third):
     process = Process(exposure=Exposure(**BEAM, **third))
     _, content, table = written(process)
@@ -113,20 +135,35 @@ def test_the_edges_of_marks_and_labels_are_judged(third):
         pytest.param(0.009, 9.58, 0.24, marks=pytest.mark.slow),
     ],
 )
-def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_needs(alpha_um, beta_um, eta):
-    process = Process(exposure=Exposure(alpha_um=float(alpha_um), beta_um=float(beta_um), eta=float(eta)))
+def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_needs(
+    alpha_um, beta_um, eta
+):
+    process = Process(
+        exposure=Exposure(
+            alpha_um=float(alpha_um), beta_um=float(beta_um), eta=float(eta)
+        )
+    )
     plan, content, table = written(process)
     found = survey(content, plan, table, process)
     assert found.ok, (found.worst_exposure, found.worst_nm)
-    assert sum(len(p) for figure in plan.figures for p in figure.polygons.values()) < 40_000
+    assert (
+        sum(len(p) for figure in plan.figures for p in figure.polygons.values())
+        < 40_000
+    )
 
 
-@pytest.mark.parametrize("third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)])
-def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(third, monkeypatch):
+@pytest.mark.parametrize(
+    "third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)]
+)
+def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(
+    third, monkeypatch
+):
     process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
     plan, content, table = written(process)
     whole = certify(content, table, process, height_um=0.7).survey
-    monkeypatch.setattr(exposed, "_MOST_PIXELS", 0)  # bands of pixels, as a large mask needs
+    monkeypatch.setattr(
+        exposed, "_MOST_PIXELS", 0
+    )  # bands of pixels, as a large mask needs
     monkeypatch.setattr(exposed, "_BAND", 700)
     monkeypatch.setattr(places, "_SITES", 100)
     bands = survey(content, plan, table, process, height_um=0.7)
@@ -146,17 +183,29 @@ def test_without_a_point_exposure_nothing_is_certified():
 
 
 def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
-    boxes = np.array([[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]])  # left, bottom, right, top
+    boxes = np.array(
+        [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
+    )  # left, bottom, right, top
     corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
     polygons = Polygons(corners, np.array([1.3, 0.7]), np.array([3, 3]))
     points = np.random.default_rng(0).uniform(-1, 4, (40, 2))
-    points[:3] = [[1.1, 0.0], [3.0, 0.4], [3.0, 0.8]]  # on an edge, on a shared edge, on a corner
+    points[:3] = [
+        [1.1, 0.0],
+        [3.0, 0.4],
+        [3.0, 0.8],
+    ]  # on an edge, on a shared edge, on a corner
     terms = [(0.4, 0.6), (1.1, 0.3)]
     want = np.zeros(len(points))
     for (l, b, r, t), dose in zip(boxes, polygons.dose, strict=True):
         for a, w in terms:
             across = (erf((r - points[:, 0]) / a) - erf((l - points[:, 0]) / a)) / 2
-            want += dose * w * across * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a)) / 2
+            want += (
+                dose
+                * w
+                * across
+                * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a))
+                / 2
+            )
     assert outlines.exposure(points, polygons, terms) == pytest.approx(want, abs=1e-9)
 
 
@@ -172,42 +221,74 @@ def test_samples_lie_on_the_outline_of_the_union_away_from_corners():
     assert x[bottom].min() > 0.2
     assert x[bottom].max() < 3.5
     assert len(x[bottom]) == 3  # 3.7 um less four ranges, a sample each um
-    assert {(round(a), round(b)) for a, b in found.normal} == {(0, -1), (1, 0), (0, 1), (-1, 0)}
+    assert {(round(a), round(b)) for a, b in found.normal} == {
+        (0, -1),
+        (1, 0),
+        (0, 1),
+        (-1, 0),
+    }
 
 
 def test_the_raster_of_a_large_polygon_carries_its_mass():
-    shape = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]])
+    shape = np.array(
+        [[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]]
+    )
     x, y, mass = outlines.spots(Polygons([shape], np.array([1.7]), np.array([3])), 0.5)
     assert mass.sum() == pytest.approx(1.7 * 23.0, rel=1e-12)
-    assert (mass * x).sum() / mass.sum() == pytest.approx((18 * 4.5 + 5 * 0.5) / 23, rel=0.02)
-    assert (mass * y).sum() / mass.sum() == pytest.approx((18 * 1.0 + 5 * 4.5) / 23, rel=0.02)
+    assert (mass * x).sum() / mass.sum() == pytest.approx(
+        (18 * 4.5 + 5 * 0.5) / 23, rel=0.02
+    )
+    assert (mass * y).sum() / mass.sum() == pytest.approx(
+        (18 * 1.0 + 5 * 4.5) / 23, rel=0.02
+    )
 
 
 def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
-    process = Process(exposure=Exposure(**BEAM), bias=Bias(isolated_nm=-12.0), etch=Etch(sidewall_deg=1.0))
+    process = Process(
+        exposure=Exposure(**BEAM),
+        bias=Bias(isolated_nm=-12.0),
+        etch=Etch(sidewall_deg=1.0),
+    )
     source = lens_map()
     _, content, table = written(process)
     found = certify(content, table, process, height_um=0.7)
     lens = found.layer == 1
     made = found.made_nm[lens]
     size = source.diameter_um.shape[0]
-    column, row = (np.rint(v[lens] / 0.4 + (size - 1) / 2).astype(int) for v in (found.x_um, found.y_um))
+    column, row = (
+        np.rint(v[lens] / 0.4 + (size - 1) / 2).astype(int)
+        for v in (found.x_um, found.y_um)
+    )
     off = made - 1e3 * source.diameter_um[row, column]
-    # step of 2 nm, 1 nm of exposure, isolation of a Gaussian on pixels beside sums over sites
+    # step of 2 nm, 1 nm of exposure, isolation of a Gaussian on pixels beside sums over
+    # sites
     assert np.abs(off).max() < 2.5
     assert np.abs(off).mean() < 0.8
-    assert found.survey.lean_nm == pytest.approx(700 * np.tan(np.deg2rad(1.0)), rel=1e-12)
+    assert found.survey.lean_nm == pytest.approx(
+        700 * np.tan(np.deg2rad(1.0)), rel=1e-12
+    )
 
 
 def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
     process = Process(exposure=Exposure(**BEAM))
     plan, content, table = written(process)
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
-    designed = Lens(lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
+    designed = Lens(
+        lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
+    )
     found, rows = certify(content, table, process), MadeRows(plan)
     rows.place(found.x_um, found.y_um, found.made_nm, found.layer)
     made = rows.lens(designed)
     d, want = made.diameters.diameter_um, designed.diameters.diameter_um
     assert np.array_equal(d > 0, want > 0)
-    assert np.abs(d - want)[want > 0].max() < 2.1e-3  # 1 nm of the step, 1 nm of the exposure
+    assert (
+        np.abs(d - want)[want > 0].max() < 2.1e-3
+    )  # 1 nm of the step, 1 nm of the exposure
     assert made.profile == "as-written"

@@ -1,4 +1,6 @@
-"""``metalens layout ARRANGEMENT.toml``: every pillar of every die of the wafer at its place, by another reader."""
+"""``metalens layout ARRANGEMENT.toml``: every pillar of every die of the wafer at its
+place, by another reader.
+"""
 
 import json
 
@@ -26,24 +28,46 @@ def lens_map(name):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two small lenses, a file of pads made elsewhere (its unit 5 nm), and a process without correction."""
+    """Two small lenses, a file of pads made elsewhere (its unit 5 nm), and a process
+    without correction.
+    """
     target = tmp_path_factory.mktemp("arranged")
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
     for name in SIDES:
-        made = Lens(lens_map(name), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
+        made = Lens(
+            lens_map(name), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
+        )
         lens.save(target / f"{name}.h5", made)
-    pad = CellContent("PAD", {(1, 0): [np.array([[0, 0], [400, 0], [400, 200], [0, 200]])]})
+    pad = CellContent(
+        "PAD", {(1, 0): [np.array([[0, 0], [400, 0], [400, 200], [0, 200]])]}
+    )
     chip = CellContent("CHIP", {(20, 3): [np.array([[0, 0], [9, 0], [9, 11]])]})
     pads = Copies("PAD", -8000, 6000, columns=30, rows=2, across=(600, 0), up=(0, 900))
     made = Assembly("PADS", {"PAD": pad, "CHIP": chip}, {"CHIP": (pads,)}, unit_nm=5.0)
     gdsii_assemble.write(made, target / "pads.gds")
-    (target / "process.toml").write_text("[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n")
+    (target / "process.toml").write_text(
+        "[exposure]\ncorrect = false\n[die]\nmargin_um = 330\nverniers = false\n"
+    )
     return target
 
 
 def run(folder, text, target, *words):
     (folder / "arrangement.toml").write_text(text)
-    options = ["--process", str(folder / "process.toml"), "-o", str(target), "--force", *words]
+    options = [
+        "--process",
+        str(folder / "process.toml"),
+        "-o",
+        str(target),
+        "--force",
+        *words,
+    ]
     return cli.main(["layout", str(folder / "arrangement.toml"), *options])
 
 
@@ -88,15 +112,21 @@ y_mm = 0.3
 
 
 def planned(name):
-    """{(x, y) nm: drawn diameter} of a lens's pillars: the first row of the map is the lowest of the mask."""
+    """{(x, y) nm: drawn diameter} of a lens's pillars: the first row of the map is the
+    lowest of the mask.
+    """
     d = lens_map(name).diameter_um
     n = len(d)
     at = (np.arange(n) - (n - 1) / 2) * 400
     return {(at[j], at[i]): d[i, j] for i in range(n) for j in range(n) if d[i, j]}
 
 
-@pytest.mark.parametrize("kept", [1 << 16, 40])  # placements of a cell in memory: all, or rows of lattices as they go
-def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_path, capsys, monkeypatch, kept):
+@pytest.mark.parametrize(
+    "kept", [1 << 16, 40]
+)  # placements of a cell in memory: all, or rows of lattices as they go
+def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(
+    folder, tmp_path, capsys, monkeypatch, kept
+):
     db = pytest.importorskip("klayout.db")
     monkeypatch.setattr(make, "KEPT", kept)
     assert run(folder, WAFER, tmp_path / "m", "--json") == 0
@@ -112,7 +142,9 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
     ):
         for u, v in planned(name):
             p, q = QUARTERS[turn].apply(np.array(u), np.array(v))
-            wanted |= {(round(x + float(p) + a), round(y + float(q) + b)) for a, b in dies}
+            wanted |= {
+                (round(x + float(p) + a), round(y + float(q) + b)) for a, b in dies
+            }
     for file in ("mask.gds", "mask.oas"):
         there = db.Layout()
         there.read(str(tmp_path / "m" / file))
@@ -120,18 +152,28 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
         pillars.merged_semantics = False
         found = [p.bbox().center() for p in pillars.each() if p.bbox().width() < 500]
         assert len(found) == len(wanted)
-        # pillars are symmetric: the middle of their box is their place, but for one step of the grid
+        # pillars are symmetric: the middle of their box is their place, but for one
+        # step of the grid
         assert {(p.x, p.y) for p in found} == wanted
         pads = db.Region(there.top_cell().begin_shapes_rec(there.layer(1, 1)))
-        assert pads.count() == 60 * len(dies)  # 1.5 of the dose: a datatype of their own
+        assert pads.count() == 60 * len(
+            dies
+        )  # 1.5 of the dose: a datatype of their own
         assert pads.area() == 60 * len(dies) * 2000 * 1000
-    sizes = [(tmp_path / "m" / file).stat().st_size for file in ("mask.gds", "mask.oas")]
-    lone = [(tmp_path / "m" / "A" / file).stat().st_size for file in ("mask.gds", "mask.oas")]
+    sizes = [
+        (tmp_path / "m" / file).stat().st_size for file in ("mask.gds", "mask.oas")
+    ]
+    lone = [
+        (tmp_path / "m" / "A" / file).stat().st_size
+        for file in ("mask.gds", "mask.oas")
+    ]
     assert sizes[0] < 5 * lone[0]
     assert sizes[1] < 5 * lone[1]
     page = (tmp_path / "m" / "report.html").read_text()
     assert "The mask passes its own checks. 2 lenses with" in page
-    assert all(text in page for text in ("mirrored", "pads.gds", f"{len(dies)} whole dies"))
+    assert all(
+        text in page for text in ("mirrored", "pads.gds", f"{len(dies)} whole dies")
+    )
     assert (tmp_path / "m" / "wafer.png").is_file()
     held = doses.read(tmp_path / "m" / "doses.csv")
     assert held[1, 0] == 1.0
@@ -139,30 +181,55 @@ def test_every_pillar_of_every_die_is_where_the_arrangement_puts_it(folder, tmp_
 
 
 @pytest.mark.parametrize("kept", [1 << 16, 40])
-def test_a_lens_goes_into_a_file_whose_cells_stay(folder, tmp_path, capsys, monkeypatch, kept):
+def test_a_lens_goes_into_a_file_whose_cells_stay(
+    folder, tmp_path, capsys, monkeypatch, kept
+):
     monkeypatch.setattr(make, "KEPT", kept)
     text = '[[lens]]\nfile = "b.h5"\nname = "B"\n[[lens.at]]\nx_um = -60.4\n[into]\nfile = "pads.gds"\ncell = "CHIP"\n'
     assert run(folder, text, tmp_path / "m", "--oasis", "--gds") == 0
     assert "The mask passes its own checks." in capsys.readouterr().out
     old = layout.read_gdsii(folder / "pads.gds")
-    for read, file in ((layout.read_gdsii, "mask.gds"), (layout.read_oasis, "mask.oas")):
+    for read, file in (
+        (layout.read_gdsii, "mask.gds"),
+        (layout.read_oasis, "mask.oas"),
+    ):
         content = read(tmp_path / "m" / file)
         assert content.tops == ["CHIP"]
         assert content.counts("CHIP")["PAD"] == old.counts("CHIP")["PAD"] == 60
-        pillars = {name: n for name, n in content.counts("CHIP").items() if name.startswith("B_D")}
+        pillars = {
+            name: n
+            for name, n in content.counts("CHIP").items()
+            if name.startswith("B_D")
+        }
         assert sum(pillars.values()) == len(planned("b"))
-        assert (5 * old.cells["CHIP"].polygons[20, 3][0]).tolist() == content.cells["CHIP"].polygons[20, 3][0].tolist()
+        assert (5 * old.cells["CHIP"].polygons[20, 3][0]).tolist() == content.cells[
+            "CHIP"
+        ].polygons[20, 3][0].tolist()
 
 
-def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder, tmp_path, capsys):
+def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(
+    folder, tmp_path, capsys
+):
     two = '[[lens]]\nfile = "a.h5"\nname = "A"\nfurnished = false\nat = [{x_um = 0}, {x_um = 5.5}]\n'
     assert run(folder, two, tmp_path / "m", "--oasis") == 1
-    assert "A at (0, 0) um to A at (5.5, 0) um, pillars: 0.000 um apart" in capsys.readouterr().out
+    assert (
+        "A at (0, 0) um to A at (5.5, 0) um, pillars: 0.000 um apart"
+        in capsys.readouterr().out
+    )
     corner = 'name = "B"\nfurnished = false\nat = [{x_um = 4.58, y_um = 4.58}, {x_um = 4.6, y_um = -4.9}]\n'
     beside = two.replace("at = [{x_um = 0}, {x_um = 5.5}]", "at = [{x_um = 0}]")
-    assert run(folder, f'{beside}[[lens]]\nfile = "b.h5"\n{corner}', tmp_path / "m", "--oasis") == 1
+    assert (
+        run(
+            folder,
+            f'{beside}[[lens]]\nfile = "b.h5"\n{corner}',
+            tmp_path / "m",
+            "--oasis",
+        )
+        == 1
+    )
     told = capsys.readouterr().out
-    # corner to corner of two squares of pillars: only the one of the upper right is nearer than 70 nm
+    # corner to corner of two squares of pillars: only the one of the upper right is
+    # nearer than 70 nm
     assert "A at (0, 0) um to B at (4.58, 4.58) um, pillars: 0.000 um apart" in told
     assert "B at (4.6, -4.9) um, pillars" not in told
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
@@ -171,30 +238,46 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(folder,
     assert "  FAILED: PADS: design rules broken: 1 feature" in told.splitlines()
     assert "passes its own checks" not in told
     page = (tmp_path / "m" / "report.html").read_text()
-    assert "FAILS: PADS: design rules broken: 1 feature" in page[page.index("<h1") : page.index("<h2")]
+    assert (
+        "FAILS: PADS: design rules broken: 1 feature"
+        in page[page.index("<h1") : page.index("<h2")]
+    )
     assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0
 
 
 @pytest.mark.slow  # two corrections and certificates: 20 s
-def test_doses_of_lenses_and_their_surroundings_are_corrected_each(folder, tmp_path, capsys):
-    (folder / "process.toml").write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 12.0\neta = 0.7\n")
+def test_doses_of_lenses_and_their_surroundings_are_corrected_each(
+    folder, tmp_path, capsys
+):
+    (folder / "process.toml").write_text(
+        "[exposure]\nalpha_um = 0.012\nbeta_um = 12.0\neta = 0.7\n"
+    )
     text = 'name = "DUO"\n[die]\nsize_um = [1500, 800]\n[[lens]]\nfile = "a.h5"\nname = "A"\n'
     text += "at = [{x_um = -40, y_um = 21}, {x_um = 60, turn_deg = 90}]\n"
     assert run(folder, text, tmp_path / "m", "--json") == 0
     values = json.loads(capsys.readouterr().out)
     assert values["failures"] == []
     held = doses.read(tmp_path / "m" / "doses.csv")
-    assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(n == 1 for n, _ in held)
+    assert len({round(v, 6) for (number, _), v in held.items() if number == 1}) == sum(
+        n == 1 for n, _ in held
+    )
     content = layout.read_oasis(tmp_path / "m" / "mask.oas")
     drawn = {layer for cell in content.cells.values() for layer in cell.polygons}
     assert not drawn - set(held) - {(10, 0), (7, 0)}
     near = text.replace("x_um = 60", "x_um = -30")
     assert run(folder, near, tmp_path / "m") == 1
-    assert "backscatter of one that the doses of the other do not know of" in capsys.readouterr().out
+    assert (
+        "backscatter of one that the doses of the other do not know of"
+        in capsys.readouterr().out
+    )
 
 
-def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(folder, tmp_path, capsys):
-    (folder / "negative.toml").write_text('tone = "negative"\n[die]\nmargin_um = 330\nverniers = false\n')
+def test_a_negative_tone_takes_lenses_with_frames_of_their_own_alone(
+    folder, tmp_path, capsys
+):
+    (folder / "negative.toml").write_text(
+        'tone = "negative"\n[die]\nmargin_um = 330\nverniers = false\n'
+    )
     words = [
         "layout",
         str(folder / "arrangement.toml"),
@@ -219,9 +302,15 @@ def test_bad_arrangements_are_refused_by_file_and_key(folder, tmp_path, capsys):
     for text, said in (
         ('name = "X"\n', "need a [[lens]] or a [[cell]]"),
         ('[[cell]]\nfile = "none.gds"\nname = "N"\n', "none.gds"),
-        ('[[cell]]\nfile = "pads.gds"\nname = "P"\ncell = "PIT"\n', "no cell 'PIT'; the file holds PAD, CHIP"),
+        (
+            '[[cell]]\nfile = "pads.gds"\nname = "P"\ncell = "PIT"\n',
+            "no cell 'PIT'; the file holds PAD, CHIP",
+        ),
         ('[[lens]]\nfile = "a.h5"\nname = "A"\nat = [{columns = 2}]\n', "step_um"),
-        ('[[lens]]\nfile = "a.h5"\nname = "A"\n[wafer]\npitch_um = [100, 900]\n', "wafer.pitch_um is 100 along x"),
+        (
+            '[[lens]]\nfile = "a.h5"\nname = "A"\n[wafer]\npitch_um = [100, 900]\n',
+            "wafer.pitch_um is 100 along x",
+        ),
         ('[[lens]]\nfile = "a.h5"\nname = "A B"\n', "cell name 'A B'"),
     ):
         assert run(folder, text, tmp_path / "n", "--oasis", "--quiet") == 2

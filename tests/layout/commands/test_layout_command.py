@@ -1,4 +1,6 @@
-"""``metalens layout`` from lens file to mask: what it writes, what it refuses, and how it ends."""
+"""``metalens layout`` from lens file to mask: what it writes, what it refuses, and how
+it ends.
+"""
 
 import json
 import shutil
@@ -28,12 +30,30 @@ from metalens.pillars.proxy import Proxy
 @pytest.fixture(scope="module")
 def lens_file(tmp_path_factory):
     """A small round lens of random diameters."""
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
     axis = np.arange(60) - 29.5
     d = np.random.default_rng(0).uniform(0.1, 0.3, (60, 60))
     d[axis**2 + axis[:, None] ** 2 > 900] = 0
     path = tmp_path_factory.mktemp("lens") / "lens.h5"
-    lens.save(path, Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"))
+    lens.save(
+        path,
+        Lens(
+            DiameterMap(d, 0.4),
+            Cell(0.4),
+            proxy,
+            0.85,
+            500.0,
+            float("inf"),
+            "hyperbolic",
+        ),
+    )
     return path
 
 
@@ -43,15 +63,46 @@ def run(*words):
 
 def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     target = tmp_path / "mask"
-    assert run(lens_file, "-o", target, "--dxf", "--oasis", "--gds", "--stl", "--window.size-um", 6) == 0
+    assert (
+        run(
+            lens_file,
+            "-o",
+            target,
+            "--dxf",
+            "--oasis",
+            "--gds",
+            "--stl",
+            "--window.size-um",
+            6,
+        )
+        == 0
+    )
     assert "reads back as planned" in capsys.readouterr().out
     names = {path.name for path in target.iterdir()}
-    assert {"mask.oas", "mask.gds", "mask.dxf", "mask.lyp", "mask.lyrdb", "report.html", "pillars.stl"} <= names
-    assert {"die.png", "pillars.png", "diameters.png", "margins.png", "process.toml", "layout.json"} <= names
+    assert {
+        "mask.oas",
+        "mask.gds",
+        "mask.dxf",
+        "mask.lyp",
+        "mask.lyrdb",
+        "report.html",
+        "pillars.stl",
+    } <= names
+    assert {
+        "die.png",
+        "pillars.png",
+        "diameters.png",
+        "margins.png",
+        "process.toml",
+        "layout.json",
+    } <= names
     values = json.loads((target / "layout.json").read_text())
     assert values["ok"]
     planned = np.count_nonzero(lens.load(lens_file).diameters.diameter_um)
-    for content in (layout.read_oasis(target / "mask.oas"), layout.read_gdsii(target / "mask.gds")):
+    for content in (
+        layout.read_oasis(target / "mask.oas"),
+        layout.read_gdsii(target / "mask.gds"),
+    ):
         assert sum(content.counts("LENS").values()) == planned
     page = (target / "report.html").read_text()
     assert "violations" in page
@@ -60,7 +111,9 @@ def test_a_lens_becomes_a_mask_with_report(lens_file, tmp_path, capsys):
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
-def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(lens_file, tmp_path, monkeypatch, capsys):
+def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(
+    lens_file, tmp_path, monkeypatch, capsys
+):
     behind = replace(lens.load(lens_file), layers=Layers(stop=Stop(9.0, 4.0)))
     lens.save(tmp_path / "behind.h5", behind)
     monkeypatch.setattr(make.build, "prepare", None)
@@ -73,22 +126,39 @@ def test_a_study_of_a_lens_behind_a_stop_is_refused_before_its_mask_is_made(lens
 def test_a_study_of_pillars_whose_answers_are_hardly_known_is_none(
     lens_file, tmp_path, monkeypatch, capsys, error, code
 ):
-    """The mask is what was asked for, and says that it passes; the study beside it is no study."""
-    monkeypatch.setattr(study_page, "answers_of", lambda lens: {"": SimpleNamespace(error=error)})
+    """The mask is what was asked for, and says that it passes; the study beside it is
+    no study.
+    """
+    monkeypatch.setattr(
+        study_page, "answers_of", lambda lens: {"": SimpleNamespace(error=error)}
+    )
     monkeypatch.setattr(study_page, "sections", lambda *about: [])
     assert run(lens_file, "-o", tmp_path / "mask", "--study") == code
     told = capsys.readouterr().out
     assert "The mask passes its own checks." in told
     assert ("  FAILED: --study: how these pillars answer" in told) is bool(code)
     assert ("is known within 52% alone" in told) is bool(code)
-    assert json.loads((tmp_path / "mask" / "layout.json").read_text())["answers_error"] == error
+    assert (
+        json.loads((tmp_path / "mask" / "layout.json").read_text())["answers_error"]
+        == error
+    )
 
 
-def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(tmp_path):
+def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(
+    tmp_path,
+):
     """The table has a slow tail that no few Gaussians follow."""
     radius = np.geomspace(0.01, 30.0, 40)
-    rows = np.c_[radius, np.exp(-((radius / 0.02) ** 2)) / 4e-4 + 3e-3 / (radius + 0.3) ** 3]
-    np.savetxt(tmp_path / "point.csv", rows, delimiter=",", header="radius_um,density", comments="")
+    rows = np.c_[
+        radius, np.exp(-((radius / 0.02) ** 2)) / 4e-4 + 3e-3 / (radius + 0.3) ** 3
+    ]
+    np.savetxt(
+        tmp_path / "point.csv",
+        rows,
+        delimiter=",",
+        header="radius_um,density",
+        comments="",
+    )
     measured = Exposure(csv=tmp_path / "point.csv")
     point = point_exposure(measured)
     assert 1e-3 < point.fit_error < 0.05
@@ -98,7 +168,9 @@ def test_the_page_says_how_far_the_gaussians_are_from_a_measured_point_exposure(
     assert page._table_said(Exposure(alpha_um=0.01, beta_um=40.0, eta=0.7), point) == ""
 
 
-def test_a_corrected_mask_is_certified_and_hands_on_its_lens(lens_file, tmp_path, capsys):
+def test_a_corrected_mask_is_certified_and_hands_on_its_lens(
+    lens_file, tmp_path, capsys
+):
     process = tmp_path / "process.toml"
     process.write_text("[exposure]\nalpha_um = 0.012\nbeta_um = 40.0\neta = 0.7\n")
     target = tmp_path / "mask"
@@ -106,8 +178,13 @@ def test_a_corrected_mask_is_certified_and_hands_on_its_lens(lens_file, tmp_path
     values = json.loads(capsys.readouterr().out)
     assert values["failures"] == []
     assert values["exposure"]["mask.oas"]["edges"] > 100
-    made, designed = (lens.load(path).diameters.diameter_um for path in (target / "made.h5", lens_file))
-    assert np.abs(made - designed).max() < 2.1e-3  # half a step of 2 nm, and 1 nm of the exposure
+    made, designed = (
+        lens.load(path).diameters.diameter_um
+        for path in (target / "made.h5", lens_file)
+    )
+    assert (
+        np.abs(made - designed).max() < 2.1e-3
+    )  # half a step of 2 nm, and 1 nm of the exposure
     assert (target / "fields.csv").read_text().startswith("sequence,")
     assert "The mask passes its own checks." in (target / "job.txt").read_text()
 
@@ -122,7 +199,14 @@ def made(lens_file, tmp_path_factory):
 
 def test_same_input_gives_the_same_masks(lens_file, made, tmp_path):
     assert run(lens_file, "-o", tmp_path / "again", "--quiet") == 0
-    for name in ("mask.oas", "mask.gds", "mask.lyp", "mask.lyrdb", "process.toml", "die.png"):
+    for name in (
+        "mask.oas",
+        "mask.gds",
+        "mask.lyp",
+        "mask.lyrdb",
+        "process.toml",
+        "die.png",
+    ):
         assert (tmp_path / "again" / name).read_bytes() == (made / name).read_bytes()
 
 
@@ -134,7 +218,9 @@ def test_a_broken_rule_ends_with_one_and_is_marked(lens_file, tmp_path, capsys):
     values = json.loads(capsys.readouterr().out)
     assert not values["ok"]
     assert values["violations"]["gap"] > 0
-    assert values["failures"] == [f"design rules broken: {values['violations']['gap']:,} gap"]
+    assert values["failures"] == [
+        f"design rules broken: {values['violations']['gap']:,} gap"
+    ]
     rdb = pytest.importorskip("klayout.rdb")
     database = rdb.ReportDatabase()
     database.load(str(target / "mask.lyrdb"))
@@ -152,7 +238,9 @@ def test_a_broken_rule_ends_with_one_and_is_marked(lens_file, tmp_path, capsys):
         ("[die]\nlabel = 'ÄÖ'\n", "font"),
     ],
 )
-def test_bad_processes_end_with_two_and_write_nothing(lens_file, tmp_path, capsys, text, match):
+def test_bad_processes_end_with_two_and_write_nothing(
+    lens_file, tmp_path, capsys, text, match
+):
     process = tmp_path / "process.toml"
     process.write_text(text)
     assert run(lens_file, "--process", process, "-o", tmp_path / "mask") == 2
@@ -170,12 +258,16 @@ def test_bad_targets_and_lenses_end_with_two(lens_file, tmp_path, capsys):
     assert not (tmp_path / "mask").exists()
 
 
-def test_an_existing_mask_stays_without_force_and_stale_files_go_with_it(lens_file, made, tmp_path, capsys):
+def test_an_existing_mask_stays_without_force_and_stale_files_go_with_it(
+    lens_file, made, tmp_path, capsys
+):
     target = shutil.copytree(made, tmp_path / "mask")
     before = (target / "mask.oas").read_bytes()
     assert run(lens_file, "-o", target, "--quiet") == 2
     assert (target / "mask.oas").read_bytes() == before
-    assert run(lens_file, "-o", target, "--quiet", "--force", "--oasis", "--circles") == 0
+    assert (
+        run(lens_file, "-o", target, "--quiet", "--force", "--oasis", "--circles") == 0
+    )
     assert not (target / "mask.gds").exists()
     assert (target / "mask.oas").read_bytes() != before
     capsys.readouterr()
@@ -200,7 +292,9 @@ def test_dxf_of_a_window_reads_in_klayout(plan, tmp_path):
     layer = next(i for i in read.layer_indexes() if read.get_info(i).name == "PILLAR")
     region = db.Region(read.top_cell().begin_shapes_rec(layer))
     assert region.count() == count
-    area = sum(polygon.twice_area(plan.classes[k - 1].outline) for _, _, k in inside) / 2
+    area = (
+        sum(polygon.twice_area(plan.classes[k - 1].outline) for _, _, k in inside) / 2
+    )
     assert region.area() == area
 
 
@@ -210,7 +304,9 @@ def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path
     layout.write_dxf(plan, path, window=window)
     drawing = ezdxf.readfile(path)
     assert drawing.units == 13  # micrometres, in the table of $INSUNITS
-    assert {"PILLAR": "1/0", "MARKS": "3/0"}.items() <= {e.dxf.name: e.description for e in drawing.layers}.items()
+    assert {"PILLAR": "1/0", "MARKS": "3/0"}.items() <= {
+        e.dxf.name: e.description for e in drawing.layers
+    }.items()
     assert dxf.differences(plan, path, window=window) == ()
     layout.write_dxf(plan, tmp_path / "again.dxf", window=window)
     assert path.read_bytes() == (tmp_path / "again.dxf").read_bytes()
@@ -220,7 +316,10 @@ def test_a_dxf_says_its_unit_and_layers_and_every_change_is_found(plan, tmp_path
     drawing.saveas(path)
     found = dxf.differences(plan, path, window=window)
     assert found[0].startswith("unit 4, planned 13")
-    assert found[1:] == ("layer PILLAR: 1 polygons missing", "layer PILLAR: 1 polygons not planned")
+    assert found[1:] == (
+        "layer PILLAR: 1 polygons missing",
+        "layer PILLAR: 1 polygons not planned",
+    )
     path.write_text("no drawing")
     with pytest.raises(MaskFileError, match=r"m\.dxf: cannot be read"):
         dxf.differences(plan, path, window=window)
@@ -251,4 +350,6 @@ def test_markers_stand_where_the_violations_are(make_plan, tmp_path):
     (item,) = database.each_item()
     box = next(v.box() for v in item.each_value() if v.is_box())
     violation = found.violations[0]
-    assert [round(1000 * v) for v in (box.left, box.bottom, box.right, box.top)] == list(violation.box)
+    assert [
+        round(1000 * v) for v in (box.left, box.bottom, box.right, box.top)
+    ] == list(violation.box)

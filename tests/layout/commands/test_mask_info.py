@@ -23,7 +23,9 @@ def counted(path):
     found = {}
     for index in layout.layer_indexes():
         about = layout.get_info(index)
-        number = sum(1 for top in layout.top_cells() for _ in _each(top.begin_shapes_rec(index)))
+        number = sum(
+            1 for top in layout.top_cells() for _ in _each(top.begin_shapes_rec(index))
+        )
         if number:
             found[f"{about.layer}/{about.datatype}"] = number
     return found, [top.name for top in layout.top_cells()]
@@ -35,15 +37,27 @@ def _each(walk):
         walk.next()
 
 
-@pytest.mark.parametrize(("ending", "kind"), [("oas", "OASIS mask"), ("gds", "GDSII mask")])
-def test_shapes_of_every_layer_are_those_that_klayout_counts(make_plan, tmp_path, capsys, ending, kind):
+@pytest.mark.parametrize(
+    ("ending", "kind"), [("oas", "OASIS mask"), ("gds", "GDSII mask")]
+)
+def test_shapes_of_every_layer_are_those_that_klayout_counts(
+    make_plan, tmp_path, capsys, ending, kind
+):
     path = tmp_path / f"m.{ending}"
-    (oasis_write.write if ending == "oas" else gdsii_write.write)(make_plan(seed=7), path)
+    (oasis_write.write if ending == "oas" else gdsii_write.write)(
+        make_plan(seed=7), path
+    )
     assert main(["info", str(path), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
     shapes, tops = counted(path)
-    assert {number: entry["shapes"] for number, entry in told["layers"].items()} == shapes
-    assert (told["kind"], told["tops"], told["shapes"]) == (kind, tops, sum(shapes.values()))
+    assert {
+        number: entry["shapes"] for number, entry in told["layers"].items()
+    } == shapes
+    assert (told["kind"], told["tops"], told["shapes"]) == (
+        kind,
+        tops,
+        sum(shapes.values()),
+    )
     assert main(["info", str(path)]) == SUCCESS
     assert f"{sum(shapes.values()):,} shapes" in capsys.readouterr().out
 
@@ -60,18 +74,29 @@ def test_a_mask_cut_short_is_refused_by_name(make_plan, tmp_path, capsys):
 
 @pytest.mark.parametrize("ending", ["oas", "gds"])
 def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
-    """Arrays of arrays of arrays: the numbers are products, far beyond what could be taken apart."""
+    """Arrays of arrays of arrays: the numbers are products, far beyond what could be
+    taken apart.
+    """
     box = np.array([[0, 0], [130, 0], [130, 70]])
-    dot, bar = (CellContent(name, {(7, n): [box] * (n + 1)}) for n, name in enumerate(("DOT", "BAR")))
+    dot, bar = (
+        CellContent(name, {(7, n): [box] * (n + 1)})
+        for n, name in enumerate(("DOT", "BAR"))
+    )
     lens, die, wafer = (CellContent(name) for name in ("LENS", "DIE", "WAFER"))
     steps = {"across": (300, 0), "up": (0, 310)}
     copies = {
-        "LENS": (Copies("DOT", 0, 0, columns=600, rows=700, **steps), Copies("BAR", 5, 9, QUARTERS[3])),
+        "LENS": (
+            Copies("DOT", 0, 0, columns=600, rows=700, **steps),
+            Copies("BAR", 5, 9, QUARTERS[3]),
+        ),
         "DIE": (
             Copies("LENS", 0, 0, QUARTERS[6], columns=40, rows=50, **steps),
             Copies("BAR", 0, 0, rows=3, up=(0, 9)),
         ),
-        "WAFER": (Copies("DIE", -7, 0, columns=210, rows=330, **steps), Copies("LENS", 0, 0)),
+        "WAFER": (
+            Copies("DIE", -7, 0, columns=210, rows=330, **steps),
+            Copies("LENS", 0, 0),
+        ),
     }
     cells = {cell.name: cell for cell in (dot, bar, lens, die, wafer)}
     write = oasis_assemble.write if ending == "oas" else gdsii_assemble.write
@@ -85,11 +110,23 @@ def test_a_wafer_of_any_size_is_told_by_products(tmp_path, capsys, ending):
 
 
 def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
-    """A cell of each top, one that holds only another, and one that is empty; no layer but those that are drawn."""
+    """A cell of each top, one that holds only another, and one that is empty; no layer
+    but those that are drawn.
+    """
     box = np.array([[0, 0], [130, 0], [130, 70]])
-    cells = [CellContent("A", {(7, 0): [box]}), CellContent("EMPTY"), CellContent("ONE"), CellContent("TWO")]
-    copies = {"ONE": (Copies("A", 0, 0), Copies("EMPTY", 0, 0, rows=9, up=(0, 5))), "TWO": (Copies("A", 3, 4),) * 3}
-    gdsii_assemble.write(Assembly("L", {cell.name: cell for cell in cells}, copies), tmp_path / "w.gds")
+    cells = [
+        CellContent("A", {(7, 0): [box]}),
+        CellContent("EMPTY"),
+        CellContent("ONE"),
+        CellContent("TWO"),
+    ]
+    copies = {
+        "ONE": (Copies("A", 0, 0), Copies("EMPTY", 0, 0, rows=9, up=(0, 5))),
+        "TWO": (Copies("A", 3, 4),) * 3,
+    }
+    gdsii_assemble.write(
+        Assembly("L", {cell.name: cell for cell in cells}, copies), tmp_path / "w.gds"
+    )
     assert main(["info", str(tmp_path / "w.gds"), "--json"]) == SUCCESS
     told = json.loads(capsys.readouterr().out)
     assert told["layers"] == {"7/0": {"name": "", "shapes": 4}}
@@ -98,8 +135,13 @@ def test_cells_that_draw_nothing_and_two_tops_are_counted(tmp_path, capsys):
 
 @pytest.mark.parametrize("command", ["check", "info"])
 def test_a_compressed_mask_is_told_from_a_damaged_one(tmp_path, capsys, command):
-    """``.gds.gz`` as KLayout writes it: neither record nor checksum of it means anything before it is unpacked."""
+    """``.gds.gz`` as KLayout writes it: neither record nor checksum of it means
+    anything before it is unpacked.
+    """
     path = tmp_path / "chip.gds.gz"
     path.write_bytes(gzip.compress(bytes(range(256)) * 9))
     assert main([command, str(path)]) == BAD_INPUT
-    assert "chip.gds.gz: a compressed file (gzip: unpack it), need" in capsys.readouterr().err
+    assert (
+        "chip.gds.gz: a compressed file (gzip: unpack it), need"
+        in capsys.readouterr().err
+    )

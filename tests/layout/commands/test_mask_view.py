@@ -1,4 +1,6 @@
-"""A mask to be looked at: every shape of the file is in the page, where the file has it."""
+"""A mask to be looked at: every shape of the file is in the page, where the file has
+it.
+"""
 
 import base64
 import json
@@ -22,11 +24,17 @@ KINDS = {"Float32Array": "<f4", "Int32Array": "<i4", "Uint8Array": "u1"}
 
 
 def unpacked(entry):
-    return np.frombuffer(zlib.decompress(base64.b64decode(entry["data"])), KINDS[entry["type"]]).reshape(entry["shape"])
+    return np.frombuffer(
+        zlib.decompress(base64.b64decode(entry["data"])), KINDS[entry["type"]]
+    ).reshape(entry["shape"])
 
 
 def content(text):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S).group(1))
+    return json.loads(
+        re.search(
+            r'<script type="application/json" id="data">(.*?)</script>', text, re.S
+        ).group(1)
+    )
 
 
 @pytest.mark.parametrize("ending", ["oas", "gds"])
@@ -40,8 +48,14 @@ def test_every_shape_is_in_the_page_where_the_file_has_it(make_plan, tmp_path, e
     for outline in panel["outlines"]:
         x, y = np.cumsum(unpacked(outline["dx"])), np.cumsum(unpacked(outline["dy"]))
         width = float(np.ptp(unpacked(outline["corners"])[:, 0]))
-        found |= {(outline["layer"].split()[0], width, int(a), int(b)) for a, b in zip(x, y, strict=True)}
-    lattice, sizes = plan.lattices[0], [float(np.ptp(made.outline[:, 0])) for made in plan.classes]
+        found |= {
+            (outline["layer"].split()[0], width, int(a), int(b))
+            for a, b in zip(x, y, strict=True)
+        }
+    lattice, sizes = (
+        plan.lattices[0],
+        [float(np.ptp(made.outline[:, 0])) for made in plan.classes],
+    )
     rows, columns = np.nonzero(lattice.array)
     want = {
         ("1", sizes[lattice.array[i, k] - 1], -6000 + 400 * int(k), 4400 - 400 * int(i))
@@ -62,7 +76,9 @@ def test_doses_and_broken_rules_beside_the_mask_are_shown(plan, tmp_path):
     drawn, layers = view.panels(tmp_path)
     ((x, y, rule),) = drawn.marks
     assert (x, y, rule) == (pytest.approx(-4.85), pytest.approx(4.4), "gap")
-    assert {o.notes["relative dose"] for o in drawn.outlines if o.layer == "1 pillar"} == {1.37}
+    assert {
+        o.notes["relative dose"] for o in drawn.outlines if o.layer == "1 pillar"
+    } == {1.37}
     rows = {row[0]: row for row in layers.rows}
     assert rows["1/0"][2] == int((plan.lattices[0].array > 0).sum())
     assert rows["3/0"][3] == pytest.approx(9 * 0.5 + 8.5 * 0.5)  # an L of two bars, um²
@@ -74,5 +90,8 @@ def test_what_holds_no_mask_is_refused(tmp_path, capsys):
         view.panels(tmp_path)
     (tmp_path / "notes.txt").write_text("x")
     assert cli.main(["view", str(tmp_path), "-o", str(tmp_path / "page.html")]) == 2
-    assert "is no folder of a mask, of captures or of a run; give a file" in capsys.readouterr().err
+    assert (
+        "is no folder of a mask, of captures or of a run; give a file"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "page.html").exists()

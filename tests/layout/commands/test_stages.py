@@ -24,7 +24,9 @@ def test_a_long_stage_speaks_and_a_short_one_does_not(plan):
     watched = stages.rows.watched(plan)
     with stages("write"):
         assert np.array_equal(watched.lattices[0].source(0, 9), lens.source(0, 9))
-        assert heard.wait(60)  # lines from before the rows were taken may come first, without a share
+        assert heard.wait(
+            60
+        )  # lines from before the rows were taken may come first, without a share
     assert all(line.startswith("write: ") for line in said)
     count = len(said)
     with Stages(said.append, first_s=60.0)("short"):

@@ -1,4 +1,6 @@
-"""What shapes expose by themselves: polygons of circles against closed forms, rectangles against error functions."""
+"""What shapes expose by themselves: polygons of circles against closed forms,
+rectangles against error functions.
+"""
 
 import math
 
@@ -24,7 +26,9 @@ def round_ones(count=256):
 
 
 def test_the_polygon_of_a_circle_exposes_as_the_disc_does():
-    """Level and slope on pixels of a sixth of the core: 2e-3 and 1 %; moments of 256 corners: 1e-4."""
+    """Level and slope on pixels of a sixth of the core: 2e-3 and 1 %; moments of 256
+    corners: 1e-4.
+    """
     polygon, disc = round_ones()
     (own, slope), (want, fall) = polygon.edges(ONE, POINT), disc.edges(ONE, POINT)
     assert own[1] == pytest.approx(want[1], rel=2e-3)
@@ -33,7 +37,9 @@ def test_the_polygon_of_a_circle_exposes_as_the_disc_does():
     assert polygon.wider_um2[1] == pytest.approx(disc.wider_um2[1], rel=1e-4)
     at = np.array([[0.13, 0.04], [0.02, -0.1], [-0.4, 0.2]])
     for width in POINT.widths_um:
-        assert polygon.given(1, at + OFF, width) == pytest.approx(disc.given(1, at, width), abs=1e-4)
+        assert polygon.given(1, at + OFF, width) == pytest.approx(
+            disc.given(1, at, width), abs=1e-4
+        )
 
 
 def test_a_rectangle_and_its_hole_are_products_of_error_functions():
@@ -45,27 +51,48 @@ def test_a_rectangle_and_its_hole_are_products_of_error_functions():
 
     def plain(a, b):
         x, y = at.T
-        return np.prod([(erf((s + v) / width) + erf((s - v) / width)) / 2 for s, v in ((a, x), (b, y))], axis=0)
+        return np.prod(
+            [
+                (erf((s + v) / width) + erf((s - v) / width)) / 2
+                for s, v in ((a, x), (b, y))
+            ],
+            axis=0,
+        )
 
     want = plain(0.13, 0.06) - plain(0.05, 0.021)
-    assert shape.given(1, at, width) == pytest.approx(want, abs=1e-6)  # four Gauss points on 0.8 widths
+    assert shape.given(1, at, width) == pytest.approx(
+        want, abs=1e-6
+    )  # four Gauss points on 0.8 widths
     seen = raster.image(shape.contours[1], width)
-    j, i = (np.rint(at[:, k] / seen.pixel_um).astype(int) + len(seen.value) // 2 for k in (1, 0))
+    j, i = (
+        np.rint(at[:, k] / seen.pixel_um).astype(int) + len(seen.value) // 2
+        for k in (1, 0)
+    )
     at = np.column_stack([seen.axis_um[i], seen.axis_um[j]])
-    assert seen.value[j, i] == pytest.approx(plain(0.13, 0.06) - plain(0.05, 0.021), abs=1e-6)
+    assert seen.value[j, i] == pytest.approx(
+        plain(0.13, 0.06) - plain(0.05, 0.021), abs=1e-6
+    )
 
 
 def level_of_a_rectangle(a, b):
-    """What the exposure of a rectangle of half sides a, b exceeds on its own area: rays from its middle, by halving.
+    """What the exposure of a rectangle of half sides a, b exceeds on its own area: rays
+    from its middle, by halving.
 
-    Products of error functions fall along every ray; the area is the mean of r^2 / 2 over the angles.
+    Products of error functions fall along every ray; the area is the mean of r^2 / 2
+    over the angles.
     """
     angle = 2 * math.pi * (np.arange(4000) + 0.5) / 4000
 
     def exposure(r):
         sides = ((a, r * np.cos(angle)), (b, r * np.sin(angle)))
-        parts = [[erf((s + v) / w) + erf((s - v) / w) for s, v in sides] for w in POINT.widths_um]
-        return sum(share / 4 * x * y for share, (x, y) in zip(POINT.weights, parts, strict=True))
+        parts = [
+            [erf((s + v) / w) + erf((s - v) / w) for s, v in sides]
+            for w in POINT.widths_um
+        ]
+        return sum(
+            share / 4 * x * y
+            for share, (x, y) in zip(POINT.weights, parts, strict=True)
+        )
 
     def excess(level):
         low, high = np.zeros_like(angle), np.full_like(angle, 2 * (a + b))
@@ -78,29 +105,45 @@ def level_of_a_rectangle(a, b):
     return brentq(excess, 0.1, 0.6, xtol=1e-6)
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 17.2, math.degrees(math.atan(0.5)), 45.0, 63.0, 90.0, 135.0])
+@pytest.mark.parametrize(
+    "turn_deg", [0.0, 17.2, math.degrees(math.atan(0.5)), 45.0, 63.0, 90.0, 135.0]
+)
 @pytest.mark.parametrize("sides", [(0.132, 0.066), (0.1201, 0.0243)])
 def test_a_turn_leaves_the_level_of_a_shape_as_it_is(sides, turn_deg):
-    """At 45 degrees all pixels along an edge are cut alike: errors of their shares do not average out, and doses are
-    promised to 1e-2. Pixels of a sixth and of a tenth of the core see the bend of the exposure: 5e-4 of the level."""
+    """At 45 degrees all pixels along an edge are cut alike: errors of their shares do
+    not average out, and doses are
+    promised to 1e-2. Pixels of a sixth and of a tenth of the core see the bend of the
+    exposure: 5e-4 of the level."""
     a, b = sides
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    corners = np.array([[-a, -b], [a, -b], [a, b], [-a, b]]) @ np.array([[c, s], [-s, c]])
+    corners = np.array([[-a, -b], [a, -b], [a, b], [-a, b]]) @ np.array(
+        [[c, s], [-s, c]]
+    )
     want = level_of_a_rectangle(a, b)
-    assert Outlines([(), [corners + OFF]]).edges(ONE, POINT)[0][1] == pytest.approx(want, rel=5e-4)
+    assert Outlines([(), [corners + OFF]]).edges(ONE, POINT)[0][1] == pytest.approx(
+        want, rel=5e-4
+    )
     terms = list(zip(POINT.widths_um.tolist(), POINT.weights.tolist(), strict=True))
     radius = math.sqrt(4 * a * b / math.pi) + np.array([-1e-3, 0.0, 1e-3])
-    assert raster.own_levels([corners], terms, radius)[1] == pytest.approx(want, rel=5e-4)
+    assert raster.own_levels([corners], terms, radius)[1] == pytest.approx(
+        want, rel=5e-4
+    )
 
 
 def test_levels_of_a_certificate_are_those_of_a_disc():
-    """Exposure at any radius about the rim: pixels of a tenth of the core, 2e-3 of the rim's."""
+    """Exposure at any radius about the rim: pixels of a tenth of the core, 2e-3 of the
+    rim's.
+    """
     polygon, _ = round_ones()
     radius = np.linspace(D / 2 - 0.012, D / 2 + 0.012, 9)
     terms = list(zip(POINT.widths_um.tolist(), POINT.weights.tolist(), strict=True))
-    want = sum(w * chndtr(2 * (D / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms)
+    want = sum(
+        w * chndtr(2 * (D / 2 / a) ** 2, 2.0, 2 * (radius / a) ** 2) for a, w in terms
+    )
     contours = [polygon.contours[1][0] - OFF]
-    assert raster.own_levels(contours, terms, radius) == pytest.approx(want, abs=2e-3 * want[4])
+    assert raster.own_levels(contours, terms, radius) == pytest.approx(
+        want, abs=2e-3 * want[4]
+    )
 
 
 def test_edges_are_seen_from_places_that_divide_them():
@@ -108,11 +151,18 @@ def test_edges_are_seen_from_places_that_divide_them():
     around = discs.edge_um(2)
     assert np.hypot(*around.T) == pytest.approx(D / 2)
     steps = np.linalg.norm(around - np.roll(around, -1, axis=0), axis=1)
-    assert steps == pytest.approx(D * math.sin(math.pi / len(around)))  # of a regular polygon
+    assert steps == pytest.approx(
+        D * math.sin(math.pi / len(around))
+    )  # of a regular polygon
     assert discs.edge_um(1) == pytest.approx(around * 0.31 / D)
-    box = Outlines([(), [np.array([[1.0, 2.0], [1.3, 2.0], [1.3, 2.1], [1.0, 2.1]])]]).edge_um(1)
+    box = Outlines(
+        [(), [np.array([[1.0, 2.0], [1.3, 2.0], [1.3, 2.1], [1.0, 2.1]])]]
+    ).edge_um(1)
     assert len(box) == 48  # 18 along each long side, 6 along each short one
-    on = [np.isclose(box[:, k], place).sum() for k, place in ((1, 2.0), (0, 1.3), (1, 2.1), (0, 1.0))]
+    on = [
+        np.isclose(box[:, k], place).sum()
+        for k, place in ((1, 2.0), (0, 1.3), (1, 2.1), (0, 1.0))
+    ]
     assert on == [18, 6, 18, 6]
 
 
@@ -120,10 +170,15 @@ def test_the_widest_reach_farthest_along_the_steps_of_those_used():
     """A long, a high and a large one that is not used; a small one behind."""
     boxes = [(0.3, 0.05), (0.04, 0.2), (0.9, 0.9), (0.1, 0.1)]
     outlines = [[np.array([[-a, -b], [a, -b], [a, b], [-a, b]])] for a, b in boxes]
-    used, steps = np.array([False, True, True, False, True]), np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]])
+    used, steps = (
+        np.array([False, True, True, False, True]),
+        np.array([[0.4, 0.0], [0.0, 0.4], [0.4, 0.1]]),
+    )
     assert Outlines([(), *outlines]).widest(used, steps) == [1, 2]
     assert Outlines([(), *outlines]).widest(used, steps[:1]) == [1]
-    assert Discs(np.array([0.0, 0.2, 0.3, 0.4])).widest(np.array([False, True, True, False]), steps) == [2]
+    assert Discs(np.array([0.0, 0.2, 0.3, 0.4])).widest(
+        np.array([False, True, True, False]), steps
+    ) == [2]
 
 
 def test_what_is_not_used_has_no_edge():

@@ -7,7 +7,9 @@ from layout.dose.exposure import PointExposure, fit
 
 
 def test_the_narrowest_gaussian_may_be_as_wide_as_the_first_radius():
-    """Coarse samples: half of the energy lies in a core of which only the first radius tells the width."""
+    """Coarse samples: half of the energy lies in a core of which only the first radius
+    tells the width.
+    """
     truth = PointExposure(np.array([0.02, 5.0]), np.array([0.5, 0.5]))
     radius = np.geomspace(0.02, 20.0, 31)
     found = fit(radius, 3.0 * truth.density(radius))

@@ -1,4 +1,6 @@
-"""Coarse nodes: interpolation of order 4, its transpose, and the convolution against the plain sum over pillars."""
+"""Coarse nodes: interpolation of order 4, its transpose, and the convolution against
+the plain sum over pillars.
+"""
 
 import numpy as np
 import pytest
@@ -15,9 +17,14 @@ PLACES = RNG.uniform(3.1, 26.5, 90), RNG.uniform(-7.3, 21.9, 90)
 
 def test_deposit_is_the_transpose_of_sample():
     mass, nodes = RNG.normal(size=90), RNG.normal(size=GRID.shape)
-    there, back = (GRID.deposit(*PLACES, mass) * nodes).sum(), (mass * GRID.sample(nodes, *PLACES)).sum()
+    there, back = (
+        (GRID.deposit(*PLACES, mass) * nodes).sum(),
+        (mass * GRID.sample(nodes, *PLACES)).sum(),
+    )
     assert there == pytest.approx(back)
-    assert GRID.deposit(*PLACES, mass).sum() == pytest.approx(mass.sum())  # the weights of each place sum to 1
+    assert GRID.deposit(*PLACES, mass).sum() == pytest.approx(
+        mass.sum()
+    )  # the weights of each place sum to 1
 
 
 def test_cubics_are_interpolated_exactly_and_the_rest_to_fourth_order():
@@ -31,7 +38,11 @@ def test_cubics_are_interpolated_exactly_and_the_rest_to_fourth_order():
         around = first[:, None] + np.arange(4)
         assert (cubic(nodes)[around] * weights).sum(1) == pytest.approx(cubic(at))
         bell = np.exp(-(((nodes - 17.3) / 9.0) ** 2))
-        error.append(abs((bell[around] * weights).sum(1) - np.exp(-(((at - 17.3) / 9.0) ** 2))).max())
+        error.append(
+            abs(
+                (bell[around] * weights).sum(1) - np.exp(-(((at - 17.3) / 9.0) ** 2))
+            ).max()
+        )
     assert error[0] / error[1] == pytest.approx(16, rel=0.25)
 
 
@@ -47,10 +58,14 @@ def test_rows_of_a_lattice_are_deposits_at_its_sites(grid):
     lines = *grid.y.at(body.rows_um(0, 13)), *grid.x.at(body.columns_um)
     gather(index, value, *lines, out)
     y, x = np.meshgrid(body.rows_um(0, 13), body.columns_um, indexing="ij")
-    assert out[0] == pytest.approx(grid.deposit(x.ravel(), y.ravel(), value[0][index].ravel()))
+    assert out[0] == pytest.approx(
+        grid.deposit(x.ravel(), y.ravel(), value[0][index].ravel())
+    )
     sites = np.empty((13, 9), np.float32)
     spread(nodes, *lines, sites)
-    assert sites.ravel() == pytest.approx(grid.sample(nodes, x.ravel(), y.ravel()), rel=1e-5, abs=1e-6)
+    assert sites.ravel() == pytest.approx(
+        grid.sample(nodes, x.ravel(), y.ravel()), rel=1e-5, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("hollow", [True, False])
@@ -87,7 +102,10 @@ def test_every_place_lies_between_the_middle_two_of_its_four_nodes():
 
 
 def test_nodes_of_a_die_are_as_fine_as_its_gaussian_asks():
-    made, half = Grid.over((2.0, -5.0, 30.0, 9.0), 4.0), Grid.over((2.0, -5.0, 30.0, 9.0), 2.0)
+    made, half = (
+        Grid.over((2.0, -5.0, 30.0, 9.0), 4.0),
+        Grid.over((2.0, -5.0, 30.0, 9.0), 2.0),
+    )
     assert made.x.spacing_um == made.y.spacing_um == 2 * half.x.spacing_um
     assert made.x.spacing_um == pytest.approx(4.0 / nodes._PER_WIDTH)
     assert (made.y.count, made.x.count) == made.shape

@@ -1,4 +1,6 @@
-"""Running extremes of exposure errors: the worst lies on either side, and the diameter follows from the slope."""
+"""Running extremes of exposure errors: the worst lies on either side, and the diameter
+follows from the slope.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ def test_or_above():
     tally = Tally()
     tally.merge(np.array([-0.01, 0.07, 0.0049, 1.0]))
     assert tally.worst == 0.07
-    assert tally.result(slope=2.0, shift=0.001).rms == pytest.approx(0.071)  # of one pillar its own error
+    assert tally.result(slope=2.0, shift=0.001).rms == pytest.approx(
+        0.071
+    )  # of one pillar its own error
 
 
 def test_nothing_taken_in_is_no_error():

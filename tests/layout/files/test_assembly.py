@@ -1,4 +1,6 @@
-"""Cells put together: arrays found again hold every copy once, and both formats hold them, read by KLayout too."""
+"""Cells put together: arrays found again hold every copy once, and both formats hold
+them, read by KLayout too.
+"""
 
 import numpy as np
 import pytest
@@ -12,21 +14,35 @@ from layout.oasis import assemble as oasis_assemble
 from layout.oasis import read as oasis_read
 from metalens.ground.errors import ProcessError
 
-WRITERS = {".gds": (gdsii_assemble.write, gdsii_read.read), ".oas": (oasis_assemble.write, oasis_read.read)}
+WRITERS = {
+    ".gds": (gdsii_assemble.write, gdsii_read.read),
+    ".oas": (oasis_assemble.write, oasis_read.read),
+}
 BAR = np.array([[0, 0], [10, 0], [10, 23], [0, 23]])
 ELL = np.array([[0, 0], [90, 0], [90, 40], [31, 40], [31, 70], [0, 70]])
 
 
 def listed(placed):
     """Every placement as (child, turn, x, y)."""
-    rows = zip(placed.child.tolist(), placed.turn.tolist(), placed.x.tolist(), placed.y.tolist(), strict=True)
+    rows = zip(
+        placed.child.tolist(),
+        placed.turn.tolist(),
+        placed.x.tolist(),
+        placed.y.tolist(),
+        strict=True,
+    )
     return [(placed.children[c], placed.turns[t], x, y) for c, t, x, y in rows]
 
 
 def expanded(made):
     """Every copy of arrays as (child, turn, x, y)."""
     return [
-        (one.child, one.turn, one.x + i * one.across[0] + j * one.up[0], one.y + i * one.across[1] + j * one.up[1])
+        (
+            one.child,
+            one.turn,
+            one.x + i * one.across[0] + j * one.up[0],
+            one.y + i * one.across[1] + j * one.up[1],
+        )
         for one in made
         for i in range(one.columns)
         for j in range(one.rows)
@@ -34,7 +50,11 @@ def expanded(made):
 
 
 def placements(child, x, y, turn):
-    return Placed(("A", "B"), *(np.asarray(v, np.int32) for v in (child, x, y)), np.asarray(turn, np.uint8))
+    return Placed(
+        ("A", "B"),
+        *(np.asarray(v, np.int32) for v in (child, x, y)),
+        np.asarray(turn, np.uint8),
+    )
 
 
 def sort_key(row):
@@ -44,12 +64,19 @@ def sort_key(row):
 
 @pytest.mark.parametrize("suffix", WRITERS)
 @pytest.mark.parametrize(("child", "turn"), [(0, 1), (0, 0), (1, 2)])
-def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(suffix, child, turn, tmp_path):
-    """Three of one kind alone: as the first cell unturned, by its second turn, or of a later cell."""
+def test_placements_of_one_cell_in_one_turn_are_written_whatever_their_number(
+    suffix, child, turn, tmp_path
+):
+    """Three of one kind alone: as the first cell unturned, by its second turn, or of a
+    later cell.
+    """
     write, read = WRITERS[suffix]
     placed = placements([child] * 3, [5, -7, 130], [11, 4, -60], [turn] * 3)
     cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in placed.children}
-    write(Assembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}), tmp_path / f"a{suffix}")
+    write(
+        Assembly("TOP", cells | {"TOP": CellContent("TOP", placed=placed)}, {}),
+        tmp_path / f"a{suffix}",
+    )
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
     assert sorted(listed(found), key=sort_key) == sorted(listed(placed), key=sort_key)
 
@@ -60,11 +87,25 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
     write, read = WRITERS[suffix]
     turns = (*QUARTERS, *(Turn(0.5 + n / 4) for n in range(300)))
     x = 7 * np.arange(308, dtype=np.int32)
-    placed = Placed(("A",), np.zeros(308, np.int32), x, x[::-1].copy(), np.arange(308, dtype=np.int32), turns)
-    cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP", placed=placed)}
+    placed = Placed(
+        ("A",),
+        np.zeros(308, np.int32),
+        x,
+        x[::-1].copy(),
+        np.arange(308, dtype=np.int32),
+        turns,
+    )
+    cells = {
+        "A": CellContent("A", {(1, 0): [BAR]}),
+        "TOP": CellContent("TOP", placed=placed),
+    }
     write(Assembly("TOP", cells, {}), tmp_path / f"a{suffix}")
     found = read(tmp_path / f"a{suffix}").cells["TOP"].kept()
-    for got, want in zip(sorted(listed(found), key=sort_key), sorted(listed(placed), key=sort_key), strict=True):
+    for got, want in zip(
+        sorted(listed(found), key=sort_key),
+        sorted(listed(placed), key=sort_key),
+        strict=True,
+    ):
         assert got[2:] == want[2:]
         assert got[1].mirrored == want[1].mirrored
         assert got[1].angle_deg == pytest.approx(want[1].angle_deg, abs=1e-9)
@@ -78,19 +119,28 @@ def test_hundreds_of_turns_come_back_each_with_its_own_placement(suffix, tmp_pat
 def test_arrays_and_what_is_left_are_all_copies_and_none_twice(seed, shape, loose):
     rng = np.random.default_rng(seed)
     i, j = (v.ravel() for v in np.meshgrid(np.arange(shape[0]), np.arange(shape[1])))
-    x, y = np.r_[3 + 31 * i, rng.integers(-60, 60, loose)], np.r_[-7 + 43 * j, rng.integers(-9, 9, loose)]
+    x, y = (
+        np.r_[3 + 31 * i, rng.integers(-60, 60, loose)],
+        np.r_[-7 + 43 * j, rng.integers(-9, 9, loose)],
+    )
     child, turn = (np.r_[np.full(len(i), k), rng.integers(0, 2, loose)] for k in (1, 0))
     order = rng.permutation(len(x))
     placed = placements(child[order], x[order], y[order], turn[order])
     made, left = arrays(placed)
-    assert sorted(expanded(made) + listed(left), key=sort_key) == sorted(listed(placed), key=sort_key)
+    assert sorted(expanded(made) + listed(left), key=sort_key) == sorted(
+        listed(placed), key=sort_key
+    )
     assert all(one.count >= 4 for one in made)
 
 
 def test_a_raster_becomes_one_array_however_it_was_listed():
     i, j = (v.ravel() for v in np.meshgrid(np.arange(7), np.arange(5)))
     order = np.random.default_rng(2).permutation(35)
-    made, left = arrays(placements(np.ones(35), (11 - 31 * i)[order], (5 + 43 * j)[order], np.full(35, 6)))
+    made, left = arrays(
+        placements(
+            np.ones(35), (11 - 31 * i)[order], (5 + 43 * j)[order], np.full(35, 6)
+        )
+    )
     assert made == (Copies("B", 11 - 31 * 6, 5, QUARTERS[6], 7, 5, (31, 0), (0, 43)),)
     assert not len(left.child)
 
@@ -129,7 +179,9 @@ def test_every_copy_comes_back(tmp_path, end):
     assert sorted(there, key=sort_key) == sorted(planned, key=sort_key)
     for name in ("A", "B"):
         for layer, shapes in made.cells[name].polygons.items():
-            assert [p.tolist() for p in content.cells[name].polygons[layer]] == [p.tolist() for p in shapes]
+            assert [p.tolist() for p in content.cells[name].polygons[layer]] == [
+                p.tolist() for p in shapes
+            ]
     if end == ".oas":
         assert content.cells["B"].circles == made.cells["B"].circles
         assert content.layer_names == {(1, 0): "pillar"}
@@ -151,10 +203,20 @@ def test_an_independent_reader_finds_every_shape(tmp_path, end):
         polygon = db.Polygon([db.Point(*map(int, p)) for p in shape])
         for name, turn, x, y in planned:
             if name == child:
-                wanted.insert(polygon.transformed(db.ICplxTrans(turn.scale, turn.angle_deg, turn.mirrored, x, y)))
+                wanted.insert(
+                    polygon.transformed(
+                        db.ICplxTrans(turn.scale, turn.angle_deg, turn.mirrored, x, y)
+                    )
+                )
         wanted.merged_semantics = False
-        assert found.count() == wanted.count() == sum(name == child for name, *_ in planned)
-        assert sorted(str(p) for p in found.each()) == sorted(str(p) for p in wanted.each())
+        assert (
+            found.count()
+            == wanted.count()
+            == sum(name == child for name, *_ in planned)
+        )
+        assert sorted(str(p) for p in found.each()) == sorted(
+            str(p) for p in wanted.each()
+        )
 
 
 def test_files_do_not_grow_with_copies(tmp_path):
@@ -170,7 +232,9 @@ def test_files_do_not_grow_with_copies(tmp_path):
 
 def test_what_gdsii_cannot_hold_is_refused_by_name(tmp_path):
     cells = {"A": CellContent("A", {(1, 0): [BAR]}), "TOP": CellContent("TOP")}
-    long = Assembly("TOP", cells, {"TOP": (Copies("A", 0, 0, columns=32768, across=(30, 0)),)})
+    long = Assembly(
+        "TOP", cells, {"TOP": (Copies("A", 0, 0, columns=32768, across=(30, 0)),)}
+    )
     with pytest.raises(ProcessError, match="32768 x 1 copies of A: GDSII holds 32767"):
         gdsii_assemble.write(long, tmp_path / "m.gds")
     oasis_assemble.write(long, tmp_path / "m.oas")

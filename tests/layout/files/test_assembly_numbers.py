@@ -1,4 +1,6 @@
-"""Arrays found among placements by hand: runs, what is too short for one, and lattices in other numbers."""
+"""Arrays found among placements by hand: runs, what is too short for one, and lattices
+in other numbers.
+"""
 
 import numpy as np
 import pytest
@@ -17,7 +19,9 @@ def placed(*rows, children=("A", "B", "C")):
 
 def told(*rows):
     made, left = arrays(placed(*rows))
-    loose = zip(*(v.tolist() for v in (left.child, left.x, left.y, left.turn)), strict=True)
+    loose = zip(
+        *(v.tolist() for v in (left.child, left.x, left.y, left.turn)), strict=True
+    )
     return sorted(made, key=lambda c: (c.child, c.x, c.y)), sorted(loose)
 
 
@@ -26,17 +30,28 @@ def row(child, x, y, turn, count, step):
 
 
 def test_copies_stand_at_their_steps_row_by_row():
-    one = Copies("A", 5, -7, QUARTERS[3], columns=3, rows=2, across=(10, 1), up=(-2, 100))
+    one = Copies(
+        "A", 5, -7, QUARTERS[3], columns=3, rows=2, across=(10, 1), up=(-2, 100)
+    )
     assert one.count == 6
     x, y = one.places()
-    assert (x.tolist(), y.tolist()) == ([5, 15, 25, 3, 13, 23], [-7, -6, -5, 93, 94, 95])
+    assert (x.tolist(), y.tolist()) == (
+        [5, 15, 25, 3, 13, 23],
+        [-7, -6, -5, 93, 94, 95],
+    )
     assert [v.tolist() for v in Copies("A", 5, -7).places()] == [[5], [-7]]
 
 
 def test_four_in_a_row_or_a_column_are_an_array_and_three_are_not():
-    assert told(*row(1, -40, 9, 6, 4, 30)) == ([Copies("B", -40, 9, Turn(180.0, True), 4, 1, (30, 0), (0, 0))], [])
+    assert told(*row(1, -40, 9, 6, 4, 30)) == (
+        [Copies("B", -40, 9, Turn(180.0, True), 4, 1, (30, 0), (0, 0))],
+        [],
+    )
     upright = [(2, 9, -40 + 25 * k, 8) for k in range(4)]
-    assert told(*upright) == ([Copies("C", 9, -40, Turn(30.0), 1, 4, (0, 0), (0, 25))], [])
+    assert told(*upright) == (
+        [Copies("C", 9, -40, Turn(30.0), 1, 4, (0, 0), (0, 25))],
+        [],
+    )
     three = row(1, -40, 9, 6, 3, 30)
     assert told(*three) == ([], sorted(three))
     loose = (0, 500, 600, 0)
@@ -60,7 +75,12 @@ def test_equal_rows_at_equal_distances_are_one_array():
 
 def test_copies_of_another_cell_turn_or_line_are_in_no_run():
     """Three each of what is alike: B's at two turns, A's on two lines."""
-    rows = [*row(1, 0, 5, 0, 3, 30), *row(1, 90, 5, 1, 3, 30), *row(0, 0, 5, 0, 3, 30), *row(0, 90, 6, 0, 3, 30)]
+    rows = [
+        *row(1, 0, 5, 0, 3, 30),
+        *row(1, 90, 5, 1, 3, 30),
+        *row(0, 0, 5, 0, 3, 30),
+        *row(0, 90, 6, 0, 3, 30),
+    ]
     made, left = told(*rows)
     assert (made, left) == ([], sorted(rows))
 
@@ -69,14 +89,21 @@ def test_a_run_ends_where_its_step_changes_and_copies_on_each_other_are_left():
     """Steps of 10, then 25 from the fifth on: the fifth is of the first run alone."""
     some = [*row(0, 0, 0, 0, 5, 10), *row(0, 65, 0, 0, 4, 25)]
     assert told(*some) == (
-        [Copies("A", 0, 0, QUARTERS[0], 5, 1, (10, 0), (0, 0)), Copies("A", 65, 0, QUARTERS[0], 4, 1, (25, 0), (0, 0))],
+        [
+            Copies("A", 0, 0, QUARTERS[0], 5, 1, (10, 0), (0, 0)),
+            Copies("A", 65, 0, QUARTERS[0], 4, 1, (25, 0), (0, 0)),
+        ],
         [],
     )
     twice = [(0, 3, 4, 0)] * 5
     assert told(*twice) == ([], twice)
     double = [*row(0, 0, 0, 0, 4, 10), (0, 20, 0, 0)]  # one of four twice
     made, left = told(*double)
-    places = [(0, x, y, 0) for c in made for x, y in zip(*(v.tolist() for v in c.places()), strict=True)]
+    places = [
+        (0, x, y, 0)
+        for c in made
+        for x, y in zip(*(v.tolist() for v in c.places()), strict=True)
+    ]
     assert sorted([*places, *left]) == sorted(double)
 
 
@@ -96,7 +123,9 @@ BLOCK = np.array([[1, 0, 3], [2, 3, 3]], np.uint8)
 
 
 def sites():
-    lattice = Lattice("OWN", 2, 3, 410, -7, 9, lambda a, b: BLOCK[a:b], BLOCK, row_pitch=300)
+    lattice = Lattice(
+        "OWN", 2, 3, 410, -7, 9, lambda a, b: BLOCK[a:b], BLOCK, row_pitch=300
+    )
     return Sites(lattice, ("X", "", "Z"))
 
 

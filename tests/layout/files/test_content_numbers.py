@@ -1,4 +1,6 @@
-"""Turns of placements by plain trigonometry, hierarchies taken apart by hand, placements kept up to a number."""
+"""Turns of placements by plain trigonometry, hierarchies taken apart by hand,
+placements kept up to a number.
+"""
 
 import math
 
@@ -6,7 +8,14 @@ import numpy as np
 import pytest
 
 from layout.files import content
-from layout.files.content import QUARTERS, CellContent, Gathered, MaskContent, Placed, Turn
+from layout.files.content import (
+    QUARTERS,
+    CellContent,
+    Gathered,
+    MaskContent,
+    Placed,
+    Turn,
+)
 from metalens.ground.errors import MaskFileError
 
 X, Y = np.array([1000, -370, 12]), np.array([300, 45, -811])
@@ -14,7 +23,11 @@ X, Y = np.array([1000, -370, 12]), np.array([300, 45, -811])
 
 def turned(x, y, turn):
     """Mirror at the x axis, then a complex factor."""
-    z = turn.scale * np.exp(1j * math.radians(turn.angle_deg)) * (x + 1j * (-y if turn.mirrored else y))
+    z = (
+        turn.scale
+        * np.exp(1j * math.radians(turn.angle_deg))
+        * (x + 1j * (-y if turn.mirrored else y))
+    )
     return z.real, z.imag
 
 
@@ -44,7 +57,12 @@ def test_quarters_are_exact_and_numbered_by_their_turn_and_their_mirror(k):
 
 
 def test_other_turns_and_scales_go_to_the_nearest_whole_unit():
-    for turn in (Turn(30.0, True, 2.5), Turn(205.0), Turn(90.0, False, 0.5), Turn(-47.0, True)):
+    for turn in (
+        Turn(30.0, True, 2.5),
+        Turn(205.0),
+        Turn(90.0, False, 0.5),
+        Turn(-47.0, True),
+    ):
         assert points(turn) == [[round(v) for v in some] for some in turned(X, Y, turn)]
         assert not turn.quarter
     assert points(Turn(450.0)) == points(QUARTERS[1])
@@ -52,7 +70,9 @@ def test_other_turns_and_scales_go_to_the_nearest_whole_unit():
     assert Turn(-180.0).quarter
 
 
-@pytest.mark.parametrize("outer", [Turn(30.0, True, 2.5), Turn(205.0, False, 0.4), QUARTERS[3], QUARTERS[6]])
+@pytest.mark.parametrize(
+    "outer", [Turn(30.0, True, 2.5), Turn(205.0, False, 0.4), QUARTERS[3], QUARTERS[6]]
+)
 def test_turns_follow_each_other_and_are_undone(outer):
     for inner in (Turn(77.0, False, 1.25), Turn(310.0, True, 3.0)):
         both = outer.after(inner)
@@ -75,7 +95,9 @@ def placed(children, *rows, turns=QUARTERS):
 @pytest.mark.parametrize("at_once", [1 << 20, 3])
 def test_placements_are_counted_by_child_and_turn(monkeypatch, at_once):
     monkeypatch.setattr(content, "_AT_ONCE", at_once)
-    some = placed(("A", "B", "C"), *((0, 0, 0, 3),) * 4, (1, 0, 0, 7), (1, 0, 0, 0), (1, 5, 5, 0))
+    some = placed(
+        ("A", "B", "C"), *((0, 0, 0, 3),) * 4, (1, 0, 0, 7), (1, 0, 0, 0), (1, 5, 5, 0)
+    )
     want = np.zeros((3, 8), int)
     want[0, 3], want[1, 7], want[1, 0] = 4, 1, 2
     assert some.counts().tolist() == want.tolist()
@@ -86,11 +108,16 @@ SHAPE = np.array([[0, 0], [5, 0], [0, 7]])
 
 
 def test_a_cell_is_taken_for_its_shapes_and_an_empty_one_for_one():
-    drawn = CellContent("A", {(1, 0): [SHAPE] * 3, (2, 0): [SHAPE]}, {(1, 0): [(0, 0, 3)] * 2})
+    drawn = CellContent(
+        "A", {(1, 0): [SHAPE] * 3, (2, 0): [SHAPE]}, {(1, 0): [(0, 0, 3)] * 2}
+    )
     assert drawn.taken == 6
     assert (CellContent("B").taken, CellContent("B").texts) == (1, 0)
     nothing = CellContent("B").placed
-    assert [len(v) for v in (nothing.child, nothing.x, nothing.y, nothing.turn, nothing.children)] == [0] * 5
+    assert [
+        len(v)
+        for v in (nothing.child, nothing.x, nothing.y, nothing.turn, nothing.children)
+    ] == [0] * 5
     assert CellContent("C", placed=placed(("A",))).taken == 0
 
 
@@ -98,13 +125,25 @@ ODD = (*QUARTERS, Turn(30.0, True, 2.0))
 
 
 def nested():
-    """TOP places ROW twice (once turned by 30 degrees and doubled), and the leaf A between them."""
+    """TOP places ROW twice (once turned by 30 degrees and doubled), and the leaf A
+    between them.
+    """
     cells = {
         "A": CellContent("A", {(1, 0): [SHAPE]}),
-        "ROW": CellContent("ROW", placed=placed(("B", "A"), (1, 100, 0, 0), (0, 0, 70, 5), (1, -30, 40, 6))),
+        "ROW": CellContent(
+            "ROW",
+            placed=placed(("B", "A"), (1, 100, 0, 0), (0, 0, 70, 5), (1, -30, 40, 6)),
+        ),
         "B": CellContent("B", {(1, 0): [SHAPE]}),
         "TOP": CellContent(
-            "TOP", placed=placed(("A", "ROW"), (1, 900, -70, 7), (0, 11, 13, 1), (1, -500, 200, 8), turns=ODD)
+            "TOP",
+            placed=placed(
+                ("A", "ROW"),
+                (1, 900, -70, 7),
+                (0, 11, 13, 1),
+                (1, -500, 200, 8),
+                turns=ODD,
+            ),
         ),
         "ALONE": CellContent("ALONE"),
     }
@@ -112,7 +151,9 @@ def nested():
 
 
 def test_leaves_of_a_hierarchy_stand_where_its_turns_take_them():
-    """QUARTERS[7] mirrors at x and turns by 270: (x, y) -> (-y, -x). The ninth mirrors, turns by 30 and doubles."""
+    """QUARTERS[7] mirrors at x and turns by 270: (x, y) -> (-y, -x). The ninth mirrors,
+    turns by 30 and doubles.
+    """
     mask = nested()
     assert mask.tops == ["TOP", "ALONE"]
     c, s = 2 * math.cos(math.pi / 6), 1.0
@@ -123,18 +164,31 @@ def test_leaves_of_a_hierarchy_stand_where_its_turns_take_them():
     want_a = [(900, -170), (860, -40), ninth(100, 0), ninth(-30, 40), (11, 13)]
     want_b = [(830, -70), ninth(0, 70)]
     found = mask.sites("TOP")
-    assert {name: set(zip(x.tolist(), y.tolist(), strict=True)) for name, (x, y) in found.items()} == {
+    assert {
+        name: set(zip(x.tolist(), y.tolist(), strict=True))
+        for name, (x, y) in found.items()
+    } == {
         "A": set(want_a),
         "B": set(want_b),
     }
     assert mask.counts("TOP") == {"A": 5, "B": 2}
     ways = {}
     for leaf in mask.leaves("TOP"):
-        for child, x, y, turn in zip(leaf.child, leaf.x, leaf.y, leaf.turn, strict=True):
+        for child, x, y, turn in zip(
+            leaf.child, leaf.x, leaf.y, leaf.turn, strict=True
+        ):
             this = leaf.turns[turn]
-            ways[leaf.children[child], int(x), int(y)] = (this.angle_deg, this.mirrored, this.scale)
+            ways[leaf.children[child], int(x), int(y)] = (
+                this.angle_deg,
+                this.mirrored,
+                this.scale,
+            )
     assert ways["A", 900, -170] == (270.0, True, 1.0)
-    assert ways["A", 860, -40] == (90.0, False, 1.0)  # 180 after a mirror, then a mirror and 270: 270 - 180
+    assert ways["A", 860, -40] == (
+        90.0,
+        False,
+        1.0,
+    )  # 180 after a mirror, then a mirror and 270: 270 - 180
     assert ways["B", 830, -70] == (180.0, False, 1.0)
     assert ways["A", *ninth(-30, 40)] == (210.0, False, 2.0)
     assert ways["A", 11, 13] == (90.0, False, 1.0)
@@ -142,7 +196,9 @@ def test_leaves_of_a_hierarchy_stand_where_its_turns_take_them():
 
 def test_a_hierarchy_without_end_or_with_a_hole_is_refused():
     cells = {"A": CellContent("A", placed=placed(("B",), (0, 0, 0, 0)))}
-    with pytest.raises(MaskFileError, match="cell 'B' is placed, but the file does not hold it"):
+    with pytest.raises(
+        MaskFileError, match="cell 'B' is placed, but the file does not hold it"
+    ):
         list(MaskContent("G", 1.0, cells).leaves("A"))
     cells["B"] = CellContent("B", placed=placed(("A",), (0, 0, 0, 0)))
     with pytest.raises(MaskFileError, match="cell 'A' places itself through A > B"):
@@ -151,7 +207,10 @@ def test_a_hierarchy_without_end_or_with_a_hole_is_refused():
 
 @pytest.mark.parametrize(("depth", "fits"), [(65, True), (66, False)])
 def test_sixty_five_cells_may_lie_in_each_other(depth, fits):
-    cells = {f"C{k}": CellContent(f"C{k}", placed=placed((f"C{k + 1}",), (0, 3, 1, 0))) for k in range(depth)}
+    cells = {
+        f"C{k}": CellContent(f"C{k}", placed=placed((f"C{k + 1}",), (0, 3, 1, 0)))
+        for k in range(depth)
+    }
     cells[f"C{depth}"] = CellContent(f"C{depth}")
     mask = MaskContent("G", 1.0, cells)
     if fits:
@@ -161,7 +220,10 @@ def test_sixty_five_cells_may_lie_in_each_other(depth, fits):
             mask.sites("C0")
 
 
-@pytest.mark.parametrize(("x", "fits"), [(2**31 - 1, True), (2**31, False), (-(2**31) + 1, True), (-(2**31), False)])
+@pytest.mark.parametrize(
+    ("x", "fits"),
+    [(2**31 - 1, True), (2**31, False), (-(2**31) + 1, True), (-(2**31), False)],
+)
 def test_nested_places_stay_within_32_bits(x, fits):
     inner = x // 2
     cells = {
@@ -173,7 +235,10 @@ def test_nested_places_stay_within_32_bits(x, fits):
     if fits:
         assert mask.sites("A")["C"][0].tolist() == [x]
     else:
-        with pytest.raises(MaskFileError, match=f"is placed {abs(x)} units from the origin, beyond 32 bits"):
+        with pytest.raises(
+            MaskFileError,
+            match=f"is placed {abs(x)} units from the origin, beyond 32 bits",
+        ):
             mask.sites("A")
 
 
@@ -205,10 +270,18 @@ def test_what_is_kept_comes_back_in_its_order(monkeypatch, large):
         held.add(*some(first, count))
         first += count
         if large == 5:
-            assert sum(len(part[0]) for part in held.parts[held.merged :]) == held.small < 5
+            assert (
+                sum(len(part[0]) for part in held.parts[held.merged :])
+                == held.small
+                < 5
+            )
     assert (held.count, held.digest) == (22, None)
     if large == 5:
-        assert [len(part[0]) for part in held.parts] == [8, 13, 1]  # 3 + 1 + 4, then 2 + 2 + 9
+        assert [len(part[0]) for part in held.parts] == [
+            8,
+            13,
+            1,
+        ]  # 3 + 1 + 4, then 2 + 2 + 9
     assert [v.tolist() for v in held.columns()] == [v.tolist() for v in some(0, 22)]
     assert held.parts == []
 
@@ -220,9 +293,16 @@ def test_as_many_are_kept_as_was_said_and_none_of_more():
     assert (held.count, len(held.parts), held.digest) == (7, 2, None)
     six = Gathered(keep=6)
     for _ in range(3):
-        six.add(np.array([2, 5]), np.array([11, -3]), np.array([7, 1]), np.array([0, 3]))
+        six.add(
+            np.array([2, 5]), np.array([11, -3]), np.array([7, 1]), np.array([0, 3])
+        )
     assert (six.digest, six.count) == (None, 6)
     six.add(np.array([5]), np.array([1]), np.array([-9]), np.array([0]))
     assert (six.count, six.parts) == (7, [])
     sums = six.digest.of(np.array([2, 5]))
-    assert [v.tolist() for v in (sums.count, sums.x, sums.y, sums.turned)] == [[3, 4], [33, -8], [21, -6], [0, 3]]
+    assert [v.tolist() for v in (sums.count, sums.x, sums.y, sums.turned)] == [
+        [3, 4],
+        [33, -8],
+        [21, -6],
+        [0, 3],
+    ]

@@ -1,4 +1,6 @@
-"""Sums of placements: the same for the same places in any order, different for any one change, in both formats."""
+"""Sums of placements: the same for the same places in any order, different for any one
+change, in both formats.
+"""
 
 import dataclasses
 
@@ -24,14 +26,18 @@ def splitmix(x, y):
     return z ^ z >> 31
 
 
-NUMBERS = st.integers(-7, 9) | st.sampled_from([-4001, -129, 127, 128, 129, 9003])  # there is room for 127 at first
+NUMBERS = st.integers(-7, 9) | st.sampled_from(
+    [-4001, -129, 127, 128, 129, 9003]
+)  # there is room for 127 at first
 PLACES = st.integers(-(2**31), 2**31 - 1)
 
 
 @given(st.lists(st.tuples(NUMBERS, PLACES, PLACES)))
 def test_sums_are_those_of_plain_integers_in_any_order(places):
     child, x, y = (np.array([p[k] for p in places], np.int32) for k in range(3))
-    turn = (np.arange(len(places)) % 11).astype(np.uint8)  # 8 and beyond are no quarter turns
+    turn = (np.arange(len(places)) % 11).astype(
+        np.uint8
+    )  # 8 and beyond are no quarter turns
     forward, back = Digest(), Digest()
     forward.take(child, x, y, turn)
     for n in reversed(range(len(places))):
@@ -40,10 +46,22 @@ def test_sums_are_those_of_plain_integers_in_any_order(places):
         numbers = digest.children
         assert sorted(numbers.tolist()) == sorted({p[0] for p in places})
         for k, *found in zip(numbers.tolist(), *digest.of(numbers), strict=True):
-            mine = [(a, b, 2 * min(n % 11, 8) + 1) for n, (c, a, b) in enumerate(places) if c == k]
+            mine = [
+                (a, b, 2 * min(n % 11, 8) + 1)
+                for n, (c, a, b) in enumerate(places)
+                if c == k
+            ]
             turned = int(((turn != 0) & (child == k)).sum())
-            want = [len(mine), sum(a for a, _, _ in mine), sum(b for _, b, _ in mine), turned]
-            assert [int(f) for f in found] == [*want, sum(splitmix(a, b) * w for a, b, w in mine) % 2**64]
+            want = [
+                len(mine),
+                sum(a for a, _, _ in mine),
+                sum(b for _, b, _ in mine),
+                turned,
+            ]
+            assert [int(f) for f in found] == [
+                *want,
+                sum(splitmix(a, b) * w for a, b, w in mine) % 2**64,
+            ]
 
 
 def test_no_more_is_kept_than_was_allowed():
@@ -66,7 +84,12 @@ def both(request, tmp_path):
         if request.param == "gds":
             layout.write_gdsii(plan, path)
             return layout.read_gdsii(path, keep=50)
-        layout.write_oasis(plan, path, fold=False, form="reader" if request.param == "reader" else "small")
+        layout.write_oasis(
+            plan,
+            path,
+            fold=False,
+            form="reader" if request.param == "reader" else "small",
+        )
         return layout.read_oasis(path, keep=50)
 
     return again
@@ -74,7 +97,13 @@ def both(request, tmp_path):
 
 def changed(plan, sites):
     lattice = plan.lattices[0]
-    return plan.replace(lattices=(Lattice.of("LENS", sites, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0),))
+    return plan.replace(
+        lattices=(
+            Lattice.of(
+                "LENS", sites, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0
+            ),
+        )
+    )
 
 
 def test_a_file_as_planned_agrees_and_every_change_is_found(plan, both):
@@ -88,7 +117,9 @@ def test_a_file_as_planned_agrees_and_every_change_is_found(plan, both):
     fewer = sites.copy()
     fewer[row, column] = 0
     lattice = plan.lattices[0]
-    place = f"({lattice.x0 + column * lattice.pitch}, {lattice.y0 - row * lattice.pitch})"
+    place = (
+        f"({lattice.x0 + column * lattice.pitch}, {lattice.y0 - row * lattice.pitch})"
+    )
     (text,) = layout.compare(plan, both(changed(plan, fewer))).differences
     assert "one pillar is missing" in text
     assert place in text
@@ -106,7 +137,9 @@ def test_a_file_as_planned_agrees_and_every_change_is_found(plan, both):
 def test_turned_pillars_are_found(plan, both):
     read = both(plan)
     cell = read.cells["LENS"]
-    turned = dataclasses.replace(cell.sums, turned=cell.sums.turned + np.arange(len(cell.sums.turned)) // 6)
+    turned = dataclasses.replace(
+        cell.sums, turned=cell.sums.turned + np.arange(len(cell.sums.turned)) // 6
+    )
     read.cells["LENS"] = dataclasses.replace(cell, sums=turned)
     assert any("turned" in text for text in layout.compare(plan, read).differences)
 

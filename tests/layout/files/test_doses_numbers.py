@@ -1,4 +1,6 @@
-"""The dose table: columns of numbers as pattern preparation reads them, and what it leaves out."""
+"""The dose table: columns of numbers as pattern preparation reads them, and what it
+leaves out.
+"""
 
 from types import SimpleNamespace
 
@@ -19,12 +21,19 @@ TABLE = """layer,datatype,relative_dose,dose_uC_cm2,step,name
 
 
 def test_the_table_has_six_decimals_of_doses_rising_by_layer(tmp_path):
-    """1.2345679 x 270 is 333.333; a layer is of the aperture by its number, whatever its datatype."""
+    """1.2345679 x 270 is 333.333; a layer is of the aperture by its number, whatever
+    its datatype.
+    """
     made = {(22, 1): 2.0, (1, 0): 1.2345679, (22, 0): 1.5, (2, 7): 0.04}
     plan = SimpleNamespace(doses=made, layer_names={(1, 0): "thin", (22, 0): "opening"})
     doses.write(plan, PROCESS, tmp_path / "doses.csv")
     assert (tmp_path / "doses.csv").read_text() == TABLE
-    assert doses.read(tmp_path / "doses.csv") == {(1, 0): 1.234568, (2, 7): 0.04, (22, 0): 1.5, (22, 1): 2.0}
+    assert doses.read(tmp_path / "doses.csv") == {
+        (1, 0): 1.234568,
+        (2, 7): 0.04,
+        (22, 0): 1.5,
+        (22, 1): 2.0,
+    }
     assert doses.HEAD[:3] == ("layer", "datatype", "relative_dose")
 
 
@@ -36,7 +45,10 @@ def test_the_table_has_six_decimals_of_doses_rising_by_layer(tmp_path):
         ("1,0,-1.5\n", "line 2: "),
         ("1,0,1e6\n", "line 2: "),
         ("1,0,nan\n", "line 2: "),
-        ("1,0,1.5\n1,1,1.5\n1,x,1.6\n", "line 4: need columns layer, datatype, relative_dose of numbers"),
+        (
+            "1,0,1.5\n1,1,1.5\n1,x,1.6\n",
+            "line 4: need columns layer, datatype, relative_dose of numbers",
+        ),
     ],
 )
 def test_a_line_that_is_no_dose_is_refused_by_number(tmp_path, lines, words):
@@ -46,7 +58,9 @@ def test_a_line_that_is_no_dose_is_refused_by_number(tmp_path, lines, words):
 
 
 def test_doses_just_within_the_limits_are_read(tmp_path):
-    (tmp_path / "d.csv").write_text("layer,datatype,relative_dose\n0,3,999999\n5,0,1e-9\n")
+    (tmp_path / "d.csv").write_text(
+        "layer,datatype,relative_dose\n0,3,999999\n5,0,1e-9\n"
+    )
     assert doses.read(tmp_path / "d.csv") == {(0, 3): 999999.0, (5, 0): 1e-9}
 
 
@@ -54,8 +68,19 @@ def test_layers_without_a_dose_are_those_that_are_exposed_and_not_in_the_table()
     shape = np.array([[0, 0], [5, 0], [0, 7]])
     cells = {
         "A": CellContent("A", {(1, 0): [shape], (7, 0): [shape], (40, 2): [shape]}),
-        "B": CellContent("B", {(10, 0): [shape], (9, 9): [shape]}, {(3, 1): [(0, 0, 4)]}),
+        "B": CellContent(
+            "B", {(10, 0): [shape], (9, 9): [shape]}, {(3, 1): [(0, 0, 4)]}
+        ),
     }
     content = MaskContent("GDSII", 1.0, cells)
-    assert doses.missing(content, {(1, 0): 1.0, (50, 0): 1.0}, Process()) == ((3, 1), (9, 9), (40, 2))
-    assert doses.missing(content, dict.fromkeys([(1, 0), (3, 1), (9, 9), (40, 2)], 1.0), Process()) == ()
+    assert doses.missing(content, {(1, 0): 1.0, (50, 0): 1.0}, Process()) == (
+        (3, 1),
+        (9, 9),
+        (40, 2),
+    )
+    assert (
+        doses.missing(
+            content, dict.fromkeys([(1, 0), (3, 1), (9, 9), (40, 2)], 1.0), Process()
+        )
+        == ()
+    )

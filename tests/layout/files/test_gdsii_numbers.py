@@ -1,4 +1,6 @@
-"""GDSII bytes against the Stream Format Manual 6.0: kinds of records, excess-64 numbers, both units."""
+"""GDSII bytes against the Stream Format Manual 6.0: kinds of records, excess-64
+numbers, both units.
+"""
 
 import struct
 from dataclasses import replace
@@ -29,7 +31,9 @@ REALS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "code"), list(zip(RECORDS[::2], RECORDS[1::2], strict=True)))
+@pytest.mark.parametrize(
+    ("name", "code"), list(zip(RECORDS[::2], RECORDS[1::2], strict=True))
+)
 def test_records_are_those_of_the_manual(name, code):
     kind = getattr(gds, name)
     assert f"{kind:02X}{gds.DATA[kind]:02X}" == code
@@ -58,6 +62,8 @@ def test_a_unit_is_told_in_micrometres_and_in_metres(plan, tmp_path, unit_nm):
     data = (tmp_path / "m.gds").read_bytes()
     at = data.index(bytes.fromhex("0014 0305"))
     user, metres = (gds.to_float(data[at + k : at + k + 8]) for k in (4, 12))
-    assert user == pytest.approx(unit_nm * 1e-3, rel=1e-15)  # user units are micrometres
+    assert user == pytest.approx(
+        unit_nm * 1e-3, rel=1e-15
+    )  # user units are micrometres
     assert metres == pytest.approx(unit_nm * 1e-9, rel=1e-15)
     assert struct.unpack(">h", data[4:6]) == (600,)

@@ -1,4 +1,6 @@
-"""GDSII and OASIS: what is written reads back the same, here and in KLayout; limits of the formats are refused."""
+"""GDSII and OASIS: what is written reads back the same, here and in KLayout; limits of
+the formats are refused.
+"""
 
 import dataclasses
 import errno
@@ -19,18 +21,25 @@ from layout.oasis import bytes as oasis_bytes
 from layout.oasis import write as oasis_write
 from metalens.ground.errors import MaskFileError, ProcessError
 
-FORMS = [("gds", {}), *(("oas", {"form": form}) for form in ("small", "fast", "reader"))]
+FORMS = [
+    ("gds", {}),
+    *(("oas", {"form": form}) for form in ("small", "fast", "reader")),
+]
 FORMS.append(("oas", {"form": "small", "circles": True}))
 READ = {"gds": layout.read_gdsii, "oas": layout.read_oasis}
 
 
 def write(plan, path, options):
-    (layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis)(plan, path, **options)
+    (layout.write_gdsii if path.suffix == ".gds" else layout.write_oasis)(
+        plan, path, **options
+    )
     return path
 
 
 def klayout_sites(path, plan):
-    """{cell: sorted (x, y)} of all placements of pillar cells below the top, as KLayout reads them."""
+    """{cell: sorted (x, y)} of all placements of pillar cells below the top, as KLayout
+    reads them.
+    """
     db = pytest.importorskip("klayout.db")
     read = db.Layout()
     read.read(str(path))
@@ -44,7 +53,9 @@ def klayout_sites(path, plan):
         if name in pillars:
             for step in each_copy(walk.current_inst_element()):
                 move = walk.trans() * step
-                found.setdefault(name, []).append((round(move.disp.x), round(move.disp.y)))
+                found.setdefault(name, []).append(
+                    (round(move.disp.x), round(move.disp.y))
+                )
         walk.next()
     return {name: sorted(places) for name, places in found.items()}, read
 
@@ -58,19 +69,27 @@ def planned_sites(plan):
     for lattice in plan.lattices:
         for row, column in np.argwhere(lattice.whole() > 0):
             name = plan.classes[lattice.whole()[row, column] - 1].name
-            place = (lattice.x0 + int(column) * lattice.pitch, lattice.y0 - int(row) * lattice.pitch)
+            place = (
+                lattice.x0 + int(column) * lattice.pitch,
+                lattice.y0 - int(row) * lattice.pitch,
+            )
             found.setdefault(name, []).append(place)
     return {name: sorted(places) for name, places in found.items()}
 
 
 @pytest.mark.parametrize(("suffix", "options"), FORMS)
-def test_a_mask_reads_back_as_planned_and_klayout_agrees(plan, tmp_path, suffix, options):
+def test_a_mask_reads_back_as_planned_and_klayout_agrees(
+    plan, tmp_path, suffix, options
+):
     path = write(plan, tmp_path / f"m.{suffix}", options)
     content = READ[suffix](path)
     outcome = layout.compare(plan, content)
     assert outcome.ok, outcome.differences
     assert outcome.pillars == np.count_nonzero(plan.lattices[0].whole())
-    own = {k: sorted(zip(x.tolist(), y.tolist(), strict=True)) for k, (x, y) in content.sites("LENS").items()}
+    own = {
+        k: sorted(zip(x.tolist(), y.tolist(), strict=True))
+        for k, (x, y) in content.sites("LENS").items()
+    }
     assert own == planned_sites(plan)
     seen, read = klayout_sites(path, plan)
     assert seen == planned_sites(plan)
@@ -84,7 +103,11 @@ def test_a_mask_reads_back_as_planned_and_klayout_agrees(plan, tmp_path, suffix,
 
 @settings(max_examples=40)
 @given(
-    classes=arrays.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 3)),
+    classes=arrays.arrays(
+        np.uint8,
+        st.tuples(st.integers(1, 9), st.integers(1, 9)),
+        elements=st.integers(0, 3),
+    ),
     form=st.sampled_from(FORMS),
 )
 def test_any_small_map_survives_the_round_trip(make_plan, tmp_path, classes, form):
@@ -92,13 +115,19 @@ def test_any_small_map_survives_the_round_trip(make_plan, tmp_path, classes, for
     path = write(plan, tmp_path / f"m.{form[0]}", form[1])
     if classes.any():
         assert layout.compare(plan, READ[form[0]](path)).ok
-    assert READ[form[0]](path).counts("LENS") == {k: len(v) for k, v in planned_sites(plan).items()}
+    assert READ[form[0]](path).counts("LENS") == {
+        k: len(v) for k, v in planned_sites(plan).items()
+    }
 
 
 @pytest.mark.parametrize("size", [4, 5, 8, 9, 40, 41])
-def test_a_symmetric_lens_is_stored_as_an_eighth_and_klayout_sees_it_whole(make_plan, tmp_path, size):
+def test_a_symmetric_lens_is_stored_as_an_eighth_and_klayout_sees_it_whole(
+    make_plan, tmp_path, size
+):
     axis = np.arange(size) - (size - 1) / 2
-    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(np.uint8)
+    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(
+        np.uint8
+    )
     classes[axis**2 + axis[:, None] ** 2 > (size / 2) ** 2] = 0
     plan = make_plan(classes)
     half = (size - 1) * 200
@@ -106,7 +135,11 @@ def test_a_symmetric_lens_is_stored_as_an_eighth_and_klayout_sees_it_whole(make_
     plan = plan.replace(lattices=(lattice,))
     path = write(plan, tmp_path / "m.oas", {})
     content = layout.read_oasis(path)
-    stored = sum(len(content.cells[name].placed.child) for name in content.cells if name.startswith("LENS_"))
+    stored = sum(
+        len(content.cells[name].placed.child)
+        for name in content.cells
+        if name.startswith("LENS_")
+    )
     assert stored < np.count_nonzero(classes) * (0.55 if size < 10 else 0.2)
     assert layout.compare(plan, content).ok
     assert klayout_sites(path, plan)[0] == planned_sites(plan)
@@ -119,9 +152,13 @@ def test_an_eighth_too_large_to_keep_is_compared_by_its_sums(make_plan, tmp_path
 
     def planned(classes):
         plan = make_plan(classes)
-        return plan.replace(lattices=(dataclasses.replace(plan.lattices[0], x0=-half, y0=half),))
+        return plan.replace(
+            lattices=(dataclasses.replace(plan.lattices[0], x0=-half, y0=half),)
+        )
 
-    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(np.uint8)
+    classes = (1 + np.round(axis**2 + axis[:, None] ** 2).astype(int) % 5).astype(
+        np.uint8
+    )
     path = write(planned(classes), tmp_path / "m.oas", {})
     content = layout.read_oasis(path, keep=30)
     assert content.cells["LENS_8"].sums is not None  # about 170 pillars
@@ -133,9 +170,15 @@ def test_an_eighth_too_large_to_keep_is_compared_by_its_sums(make_plan, tmp_path
             a[3, 9] = 1 + a[3, 9] % 5
     wrong = layout.compare(planned(other), content).differences
     assert any("LENS_8: class" in text for text in wrong), wrong
-    moved = dataclasses.replace(content.cells["LENS"].placed, turn=content.cells["LENS"].placed.turn * 0)
-    cells = content.cells | {"LENS": dataclasses.replace(content.cells["LENS"], placed=moved)}
-    assert not layout.compare(planned(classes), dataclasses.replace(content, cells=cells)).ok
+    moved = dataclasses.replace(
+        content.cells["LENS"].placed, turn=content.cells["LENS"].placed.turn * 0
+    )
+    cells = content.cells | {
+        "LENS": dataclasses.replace(content.cells["LENS"], placed=moved)
+    }
+    assert not layout.compare(
+        planned(classes), dataclasses.replace(content, cells=cells)
+    ).ok
 
 
 def test_one_broken_symmetry_is_not_folded(make_plan):
@@ -149,12 +192,16 @@ def test_one_broken_symmetry_is_not_folded(make_plan):
 
 @pytest.mark.parametrize(("suffix", "options"), FORMS)
 def test_same_plan_gives_same_bytes(plan, tmp_path, suffix, options):
-    first, second = (write(plan, tmp_path / f"{n}.{suffix}", options).read_bytes() for n in "ab")
+    first, second = (
+        write(plan, tmp_path / f"{n}.{suffix}", options).read_bytes() for n in "ab"
+    )
     assert hashlib.sha256(first).digest() == hashlib.sha256(second).digest()
 
 
 @pytest.mark.parametrize(("suffix", "options"), FORMS)
-def test_row_blocks_give_the_same_file_as_the_whole_map(make_plan, tmp_path, suffix, options):
+def test_row_blocks_give_the_same_file_as_the_whole_map(
+    make_plan, tmp_path, suffix, options
+):
     classes = np.random.default_rng(1).integers(0, 8, (1100, 130)).astype(np.uint8)
     plan = make_plan(classes)
     whole = plan.lattices[0]
@@ -164,9 +211,13 @@ def test_row_blocks_give_the_same_file_as_the_whole_map(make_plan, tmp_path, suf
         calls.append((first, end))
         return classes[first:end].copy()
 
-    streamed = Lattice(whole.name, whole.rows, whole.columns, whole.pitch, whole.x0, whole.y0, rows)
+    streamed = Lattice(
+        whole.name, whole.rows, whole.columns, whole.pitch, whole.x0, whole.y0, rows
+    )
     one = write(plan, tmp_path / f"a.{suffix}", options).read_bytes()
-    two = write(plan.replace(lattices=(streamed,)), tmp_path / f"b.{suffix}", options).read_bytes()
+    two = write(
+        plan.replace(lattices=(streamed,)), tmp_path / f"b.{suffix}", options
+    ).read_bytes()
     assert one == two
     assert calls
 
@@ -174,7 +225,12 @@ def test_row_blocks_give_the_same_file_as_the_whole_map(make_plan, tmp_path, suf
 def test_one_pillar(make_plan, tmp_path):
     for suffix, options in FORMS:
         plan = make_plan(np.ones((1, 1), np.uint8))
-        assert layout.compare(plan, READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))).pillars == 1
+        assert (
+            layout.compare(
+                plan, READ[suffix](write(plan, tmp_path / f"m.{suffix}", options))
+            ).pillars
+            == 1
+        )
 
 
 def test_all_pillars_alike(make_plan, tmp_path):
@@ -197,13 +253,28 @@ def test_negative_steps_in_a_repetition(make_plan, tmp_path):
     classes = np.zeros((3, 80), np.uint8)
     classes[0, 70], classes[1, 2], classes[2, 40] = 1, 1, 1  # the list goes back in x
     plan = make_plan(classes)
-    assert layout.compare(plan, layout.read_oasis(write(plan, tmp_path / "m.oas", {"form": "reader"}))).ok
+    assert layout.compare(
+        plan, layout.read_oasis(write(plan, tmp_path / "m.oas", {"form": "reader"}))
+    ).ok
 
 
 @pytest.mark.parametrize("count", [3000, pytest.param(65535, marks=pytest.mark.slow)])
 def test_thousands_of_classes(tmp_path, count):
-    outline = np.array([[40, -20], [40, 20], [20, 40], [-20, 40], [-40, 20], [-40, -20], [-20, -40], [20, -40]])
-    made = tuple(PillarClass(f"C{n:05}", 80.0, 80, (1, 0), outline) for n in range(count))
+    outline = np.array(
+        [
+            [40, -20],
+            [40, 20],
+            [20, 40],
+            [-20, 40],
+            [-40, 20],
+            [-40, -20],
+            [-20, -40],
+            [20, -40],
+        ]
+    )
+    made = tuple(
+        PillarClass(f"C{n:05}", 80.0, 80, (1, 0), outline) for n in range(count)
+    )
     classes = np.arange(1, count + 1, dtype=np.uint16).reshape(15, -1)
     plan = MaskPlan("TOP", made, (Lattice.of("LENS", classes, pitch=400, x0=0, y0=0),))
     for suffix in ("gds", "oas"):
@@ -223,15 +294,23 @@ def test_coordinates_beyond_32_bit_are_refused():
         Figure("F", {(1, 0): (np.array([[0, 0], [2**31, 0], [0, 5]]),)})
 
 
-def test_polygons_beyond_8190_points_are_refused_by_gdsii_and_the_old_file_stays(plan, tmp_path):
+def test_polygons_beyond_8190_points_are_refused_by_gdsii_and_the_old_file_stays(
+    plan, tmp_path
+):
     angle = np.arange(8190) * 2 * np.pi / 8190
-    ring = np.rint(1e6 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.int64)
+    ring = np.rint(1e6 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(
+        np.int64
+    )
     path = tmp_path / "m.gds"
     path.write_bytes(b"old")
     with pytest.raises(ProcessError, match="8190 vertices"):
-        layout.write_gdsii(plan.replace(figures=(Figure("BIG", {(2, 0): (ring,)}),)), path)
+        layout.write_gdsii(
+            plan.replace(figures=(Figure("BIG", {(2, 0): (ring,)}),)), path
+        )
     assert path.read_bytes() == b"old"
-    layout.write_gdsii(plan.replace(figures=(Figure("BIG", {(2, 0): (ring[:-1],)}),)), path)
+    layout.write_gdsii(
+        plan.replace(figures=(Figure("BIG", {(2, 0): (ring[:-1],)}),)), path
+    )
     assert len(layout.read_gdsii(path).cells["BIG"].polygons[2, 0][0]) == 8189
 
 
@@ -240,7 +319,9 @@ def test_layers_beyond_gdsii_are_refused(plan, tmp_path):
     with pytest.raises(ProcessError, match="32767"):
         layout.write_gdsii(plan.replace(classes=far), tmp_path / "m.gds")
     layout.write_oasis(plan.replace(classes=far), tmp_path / "m.oas")
-    assert (40000, 0) in layout.read_oasis(tmp_path / "m.oas").cells[far[0].name].polygons
+    assert (40000, 0) in layout.read_oasis(tmp_path / "m.oas").cells[
+        far[0].name
+    ].polygons
 
 
 def test_circles_of_odd_diameter_are_refused(make_plan, tmp_path):
@@ -266,7 +347,9 @@ def test_unknown_form_is_refused(plan, tmp_path):
 
 
 @pytest.mark.parametrize(("suffix", "options"), FORMS)
-def test_a_full_disk_leaves_the_old_file_and_no_part(plan, tmp_path, monkeypatch, suffix, options):
+def test_a_full_disk_leaves_the_old_file_and_no_part(
+    plan, tmp_path, monkeypatch, suffix, options
+):
     path = tmp_path / f"m.{suffix}"
     path.write_bytes(b"old")
     target = gdsii_write if suffix == "gds" else oasis_write
@@ -304,7 +387,9 @@ def test_an_unwritable_target_is_an_os_error(plan, tmp_path):
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])
 def test_a_file_cut_at_any_byte_is_refused_with_the_offset(make_plan, tmp_path, suffix):
-    data = write(make_plan(np.ones((3, 4), np.uint8), kinds=2), tmp_path / f"m.{suffix}", {}).read_bytes()
+    data = write(
+        make_plan(np.ones((3, 4), np.uint8), kinds=2), tmp_path / f"m.{suffix}", {}
+    ).read_bytes()
     cut = tmp_path / f"cut.{suffix}"
     for length in range(len(data)):
         cut.write_bytes(data[:length])
@@ -327,10 +412,18 @@ def test_a_moved_pillar_and_another_diameter_are_found(make_plan, tmp_path):
     classes = plan.lattices[0].whole().copy()
     row, column = np.argwhere(classes == 1)[5]
     classes[row, column] = 2
-    other = plan.replace(lattices=(Lattice.of("LENS", classes, pitch=400, x0=-6000, y0=4400),))
-    assert f"row {row}, column {column}" in layout.compare(other, layout.read_gdsii(path)).differences[0]
+    other = plan.replace(
+        lattices=(Lattice.of("LENS", classes, pitch=400, x0=-6000, y0=4400),)
+    )
+    assert (
+        f"row {row}, column {column}"
+        in layout.compare(other, layout.read_gdsii(path)).differences[0]
+    )
     shifted = plan.replace(lattices=(dataclasses.replace(plan.lattices[0], x0=-5999),))
-    assert "off the lattice" in layout.compare(shifted, layout.read_gdsii(path)).differences[0]
+    assert (
+        "off the lattice"
+        in layout.compare(shifted, layout.read_gdsii(path)).differences[0]
+    )
 
 
 @pytest.mark.parametrize("form", ["small", "fast", "reader"])
@@ -350,9 +443,16 @@ def test_masks_of_klayout_are_read(tmp_path):
     top, pillar = made.create_cell("TOP"), made.create_cell("PILLAR")
     layer = made.layer(7, 3)
     pillar.shapes(layer).insert(db.Box(-50, -40, 60, 70))
-    pillar.shapes(layer).insert(db.Polygon([db.Point(0, 0), db.Point(10, 30), db.Point(40, 5)]))
+    pillar.shapes(layer).insert(
+        db.Polygon([db.Point(0, 0), db.Point(10, 30), db.Point(40, 5)])
+    )
     array = db.CellInstArray(
-        pillar.cell_index(), db.Trans(1, False, 100, 200), db.Vector(400, 0), db.Vector(0, 500), 3, 2
+        pillar.cell_index(),
+        db.Trans(1, False, 100, 200),
+        db.Vector(400, 0),
+        db.Vector(0, 500),
+        3,
+        2,
     )
     top.insert(array)
     top.shapes(layer).insert(db.Text("note", 5, 6))
@@ -374,4 +474,8 @@ def test_reals_and_integers_of_oasis_follow_the_standard():
     assert oasis_bytes.signed(-1) == b"\x03"
     assert oasis_bytes.real(1000.0) == b"\x00\xe8\x07"
     assert oasis_bytes.real(0.25) == b"\x02\x04"
-    assert len(oasis_bytes.end((0, 0, 0, 0, 0, 0), 0)) == len(oasis_bytes.end((2**40,) * 6, 0)) == 256
+    assert (
+        len(oasis_bytes.end((0, 0, 0, 0, 0, 0), 0))
+        == len(oasis_bytes.end((2**40,) * 6, 0))
+        == 256
+    )

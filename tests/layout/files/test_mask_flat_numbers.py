@@ -1,4 +1,6 @@
-"""A hierarchy taken apart by hand: outlines turned and counter-clockwise, equal ones together, cells kept whole."""
+"""A hierarchy taken apart by hand: outlines turned and counter-clockwise, equal ones
+together, cells kept whole.
+"""
 
 import math
 
@@ -21,9 +23,19 @@ def placed(children, *rows):
 
 def mask():
     cells = {
-        "A": CellContent("A", {(1, 0): [WEDGE, BAR, WEDGE + 100], (2, 5): [WEDGE]}, {(3, 0): [(4, -7, 90)]}),
-        "MID": CellContent("MID", placed=placed(("A",), (0, 10, 20, 0), (0, -40, 3, 5), (0, 11, 21, 0))),
-        "TOP": CellContent("TOP", {(1, 0): [BAR]}, placed=placed(("MID",), (0, 1000, -200, 1), (0, 0, 0, 8))),
+        "A": CellContent(
+            "A",
+            {(1, 0): [WEDGE, BAR, WEDGE + 100], (2, 5): [WEDGE]},
+            {(3, 0): [(4, -7, 90)]},
+        ),
+        "MID": CellContent(
+            "MID", placed=placed(("A",), (0, 10, 20, 0), (0, -40, 3, 5), (0, 11, 21, 0))
+        ),
+        "TOP": CellContent(
+            "TOP",
+            {(1, 0): [BAR]},
+            placed=placed(("MID",), (0, 1000, -200, 1), (0, 0, 0, 8)),
+        ),
     }
     return MaskContent("OASIS", 1.0, cells)
 
@@ -46,21 +58,35 @@ def told(content, top="TOP", **more):
     found = {}
     for shape in flat.shapes(content, top, **more):
         key = shape.cell, shape.layer, canonical(shape.outline)
-        found.setdefault(key, []).extend(zip(shape.x.tolist(), shape.y.tolist(), strict=True))
+        found.setdefault(key, []).extend(
+            zip(shape.x.tolist(), shape.y.tolist(), strict=True)
+        )
     return {key: sorted(at) for key, at in found.items()}
 
 
 def test_polygons_stand_where_turns_take_them_and_run_counter_clockwise():
-    """MID by a quarter at (1000, -200): A at (10, 20) goes to (980, -190) and (979, -189), turned by a quarter; that at
-    (-40, 3), mirrored and turned by a quarter there, to (997, -240) with half a turn after its mirror."""
+    """MID by a quarter at (1000, -200): A at (10, 20) goes to (980, -190) and (979,
+    -189), turned by a quarter; that at
+    (-40, 3), mirrored and turned by a quarter there, to (997, -240) with half a turn
+    after its mirror."""
     found = told(mask())
     assert found["TOP", (1, 0), canonical(BAR)] == [(0, 0)]
-    assert found["A", (2, 5), canonical(turned(WEDGE, 1, False))] == [(979, -189), (980, -190)]
+    assert found["A", (2, 5), canonical(turned(WEDGE, 1, False))] == [
+        (979, -189),
+        (980, -190),
+    ]
     assert found["A", (2, 5), canonical(turned(WEDGE, 2, True))] == [(997, -240)]
-    assert found["A", (1, 0), canonical(turned(WEDGE + 100, 1, False))] == [(979, -189), (980, -190)]
+    assert found["A", (1, 0), canonical(turned(WEDGE + 100, 1, False))] == [
+        (979, -189),
+        (980, -190),
+    ]
     assert found["A", (1, 0), canonical(turned(BAR, 2, True))] == [(997, -240)]
     c, s = 2 * math.cos(math.pi / 6), 1.0
-    askew = np.rint(np.column_stack([c * WEDGE[:, 0] - s * WEDGE[:, 1], s * WEDGE[:, 0] + c * WEDGE[:, 1]])).astype(int)
+    askew = np.rint(
+        np.column_stack(
+            [c * WEDGE[:, 0] - s * WEDGE[:, 1], s * WEDGE[:, 0] + c * WEDGE[:, 1]]
+        )
+    ).astype(int)
     assert found["A", (2, 5), canonical(askew)] == sorted(
         (round(c * x - s * y), round(s * x + c * y)) for x, y in ((10, 20), (11, 21))
     )
@@ -73,28 +99,42 @@ def test_polygons_of_one_cell_and_layer_with_equally_many_corners_are_a_stack():
     stacks = [s for s in flat.stacks(mask(), "MID") if s.layer == (1, 0)]
     upright = [s for s in stacks if len(s.x) == 2]
     assert {s.outlines.shape for s in upright} == {(2, 3, 2), (1, 4, 2)}
-    assert {tuple(zip(s.x.tolist(), s.y.tolist(), strict=True)) for s in upright} == {((10, 20), (11, 21))}
+    assert {tuple(zip(s.x.tolist(), s.y.tolist(), strict=True)) for s in upright} == {
+        ((10, 20), (11, 21))
+    }
     assert len(stacks) == 4
 
 
 @pytest.mark.parametrize("at_once", [1 << 22, 1])
-def test_cells_that_are_kept_whole_are_left_out_but_where_they_stand_askew(monkeypatch, at_once):
+def test_cells_that_are_kept_whole_are_left_out_but_where_they_stand_askew(
+    monkeypatch, at_once
+):
     monkeypatch.setattr(flat, "_AT_ONCE", at_once)
     assert set(told(mask(), whole={"A"})) >= {("TOP", (1, 0), canonical(BAR))}
     left = {key for key in told(mask(), whole={"A"}) if key[0] == "A"}
     assert canonical(turned(WEDGE, 1, False)) not in {corners for _, _, corners in left}
     assert len(left) == 2 * 5  # five shapes by 30 degrees, and those mirrored before
     kept = [
-        (name, turn.angle_deg, turn.mirrored, list(zip(x.tolist(), y.tolist(), strict=True)))
+        (
+            name,
+            turn.angle_deg,
+            turn.mirrored,
+            list(zip(x.tolist(), y.tolist(), strict=True)),
+        )
         for name, turn, x, y in flat.places(mask(), "TOP", {"A"})
     ]
-    places = {(name, angle, mirror, at) for name, angle, mirror, every in kept for at in every}
+    places = {
+        (name, angle, mirror, at) for name, angle, mirror, every in kept for at in every
+    }
     assert places == {
         ("A", 90.0, False, (980, -190)),
         ("A", 90.0, False, (979, -189)),
         ("A", 180.0, True, (997, -240)),
     }
-    whole = [(name, turn.angle_deg, x.tolist(), y.tolist()) for name, turn, x, y in flat.places(mask(), "TOP", {"MID"})]
+    whole = [
+        (name, turn.angle_deg, x.tolist(), y.tolist())
+        for name, turn, x, y in flat.places(mask(), "TOP", {"MID"})
+    ]
     assert whole == [("MID", 90.0, [1000], [-200])]
 
 
@@ -102,7 +142,11 @@ def test_shapes_of_one_key_and_outline_come_together_from_all_top_cells():
     content = mask()
     content.cells["ALONE"] = CellContent("ALONE", {(1, 0): [BAR], (9, 0): [BAR]})
     found = flat.alike(content, lambda s: s.layer[0] if s.layer[0] != 9 else None)
-    bars = [group for (key, _), group in found.items() if key == 1 and np.array_equal(group[0].outline, BAR)]
+    bars = [
+        group
+        for (key, _), group in found.items()
+        if key == 1 and np.array_equal(group[0].outline, BAR)
+    ]
     assert [[s.cell for s in group] for group in bars] == [["TOP", "ALONE"]]
     assert {key for key, _ in found} == {1, 2, 3}
     alone = flat.alike(content, lambda s: s.layer[0], tops=["ALONE"])
@@ -118,7 +162,10 @@ def test_true_circles_are_polygons_of_64_corners_and_their_area():
     assert (x.min() + x.max(), y.min() + y.max()) == (2 * 4, -2 * 7)
 
 
-@pytest.mark.parametrize(("x", "fits"), [(2**31 - 1, True), (2**31, False), (-(2**31) + 1, True), (-(2**31), False)])
+@pytest.mark.parametrize(
+    ("x", "fits"),
+    [(2**31 - 1, True), (2**31, False), (-(2**31) + 1, True), (-(2**31), False)],
+)
 def test_places_stay_within_32_bits(x, fits):
     cells = {
         "A": CellContent("A", placed=placed(("B",), (0, x // 2, 0, 0))),
@@ -126,19 +173,39 @@ def test_places_stay_within_32_bits(x, fits):
         "C": CellContent("C", {(1, 0): [BAR]}),
     }
     if fits:
-        assert [at for every in told(MaskContent("G", 1.0, cells), "A").values() for at in every] == [(x, 0)]
+        assert [
+            at
+            for every in told(MaskContent("G", 1.0, cells), "A").values()
+            for at in every
+        ] == [(x, 0)]
     else:
         with pytest.raises(MaskFileError, match="beyond 32 bits"):
             told(MaskContent("G", 1.0, cells), "A")
 
 
 def test_a_hierarchy_may_be_sixty_five_deep_and_not_without_end():
-    cells = {f"C{k}": CellContent(f"C{k}", placed=placed((f"C{k + 1}",), (0, 3, 1, 0))) for k in range(66)}
+    cells = {
+        f"C{k}": CellContent(f"C{k}", placed=placed((f"C{k + 1}",), (0, 3, 1, 0)))
+        for k in range(66)
+    }
     cells["C66"] = CellContent("C66", {(1, 0): [BAR]})
     cells["C65"] = CellContent("C65", {(1, 0): [BAR]})
-    assert [at for every in told(MaskContent("G", 1.0, cells), "C0").values() for at in every] == [(195, 65)]
-    cells["C65"] = CellContent("C65", placed=placed(("C66", "C0"), (0, 0, 0, 0), (1, 0, 0, 0)))
+    assert [
+        at
+        for every in told(MaskContent("G", 1.0, cells), "C0").values()
+        for at in every
+    ] == [(195, 65)]
+    cells["C65"] = CellContent(
+        "C65", placed=placed(("C66", "C0"), (0, 0, 0, 0), (1, 0, 0, 0))
+    )
     with pytest.raises(MaskFileError, match="places itself through C0 > C1"):
         told(MaskContent("G", 1.0, cells), "C0")
     with pytest.raises(MaskFileError, match="'NONE' is placed"):
-        told(MaskContent("G", 1.0, {"T": CellContent("T", placed=placed(("NONE",), (0, 0, 0, 0)))}), "T")
+        told(
+            MaskContent(
+                "G",
+                1.0,
+                {"T": CellContent("T", placed=placed(("NONE",), (0, 0, 0, 0)))},
+            ),
+            "T",
+        )

@@ -1,4 +1,6 @@
-"""Broken mask files: a typed error that names the byte, or a clean read; never a crash, a hang, or another error."""
+"""Broken mask files: a typed error that names the byte, or a clean read; never a crash,
+a hang, or another error.
+"""
 
 import json
 import signal
@@ -18,7 +20,12 @@ from metalens.ground.errors import MaskFileError
 LIMIT = 200_000  # placements: a mutated array count must not fill the memory
 READ = {"gds": gdsii_read.read, "oas": oasis_read.read}
 PARSE = {"gds": gdsii_read.parse, "oas": oasis_read.parse}
-FORMS = [("gds", {}), ("oas", {"form": "small"}), ("oas", {"form": "reader"}), ("oas", {"circles": True})]
+FORMS = [
+    ("gds", {}),
+    ("oas", {"form": "small"}),
+    ("oas", {"form": "reader"}),
+    ("oas", {"circles": True}),
+]
 
 
 @pytest.fixture
@@ -30,7 +37,9 @@ def masks(make_plan, tmp_path):
         for kind, sites in enumerate((classes, np.ones((40, 40), np.uint8))):
             path = tmp_path / f"{n}{kind}.{suffix}"
             plan = make_plan(sites, kinds=4)
-            (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(plan, path, **options)
+            (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
+                plan, path, **options
+            )
             made.append((suffix, path.read_bytes()))
     return made
 
@@ -49,7 +58,11 @@ def mutated(data, rng):
         elif kind == 3:
             out[at:at] = out[at : at + int(rng.integers(1, 9))]
         else:
-            out[at : at + 1] = bytes(rng.choice([0, 127, 128, 255], int(rng.integers(1, 12))).astype(np.uint8))
+            out[at : at + 1] = bytes(
+                rng.choice([0, 127, 128, 255], int(rng.integers(1, 12))).astype(
+                    np.uint8
+                )
+            )
         if not out:
             break
     return bytes(out)
@@ -96,7 +109,12 @@ def test_random_bytes_are_refused(tmp_path):
         for suffix in READ:
             path = tmp_path / f"r.{suffix}"
             path.write_bytes(
-                (b"%SEMI-OASIS\r\n\x01\x031.0\x00\xe8\x07\x01" if n % 2 and suffix == "oas" else b"") + data
+                (
+                    b"%SEMI-OASIS\r\n\x01\x031.0\x00\xe8\x07\x01"
+                    if n % 2 and suffix == "oas"
+                    else b""
+                )
+                + data
             )
             with pytest.raises(MaskFileError, match="byte"):
                 READ[suffix](path)
@@ -114,7 +132,12 @@ def test_a_bomb_of_copies_is_refused(tmp_path):
 
     matrix = b"\x01" + oasis.unsigned(2**40) + oasis.unsigned(2**40) + b"\x01\x01"
     body = (
-        bytes([oasis.CELL]) + oasis.string("T") + bytes([oasis.PLACEMENT, 0xB8]) + oasis.string("U") + b"\0\0" + matrix
+        bytes([oasis.CELL])
+        + oasis.string("T")
+        + bytes([oasis.PLACEMENT, 0xB8])
+        + oasis.string("U")
+        + b"\0\0"
+        + matrix
     )
     (tmp_path / "b.oas").write_bytes(oasis.start(1.0) + body + oasis.end((0,) * 6, 0))
     with pytest.raises(MaskFileError, match=r"copies, at most 16,777,216 more"):
@@ -124,7 +147,9 @@ def test_a_bomb_of_copies_is_refused(tmp_path):
 def test_a_bomb_of_zeros_is_refused(tmp_path):
     from layout.oasis import bytes as oasis
 
-    block = bytes([oasis.CBLOCK, 0]) + oasis.unsigned(2**45) + oasis.unsigned(3) + b"abc"
+    block = (
+        bytes([oasis.CBLOCK, 0]) + oasis.unsigned(2**45) + oasis.unsigned(3) + b"abc"
+    )
     (tmp_path / "z.oas").write_bytes(oasis.start(1.0) + block + oasis.end((0,) * 6, 0))
     with pytest.raises(MaskFileError, match="compressed block of 3 bytes"):
         layout.read_oasis(tmp_path / "z.oas")
@@ -133,7 +158,9 @@ def test_a_bomb_of_zeros_is_refused(tmp_path):
 @pytest.mark.parametrize(("suffix", "options"), FORMS)
 def test_own_masks_pass_the_validator(plan, tmp_path, suffix, options):
     path = tmp_path / f"m.{suffix}"
-    (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(plan, path, **options)
+    (layout.write_gdsii if suffix == "gds" else layout.write_oasis)(
+        plan, path, **options
+    )
     assert validate(path) == []
 
 

@@ -1,4 +1,6 @@
-"""Places by square: numbers row by row by hand, and neighbours no further than the square beside."""
+"""Places by square: numbers row by row by hand, and neighbours no further than the
+square beside.
+"""
 
 import math
 
@@ -12,16 +14,23 @@ DRAW = np.random.default_rng(61)
 
 def by_hand(x, y, side, left, bottom, columns):
     return [
-        math.floor((b - bottom) / side) * columns + math.floor((a - left) / side) + 1 for a, b in zip(x, y, strict=True)
+        math.floor((b - bottom) / side) * columns + math.floor((a - left) / side) + 1
+        for a, b in zip(x, y, strict=True)
     ]
 
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_squares_are_numbered_row_by_row_with_an_empty_one_at_both_ends(moved):
-    """Places of kinds are moved by the middles of these; the room is that of the outermost middles."""
+    """Places of kinds are moved by the middles of these; the room is that of the
+    outermost middles.
+    """
     x, y = DRAW.integers(-700, 2100, (2, 80)).astype(np.int32)
     kind = DRAW.integers(0, 3, 80).astype(np.int32)
-    middle = np.array([[-31.5, 4.25], [12.0, -60.5], [0.5, 33.0]]) if moved else np.zeros((1, 2))
+    middle = (
+        np.array([[-31.5, 4.25], [12.0, -60.5], [0.5, 33.0]])
+        if moved
+        else np.zeros((1, 2))
+    )
     about = {"kind": kind, "middle": middle} if moved else {}
     made = Squares.of(x, y, 130.0, **about)
     left, bottom = x.min() + middle[:, 0].min(), y.min() + middle[:, 1].min()
@@ -55,6 +64,15 @@ def test_places_nearer_than_a_side_are_in_squares_beside_each_other():
 
 def test_the_first_place_of_a_square_or_beyond_is_looked_for_from_the_last_on():
     key = np.array([2, 2, 5, 9, 9, 9, 14])
-    assert [first_from(key, wanted, 0) for wanted in (0, 2, 3, 5, 9, 10, 14, 15)] == [0, 0, 2, 2, 3, 6, 6, 7]
+    assert [first_from(key, wanted, 0) for wanted in (0, 2, 3, 5, 9, 10, 14, 15)] == [
+        0,
+        0,
+        2,
+        2,
+        3,
+        6,
+        6,
+        7,
+    ]
     assert first_from(key, 2, 4) == 4
     assert first_from(key, 9, 4) == 4

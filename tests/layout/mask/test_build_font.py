@@ -1,4 +1,6 @@
-"""What stands around a lens on the mask: all of it, its opening alone, or nothing; labels where they belong."""
+"""What stands around a lens on the mask: all of it, its opening alone, or nothing;
+labels where they belong.
+"""
 
 import numpy as np
 import pytest
@@ -39,7 +41,9 @@ def test_a_line_of_text_stands_where_it_is_asked_for(x, y):
 
 
 def test_squares_of_a_letter_meet_along_edges_and_none_lies_on_another():
-    """On a grid of quarter squares: no two filled cells meet at a corner alone, none is filled twice."""
+    """On a grid of quarter squares: no two filled cells meet at a corner alone, none is
+    filled twice.
+    """
     words = "".join(font._GLYPHS)
     filled = np.zeros((60, 20 + 24 * len(words)), int)
     for box in font.text(words, x=8, y=12, square=4):

@@ -1,4 +1,6 @@
-"""What stands on a die, where and with how much room about it: sums of lengths typed here, 10 um between structures."""
+"""What stands on a die, where and with how much room about it: sums of lengths typed
+here, 10 um between structures.
+"""
 
 import re
 
@@ -22,7 +24,10 @@ def lens_map():
 
 
 def process(**die):
-    return Process(die=Die(verniers=False, **{"size_um": (1300.0, 900.0)} | die), exposure=Exposure(correct=False))
+    return Process(
+        die=Die(verniers=False, **{"size_um": (1300.0, 900.0)} | die),
+        exposure=Exposure(correct=False),
+    )
 
 
 def boxes(shapes):
@@ -35,7 +40,10 @@ def drawn(plan, name, layer):
 
 def of_sites(lattice):
     """(left, bottom, right, top) of the middles of the sites."""
-    right, bottom = lattice.x0 + (lattice.columns - 1) * PITCH_NM, lattice.y0 - (lattice.rows - 1) * BETWEEN_NM
+    right, bottom = (
+        lattice.x0 + (lattice.columns - 1) * PITCH_NM,
+        lattice.y0 - (lattice.rows - 1) * BETWEEN_NM,
+    )
     return np.array([lattice.x0, bottom, right, lattice.y0])
 
 
@@ -45,22 +53,30 @@ def plan():
 
 
 def test_test_structures_stand_half_way_between_lens_and_street(plan):
-    """Dose test left, witnesses right, about the axis to a step of the grid; pillars as far apart as the lens's."""
+    """Dose test left, witnesses right, about the axis to a step of the grid; pillars as
+    far apart as the lens's.
+    """
     windows = drawn(plan, "APERTURE", process().layers.aperture)
     aperture = windows[0]
     middle = (aperture[2] + (1300_000 / 2 - 50_000)) / 2
     assert [lattice.name for lattice in plan.lattices[1:]] == ["DOSETEST", "WITNESS"]
     for lattice, side in zip(plan.lattices[1:], (-1, 1), strict=True):
         left, bottom, right, top = of_sites(lattice)
-        assert (left + right) / 2 == pytest.approx(side * middle, abs=3)  # the aperture's vertices, two halves
+        assert (left + right) / 2 == pytest.approx(
+            side * middle, abs=3
+        )  # the aperture's vertices, two halves
         assert (bottom + top) / 2 == pytest.approx(0, abs=1)
         assert lattice.down == BETWEEN_NM
         there = lattice.array > 0  # no empty rows or columns at its rims
         assert there[[0, -1]].any(1).all()
         assert there[:, [0, -1]].any(0).all()
         own = next(w for w in windows[1:] if w[0] < left < w[2])
-        room = own - of_sites(lattice)  # half the film's clearance beside the cells of the outermost pillars
-        assert np.abs(room) == pytest.approx(np.full(4, CLEAR_NM / 2 + BETWEEN_NM / 2), abs=1)
+        room = own - of_sites(
+            lattice
+        )  # half the film's clearance beside the cells of the outermost pillars
+        assert np.abs(room) == pytest.approx(
+            np.full(4, CLEAR_NM / 2 + BETWEEN_NM / 2), abs=1
+        )
 
 
 def test_witnesses_are_written_with_the_dose_of_the_lens(plan):
@@ -84,10 +100,16 @@ def test_the_film_opens_half_a_clearance_around_the_label(plan):
 
 
 @pytest.mark.parametrize(
-    "words", ["THE LENS OF A LONG NAME THAT NEEDS SMALL LETTERS", "A LENS OF THIRTY LETTERS OR SO"]
+    "words",
+    [
+        "THE LENS OF A LONG NAME THAT NEEDS SMALL LETTERS",
+        "A LENS OF THIRTY LETTERS OR SO",
+    ],
 )
 def test_letters_of_a_long_label_are_as_large_as_fit_between_the_crosses(words):
-    """Six squares a letter, of an even number of steps; 10 um off the street, off the crosses by twice that."""
+    """Six squares a letter, of an even number of steps; 10 um off the street, off the
+    crosses by twice that.
+    """
     size_um = 700.0
     made = process(size_um=(size_um, 900.0), label=words)
     letters = drawn(layout.plan(lens_map(), made), "LABEL", made.layers.labels)
@@ -103,8 +125,17 @@ def test_a_die_is_wide_enough_by_what_is_said_to_be_needed_and_not_by_less():
     with pytest.raises(ProcessError, match="too small for WITNESS") as refused:
         layout.plan(lens_map(), process(size_um=(200.0, 900.0), **about))
     need = float(re.search(r"(\d+) um are needed", str(refused.value))[1])
-    radius = drawn(layout.plan(lens_map(), process()), "APERTURE", process().layers.aperture)[0][2] * 1e-3
-    wide = layout.plan(lens_map(), process(size_um=(2 * (radius + need + 0.6), 900.0), **about))
+    radius = (
+        drawn(
+            layout.plan(lens_map(), process()), "APERTURE", process().layers.aperture
+        )[0][2]
+        * 1e-3
+    )
+    wide = layout.plan(
+        lens_map(), process(size_um=(2 * (radius + need + 0.6), 900.0), **about)
+    )
     assert len(wide.lattices) == 3
     with pytest.raises(ProcessError, match="too small for"):
-        layout.plan(lens_map(), process(size_um=(2 * (radius + need - 0.6), 900.0), **about))
+        layout.plan(
+            lens_map(), process(size_um=(2 * (radius + need - 0.6), 900.0), **about)
+        )

@@ -1,4 +1,6 @@
-"""Write fields cut no pillar; what stitching costs the focus, by the square of its error and the variance of ramps."""
+"""Write fields cut no pillar; what stitching costs the focus, by the square of its
+error and the variance of ramps.
+"""
 
 import dataclasses
 
@@ -16,7 +18,14 @@ from metalens.lens.record import DiameterMap, Lens
 from metalens.made import Bias
 from metalens.pillars.proxy import Proxy
 
-PROXY = Proxy(np.array([[3.3, 3.3, 0.2]]), np.array([[0.9, 0.05]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[3.3, 3.3, 0.2]]),
+    np.array([[0.9, 0.05]]),
+    (0.1, 0.3),
+    (0.85, 0.85),
+    0.0,
+    0.0,
+)
 
 
 def process(size_um, mode="floating", stitching_nm=20.0):
@@ -47,9 +56,14 @@ def test_no_border_cuts_a_pillar_and_every_pillar_has_one_field(n, m, size, mode
     diameters = DiameterMap(d, 0.4)
     plan = fields.split(diameters, process(size, mode))
     rows, columns = np.nonzero(d)
-    for positions, borders, index in ((diameters.x_um, plan.x_um, columns), (diameters.y_um, plan.y_um, rows)):
+    for positions, borders, index in (
+        (diameters.x_um, plan.x_um, columns),
+        (diameters.y_um, plan.y_um, rows),
+    ):
         away = abs(positions[index][:, None] - borders)
-        assert (away - d[rows, columns][:, None] / 2).min() >= plan.clearance_um - 0.51e-3  # half a step, halved
+        assert (
+            away - d[rows, columns][:, None] / 2
+        ).min() >= plan.clearance_um - 0.51e-3  # half a step, halved
         assert plan.clearance_um > 0
         assert np.diff(borders).max() <= size + 1e-9
     number = plan.of(rows, columns)
@@ -70,7 +84,9 @@ def test_floating_fields_are_as_few_and_as_equal_as_can_be():
 
 
 def test_a_fixed_raster_is_shifted_to_the_gaps_and_keeps_its_period():
-    plan = fields.split(DiameterMap(np.full((250, 250), 0.2), 0.4), process(30.1, "shift"))
+    plan = fields.split(
+        DiameterMap(np.full((250, 250), 0.2), 0.4), process(30.1, "shift")
+    )
     assert set(np.diff(plan.rows).tolist()) == {75}
     assert plan.y_um[0] <= -50
     assert plan.y_um[-1] >= 50
@@ -95,7 +111,9 @@ def test_stitching_hurts_as_the_square_of_the_offset_and_not_at_all_at_zero():
     loss = []
     for error in (0.0, 10.0, 20.0):
         chosen = process(30.0, stitching_nm=error)
-        report = stitching.stitching(lens, fields.split(lens.diameters, chosen), chosen, draws=100, seed=1)
+        report = stitching.stitching(
+            lens, fields.split(lens.diameters, chosen), chosen, draws=100, seed=1
+        )
         loss.append(1 - report.strehl.mean())
     assert loss[0] == pytest.approx(0, abs=1e-6)
     assert loss[2] / loss[1] == pytest.approx(
@@ -105,7 +123,8 @@ def test_stitching_hurts_as_the_square_of_the_offset_and_not_at_all_at_zero():
 
 
 def test_the_loss_is_what_the_variance_of_the_ramps_says():
-    # 1 - S = variance over the pillars of k delta (sin of the angle to the focus + to the source)
+    # 1 - S = variance over the pillars of k delta (sin of the angle to the focus + to
+    # the source)
     lens, chosen = hyperbolic(), process(30.0)
     plan = fields.split(lens.diameters, chosen)
     report = stitching.stitching(lens, plan, chosen, draws=400, seed=2)
@@ -122,15 +141,31 @@ def test_the_loss_is_what_the_variance_of_the_ramps_says():
         phase = offset[number, 0] * ramp[0] + offset[number, 1] * ramp[1]
         mean = np.average(phase, weights=weight)
         # a common tilt only moves the spot: take out the best plane
-        a = np.stack([ramp[0].ravel(), ramp[1].ravel()], 1) * np.sqrt(weight.ravel())[:, None]
-        plane = np.linalg.lstsq(a, ((phase - mean) * np.sqrt(weight)).ravel(), rcond=None)[0]
-        want.append(np.average((phase - mean - plane[0] * ramp[0] - plane[1] * ramp[1]) ** 2, weights=weight))
-    assert 1 - report.strehl.mean() == pytest.approx(np.mean(want), rel=0.2)  # sampled peak, two sets of 400 draws
+        a = (
+            np.stack([ramp[0].ravel(), ramp[1].ravel()], 1)
+            * np.sqrt(weight.ravel())[:, None]
+        )
+        plane = np.linalg.lstsq(
+            a, ((phase - mean) * np.sqrt(weight)).ravel(), rcond=None
+        )[0]
+        want.append(
+            np.average(
+                (phase - mean - plane[0] * ramp[0] - plane[1] * ramp[1]) ** 2,
+                weights=weight,
+            )
+        )
+    assert 1 - report.strehl.mean() == pytest.approx(
+        np.mean(want), rel=0.2
+    )  # sampled peak, two sets of 400 draws
 
 
 def test_the_clearance_is_that_of_what_is_drawn():
-    bias = dataclasses.replace(process(30.0), bias=Bias(table_nm=((50.0, -20.0), (400.0, -20.0))))
+    bias = dataclasses.replace(
+        process(30.0), bias=Bias(table_nm=((50.0, -20.0), (400.0, -20.0)))
+    )
     plan = fields.split(DiameterMap(np.full((40, 43), 0.25), 0.4), bias)
     drawn_um = float(bias.written_diameter_nm(250.0)) * 1e-3
     assert drawn_um > 0.269  # drawn wider by what the process takes
-    assert plan.clearance_um == pytest.approx((0.4 - drawn_um) / 2, abs=0.5e-3)  # half a diameter step, halved
+    assert plan.clearance_um == pytest.approx(
+        (0.4 - drawn_um) / 2, abs=0.5e-3
+    )  # half a diameter step, halved

@@ -1,4 +1,6 @@
-"""Write fields by hand: borders midway between sites, counts and cuts pillar by pillar, unlike along x and y."""
+"""Write fields by hand: borders midway between sites, counts and cuts pillar by pillar,
+unlike along x and y.
+"""
 
 import numpy as np
 import pytest
@@ -22,16 +24,22 @@ PLAN = fields.FieldPlan(
 
 
 def process(size_um, mode="floating"):
-    return Process(rules=Rules(diameter_step_nm=2.0), write_field=WriteField(size_um, mode))
+    return Process(
+        rules=Rules(diameter_step_nm=2.0), write_field=WriteField(size_um, mode)
+    )
 
 
 def test_borders_are_half_a_step_before_their_site_about_the_axis():
-    """13 columns of 0.4 um: site 1 at -2 um, its border at -2.2; 10 rows of 0.3 um: site 5 at 0.15, its border at 0."""
+    """13 columns of 0.4 um: site 1 at -2 um, its border at -2.2; 10 rows of 0.3 um:
+    site 5 at 0.15, its border at 0.
+    """
     assert PLAN.x_um == pytest.approx([-2.2, -1.0, 1.0, 3.4], abs=1e-12)
     assert PLAN.y_um == pytest.approx([-2.1, 0.0, 1.8], abs=1e-12)
     assert PLAN.size_um == pytest.approx((2.4, 2.1), abs=1e-12)
     assert PLAN.used == 3
-    square = fields.FieldPlan(PLAN.rows, PLAN.columns, (10, 13), 0.4, "shift", PLAN.pillars, 4, 0.03)
+    square = fields.FieldPlan(
+        PLAN.rows, PLAN.columns, (10, 13), 0.4, "shift", PLAN.pillars, 4, 0.03
+    )
     assert square.y_um == pytest.approx([-2.8, 0.0, 2.4], abs=1e-12)
 
 
@@ -62,7 +70,9 @@ def test_borders_hold_the_occupied_lines_in_as_few_fields_as_can_be(mode, sites,
 
 
 def ragged(shape=(10, 13), seed=5):
-    """Diameters of whole steps, a third of the sites empty; the first column and the last two rows are."""
+    """Diameters of whole steps, a third of the sites empty; the first column and the
+    last two rows are.
+    """
     rng = np.random.default_rng(seed)
     sizes = np.where(rng.random(shape) < 0.67, rng.integers(60, 170, shape) * 2e-3, 0.0)
     sizes[:, 0], sizes[-2:], sizes[3, 5] = 0, 0, 0.342
@@ -70,13 +80,26 @@ def ragged(shape=(10, 13), seed=5):
 
 
 def test_pillars_are_counted_field_by_field_and_borders_keep_their_distance():
-    """Fields of 3 columns and 3 rows (1.2 um of 0.4 and 0.37): 1.2 / 0.4 is just below 3 in floating point."""
+    """Fields of 3 columns and 3 rows (1.2 um of 0.4 and 0.37): 1.2 / 0.4 is just below
+    3 in floating point.
+    """
     assert 1.2 / 0.4 < 3
     sizes = ragged()
     plan = fields.split(DiameterMap(sizes, 0.4, row_um=0.37), process(1.2))
-    assert (plan.columns.tolist(), plan.rows.tolist()) == ([1, 4, 7, 10, 13], [0, 2, 5, 8])
-    assert (plan.shape, plan.pitch_um, plan.row_um, plan.mode) == ((10, 13), 0.4, 0.37, "floating")
-    want = [[np.count_nonzero(sizes[a:b, c : c + 3]) for c in (1, 4, 7, 10)] for a, b in ((0, 2), (2, 5), (5, 8))]
+    assert (plan.columns.tolist(), plan.rows.tolist()) == (
+        [1, 4, 7, 10, 13],
+        [0, 2, 5, 8],
+    )
+    assert (plan.shape, plan.pitch_um, plan.row_um, plan.mode) == (
+        (10, 13),
+        0.4,
+        0.37,
+        "floating",
+    )
+    want = [
+        [np.count_nonzero(sizes[a:b, c : c + 3]) for c in (1, 4, 7, 10)]
+        for a, b in ((0, 2), (2, 5), (5, 8))
+    ]
     assert plan.pillars.tolist() == want
     assert plan.clearance_um == pytest.approx((0.37 - 0.342) / 2, abs=1e-12)
     with pytest.raises(ProcessError, match="smaller than the pitch"):
@@ -85,8 +108,11 @@ def test_pillars_are_counted_field_by_field_and_borders_keep_their_distance():
 
 @pytest.mark.parametrize("sites", [1 << 20, 26, 5])
 @pytest.mark.parametrize("size_um", [1.42, 1.32, 0.97])
-def test_a_raster_about_the_axis_cuts_pillars_that_lie_on_its_borders(monkeypatch, sites, size_um):
-    """A border at k sizes from the axis cuts a pillar whose middle is nearer than half its diameter; once, though two
+def test_a_raster_about_the_axis_cuts_pillars_that_lie_on_its_borders(
+    monkeypatch, sites, size_um
+):
+    """A border at k sizes from the axis cuts a pillar whose middle is nearer than half
+    its diameter; once, though two
     may."""
     monkeypatch.setattr(fields, "_BLOCK_SITES", sites)
     sizes, want = ragged(), 0
@@ -104,4 +130,8 @@ def test_a_single_column_of_pillars_lies_on_the_border_at_the_axis():
     plan = fields.split(DiameterMap(np.array([[0.1], [0.0], [0.2]]), 0.4), process(1.2))
     assert (plan.cut_before, plan.pillars.tolist()) == (2, [[2]])
     row = fields.split(DiameterMap(np.array([[0.1, 0.3]]), 0.4), process(1.2))
-    assert (row.cut_before, row.pillars.tolist(), row.columns.tolist()) == (2, [[2]], [0, 2])
+    assert (row.cut_before, row.pillars.tolist(), row.columns.tolist()) == (
+        2,
+        [[2]],
+        [0, 2],
+    )

@@ -1,4 +1,6 @@
-"""Letters as rectangles: bits of some glyphs drawn here, places and lengths of lines, joints of half a square."""
+"""Letters as rectangles: bits of some glyphs drawn here, places and lengths of lines,
+joints of half a square.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ DRAWN = {
 
 
 def filled(words, square, x, y):
-    """(7, 6 n) halves of squares that the rectangles cover, doubled both ways, row 0 the topmost; nothing twice."""
+    """(7, 6 n) halves of squares that the rectangles cover, doubled both ways, row 0
+    the topmost; nothing twice.
+    """
     half = square // 2
     image = np.zeros((14, 12 * len(words)), int)
     for box in font.text(words, x=x, y=y, square=square):
@@ -35,21 +39,28 @@ def expected(words):
         for row, bits in enumerate(DRAWN[letter]):
             for column, bit in enumerate(bits):
                 if bit == "#":
-                    image[2 * row : 2 * row + 2, 12 * n + 2 * column : 12 * n + 2 * column + 2] = 1
+                    image[
+                        2 * row : 2 * row + 2,
+                        12 * n + 2 * column : 12 * n + 2 * column + 2,
+                    ] = 1
     return image
 
 
 @pytest.mark.parametrize("words", ["F", "4", "F4", "R/,4F"])
 def test_letters_are_their_bits_and_small_squares_where_corners_meet(words):
-    """Where two squares meet at a corner alone, a half square on either side of it joins them: of the two empty squares
-    at the corner the upper one's lower inner half, and the lower one's upper inner half."""
+    """Where two squares meet at a corner alone, a half square on either side of it
+    joins them: of the two empty squares
+    at the corner the upper one's lower inner half, and the lower one's upper inner
+    half."""
     bits = expected(words)
     want = bits.copy()
     for row in range(1, 7):
         for column in range(1, 6 * len(words)):
             if column % 6 in (0, 5):
                 continue
-            square = bits[2 * row - 2 : 2 * row + 1 : 2, 2 * column - 2 : 2 * column + 1 : 2].tolist()
+            square = bits[
+                2 * row - 2 : 2 * row + 1 : 2, 2 * column - 2 : 2 * column + 1 : 2
+            ].tolist()
             if square == [[0, 1], [1, 0]]:
                 want[2 * row - 1, 2 * column - 1] = want[2 * row, 2 * column] = 1
             if square == [[1, 0], [0, 1]]:
@@ -61,13 +72,19 @@ def test_small_letters_are_capitals_and_unknown_ones_are_named():
     assert [b.tolist() for b in font.text("f4", x=5, y=7, square=6)] == [
         b.tolist() for b in font.text("F4", x=5, y=7, square=6)
     ]
-    with pytest.raises(ProcessError, match="label 'A!': no '!' in the font; use letters, digits and # "):
+    with pytest.raises(
+        ProcessError, match="label 'A!': no '!' in the font; use letters, digits and # "
+    ):
         font.text("A!", x=0, y=0, square=2)
     assert font.text(" ", x=0, y=0, square=2) == ()
 
 
-@pytest.mark.parametrize(("words", "squares"), [("", 0), ("A", 5), ("AB", 11), ("A LONG LINE", 65)])
-def test_a_line_is_as_long_as_its_letters_of_five_squares_and_the_gaps_between(words, squares):
+@pytest.mark.parametrize(
+    ("words", "squares"), [("", 0), ("A", 5), ("AB", 11), ("A LONG LINE", 65)]
+)
+def test_a_line_is_as_long_as_its_letters_of_five_squares_and_the_gaps_between(
+    words, squares
+):
     assert font.width(words, 34) == 34 * squares
 
 

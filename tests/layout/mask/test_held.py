@@ -1,4 +1,6 @@
-"""A lens that stays in its file, and classes in a scratch file, give the very mask of one in memory."""
+"""A lens that stays in its file, and classes in a scratch file, give the very mask of
+one in memory.
+"""
 
 import dataclasses
 
@@ -30,7 +32,9 @@ def test_blocks_come_back_from_memory_and_from_the_scratch_file(monkeypatch):
     for one in (small, large):
         assert np.array_equal(one.whole(), sites)
         assert np.array_equal(one.source(5, 31), sites[5:31])
-        plain, turned = (one.lattice("A", pitch=4, x0=0, y0=0, upside_down=u) for u in (False, True))
+        plain, turned = (
+            one.lattice("A", pitch=4, x0=0, y0=0, upside_down=u) for u in (False, True)
+        )
         assert np.array_equal(plain.source(3, 8), sites[3:8])
         assert np.array_equal(turned.source(3, 20), sites[::-1][3:20])
 
@@ -44,12 +48,23 @@ def test_blocks_come_back_from_memory_and_from_the_scratch_file(monkeypatch):
         Process(bias=Bias(isolated_nm=-9.0), write_field=WriteField(7.1)),
     ],
 )
-def test_the_mask_is_the_same_from_the_file_and_from_memory(process, tmp_path, monkeypatch):
+def test_the_mask_is_the_same_from_the_file_and_from_memory(
+    process, tmp_path, monkeypatch
+):
     axis = np.arange(53) - 26
     d = np.random.default_rng(1).uniform(0.1, 0.3, (53, 53))
     d[axis**2 + (axis[:, None] - 3) ** 2 > 500] = 0
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
-    lens = Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic")
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
+    lens = Lens(
+        DiameterMap(d, 0.4), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
+    )
     lenses.save(tmp_path / "lens.h5", lens)
     small = build.prepare(lens, process)
     few = fields.split(lens.diameters, process)
@@ -66,4 +81,6 @@ def test_the_mask_is_the_same_from_the_file_and_from_memory(process, tmp_path, m
     assert layout.compare(large.plan, layout.read_gdsii(tmp_path / "b.gds")).ok
     again = fields.split(source.diameters, process)
     for one in dataclasses.fields(few):
-        assert np.array_equal(getattr(few, one.name), getattr(again, one.name)), one.name
+        assert np.array_equal(getattr(few, one.name), getattr(again, one.name)), (
+            one.name
+        )

@@ -1,4 +1,6 @@
-"""Marks of a die corner by corner, in units of 2 nm on a grid of 5: lengths of the process by hand."""
+"""Marks of a die corner by corner, in units of 2 nm on a grid of 5: lengths of the
+process by hand.
+"""
 
 from types import SimpleNamespace
 
@@ -30,14 +32,22 @@ def edges(shape):
     """Left, bottom, right, top of a rectangle."""
     left, bottom = shape.min(0).tolist()
     right, top = shape.max(0).tolist()
-    assert sorted(shape.tolist()) == sorted([[left, bottom], [right, bottom], [right, top], [left, top]])
+    assert sorted(shape.tolist()) == sorted(
+        [[left, bottom], [right, bottom], [right, top], [left, top]]
+    )
     return left, bottom, right, top
 
 
 def test_lengths_go_to_the_nearest_step_and_boxes_to_no_smaller_ones():
     unit = Units(PLAN)
     assert (unit.per_um, unit.grid, unit.pitch) == (500.0, 5, 403)
-    assert [unit(v) for v in (1.0, 0.0049, 0.0051, 7.504, -3.307)] == [500, 0, 5, 3750, -1655]
+    assert [unit(v) for v in (1.0, 0.0049, 0.0051, 7.504, -3.307)] == [
+        500,
+        0,
+        5,
+        3750,
+        -1655,
+    ]
     assert UNIT.snapped(Box(-12, -10, 11, 15)) == Box(-15, -10, 15, 15)
     assert UNIT.snapped(Box(1, 4, 6, -4)) == Box(0, 0, 10, 0)
     assert edges(Box(-12, -10, 11, 15).polygon) == (-12, -10, 11, 15)
@@ -68,7 +78,9 @@ def test_a_cross_has_four_arms_of_twice_the_half_width():
 
 
 def test_crosses_stand_in_the_corners_fine_ones_inwards_and_an_f_beside_the_upper_left():
-    """Arms of 75 um, 40 um from the edge: middles at (285, 235) um; fine arms of 15 um, 10 um from the coarse ones."""
+    """Arms of 75 um, 40 um from the edge: middles at (285, 235) um; fine arms of 15 um,
+    10 um from the coarse ones.
+    """
     shapes, windows = marks.crosses(process(), UNIT, DIE)
     signs = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     for n, (sx, sy) in enumerate(signs):
@@ -79,18 +91,33 @@ def test_crosses_stand_in_the_corners_fine_ones_inwards_and_an_f_beside_the_uppe
         assert windows[2 * n] == marks.around(coarse).grown(2500)  # half of 10 um
         assert windows[2 * n + 1] == marks.around(fine).grown(2500)
     s, x, y = 7500, -100_000, 80_000
-    corners = [(0, 0), (1, 0), (1, 3), (4, 3), (4, 4), (1, 4), (1, 6), (5, 6), (5, 7), (0, 7)]
+    corners = [
+        (0, 0),
+        (1, 0),
+        (1, 3),
+        (4, 3),
+        (4, 4),
+        (1, 4),
+        (1, 6),
+        (5, 6),
+        (5, 7),
+        (0, 7),
+    ]
     assert shapes[8].tolist() == [[x + u * s, y + v * s] for u, v in corners]
     assert windows[8] == Box(x - 2500, y - 2500, x + 5 * s + 2500, y + 7 * s + 2500)
     assert (len(shapes), len(windows)) == (9, 9)
 
 
 def test_fifths_are_whole_steps_and_one_at_least():
-    """Arms of 37 840 and 2620 units: fifths of 7568 and 524 go down to 7565 and 520; those of 10 and 5 up to a step."""
+    """Arms of 37 840 and 2620 units: fifths of 7568 and 524 go down to 7565 and 520;
+    those of 10 and 5 up to a step.
+    """
     shapes, _ = marks.crosses(process(mark_um=151.36, mark_width_um=10.48), UNIT, DIE)
     fine = marks.around(shapes[1])
     assert fine.right - fine.left == 2 * 7565
-    assert sorted({abs(v - (fine.left + fine.right) // 2) for v in shapes[1][:, 0].tolist()}) == [520, 7565]
+    assert sorted(
+        {abs(v - (fine.left + fine.right) // 2) for v in shapes[1][:, 0].tolist()}
+    ) == [520, 7565]
     assert shapes[8][7:9, 0].tolist() == [shapes[8][0, 0] + 5 * 7565] * 2
     tiny, _ = marks.crosses(process(mark_um=0.04, mark_width_um=0.02), UNIT, DIE)
     fine = marks.around(tiny[1])
@@ -100,7 +127,9 @@ def test_fifths_are_whole_steps_and_one_at_least():
 
 
 def test_a_wafer_cross_is_four_bars_about_a_fine_cross():
-    """Bars of 120 um from 80 um to 200 um, 20 um wide; the fine cross has arms of 40 um, 4 um wide."""
+    """Bars of 120 um from 80 um to 200 um, 20 um wide; the fine cross has arms of 40
+    um, 4 um wide.
+    """
     *bars, fine = marks.wafer_cross(UNIT, 400.0, 20.0)
     assert [edges(bar) for bar in bars] == [
         (-5000, 40_000, 5000, 100_000),
@@ -109,40 +138,75 @@ def test_a_wafer_cross_is_four_bars_about_a_fine_cross():
         (40_000, -5000, 100_000, 5000),
     ]
     assert fine.tolist() == marks.cross(0, 0, 20_000, 1000).tolist()
-    *bars, fine = marks.wafer_cross(UNIT, 400.1, 20.0)  # arms of 100 025: two fifths are 40 010
+    *bars, fine = marks.wafer_cross(
+        UNIT, 400.1, 20.0
+    )  # arms of 100 025: two fifths are 40 010
     assert edges(bars[0]) == (-5000, 40_010, 5000, 100_025)
     assert marks.around(fine) == Box(-20_005, -20_005, 20_005, 20_005)
 
 
 def test_verniers_and_boxes_stand_left_of_the_upper_right_cross():
-    """Pitches of 7.5 and 7.57 um; bars 2.82 um wide (0.375 of 7.5, to the grid), 12 and 16 um long, 2 um off
+    """Pitches of 7.5 and 7.57 um; bars 2.82 um wide (0.375 of 7.5, to the grid), 12 and
+    16 um long, 2 um off
     the middle line.
-    From the right, in um: 30 + 10 + 150 + 20, the upright scale's 20, another 20, the box of 20 between 10 and 10, and
+    From the right, in um: 30 + 10 + 150 + 20, the upright scale's 20, another 20, the
+    box of 20 between 10 and 10, and
     the level scale from its middle on: 10 x 7.57 + 3.75."""
     scales = marks.scales(process(), UNIT, DIE)
     assert (len(scales.drawn), len(scales.openings)) == (43, 45)
     for n in range(-10, 11):
         long = 6000 if n else 8000
         x = 15_275 + 3750 * n
-        assert edges(scales.drawn[n + 10]) == (x - 705, 146_000, x + 705, 146_000 + long)
+        assert edges(scales.drawn[n + 10]) == (
+            x - 705,
+            146_000,
+            x + 705,
+            146_000 + long,
+        )
         x = 15_275 + 3785 * n
-        assert edges(scales.openings[n + 10]) == (x - 705, 144_000 - long, x + 705, 144_000)
+        assert edges(scales.openings[n + 10]) == (
+            x - 705,
+            144_000 - long,
+            x + 705,
+            144_000,
+        )
         y = 115_275 + 3750 * n
         assert edges(scales.drawn[n + 31]) == (84_000 - long, y - 705, 84_000, y + 705)
         y = 115_275 + 3785 * n
-        assert edges(scales.openings[n + 32]) == (86_000, y - 705, 86_000 + long, y + 705)
-    assert edges(scales.openings[21]) == (15_275 - 39_375, 145_000, 15_275 + 39_375, 155_000)
-    assert edges(scales.openings[43]) == (75_000, 115_275 - 39_375, 85_000, 115_275 + 39_375)
+        assert edges(scales.openings[n + 32]) == (
+            86_000,
+            y - 705,
+            86_000 + long,
+            y + 705,
+        )
+    assert edges(scales.openings[21]) == (
+        15_275 - 39_375,
+        145_000,
+        15_275 + 39_375,
+        155_000,
+    )
+    assert edges(scales.openings[43]) == (
+        75_000,
+        115_275 - 39_375,
+        85_000,
+        115_275 + 39_375,
+    )
     assert edges(scales.drawn[42]) == (62_500, 147_500, 67_500, 152_500)
     assert edges(scales.openings[44]) == (60_000, 145_000, 70_000, 155_000)
     assert marks.scales(process(verniers=False), UNIT, DIE) == marks.Scales((), ())
 
 
 def test_bars_are_a_step_wide_at_least_on_each_side():
-    narrow = Units(SimpleNamespace(unit_nm=2.0, grid=1000, lattices=[SimpleNamespace(constant=403)]))
+    narrow = Units(
+        SimpleNamespace(
+            unit_nm=2.0, grid=1000, lattices=[SimpleNamespace(constant=403)]
+        )
+    )
     drawn, _ = marks._vernier(narrow, 2000, 1000)
     assert edges(drawn[10])[::2] == (-1000, 1000)
-    finest = Units(SimpleNamespace(unit_nm=2.0, grid=1, lattices=[SimpleNamespace(constant=403)]))
+    finest = Units(
+        SimpleNamespace(unit_nm=2.0, grid=1, lattices=[SimpleNamespace(constant=403)])
+    )
     drawn, opened = marks._vernier(finest, 3771, 33)
     assert edges(drawn[11])[::2] == (3771 - 707, 3771 + 707)  # 0.375 of 3771 is 1414
     assert edges(opened[9])[::2] == (-3804 - 707, -3804 + 707)
@@ -151,7 +215,8 @@ def test_bars_are_a_step_wide_at_least_on_each_side():
 
 @pytest.mark.parametrize(("half", "fits"), [(183_475, True), (183_470, False)])
 def test_a_die_is_wide_enough_for_verniers_between_the_crosses_and_the_f(half, fits):
-    """369.45 um from the right edge to the middle of the level scale, 79.45 um of it, and 285 um
+    """369.45 um from the right edge to the middle of the level scale, 79.45 um of it,
+    and 285 um
     of cross, room and F."""
     die = Box(-half, -175_000, half, 175_000)
     if fits:

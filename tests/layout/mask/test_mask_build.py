@@ -1,4 +1,6 @@
-"""From diameters to the plan of a mask: quantisation, bias, doses, die features; impossible input is refused."""
+"""From diameters to the plan of a mask: quantisation, bias, doses, die features;
+impossible input is refused.
+"""
 
 import dataclasses
 import math
@@ -37,7 +39,9 @@ def test_drawn_diameters_are_within_half_a_step(step, seed):
     assert np.array_equal(found.classes > 0, there)
     drawn = found.diameters_nm[found.classes[there].astype(int) - 1]
     wanted = Process().written_diameter_nm(source.diameter_um[there] * 1e3)
-    assert np.abs(drawn - wanted).max() <= step / 2 + 1 / 16  # the table of designed diameters has 1/16 nm
+    assert (
+        np.abs(drawn - wanted).max() <= step / 2 + 1 / 16
+    )  # the table of designed diameters has 1/16 nm
     assert np.array_equal(np.bincount(found.classes.ravel())[1:], found.counts)
 
 
@@ -50,7 +54,9 @@ def test_bias_is_taken_off():
 
 def test_a_pillar_at_the_rim_is_drawn_wider_where_isolated_ones_come_out_thin():
     process = Process(bias=Bias(isolated_nm=-10.0))
-    ((_, drawn),) = cells.drawn_blocks(DiameterMap(np.full((31, 31), 0.2), 0.4), process)
+    ((_, drawn),) = cells.drawn_blocks(
+        DiameterMap(np.full((31, 31), 0.2), 0.4), process
+    )
     ((_, alone),) = cells.drawn_blocks(DiameterMap(np.array([[0.2]]), 0.4), Process())
     assert drawn[0, 0] > drawn[15, 15]
     assert drawn[15, 15] == alone[0, 0]
@@ -88,13 +94,23 @@ def test_a_pitch_off_the_grid_is_refused():
     with pytest.raises(ProcessError, match="no multiple of the grid"):
         layout.plan(disc_map(pitch=0.4005), PLAIN)
     with pytest.raises(ProcessError, match="no multiple of the grid"):
-        layout.plan(disc_map(pitch=0.402), Process(rules=Rules(grid_nm=5, diameter_step_nm=10)))
+        layout.plan(
+            disc_map(pitch=0.402), Process(rules=Rules(grid_nm=5, diameter_step_nm=10))
+        )
 
 
 def test_coordinates_beyond_32_bit_are_refused():
     rows = 10_800_000  # times 0.4 um is 4.3 m: 2^32 nm
     with pytest.raises(ProcessError, match="32 bits"):
-        Lattice("LENS", rows, 2, 400, -200, 200 * (rows - 1), lambda a, b: np.zeros((b - a, 2), np.uint8))
+        Lattice(
+            "LENS",
+            rows,
+            2,
+            400,
+            -200,
+            200 * (rows - 1),
+            lambda a, b: np.zeros((b - a, 2), np.uint8),
+        )
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 10])
@@ -105,7 +121,9 @@ def test_the_axis_of_the_lens_is_the_origin_and_coordinates_are_those_of_the_len
     lattice = plan.lattices[0]
     half = (n - 1) * 200
     assert (lattice.x0, lattice.y0) == (-half, half)
-    assert lattice.whole()[n - 1, n - 1] == 1  # the map's first row, at negative y, is the lowest of the mask
+    assert (
+        lattice.whole()[n - 1, n - 1] == 1
+    )  # the map's first row, at negative y, is the lowest of the mask
     assert plan.axis == (0, 0)
 
 
@@ -116,7 +134,9 @@ def test_an_even_lens_on_an_odd_pitch_lies_half_a_step_off_and_says_so():
 
 
 def test_a_coarse_grid_holds_for_everything():
-    process = Process(rules=Rules(grid_nm=5, diameter_step_nm=10), exposure=Exposure(correct=False))
+    process = Process(
+        rules=Rules(grid_nm=5, diameter_step_nm=10), exposure=Exposure(correct=False)
+    )
     plan = layout.plan(disc_map(31), process)
     assert plan.grid == 5
     assert layout.check(plan, process.rules).counts["off-grid"] == 0
@@ -135,10 +155,14 @@ def test_without_a_point_exposure_the_lens_has_one_datatype_and_one_dose():
 
 
 def test_doses_become_named_datatypes_and_every_shape_has_one():
-    made = build.prepare(disc_map(61), Process(exposure=Exposure(**BEAM, tolerance=0.02)))
+    made = build.prepare(
+        disc_map(61), Process(exposure=Exposure(**BEAM, tolerance=0.02))
+    )
     assert made.dose is not None
     assert made.dose.worst < 0.02
-    drawn = {c.layer for c in made.plan.classes} | {layer for f in made.plan.figures for layer in f.polygons}
+    drawn = {c.layer for c in made.plan.classes} | {
+        layer for f in made.plan.figures for layer in f.polygons
+    }
     assert drawn - set(made.plan.doses) == {(10, 0)}
     for c in made.plan.classes:
         assert made.plan.doses[c.layer] == c.dose
@@ -147,27 +171,40 @@ def test_doses_become_named_datatypes_and_every_shape_has_one():
 
 
 def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
-    """Pillars of lens, dose test and witness cells, and a mark: the direct sum over all of them, at some edges."""
+    """Pillars of lens, dose test and witness cells, and a mark: the direct sum over all
+    of them, at some edges.
+    """
     settings = Exposure(**BEAM, tolerance=0.01)
     plan = build.prepare(disc_map(41), Process(exposure=settings)).plan
     point = exposure.point_exposure(settings)
     centres, wide, dose, goal = [], [], [], []
     for lattice in plan.lattices:
         rows, columns = np.nonzero(lattice.whole())
-        centres.append(np.stack([lattice.x0 + columns * 400, lattice.y0 - rows * 400], -1) * 1e-3)
+        centres.append(
+            np.stack([lattice.x0 + columns * 400, lattice.y0 - rows * 400], -1) * 1e-3
+        )
         kinds = [plan.classes[k - 1] for k in lattice.whole()[rows, columns]]
         wide += [c.diameter_nm * 1e-3 for c in kinds]
         dose += [c.dose for c in kinds]
         goal += [c.goal for c in kinds]
-    centres, wide, dose, goal = np.concatenate(centres), np.array(wide), np.array(dose), np.array(goal)
+    centres, wide, dose, goal = (
+        np.concatenate(centres),
+        np.array(wide),
+        np.array(dose),
+        np.array(goal),
+    )
     which = np.linspace(0, len(wide) - 1, 24).astype(int)
     beside = [f.polygons.items() for f in plan.figures if f.name in ("MARKS", "LABEL")]
-    shapes = [(p, plan.doses[layer]) for items in beside for layer, ps in items for p in ps]
+    shapes = [
+        (p, plan.doses[layer]) for items in beside for layer, ps in items for p in ps
+    ]
     edges = rims.at_edges(centres, wide, dose, point, which=which, rim_points=8)
     box = np.array([[*p.min(0), *p.max(0)] for p, _ in shapes]) * 1e-3
     level = np.array([dose for _, dose in shapes])
     area = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
-    for n, index in enumerate(which):  # marks and label: small beside the width of the beam that reaches this far
+    for n, index in enumerate(
+        which
+    ):  # marks and label: small beside the width of the beam that reaches this far
         away = np.hypot(*(((box[:, :2] + box[:, 2:]) / 2 - centres[index]).T))
         edges[n] += (level * area * point.density(away)).sum()
     assert abs(edges / (0.5 * goal[which]) - 1).max() < 0.01 + 2e-3
@@ -177,27 +214,53 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
 def test_the_die_holds_everything_within_its_street_and_apart():
     process = Process(exposure=Exposure(correct=False))
     plan = layout.plan(disc_map(101), process, name="LENS_7")
-    names = {figure.name for figure in plan.figures} | {lattice.name for lattice in plan.lattices}
-    assert names == {"APERTURE", "MARKS", "VERNIERS", "LABEL", "OUTLINE", "LENS", "DOSETEST", "WITNESS"}
+    names = {figure.name for figure in plan.figures} | {
+        lattice.name for lattice in plan.lattices
+    }
+    assert names == {
+        "APERTURE",
+        "MARKS",
+        "VERNIERS",
+        "LABEL",
+        "OUTLINE",
+        "LENS",
+        "DOSETEST",
+        "WITNESS",
+    }
     assert layout.check(plan, process.rules).ok
-    outline = next(f for f in plan.figures if f.name == "OUTLINE").polygons[process.layers.outline][0]
+    outline = next(f for f in plan.figures if f.name == "OUTLINE").polygons[
+        process.layers.outline
+    ][0]
     edge = outline.max() - 1000 * process.die.street_um
     for figure in plan.figures:
         if figure.name != "OUTLINE":
-            assert max(np.abs(p).max() for ps in figure.polygons.values() for p in ps) <= edge
+            assert (
+                max(np.abs(p).max() for ps in figure.polygons.values() for p in ps)
+                <= edge
+            )
     doses = {c.dose for c in plan.classes if c.layer[0] == process.layers.dose[0]}
     assert doses == set(die.DOSES)
 
 
 def test_the_aperture_opens_the_lens_and_the_test_structures():
     plan = layout.plan(disc_map(101), PLAIN)
-    openings = next(f for f in plan.figures if f.name == "APERTURE").polygons[PLAIN.layers.aperture]
+    openings = next(f for f in plan.figures if f.name == "APERTURE").polygons[
+        PLAIN.layers.aperture
+    ]
     radius = 1000 * (disc_map(101).radius_um + 0.2)
-    assert polygon.twice_area(openings[0]) / 2 == pytest.approx(math.pi * radius**2, rel=1e-4)
+    assert polygon.twice_area(openings[0]) / 2 == pytest.approx(
+        math.pi * radius**2, rel=1e-4
+    )
     for lattice in plan.lattices[1:]:
-        corners = (lattice.x0, lattice.y0), (lattice.x0 + (lattice.columns - 1) * lattice.pitch, lattice.y0)
+        corners = (
+            (lattice.x0, lattice.y0),
+            (lattice.x0 + (lattice.columns - 1) * lattice.pitch, lattice.y0),
+        )
         assert any(
-            all(p[:, 0].min() < x < p[:, 0].max() and p[:, 1].min() < y < p[:, 1].max() for x, y in corners)
+            all(
+                p[:, 0].min() < x < p[:, 0].max() and p[:, 1].min() < y < p[:, 1].max()
+                for x, y in corners
+            )
             for p in openings[1:]
         )
 
@@ -207,8 +270,11 @@ def test_the_aperture_disc_keeps_its_area_and_fits_gdsii(radius, grid):
     shape = die.disc(radius, (0.0, 0.0), grid)
     assert len(shape) <= 8000
     assert (shape % grid == 0).all()
-    # rounding moves each vertex by at most 0.71 grid steps, its edge by as much: 1.5 g / R of the area
-    assert polygon.twice_area(shape) / 2 == pytest.approx(math.pi * radius**2, rel=1.5 * grid / radius + 1e-9)
+    # rounding moves each vertex by at most 0.71 grid steps, its edge by as much: 1.5 g
+    # / R of the area
+    assert polygon.twice_area(shape) / 2 == pytest.approx(
+        math.pi * radius**2, rel=1.5 * grid / radius + 1e-9
+    )
 
 
 def test_a_die_without_room_is_refused_with_what_it_needs():
@@ -222,13 +288,18 @@ def test_the_orientation_mark_is_like_none_of_its_images():
     shape = db.Region(db.Polygon([db.Point(*map(int, p)) for p in mark]))
     for turn in range(1, 8):
         other = shape.transformed(db.Trans(turn % 4, turn >= 4, 0, 0))
-        moved = other.moved(shape.bbox().left - other.bbox().left, shape.bbox().bottom - other.bbox().bottom)
+        moved = other.moved(
+            shape.bbox().left - other.bbox().left,
+            shape.bbox().bottom - other.bbox().bottom,
+        )
         assert not (moved ^ shape).is_empty()
 
 
 def test_letters_are_upright_and_unknown_ones_are_refused():
     shapes = font.text("L", x=0, y=0, square=10)
-    heights = {(int(s[:, 0].min()), int(s[:, 0].max())) for s in shapes if s[:, 1].min() == 0}
+    heights = {
+        (int(s[:, 0].min()), int(s[:, 0].max())) for s in shapes if s[:, 1].min() == 0
+    }
     assert heights == {(0, 50)}  # the foot of an L is at the bottom
     assert max(int(s[:, 1].max()) for s in shapes) == 70
     with pytest.raises(ProcessError, match="font"):
@@ -243,13 +314,19 @@ def test_dose_test_layers_keep_clear_of_the_others():
 
 def test_doses_of_the_test_array_are_datatypes_of_one_layer():
     """From 0.8 in steps of 0.05, on 16/20 and the eight that follow."""
-    plan = layout.plan(disc_map(101), dataclasses.replace(PLAIN, layers=Layers(dose=(16, 20))))
+    plan = layout.plan(
+        disc_map(101), dataclasses.replace(PLAIN, layers=Layers(dose=(16, 20)))
+    )
     found = {made.layer: made.dose for made in plan.classes if made.layer[0] == 16}
     assert found == pytest.approx({(16, 20 + k): 0.8 + 0.05 * k for k in range(9)})
 
 
-def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independent_reader_sees_them(tmp_path):
-    """One pillar right of the axis and one at positive y, read back by KLayout: neither axis is mirrored."""
+def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independent_reader_sees_them(
+    tmp_path,
+):
+    """One pillar right of the axis and one at positive y, read back by KLayout: neither
+    axis is mirrored.
+    """
     db = pytest.importorskip("klayout.db")
     d = np.zeros((21, 21))
     d[10, 15], d[18, 10] = 0.20, 0.30  # (x, y) = (+2.0, 0) and (0, +3.2) um
@@ -259,7 +336,10 @@ def test_a_lens_without_symmetry_is_drawn_in_its_own_coordinates_as_an_independe
         read = db.Layout()
         read.read(str(tmp_path / name))
         region = db.Region(read.top_cell().begin_shapes_rec(read.layer(1, 0)))
-        found = {(round(p.bbox().center().x), round(p.bbox().center().y)): p.bbox().width() for p in region.each()}
+        found = {
+            (round(p.bbox().center().x), round(p.bbox().center().y)): p.bbox().width()
+            for p in region.each()
+        }
         assert found.keys() == {(2000, 0), (0, 3200)}
         assert found[2000, 0] == pytest.approx(200, abs=4)
         assert found[0, 3200] == pytest.approx(300, abs=4)

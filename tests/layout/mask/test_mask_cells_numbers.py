@@ -25,13 +25,21 @@ def lens(sizes_nm, pitch_um=0.4):
 @pytest.mark.parametrize("sites", [1 << 20, 6])
 def test_classes_are_the_drawn_sizes_thinnest_first(tmp_path, monkeypatch, sites):
     monkeypatch.setattr(cells, "_BLOCK_SITES", sites)
-    sizes = [[0, 101.5, 240.0], [198.2, 0, 101.9], [100.4, 240.9, 197.9], [0, 0, 102.2], [237.9, 300, 0]]
+    sizes = [
+        [0, 101.5, 240.0],
+        [198.2, 0, 101.9],
+        [100.4, 240.9, 197.9],
+        [0, 0, 102.2],
+        [237.9, 300, 0],
+    ]
     found = cells.quantise(lens(sizes), rules(tmp_path, PLAIN))
     assert found.diameters_nm.tolist() == [100, 104, 196, 200, 236, 240, 300]
     drawn = np.rint(np.asarray(sizes) / 4) * 4
     classes = np.searchsorted(found.diameters_nm, drawn) + 1
     assert np.array_equal(found.classes, np.where(drawn > 0, classes, 0))
-    assert found.counts.tolist() == [int((drawn == d).sum()) for d in found.diameters_nm]
+    assert found.counts.tolist() == [
+        int((drawn == d).sum()) for d in found.diameters_nm
+    ]
     assert found.rounding_nm == 2.0
     assert found.classes.dtype == np.uint8
 
@@ -39,17 +47,25 @@ def test_classes_are_the_drawn_sizes_thinnest_first(tmp_path, monkeypatch, sites
 def test_more_than_255_classes_take_two_bytes(tmp_path):
     text = PLAIN.replace("= 4", "= 1")
     for count, kind in ((255, np.uint8), (256, np.uint16)):
-        found = cells.quantise(lens([np.arange(100, 100 + count)], 0.5), rules(tmp_path, text))
+        found = cells.quantise(
+            lens([np.arange(100, 100 + count)], 0.5), rules(tmp_path, text)
+        )
         assert (len(found.diameters_nm), found.classes.dtype) == (count, kind)
         assert found.classes[0].tolist() == list(range(1, count + 1))
 
 
 @pytest.mark.parametrize("sites", [1 << 20, 30])
-def test_pillars_that_lack_neighbours_are_drawn_for_what_they_lack(tmp_path, monkeypatch, sites):
-    """Isolation of the whole map at once, and the size that is drawn for each pillar by itself."""
+def test_pillars_that_lack_neighbours_are_drawn_for_what_they_lack(
+    tmp_path, monkeypatch, sites
+):
+    """Isolation of the whole map at once, and the size that is drawn for each pillar by
+    itself.
+    """
     monkeypatch.setattr(cells, "_BLOCK_SITES", sites)
     made = rules(tmp_path, ALONE)
-    sizes = np.where(RNG.uniform(size=(31, 9)) < 0.4, RNG.uniform(120, 260, (31, 9)), 0.0)
+    sizes = np.where(
+        RNG.uniform(size=(31, 9)) < 0.4, RNG.uniform(120, 260, (31, 9)), 0.0
+    )
     design = lens(sizes)
     found = cells.quantise(design, made)
     alone = isolation.isolation(sizes > 0, design.steps_um, 0.9, centred=False)
@@ -57,24 +73,34 @@ def test_pillars_that_lack_neighbours_are_drawn_for_what_they_lack(tmp_path, mon
     for at in zip(*np.nonzero(sizes), strict=True):
         want[at] = made.written_diameter_nm(sizes[at][None], alone[at][None])[0]
     drawn = np.concatenate([[0], found.diameters_nm])[found.classes]
-    assert np.abs(drawn - want)[sizes > 0].max() <= 2.0 + 1 / 16  # half a step, and the table of those with neighbours
+    assert (
+        np.abs(drawn - want)[sizes > 0].max() <= 2.0 + 1 / 16
+    )  # half a step, and the table of those with neighbours
     assert (np.abs(drawn - want) <= 2.0)[alone > 0].all()
     assert np.abs(want - sizes)[sizes > 0].max() > 4.5
     assert not drawn[sizes == 0].any()
 
 
 @pytest.mark.parametrize("sites", [1 << 20, 6])
-def test_what_cannot_be_drawn_is_named_in_its_row_of_the_map(tmp_path, monkeypatch, sites):
+def test_what_cannot_be_drawn_is_named_in_its_row_of_the_map(
+    tmp_path, monkeypatch, sites
+):
     monkeypatch.setattr(cells, "_BLOCK_SITES", sites)
     made = rules(tmp_path, PLAIN)
     sizes = np.full((7, 3), 200.0)
     sizes[5, 2] = 399.0
-    with pytest.raises(ProcessError, match=r"row 5, column 2 is 0\.4 um, need less than the pitch of 0\.4 um"):
+    with pytest.raises(
+        ProcessError,
+        match=r"row 5, column 2 is 0\.4 um, need less than the pitch of 0\.4 um",
+    ):
         cells.quantise(lens(sizes), made)
     sizes[5, 2] = 397.0
     assert cells.quantise(lens(sizes), made).diameters_nm.tolist() == [200, 396]
     sizes[4, 1] = 1.9
-    with pytest.raises(ProcessError, match=r"row 4, column 1, 0\.0019 um wide, would be drawn with diameter 0"):
+    with pytest.raises(
+        ProcessError,
+        match=r"row 4, column 1, 0\.0019 um wide, would be drawn with diameter 0",
+    ):
         cells.quantise(lens(sizes), made)
 
 

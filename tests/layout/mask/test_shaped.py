@@ -1,4 +1,6 @@
-"""Masks of turned pillars, other shapes and hexagonal lattices, as KLayout reads them; what is refused by name."""
+"""Masks of turned pillars, other shapes and hexagonal lattices, as KLayout reads them;
+what is refused by name.
+"""
 
 import dataclasses
 import math
@@ -16,13 +18,23 @@ from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from layout.rules import check as drc
 from metalens.cell import Cell, Lattice
-from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring, Square
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Polygon,
+    Rectangle,
+    Ring,
+    Square,
+)
 from metalens.ground.errors import ProcessError
 from metalens.lens import DiameterMap, Lens, Pairs
 from metalens.made import Bias
 from metalens.pillars import Proxy
 
-PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01)
+PROXY = Proxy(
+    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01
+)
 PROCESS = processes.Process()
 
 
@@ -32,7 +44,14 @@ def lens(shape=None, turned=True, rows=14, columns=19):
     angle = rng.uniform(0, math.pi, size.shape) if turned else None
     cell = Cell(0.4, shape=shape or Rectangle(0.55))
     return Lens(
-        DiameterMap(size, 0.4, angle_rad=angle), cell, PROXY, 0.94, 77.0, math.inf, "map", hand="left" if turned else ""
+        DiameterMap(size, 0.4, angle_rad=angle),
+        cell,
+        PROXY,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+        hand="left" if turned else "",
     )
 
 
@@ -41,11 +60,21 @@ def hexagonal(row_um=0.291):
     size = np.rint(rng.uniform(90, 240, (15, 22))) * 1e-3
     size[(np.arange(15)[:, None] + np.arange(22)) % 2 == 1] = 0
     cell = Cell(0.336, lattice=Lattice("hexagonal"))
-    return Lens(DiameterMap(size, 0.336, cell.lattice, row_um), cell, PROXY, 0.94, 77.0, math.inf, "map")
+    return Lens(
+        DiameterMap(size, 0.336, cell.lattice, row_um),
+        cell,
+        PROXY,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+    )
 
 
 def shapes(path):
-    """[(x, y, corners about the site)] of every pillar of the lens, as KLayout reads them."""
+    """[(x, y, corners about the site)] of every pillar of the lens, as KLayout reads
+    them.
+    """
     db = pytest.importorskip("klayout.db")
     read = db.Layout()
     read.read(str(path))
@@ -74,12 +103,22 @@ def written(made, folder, suffix):
 
 
 def axis_of(corners):
-    """(turn of the long axis modulo pi, area, second moments) of a polygon, by Green's theorem."""
+    """(turn of the long axis modulo pi, area, second moments) of a polygon, by Green's
+    theorem.
+    """
     p, q = corners.astype(float), np.roll(corners, -1, axis=0).astype(float)
     cross = p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]
     area = cross.sum() / 2
-    xx, yy = ((cross * (a * a + a * b + b * b)).sum() / 12 for a, b in zip(p.T, q.T, strict=True))
-    mixed = (p[:, 0] * q[:, 1] + 2 * p[:, 0] * p[:, 1] + 2 * q[:, 0] * q[:, 1] + q[:, 0] * p[:, 1]) * cross
+    xx, yy = (
+        (cross * (a * a + a * b + b * b)).sum() / 12
+        for a, b in zip(p.T, q.T, strict=True)
+    )
+    mixed = (
+        p[:, 0] * q[:, 1]
+        + 2 * p[:, 0] * p[:, 1]
+        + 2 * q[:, 0] * q[:, 1]
+        + q[:, 0] * p[:, 1]
+    ) * cross
     xy = mixed.sum() / 24
     sign = np.sign(area)
     return 0.5 * math.atan2(2 * sign * xy, sign * (xx - yy)) % math.pi, abs(area)
@@ -97,20 +136,40 @@ def test_every_turned_pillar_is_drawn_at_its_place_and_turn(tmp_path, suffix):
         corners = there[round(1e3 * d.x_um[column]), round(1e3 * d.y_um[row])]
         turn, area = axis_of(corners)
         off = (turn - d.angle_rad[row, column] + math.pi / 2) % math.pi - math.pi / 2
-        assert abs(math.degrees(off)) < 0.5 + 0.35  # half a step of the turns; corners on the grid: 1 nm of 120
-        assert area == pytest.approx(240 * 132, rel=0.012)  # half a nm along each edge of 240 and 132
+        assert (
+            abs(math.degrees(off)) < 0.5 + 0.35
+        )  # half a step of the turns; corners on the grid: 1 nm of 120
+        assert area == pytest.approx(
+            240 * 132, rel=0.012
+        )  # half a nm along each edge of 240 and 132
 
 
 @pytest.mark.parametrize(
     ("shape", "area"),
-    [(Square(), 240**2), (Ellipse(0.6), math.pi / 4 * 240 * 144), (Rectangle(0.55, angle_rad=0.4), 240 * 132)],
+    [
+        (Square(), 240**2),
+        (Ellipse(0.6), math.pi / 4 * 240 * 144),
+        (Rectangle(0.55, angle_rad=0.4), 240 * 132),
+    ],
 )
-def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(tmp_path, shape, area):
+def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(
+    tmp_path, shape, area
+):
     made = lens(shape, turned=False, rows=12, columns=12)
-    d = dataclasses.replace(made.diameters, diameter_um=np.full((12, 12), 0.24))  # the map is symmetric, the shape not
+    d = dataclasses.replace(
+        made.diameters, diameter_um=np.full((12, 12), 0.24)
+    )  # the map is symmetric, the shape not
     _, found = written(dataclasses.replace(made, diameters=d), tmp_path, "oas")
     assert len(found) == 144
-    assert len({tuple(map(tuple, np.roll(c, -np.lexsort(c.T)[0], axis=0))) for _, _, c in found}) == 1
+    assert (
+        len(
+            {
+                tuple(map(tuple, np.roll(c, -np.lexsort(c.T)[0], axis=0)))
+                for _, _, c in found
+            }
+        )
+        == 1
+    )
     assert axis_of(found[0][2])[1] == pytest.approx(area, rel=0.012)
     if isinstance(shape, Rectangle):
         assert axis_of(found[0][2])[0] == pytest.approx(0.4, abs=0.006)
@@ -118,23 +177,46 @@ def test_unturned_shapes_are_drawn_too_and_never_folded_into_their_mirror_image(
 
 @pytest.mark.parametrize("shape", [Rectangle(), Ellipse()], ids=lambda s: s.kind)
 def test_pillars_of_two_sizes_are_drawn_with_their_width_and_length(tmp_path, shape):
-    rng, there = np.random.default_rng(8), np.random.default_rng(4).random((9, 12)) < 0.8
+    rng, there = (
+        np.random.default_rng(8),
+        np.random.default_rng(4).random((9, 12)) < 0.8,
+    )
     size, length = (
-        np.where(there, rng.integers(low, high, (9, 12)) * 2e-3, 0.0) for low, high in ((45, 140), (60, 150))
+        np.where(there, rng.integers(low, high, (9, 12)) * 2e-3, 0.0)
+        for low, high in ((45, 140), (60, 150))
     )
     axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
-    table = Pairs(np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf))
+    table = Pairs(
+        np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf)
+    )
     sizes = DiameterMap(size, 0.4, length_um=length)
-    made = Lens(sizes, Cell(0.4, shape=shape), table.proxy, 0.94, 77.0, math.inf, "map", pairs=table)
+    made = Lens(
+        sizes,
+        Cell(0.4, shape=shape),
+        table.proxy,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+        pairs=table,
+    )
     plan, found = written(made, tmp_path, "gds")
     placed = {(x, y): np.ptp(corners, axis=0) for x, y, corners in found}
     assert len(found) == there.sum()
-    d, grid = made.diameters, 1.0 if shape.kind == "rectangle" else 2.0  # corners of ellipses keep the area
+    d, grid = (
+        made.diameters,
+        1.0 if shape.kind == "rectangle" else 2.0,
+    )  # corners of ellipses keep the area
     for row, column in np.argwhere(there):
-        at = round(1e3 * d.x_um[column] + plan.axis[0]), round(1e3 * d.y_um[row] + plan.axis[1])
+        at = (
+            round(1e3 * d.x_um[column] + plan.axis[0]),
+            round(1e3 * d.y_um[row] + plan.axis[1]),
+        )
         want = 1e3 * np.array([size[row, column], length[row, column]])
         assert np.abs(placed[at] - want).max() <= grid
-    wide = np.array([c.outline for c in plan.classes if c.name.startswith("D")], dtype=object)
+    wide = np.array(
+        [c.outline for c in plan.classes if c.name.startswith("D")], dtype=object
+    )
     assert len(wide) == len(np.unique(np.stack([size[there], length[there]]), axis=1).T)
 
 
@@ -147,31 +229,53 @@ def test_pillars_of_a_hexagonal_lattice_stand_on_it(tmp_path, suffix):
     axis = np.array(plan.axis)  # it may lie half a step off the grid
     want = np.stack([1e3 * d.x_um[columns], 1e3 * d.y_um[rows]], 1) + axis
     got = np.array([(x, y) for x, y, _ in found], float)
-    assert np.abs(got[np.lexsort(got.T)] - want[np.lexsort(np.rint(want).T)]).max() < 1e-6
+    assert (
+        np.abs(got[np.lexsort(got.T)] - want[np.lexsort(np.rint(want).T)]).max() < 1e-6
+    )
     apart = np.hypot(*(got[:, None] - got).T)
-    assert np.sort(apart[apart > 0])[0] == pytest.approx(336, abs=0.02)  # hypot(168, 291) = 336.01
+    assert np.sort(apart[apart > 0])[0] == pytest.approx(
+        336, abs=0.02
+    )  # hypot(168, 291) = 336.01
 
 
 def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
-    """Against the least distance between the corners and edges of all pairs, written out."""
+    """Against the least distance between the corners and edges of all pairs, written
+    out.
+    """
     for made in (lens(), hexagonal()):
         plan = build.plan(made, PROCESS, furnished=False)
         lattice = plan.lattices[0]
         sites = lattice.whole()
         rows, columns = np.nonzero(sites)
-        place = np.stack([lattice.x0 + columns * lattice.pitch, lattice.y0 - rows * lattice.down], 1)
-        outlines = [plan.classes[sites[r, c] - 1].outline + at for r, c, at in zip(rows, columns, place, strict=True)]
+        place = np.stack(
+            [lattice.x0 + columns * lattice.pitch, lattice.y0 - rows * lattice.down], 1
+        )
+        outlines = [
+            plan.classes[sites[r, c] - 1].outline + at
+            for r, c, at in zip(rows, columns, place, strict=True)
+        ]
         middles = np.array([o.mean(0) for o in outlines])
         least = math.inf
-        for i, j in zip(*np.nonzero(np.triu(np.hypot(*(middles[:, None] - middles).T) < 700, 1)), strict=True):
+        for i, j in zip(
+            *np.nonzero(np.triu(np.hypot(*(middles[:, None] - middles).T) < 700, 1)),
+            strict=True,
+        ):
             for a, b in ((outlines[i], outlines[j]), (outlines[j], outlines[i])):
                 edge = np.roll(b, -1, axis=0) - b
                 to = a[:, None].astype(float) - b
                 along = np.clip((to * edge).sum(-1) / (edge**2).sum(-1), 0, 1)
-                least = min(least, float(np.hypot(*(to - along[..., None] * edge).T).min()))
-        found = drc.check(plan, PROCESS.rules, foot_nm=np.array([c.diameter_nm + 20.0 for c in plan.classes]))
+                least = min(
+                    least, float(np.hypot(*(to - along[..., None] * edge).T).min())
+                )
+        found = drc.check(
+            plan,
+            PROCESS.rules,
+            foot_nm=np.array([c.diameter_nm + 20.0 for c in plan.classes]),
+        )
         assert found.minimum_gap_nm == pytest.approx(least)
-        assert found.minimum_foot_gap_nm == pytest.approx(least - 20, abs=1.1)  # round ones by circles
+        assert found.minimum_foot_gap_nm == pytest.approx(
+            least - 20, abs=1.1
+        )  # round ones by circles
         assert found.pillars == len(rows)
 
 
@@ -179,7 +283,11 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
     ("made", "change", "words"),
     [
         (lens(Ring(0.01), turned=False), {}, "four steps of the grid"),
-        (lens(Ring(0.05), turned=False), {"bias": Bias(table_nm=((80.0, -30.0), (300.0, -30.0)))}, "no hole"),
+        (
+            lens(Ring(0.05), turned=False),
+            {"bias": Bias(table_nm=((80.0, -30.0), (300.0, -30.0)))},
+            "no hole",
+        ),
         (hexagonal(row_um=0.0), {}, "no multiple of the grid"),
     ],
 )
@@ -199,30 +307,47 @@ def drawn_of(made, process):
 
 @pytest.mark.parametrize("shape", [Rectangle(0.55), Ellipse(1.4), Ring(0.45)])
 def test_edges_of_a_lone_pillar_of_any_shape_move_by_what_it_lacks(shape):
-    """It comes out 14 nm thinner: all its edges are drawn 7 nm further out, its two sides stay those of the design."""
+    """It comes out 14 nm thinner: all its edges are drawn 7 nm further out, its two
+    sides stay those of the design.
+    """
     size = np.full((31, 31), 0.2)
     size[:, 22:] = 0
     size[15, 28] = 0.2  # 3.5 ranges from all others
-    made = dataclasses.replace(lens(shape, turned=False), diameters=DiameterMap(size, 0.4))
+    made = dataclasses.replace(
+        lens(shape, turned=False), diameters=DiameterMap(size, 0.4)
+    )
     number, kinds = drawn_of(made, LONE)
     among, lone = kinds[number[15, 8]], kinds[number[15, 28]]
     spread = np.ptp(lone.outline, axis=0) - np.ptp(among.outline, axis=0)
-    assert np.abs(spread - 14).max() <= 1  # corners on a grid of 1 nm on both sides, both of the same design
+    assert (
+        np.abs(spread - 14).max() <= 1
+    )  # corners on a grid of 1 nm on both sides, both of the same design
     edge = kinds[number[15, 21]]  # at a straight rim
     lost = sum(math.exp(-((0.4 * i / 0.6) ** 2)) for i in range(1, 9))
     share = lost * (1 + 2 * lost) / ((1 + 2 * lost) ** 2 - 1)
-    assert abs(edge.diameter_nm - 200 - 14 * share) <= 1.01  # a step of 2 nm; the other side 1.4 of half a step
-    assert np.abs(np.ptp(edge.outline, axis=0) - np.ptp(among.outline, axis=0) - 14 * share).max() <= 3
+    assert (
+        abs(edge.diameter_nm - 200 - 14 * share) <= 1.01
+    )  # a step of 2 nm; the other side 1.4 of half a step
+    assert (
+        np.abs(
+            np.ptp(edge.outline, axis=0) - np.ptp(among.outline, axis=0) - 14 * share
+        ).max()
+        <= 3
+    )
 
 
 def test_a_round_pillar_of_a_hexagonal_lattice_lacks_what_is_missing_of_that_lattice():
-    """Half the places of the map hold no site: a pillar with all its neighbours must not count as half alone."""
+    """Half the places of the map hold no site: a pillar with all its neighbours must
+    not count as half alone.
+    """
     size = np.full((31, 41), 0.16)
     size[(np.arange(31)[:, None] + np.arange(41)) % 2 == 1] = 0
     size[:, 30:] = 0
     size[15, 39] = 0.16
     source = hexagonal()
-    made = dataclasses.replace(source, diameters=dataclasses.replace(source.diameters, diameter_um=size))
+    made = dataclasses.replace(
+        source, diameters=dataclasses.replace(source.diameters, diameter_um=size)
+    )
     number, kinds = drawn_of(made, LONE)
     assert kinds[number[15, 15]].diameter_nm == 160
     assert kinds[number[15, 39]].diameter_nm == 174
@@ -231,15 +356,39 @@ def test_a_round_pillar_of_a_hexagonal_lattice_lacks_what_is_missing_of_that_lat
 def test_lone_pillars_of_two_sizes_have_both_drawn_larger():
     there = np.zeros((9, 12), bool)
     axes = 0.09 + 2e-3 * np.arange(96), 0.12 + 2e-3 * np.arange(91)
-    pairs = Pairs(np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf))
+    pairs = Pairs(
+        np.array([0.94]), *axes, np.ones((1, 96, 91, 2), complex), (77.0, math.inf)
+    )
     there[::3, 1::3] = True  # 1.2 um apart: 6 ranges
-    sizes = DiameterMap(np.where(there, 0.15, 0), 0.4, length_um=np.where(there, 0.24, 0))
-    made = Lens(sizes, Cell(0.4, shape=Rectangle()), pairs.proxy, 0.94, 77.0, math.inf, "map", pairs=pairs)
+    sizes = DiameterMap(
+        np.where(there, 0.15, 0), 0.4, length_um=np.where(there, 0.24, 0)
+    )
+    made = Lens(
+        sizes,
+        Cell(0.4, shape=Rectangle()),
+        pairs.proxy,
+        0.94,
+        77.0,
+        math.inf,
+        "map",
+        pairs=pairs,
+    )
     table = dataclasses.replace(LONE, bias=Bias(isolated_nm=-20.0, range_um=0.2))
     number, kinds = drawn_of(made, table)
     plain, before = drawn_of(made, PROCESS)
-    for now, was in {(int(a), int(b)) for a, b in zip(number.ravel(), plain.ravel(), strict=True) if a}:
-        assert np.abs(np.ptp(kinds[now].outline, axis=0) - np.ptp(before[was].outline, axis=0) - 20).max() <= 1
+    for now, was in {
+        (int(a), int(b))
+        for a, b in zip(number.ravel(), plain.ravel(), strict=True)
+        if a
+    }:
+        assert (
+            np.abs(
+                np.ptp(kinds[now].outline, axis=0)
+                - np.ptp(before[was].outline, axis=0)
+                - 20
+            ).max()
+            <= 1
+        )
 
 
 def test_a_step_of_turns_divides_half_a_turn():
@@ -248,19 +397,29 @@ def test_a_step_of_turns_divides_half_a_turn():
 
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])
-@pytest.mark.parametrize("open_", [Square(hole=True), Circle(hole=True), Ellipse(0.7, 0.4, hole=True)])
-def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(open_, suffix, tmp_path):
+@pytest.mark.parametrize(
+    "open_", [Square(hole=True), Circle(hole=True), Ellipse(0.7, 0.4, hole=True)]
+)
+def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(
+    open_, suffix, tmp_path
+):
     plan, found = written(lens(open_, turned=False), tmp_path, suffix)
     size = 0.24e3  # nm, drawn as it is: the default process has no bias
-    area = {"square": 1.0, "circle": math.pi / 4, "ellipse": math.pi / 4 * 0.7}[open_.kind] * size**2
+    area = {"square": 1.0, "circle": math.pi / 4, "ellipse": math.pi / 4 * 0.7}[
+        open_.kind
+    ] * size**2
     assert len(found) == (lens(open_, turned=False).diameters.diameter_um > 0).sum()
     for *_, corners in found:
         x, y = corners.T
         shoelace = abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
-        # corners on a grid of 1 nm: half a unit along at most four edges of 240 nm, and the n-gon's area for arcs
+        # corners on a grid of 1 nm: half a unit along at most four edges of 240 nm, and
+        # the n-gon's area for arcs
         assert shoelace == pytest.approx(area, rel=0.01)
     assert plan.layer_names[1, 0] == "opening"
-    assert drc.check(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok is False  # walls of 160 to 240 nm
+    assert (
+        drc.check(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok
+        is False
+    )  # walls of 160 to 240 nm
 
 
 def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypatch):
@@ -268,21 +427,40 @@ def test_keys_are_counted_and_numbered_alike_by_a_table_and_by_sorting(monkeypat
     monkeypatch.setattr(shaped, "_TABLED", 0)
     by_sorting = build.plan(lens(), PROCESS, furnished=False)
     assert [c.name for c in table.classes] == [c.name for c in by_sorting.classes]
-    np.testing.assert_array_equal(table.lattices[0].whole(), by_sorting.lattices[0].whole())
+    np.testing.assert_array_equal(
+        table.lattices[0].whole(), by_sorting.lattices[0].whole()
+    )
 
 
 def test_all_edges_of_a_shape_move_by_the_bias_of_its_size():
-    """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of both; no ratio of 240."""
-    process = SimpleNamespace(bias=SimpleNamespace(made_nm=lambda drawn, alone: drawn - 12.0), rules=PROCESS.rules)
-    corners = shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process, 0.0).parts[0].vertices(32)
-    assert np.ptp(corners, axis=0) * 1e3 == pytest.approx([240.0, 0.55 * 228 + 12], abs=1e-9)
+    """240 nm drawn come out as 228: a rectangle of 228 by 0.55 x 228, 12 nm more of
+    both; no ratio of 240.
+    """
+    process = SimpleNamespace(
+        bias=SimpleNamespace(made_nm=lambda drawn, alone: drawn - 12.0),
+        rules=PROCESS.rules,
+    )
+    corners = (
+        shaped._biased(Cell(0.4, shape=Rectangle(0.55)), 240, process, 0.0)
+        .parts[0]
+        .vertices(32)
+    )
+    assert np.ptp(corners, axis=0) * 1e3 == pytest.approx(
+        [240.0, 0.55 * 228 + 12], abs=1e-9
+    )
 
 
 def test_turns_are_counted_over_half_a_turn_where_that_brings_the_shape_back():
-    """Every half degree: 360 of a rectangle, 720 of what a half turn changes, one where nothing is turned."""
-    process = dataclasses.replace(PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=0.5))
+    """Every half degree: 360 of a rectangle, 720 of what a half turn changes, one where
+    nothing is turned.
+    """
+    process = dataclasses.replace(
+        PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=0.5)
+    )
     d = lens().diameters
-    lone = SimpleNamespace(pitch_um=0.4, outline=lambda size: SimpleNamespace(repeats=lambda by: by > 6))
+    lone = SimpleNamespace(
+        pitch_um=0.4, outline=lambda size: SimpleNamespace(repeats=lambda by: by > 6)
+    )
     assert shaped._turns(Cell(0.4, shape=Rectangle(0.55)), d, process) == 360
     assert shaped._turns(lone, d, process) == 720
     assert shaped._turns(lone, lens(turned=False).diameters, process) == 1
@@ -291,7 +469,9 @@ def test_turns_are_counted_over_half_a_turn_where_that_brings_the_shape_back():
 def test_a_turn_goes_to_the_nearest_step_and_half_a_turn_to_none():
     degrees = np.array([[0.3, 179.7, 0.6, 90.4, -0.7]])
     sizes = DiameterMap(np.full((1, 5), 0.24), 0.4, angle_rad=np.radians(degrees))
-    process = dataclasses.replace(PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=1.0))
+    process = dataclasses.replace(
+        PROCESS, rules=dataclasses.replace(PROCESS.rules, angle_step_deg=1.0)
+    )
     ((_, key),) = shaped._keys(sizes, process, 180)
     assert (key % 180).tolist() == [[0, 0, 1, 90, 179]]
     assert (key // 180).tolist() == [[240] * 5]
@@ -299,19 +479,39 @@ def test_a_turn_goes_to_the_nearest_step_and_half_a_turn_to_none():
 
 @pytest.mark.parametrize("unit_nm", [1.0, 0.5])
 def test_a_class_is_as_wide_as_its_widest_corners_whatever_the_unit(unit_nm):
-    """Corners of 240 by 132 nm lie 273.9 apart, turned or not; sizes are met to half a step of 2 nm."""
+    """Corners of 240 by 132 nm lie 273.9 apart, turned or not; sizes are met to half a
+    step of 2 nm.
+    """
     made, drawn = shaped.classes(lens(), PROCESS, unit_nm=unit_nm)
-    across, found, within = (getattr(made, f.name) for f in dataclasses.fields(made)[1:])
-    assert across == pytest.approx(np.full(len(drawn), math.hypot(240, 132)), abs=1.5)  # corners on a grid of 1 nm
+    across, found, within = (
+        getattr(made, f.name) for f in dataclasses.fields(made)[1:]
+    )
+    assert across == pytest.approx(
+        np.full(len(drawn), math.hypot(240, 132)), abs=1.5
+    )  # corners on a grid of 1 nm
     assert found.sum() == (lens().diameters.diameter_um > 0).sum()
     assert within == PROCESS.rules.diameter_step_nm / 2
     assert {one.diameter_nm for one in drawn} == {240.0}
 
 
 U = Polygon(
-    ((-0.5, -0.45), (0.5, -0.35), (0.5, 0.5), (0.2, 0.5), (0.2, 0.0), (-0.2, -0.1), (-0.25, 0.4), (-0.5, 0.4)), 0.2
+    (
+        (-0.5, -0.45),
+        (0.5, -0.35),
+        (0.5, 0.5),
+        (0.2, 0.5),
+        (0.2, 0.0),
+        (-0.2, -0.1),
+        (-0.25, 0.4),
+        (-0.5, 0.4),
+    ),
+    0.2,
 )
-LATTICES = {"square": Lattice(), "rectangular": Lattice("rectangular", 1.1), "hexagonal": Lattice("hexagonal")}
+LATTICES = {
+    "square": Lattice(),
+    "rectangular": Lattice("rectangular", 1.1),
+    "hexagonal": Lattice("hexagonal"),
+}
 
 
 def of_sizes(shape, kind, rows=9, columns=14):
@@ -338,29 +538,52 @@ def region(path, cell):
     db = pytest.importorskip("klayout.db")
     read = db.Layout()
     read.read(str(path))
-    return db.Region(db.RecursiveShapeIterator(read, read.cell(cell), read.layer(1, 0))).merged()
+    return db.Region(
+        db.RecursiveShapeIterator(read, read.cell(cell), read.layer(1, 0))
+    ).merged()
 
 
 @pytest.mark.parametrize("suffix", ["gds", "oas"])
 @pytest.mark.parametrize("kind", list(LATTICES))
-@pytest.mark.parametrize("shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind)
-def test_rings_crosses_and_hollow_polygons_are_drawn_with_their_area_on_their_sites(shape, kind, suffix, tmp_path):
-    """KLayout merges the pieces of a ring into one polygon with one hole; no piece touches itself."""
+@pytest.mark.parametrize(
+    "shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind
+)
+def test_rings_crosses_and_hollow_polygons_are_drawn_with_their_area_on_their_sites(
+    shape, kind, suffix, tmp_path
+):
+    """KLayout merges the pieces of a ring into one polygon with one hole; no piece
+    touches itself.
+    """
     made = of_sizes(shape, kind)
     plan, found = written(made, tmp_path, suffix)
     d = made.diameters
     rows, columns = np.nonzero(d.diameter_um)
-    want = np.stack([1e3 * d.x_um[columns], 1e3 * d.y_um[rows]], 1) + np.array(plan.axis)
+    want = np.stack([1e3 * d.x_um[columns], 1e3 * d.y_um[rows]], 1) + np.array(
+        plan.axis
+    )
     sizes = dict(
-        zip(map(tuple, np.rint(want).astype(int).tolist()), d.diameter_um[rows, columns].tolist(), strict=True)
+        zip(
+            map(tuple, np.rint(want).astype(int).tolist()),
+            d.diameter_um[rows, columns].tolist(),
+            strict=True,
+        )
     )
     merged = region(tmp_path / f"m.{suffix}", "LENS")
-    assert sum(p.area2() for p in merged.each()) == 2 * sum(axis_of(c)[1] for *_, c in found)  # pieces do not overlap
-    assert merged.count() == len(rows) == len(found) / (2 if shape.kind == "ring" else 1)
+    assert sum(p.area2() for p in merged.each()) == 2 * sum(
+        axis_of(c)[1] for *_, c in found
+    )  # pieces do not overlap
+    assert (
+        merged.count() == len(rows) == len(found) / (2 if shape.kind == "ring" else 1)
+    )
     for x, y, corners in found:
         outline = made.cell.outline(sizes[x, y])
-        share = axis_of(corners)[1] / (1e6 * outline.area_um2) * (2 if shape.kind == "ring" else 1)
-        # circles keep their area to 1e-3; half a unit along 1.3 um of edges, random over 8 or more, is 0.7 % of 25 000
+        share = (
+            axis_of(corners)[1]
+            / (1e6 * outline.area_um2)
+            * (2 if shape.kind == "ring" else 1)
+        )
+        # circles keep their area to 1e-3; half a unit along 1.3 um of edges, random
+        # over 8 or more, is 0.7 % of 25 000
         assert share == pytest.approx(1, rel=2e-3 if shape.kind == "ring" else 1.2e-2)
         assert len(np.unique(corners, axis=0)) == len(corners)
     holes = [polygon.holes() for polygon in merged.each()]
@@ -368,38 +591,63 @@ def test_rings_crosses_and_hollow_polygons_are_drawn_with_their_area_on_their_si
 
 
 @pytest.mark.parametrize("kind", list(LATTICES))
-@pytest.mark.parametrize("shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind)
-def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(shape, kind, tmp_path):
-    """The least width and space: the next whole nm below passes its check, the next above does not."""
+@pytest.mark.parametrize(
+    "shape", [Ring(0.45), Cross(0.35, 0.3), U], ids=lambda s: s.kind
+)
+def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
+    shape, kind, tmp_path
+):
+    """The least width and space: the next whole nm below passes its check, the next
+    above does not.
+    """
     db = pytest.importorskip("klayout.db")
     made = of_sizes(shape, kind)
     plan = build.plan(made, PROCESS, furnished=False)
     gdsii_write.write(plan, tmp_path / "m.gds")
     drawn = region(tmp_path / "m.gds", "LENS")
     found = drc.check(plan, PROCESS.rules)
-    # of curves chords at an angle are no widths; edges that share a corner count for neither
-    how = (db.Region.Projection, 10) if shape.kind == "ring" else (db.Region.Euclidian, 45)
-    for value, check in ((found.minimum_feature_nm, drawn.width_check), (found.minimum_gap_nm, drawn.space_check)):
+    # of curves chords at an angle are no widths; edges that share a corner count for
+    # neither
+    how = (
+        (db.Region.Projection, 10)
+        if shape.kind == "ring"
+        else (db.Region.Euclidian, 45)
+    )
+    for value, check in (
+        (found.minimum_feature_nm, drawn.width_check),
+        (found.minimum_gap_nm, drawn.space_check),
+    ):
         assert check(math.floor(value), False, *how).is_empty()
         assert not check(math.floor(value) + 1, False, *how).is_empty()
     outline = made.cell.outline(0.22)
     solid, space = (1e3 * v for v in outline.spans_um)
-    assert found.minimum_feature_nm == pytest.approx(solid, abs=1.5)  # corners on a grid of 1 nm
+    assert found.minimum_feature_nm == pytest.approx(
+        solid, abs=1.5
+    )  # corners on a grid of 1 nm
     assert found.minimum_gap_nm <= space + 1.5
 
 
 def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
     made = of_sizes(Ring(0.45), "square")
-    rules = dataclasses.replace(PROCESS.rules, minimum_feature_nm=65, minimum_gap_nm=105)
+    rules = dataclasses.replace(
+        PROCESS.rules, minimum_feature_nm=65, minimum_gap_nm=105
+    )
     found = drc.check(build.plan(made, PROCESS, furnished=False), rules)
-    few = int((made.diameters.diameter_um == 0.22).sum())  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
+    few = int(
+        (made.diameters.diameter_um == 0.22).sum()
+    )  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
     assert found.counts["feature"] == few
     assert found.counts["gap"] == few
-    assert {round(v.value) for v in found.violations} == {60, 98}  # flats of the circles stand on whole nm
+    assert {round(v.value) for v in found.violations} == {
+        60,
+        98,
+    }  # flats of the circles stand on whole nm
 
 
 def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
-    """The ring of 260 nm has a hole of 117: a zone of 60 by 60 about its site is free, one of 140 by 140 is not."""
+    """The ring of 260 nm has a hole of 117: a zone of 60 by 60 about its site is free,
+    one of 140 by 140 is not.
+    """
     made = of_sizes(Ring(0.45), "square")
     row, column = np.argwhere(made.diameters.diameter_um == 0.26)[0]
     x, y = made.diameters.x_um[column], made.diameters.y_um[row]
@@ -412,22 +660,32 @@ def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
 
 @pytest.mark.parametrize("kind", ["rectangular", "hexagonal"])
 def test_dose_test_and_witness_cells_stand_on_the_lattice_of_the_lens(kind):
-    """Pillars 1.1 pitches apart along y, and long along y, would touch on a square lattice."""
+    """Pillars 1.1 pitches apart along y, and long along y, would touch on a square
+    lattice.
+    """
     made = of_sizes(Ellipse(1.5) if kind == "rectangular" else Circle(), kind)
     plan = build.plan(made, PROCESS)
     lens_ = plan.lattices[0]
     assert [each.name for each in plan.lattices] == ["LENS", "DOSETEST", "WITNESS"]
     for each in plan.lattices[1:]:
-        assert (each.pitch, each.down, each.centred) == (lens_.pitch, lens_.down, lens_.centred)
+        assert (each.pitch, each.down, each.centred) == (
+            lens_.pitch,
+            lens_.down,
+            lens_.centred,
+        )
         sites = each.whole()
         if each.centred:
-            assert not sites[np.add.outer(np.arange(each.rows), np.arange(each.columns)) % 2 == 1].any()
+            assert not sites[
+                np.add.outer(np.arange(each.rows), np.arange(each.columns)) % 2 == 1
+            ].any()
         blocks = np.bincount(sites.ravel())[1:]
         assert set(blocks[blocks > 0]) == {16**2 if each.name == "DOSETEST" else 40**2}
 
 
 def exposed(path):
-    """(merged, twice the area of the pieces, outline) of all that is written with the pillars, as KLayout reads it."""
+    """(merged, twice the area of the pieces, outline) of all that is written with the
+    pillars, as KLayout reads it.
+    """
     db = pytest.importorskip("klayout.db")
     mask, found, area = db.Layout(), db.Region(), 0
     mask.read(str(path))
@@ -437,15 +695,26 @@ def exposed(path):
             raw.merged_semantics = False
             area += sum(p.area2() for p in raw.each())
             found += raw
-    return found.merged(), area, db.Region(mask.top_cell().begin_shapes_rec(mask.find_layer(10, 0))).merged()
+    return (
+        found.merged(),
+        area,
+        db.Region(mask.top_cell().begin_shapes_rec(mask.find_layer(10, 0))).merged(),
+    )
 
 
 @pytest.mark.parametrize(
     "made",
-    [of_sizes(Ring(0.45), "hexagonal"), of_sizes(Cross(0.35, 0.3), "rectangular"), of_sizes(U, "hexagonal"), lens()],
+    [
+        of_sizes(Ring(0.45), "hexagonal"),
+        of_sizes(Cross(0.35, 0.3), "rectangular"),
+        of_sizes(U, "hexagonal"),
+        lens(),
+    ],
     ids=["ring", "cross", "own", "turned"],
 )
-def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(made, tmp_path):
+def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
+    made, tmp_path
+):
     found = []
     for tone in ("positive", "negative"):
         plan = build.plan(made, dataclasses.replace(PROCESS, tone=tone))
@@ -455,15 +724,25 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(made,
     (stays, _, die), (drawn, area, _) = found
     assert (drawn & stays).is_empty()
     assert ((drawn + stays) ^ die).is_empty()
-    assert area == sum(p.area2() for p in drawn.each())  # nothing is drawn (and exposed) twice
-    assert drc.check(plan, PROCESS.rules).pillars > (made.diameters.diameter_um > 0).sum()
+    assert area == sum(
+        p.area2() for p in drawn.each()
+    )  # nothing is drawn (and exposed) twice
+    assert (
+        drc.check(plan, PROCESS.rules).pillars > (made.diameters.diameter_um > 0).sum()
+    )
 
 
 def test_sizes_are_rounded_by_no_more_than_is_told():
-    """Of 961 sizes some lie half a step of 2 nm off the drawn ones, or nearly so; none farther."""
+    """Of 961 sizes some lie half a step of 2 nm off the drawn ones, or nearly so; none
+    farther.
+    """
     size = np.random.default_rng(8).uniform(0.12, 0.26, (31, 31))
-    made = dataclasses.replace(lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4))
+    made = dataclasses.replace(
+        lens(Rectangle(0.55), turned=False), diameters=DiameterMap(size, 0.4)
+    )
     found = build.prepare(made, PROCESS)
-    drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[found.cells.classes]
+    drawn = np.array([0, *(one.diameter_nm for one in found.plan.classes)])[
+        found.cells.classes
+    ]
     off = np.abs(drawn - 1e3 * size).max()
     assert 0.95 * found.cells.rounding_nm < off <= found.cells.rounding_nm * (1 + 1e-9)

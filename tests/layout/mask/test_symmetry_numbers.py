@@ -26,14 +26,18 @@ def places(lattice):
     """{(x, y): class} of the pillars."""
     values = lattice.whole()
     return {
-        (lattice.x0 + int(c) * lattice.pitch, lattice.y0 - int(r) * lattice.pitch): int(values[r, c])
+        (lattice.x0 + int(c) * lattice.pitch, lattice.y0 - int(r) * lattice.pitch): int(
+            values[r, c]
+        )
         for r, c in np.argwhere(values)
     }
 
 
 @pytest.mark.parametrize("n", [4, 5, 8, 9])
 def test_pieces_turned_and_mirrored_cover_every_pillar_once(n):
-    """Mirrored at the x axis first (y to -y), then turned by quarters counter-clockwise."""
+    """Mirrored at the x axis first (y to -y), then turned by quarters
+    counter-clockwise.
+    """
     whole = lattice_of(symmetric(n))
     assert is_square_symmetric(whole)
     found, count = {}, 0
@@ -47,7 +51,11 @@ def test_pieces_turned_and_mirrored_cover_every_pillar_once(n):
                 count += 1
     assert found == places(whole)
     assert count == len(found)
-    assert [piece.lattice.name[-2:] for piece in pieces(whole)] == ["_8", "_D", *(["_A", "_C"] if n % 2 else [])]
+    assert [piece.lattice.name[-2:] for piece in pieces(whole)] == [
+        "_8",
+        "_D",
+        *(["_A", "_C"] if n % 2 else []),
+    ]
 
 
 def test_what_is_missing_of_a_piece_is_no_piece():
@@ -71,7 +79,9 @@ def test_only_two_of_three_symmetries_are_not_enough():
     assert not is_square_symmetric(lattice_of((10 * rows + columns).astype(np.uint8)))
     rows, columns = np.indices((6, 6))
     assert not is_square_symmetric(lattice_of((rows * columns + 1).astype(np.uint8)))
-    assert not is_square_symmetric(lattice_of((np.abs(2 * rows - 5) + 1 + 0 * columns).astype(np.uint8)))
+    assert not is_square_symmetric(
+        lattice_of((np.abs(2 * rows - 5) + 1 + 0 * columns).astype(np.uint8))
+    )
 
 
 def test_lattices_off_the_middle_small_or_of_unlike_rows_are_left_whole():
@@ -88,5 +98,7 @@ def test_lattices_off_the_middle_small_or_of_unlike_rows_are_left_whole():
 def test_the_least_of_eight_images():
     values = np.arange(16.0).reshape(4, 4)[::-1]
     found = least(values)
-    assert found == pytest.approx(np.array([[0, 1, 1, 0], [1, 5, 5, 1], [1, 5, 5, 1], [0, 1, 1, 0]]))
+    assert found == pytest.approx(
+        np.array([[0, 1, 1, 0], [1, 5, 5, 1], [1, 5, 5, 1], [0, 1, 1, 0]])
+    )
     assert np.array_equal(found, np.rot90(found))

@@ -1,4 +1,6 @@
-"""Records of an OASIS cell field by field: every bit of the info byte reads its own field and leaves the others."""
+"""Records of an OASIS cell field by field: every bit of the info byte reads its own
+field and leaves the others.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +9,9 @@ from layout.oasis import Cursor, cells
 from layout.oasis import bytes as oasis
 from layout.oasis.cursor import Repetition
 
-TWICE = bytes([4, 0, 70])  # a repetition of two copies, 70 apart along x: one step, count less 2
+TWICE = bytes(
+    [4, 0, 70]
+)  # a repetition of two copies, 70 apart along x: one step, count less 2
 BEFORE = {
     "layer": 3, "datatype": 4, "width": 50, "height": 20, "radius": 31, "half_width": 6, "kind": 25, "child": 9,
     "x": 1000, "y": -2000, "text_x": 300, "text_y": 400, "placement_x": -500, "placement_y": 600, "path_ends": (2, 1),
@@ -21,7 +25,9 @@ SHAPE = {
 }
 SIZE = {0x40: (b"\x29", {"width": 41}), 0x20: (b"\x1f", {"height": 31})}
 RECTANGLE = SHAPE | SIZE | {0x80: (b"", {"height": 50})}
-POLYGON = SHAPE | {0x20: (bytes([0, 2, 10, 6]), {"points": [[0, 0], [5, 0], [5, 3], [0, 3]]})}
+POLYGON = SHAPE | {
+    0x20: (bytes([0, 2, 10, 6]), {"points": [[0, 0], [5, 0], [5, 3], [0, 3]]})
+}
 PATH = SHAPE | {
     0x20: (bytes([0, 2, 18, 8]), {"path_points": [[0, 0], [9, 0], [9, 4]]}),
     0x40: (b"\x0d", {"half_width": 13}),
@@ -70,17 +76,26 @@ def state(made):
     """Values of the modal record, arrays as lists."""
     names = (*BEFORE, "points", "path_points")
     found = {name: getattr(made.modal, name) for name in names}
-    found = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
+    found = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in found.items()
+    }
     again = made.modal.repetition
     return found | {"repetition": np.column_stack([again.x, again.y]).tolist()}
 
 
 @pytest.mark.parametrize(
     ("kind", "bit", "field", "always", "changed"),
-    [(kind, bit, *fields[:1], always, fields[1]) for kind, table, always in RECORDS for bit, fields in table.items()],
+    [
+        (kind, bit, *fields[:1], always, fields[1])
+        for kind, table, always in RECORDS
+        for bit, fields in table.items()
+    ],
 )
 def test_a_bit_reads_its_own_field_and_no_other(kind, bit, field, always, changed):
-    """Fields come in one order: layer and sizes, then what a trapezoid always holds, then place and repetition."""
+    """Fields come in one order: layer and sizes, then what a trapezoid always holds,
+    then place and repetition.
+    """
     raw = always + field if bit in (0x04, 0x08, 0x10) else field + always
     made = reader()
     cursor = Cursor("FILE", np.frombuffer(bytes([bit]) + raw, np.uint8))
@@ -94,7 +109,9 @@ def test_a_bit_reads_its_own_field_and_no_other(kind, bit, field, always, change
     assert len(shapes) + len(circles) + made.cell.texts + made.cell.held.count == drawn
     if shapes or circles:
         after = made.modal
-        assert {*made.cell.polygons, *made.cell.circles} == {(after.layer, after.datatype)}
+        assert {*made.cell.polygons, *made.cell.circles} == {
+            (after.layer, after.datatype)
+        }
 
 
 @pytest.mark.parametrize(
@@ -114,21 +131,47 @@ def test_ends_of_a_path_are_as_before_flush_half_its_width_or_told(scheme, more,
 
 
 def test_trapezoids_lean_along_x_or_along_y():
-    """Of 50 x 20: sides moved by 2 below and by -3 above (the bytes 4 and 7), or on the left and the right."""
-    raw = bytes([0]) + b"\x04\x07" + bytes([0x80]) + b"\x04\x07" + bytes([0]) + b"\x04" + bytes([0]) + b"\x07"
+    """Of 50 x 20: sides moved by 2 below and by -3 above (the bytes 4 and 7), or on the
+    left and the right.
+    """
+    raw = (
+        bytes([0])
+        + b"\x04\x07"
+        + bytes([0x80])
+        + b"\x04\x07"
+        + bytes([0])
+        + b"\x04"
+        + bytes([0])
+        + b"\x07"
+    )
     made, cursor = reader(), Cursor("FILE", np.frombuffer(raw, np.uint8))
-    for kind in (oasis.TRAPEZOID, oasis.TRAPEZOID, oasis.TRAPEZOID_A, oasis.TRAPEZOID_B):
+    for kind in (
+        oasis.TRAPEZOID,
+        oasis.TRAPEZOID,
+        oasis.TRAPEZOID_A,
+        oasis.TRAPEZOID_B,
+    ):
         made.record(cursor, kind)
     areas = []
     for shape in made.cell.polygons[3, 4]:
         x, y = (shape - [1000, -2000]).T.astype(float)
         areas.append(abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2)
-    assert areas == pytest.approx([20 * (50 - 2.5), 50 * (20 - 2.5), 20 * (50 - 1), 20 * (50 - 1.5)])
+    assert areas == pytest.approx(
+        [20 * (50 - 2.5), 50 * (20 - 2.5), 20 * (50 - 1), 20 * (50 - 1.5)]
+    )
 
 
 def test_placements_are_turned_mirrored_and_scaled_as_told():
-    """Quarters by AAF of a plain one; of any other a scale of 3 and 30 degrees, then a scale alone."""
-    raw = bytes([0x03]) + bytes([0x06]) + bytes([0x07, 0, 3, 0, 30]) + bytes([0x04, 0, 2]) + bytes([0x02, 1, 30])
+    """Quarters by AAF of a plain one; of any other a scale of 3 and 30 degrees, then a
+    scale alone.
+    """
+    raw = (
+        bytes([0x03])
+        + bytes([0x06])
+        + bytes([0x07, 0, 3, 0, 30])
+        + bytes([0x04, 0, 2])
+        + bytes([0x02, 1, 30])
+    )
     made, cursor = reader(), Cursor("FILE", np.frombuffer(raw, np.uint8))
     for kind in (oasis.PLACEMENT, oasis.PLACEMENT, *[oasis.PLACEMENT_ANY] * 3):
         made.record(cursor, kind)
@@ -136,4 +179,10 @@ def test_placements_are_turned_mirrored_and_scaled_as_told():
     placed = made.cell.close("TOP", {9: "child"}).placed
     turns = [placed.turns[int(k)] for k in placed.turn]
     told = [(turn.angle_deg, turn.mirrored, turn.scale) for turn in turns]
-    assert told == [(90, True, 1), (270, False, 1), (30, True, 3), (0, False, 2), (330, False, 1)]
+    assert told == [
+        (90, True, 1),
+        (270, False, 1),
+        (30, True, 3),
+        (0, False, 2),
+        (330, False, 1),
+    ]

@@ -25,7 +25,9 @@ class Bytes:
 
 
 def places(x, y, at):
-    made = SimpleNamespace(modal=SimpleNamespace(repetition=None), budget=SimpleNamespace(left=9))
+    made = SimpleNamespace(
+        modal=SimpleNamespace(repetition=None), budget=SimpleNamespace(left=9)
+    )
     return cells.CellReader._repeated(made, Bytes(x, y), 0x08, 0x08, *at)
 
 
@@ -50,15 +52,36 @@ def test_a_copy_beyond_32_bits_is_refused_on_every_side(x, y, at):
 
 
 def test_cells_placed_by_name_are_told_apart():
-    """Two names and one of them again, each with its place, beside a cell by number (SEMI P39: CNXYRAAF, x, y)."""
+    """Two names and one of them again, each with its place, beside a cell by number
+    (SEMI P39: CNXYRAAF, x, y).
+    """
     rods, dots = (bytes([0xB0, 4]) + name for name in (b"rods", b"dots"))
-    raw = rods + bytes([6, 10]) + dots + bytes([14, 3]) + bytes([0xF0, 6, 4, 18]) + rods + bytes([22, 26])
-    cursor, reader = Cursor("FILE", np.frombuffer(raw, np.uint8)), cells.CellReader(cells.OpenCell(0), cells.Budget(9))
+    raw = (
+        rods
+        + bytes([6, 10])
+        + dots
+        + bytes([14, 3])
+        + bytes([0xF0, 6, 4, 18])
+        + rods
+        + bytes([22, 26])
+    )
+    cursor, reader = (
+        Cursor("FILE", np.frombuffer(raw, np.uint8)),
+        cells.CellReader(cells.OpenCell(0), cells.Budget(9)),
+    )
     for _ in range(4):
         assert reader.record(cursor, oasis.PLACEMENT)
     placed = reader.cell.close("TOP", {6: "rings"}).placed
-    told = [(placed.children[i], int(x), int(y)) for i, x, y in zip(placed.child, placed.x, placed.y, strict=True)]
-    assert sorted(told) == [("dots", 7, -1), ("rings", 2, 9), ("rods", 3, 5), ("rods", 11, 13)]
+    told = [
+        (placed.children[i], int(x), int(y))
+        for i, x, y in zip(placed.child, placed.x, placed.y, strict=True)
+    ]
+    assert sorted(told) == [
+        ("dots", 7, -1),
+        ("rings", 2, 9),
+        ("rods", 3, 5),
+        ("rods", 11, 13),
+    ]
 
 
 def signed(value):
@@ -71,9 +94,11 @@ def signed(value):
 
 
 def test_relative_places_add_to_those_before_of_shapes_placements_and_texts_each_their_own():
-    """Rectangles SWHXYRDL, circles 00rXYRDL, placements CNXYRAAF, texts 0CNXYRTL (SEMI P39 22 to 33).
+    """Rectangles SWHXYRDL, circles 00rXYRDL, placements CNXYRAAF, texts 0CNXYRTL (SEMI
+    P39 22 to 33).
 
-    A rectangle takes as much room as 8 placements and its 4 corners, a circle as 8 and its middle.
+    A rectangle takes as much room as 8 placements and its 4 corners, a circle as 8 and
+    its middle.
     """
     records = (
         (oasis.RECTANGLE, bytes([0x7B, 5, 2, 30, 11]) + signed(100) + signed(-20)),
@@ -89,16 +114,24 @@ def test_relative_places_add_to_those_before_of_shapes_placements_and_texts_each
         (oasis.XYABSOLUTE, b""),
         (oasis.RECTANGLE, b"\x10" + signed(1)),
     )
-    cursor = Cursor("FILE", np.frombuffer(b"".join(raw for _, raw in records), np.uint8))
+    cursor = Cursor(
+        "FILE", np.frombuffer(b"".join(raw for _, raw in records), np.uint8)
+    )
     reader = cells.CellReader(cells.OpenCell(0), cells.Budget(90))
     assert all(reader.record(cursor, kind) for kind, _ in records)
     found = reader.cell.close("TOP", {6: "rings"})
     corners = [shape[0].tolist() for shape in found.polygons[5, 2]]
     assert corners == [[100, -20], [107, -20], [107, -23], [1, -19]]
-    assert all(np.ptp(shape, axis=0).tolist() == [30, 11] for shape in found.polygons[5, 2])
+    assert all(
+        np.ptp(shape, axis=0).tolist() == [30, 11] for shape in found.polygons[5, 2]
+    )
     assert found.circles == {(5, 2): [(57, -19, 9)]}
     placed = found.placed
-    assert list(zip(placed.x.tolist(), placed.y.tolist(), strict=True)) == [(1000, -70), (1003, -65), (990, -65)]
+    assert list(zip(placed.x.tolist(), placed.y.tolist(), strict=True)) == [
+        (1000, -70),
+        (1003, -65),
+        (990, -65),
+    ]
     assert (reader.modal.text_x, reader.modal.text_y) == (13, 8)
     assert found.texts == 2
     assert reader.budget.used == 4 * (8 + 4) + (8 + 1) + 3 + 2

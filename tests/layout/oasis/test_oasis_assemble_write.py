@@ -1,4 +1,6 @@
-"""The end of an OASIS file by its standard (SEMI P39): tables of names where the file says, each with all its names."""
+"""The end of an OASIS file by its standard (SEMI P39): tables of names where the file
+says, each with all its names.
+"""
 
 import struct
 import zlib
@@ -39,15 +41,28 @@ def names(data, at, record, numbers):
 
 
 def assembled(layers, path):
-    cells = {name: CellContent(name, {(1, 0): [BAR]}) for name in ("ONE", "LONGER", "TOP")}
+    cells = {
+        name: CellContent(name, {(1, 0): [BAR]}) for name in ("ONE", "LONGER", "TOP")
+    }
     assemble.write(Assembly("TOP", cells, {}, layer_names=layers), path)
     return ["ONE", "LONGER", "TOP"]
 
 
 def planned(layers, path):
-    classes = pillar_classes(np.array([120, 200]), layer=(1, 0), grid=1, unit_nm=1.0, vertices=8, shape="round")
-    lattice = Lattice.of("LENS", np.array([[1, 2, 2], [0, 1, 2]], np.uint8), pitch=400, x0=0, y0=0)
-    plan = MaskPlan("TOP", tuple(classes), (lattice,), (), layer_names=layers, doses={(1, 0): 1.0})
+    classes = pillar_classes(
+        np.array([120, 200]),
+        layer=(1, 0),
+        grid=1,
+        unit_nm=1.0,
+        vertices=8,
+        shape="round",
+    )
+    lattice = Lattice.of(
+        "LENS", np.array([[1, 2, 2], [0, 1, 2]], np.uint8), pitch=400, x0=0, y0=0
+    )
+    plan = MaskPlan(
+        "TOP", tuple(classes), (lattice,), (), layer_names=layers, doses={(1, 0): 1.0}
+    )
     write.write(plan, path)
     return [*(made.name for made in classes), "LENS", "TOP"]
 
@@ -55,7 +70,9 @@ def planned(layers, path):
 @pytest.mark.parametrize("layers", [TITLES, {}], ids=["layers", "none"])
 @pytest.mark.parametrize("made", [assembled, planned])
 def test_tables_stand_where_the_end_of_the_file_says(tmp_path, made, layers):
-    """END: strict tables of cells, text strings, property names, property strings, layers and extensions; a CRC-32."""
+    """END: strict tables of cells, text strings, property names, property strings,
+    layers and extensions; a CRC-32.
+    """
     cells = made(layers, tmp_path / "a.oas")
     data = (tmp_path / "a.oas").read_bytes()
     assert data[-256] == END

@@ -1,4 +1,6 @@
-"""Trapezoids of OASIS by what defines them: how far each slanted side leans, their box, and their area."""
+"""Trapezoids of OASIS by what defines them: how far each slanted side leans, their box,
+and their area.
+"""
 
 import numpy as np
 import pytest
@@ -14,9 +16,12 @@ def area(corners):
 
 
 @pytest.mark.parametrize("upright", [False, True])
-@pytest.mark.parametrize(("a", "b"), [(40, 25), (40, -25), (-40, 25), (-40, -25), (0, 30), (-60, 0)])
+@pytest.mark.parametrize(
+    ("a", "b"), [(40, 25), (40, -25), (-40, 25), (-40, -25), (0, 30), (-60, 0)]
+)
 def test_the_sides_lean_by_what_is_said_within_their_box(a, b, upright):
-    """Lying: from foot to head the left side goes right by a, the right one by b. Upright: the lower side from its
+    """Lying: from foot to head the left side goes right by a, the right one by b.
+    Upright: the lower side from its
     right end to its left one goes up by a, the upper one by b."""
     made = trapezoids.sloped(W, H, a, b, upright=upright)
     assert made.min(0).tolist() == [0, 0]
@@ -26,22 +31,37 @@ def test_the_sides_lean_by_what_is_said_within_their_box(a, b, upright):
         assert left_low[0] == left_high[0] == 0
         assert right_low[0] == right_high[0] == W
         assert (left_low[1] - right_low[1], left_high[1] - right_high[1]) == (a, b)
-        assert area(made) == W * (left_high[1] - left_low[1] + right_high[1] - right_low[1]) / 2
+        assert (
+            area(made)
+            == W * (left_high[1] - left_low[1] + right_high[1] - right_low[1]) / 2
+        )
     else:
         (head_left, head_right), (foot_right, foot_left) = made[:2], made[2:]
         assert head_left[1] == head_right[1] == H
         assert foot_left[1] == foot_right[1] == 0
         assert (head_left[0] - foot_left[0], head_right[0] - foot_right[0]) == (a, b)
-        assert area(made) == H * (head_right[0] - head_left[0] + foot_right[0] - foot_left[0]) / 2
+        assert (
+            area(made)
+            == H * (head_right[0] - head_left[0] + foot_right[0] - foot_left[0]) / 2
+        )
 
 
-CUT = [W * H - H * H / 2] * 4 + [W * H - H * H] * 4  # lying, then upright with width and height in turn
+CUT = [W * H - H * H / 2] * 4 + [
+    W * H - H * H
+] * 4  # lying, then upright with width and height in turn
 AREAS = [*CUT, *CUT] + [W * W / 2] * 4 + [H * H] * 2 + [W * W] * 2 + [W * H, W * W]
-BOXES = [(W, H)] * 16 + [(W, W)] * 4 + [(2 * H, H)] * 2 + [(W, 2 * W)] * 2 + [(W, H), (W, W)]
+BOXES = (
+    [(W, H)] * 16
+    + [(W, W)] * 4
+    + [(2 * H, H)] * 2
+    + [(W, 2 * W)] * 2
+    + [(W, H), (W, W)]
+)
 
 
 def test_compact_ones_have_their_box_and_area_and_edges_of_45_degrees():
-    """Kinds 0 to 7 are wider than high, 8 to 15 higher than wide: one corner or two cut off; 16 to 19 half squares, 20
+    """Kinds 0 to 7 are wider than high, 8 to 15 higher than wide: one corner or two cut
+    off; 16 to 19 half squares, 20
     to 23 their doubles, then a rectangle and a square. No two are alike."""
     assert trapezoids.KINDS == 26
     seen = set()

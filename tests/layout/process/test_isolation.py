@@ -23,14 +23,23 @@ def test_isolation_is_the_share_of_weight_that_is_missing(pitch_um, range_um):
     for y, x in ((0, 0), (5, 8), (12, 95), (13, 97), (22, 109), (7, 3)):
         stood = (around[y : y + 2 * reach + 1, x : x + 2 * reach + 1] * weight).sum()
         assert got[y, x] == pytest.approx(1 - stood / weight.sum(), abs=2e-6)  # float32
-    assert isolation(np.ones((40, 40), bool), (pitch_um, pitch_um), range_um)[15:25, 15:25].max() < 1e-6
+    assert (
+        isolation(np.ones((40, 40), bool), (pitch_um, pitch_um), range_um)[
+            15:25, 15:25
+        ].max()
+        < 1e-6
+    )
     alone = np.zeros((31, 31), bool)
     alone[14, 17] = True
-    assert isolation(alone, (pitch_um, pitch_um), range_um)[14, 17] == pytest.approx(1.0)
+    assert isolation(alone, (pitch_um, pitch_um), range_um)[14, 17] == pytest.approx(
+        1.0
+    )
 
 
 def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
-    """Weights by plain distances from site to site: no rows and columns, half the places hold none."""
+    """Weights by plain distances from site to site: no rows and columns, half the
+    places hold none.
+    """
     pitch, row, reach = 0.43, 0.37, 0.52
     rng = np.random.default_rng(11)
     rows, columns = 41, 117  # wider than one tile of 96
@@ -39,14 +48,25 @@ def test_isolation_on_a_hexagonal_lattice_is_the_share_of_its_own_neighbours():
     present[20, 56] = present[40, 116] = True
     y, x = np.nonzero(np.ones_like(present))
     got = isolation(present, (pitch / 2, row), reach, centred=True)
-    full = [(i * pitch / 2, j * row) for i in range(-40, 41) for j in range(-40, 41) if (i + j) % 2 == 0 and (i or j)]
+    full = [
+        (i * pitch / 2, j * row)
+        for i in range(-40, 41)
+        for j in range(-40, 41)
+        if (i + j) % 2 == 0 and (i or j)
+    ]
     whole = sum(math.exp(-(a * a + b * b) / reach**2) for a, b in full)
     for j, i in ((20, 56), (40, 116), (3, 5), (17, 97)):
         weight = np.exp(-(((x - i) * pitch / 2) ** 2 + ((y - j) * row) ** 2) / reach**2)
         stood = weight[present[y, x] & ((x != i) | (y != j))].sum()
-        # float32; 3 ranges along each axis leave erfc(3) = 2e-5 of a Gaussian's weight out, about twice that of a plane
+        # float32; 3 ranges along each axis leave erfc(3) = 2e-5 of a Gaussian's weight
+        # out, about twice that of a plane
         assert got[j, i] == pytest.approx(1 - stood / whole, abs=1e-4)
-    assert isolation(site, (pitch / 2, row), reach, centred=True)[10:-10, 10:-10][site[10:-10, 10:-10]].max() < 1e-5
+    assert (
+        isolation(site, (pitch / 2, row), reach, centred=True)[10:-10, 10:-10][
+            site[10:-10, 10:-10]
+        ].max()
+        < 1e-5
+    )
 
 
 def test_rows_of_a_rectangular_lattice_count_by_their_own_distance():

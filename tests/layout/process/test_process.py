@@ -1,4 +1,6 @@
-"""PROCESS.toml: round trip, refusals that name the key, bias and corner rounding inverted together."""
+"""PROCESS.toml: round trip, refusals that name the key, bias and corner rounding
+inverted together.
+"""
 
 import math
 from pathlib import Path
@@ -7,7 +9,15 @@ import numpy as np
 import pytest
 
 from layout.process import process
-from layout.process.process import Die, Etch, Exposure, Layers, Process, Rules, WriteField
+from layout.process.process import (
+    Die,
+    Etch,
+    Exposure,
+    Layers,
+    Process,
+    Rules,
+    WriteField,
+)
 from metalens.ground import config
 from metalens.ground.errors import ConfigError, ProcessError
 from metalens.made import Spread
@@ -20,7 +30,9 @@ def test_the_example_says_what_the_defaults_say_but_for_the_bias_and_the_wall():
     example = process.load(EXAMPLE)
     assert example.rules == Rules()
     assert example.layers == Layers()
-    assert example.exposure == Exposure(alpha_um=0.010, beta_um=31.0, eta=0.6, correct=True)
+    assert example.exposure == Exposure(
+        alpha_um=0.010, beta_um=31.0, eta=0.6, correct=True
+    )
     assert example.write_field == WriteField()
     assert example.die == Die()
     assert example.spread == Spread()
@@ -44,7 +56,9 @@ def test_corner_rounding_takes_the_area_between_corner_and_arc():
     lost = 8 * 400 * (math.tan(side_angle) - side_angle)
     area = math.pi / 4 * 200**2 - lost
     want = math.sqrt(4 * area / math.pi)
-    assert octagon.made_diameter_nm(200.0) == pytest.approx(want, abs=2e-3)  # next order: loss^2 / 2D = 1e-4 nm
+    assert octagon.made_diameter_nm(200.0) == pytest.approx(
+        want, abs=2e-3
+    )  # next order: loss^2 / 2D = 1e-4 nm
 
 
 def test_sidewall_spreads_top_and_foot_about_half_height():
@@ -57,7 +71,9 @@ def test_bias_and_exposure_tables_lie_beside_the_toml(tmp_path):
     (tmp_path / "bias.csv").write_text("100,-3\n200,0.5\n", encoding="utf-8")
     (tmp_path / "psf.csv").write_text("0.01,1\n1,0.1\n", encoding="utf-8")
     toml = tmp_path / "p.toml"
-    toml.write_text('[bias]\ncsv = "bias.csv"\n[exposure]\ncsv = "psf.csv"\n', encoding="utf-8")
+    toml.write_text(
+        '[bias]\ncsv = "bias.csv"\n[exposure]\ncsv = "psf.csv"\n', encoding="utf-8"
+    )
     found = process.load(toml)
     assert found.bias.table_nm == ((100.0, -3.0), (200.0, 0.5))
     assert found.exposure.csv == tmp_path / "psf.csv"
@@ -92,7 +108,10 @@ def test_bias_and_exposure_tables_lie_beside_the_toml(tmp_path):
         ("[die]\nsize_um = [0, 1]\n", "size_um"),
         ("[die]\nstreet_um = -1\n", "street_um"),
         ("[spread]\nindex = -1\n", "index"),
-        ("[[rules.exclusion]]\nx_um = 0\ny_um = 0\nwidth_um = 0\nheight_um = 1\n", "width_um"),
+        (
+            "[[rules.exclusion]]\nx_um = 0\ny_um = 0\nwidth_um = 0\nheight_um = 1\n",
+            "width_um",
+        ),
         ('[bias]\ncsv = "absent.csv"\n', "cannot be read"),
     ],
 )

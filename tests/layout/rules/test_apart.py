@@ -1,4 +1,6 @@
-"""Distances of any two polygons beside closed forms, and beside convex ones measured by separating lines."""
+"""Distances of any two polygons beside closed forms, and beside convex ones measured by
+separating lines.
+"""
 
 import math
 
@@ -9,20 +11,35 @@ from layout.rules.apart import apart
 from layout.shapes import convex
 
 ANGLE = np.array([(0, 0), (900, 0), (900, 100), (120, 100), (120, 700), (0, 700)])
-HOLE = [(800, 500), (800, 200), (200, 200), (200, 800), (800, 800), (800, 500)]  # cut in along y = 500
-RING = np.array([(0, 0), (1000, 0), (1000, 500), *HOLE, (1000, 500), (1000, 1000), (0, 1000)])
+HOLE = [
+    (800, 500),
+    (800, 200),
+    (200, 200),
+    (200, 800),
+    (800, 800),
+    (800, 500),
+]  # cut in along y = 500
+RING = np.array(
+    [(0, 0), (1000, 0), (1000, 500), *HOLE, (1000, 500), (1000, 1000), (0, 1000)]
+)
 TURNED = np.array([(-30, -40), (70, 0), (0, 60)])
 
 
 def distance(first, second, dx, dy, most=math.inf):
     one, two = np.array([0]), np.array([1])
-    return apart([first, second], (one, two), (np.array([dx]), np.array([dy])), most=most)[0]
+    return apart(
+        [first, second], (one, two), (np.array([dx]), np.array([dy])), most=most
+    )[0]
 
 
 @pytest.mark.parametrize(
     ("dx", "dy", "wanted"),
     [
-        (200, 170, 30),  # within the hull: 170 - 40 above the lower arm, 200 - 30 - 120 beside the other
+        (
+            200,
+            170,
+            30,
+        ),  # within the hull: 170 - 40 above the lower arm, 200 - 30 - 120 beside the other
         (190, 350, 40),
         (151, 141, 1),
         (150, 300, 0),  # its corner on the arm
@@ -39,7 +56,9 @@ def test_a_triangle_beside_an_angle(dx, dy, wanted):
 
 
 def test_what_lies_in_a_hole_that_is_cut_in_is_apart_and_what_lies_on_the_ring_is_not():
-    assert distance(RING, TURNED, 500, 350) == 110  # its lowest corner at 310, the hole begins at 200
+    assert (
+        distance(RING, TURNED, 500, 350) == 110
+    )  # its lowest corner at 310, the hole begins at 200
     assert distance(RING, TURNED, 100, 100) == 0
     assert distance(RING, TURNED, 740, 500) == 0  # across the cut
     big = np.array([(-5000, -4000), (5000, -4000), (5000, 6000), (-5000, 6000)])
@@ -57,7 +76,9 @@ def test_convex_ones_are_as_far_apart_as_lines_between_them_say():
     shapes = []
     for corners in rng.integers(3, 9, 12).tolist():
         angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
-        shape = np.rint(rng.uniform(40, 90) * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.int64)
+        shape = np.rint(
+            rng.uniform(40, 90) * np.column_stack([np.cos(angle), np.sin(angle)])
+        ).astype(np.int64)
         shapes.append(shape[(shape != np.roll(shape, 1, axis=0)).any(1)])
     one, two = rng.integers(0, 12, (2, 600))
     dx, dy = rng.integers(-210, 210, (2, 600))

@@ -23,7 +23,9 @@ db = pytest.importorskip("klayout.db")
 
 
 def turned_pillars(path, count=900, seed=3):
-    """Rectangles and hexagons at jittered places and any angle, some too near, some too thin; no two overlap."""
+    """Rectangles and hexagons at jittered places and any angle, some too near, some too
+    thin; no two overlap.
+    """
     rng = np.random.default_rng(seed)
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(1, 0)
@@ -32,7 +34,10 @@ def turned_pillars(path, count=900, seed=3):
         x, y = np.array(divmod(n, 30)) * 372 + rng.uniform(-35, 35, 2)
         wide, long = rng.uniform(75, 190), rng.uniform(180, 300)
         if n % 3:
-            corners = np.array([[-long, -wide], [long, -wide], [long, wide], [-long, wide]]) / 2
+            corners = (
+                np.array([[-long, -wide], [long, -wide], [long, wide], [-long, wide]])
+                / 2
+            )
         else:
             angle = np.arange(6) * np.pi / 3
             corners = wide / 1.5 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -55,7 +60,9 @@ def pairs_of_klayout(shapes, gap):
             b = shapes[j]
             if (
                 a.bbox().enlarged(gap, gap).touches(b.bbox())
-                and regions[i].separation_check(regions[j], gap, False, db.Region.Euclidian).count()
+                and regions[i]
+                .separation_check(regions[j], gap, False, db.Region.Euclidian)
+                .count()
             ):
                 both = a.bbox() + b.bbox()
                 found.add((both.left, both.bottom, both.right, both.top))
@@ -67,7 +74,10 @@ def test_turned_convex_pillars_anywhere_agree_with_klayout(tmp_path, suffix):
     path = tmp_path / f"m.{suffix}"
     _, shapes = turned_pillars(path)
     touching = sum(
-        1 for i, a in enumerate(shapes) for b in shapes[i + 1 : i + 40] if a.bbox().touches(b.bbox()) and a.touches(b)
+        1
+        for i, a in enumerate(shapes)
+        for b in shapes[i + 1 : i + 40]
+        if a.bbox().touches(b.bbox()) and a.touches(b)
     )
     report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=1))
     assert report.pillars == len(shapes)
@@ -79,10 +89,22 @@ def test_turned_convex_pillars_anywhere_agree_with_klayout(tmp_path, suffix):
 
 
 def marks(path, arm=20, notch=45):
-    """A cross with one thin arm, a U with a narrow notch, and two abutting pieces of one bar."""
+    """A cross with one thin arm, a U with a narrow notch, and two abutting pieces of
+    one bar.
+    """
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(3, 0)
-    cross = [(0, 0), (0, -3000), (arm, -3000), (arm, 0), (3000, 0), (3000, 500), (500, 500), (500, 3000), (0, 3000)]
+    cross = [
+        (0, 0),
+        (0, -3000),
+        (arm, -3000),
+        (arm, 0),
+        (3000, 0),
+        (3000, 500),
+        (500, 500),
+        (500, 3000),
+        (0, 3000),
+    ]
     u = [
         (8000, 0),
         (9000, 0),
@@ -107,12 +129,29 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
     process = tmp_path / "p.toml"
     process.write_text("[rules]\nminimum_feature_nm = 80\nminimum_gap_nm = 70\n")
     assert (
-        cli.main(["check", str(path), "--process", str(process), "--json", "--output", str(tmp_path / "m.lyrdb")]) == 1
+        cli.main(
+            [
+                "check",
+                str(path),
+                "--process",
+                str(process),
+                "--json",
+                "--output",
+                str(tmp_path / "m.lyrdb"),
+            ]
+        )
+        == 1
     )
     values = json.loads(capsys.readouterr().out)
     found = values["violations"]
-    assert found["feature"] == region.width_check(80, False, db.Region.Euclidian).count() == 1
-    assert found["gap"] == region.notch_check(70, False, db.Region.Euclidian).count() == 1
+    assert (
+        found["feature"]
+        == region.width_check(80, False, db.Region.Euclidian).count()
+        == 1
+    )
+    assert (
+        found["gap"] == region.notch_check(70, False, db.Region.Euclidian).count() == 1
+    )
     assert values["minimum_feature_nm"] == 20
     assert values["minimum_gap_nm"] == 45
     assert values["failures"] == ["design rules broken: 1 gap, 1 feature"]
@@ -138,19 +177,43 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "no gap below 70 nm, thinnest 170.0 nm" in told
     assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
-    values = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)  # no Infinity, which JSON does not know
+    values = json.loads(
+        capsys.readouterr().out, parse_constant=pytest.fail
+    )  # no Infinity, which JSON does not know
     assert (values["minimum_gap_nm"], values["minimum_feature_nm"]) == (None, 170.0)
 
 
 def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
-    """A round pillar is as wide as its diameter wherever it stands; KLayout's projection says the same."""
+    """A round pillar is as wide as its diameter wherever it stands; KLayout's
+    projection says the same.
+    """
     made = db.Layout()
-    top, pillar, layer = made.create_cell("TOP"), made.create_cell("P"), made.layer(1, 0)
+    top, pillar, layer = (
+        made.create_cell("TOP"),
+        made.create_cell("P"),
+        made.layer(1, 0),
+    )
     angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
     corners = np.rint(51 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
     pillar.shapes(layer).insert(db.Polygon([db.Point(*map(int, p)) for p in corners]))
-    top.insert(db.CellInstArray(pillar.cell_index(), db.Trans(0, 0), db.Vector(400, 0), db.Vector(0, 390), 5, 4))
-    angled = [(-900, -900), (3000, -900), (3000, -100), (-100, -100), (-100, 2500), (-900, 2500)]
+    top.insert(
+        db.CellInstArray(
+            pillar.cell_index(),
+            db.Trans(0, 0),
+            db.Vector(400, 0),
+            db.Vector(0, 390),
+            5,
+            4,
+        )
+    )
+    angled = [
+        (-900, -900),
+        (3000, -900),
+        (3000, -100),
+        (-100, -100),
+        (-100, 2500),
+        (-900, 2500),
+    ]
     top.shapes(layer).insert(db.Polygon([db.Point(*p) for p in angled]))
     path = tmp_path / "m.gds"
     made.write(str(path))
@@ -160,7 +223,9 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
     assert region.width_check(95, False, db.Region.Projection).is_empty()
     thin = foreign.check(read(path), Rules(minimum_gap_nm=50, minimum_feature_nm=102))
     assert thin.counts["feature"] == 20
-    assert thin.minimum_gap_nm == 49  # of the first row and column to the bar: 100 less 51
+    assert (
+        thin.minimum_gap_nm == 49
+    )  # of the first row and column to the bar: 100 less 51
     assert not region.space_check(50, False, db.Region.Euclidian).is_empty()
     assert region.space_check(49, False, db.Region.Euclidian).is_empty()
 
@@ -188,13 +253,26 @@ def fork(rng):
 
 
 def klayout_least(check, most):
-    """Smallest whole limit that a check of KLayout finds broken, less one: what it measures, rounded down."""
-    return next((d - 1 for d in range(1, most + 1) if check(d, True, db.Region.Euclidian).count()), most)
+    """Smallest whole limit that a check of KLayout finds broken, less one: what it
+    measures, rounded down.
+    """
+    return next(
+        (
+            d - 1
+            for d in range(1, most + 1)
+            if check(d, True, db.Region.Euclidian).count()
+        ),
+        most,
+    )
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(tmp_path, seed):
-    """Overlapping, touching, nested, holes, arrays: exact, since upright edges have whole distances or corners."""
+def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(
+    tmp_path, seed
+):
+    """Overlapping, touching, nested, holes, arrays: exact, since upright edges have
+    whole distances or corners.
+    """
     rng, most = np.random.default_rng(seed), 110
     made = db.Layout()
     top, sub, layer = made.create_cell("TOP"), made.create_cell("SUB"), made.layer(3, 1)
@@ -202,23 +280,52 @@ def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(tmp_
         points = (staircase, ell, fork)[n % 3](rng)
         x, y = rng.integers(-2200, 2200, 2).tolist()
         turned = db.Trans(int(rng.integers(0, 8)), x, y)
-        (sub if n == 1 else top).shapes(layer).insert(db.Polygon([db.Point(*p) for p in points]).transformed(turned))
-    steps = (db.Vector(int(rng.integers(700, 1300)), 40), db.Vector(-30, int(rng.integers(700, 1300))))
-    top.insert(db.CellInstArray(sub.cell_index(), db.Trans(seed % 8, 50, -70), *steps, 2, 3))
+        (sub if n == 1 else top).shapes(layer).insert(
+            db.Polygon([db.Point(*p) for p in points]).transformed(turned)
+        )
+    steps = (
+        db.Vector(int(rng.integers(700, 1300)), 40),
+        db.Vector(-30, int(rng.integers(700, 1300))),
+    )
+    top.insert(
+        db.CellInstArray(sub.cell_index(), db.Trans(seed % 8, 50, -70), *steps, 2, 3)
+    )
     path = tmp_path / f"m.{('gds', 'oas')[seed % 2]}"
     made.write(str(path))
     region = db.Region(top.begin_shapes_rec(layer))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=most, minimum_feature_nm=most))
-    own = [min(np.floor(v + 1e-9), most) for v in (report.minimum_gap_nm, report.minimum_feature_nm)]
-    assert own == [klayout_least(region.space_check, most), klayout_least(region.width_check, most)]
+    report = foreign.check(
+        read(path), Rules(minimum_gap_nm=most, minimum_feature_nm=most)
+    )
+    own = [
+        min(np.floor(v + 1e-9), most)
+        for v in (report.minimum_gap_nm, report.minimum_feature_nm)
+    ]
+    assert own == [
+        klayout_least(region.space_check, most),
+        klayout_least(region.width_check, most),
+    ]
 
 
 def test_two_convex_shapes_beside_a_mark_are_one_pair(tmp_path):
-    """Two pillars 33 nm apart, both 51 nm beside an angle: three gaps, as KLayout finds pairs of shapes."""
+    """Two pillars 33 nm apart, both 51 nm beside an angle: three gaps, as KLayout finds
+    pairs of shapes.
+    """
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(1, 0)
     shapes = [
-        db.Polygon([db.Point(*p) for p in [(0, 0), (2000, 0), (2000, 300), (300, 300), (300, 900), (0, 900)]]),
+        db.Polygon(
+            [
+                db.Point(*p)
+                for p in [
+                    (0, 0),
+                    (2000, 0),
+                    (2000, 300),
+                    (300, 300),
+                    (300, 900),
+                    (0, 900),
+                ]
+            ]
+        ),
         db.Polygon(db.Box(500, 351, 700, 551)),
         db.Polygon(db.Box(733, 351, 940, 561)),
     ]
@@ -227,45 +334,88 @@ def test_two_convex_shapes_beside_a_mark_are_one_pair(tmp_path):
     path = tmp_path / "m.gds"
     made.write(str(path))
     report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
-    theirs = [pairs_of_klayout([shapes[i], shapes[j]], 70) for i, j in ((0, 1), (0, 2), (1, 2))]
+    theirs = [
+        pairs_of_klayout([shapes[i], shapes[j]], 70)
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    ]
     assert report.counts["gap"] == sum(map(len, theirs)) == 3
     assert sorted(round(v.value, 6) for v in report.violations) == [33, 51, 51]
 
 
-def test_pillars_within_the_hull_of_an_angle_are_one_gap_each_as_far_as_polygons_are(tmp_path):
-    """Round pillars 31 and 58 nm from an angle, one 40 nm from another, a square on it: pairs as KLayout finds them."""
+def test_pillars_within_the_hull_of_an_angle_are_one_gap_each_as_far_as_polygons_are(
+    tmp_path,
+):
+    """Round pillars 31 and 58 nm from an angle, one 40 nm from another, a square on it:
+    pairs as KLayout finds them.
+    """
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(1, 0)
     angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
     disc = np.rint(73 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
     r = int(disc.max())
-    angled = db.Polygon([db.Point(*p) for p in [(0, 0), (4000, 0), (4000, 300), (300, 300), (300, 3000), (0, 3000)]])
-    places = [(900, 300 + r + 31), (300 + r + 58, 900), (900 + 2 * r + 40, 300 + r + 31)]
+    angled = db.Polygon(
+        [
+            db.Point(*p)
+            for p in [
+                (0, 0),
+                (4000, 0),
+                (4000, 300),
+                (300, 300),
+                (300, 3000),
+                (0, 3000),
+            ]
+        ]
+    )
+    places = [
+        (900, 300 + r + 31),
+        (300 + r + 58, 900),
+        (900 + 2 * r + 40, 300 + r + 31),
+    ]
     shapes = [
         angled,
         db.Polygon(db.Box(2500, 300, 2700, 500)),
-        *(db.Polygon([db.Point(int(p), int(q)) for p, q in disc + at]) for at in places),
+        *(
+            db.Polygon([db.Point(int(p), int(q)) for p, q in disc + at])
+            for at in places
+        ),
     ]
     for shape in shapes:
         top.shapes(layer).insert(shape)
     path = tmp_path / "m.gds"
     made.write(str(path))
     report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
-    assert sorted(round(v.value, 6) for v in report.violations if v.rule == "gap") == [31, 31, 40, 58]
-    theirs = [pairs_of_klayout([shapes[i], shapes[j]], 70) for i, j in ((0, 2), (0, 3), (0, 4), (2, 4))]
+    assert sorted(round(v.value, 6) for v in report.violations if v.rule == "gap") == [
+        31,
+        31,
+        40,
+        58,
+    ]
+    theirs = [
+        pairs_of_klayout([shapes[i], shapes[j]], 70)
+        for i, j in ((0, 2), (0, 3), (0, 4), (2, 4))
+    ]
     assert report.counts["gap"] == sum(map(len, theirs)) == 4
     boxes = {v.value: v.box for v in report.violations if "angle" not in v.text}
-    assert boxes[58] == (300, 900 - r - 58, 300 + 2 * r + 2 * 58, 900 + r + 58)  # the pillar and as far around
+    assert boxes[58] == (
+        300,
+        900 - r - 58,
+        300 + 2 * r + 2 * 58,
+        900 + r + 58,
+    )  # the pillar and as far around
 
 
 def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
-    """Not as its chords: KLayout's projection of edges that face each other says the same."""
+    """Not as its chords: KLayout's projection of edges that face each other says the
+    same.
+    """
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(1, 0)
     angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
     plate = db.Region(db.Box(0, 0, 2300, 1900))
     for x, y, radius in ((500, 600, 41), (1400, 700, 47), (900, 1300, 60)):
-        corners = np.rint(radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int) + np.array([x, y])
+        corners = np.rint(
+            radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        ).astype(int) + np.array([x, y])
         plate -= db.Region(db.Polygon([db.Point(int(p), int(q)) for p, q in corners]))
     top.shapes(layer).insert(plate)
     path = tmp_path / "m.gds"
@@ -273,23 +423,38 @@ def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
     report = foreign.check(read(path), Rules(minimum_gap_nm=90, minimum_feature_nm=90))
     assert report.counts["gap"] == 1
     assert report.counts["feature"] == 0
-    assert plate.notch_check(int(report.minimum_gap_nm), False, db.Region.Projection, 2.0).is_empty()
-    assert not plate.notch_check(int(report.minimum_gap_nm) + 2, False, db.Region.Projection, 2.0).is_empty()
+    assert plate.notch_check(
+        int(report.minimum_gap_nm), False, db.Region.Projection, 2.0
+    ).is_empty()
+    assert not plate.notch_check(
+        int(report.minimum_gap_nm) + 2, False, db.Region.Projection, 2.0
+    ).is_empty()
     assert report.violations[0].box == (459, 559, 541, 641)
 
 
-def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(tmp_path, capsys):
-    """Pillars too thin are clear areas too small: as many as the plan has; walls between pillars are wide enough."""
+def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
+    tmp_path, capsys
+):
+    """Pillars too thin are clear areas too small: as many as the plan has; walls
+    between pillars are wide enough.
+    """
     rng = np.random.default_rng(11)
     size = rng.uniform(0.095, 0.25, (13, 17))
     size[3:5, 4:9] = 0.0
     process = tmp_path / "p.toml"
-    process.write_text('tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 20\n')
+    process.write_text(
+        'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 20\n'
+    )
     rules = processes.load(process)
     plan = build.prepare(DiameterMap(size, 0.3), rules, furniture="none").plan
     layout.write_oasis(plan, tmp_path / "m.oas")
     planned = drc.check(plan, rules.rules)
-    assert cli.main(["check", str(tmp_path / "m.oas"), "--process", str(process), "--json"]) == 1
+    assert (
+        cli.main(
+            ["check", str(tmp_path / "m.oas"), "--process", str(process), "--json"]
+        )
+        == 1
+    )
     found = json.loads(capsys.readouterr().out)
     assert found["violations"]["feature"] == planned.counts["feature"] > 20
     assert found["violations"]["gap"] == planned.counts["gap"] == 0
@@ -297,16 +462,25 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(tmp_p
 
 
 def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
-    """Pillars of 250 nm every 330 leave walls of 80, and 40 to the end of their squares: a frame makes these whole."""
+    """Pillars of 250 nm every 330 leave walls of 80, and 40 to the end of their
+    squares: a frame makes these whole.
+    """
     size = np.full((5, 9), 0.25)
     size[2, 7:] = 0.0
     process = tmp_path / "p.toml"
-    process.write_text('tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n')
+    process.write_text(
+        'tone = "negative"\n[rules]\nminimum_feature_nm = 120\nminimum_gap_nm = 79\n'
+    )
     rules = processes.load(process)
     plan = build.prepare(DiameterMap(size, 0.33), rules, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
     assert drc.check(plan, rules.rules).ok
-    assert cli.main(["check", str(tmp_path / "m.gds"), "--process", str(process), "--json"]) == 0
+    assert (
+        cli.main(
+            ["check", str(tmp_path / "m.gds"), "--process", str(process), "--json"]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["violations"]["gap"] == 0
     read_back = db.Layout()
     read_back.read(str(tmp_path / "m.gds"))
@@ -314,23 +488,36 @@ def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
     assert drawn.bbox().width() == 9 * 330 + 2 * 330
     assert drawn.width_check(79).is_empty()
     drawn.merged_semantics = False
-    assert sum(p.area() for p in drawn.each()) == drawn.merged().area()  # no shape overlaps another
+    assert (
+        sum(p.area() for p in drawn.each()) == drawn.merged().area()
+    )  # no shape overlaps another
 
 
 def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
-    """Their rounded corners leave dents of parts of a unit; chords of them are no widths."""
+    """Their rounded corners leave dents of parts of a unit; chords of them are no
+    widths.
+    """
     made = db.Layout()
     top, layer = made.create_cell("TOP"), made.layer(1, 0)
     for n, turn in enumerate((0.0, 0.31, 0.77)):
         angle = 2 * np.pi * np.arange(64) / 64 + turn
-        corners = np.rint(61 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int) + np.array([400 * n, 0])
-        top.shapes(layer).insert(db.Polygon([db.Point(int(p), int(q)) for p, q in corners]))
+        corners = np.rint(61 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(
+            int
+        ) + np.array([400 * n, 0])
+        top.shapes(layer).insert(
+            db.Polygon([db.Point(int(p), int(q)) for p, q in corners])
+        )
     path = tmp_path / "m.gds"
     made.write(str(path))
     report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=119))
     assert report.ok
     assert 119 < report.minimum_feature_nm < 123
-    assert foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)).counts["feature"] == 3
+    assert (
+        foreign.check(
+            read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)
+        ).counts["feature"]
+        == 3
+    )
 
 
 @pytest.mark.parametrize(
@@ -345,7 +532,9 @@ def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
     ],
 )
 def test_a_polygon_without_area_draws_nothing(flat):
-    """Alone, and on or beside a box that keeps the rules: what the box alone gives, 500 by 400 nm."""
+    """Alone, and on or beside a box that keeps the rules: what the box alone gives, 500
+    by 400 nm.
+    """
     box = np.array([[0, 0], [500, 0], [500, 400], [0, 400]])
     for drawn in ([box], []):
         cell = CellContent("T", {(1, 0): [*drawn, np.array(flat)]})
@@ -356,8 +545,15 @@ def test_a_polygon_without_area_draws_nothing(flat):
 
 @pytest.mark.parametrize("size", [0, 1_700_000])
 def test_a_file_is_taken_apart_to_what_the_help_says(tmp_path, size):
-    """So many million shapes, and so many more for each byte of the file: a promise to who sets no limit of his own."""
+    """So many million shapes, and so many more for each byte of the file: a promise to
+    who sets no limit of his own.
+    """
     (tmp_path / "m.oas").write_bytes(bytes(size))
     said = " ".join(checking.Options.__doc__.split())
-    millions, each = map(int, re.search(r"(\d+) million, and (\d+) more for each byte of the file", said).groups())
+    millions, each = map(
+        int,
+        re.search(
+            r"(\d+) million, and (\d+) more for each byte of the file", said
+        ).groups(),
+    )
     assert foreign.most_of(tmp_path / "m.oas") == 1_000_000 * millions + each * size

@@ -1,4 +1,6 @@
-"""What the check says of each violation, by hand: rectangles on unlike pitches, in units of half a nanometre."""
+"""What the check says of each violation, by hand: rectangles on unlike pitches, in
+units of half a nanometre.
+"""
 
 import dataclasses
 
@@ -17,20 +19,32 @@ LOOSE = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
 def rectangle(name, wide, high, **about):
     """A class of (2 wide, 2 high) database units."""
     corners = np.array([[-wide, -high], [wide, -high], [wide, high], [-wide, high]])
-    return PillarClass(name, 2 * wide * UNIT_NM, 2 * wide, (1, 0), corners, drawn=(corners,), **about)
+    return PillarClass(
+        name, 2 * wide * UNIT_NM, 2 * wide, (1, 0), corners, drawn=(corners,), **about
+    )
 
 
-def plan_of(*made, classes=((1, 2), (0, 0)), pitch=300, down=500, x0=-700, y0=900, grid=1):
+def plan_of(
+    *made, classes=((1, 2), (0, 0)), pitch=300, down=500, x0=-700, y0=900, grid=1
+):
     """Rows lie ``down`` apart, from y0 downwards."""
     lattice = Lattice.of("L", np.array(classes, np.uint8), pitch=pitch, x0=x0, y0=y0)
-    return MaskPlan("TOP", made, (dataclasses.replace(lattice, row_pitch=down),), unit_nm=UNIT_NM, grid=grid)
+    return MaskPlan(
+        "TOP",
+        made,
+        (dataclasses.replace(lattice, row_pitch=down),),
+        unit_nm=UNIT_NM,
+        grid=grid,
+    )
 
 
 A, B = rectangle("A", 90, 60), rectangle("B", 100, 40)
 
 
 def test_a_gap_is_told_in_nanometres_with_the_box_of_both():
-    """300 - 90 - 100 units of half a nm between them; a pillar is as wide as its lesser side."""
+    """300 - 90 - 100 units of half a nm between them; a pillar is as wide as its lesser
+    side.
+    """
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=70, minimum_feature_nm=50)
     found = drc.check(plan_of(A, B), rules)
     assert [v for v in found.violations if v.rule == "gap"] == [
@@ -47,10 +61,14 @@ def test_a_gap_from_row_to_row_and_an_overlap():
     """500 - 60 - 40 units downwards; 300 - 90 - 260 across."""
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=201)
     found = drc.check(plan_of(A, B, classes=((1, 0), (2, 0))), rules)
-    assert found.violations == [Violation("gap", (-800, 360, -600, 960), 200.0, 201, "B to A in L")]
+    assert found.violations == [
+        Violation("gap", (-800, 360, -600, 960), 200.0, 201, "B to A in L")
+    ]
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=8)
     found = drc.check(plan_of(A, rectangle("C", 260, 30)), rules)
-    assert found.violations == [Violation("overlap", (-790, 840, -140, 960), 0.0, 8, "A to C in L")]
+    assert found.violations == [
+        Violation("overlap", (-790, 840, -140, 960), 0.0, 8, "A to C in L")
+    ]
 
 
 def test_no_gap_is_told_where_it_is_the_rule():
@@ -58,7 +76,9 @@ def test_no_gap_is_told_where_it_is_the_rule():
     assert drc.check(plan_of(A, B), rules).ok
 
 
-@pytest.mark.parametrize("off", [{"pitch": 301}, {"down": 505}, {"x0": -701}, {"y0": 901}])
+@pytest.mark.parametrize(
+    "off", [{"pitch": 301}, {"down": 505}, {"x0": -701}, {"y0": 901}]
+)
 def test_lattices_off_the_grid_are_told_at_their_first_pillar(off):
     place = {"pitch": 300, "down": 500, "x0": -700, "y0": 900} | off
     found = drc.check(plan_of(A, B, grid=10, **place), LOOSE)
@@ -68,11 +88,15 @@ def test_lattices_off_the_grid_are_told_at_their_first_pillar(off):
 
 def test_shapes_off_the_grid_are_told_about_their_middle():
     found = drc.check(plan_of(A, rectangle("B", 100, 45), grid=10), LOOSE)
-    assert found.violations == [Violation("off-grid", (-100, -45, 100, 45), 0.0, 10.0, "B")]
+    assert found.violations == [
+        Violation("off-grid", (-100, -45, 100, 45), 0.0, 10.0, "B")
+    ]
 
 
 def test_dense_windows_step_by_half_their_size_both_ways():
-    """8 um are 16 000 units: 2 x 20 columns of 400 and 2 x 27 rows of 300. One tile of 20 x 27 pillars is full."""
+    """8 um are 16 000 units: 2 x 20 columns of 400 and 2 x 27 rows of 300. One tile of
+    20 x 27 pillars is full.
+    """
     classes = np.zeros((4 * 27, 4 * 20), np.uint8)
     classes[27:54, 40:60] = 1
     plan = plan_of(rectangle("C", 160, 100), classes=classes, pitch=400, down=300)
@@ -80,39 +104,75 @@ def test_dense_windows_step_by_half_their_size_both_ways():
     rules = dataclasses.replace(LOOSE, maximum_density=0.9 * share, density_window_um=8)
     found = drc.check(plan, rules)
     boxes = {
-        (-700 + 8000 * j, 900 - 8100 * i - 16_200, -700 + 8000 * j + 16_000, 900 - 8100 * i)
+        (
+            -700 + 8000 * j,
+            900 - 8100 * i - 16_200,
+            -700 + 8000 * j + 16_000,
+            900 - 8100 * i,
+        )
         for i in (0, 1)
         for j in (1, 2)
     }
     assert {v.box for v in found.violations} == boxes
-    assert {(v.rule, v.value, v.limit, v.text) for v in found.violations} == {("density", share, 0.9 * share, "L")}
+    assert {(v.rule, v.value, v.limit, v.text) for v in found.violations} == {
+        ("density", share, 0.9 * share, "L")
+    }
     assert (found.maximum_density, found.counts["density"]) == (share, 4)
     assert drc.check(plan, dataclasses.replace(rules, maximum_density=share)).ok
 
 
 def test_windows_reach_over_the_last_rows_and_columns():
-    """30 rows of 300 and 25 columns of 400 units, in tiles of 27 and 20: windows begin at rows 0 and 27 (of 3 left) and
+    """30 rows of 300 and 25 columns of 400 units, in tiles of 27 and 20: windows begin
+    at rows 0 and 27 (of 3 left) and
     columns 0 and 20 (of 5 left)."""
-    plan = plan_of(rectangle("C", 160, 100), classes=np.ones((30, 25), np.uint8), pitch=400, down=300)
-    found = drc.check(plan, dataclasses.replace(LOOSE, maximum_density=1e-6, density_window_um=8))
+    plan = plan_of(
+        rectangle("C", 160, 100),
+        classes=np.ones((30, 25), np.uint8),
+        pitch=400,
+        down=300,
+    )
+    found = drc.check(
+        plan, dataclasses.replace(LOOSE, maximum_density=1e-6, density_window_um=8)
+    )
     one = 320 * 200 / (16_000 * 16_200)
     assert {(v.box[0], v.box[3]): v.value for v in found.violations} == pytest.approx(
-        {(-700, 900): 750 * one, (7300, 900): 150 * one, (-700, -7200): 75 * one, (7300, -7200): 15 * one}
+        {
+            (-700, 900): 750 * one,
+            (7300, 900): 150 * one,
+            (-700, -7200): 75 * one,
+            (7300, -7200): 15 * one,
+        }
     )
-    small = drc.check(plan, dataclasses.replace(LOOSE, maximum_density=0.1, density_window_um=0.1))
-    assert small.maximum_density == pytest.approx(320 * 200 / (400 * 300))  # a window is two pillars wide at least
+    small = drc.check(
+        plan, dataclasses.replace(LOOSE, maximum_density=0.1, density_window_um=0.1)
+    )
+    assert small.maximum_density == pytest.approx(
+        320 * 200 / (400 * 300)
+    )  # a window is two pillars wide at least
 
 
 def test_feet_are_told_once_a_lattice():
-    """Round: 150 nm from axis to axis, less half of 61 and 95 nm; else 55 nm drawn, less what the widest leans out."""
+    """Round: 150 nm from axis to axis, less half of 61 and 95 nm; else 55 nm drawn,
+    less what the widest leans out.
+    """
     rules = dataclasses.replace(LOOSE, minimum_foot_gap_nm=75)
     feet = np.array([61.0, 95.0])
     found = drc.check(plan_of(A, B), rules, foot_nm=feet)
     box = (-700, -100, -100, 900)
-    assert found.violations == [Violation("foot", box, 72.0, 75, "feet of etched pillars in L")]
+    assert found.violations == [
+        Violation("foot", box, 72.0, 75, "feet of etched pillars in L")
+    ]
     assert found.counts["foot"] == 1
-    assert drc.check(plan_of(A, B), dataclasses.replace(rules, minimum_foot_gap_nm=72), foot_nm=feet).ok
+    assert drc.check(
+        plan_of(A, B), dataclasses.replace(rules, minimum_foot_gap_nm=72), foot_nm=feet
+    ).ok
     bars = (rectangle("A", 90, 60, round=False), rectangle("B", 100, 40, round=False))
     found = drc.check(plan_of(*bars), rules, foot_nm=np.array([94.0, 107.0]))
-    assert found.violations == [Violation("foot", box, 55.0 - 7.0, 75, "feet of etched pillars in L")]
-    assert drc.check(plan_of(*bars), dataclasses.replace(rules, minimum_foot_gap_nm=48), foot_nm=np.array([94, 107])).ok
+    assert found.violations == [
+        Violation("foot", box, 55.0 - 7.0, 75, "feet of etched pillars in L")
+    ]
+    assert drc.check(
+        plan_of(*bars),
+        dataclasses.replace(rules, minimum_foot_gap_nm=48),
+        foot_nm=np.array([94, 107]),
+    ).ok

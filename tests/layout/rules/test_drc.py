@@ -1,4 +1,6 @@
-"""The check against closed forms, brute force and KLayout, on patches with seeded violations."""
+"""The check against closed forms, brute force and KLayout, on patches with seeded
+violations.
+"""
 
 import dataclasses
 import itertools
@@ -20,8 +22,17 @@ LOOSE = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
 
 
 def plan_of(diameters, classes, *, pitch=400, vertices=16):
-    made = pillar_classes(np.array(diameters), layer=(1, 0), grid=1, unit_nm=1.0, vertices=vertices, shape="round")
-    lattice = Lattice.of("LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000)
+    made = pillar_classes(
+        np.array(diameters),
+        layer=(1, 0),
+        grid=1,
+        unit_nm=1.0,
+        vertices=vertices,
+        shape="round",
+    )
+    lattice = Lattice.of(
+        "LENS", np.asarray(classes, np.uint8), pitch=pitch, x0=-3000, y0=2000
+    )
     return MaskPlan("TOP", made, (lattice,))
 
 
@@ -29,7 +40,11 @@ def sites(plan):
     """(x, y, class) of every pillar."""
     lattice = plan.lattices[0]
     for row, column in np.argwhere(lattice.whole() > 0).tolist():
-        yield lattice.x0 + column * lattice.pitch, lattice.y0 - row * lattice.pitch, int(lattice.whole()[row, column])
+        yield (
+            lattice.x0 + column * lattice.pitch,
+            lattice.y0 - row * lattice.pitch,
+            int(lattice.whole()[row, column]),
+        )
 
 
 def seeded(size, seeds, seed=0):
@@ -47,7 +62,9 @@ def klayout_findings(plan, rules):
     db = pytest.importorskip("klayout.db")
     region, boxes = db.Region(), {}
     for x, y, k in sites(plan):
-        shape = db.Polygon([db.Point(x + int(a), y + int(b)) for a, b in plan.classes[k - 1].outline])
+        shape = db.Polygon(
+            [db.Point(x + int(a), y + int(b)) for a, b in plan.classes[k - 1].outline]
+        )
         region.insert(shape)
         boxes[x, y] = shape.bbox()
     region.merged_semantics = False
@@ -55,20 +72,30 @@ def klayout_findings(plan, rules):
 
     def site(edge):
         middle = ((edge.p1.x + edge.p2.x) / 2, (edge.p1.y + edge.p2.y) / 2)
-        return round((middle[0] + 3000) / pitch) * pitch - 3000, round((middle[1] - 2000) / pitch) * pitch + 2000
+        return round((middle[0] + 3000) / pitch) * pitch - 3000, round(
+            (middle[1] - 2000) / pitch
+        ) * pitch + 2000
 
     close = set()
-    for pair in region.space_check(int(rules.minimum_gap_nm), False, db.Region.Euclidian).each():
+    for pair in region.space_check(
+        int(rules.minimum_gap_nm), False, db.Region.Euclidian
+    ).each():
         both = boxes[site(pair.first)] + boxes[site(pair.second)]
         close.add((both.left, both.bottom, both.right, both.top))
-    # opposite edges only: edges at an angle measure chords of the round pillar, not its width
-    check = region.width_check(int(rules.minimum_feature_nm), False, db.Region.Euclidian, 10)
+    # opposite edges only: edges at an angle measure chords of the round pillar, not its
+    # width
+    check = region.width_check(
+        int(rules.minimum_feature_nm), False, db.Region.Euclidian, 10
+    )
     thin = {site(p.first) for p in check.each()}
     return close, thin
 
 
 def agree(size, seeds, seed):
-    plan, rules = seeded(size, seeds, seed), Rules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1)
+    plan, rules = (
+        seeded(size, seeds, seed),
+        Rules(minimum_gap_nm=70, minimum_feature_nm=80, maximum_density=1),
+    )
     found = layout.check(plan, rules)
     close, thin = klayout_findings(plan, rules)
     assert {v.box for v in found.violations if v.rule == "gap"} == close
@@ -89,12 +116,18 @@ def test_no_disagreement_with_klayout_on_240000_pillars():
     agree(490, 110, 7)
 
 
-@given(st.lists(st.lists(st.integers(0, 6), min_size=5, max_size=5), min_size=2, max_size=6))
+@given(
+    st.lists(
+        st.lists(st.integers(0, 6), min_size=5, max_size=5), min_size=2, max_size=6
+    )
+)
 def test_gap_is_the_least_of_all_pairs_by_brute_force(rows):
     plan = plan_of([100, 180, 240, 300, 350, 390], rows)
     found = drc.check(plan, LOOSE)
     gaps = [
-        convex.gap(plan.classes[k - 1].outline, plan.classes[m - 1].outline, u - x, v - y)
+        convex.gap(
+            plan.classes[k - 1].outline, plan.classes[m - 1].outline, u - x, v - y
+        )
         for (x, y, k), (u, v, m) in itertools.combinations(sites(plan), 2)
         if abs(u - x) <= 400 and abs(v - y) <= 400
     ]
@@ -128,8 +161,15 @@ def test_overlap_and_touch_are_found_with_their_place():
 
 def test_a_rule_as_wide_as_two_pitches_looks_at_second_neighbours():
     plan = plan_of([100], [[1, 0, 1]], pitch=200)
-    assert drc.check(plan, Rules(minimum_gap_nm=310, minimum_feature_nm=1, maximum_density=1)).counts["gap"] == 1
-    assert drc.check(plan, Rules(minimum_gap_nm=290, minimum_feature_nm=1, maximum_density=1)).ok
+    assert (
+        drc.check(
+            plan, Rules(minimum_gap_nm=310, minimum_feature_nm=1, maximum_density=1)
+        ).counts["gap"]
+        == 1
+    )
+    assert drc.check(
+        plan, Rules(minimum_gap_nm=290, minimum_feature_nm=1, maximum_density=1)
+    ).ok
 
 
 def test_off_grid_vertices_and_sites_are_found():
@@ -141,37 +181,63 @@ def test_off_grid_vertices_and_sites_are_found():
 
 def test_density_is_the_share_of_the_window():
     plan = plan_of([300], np.ones((60, 60)))
-    found = drc.check(plan, Rules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8))
+    found = drc.check(
+        plan, Rules(minimum_feature_nm=1, maximum_density=0.4, density_window_um=8)
+    )
     share = polygon.twice_area(plan.classes[0].outline) / 2 / 400**2
     assert found.maximum_density == pytest.approx(share, rel=1e-12)
     assert found.counts["density"] > 0
     assert drc.check(plan, Rules(minimum_feature_nm=1, maximum_density=0.45)).ok
 
 
-@given(x=st.floats(-3.5, 1), y=st.floats(-2, 2.5), w=st.floats(0.01, 2), h=st.floats(0.01, 2))
+@given(
+    x=st.floats(-3.5, 1),
+    y=st.floats(-2, 2.5),
+    w=st.floats(0.01, 2),
+    h=st.floats(0.01, 2),
+)
 def test_exclusion_zones_agree_with_klayout(x, y, w, h):
     db = pytest.importorskip("klayout.db")
-    zone = Zone(round(x, 3), round(y, 3), max(round(w, 3), 0.001), max(round(h, 3), 0.001))
+    zone = Zone(
+        round(x, 3), round(y, 3), max(round(w, 3), 0.001), max(round(h, 3), 0.001)
+    )
     plan = plan_of([120, 260], np.indices((9, 9)).sum(0) % 3)
     box = db.Region(
         db.Box(
             *(round(v * 1e3) for v in (zone.x_um, zone.y_um)),
-            *(round(v * 1e3) for v in (zone.x_um + zone.width_um, zone.y_um + zone.height_um)),
+            *(
+                round(v * 1e3)
+                for v in (zone.x_um + zone.width_um, zone.y_um + zone.height_um)
+            ),
         )
     )
     inside = 0
     for px, py, k in sites(plan):
-        shape = db.Region(db.Polygon([db.Point(px + int(a), py + int(b)) for a, b in plan.classes[k - 1].outline]))
+        shape = db.Region(
+            db.Polygon(
+                [
+                    db.Point(px + int(a), py + int(b))
+                    for a, b in plan.classes[k - 1].outline
+                ]
+            )
+        )
         # overlap of exact areas: scaled up, so that no cut is rounded away
-        inside += not (shape.transformed(db.ICplxTrans(1000)) & box.transformed(db.ICplxTrans(1000))).is_empty()
-    rules = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, exclusion=(zone,))
+        inside += not (
+            shape.transformed(db.ICplxTrans(1000))
+            & box.transformed(db.ICplxTrans(1000))
+        ).is_empty()
+    rules = Rules(
+        minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, exclusion=(zone,)
+    )
     assert drc.check(plan, rules).counts["exclusion"] == inside
 
 
 def test_structures_that_meet_are_found(make_plan):
     plan = make_plan()
     again = plan.lattices[0]
-    other = Lattice.of("OTHER", np.ones((2, 2), np.uint8), pitch=400, x0=again.x0 + 300, y0=again.y0)
+    other = Lattice.of(
+        "OTHER", np.ones((2, 2), np.uint8), pitch=400, x0=again.x0 + 300, y0=again.y0
+    )
     found = drc.check(plan.replace(lattices=(again, other)), LOOSE)
     assert found.counts["structures"] == 1
 
@@ -190,7 +256,9 @@ def test_width_of_a_regular_polygon_and_of_a_triangle():
     assert convex.width(octagon) == pytest.approx(
         min(2 * octagon[:, 0].max(), abs(octagon @ (1, 1)).max() * math.sqrt(2))
     )
-    assert convex.width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(12 / 5)  # height on the hypotenuse
+    assert convex.width(np.array([[0, 0], [4, 0], [0, 3]])) == pytest.approx(
+        12 / 5
+    )  # height on the hypotenuse
 
 
 def test_summary_says_what_was_found():
@@ -198,23 +266,57 @@ def test_summary_says_what_was_found():
     assert isinstance(report, DrcReport)
     assert "gap" in report.summary
     assert "3 pillars" in report.summary
-    assert "2,500 pillars" in drc.check(plan_of([200], np.full((50, 50), 1)), Rules(minimum_gap_nm=70)).summary
+    assert (
+        "2,500 pillars"
+        in drc.check(
+            plan_of([200], np.full((50, 50), 1)), Rules(minimum_gap_nm=70)
+        ).summary
+    )
 
 
 def test_a_thin_arm_of_a_mark_and_a_narrow_slot_are_found(make_plan):
     plan = make_plan()
-    cross = np.array([[0, 0], [4000, 0], [4000, 300], [320, 300], [320, 4000], [300, 4000], [300, 300], [0, 300]])
-    slot = np.array([[0, 0], [900, 0], [900, 900], [535, 900], [535, 200], [500, 200], [500, 900], [0, 900]])
-    figures = tuple(Figure("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)}) for shape in (cross, slot))
+    cross = np.array(
+        [
+            [0, 0],
+            [4000, 0],
+            [4000, 300],
+            [320, 300],
+            [320, 4000],
+            [300, 4000],
+            [300, 300],
+            [0, 300],
+        ]
+    )
+    slot = np.array(
+        [
+            [0, 0],
+            [900, 0],
+            [900, 900],
+            [535, 900],
+            [535, 200],
+            [500, 200],
+            [500, 900],
+            [0, 900],
+        ]
+    )
+    figures = tuple(
+        Figure("MARKS", {(3, 0): (np.add(shape, (30000, 9000)),)})
+        for shape in (cross, slot)
+    )
     rules = Rules(minimum_feature_nm=80, minimum_gap_nm=70, maximum_density=1)
     before = drc.check(plan, rules)
-    thin, narrow = (drc.check(plan.replace(figures=(figure,)), rules) for figure in figures)
+    thin, narrow = (
+        drc.check(plan.replace(figures=(figure,)), rules) for figure in figures
+    )
     assert thin.counts["feature"] == before.counts["feature"] + 1
     assert thin.minimum_feature_nm == 20
     assert narrow.counts["gap"] == before.counts["gap"] + 1
     assert narrow.minimum_gap_nm == 35
     for found, rule, limit in ((thin, "feature", 80), (narrow, "gap", 70)):
-        assert {v.limit for v in found.violations if v.rule == rule and "figures" in v.text} == {limit}
+        assert {
+            v.limit for v in found.violations if v.rule == rule and "figures" in v.text
+        } == {limit}
 
 
 def test_feet_that_nearly_meet_are_found():
@@ -223,8 +325,15 @@ def test_feet_that_nearly_meet_are_found():
     found = drc.check(plan, LOOSE, foot_nm=feet)
     assert found.minimum_foot_gap_nm == pytest.approx(400 - (241 + 305) / 2)
     assert found.counts["foot"] == 0
-    tight = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1, minimum_foot_gap_nm=150)
-    assert drc.check(plan, tight, foot_nm=feet).counts["foot"] == 2  # both pairs of unlike pillars, in x and in y
+    tight = Rules(
+        minimum_feature_nm=1,
+        minimum_gap_nm=1,
+        maximum_density=1,
+        minimum_foot_gap_nm=150,
+    )
+    assert (
+        drc.check(plan, tight, foot_nm=feet).counts["foot"] == 2
+    )  # both pairs of unlike pillars, in x and in y
 
 
 @pytest.mark.parametrize(
@@ -240,7 +349,8 @@ def test_feet_that_nearly_meet_are_found():
     ],
 )
 def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach, beside):
-    """By brute force over all steps: one of each opposite pair, the left ones of the rows above included.
+    """By brute force over all steps: one of each opposite pair, the left ones of the
+    rows above included.
 
     Of a centred lattice the next pillar of a row, two columns off, is as near as any.
     """
@@ -251,7 +361,11 @@ def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach, beside
         (i, j)
         for i in range(-7, 8)
         for j in range(-7, 8)
-        if (i, j) != (0, 0) and ((abs(i) <= beside and abs(j) <= 1) or math.hypot(i * pitch, j * down) < reach)
+        if (i, j) != (0, 0)
+        and (
+            (abs(i) <= beside and abs(j) <= 1)
+            or math.hypot(i * pitch, j * down) < reach
+        )
     }
     assert steps | {(-i, -j) for i, j in steps} == near
     assert not steps & {(-i, -j) for i, j in steps}
@@ -259,13 +373,18 @@ def test_every_neighbour_within_reach_is_visited_once(pitch, down, reach, beside
 
 @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_a_gap_across_either_diagonal_is_found(corner):
-    """Two pillars 20 nm apart across one diagonal of the lattice, nothing else: sqrt 2 · 400 - 546 = 19.7 nm."""
+    """Two pillars 20 nm apart across one diagonal of the lattice, nothing else: sqrt 2
+    · 400 - 546 = 19.7 nm.
+    """
     classes = np.zeros((4, 5), int)
     row, column = 1, 2
     classes[row + corner[0], column + corner[1]] = 1
     classes[row + 1 - corner[0], column + 1 - corner[1]] = 1
     found = layout.check(
-        plan_of([546], classes, vertices=32), Rules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1)
+        plan_of([546], classes, vertices=32),
+        Rules(minimum_gap_nm=40, minimum_feature_nm=1, maximum_density=1),
     )
     assert found.counts["gap"] == 1
-    assert found.minimum_gap_nm == pytest.approx(math.sqrt(2) * 400 - 546, abs=2.5)  # grid, and vertices 0.3 nm out
+    assert found.minimum_gap_nm == pytest.approx(
+        math.sqrt(2) * 400 - 546, abs=2.5
+    )  # grid, and vertices 0.3 nm out

@@ -1,4 +1,6 @@
-"""Edges that face each other, and the counting loops of the check, against figures whose distances are known."""
+"""Edges that face each other, and the counting loops of the check, against figures
+whose distances are known.
+"""
 
 import math
 
@@ -19,7 +21,11 @@ def found(shapes, feature, gap):
     lines = np.concatenate([contour(*s) for s in shapes])
     owner = np.concatenate([np.full(len(s), n) for n, s in enumerate(shapes)])
     rows = edges.facing(lines, owner, feature, gap)
-    return sorted((int(kind), round(away, 9)) for _, _, kind, away in rows.tolist()), rows, lines
+    return (
+        sorted((int(kind), round(away, 9)) for _, _, kind, away in rows.tolist()),
+        rows,
+        lines,
+    )
 
 
 BAR = [(0, 0), (400, 0), (400, 37), (0, 37)]
@@ -53,18 +59,28 @@ def test_a_notch_of_one_shape_is_a_space_and_its_arms_are_widths():
 def test_two_shapes_have_no_width_between_them():
     other = [(x, y + 37 + 20) for x, y in BAR]
     assert found([BAR, other], 36.0, 20.5)[0] == [(SPACE, 20.0)]
-    assert found([BAR, other], 90.0, 1.0)[0] == [(WIDTH, 37.0)] * 2  # 57 and 94 are through the space
+    assert (
+        found([BAR, other], 90.0, 1.0)[0] == [(WIDTH, 37.0)] * 2
+    )  # 57 and 94 are through the space
 
 
 def test_a_diagonal_gap_is_measured_between_the_parts_that_face():
     low = [(0, 0), (100, 0), (100, 50), (0, 50)]
-    high = [(128, 71), (300, 71), (300, 160), (128, 160)]  # 28 to the right and 21 up: 35
+    high = [
+        (128, 71),
+        (300, 71),
+        (300, 160),
+        (128, 160),
+    ]  # 28 to the right and 21 up: 35
     assert (SPACE, 35.0) in found([low, high], 1.0, 35.5)[0]
     assert found([low, high], 1.0, 35.0)[0] == []
 
 
 def test_more_pairs_than_fit_at_first_are_all_found():
-    bars = [[(0, 50 * n), (900, 50 * n), (900, 50 * n + 37), (0, 50 * n + 37)] for n in range(4200)]
+    bars = [
+        [(0, 50 * n), (900, 50 * n), (900, 50 * n + 37), (0, 50 * n + 37)]
+        for n in range(4200)
+    ]
     pairs = found(bars, 37.5, 13.5)[0]
     assert pairs.count((WIDTH, 37.0)) == 4200
     assert pairs.count((SPACE, 13.0)) == 4199
@@ -90,7 +106,12 @@ def test_pairs_of_kinds_are_counted_once_each():
     out = np.full((5, 3), -1)
     count = loops.find_pairs(block, 1, kind, offsets, bad, out, 0)
     # up and to the left of a kind 1 stands a kind 2: (row, column) of the lower one
-    want = [[r, c, 2] for r in (1, 2) for c in (1, 2) if drawn[r, c] == 1 and drawn[r - 1, c - 1] == 2]
+    want = [
+        [r, c, 2]
+        for r in (1, 2)
+        for c in (1, 2)
+        if drawn[r, c] == 1 and drawn[r - 1, c - 1] == 2
+    ]
     assert out[:count].tolist() == want
 
 
@@ -104,9 +125,16 @@ def test_pillars_and_their_area_are_counted_by_tiles():
 
 
 def test_edges_that_stand_behind_others_do_not_face():
-    """A step of the outline beside a hole: 60 up and 80 across through the solid between them, which is no space."""
+    """A step of the outline beside a hole: 60 up and 80 across through the solid
+    between them, which is no space.
+    """
     slab = [(0, 0), (400, 0), (400, 200), (180, 200), (180, 500), (0, 500)]
-    hole = [(100, 40), (100, 140), (260, 140), (260, 40)]  # clockwise; its right edge ends 80 and 60 from the step
+    hole = [
+        (100, 40),
+        (100, 140),
+        (260, 140),
+        (260, 40),
+    ]  # clockwise; its right edge ends 80 and 60 from the step
     lines = np.concatenate([contour(*slab), contour(*hole)])
     rows = edges.facing(lines, np.zeros(len(lines), int), 1.0, 99.9)
     assert rows.size == 0
@@ -123,18 +151,27 @@ def test_edges_that_stand_behind_others_do_not_face():
         (0, 500),
     ]
     opened = edges.facing(contour(*open_slab), np.zeros(10, int), 1.0, 80.5)
-    assert [round(away, 9) for away in opened[:, 3].tolist()] == [80.0]  # the same step, now beside an open space
+    assert [round(away, 9) for away in opened[:, 3].tolist()] == [
+        80.0
+    ]  # the same step, now beside an open space
 
 
 def test_what_is_hidden_at_one_end_is_measured_where_it_is_seen():
-    """Two long sides 50 apart, a post of 30 between their left ends, which are nearest: what is seen counts."""
-    low, high = [(0, 0), (900, 0), (900, 90), (0, 90)], [(0, 140), (900, 149), (900, 250), (0, 250)]
+    """Two long sides 50 apart, a post of 30 between their left ends, which are nearest:
+    what is seen counts.
+    """
+    low, high = (
+        [(0, 0), (900, 0), (900, 90), (0, 90)],
+        [(0, 140), (900, 149), (900, 250), (0, 250)],
+    )
     post = [(-20, 100), (60, 100), (60, 130), (-20, 130)]
     pairs = found([low, high, post], 1.0, 60.0)[0]
     spaces = [away for _, away in pairs]
     assert min(spaces) == 10.0  # post to either side
     beside_post = [away for away in spaces if away > 11]
-    assert beside_post[0] == pytest.approx(50 + 9 * 60 / 900, abs=0.1)  # where the post ends, not 50
+    assert beside_post[0] == pytest.approx(
+        50 + 9 * 60 / 900, abs=0.1
+    )  # where the post ends, not 50
 
 
 def test_shapes_of_known_width_have_no_width_here():

@@ -1,4 +1,6 @@
-"""Whole furnished masks and random nested ones of any turn, beside what KLayout counts and measures of the files."""
+"""Whole furnished masks and random nested ones of any turn, beside what KLayout counts
+and measures of the files.
+"""
 
 import math
 
@@ -22,9 +24,14 @@ db = pytest.importorskip("klayout.db")
 pytestmark = pytest.mark.peers
 
 MOST = 170  # nm: gaps and widths beyond are not told apart
-STEP = 1.0  # KLayout rounds the ends of the parts of slanted edges that it measures between
-PARALLEL = 2.0  # degrees: edges that lean more to each other are no width; opposite ones of our pillars do not
-PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01)
+# KLayout rounds the ends of the parts of slanted edges that it measures between
+STEP = 1.0
+# degrees: edges that lean more to each other are no width; opposite ones of our pillars
+# do not
+PARALLEL = 2.0
+PROXY = Proxy(
+    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.05, 0.32), (0.94, 0.94), 0.01, 0.01
+)
 
 
 def lens(name):
@@ -32,14 +39,28 @@ def lens(name):
     rng = np.random.default_rng(5)
     stands = rng.random((14, 19)) < 0.8
     if name == "round":
-        return DiameterMap(np.where(stands, rng.uniform(0.11, 0.29, stands.shape), 0), 0.4)
+        return DiameterMap(
+            np.where(stands, rng.uniform(0.11, 0.29, stands.shape), 0), 0.4
+        )
     if name == "hexagonal":
         stands &= (np.arange(14)[:, None] + np.arange(19)) % 2 == 0
         cell = Cell(0.336, lattice=Lattice("hexagonal"))
         size = np.where(stands, np.rint(rng.uniform(90, 240, stands.shape)) * 1e-3, 0)
-        return Lens(DiameterMap(size, 0.336, cell.lattice, 0.291), cell, PROXY, 0.94, 77.0, math.inf, "map")
+        return Lens(
+            DiameterMap(size, 0.336, cell.lattice, 0.291),
+            cell,
+            PROXY,
+            0.94,
+            77.0,
+            math.inf,
+            "map",
+        )
     cell = Cell(0.4, shape=Rectangle(0.55) if name == "rectangles" else Ellipse(0.6))
-    turned = DiameterMap(np.where(stands, 0.24, 0.0), 0.4, angle_rad=rng.uniform(0, math.pi, stands.shape))
+    turned = DiameterMap(
+        np.where(stands, 0.24, 0.0),
+        0.4,
+        angle_rad=rng.uniform(0, math.pi, stands.shape),
+    )
     return Lens(turned, cell, PROXY, 0.94, 77.0, math.inf, "map", hand="left")
 
 
@@ -80,38 +101,75 @@ def largest_kept(check):
 
 @pytest.mark.parametrize(
     ("name", "tone"),
-    [(name, "positive") for name in ("round", "hexagonal", "rectangles", "ellipses")] + [("round", "negative")],
+    [(name, "positive") for name in ("round", "hexagonal", "rectangles", "ellipses")]
+    + [("round", "negative")],
 )
-def test_furnished_masks_have_the_shapes_areas_and_least_sizes_of_klayout(tmp_path, name, tone):
-    process = Process(tone=tone, die=Die(margin_um=330, label="R8 O"), etch=Etch(sidewall_deg=1.5))
+def test_furnished_masks_have_the_shapes_areas_and_least_sizes_of_klayout(
+    tmp_path, name, tone
+):
+    process = Process(
+        tone=tone, die=Die(margin_um=330, label="R8 O"), etch=Etch(sidewall_deg=1.5)
+    )
     made = build.prepare(lens(name), process, with_doses=False).plan
     layout.write_oasis(made, tmp_path / "m.oas")
     layout.write_gdsii(made, tmp_path / "m.gds")
     for path in (tmp_path / "m.oas", tmp_path / "m.gds"):
         content, theirs = read(path), regions(path)
-        assert dict(hierarchy.shapes(content)) == {layer: raw.count() for layer, raw in theirs.items()}
+        assert dict(hierarchy.shapes(content)) == {
+            layer: raw.count() for layer, raw in theirs.items()
+        }
         assert areas(content) == {layer: raw.area() for layer, raw in theirs.items()}
-    for number in sorted({layer[0] for layer in theirs} - {process.layers.outline[0], process.layers.fields[0]}):
+    for number in sorted(
+        {layer[0] for layer in theirs}
+        - {process.layers.outline[0], process.layers.fields[0]}
+    ):
         merged = db.Region()
         for layer, raw in theirs.items():
             merged += raw if layer[0] == number else db.Region()
         merged = merged.merged()
         others = sorted({layer[0] for layer in theirs} - {number})
-        found = foreign.check(content, Rules(minimum_gap_nm=MOST, minimum_feature_nm=MOST), skip=others)
-        across = (db.Region.Projection, PARALLEL) if tone == "negative" else (db.Region.Euclidian,)  # round holes
-        gap = largest_kept(lambda d, m=merged, how=across: m.space_check(d, True, *how).count())
-        assert abs(min(math.floor(found.minimum_gap_nm + 1e-9) if found.counts["gap"] else MOST, MOST) - gap) <= STEP
-        width = largest_kept(lambda d, m=merged: m.width_check(d, True, db.Region.Projection, PARALLEL).count())
+        found = foreign.check(
+            content, Rules(minimum_gap_nm=MOST, minimum_feature_nm=MOST), skip=others
+        )
+        across = (
+            (db.Region.Projection, PARALLEL)
+            if tone == "negative"
+            else (db.Region.Euclidian,)
+        )  # round holes
+        gap = largest_kept(
+            lambda d, m=merged, how=across: m.space_check(d, True, *how).count()
+        )
+        assert (
+            abs(
+                min(
+                    math.floor(found.minimum_gap_nm + 1e-9)
+                    if found.counts["gap"]
+                    else MOST,
+                    MOST,
+                )
+                - gap
+            )
+            <= STEP
+        )
+        width = largest_kept(
+            lambda d, m=merged: m.width_check(
+                d, True, db.Region.Projection, PARALLEL
+            ).count()
+        )
         least = min(found.minimum_feature_nm, MOST)
         assert abs(math.floor(least + 1e-9) - width) <= STEP, (name, number)
 
 
 def nested(rng):
-    """Polygons of any angle in cells that are placed in rows, turned and scaled in any way, three deep."""
+    """Polygons of any angle in cells that are placed in rows, turned and scaled in any
+    way, three deep.
+    """
     cells, copies, names, size = {}, {}, [], 400
     for k in range(4):
         angle = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(5, 12))))
-        corners = np.rint(rng.uniform(60, 160) * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.int64)
+        corners = np.rint(
+            rng.uniform(60, 160) * np.column_stack([np.cos(angle), np.sin(angle)])
+        ).astype(np.int64)
         cells[f"P{k}"] = CellContent(f"P{k}", {(1 + k % 2, k): [corners]})
         names.append(f"P{k}")
     for storey in range(3):
@@ -119,10 +177,20 @@ def nested(rng):
         for name in new:
             placed = []
             for child in rng.choice(names, 3).tolist():
-                turn = Turn(float(rng.uniform(0, 360)), bool(rng.integers(2)), float(rng.choice([1.0, 0.5, 1.7])))
-                at, step = rng.integers(-5 * size, 5 * size, 2).tolist(), (size * rng.uniform(1.4, 2.2, 2)).astype(int)
+                turn = Turn(
+                    float(rng.uniform(0, 360)),
+                    bool(rng.integers(2)),
+                    float(rng.choice([1.0, 0.5, 1.7])),
+                )
+                at, step = (
+                    rng.integers(-5 * size, 5 * size, 2).tolist(),
+                    (size * rng.uniform(1.4, 2.2, 2)).astype(int),
+                )
                 columns, rows = rng.integers(1, 5, 2).tolist()
-                across, up = (int(step[0]), int(rng.integers(-60, 60))), (int(rng.integers(-60, 60)), int(step[1]))
+                across, up = (
+                    (int(step[0]), int(rng.integers(-60, 60))),
+                    (int(rng.integers(-60, 60)), int(step[1])),
+                )
                 placed.append(Copies(child, *at, turn, columns, rows, across, up))
             cells[name], copies[name] = CellContent(name), tuple(placed)
         names, size = [*new, names[0]], 4 * size
@@ -135,9 +203,13 @@ def test_random_masks_of_any_turn_and_scale_are_those_of_klayout(tmp_path, seed)
     path = tmp_path / "m.gds"
     gdsii_assemble.write(nested(np.random.default_rng(seed)), path)
     content, theirs = read(path), regions(path)
-    assert dict(hierarchy.shapes(content)) == {layer: raw.count() for layer, raw in theirs.items()}
+    assert dict(hierarchy.shapes(content)) == {
+        layer: raw.count() for layer, raw in theirs.items()
+    }
     assert min(raw.count() for raw in theirs.values()) > 0
     found = areas(content)
     for layer, raw in theirs.items():
         around = sum(p.perimeter() for p in raw.each())
-        assert abs(found[layer] - raw.area()) < around / 2  # each corner is off by half a unit along x and y at most
+        assert (
+            abs(found[layer] - raw.area()) < around / 2
+        )  # each corner is off by half a unit along x and y at most

@@ -1,11 +1,21 @@
-"""Memory that a check takes for each of many shapes, and placements that are taken up in blocks."""
+"""Memory that a check takes for each of many shapes, and placements that are taken up
+in blocks.
+"""
 
 import tracemalloc
 
 import numpy as np
 import pytest
 
-from layout.files import QUARTERS, CellContent, Gathered, MaskContent, Placed, content, flat
+from layout.files import (
+    QUARTERS,
+    CellContent,
+    Gathered,
+    MaskContent,
+    Placed,
+    content,
+    flat,
+)
 from layout.oasis import cells
 from layout.process import Rules
 from layout.rules import DrcReport, foreign, near
@@ -18,21 +28,34 @@ def lattice(columns, rows, kinds=3):
     i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
     child = ((3 * i + 5 * j) % kinds).astype(np.int32)
     names = tuple(f"P{k}" for k in range(kinds))
-    placed = Placed(names, child, (410 * i).astype(np.int32), (370 * j).astype(np.int32), (child % 4).astype(np.uint8))
+    placed = Placed(
+        names,
+        child,
+        (410 * i).astype(np.int32),
+        (370 * j).astype(np.int32),
+        (child % 4).astype(np.uint8),
+    )
     made = {"LENS": CellContent("LENS", placed=placed)}
-    made |= {name: CellContent(name, {(1, 0): [SQUARE + np.array([0, k])]}) for k, name in enumerate(names)}
+    made |= {
+        name: CellContent(name, {(1, 0): [SQUARE + np.array([0, k])]})
+        for k, name in enumerate(names)
+    }
     return MaskContent("OASIS", 1.0, made)
 
 
 def test_a_check_takes_some_twenty_bytes_a_shape(monkeypatch):
-    """12 for places and kinds of the layer, 8 for places that wait to be gathered, 3 for the bands of a large mask."""
+    """12 for places and kinds of the layer, 8 for places that wait to be gathered, 3
+    for the bands of a large mask.
+    """
     monkeypatch.setattr(near, "_BAND", 1 << 14)
     for module in (near, flat, content, foreign):
         monkeypatch.setattr(module, "_AT_ONCE", 1 << 14)
     foreign.check(lattice(90, 190), Rules(), last=True)  # compiles the loops
     some = lattice(1000, 600)
     tracemalloc.start()
-    found = foreign.check(some, Rules(minimum_gap_nm=200, minimum_feature_nm=90), last=True)
+    found = foreign.check(
+        some, Rules(minimum_gap_nm=200, minimum_feature_nm=90), last=True
+    )
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found.ok
@@ -43,10 +66,16 @@ def test_a_check_takes_some_twenty_bytes_a_shape(monkeypatch):
 
 def test_places_are_the_same_in_any_blocks(monkeypatch):
     rng = np.random.default_rng(7)
-    child, turn = rng.integers(0, 3, 101).astype(np.int32), rng.integers(0, 8, 101).astype(np.uint8)
+    child, turn = (
+        rng.integers(0, 3, 101).astype(np.int32),
+        rng.integers(0, 8, 101).astype(np.uint8),
+    )
     x, y = rng.integers(-(10**6), 10**6, (2, 101)).astype(np.int32)
     made = {"A": CellContent("A", placed=Placed(("P", "Q", "R"), child, x, y, turn))}
-    made |= {name: CellContent(name, {(1, k): [SQUARE + 3 * k]}) for k, name in enumerate("PQR")}
+    made |= {
+        name: CellContent(name, {(1, k): [SQUARE + 3 * k]})
+        for k, name in enumerate("PQR")
+    }
     monkeypatch.setattr(flat, "_AT_ONCE", 9)
     monkeypatch.setattr(content, "_AT_ONCE", 7)
     seen = sorted(
@@ -54,12 +83,24 @@ def test_places_are_the_same_in_any_blocks(monkeypatch):
         for shape in flat.shapes(MaskContent("GDSII", 1.0, made), "A")
         for px, py in zip(shape.x.tolist(), shape.y.tolist(), strict=True)
     )
-    corners = (np.column_stack(QUARTERS[t].apply(*(SQUARE + 3 * k).T)) for k, t in zip(child, turn, strict=True))
-    ends = (np.sort(own, 0)[[0, -1]] + [px, py] for own, px, py in zip(corners, x, y, strict=True))
-    assert seen == sorted((int(k), *map(tuple, end)) for k, end in zip(child, ends, strict=True))
+    corners = (
+        np.column_stack(QUARTERS[t].apply(*(SQUARE + 3 * k).T))
+        for k, t in zip(child, turn, strict=True)
+    )
+    ends = (
+        np.sort(own, 0)[[0, -1]] + [px, py]
+        for own, px, py in zip(corners, x, y, strict=True)
+    )
+    assert seen == sorted(
+        (int(k), *map(tuple, end)) for k, end in zip(child, ends, strict=True)
+    )
     counts = made["A"].placed.counts()
     assert counts.shape == (3, 8)
-    assert all(counts[k, t] == ((child == k) & (turn == t)).sum() for k in range(3) for t in range(8))
+    assert all(
+        counts[k, t] == ((child == k) & (turn == t)).sum()
+        for k in range(3)
+        for t in range(8)
+    )
 
 
 @pytest.mark.parametrize("large", [1, 40, 1 << 23])
@@ -69,7 +110,11 @@ def test_placements_keep_their_order_however_they_are_gathered(monkeypatch, larg
     for count in (3, 1, 30, 30, 2, 90, 1):
         part = rng.integers(0, 200, (4, count))
         every.append(part)
-        held.add(part[0].astype(np.int32), *part[1:3].astype(np.int32), part[3].astype(np.uint8))
+        held.add(
+            part[0].astype(np.int32),
+            *part[1:3].astype(np.int32),
+            part[3].astype(np.uint8),
+        )
     columns = held.columns()
     assert np.array_equal(np.array(columns), np.hstack(every))
     assert [column.dtype.itemsize for column in columns] == [4, 4, 4, 1]

@@ -1,4 +1,6 @@
-"""Gaps and widths of convex polygons by independent geometry: turned rectangles, circles, triangles, in closed form."""
+"""Gaps and widths of convex polygons by independent geometry: turned rectangles,
+circles, triangles, in closed form.
+"""
 
 import math
 
@@ -14,19 +16,30 @@ TURNS = ((3, 4, 5), (5, 12, 13), (8, 15, 17), (20, 21, 29))
 
 
 def rectangle(a, b, turn=None):
-    """(4, 2) of sides 2 a and 2 b about (0, 0); turned corners are ``turn[2]`` times as far."""
+    """(4, 2) of sides 2 a and 2 b about (0, 0); turned corners are ``turn[2]`` times as
+    far.
+    """
     corners = np.array([[-a, -b], [a, -b], [a, b], [-a, b]])
-    return corners if turn is None else corners @ np.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
+    return (
+        corners
+        if turn is None
+        else corners @ np.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
+    )
 
 
 def between(first, second):
-    """Distance of two polygons that do not meet, by all pairs of segments, sampled at their ends and feet."""
+    """Distance of two polygons that do not meet, by all pairs of segments, sampled at
+    their ends and feet.
+    """
 
     def to(p, a, b):
         t = np.clip(np.dot(p - a, b - a) / np.dot(b - a, b - a), 0, 1)
         return math.dist(p, a + t * (b - a))
 
-    sides = [list(zip(s.astype(float), np.roll(s, -1, axis=0).astype(float), strict=True)) for s in (first, second)]
+    sides = [
+        list(zip(s.astype(float), np.roll(s, -1, axis=0).astype(float), strict=True))
+        for s in (first, second)
+    ]
     return min(
         min(to(p, *edge) for p in one.astype(float) for edge in edges)
         for one, edges in ((first, sides[1]), (second, sides[0]))
@@ -37,7 +50,8 @@ def between(first, second):
 def test_a_gap_along_the_common_direction_of_turned_rectangles(turn):
     p, q, r = turn
     one, two = rectangle(40, 23, turn), rectangle(31, 57, turn)
-    # side by side along the turned x axis: centres 40 + 31 + 9 apart in units of r, 8 along the other
+    # side by side along the turned x axis: centres 40 + 31 + 9 apart in units of r, 8
+    # along the other
     dx, dy = 80 * p - 8 * q, 80 * q + 8 * p
     assert convex.gap(one, two, dx, dy) == pytest.approx(9 * r, rel=1e-14)
     assert convex.gap(two, one, -dx, -dy) == pytest.approx(9 * r, rel=1e-14)
@@ -56,16 +70,21 @@ def test_a_corner_that_points_at_a_side(turn):
 
 def test_a_corner_that_points_at_a_corner():
     one, two = rectangle(10, 20), rectangle(7, 5)
-    assert convex.gap(one, two, 10 + 7 + 60, 20 + 5 + 11) == pytest.approx(61)  # 11, 60, 61
+    assert convex.gap(one, two, 10 + 7 + 60, 20 + 5 + 11) == pytest.approx(
+        61
+    )  # 11, 60, 61
     assert convex.gap(one, two, -10 - 7 - 60, 20 + 5 + 11) == pytest.approx(61)
     assert convex.gap(one, two, 17, 25) == 0.0  # corner on corner
 
 
 @pytest.mark.parametrize(
-    ("step", "count", "at"), [((20, 17), 17, 6), ((2, 11), 39, 5), ((1, 25), 56, 9), ((3, 7), 8, 3)]
+    ("step", "count", "at"),
+    [((20, 17), 17, 6), ((2, 11), 39, 5), ((1, 25), 56, 9), ((3, 7), 8, 3)],
 )
 def test_a_corner_on_a_slanted_side_touches_exactly(step, count, at):
-    """A side of so many steps of whole numbers; the corner lies on one of them, where shares of the side round."""
+    """A side of so many steps of whole numbers; the corner lies on one of them, where
+    shares of the side round.
+    """
     (p, q), corner = step, np.array([[0, 0], [40, -70], [90, -60]])
     side = np.array([[0, 0], [count * p, count * q], [0, count * q]])
     assert convex.gap(side, corner, at * p, at * q) == 0.0
@@ -94,26 +113,40 @@ def test_any_convex_polygons_are_as_far_as_their_nearest_points(seed, sides, awa
     else:  # no line along an edge has all of the one on one side and all of the other strictly beyond it
         for one, two in ((shapes[0], moved), (moved, shapes[0])):
             edge = np.roll(one, -1, axis=0) - one
-            outside = edge[:, 1, None] * (two[:, 0] - one[:, :1]) - edge[:, 0, None] * (two[:, 1] - one[:, 1:])
+            outside = edge[:, 1, None] * (two[:, 0] - one[:, :1]) - edge[:, 0, None] * (
+                two[:, 1] - one[:, 1:]
+            )
             assert (outside.min(1) <= 0).all()
 
 
 def test_polygons_of_circles_are_as_far_as_circles_less_their_flats():
     count, radius = 64, 100_000
     angle = 2 * math.pi * (np.arange(count) + 0.5) / count
-    circle = np.rint(radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.int64)
+    circle = np.rint(radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(
+        np.int64
+    )
     for direction in (0.0, 0.7, 1.9, 4.4):
-        dx, dy = round(234_567 * math.cos(direction)), round(234_567 * math.sin(direction))
+        dx, dy = (
+            round(234_567 * math.cos(direction)),
+            round(234_567 * math.sin(direction)),
+        )
         found = convex.gap(circle, circle, dx, dy)
         exact = math.hypot(dx, dy) - 2 * radius
-        # corners lie on the circle to 0.71, flats radius (1 - cos(pi / 64)) = 120.5 within it
-        assert -1.5 <= found - exact <= 2 * radius * (1 - math.cos(math.pi / count)) + 1.5
+        # corners lie on the circle to 0.71, flats radius (1 - cos(pi / 64)) = 120.5
+        # within it
+        assert (
+            -1.5 <= found - exact <= 2 * radius * (1 - math.cos(math.pi / count)) + 1.5
+        )
 
 
 def test_width_is_the_least_height():
     assert convex.width(rectangle(40, 23)) == 46
     assert convex.width(rectangle(23, 40, (5, 12, 13))) == pytest.approx(46 * 13)
-    assert convex.width(np.array([[0, 0], [60, 0], [0, 11]])) == pytest.approx(60 * 11 / 61)
-    hexagon = np.array([[200, 0], [100, 173], [-100, 173], [-200, 0], [-100, -173], [100, -173]])
+    assert convex.width(np.array([[0, 0], [60, 0], [0, 11]])) == pytest.approx(
+        60 * 11 / 61
+    )
+    hexagon = np.array(
+        [[200, 0], [100, 173], [-100, 173], [-200, 0], [-100, -173], [100, -173]]
+    )
     assert convex.width(hexagon) == pytest.approx(2 * 173)
     assert convex.reach(np.array([[3, -4], [1, 1], [-2, 0]])) == 5

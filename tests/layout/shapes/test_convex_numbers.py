@@ -22,10 +22,15 @@ def test_the_hull_leaves_out_what_lies_within():
     assert got[start:] + got[:start] == [[0, 0], [50, -10], [60, 40], [5, 30]]
 
 
-@pytest.mark.parametrize(("shape", "want"), [(TRIANGLE, 24.0), (SLANTED, 15.0), (BOX, 12.0), (BOX[:, ::-1], 12.0)])
+@pytest.mark.parametrize(
+    ("shape", "want"),
+    [(TRIANGLE, 24.0), (SLANTED, 15.0), (BOX, 12.0), (BOX[:, ::-1], 12.0)],
+)
 def test_the_width_is_the_least_of_all_directions(shape, want):
     assert convex.width(shape) == pytest.approx(want, rel=1e-15)
-    assert convex.width(shape + np.array([1000, -300])) == pytest.approx(want, rel=1e-15)
+    assert convex.width(shape + np.array([1000, -300])) == pytest.approx(
+        want, rel=1e-15
+    )
     assert convex.width(shape[::-1]) == pytest.approx(want, rel=1e-15)
 
 
@@ -58,7 +63,9 @@ def test_boxes_of_a_unit_lie_a_unit_apart():
 
 
 def test_gaps_agree_with_points_along_both_outlines():
-    """500 places on each side of each: never nearer than the gap, and within their step of it."""
+    """500 places on each side of each: never nearer than the gap, and within their step
+    of it.
+    """
     rng = np.random.default_rng(12)
 
     def places(shape):

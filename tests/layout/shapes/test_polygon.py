@@ -1,4 +1,6 @@
-"""Pillar polygons: area of the circle, centroid at the site, symmetry of the square, on the grid."""
+"""Pillar polygons: area of the circle, centroid at the site, symmetry of the square, on
+the grid.
+"""
 
 import math
 
@@ -19,12 +21,18 @@ def images(points):
             yield sorted(map(tuple, p.tolist()))
 
 
-@given(diameter=st.floats(8, 400), vertices=st.sampled_from([8, 12, 16, 20, 24, 32, 48, 64]))
+@given(
+    diameter=st.floats(8, 400),
+    vertices=st.sampled_from([8, 12, 16, 20, 24, 32, 48, 64]),
+)
 def test_polygons_are_symmetric_convex_and_on_the_grid(diameter, vertices):
     made = polygon.pillar(diameter, vertices=vertices)
     assert made.points.dtype == np.int64
     assert len(made.points) <= vertices
-    assert all(image == sorted(map(tuple, made.points.tolist())) for image in images(made.points))
+    assert all(
+        image == sorted(map(tuple, made.points.tolist()))
+        for image in images(made.points)
+    )
     before, after = (np.roll(made.points, n, axis=0) - made.points for n in (1, -1))
     turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     assert (turn < 0).all()  # strictly convex, counter-clockwise, no double vertex
@@ -36,7 +44,10 @@ def test_area_of_32_vertices_is_the_circle_within_a_thousandth(diameter):
     assert abs(made.area / (math.pi * diameter**2 / 4) - 1) < 1e-3
     x, y = made.points.T.astype(float)
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y
-    centroid = ((x + np.roll(x, -1)) * cross).sum(), ((y + np.roll(y, -1)) * cross).sum()
+    centroid = (
+        ((x + np.roll(x, -1)) * cross).sum(),
+        ((y + np.roll(y, -1)) * cross).sum(),
+    )
     assert centroid == (0.0, 0.0)  # odd diameters too: no half grid step
 
 
@@ -50,9 +61,12 @@ def test_frontier_improves_with_vertices_and_costs_shots():
 
 
 def test_edge_error_of_an_equal_area_polygon_follows_the_closed_form():
-    # n = 16: vertices stand out by R (sqrt(pi / (n/2 sin(2 pi/n))) - 1); grid rounding adds 0.7 steps at most
+    # n = 16: vertices stand out by R (sqrt(pi / (n/2 sin(2 pi/n))) - 1); grid rounding
+    # adds 0.7 steps at most
     diameter, n = 300, 16
-    ideal = diameter / 2 * (math.sqrt(math.pi / (n / 2 * math.sin(2 * math.pi / n))) - 1)
+    ideal = (
+        diameter / 2 * (math.sqrt(math.pi / (n / 2 * math.sin(2 * math.pi / n))) - 1)
+    )
     made = polygon.pillar(diameter, vertices=n)
     assert ideal - 0.8 < made.edge_error < 2 * ideal + 0.8
 
@@ -68,19 +82,26 @@ def test_shoelace_of_the_unit_square_and_of_huge_numbers_is_exact():
     assert polygon.twice_area(square * (2**31 - 1)) == 2 * (2**31 - 1) ** 2
 
 
-@pytest.mark.parametrize(("diameter", "vertices"), [(3.9, 32), (float("nan"), 32), (100, 10), (100, 4), (100, 68)])
+@pytest.mark.parametrize(
+    ("diameter", "vertices"),
+    [(3.9, 32), (float("nan"), 32), (100, 10), (100, 4), (100, 68)],
+)
 def test_impossible_polygons_are_refused(diameter, vertices):
     with pytest.raises(ProcessError, match="need"):
         polygon.pillar(diameter, vertices=vertices)
 
 
 def test_equal_area_vertices_stand_outside_the_circle_and_cost_little_there():
-    """The ideal polygon of a large pillar, on the grid, is cheap; one with its vertices on the circle is not."""
+    """The ideal polygon of a large pillar, on the grid, is cheap; one with its vertices
+    on the circle is not.
+    """
     diameter, n = 4001.3, 32
     ideal = diameter / 2 * math.sqrt(math.pi / (n / 2 * math.sin(2 * math.pi / n)))
     angle = (np.arange(n // 8) + 0.5) * 2 * math.pi / n
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    out, on = (np.rint(radius * ring).astype(np.int64) for radius in (ideal, diameter / 2))
+    out, on = (
+        np.rint(radius * ring).astype(np.int64) for radius in (ideal, diameter / 2)
+    )
     cost = polygon._cost(np.stack([out, on], -1), diameter)
     assert cost[0] < 0.5  # rounding: 1/6 in the mean square, area 1e-4
     assert cost[1] > 100  # 0.64 % of the area: 12 times the 0.05 % that is free

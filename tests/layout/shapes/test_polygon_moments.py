@@ -13,7 +13,10 @@ def test_moments_are_those_of_the_rectangle_less_those_of_the_hole():
     area, first, second = moments([OUTER, HOLE])
     assert area == pytest.approx(15 - 3)
     assert first == pytest.approx([15 * 3.5 - 3 * 3, 15 * 3.5 - 3 * 3.75])
-    third = [(6**3 - 1) / 3 * 3 + (5**3 - 2**3) / 3 * 5, (4**3 - 2**3) / 3 * 1.5 + (4.5**3 - 3**3) / 3 * 2]
+    third = [
+        (6**3 - 1) / 3 * 3 + (5**3 - 2**3) / 3 * 5,
+        (4**3 - 2**3) / 3 * 1.5 + (4.5**3 - 3**3) / 3 * 2,
+    ]
     assert second == pytest.approx(third[0] - third[1])
     assert moments([HOLE])[0] == pytest.approx(-3)
 

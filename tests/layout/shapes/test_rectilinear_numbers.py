@@ -1,4 +1,6 @@
-"""Rectilinear polygons in rectangles, others in boxes, boxes in pieces: counted unit by unit and by closed forms."""
+"""Rectilinear polygons in rectangles, others in boxes, boxes in pieces: counted unit by
+unit and by closed forms.
+"""
 
 import numpy as np
 import pytest
@@ -7,16 +9,24 @@ from layout.shapes import rectilinear
 from metalens.ground.errors import ProcessError
 
 # an L with a notch from below; and two arms of unlike height
-NOTCHED = np.array([[0, 0], [3, 0], [3, 2], [5, 2], [5, 0], [9, 0], [9, 4], [6, 4], [6, 7], [0, 7]])
+NOTCHED = np.array(
+    [[0, 0], [3, 0], [3, 2], [5, 2], [5, 0], [9, 0], [9, 4], [6, 4], [6, 7], [0, 7]]
+)
 ARMS = np.array([[-4, -3], [8, -3], [8, 5], [6, 5], [6, 1], [-1, 1], [-1, 9], [-4, 9]])
 
 
 def inside(shape, x, y):
-    """Whether the middles of unit squares lie in a polygon: edges crossed on the way to +x."""
+    """Whether the middles of unit squares lie in a polygon: edges crossed on the way to
+    +x.
+    """
     start, end = shape, np.roll(shape, -1, axis=0)
     upright = start[:, 0] == end[:, 0]
     low, high = np.minimum(start, end)[upright, 1], np.maximum(start, end)[upright, 1]
-    crossed = (start[upright, 0] > x[..., None]) & (low < y[..., None]) & (y[..., None] < high)
+    crossed = (
+        (start[upright, 0] > x[..., None])
+        & (low < y[..., None])
+        & (y[..., None] < high)
+    )
     return crossed.sum(-1) % 2 == 1
 
 
@@ -58,24 +68,35 @@ def test_a_slanted_edge_is_refused_where_rectangles_are_asked_for():
     ],
 )
 def test_slices_of_a_slanted_shape_are_as_wide_as_it_is_there(shape, count):
-    """Against 50 000 points along each edge: rounded outwards to whole units, and to the next point."""
+    """Against 50 000 points along each edge: rounded outwards to whole units, and to
+    the next point.
+    """
     shape = np.array(shape)
     share = np.linspace(0, 1, 50_001)[:, None]
-    edge = np.concatenate([a + share * (b - a) for a, b in zip(shape, np.roll(shape, -1, axis=0), strict=True)])
+    edge = np.concatenate(
+        [
+            a + share * (b - a)
+            for a, b in zip(shape, np.roll(shape, -1, axis=0), strict=True)
+        ]
+    )
     step = 1 + np.ptp(shape, axis=0).max() / 50_000
     found = rectilinear.covering(shape)
     ends = np.linspace(shape[:, 1].min(), shape[:, 1].max(), count + 1)
     assert len(found) == count
     assert found[:, 1].tolist() == np.floor(ends[:-1]).tolist()
     assert found[:, 3].tolist() == np.ceil(ends[1:]).tolist()
-    for (left, _, right, _), low, high in zip(found.tolist(), ends[:-1], ends[1:], strict=True):
+    for (left, _, right, _), low, high in zip(
+        found.tolist(), ends[:-1], ends[1:], strict=True
+    ):
         x = edge[(edge[:, 1] >= low) & (edge[:, 1] <= high), 0]
         assert 0 <= x.min() - left <= step
         assert 0 <= right - x.max() <= step
 
 
 def test_boxes_are_cut_evenly_on_the_grid():
-    """Sides of 10 in pieces of 4 at most: three of 10 / 3, on a grid of 2 at 0, 4, 6, 10; a side of 8 is cut in two."""
+    """Sides of 10 in pieces of 4 at most: three of 10 / 3, on a grid of 2 at 0, 4, 6,
+    10; a side of 8 is cut in two.
+    """
     boxes = np.array([[100, -6, 110, 2], [0, 0, 3, 3]])
     pieces, of = rectilinear.cut(boxes, 4.0, 2)
     columns, rows = [(100, 104), (104, 106), (106, 110)], [(-6, -2), (-2, 2)]
@@ -89,4 +110,9 @@ def test_boxes_are_cut_evenly_on_the_grid():
 
 
 def test_corners_run_counter_clockwise():
-    assert rectilinear.corners([1, 2, 5, 9]).tolist() == [[1, 2], [5, 2], [5, 9], [1, 9]]
+    assert rectilinear.corners([1, 2, 5, 9]).tolist() == [
+        [1, 2],
+        [5, 2],
+        [5, 9],
+        [1, 9],
+    ]

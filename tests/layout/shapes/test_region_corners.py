@@ -10,7 +10,9 @@ TRIANGLE = np.array([[10, -20], [70, -10], [30, 50]])
 def test_a_triangle_stays():
     (found,) = region.union([TRIANGLE])
     assert len(found) == 3
-    assert abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10  # of the sides (60, 10) and (20, 70)
+    assert (
+        abs(polygon.twice_area(found)) == 60 * 70 - 20 * 10
+    )  # of the sides (60, 10) and (20, 70)
 
 
 def test_a_triangle_cut_off_a_square_is_left():
@@ -22,7 +24,9 @@ def test_a_triangle_cut_off_a_square_is_left():
 
 
 def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
-    """The middle of the hole lies off whole units on its edges: no corner is made, and twice the area is kept."""
+    """The middle of the hole lies off whole units on its edges: no corner is made, and
+    twice the area is kept.
+    """
     square = np.array([[-200, -200], [201, -200], [201, 200], [-200, 200]])
     hole = np.array([[-70, -31], [77, -62], [90, 10], [13, 101], [-3, 40]])
     left = region.difference([square], [hole])
@@ -30,8 +34,12 @@ def test_a_slanted_hole_is_cut_from_corner_to_corner_and_nothing_moves():
     assert len(pieces) == 2
     corners = {tuple(p) for p in np.concatenate([square, hole]).tolist()}
     assert {tuple(p) for piece in pieces for p in piece.tolist()} == corners
-    assert all(len(np.unique(piece, axis=0)) == len(piece) for piece in pieces)  # no way there and back
-    assert sum(map(polygon.twice_area, pieces)) == 2 * 401 * 400 - polygon.twice_area(hole)
+    assert all(
+        len(np.unique(piece, axis=0)) == len(piece) for piece in pieces
+    )  # no way there and back
+    assert sum(map(polygon.twice_area, pieces)) == 2 * 401 * 400 - polygon.twice_area(
+        hole
+    )
     (whole,) = [c for c in region.union(pieces) if polygon.twice_area(c) > 0]
     assert len(whole) == 4
 
@@ -40,16 +48,22 @@ def test_a_hole_whose_middle_meets_flats_is_cut_upright():
     square = np.array([[-200, -200], [200, -200], [200, 200], [-200, 200]])
     hole = np.array([[-50, -60], [50, -60], [80, 0], [50, 60], [-50, 60], [-80, 0]])
     pieces = region.without_holes(region.difference([square], [hole]))
-    assert sorted(tuple(p[:, 0][[p[:, 0].argmin(), p[:, 0].argmax()]].tolist()) for p in pieces) == [
+    assert sorted(
+        tuple(p[:, 0][[p[:, 0].argmin(), p[:, 0].argmax()]].tolist()) for p in pieces
+    ) == [
         (-200, 0),
         (0, 200),
     ]
 
 
 def test_triangles_fill_an_outline_but_for_its_hole():
-    outline = np.array([[0, 0], [90, 0], [90, 70], [60, 70], [60, 30], [30, 30], [30, 70], [0, 70]])
+    outline = np.array(
+        [[0, 0], [90, 0], [90, 70], [60, 70], [60, 30], [30, 30], [30, 70], [0, 70]]
+    )
     hole = np.array([[10, 10], [10, 20], [80, 20], [80, 10]])
     points = np.concatenate([outline, hole])
-    areas = [polygon.twice_area(points[three]) for three in region.triangles([outline, hole])]
+    areas = [
+        polygon.twice_area(points[three]) for three in region.triangles([outline, hole])
+    ]
     assert min(areas) > 0
     assert sum(areas) == 2 * (90 * 70 - 30 * 40 - 70 * 10)

@@ -1,4 +1,6 @@
-"""How far meshes may be off before it is told: a tapered box whose volume, sides and heights are known."""
+"""How far meshes may be off before it is told: a tapered box whose volume, sides and
+heights are known.
+"""
 
 import math
 import struct
@@ -13,8 +15,13 @@ from metalens.cell.shapes import Conic, Loop, Outline
 
 HEIGHT = 0.7
 FOOT, TOP = ((0.2, 0.13), (0.15, 0.09))  # half sides, um
-# corners 0 to 3 of the foot, 4 to 7 of the top, counter-clockwise from above; triangles outwards
-SIDES = [t for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for t in ((a, b, b + 4), (a, b + 4, a + 4))]
+# corners 0 to 3 of the foot, 4 to 7 of the top, counter-clockwise from above; triangles
+# outwards
+SIDES = [
+    t
+    for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))
+    for t in ((a, b, b + 4), (a, b + 4, a + 4))
+]
 TRIANGLES = np.array([(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7), *SIDES])
 SIGNS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
@@ -39,13 +46,20 @@ def test_a_tapered_box_as_planned_has_its_volume():
     """(A0 + 4 Am + A1) h / 6 of 0.104, 0.077 and 0.054 um2."""
     assert told(corners()) == []
     lines = told(corners() * [1.1, 1, 1])
-    assert lines[0] == f"volume {1.1 * 0.7 / 6 * 0.466:.9g} um3, planned {0.7 / 6 * 0.466:.9g}"
+    assert (
+        lines[0]
+        == f"volume {1.1 * 0.7 / 6 * 0.466:.9g} um3, planned {0.7 / 6 * 0.466:.9g}"
+    )
     assert told(corners(), TRIANGLES[:, ::-1])[0].startswith("volume -0.0543666667 um3")
 
 
-@pytest.mark.parametrize(("part", "count"), [(0.72e-5, 0), (-0.72e-5, 0), (0.8e-5, 1), (-0.8e-5, 1)])
+@pytest.mark.parametrize(
+    ("part", "count"), [(0.72e-5, 0), (-0.72e-5, 0), (0.8e-5, 1), (-0.8e-5, 1)]
+)
 def test_volumes_agree_to_fifteen_millionths(part, count):
-    """Sides that are longer by this part hold twice as much more; corners may be off by a hundred thousandth."""
+    """Sides that are longer by this part hold twice as much more; corners may be off by
+    a hundred thousandth.
+    """
     lines = told(corners() * [1 + part, 1 + part, 1])
     assert [line.split()[0] for line in lines] == ["volume"] * count
 
@@ -64,7 +78,12 @@ def test_corners_agree_to_a_hundred_thousandth_of_the_reach(part, count):
 def test_heights_agree_to_five_millionths(count):
     away = (4.9e-6, 5.1e-6)[count] * HEIGHT
     up, part = np.array([0, 0, away]), away / HEIGHT
-    for moved in (corners() + up, corners() - up, corners() * [1, 1, 1 + part], corners() * [1, 1, 1 - part]):
+    for moved in (
+        corners() + up,
+        corners() - up,
+        corners() * [1, 1, 1 + part],
+        corners() * [1, 1, 1 - part],
+    ):
         lines = told(moved)
         assert [line[:5] for line in lines] == ["from "] * count
     if count:
@@ -73,7 +92,9 @@ def test_heights_agree_to_five_millionths(count):
 
 @pytest.mark.parametrize(("down", "closed"), [(2.05e-5, True), (2.13e-5, False)])
 def test_a_surface_is_closed_to_a_part_of_its_sides(down, closed):
-    """One triangle's top corner lower than its neighbours': 0.4 um of its foot times that, of 5e-5 r h."""
+    """One triangle's top corner lower than its neighbours': 0.4 um of its foot times
+    that, of 5e-5 r h.
+    """
     assert 0.4 * 2.05e-5 < 5e-5 * math.hypot(*FOOT) * HEIGHT < 0.4 * 2.13e-5
     made = corners()[TRIANGLES].reshape(-1, 3)
     apart = np.arange(36).reshape(-1, 3)
@@ -95,13 +116,20 @@ def around(form, count=8):
 
 def test_corners_of_a_curve_lie_on_one_line_a_little_outside():
     form = np.full(8, 1.03)
-    assert read._beside(around(form), Outline((ELLIPSE,)))[0] == pytest.approx(0, abs=1e-14)
+    assert read._beside(around(form), Outline((ELLIPSE,)))[0] == pytest.approx(
+        0, abs=1e-14
+    )
     form[3] += 7e-6
     away, low, high = read._beside(around(form), Outline((ELLIPSE,)))
     assert away == pytest.approx(7e-6, rel=1e-6)
     reach = np.hypot(*around(form).T)
     assert (low, high) == (reach.min(), reach.max())
-    for bad, least in ((0.9999, np.inf), (1.1001, np.inf), (1.0999, 0.0699), (1 - 4e-6, 0.030004)):
+    for bad, least in (
+        (0.9999, np.inf),
+        (1.1001, np.inf),
+        (1.0999, 0.0699),
+        (1 - 4e-6, 0.030004),
+    ):
         form[3] = bad
         found = read._beside(around(form), Outline((ELLIPSE,)))[0]
         assert found == pytest.approx(least, rel=1e-6)
@@ -121,7 +149,9 @@ def test_every_part_of_an_outline_has_three_corners_at_least():
     assert read._beside(every[5:], both)[0] == pytest.approx(0, abs=1e-14)
     moved = every.copy()
     moved[-1] += np.array([3.0, 4.0]) * 0.8e-7
-    assert read._beside(moved, both)[0] == pytest.approx(4e-7 / both.radius_um, rel=1e-6)
+    assert read._beside(moved, both)[0] == pytest.approx(
+        4e-7 / both.radius_um, rel=1e-6
+    )
     moved[-1] += np.array([3.0, 4.0]) * 8e-7  # more than 2e-6 um of 0.2
     assert read._beside(moved, both)[0] == np.inf
     assert read._beside(np.empty((0, 2)), both)[0] == np.inf
@@ -135,15 +165,33 @@ def test_copies_are_as_far_off_as_the_farthest_and_each_has_a_place():
 
 
 def tile(x=(3.0, -8.0), y=(1.5, 0.25)):
-    one, two = Section("S", outline(FOOT), outline(TOP)), Section("E", outline((0.1, 0.07)), outline((0.1, 0.07)))
+    one, two = (
+        Section("S", outline(FOOT), outline(TOP)),
+        Section("E", outline((0.1, 0.07)), outline((0.1, 0.07))),
+    )
     size = np.array([0.4, 0.2])
-    return Tile(size, size, np.array([*x, 0.0]), np.array([*y, 9.0]), np.array([0, 0, 1]), HEIGHT, 0.5, (one, two))
+    return Tile(
+        size,
+        size,
+        np.array([*x, 0.0]),
+        np.array([*y, 9.0]),
+        np.array([0, 0, 1]),
+        HEIGHT,
+        0.5,
+        (one, two),
+    )
 
 
 def parts(**other):
     upright = np.vstack([SIGNS * (0.1, 0.07)] * 2)
-    second = read._Part(np.column_stack([upright, np.repeat([0, HEIGHT], 4)]), TRIANGLES, np.array([[0.0, 9.0, 0.0]]))
-    first = read._Part(corners(), TRIANGLES, np.array([[-8.0, 0.25, 0.0], [3.0, 1.5, 0.0]]))
+    second = read._Part(
+        np.column_stack([upright, np.repeat([0, HEIGHT], 4)]),
+        TRIANGLES,
+        np.array([[0.0, 9.0, 0.0]]),
+    )
+    first = read._Part(
+        corners(), TRIANGLES, np.array([[-8.0, 0.25, 0.0], [3.0, 1.5, 0.0]])
+    )
     return {"S": first, "E": second} | other
 
 
@@ -176,10 +224,22 @@ def test_metres_with_y_up_are_micrometres_with_z_up():
 def test_positions_begin_where_view_and_accessor_say():
     buffer = struct.pack("<9f", 7, 7, *(1.5, -2.0, 3.25, 4.0, 5.5, -6.0), 9)
     tree = {
-        "accessors": [{}, {"componentType": 5126, "type": "VEC3", "bufferView": 1, "byteOffset": 4, "count": 2}],
+        "accessors": [
+            {},
+            {
+                "componentType": 5126,
+                "type": "VEC3",
+                "bufferView": 1,
+                "byteOffset": 4,
+                "count": 2,
+            },
+        ],
         "bufferViews": [{}, {"byteOffset": 4}],
     }
-    assert read._positions(tree, buffer, 1).tolist() == [[1.5, -2.0, 3.25], [4.0, 5.5, -6.0]]
+    assert read._positions(tree, buffer, 1).tolist() == [
+        [1.5, -2.0, 3.25],
+        [4.0, 5.5, -6.0],
+    ]
     tree["accessors"][1]["componentType"] = 5125
     with pytest.raises(ValueError, match="float32"):
         read._positions(tree, buffer, 1)

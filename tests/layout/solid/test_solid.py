@@ -1,4 +1,6 @@
-"""Solids: closed surfaces checked twice, instances shared, labels, colours and places kept through STEP."""
+"""Solids: closed surfaces checked twice, instances shared, labels, colours and places
+kept through STEP.
+"""
 
 import json
 import math
@@ -26,7 +28,9 @@ from metalens.lens.record import DiameterMap, Lens
 from metalens.made import Bias
 from metalens.pillars.proxy import Proxy
 
-PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.9]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[3.0, 3.0]]), np.array([[0.9]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0
+)
 TILTED = Process(etch=Etch(sidewall_deg=1.0))
 
 
@@ -34,7 +38,9 @@ def lens(ny=14, nx=11):
     rng = np.random.default_rng(0)
     diameter = rng.choice([0.0, 0.12, 0.2, 0.26], (ny, nx))
     diameter[0, 0], diameter[ny - 1, nx - 1] = 0.12, 0.26
-    return Lens(DiameterMap(diameter, 0.4), Cell(0.4), PROXY, 0.85, 100.0, 1000.0, "random")
+    return Lens(
+        DiameterMap(diameter, 0.4), Cell(0.4), PROXY, 0.85, 100.0, 1000.0, "random"
+    )
 
 
 def stl(path):
@@ -48,9 +54,15 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
     assert len(whole.kind) == (d.diameter_um > 0).sum()
     lean = 0.7 * math.tan(math.radians(1))
     assert whole.foot_um - whole.top_um == pytest.approx(np.full(3, 2 * lean))
-    assert (whole.foot_um + whole.top_um) / 2 == pytest.approx([0.12, 0.2, 0.26], abs=1e-5)  # corners: 3e-6
+    assert (whole.foot_um + whole.top_um) / 2 == pytest.approx(
+        [0.12, 0.2, 0.26], abs=1e-5
+    )  # corners: 3e-6
     part = solid.tile(lens(), TILTED, side_um=1.6, centre_um=(0.4, 1.0))
-    inside = (abs(d.x_um - 0.4) <= 0.8 + 1e-6) & (abs(d.y_um[:, None] - 1.0) <= 0.8 + 1e-6) & (d.diameter_um > 0)
+    inside = (
+        (abs(d.x_um - 0.4) <= 0.8 + 1e-6)
+        & (abs(d.y_um[:, None] - 1.0) <= 0.8 + 1e-6)
+        & (d.diameter_um > 0)
+    )
     assert len(part.kind) == inside.sum()
     rows, columns = np.nonzero(inside)
     assert part.y_um == pytest.approx(d.y_um[rows])
@@ -60,12 +72,16 @@ def test_a_tile_holds_the_pillars_of_its_square_with_tilted_walls():
 def test_a_frustum_has_the_volume_of_its_cone_and_manifold3d_takes_it():
     manifold3d = pytest.importorskip("manifold3d")
     mesh = solid_mesh.frustum(0.3, 0.2, 0.7, sides=8)
-    want = math.pi * 0.7 / 12 * (0.3**2 + 0.3 * 0.2 + 0.2**2)  # equal areas at foot and top: equal volume
+    want = (
+        math.pi * 0.7 / 12 * (0.3**2 + 0.3 * 0.2 + 0.2**2)
+    )  # equal areas at foot and top: equal volume
     assert solid_mesh.volume_um3(mesh) == pytest.approx(want, rel=1e-12)
     body = manifold3d.Manifold(
         manifold3d.Mesh64(mesh.vertices_um, mesh.triangles.astype(np.uint64))
         if hasattr(manifold3d, "Mesh64")
-        else manifold3d.Mesh(mesh.vertices_um.astype(np.float32), mesh.triangles.astype(np.uint32))
+        else manifold3d.Mesh(
+            mesh.vertices_um.astype(np.float32), mesh.triangles.astype(np.uint32)
+        )
     )
     assert body.status() == manifold3d.Error.NoError
     assert body.volume() == pytest.approx(want, rel=1e-5)
@@ -73,7 +89,15 @@ def test_a_frustum_has_the_volume_of_its_cone_and_manifold3d_takes_it():
 
 def test_a_continuous_design_becomes_few_classes_of_made_pillars():
     rng = np.random.default_rng(1)
-    many = Lens(DiameterMap(rng.uniform(0.1, 0.2, (60, 60)), 0.4), Cell(0.4), PROXY, 0.85, 100.0, 1000.0, "map")
+    many = Lens(
+        DiameterMap(rng.uniform(0.1, 0.2, (60, 60)), 0.4),
+        Cell(0.4),
+        PROXY,
+        0.85,
+        100.0,
+        1000.0,
+        "map",
+    )
     biased = Process(bias=Bias(table_nm=((80.0, -6.0), (300.0, 1.0))))
     pillars = solid.tile(many, biased)
     assert len(pillars.names) <= 52
@@ -104,14 +128,27 @@ def test_stl_holds_every_pillar_in_its_place_and_all_volume(tmp_path):
     corners = facets["corners"].astype(float)
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     volume = (a * np.cross(b, c)).sum() / 6
-    cones = math.pi * 0.7 / 12 * (pillars.foot_um**2 + pillars.foot_um * pillars.top_um + pillars.top_um**2)
+    cones = (
+        math.pi
+        * 0.7
+        / 12
+        * (pillars.foot_um**2 + pillars.foot_um * pillars.top_um + pillars.top_um**2)
+    )
     assert volume == pytest.approx(cones[pillars.kind].sum(), rel=1e-5)  # float32
     middles = corners.reshape(len(pillars.kind), -1, 3)
-    assert np.ptp(middles[..., 2], axis=1) == pytest.approx(np.full(len(pillars.kind), 0.7))
-    assert (middles[..., 0].max(1) + middles[..., 0].min(1)) / 2 == pytest.approx(pillars.x_um, abs=1e-6)
-    assert (middles[..., 1].max(1) + middles[..., 1].min(1)) / 2 == pytest.approx(pillars.y_um, abs=1e-6)
+    assert np.ptp(middles[..., 2], axis=1) == pytest.approx(
+        np.full(len(pillars.kind), 0.7)
+    )
+    assert (middles[..., 0].max(1) + middles[..., 0].min(1)) / 2 == pytest.approx(
+        pillars.x_um, abs=1e-6
+    )
+    assert (middles[..., 1].max(1) + middles[..., 1].min(1)) / 2 == pytest.approx(
+        pillars.y_um, abs=1e-6
+    )
     normal = np.cross(b - a, c - a)
-    assert (facets["normal"] * normal).sum(1) == pytest.approx(np.linalg.norm(normal, axis=1), rel=1e-4)
+    assert (facets["normal"] * normal).sum(1) == pytest.approx(
+        np.linalg.norm(normal, axis=1), rel=1e-4
+    )
 
 
 def test_3mf_places_one_object_a_class_and_repeats_itself(tmp_path):
@@ -124,7 +161,11 @@ def test_3mf_places_one_object_a_class_and_repeats_itself(tmp_path):
     space = {"m": "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"}
     assert root.attrib["unit"] == "micron"
     objects = root.findall("m:resources/m:object", space)
-    assert [each.attrib["name"] for each in objects] == ["pillar_120nm", "pillar_200nm", "pillar_260nm"]
+    assert [each.attrib["name"] for each in objects] == [
+        "pillar_120nm",
+        "pillar_200nm",
+        "pillar_260nm",
+    ]
     items = root.findall("m:build/m:item", space)
     assert len(items) == len(pillars.kind)
     last = [float(v) for v in items[-1].attrib["transform"].split()]
@@ -143,12 +184,22 @@ def test_gltf_is_one_mesh_a_class_and_one_node_a_pillar(tmp_path):
     assert len(tree["meshes"]) == 3
     assert len(tree["nodes"]) == len(pillars.kind) + 1
     place = tree["nodes"][5]["translation"]
-    assert place == pytest.approx([1e-6 * pillars.x_um[5], 0, -1e-6 * pillars.y_um[5]])  # metres
+    assert place == pytest.approx(
+        [1e-6 * pillars.x_um[5], 0, -1e-6 * pillars.y_um[5]]
+    )  # metres
     view = tree["bufferViews"][tree["accessors"][0]["bufferView"]]
     start = 28 + length + view["byteOffset"]
-    points = np.frombuffer(data[start : start + view["byteLength"]], "<f4").reshape(-1, 3)
-    a, b, c = points[::3].astype(float), points[1::3].astype(float), points[2::3].astype(float)
-    assert (a * np.cross(b, c)).sum() / 6 > 0  # still right side out after the axes were turned
+    points = np.frombuffer(data[start : start + view["byteLength"]], "<f4").reshape(
+        -1, 3
+    )
+    a, b, c = (
+        points[::3].astype(float),
+        points[1::3].astype(float),
+        points[2::3].astype(float),
+    )
+    assert (
+        a * np.cross(b, c)
+    ).sum() / 6 > 0  # still right side out after the axes were turned
     assert points[:, 1].max() == pytest.approx(0.7e-6)
     assert points.max(0).tolist() == pytest.approx(tree["accessors"][0]["max"])
 
@@ -161,21 +212,33 @@ def test_step_of_a_tile_shares_its_pillars_and_keeps_labels_places_and_sizes(tmp
     first = path.read_bytes()
     solid_step.write_step(path, pillars)
     assert path.read_bytes() == first
-    assert len(re.findall(rb"CONICAL_SURFACE", first)) == 3  # one for each class, however many pillars
+    assert (
+        len(re.findall(rb"CONICAL_SURFACE", first)) == 3
+    )  # one for each class, however many pillars
     found = build123d.import_step(path)
     assert found.label.replace("_", " ") == "metalens tile"
     assert len(found.children) == len(pillars.kind) + 1
-    slab = found.children[0].bounding_box()  # half a pitch wider than the sites on every side, 1 um thick
+    slab = found.children[
+        0
+    ].bounding_box()  # half a pitch wider than the sites on every side, 1 um thick
     half = pillars.pitch_um / 2
     low = pillars.x_um.min() - half, pillars.y_um.min() - half, -1.0
     high = pillars.x_um.max() + half, pillars.y_um.max() + half, 0.0
-    assert pytest.approx([v * 1e-3 for v in (*low, *high)], abs=1e-9) == [*slab.min, *slab.max]
+    assert pytest.approx([v * 1e-3 for v in (*low, *high)], abs=1e-9) == [
+        *slab.min,
+        *slab.max,
+    ]
     order = np.argsort(pillars.kind, kind="stable")
-    sites = zip(pillars.kind[order], pillars.x_um[order], pillars.y_um[order], strict=True)
+    sites = zip(
+        pillars.kind[order], pillars.x_um[order], pillars.y_um[order], strict=True
+    )
     for part, (kind, x, y) in zip(found.children[1:], sites, strict=True):
         assert part.label == pillars.names[kind]
         box = part.bounding_box()
-        assert pytest.approx((x * 1e-3, y * 1e-3), abs=1e-9) == (box.center().X, box.center().Y)  # mm
+        assert pytest.approx((x * 1e-3, y * 1e-3), abs=1e-9) == (
+            box.center().X,
+            box.center().Y,
+        )  # mm
         assert pytest.approx(pillars.foot_um[kind] * 1e-3, rel=1e-3) == box.size.X
         assert pytest.approx([0, 7e-4], abs=1e-9) == [box.min.Z, box.max.Z]
         assert tuple(part.color)[:3] == pytest.approx((0.25, 0.35, 0.75), abs=0.01)
@@ -198,8 +261,13 @@ def test_the_module_is_3_5_mm_and_comes_back_with_labels_colours_and_places(tmp_
     assert list(found) == list(module.COLOURS)
     for name, colour in module.COLOURS.items():
         assert tuple(found[name].color)[:3] == pytest.approx(colour[:3], abs=1e-6)
-    ends = {name: (part.bounding_box().min.Z, part.bounding_box().max.Z) for name, part in found.items()}
-    assert max(e[1] for e in ends.values()) - min(e[0] for e in ends.values()) == pytest.approx(3.5)
+    ends = {
+        name: (part.bounding_box().min.Z, part.bounding_box().max.Z)
+        for name, part in found.items()
+    }
+    assert max(e[1] for e in ends.values()) - min(
+        e[0] for e in ends.values()
+    ) == pytest.approx(3.5)
     assert ends["nir_filter"] == pytest.approx((-0.8, -0.3))
     assert ends["die"] == pytest.approx((-0.3, 0), abs=1e-9)
     assert ends["sensor"] == pytest.approx((2.0, 2.5))
@@ -216,8 +284,13 @@ def test_a_cut_takes_a_quarter_out_and_leaves_out_what_stands_in_it():
     build123d = pytest.importorskip("build123d")
     whole = build123d.Box(2, 3, 1)
     assert module._without_quarter(whole).volume == pytest.approx(0.75 * 6)
-    assert module._without_quarter(build123d.Pos(2, -1, 0) * build123d.Box(1, 1, 1)) is None  # to +x, -y
-    assert module._without_quarter(build123d.Pos(2, 1, 0) * build123d.Box(1, 1, 1)).volume == pytest.approx(1)
+    assert (
+        module._without_quarter(build123d.Pos(2, -1, 0) * build123d.Box(1, 1, 1))
+        is None
+    )  # to +x, -y
+    assert module._without_quarter(
+        build123d.Pos(2, 1, 0) * build123d.Box(1, 1, 1)
+    ).volume == pytest.approx(1)
 
 
 def test_colliding_parts_are_refused():
@@ -249,7 +322,15 @@ def test_the_picture_of_the_module_is_a_png():
 
 
 def test_too_many_pillars_are_refused_with_a_square_that_would_do(tmp_path):
-    full = Lens(DiameterMap(np.full((120, 120), 0.2), 0.4), Cell(0.4), PROXY, 0.85, 100.0, 1000.0, "map")
+    full = Lens(
+        DiameterMap(np.full((120, 120), 0.2), 0.4),
+        Cell(0.4),
+        PROXY,
+        0.85,
+        100.0,
+        1000.0,
+        "map",
+    )
     pillars = solid.tile(full, TILTED)
     with pytest.raises(ProcessError, match=r"14,400 pillars.*side_um = 39.6"):
         solid_step.write_step(tmp_path / "tile.step", pillars)
@@ -293,10 +374,12 @@ def test_a_module_is_built_around_any_lens():
 def test_files_of_a_window_of_a_lens(tmp_path):
     pytest.importorskip("build123d")
     window = Window(0.4, 0.6, 1.2)
-    made = solid_files.write_stl(lens(), TILTED, tmp_path, window) + solid_files.write_step(
+    made = solid_files.write_stl(
         lens(), TILTED, tmp_path, window
+    ) + solid_files.write_step(lens(), TILTED, tmp_path, window)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        path.name for path in made
     )
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in made)
     corners = stl(tmp_path / "pillars.stl")[0]["corners"]
     assert 0.4 < corners[..., 1].mean() < 0.8  # +y up, as in the mask
     with pytest.raises(ProcessError, match="no pillar"):
@@ -326,27 +409,53 @@ for name, write in (("a.stl", solid.write_stl), ("a.glb", solid.write_gltf), ("a
 
 def test_a_full_disk_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     pytest.importorskip("build123d")
-    done = subprocess.run([sys.executable, "-c", FULL_DISK, str(tmp_path)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout.split("\n")[:3] == ["a.stl old 1", "a.glb old 1", "a.step old 1"]
 
 
 def test_colours_stay_with_their_solids_wherever_these_lie_in_memory(tmp_path):
     build123d = pytest.importorskip("build123d")
-    colours = [(0.75, 0.85, 0.95), (0.25, 0.35, 0.75), (0.9, 0.1, 0.2), (0.25, 0.35, 0.75), (0.3, 0.31, 0.0)]
+    colours = [
+        (0.75, 0.85, 0.95),
+        (0.25, 0.35, 0.75),
+        (0.9, 0.1, 0.2),
+        (0.25, 0.35, 0.75),
+        (0.3, 0.31, 0.0),
+    ]
     made, kept = [], []
     for turn in range(4):
         pieces = []
-        for k in np.random.default_rng(turn).permutation(5).tolist():  # other addresses each time
+        for k in (
+            np.random.default_rng(turn).permutation(5).tolist()
+        ):  # other addresses each time
             kept.append(build123d.Solid.make_box(1 + k, 2, 3))
             pieces.append(
-                (k, solid_step.Piece(f"p{k}", kept[-1].wrapped, colours[k], [(9.0 * k, 0, 0), (0, 5.0 * k, 1)]))
+                (
+                    k,
+                    solid_step.Piece(
+                        f"p{k}",
+                        kept[-1].wrapped,
+                        colours[k],
+                        [(9.0 * k, 0, 0), (0, 5.0 * k, 1)],
+                    ),
+                )
             )
         pieces.sort(key=lambda piece: piece[0])
-        solid_step.write_pieces(tmp_path / "a.step", "all", [piece for _, piece in pieces], unit_m=1e-3)
+        solid_step.write_pieces(
+            tmp_path / "a.step", "all", [piece for _, piece in pieces], unit_m=1e-3
+        )
         made.append((tmp_path / "a.step").read_bytes())
     assert len(set(made)) == 1
     assert made[0].count(b"COLOUR_RGB") == 4  # one for each colour
-    found = [(part.label, tuple(part.color)[:3]) for part in build123d.import_step(tmp_path / "a.step").children]
+    found = [
+        (part.label, tuple(part.color)[:3])
+        for part in build123d.import_step(tmp_path / "a.step").children
+    ]
     assert len(found) == 10
     for label, colour in found:
         assert colour == pytest.approx(colours[int(label[1])], abs=1e-6)

@@ -1,4 +1,6 @@
-"""Derivatives of ln t by differences through a solver that is a formula: slopes, their error, what lies between."""
+"""Derivatives of ln t by differences through a solver that is a formula: slopes, their
+error, what lies between.
+"""
 
 import dataclasses
 
@@ -12,18 +14,31 @@ from tests.layout.study.test_tolerance import hyperbolic
 
 ROWS = named(Answers)
 SLOPES = {"height_nm": 3.1j, "index": -0.02 + 0.4j, "sidewall_deg": 0.3 + 0.1j}
-FINER = {"height_nm": 1.03, "index": 0.91, "sidewall_deg": 1.2}  # by how much they differ at the finer truncation
+FINER = {
+    "height_nm": 1.03,
+    "index": 0.91,
+    "sidewall_deg": 1.2,
+}  # by how much they differ at the finer truncation
 
 
 def solver(cell, diameter_um, wavelength_um, finer):
     """ln t is a straight line in every number, so that differences are slopes."""
-    now = {"height_nm": cell.height_um, "index": cell.pillar.n, "sidewall_deg": cell.sidewall_rad}
-    terms = (SLOPES[name] * (FINER[name] if finer else 1) * value for name, value in now.items())
+    now = {
+        "height_nm": cell.height_um,
+        "index": cell.pillar.n,
+        "sidewall_deg": cell.sidewall_rad,
+    }
+    terms = (
+        SLOPES[name] * (FINER[name] if finer else 1) * value
+        for name, value in now.items()
+    )
     return np.exp(sum(terms) * diameter_um / wavelength_um)
 
 
 def test_slopes_are_the_finer_ones_and_the_error_is_what_the_coarser_differ_by():
-    """The wall's slope is 0.1 and small, and its change is the largest, of its own size: 0.2 of 1.2."""
+    """The wall's slope is 0.1 and small, and its change is the largest, of its own
+    size: 0.2 of 1.2.
+    """
     lens = dataclasses.replace(hyperbolic(21), cell=Cell(0.4, 0.61, Index(2.7)))
     found = sensitivities(lens, count=5, solver=solver)
     assert found.diameter_um == pytest.approx(np.linspace(0.1, 0.3, 5))

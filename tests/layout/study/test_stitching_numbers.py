@@ -1,4 +1,6 @@
-"""Fields that stand off: the second-order expansion on quadratics, the centroid of a window."""
+"""Fields that stand off: the second-order expansion on quadratics, the centroid of a
+window.
+"""
 
 from types import SimpleNamespace
 
@@ -12,8 +14,12 @@ RNG = np.random.default_rng(10)
 
 
 def test_derivatives_of_a_quadratic_are_its_own():
-    """Light a + b x + c y + d x²/2 + e y²/2 + g xy of every field, offsets in um, terms in steps of 20 nm."""
-    a, b, c, d, e, g = RNG.normal(size=(6, 3, 2, 4)) + 1j * RNG.normal(size=(6, 3, 2, 4))
+    """Light a + b x + c y + d x²/2 + e y²/2 + g xy of every field, offsets in um, terms
+    in steps of 20 nm.
+    """
+    a, b, c, d, e, g = RNG.normal(size=(6, 3, 2, 4)) + 1j * RNG.normal(
+        size=(6, 3, 2, 4)
+    )
 
     def light(moments, place):
         x, y = place
@@ -27,7 +33,9 @@ def test_derivatives_of_a_quadratic_are_its_own():
 
 
 def test_the_centroid_of_a_window_is_the_mean_place_of_its_light():
-    where = Window(np.array([-1.0, 0.5, 3.0]), np.array([2.0, 7.0]), 500.0, 0.85, np.ones(1))
+    where = Window(
+        np.array([-1.0, 0.5, 3.0]), np.array([2.0, 7.0]), 500.0, 0.85, np.ones(1)
+    )
     psf = np.array([[[1.0, 0.0, 3.0], [2.0, 4.0, 0.0]]])
     x = (-1 + 9 - 2 + 2) / 10
     y = (2 * 4 + 7 * 6) / 10

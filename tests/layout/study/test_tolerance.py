@@ -1,4 +1,6 @@
-"""Tolerance: the reduced model against the plain sum with every pillar changed, limits, and the tolerant choice."""
+"""Tolerance: the reduced model against the plain sum with every pillar changed, limits,
+and the tolerant choice.
+"""
 
 import dataclasses
 import functools
@@ -24,11 +26,24 @@ from metalens.made import Answers, Spread, draws, named, transmission
 from metalens.pillars.proxy import Proxy
 from tests.referees import plain_sum
 
-PROXY = Proxy(np.array([[4.6, 4.2, 0.5, 0.3]]), np.array([[0.9, 0.02, 0.04]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[4.6, 4.2, 0.5, 0.3]]),
+    np.array([[0.9, 0.02, 0.04]]),
+    (0.1, 0.3),
+    (0.85, 0.85),
+    0.0,
+    0.0,
+)
 DIAMETERS = np.linspace(0.1, 0.3, 9)
 SENS = Sensitivities(
     DIAMETERS,
-    np.array([8j + 30j * (DIAMETERS - 0.1) - 1.0, 0.3j + 25j * (DIAMETERS - 0.1), 0.2 + 5j * (DIAMETERS - 0.2)]),
+    np.array(
+        [
+            8j + 30j * (DIAMETERS - 0.1) - 1.0,
+            0.3j + 25j * (DIAMETERS - 0.1),
+            0.2 + 5j * (DIAMETERS - 0.2),
+        ]
+    ),
     0.01,
 )
 
@@ -39,29 +54,47 @@ def hyperbolic(n=161, distance_um=150.0, source_um=1500.0):
     path = np.sqrt(r**2 + distance_um**2) + np.sqrt(r**2 + source_um**2)
     table = np.arange(0.1, 0.3, 0.002)
     phase = PROXY.phase_rad(table, 0.85)
-    table, phase = table[phase < phase[0] + 2 * np.pi], phase[phase < phase[0] + 2 * np.pi]
+    table, phase = (
+        table[phase < phase[0] + 2 * np.pi],
+        phase[phase < phase[0] + 2 * np.pi],
+    )
     wanted = np.remainder(-2 * np.pi / 0.85 * path - phase[0], 2 * np.pi)
-    diameter = table[np.clip(np.searchsorted(phase - phase[0], wanted), 0, len(table) - 1)]
+    diameter = table[
+        np.clip(np.searchsorted(phase - phase[0], wanted), 0, len(table) - 1)
+    ]
     diameters = DiameterMap(np.where(r < n * 0.2, diameter, 0), 0.4)
     return Lens(diameters, Cell(0.4), PROXY, 0.85, distance_um, source_um, "hyperbolic")
 
 
 def hexagonal():
-    """The hyperbolic lens with its pillars on the sites of a hexagonal lattice, squares."""
+    """The hyperbolic lens with its pillars on the sites of a hexagonal lattice,
+    squares.
+    """
     made, cell = hyperbolic(), Cell(0.44, lattice=Lattice("hexagonal"), shape=Square())
     d = made.diameters.diameter_um.copy()
     d[np.add.outer(*map(np.arange, d.shape)) % 2 == 1] = 0
-    return dataclasses.replace(made, cell=cell, diameters=DiameterMap(d, 0.44, cell.lattice))
+    return dataclasses.replace(
+        made, cell=cell, diameters=DiameterMap(d, 0.44, cell.lattice)
+    )
 
 
 def turned(n=161):
-    """Rectangles, each turned so that left circular light, whose phase falls by twice the turn, has a focus."""
+    """Rectangles, each turned so that left circular light, whose phase falls by twice
+    the turn, has a focus.
+    """
     made, cell = hyperbolic(n), Cell(0.4, shape=Rectangle(0.5))
     d = made.diameters.diameter_um
     x, y = made.diameters.x_um, made.diameters.y_um[:, None]
-    turn = np.pi / 0.85 * (np.hypot(np.hypot(x, y), 150.0) + np.hypot(np.hypot(x, y), 1500.0)) % np.pi
+    turn = (
+        np.pi
+        / 0.85
+        * (np.hypot(np.hypot(x, y), 150.0) + np.hypot(np.hypot(x, y), 1500.0))
+        % np.pi
+    )
     sizes = np.where(d > 0, 0.2 + 0.0005 * x, 0.0)
-    return dataclasses.replace(made, cell=cell, hand="left", diameters=DiameterMap(sizes, 0.4, angle_rad=turn))
+    return dataclasses.replace(
+        made, cell=cell, hand="left", diameters=DiameterMap(sizes, 0.4, angle_rad=turn)
+    )
 
 
 @pytest.mark.parametrize("made", [hyperbolic, hexagonal, turned])
@@ -69,19 +102,38 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
     lens = made()
     turn = lens.diameters.angle_rad
     swung = 1.0 if turn is None else np.exp(-2j * turn)
-    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0, 1200.0]))
+    where = focus.Window(
+        np.linspace(-2, 3, 3),
+        np.linspace(-1, 4, 3),
+        150.0,
+        0.85,
+        np.array([1500.0, 1200.0]),
+    )
     model = reduce(lens, SENS, focus.prepare(lens, where), Spread(), seed=0)
     lenses = draws(Spread(), 4, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
-    x, y = (axis / lens.diameters.radius_um for axis in (lens.diameters.x_um, lens.diameters.y_um[:, None]))
+    x, y = (
+        axis / lens.diameters.radius_um
+        for axis in (lens.diameters.x_um, lens.diameters.y_um[:, None])
+    )
     for draw, light in zip(lenses, fast, strict=True):
         d, a = lens.diameters.diameter_um, draw.amounts
         along = x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
-        bias_nm = a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (x**2 + y**2 - 0.5)
+        bias_nm = (
+            a["bias_nm"]
+            + a["gradient_nm"] / 2 * along
+            + a["bow_nm"] * (x**2 + y**2 - 0.5)
+        )
         made = np.where(d > 0, d + bias_nm * 1e-3, 0.2)
         height, index, wall = SENS.at(made)[:3]
-        change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
-        t = transmission(PROXY, SENS, made, 0.85, np.zeros(len(named(Answers)))) * np.exp(change)
+        change = (
+            height * a["height_nm"] * 1e-3
+            + index * a["index"]
+            + wall * np.deg2rad(a["sidewall_deg"])
+        )
+        t = transmission(
+            PROXY, SENS, made, 0.85, np.zeros(len(named(Answers)))
+        ) * np.exp(change)
         exact = plain_sum.field(lens, np.where(d > 0, t * swung, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
     assert missed(model, lenses) < 2e-3
@@ -90,22 +142,29 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
 
 def test_no_spread_leaves_the_lens_as_it_is():
     still = Process(spread=Spread.only())
-    report = tolerance.analyse(hyperbolic(), still, sens=SENS, depths_um=(1200.0,), draws=10)
+    report = tolerance.analyse(
+        hyperbolic(), still, sens=SENS, depths_um=(1200.0,), draws=10
+    )
     assert report.draws.strehl == pytest.approx(np.ones(10), abs=1e-5)
     assert report.draws.psf_change == pytest.approx(np.zeros(10), abs=1e-5)
     assert all(effect.phase_rad < 1e-12 for effect in report.effects)
 
 
 def test_effects_and_bands_of_a_lens():
-    report = tolerance.analyse(hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3)
+    report = tolerance.analyse(
+        hyperbolic(), Process(), sens=SENS, depths_um=(1200.0, 2000.0), draws=40, seed=3
+    )
     assert [effect.cause for effect in report.effects] == list(Spread().stated)
     low, middle, high = report.band("information")
     assert low.shape == (2,)
     assert (low < middle).all()
     assert (middle < high).all()
-    # a phase spread s costs exp(-s^2) of the peak; height changes phase and, by its real part, the level
+    # a phase spread s costs exp(-s^2) of the peak; height changes phase and, by its
+    # real part, the level
     height = report.effects[list(Spread().stated).index("height_nm")]
-    assert height.strehl == pytest.approx(1 - np.exp(-(height.phase_rad**2) - 2 * 1.0 * 0.007), abs=0.004)
+    assert height.strehl == pytest.approx(
+        1 - np.exp(-(height.phase_rad**2) - 2 * 1.0 * 0.007), abs=0.004
+    )
     assert report.error < 2e-3
     assert 0.4 < report.nominal.efficiency[0] < 1
 
@@ -121,10 +180,18 @@ def test_the_effect_of_a_bias_on_the_phase_is_the_slope_of_the_proxy():
 
 def test_axial_information_is_equation_11_of_the_direct_psf():
     lens = hyperbolic()
-    report = tolerance.analyse(lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10)
-    near = 1 / (1 / 1500 + 3.5 * 0.85 / lens.diameters.radius_um**2)  # the rim 1.75 waves out; beyond: ten times as far
-    assert report.step_um == pytest.approx(9 * near / 50, rel=0.02)  # both ends rounded to two digits
-    where = dataclasses.replace(report.window, depths_um=np.array([1200.0, 1200.0 + report.step_um]))
+    report = tolerance.analyse(
+        lens, Process(), sens=SENS, depths_um=(1200.0,), draws=10
+    )
+    near = 1 / (
+        1 / 1500 + 3.5 * 0.85 / lens.diameters.radius_um**2
+    )  # the rim 1.75 waves out; beyond: ten times as far
+    assert report.step_um == pytest.approx(
+        9 * near / 50, rel=0.02
+    )  # both ends rounded to two digits
+    where = dataclasses.replace(
+        report.window, depths_um=np.array([1200.0, 1200.0 + report.step_um])
+    )
     t = lens.transmission() * np.exp(1j * lens.phase_rad())
     few = dataclasses.replace(where, x_um=where.x_um[::2], y_um=where.y_um[::2])
     psf = abs(plain_sum.field(lens, t, few)) ** 2
@@ -138,8 +205,12 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
 
 def test_beyond_the_domain_the_phase_goes_on_straight():
     d = np.array([0.3, 0.31, 0.32])
-    phase = np.unwrap(np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(Answers))))))
-    assert np.diff(phase) == pytest.approx(0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9)
+    phase = np.unwrap(
+        np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(Answers)))))
+    )
+    assert np.diff(phase) == pytest.approx(
+        0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -151,28 +222,40 @@ def test_beyond_the_domain_the_phase_goes_on_straight():
     ],
 )
 def test_sensitivities_of_a_film_of_air_are_its_optical_path(shape, lattice, share):
-    """Of any shape on any lattice: an index change counts by the share of the area that the pillar covers."""
-    # pillars of the index of what is between them do not exist: t = exp(ik n h) up to a constant
+    """Of any shape on any lattice: an index change counts by the share of the area that
+    the pillar covers.
+    """
+    # pillars of the index of what is between them do not exist: t = exp(ik n h) up to a
+    # constant
     film = Cell(0.3, pillar="air", substrate="air", shape=shape, lattice=lattice)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
     lens = dataclasses.replace(hyperbolic(), cell=film, proxy=narrow)
     found = sensitivities(lens, count=5)
     assert found.rates[0] == pytest.approx(np.full(5, 2j * np.pi / 0.85), abs=1e-6)
     assert found.rates[2] == pytest.approx(np.zeros(5), abs=1e-6)
-    # an index change counts by the area of the pillar, to first order in the contrast (and no coupling)
+    # an index change counts by the area of the pillar, to first order in the contrast
+    # (and no coupling)
     filled = share * found.diameter_um**2 / 0.3**2
-    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.7 * filled, rel=0.03)
+    assert found.rates[1].imag == pytest.approx(
+        2 * np.pi / 0.85 * 0.7 * filled, rel=0.03
+    )
 
 
 def test_sensitivities_of_a_layered_film_of_air_are_the_optical_path_of_its_own_sections():
-    """0.7 um, of which 0.2 um are of another film: it has no part in what the pillar's index does."""
+    """0.7 um, of which 0.2 um are of another film: it has no part in what the pillar's
+    index does.
+    """
     layers = (Layer(0.3), Layer(0.2, material=Index(1.0)), Layer(0.2))
     film = Cell(0.3, pillar="air", substrate="air", layers=layers)
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.25))
-    found = sensitivities(dataclasses.replace(hyperbolic(), cell=film, proxy=narrow), count=2)
+    found = sensitivities(
+        dataclasses.replace(hyperbolic(), cell=film, proxy=narrow), count=2
+    )
     assert found.rates[0] == pytest.approx(np.full(2, 2j * np.pi / 0.85), abs=1e-6)
     filled = np.pi / 4 * found.diameter_um**2 / 0.3**2
-    assert found.rates[1].imag == pytest.approx(2 * np.pi / 0.85 * 0.5 * filled, rel=0.03)  # as in the test above
+    assert found.rates[1].imag == pytest.approx(
+        2 * np.pi / 0.85 * 0.5 * filled, rel=0.03
+    )  # as in the test above
 
 
 def test_too_few_draws_are_refused():
@@ -186,7 +269,11 @@ def test_the_tolerant_choice_keeps_the_phase_and_lowers_the_spread():
     d, made = lens.diameters.diameter_um, result.lens.diameters.diameter_um
     here = d > 0
     assert ((made > 0) == here).all()
-    away = np.angle(np.exp(1j * (PROXY.phase_rad(made[here], 0.85) - PROXY.phase_rad(d[here], 0.85))))
+    away = np.angle(
+        np.exp(
+            1j * (PROXY.phase_rad(made[here], 0.85) - PROXY.phase_rad(d[here], 0.85))
+        )
+    )
     assert abs(away).max() < 0.1 + 2 * np.pi / 2048
     assert result.after < 0.95 * result.before
     assert result.moved > 0.02
@@ -198,7 +285,9 @@ def test_the_tolerant_choice_loses_less_to_a_bias():
     result = tolerant.choose(lens, Process(), tolerance_rad=0.1)
     only_bias = Process(spread=Spread.only(bias_nm=8.0))
     lost = [
-        tolerance.analyse(each, only_bias, sens=SENS, depths_um=(1200.0,), draws=10).effects[0].phase_rad
+        tolerance.analyse(each, only_bias, sens=SENS, depths_um=(1200.0,), draws=10)
+        .effects[0]
+        .phase_rad
         for each in (lens, result.lens)
     ]
     assert lost[1] < 0.9 * lost[0]
@@ -208,7 +297,9 @@ def test_chosen_diameters_are_printable():
     result = tolerant.choose(hyperbolic(), Process())
     made = result.lens.diameters.diameter_um
     sizes = np.unique(made[made > 0]) * 1e3
-    assert np.allclose(sizes % 2, 0, atol=1e-6) or np.allclose(2 - sizes % 2, 0, atol=1e-6)
+    assert np.allclose(sizes % 2, 0, atol=1e-6) or np.allclose(
+        2 - sizes % 2, 0, atol=1e-6
+    )
     assert sizes.min() >= 100
     assert sizes.max() <= 400 - 70
 
@@ -225,41 +316,82 @@ def _drawn(study, most, *given, **more):
 
 
 def test_the_report_sections_say_what_was_found(monkeypatch):
-    for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
-        monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
+    for module, name, most in (
+        (tolerance, "analyse", 10),
+        (stitching, "stitching", 20),
+    ):
+        monkeypatch.setattr(
+            module, name, functools.partial(_drawn, getattr(module, name), most)
+        )
     monkeypatch.setattr(study_page, "CHOICE_RAD", (0.1, 0.3))
     lens = hyperbolic(31)
     process = Process(write_field=WriteField(size_um=6.0))
-    made = study_page.sections(lens, process, fields.split(lens.diameters, process), {"": SENS})
-    assert [section.title for section in made] == ["Stitching", "Tolerance", "Tolerant choice"]
-    tables = [item for section in made for item in section.items if isinstance(item, Table)]
-    assert [row[0] for row in tables[1].rows] == list(Spread().stated)
-    assert [row[0] for row in tables[-1].rows] == ["as designed", "within 0.1 rad", "within 0.3 rad"]
-    assert all(
-        np.isfinite(value) for table in tables for row in table.rows for value in row if isinstance(value, float)
+    made = study_page.sections(
+        lens, process, fields.split(lens.diameters, process), {"": SENS}
     )
-    pictures = [item for section in made for item in section.items if isinstance(item, Figure)]
+    assert [section.title for section in made] == [
+        "Stitching",
+        "Tolerance",
+        "Tolerant choice",
+    ]
+    tables = [
+        item for section in made for item in section.items if isinstance(item, Table)
+    ]
+    assert [row[0] for row in tables[1].rows] == list(Spread().stated)
+    assert [row[0] for row in tables[-1].rows] == [
+        "as designed",
+        "within 0.1 rad",
+        "within 0.3 rad",
+    ]
+    assert all(
+        np.isfinite(value)
+        for table in tables
+        for row in table.rows
+        for value in row
+        if isinstance(value, float)
+    )
+    pictures = [
+        item for section in made for item in section.items if isinstance(item, Figure)
+    ]
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
 
 
 def test_a_turned_lens_has_its_study_without_a_choice_of_sizes(monkeypatch):
-    for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
-        monkeypatch.setattr(module, name, functools.partial(_drawn, getattr(module, name), most))
+    for module, name, most in (
+        (tolerance, "analyse", 10),
+        (stitching, "stitching", 20),
+    ):
+        monkeypatch.setattr(
+            module, name, functools.partial(_drawn, getattr(module, name), most)
+        )
     lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
-    made = study_page.sections(lens, process, fields.split(lens.diameters, process), {"": SENS})
+    made = study_page.sections(
+        lens, process, fields.split(lens.diameters, process), {"": SENS}
+    )
     assert [section.title for section in made] == ["Stitching", "Tolerance"]
     assert "what keeps its hand has no focus" in made[1].text
     assert "walls" not in made[1].text
 
 
-@pytest.mark.parametrize(("made_deg", "designed_deg", "told"), [(0.6, 0, True), (0.4, 0, False), (2, 1.7, False)])
+@pytest.mark.parametrize(
+    ("made_deg", "designed_deg", "told"),
+    [(0.6, 0, True), (0.4, 0, False), (2, 1.7, False)],
+)
 def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
     made_deg, designed_deg, told, monkeypatch
 ):
     """The spread of a wall is 0.5 deg."""
-    monkeypatch.setattr(tolerance, "analyse", functools.partial(_drawn, tolerance.analyse, 10))
-    lens, process = hyperbolic(31), Process(etch=Etch(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0))
-    lens = dataclasses.replace(lens, cell=dataclasses.replace(lens.cell, sidewall_rad=math.radians(designed_deg)))
+    monkeypatch.setattr(
+        tolerance, "analyse", functools.partial(_drawn, tolerance.analyse, 10)
+    )
+    lens, process = (
+        hyperbolic(31),
+        Process(etch=Etch(sidewall_deg=made_deg), write_field=WriteField(size_um=6.0)),
+    )
+    lens = dataclasses.replace(
+        lens,
+        cell=dataclasses.replace(lens.cell, sidewall_rad=math.radians(designed_deg)),
+    )
     text = study_page.tolerances(lens, process, SENS).text
     assert ("the process makes 0.6 deg" in text) is told
     assert ("sidewall_rad = 0.0105 in [cell]" in text) is told
@@ -268,20 +400,33 @@ def test_walls_that_the_process_leans_beyond_its_spread_are_named_with_the_cure(
 
 def test_fields_of_a_turned_lens_add_up_to_its_light():
     lens, process = turned(51), Process(write_field=WriteField(size_um=10.0))
-    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0]))
+    where = focus.Window(
+        np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
+    )
     ready = focus.prepare(lens, where)
-    held, moments = stitching.field_moments(lens, fields.split(lens.diameters, process), ready)
+    held, moments = stitching.field_moments(
+        lens, fields.split(lens.diameters, process), ready
+    )
     d = lens.diameters.diameter_um
     t = PROXY.transmission(np.where(d > 0, d, 0.2), 0.85) * np.exp(
-        1j * (PROXY.phase_rad(np.where(d > 0, d, 0.2), 0.85) - 2 * lens.diameters.angle_rad)
+        1j
+        * (
+            PROXY.phase_rad(np.where(d > 0, d, 0.2), 0.85)
+            - 2 * lens.diameters.angle_rad
+        )
     )
     exact = plain_sum.field(lens, np.where(d > 0, t, 0), where)
     assert held == 9
-    assert abs(ready.light(moments.sum(0)[None])[0] - exact).max() < 1e-4 * abs(exact).max()  # float32 sums
+    assert (
+        abs(ready.light(moments.sum(0)[None])[0] - exact).max()
+        < 1e-4 * abs(exact).max()
+    )  # float32 sums
 
 
 def test_the_tolerant_choice_keeps_the_lattice_and_what_a_shape_may_be():
-    """Squares on a hexagonal lattice of 440 nm: neighbours along a row are 440 nm less the side apart."""
+    """Squares on a hexagonal lattice of 440 nm: neighbours along a row are 440 nm less
+    the side apart.
+    """
     lens = hexagonal()
     rules = Rules(minimum_gap_nm=201.0, minimum_feature_nm=121.0)
     made = tolerant.choose(lens, Process(rules=rules), tolerance_rad=0.4).lens
@@ -294,18 +439,38 @@ def test_the_tolerant_choice_keeps_the_lattice_and_what_a_shape_may_be():
 def test_sensitivities_agree_with_an_independent_solver():
     cell = Cell(0.3, pillar=Index(3.6), substrate=Index(1.45))
     narrow = dataclasses.replace(PROXY, domain_um=(0.1, 0.16))
-    found = sensitivities(dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3)
+    found = sensitivities(
+        dataclasses.replace(hyperbolic(21), cell=cell, proxy=narrow), count=3
+    )
 
     def rate(low, high, step, tolerance=1e-4):
-        less, more = (modal.solve(each, 0.13, 0.85, tolerance=tolerance).t for each in (low, high))
+        less, more = (
+            modal.solve(each, 0.13, 0.85, tolerance=tolerance).t for each in (low, high)
+        )
         return np.log(more / less) / (2 * step)
 
-    height = rate(dataclasses.replace(cell, height_um=0.69), dataclasses.replace(cell, height_um=0.71), 0.01)
-    index = rate(dataclasses.replace(cell, pillar=Index(3.58)), dataclasses.replace(cell, pillar=Index(3.62)), 0.02)
-    lean = 0.008  # a wall acts in second order, of a twentieth of the height's size at 8 mrad: differences are exact
+    height = rate(
+        dataclasses.replace(cell, height_um=0.69),
+        dataclasses.replace(cell, height_um=0.71),
+        0.01,
+    )
+    index = rate(
+        dataclasses.replace(cell, pillar=Index(3.58)),
+        dataclasses.replace(cell, pillar=Index(3.62)),
+        0.02,
+    )
+    # a wall acts in second order, of a twentieth of the height's size at 8 mrad:
+    # differences are exact
+    lean = 0.008
     leans = (dataclasses.replace(cell, sidewall_rad=sign * lean) for sign in (-1, 1))
     wall = rate(*leans, lean, 3e-4)  # 1.3 % from that at 1e-4, at a quarter of its cost
-    assert abs(found.rates[0, 1] / height - 1) < 0.03  # truncation of the plane waves: 1 to 2 % here
+    assert (
+        abs(found.rates[0, 1] / height - 1) < 0.03
+    )  # truncation of the plane waves: 1 to 2 % here
     assert abs(found.rates[1, 1] / index - 1) < 0.05
-    assert abs(found.rates[2, 1] / wall - 1) < 0.08  # and 4 %; differences at four harmonics had the other sign
-    assert 2 * np.pi / 0.85 < found.rates[0, 1].imag < 2 * np.pi / 0.85 * 3.6  # between air and bulk
+    assert (
+        abs(found.rates[2, 1] / wall - 1) < 0.08
+    )  # and 4 %; differences at four harmonics had the other sign
+    assert (
+        2 * np.pi / 0.85 < found.rates[0, 1].imag < 2 * np.pi / 0.85 * 3.6
+    )  # between air and bulk

@@ -1,4 +1,6 @@
-"""Monte Carlo of the process on workers: the bytes of this process, from any number of them and with one lost."""
+"""Monte Carlo of the process on workers: the bytes of this process, from any number of
+them and with one lost.
+"""
 
 import dataclasses
 
@@ -15,7 +17,10 @@ from tests.lost_worker import losing_one
 def content(lens):
     """All numbers of a study with 26 draws, two batches, as bytes."""
     found = tolerance.analyse(lens, Process(), sens=SENS, draws=26, seed=3)
-    rows = [getattr(found.draws, field.name).tobytes() for field in dataclasses.fields(found.draws)]
+    rows = [
+        getattr(found.draws, field.name).tobytes()
+        for field in dataclasses.fields(found.draws)
+    ]
     return [*rows, repr((found.effects, found.rank, found.error))]
 
 
@@ -34,14 +39,23 @@ def test_draws_are_the_same_from_a_cluster_that_loses_a_worker(plain, tmp_path):
 
 def unlike(cell, diameter_um, wavelength_um, finer):
     """A solver by formula: every number of the cell counts, and the truncation."""
-    change = 3.7j * cell.height_um + 0.4 * cell.sidewall_rad - 0.2j * complex(cell.pillar.n)
+    change = (
+        3.7j * cell.height_um + 0.4 * cell.sidewall_rad - 0.2j * complex(cell.pillar.n)
+    )
     return (1 + 0.01 * finer) * (change * diameter_um / wavelength_um + 2.1)
 
 
-def test_more_workers_than_batches_give_the_same_draws_and_answers_in_the_order_of_their_causes(plain):
+def test_more_workers_than_batches_give_the_same_draws_and_answers_in_the_order_of_their_causes(
+    plain,
+):
     lens, here = plain
-    solved = dataclasses.replace(lens, cell=dataclasses.replace(lens.cell, pillar=Index(3.6)))
+    solved = dataclasses.replace(
+        lens, cell=dataclasses.replace(lens.cell, pillar=Index(3.6))
+    )
     answers = sensitivity.sensitivities(solved, count=5, solver=unlike)
     with executor.on(processes=3):  # two batches
         assert content(lens) == here
-        assert sensitivity.sensitivities(solved, count=5, solver=unlike).rates.tobytes() == answers.rates.tobytes()
+        assert (
+            sensitivity.sensitivities(solved, count=5, solver=unlike).rates.tobytes()
+            == answers.rates.tobytes()
+        )

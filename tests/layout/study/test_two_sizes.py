@@ -1,4 +1,6 @@
-"""Studies of pillars of two sizes: against the plain sum with every pillar changed, and derivatives by differences."""
+"""Studies of pillars of two sizes: against the plain sum with every pillar changed, and
+derivatives by differences.
+"""
 
 import dataclasses
 import functools
@@ -35,65 +37,105 @@ from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum
 
 X_UM, Y_UM = np.linspace(0.1, 0.3, 51), np.linspace(0.12, 0.28, 41)  # one step of 4 nm
-LIGHTS = {"x": (19.0, 9.0, 0.93), "y": (8.0, 21.0, 0.97)}  # rad per um of width and of length, |t| of the thinnest
+LIGHTS = {
+    "x": (19.0, 9.0, 0.93),
+    "y": (8.0, 21.0, 0.97),
+}  # rad per um of width and of length, |t| of the thinnest
 CAUSES = named(Answers)
 
 
 def formula(width_um, length_um, light):
     """t of the pillars, a closed form that bends."""
     wide, long, level = LIGHTS[light]
-    phase = wide * width_um + long * length_um + 15 * (width_um - 0.1) * (length_um - 0.1) - 12 * (width_um - 0.2) ** 2
+    phase = (
+        wide * width_um
+        + long * length_um
+        + 15 * (width_um - 0.1) * (length_um - 0.1)
+        - 12 * (width_um - 0.2) ** 2
+    )
     return (level - 0.8 * (width_um - 0.1) ** 2) * np.exp(1j * phase)
 
 
 def rates(width_um, length_um):
     """d ln t by height, index and wall."""
     height = -0.9 + 8j + 21j * (width_um - 0.1) + 9j * (length_um - 0.1)
-    return np.array([height, 0.2j + 17j * width_um * length_um, 0.3 + 4j * (length_um - 0.2)])
+    return np.array(
+        [height, 0.2j + 17j * width_um * length_um, 0.3 + 4j * (length_um - 0.2)]
+    )
 
 
 def two_sizes(n=141):
-    """Light along x has its focus 150 um behind, light along y 170 um; every pair is of the table."""
+    """Light along x has its focus 150 um behind, light along y 170 um; every pair is of
+    the table.
+    """
     x = (np.arange(n) - (n - 1) / 2) * 0.4
     r = np.hypot(x, x[:, None])
     places = [np.hypot(r, z) + np.hypot(r, 1500.0) for z in (150.0, 170.0)]
     wanted = [np.exp(-2j * np.pi / 0.85 * place) for place in places]
     grid = np.meshgrid(X_UM[::5], Y_UM[::4], indexing="ij")
     kinds = np.stack([formula(*grid, light).ravel() for light in "xy"])
-    off = sum(abs(want[..., None] - t) ** 2 for want, t in zip(wanted, kinds, strict=True))
+    off = sum(
+        abs(want[..., None] - t) ** 2 for want, t in zip(wanted, kinds, strict=True)
+    )
     best = off.argmin(-1)
     there = r < n * 0.2
     width, length = (np.where(there, axis.ravel()[best], 0.0) for axis in grid)
-    table = np.stack([formula(*np.meshgrid(X_UM, Y_UM, indexing="ij"), light) for light in "xy"], -1)[None]
+    table = np.stack(
+        [formula(*np.meshgrid(X_UM, Y_UM, indexing="ij"), light) for light in "xy"], -1
+    )[None]
     pairs = Pairs(np.array([0.85]), X_UM, Y_UM, table, (170.0, 1500.0))
     cell = Cell(0.4, 0.6, Index(2.7), shape=Rectangle())
     diameters = DiameterMap(width, 0.4, length_um=length)
-    return Lens(diameters, cell, pairs.proxy, 0.85, 150.0, 1500.0, "hyperbolic", pairs=pairs)
+    return Lens(
+        diameters, cell, pairs.proxy, 0.85, 150.0, 1500.0, "hyperbolic", pairs=pairs
+    )
 
 
 def told(lens):
     """The closed form's answers at every pair that the lens has."""
     d = lens.diameters
-    pairs = np.unique(np.stack([d.diameter_um[d.diameter_um > 0], d.length_um[d.diameter_um > 0]], 1), axis=0)
+    pairs = np.unique(
+        np.stack([d.diameter_um[d.diameter_um > 0], d.length_um[d.diameter_um > 0]], 1),
+        axis=0,
+    )
     return PairSensitivities(*pairs.T, rates(*pairs.T), 0.02)
 
 
 @pytest.mark.parametrize("light", ["x", "y"])
 def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
-    """Basis and sums leave 2e-3, splines over steps of 4 nm and answers held at the designed sizes less."""
+    """Basis and sums leave 2e-3, splines over steps of 4 nm and answers held at the
+    designed sizes less.
+    """
     lens = two_sizes().seen(light)
     away = {"x": 150.0, "y": 170.0}[light]
-    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), away, 0.85, np.array([1500.0, 1200.0]))
+    where = focus.Window(
+        np.linspace(-2, 3, 3),
+        np.linspace(-1, 4, 3),
+        away,
+        0.85,
+        np.array([1500.0, 1200.0]),
+    )
     model = reduce(lens, told(lens), focus.prepare(lens, where), Spread(), seed=0)
     lenses = draws(Spread(), 3, seed=9)
     fast = model.focus.light(model.drawn([each.state() for each in lenses]))
-    x, y = (axis / lens.diameters.radius_um for axis in (lens.diameters.x_um, lens.diameters.y_um[:, None]))
+    x, y = (
+        axis / lens.diameters.radius_um
+        for axis in (lens.diameters.x_um, lens.diameters.y_um[:, None])
+    )
     wide, long = lens.diameters.diameter_um, lens.diameters.length_um
     for draw, seen in zip(lenses, fast, strict=True):
         a, along = draw.amounts, x * np.cos(draw.turn_rad) + y * np.sin(draw.turn_rad)
-        bias_um = 1e-3 * (a["bias_nm"] + a["gradient_nm"] / 2 * along + a["bow_nm"] * (x**2 + y**2 - 0.5))
+        bias_um = 1e-3 * (
+            a["bias_nm"]
+            + a["gradient_nm"] / 2 * along
+            + a["bow_nm"] * (x**2 + y**2 - 0.5)
+        )
         height, index, wall = rates(wide, long)
-        change = height * a["height_nm"] * 1e-3 + index * a["index"] + wall * np.deg2rad(a["sidewall_deg"])
+        change = (
+            height * a["height_nm"] * 1e-3
+            + index * a["index"]
+            + wall * np.deg2rad(a["sidewall_deg"])
+        )
         t = formula(wide + bias_um, long + bias_um, light) * np.exp(change)
         exact = plain_sum.field(lens, np.where(wide > 0, t, 0), where)
         assert abs(seen - exact).max() < 2.5e-3 * abs(exact).max()
@@ -101,25 +143,41 @@ def test_a_drawn_lens_sends_the_light_of_pairs_changed_one_by_one(light):
 
 
 def test_beyond_its_table_a_pillar_goes_on_along_the_tangents():
-    """Phase and level are polynomials of second order: over 5 nm beyond both ends their curvature is below 1e-3."""
+    """Phase and level are polynomials of second order: over 5 nm beyond both ends their
+    curvature is below 1e-3.
+    """
     lens = two_sizes()
-    corner = dataclasses.replace(told(lens), width_um=np.array([0.3]), length_um=np.array([0.12]))
+    corner = dataclasses.replace(
+        told(lens), width_um=np.array([0.3]), length_um=np.array([0.12])
+    )
     corner = dataclasses.replace(corner, rates=np.zeros((3, 1)))
-    few = DiameterMap(np.array([[0.3, 0.3], [0.0, 0.3]]), 0.4, length_um=np.array([[0.12, 0.12], [0.0, 0.12]]))
+    few = DiameterMap(
+        np.array([[0.3, 0.3], [0.0, 0.3]]),
+        0.4,
+        length_um=np.array([[0.12, 0.12], [0.0, 0.12]]),
+    )
     kind, count, made = pillars.kinds(dataclasses.replace(lens, diameters=few), corner)
     assert kind.tolist() == [[1, 1], [0, 1]]
     assert count.tolist() == [3]
     found = made.curve(np.array([-0.005, 0.0, 0.005]), State.of())[:, 0]
     assert found == pytest.approx(
-        formula(0.3 + np.array([-5e-3, 0, 5e-3]), 0.12 + np.array([-5e-3, 0, 5e-3]), "x"), abs=1e-3
+        formula(
+            0.3 + np.array([-5e-3, 0, 5e-3]), 0.12 + np.array([-5e-3, 0, 5e-3]), "x"
+        ),
+        abs=1e-3,
     )
 
 
 def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
-    """|t| = 0.9 - 3 (width - 0.1) - 0.3 (length - 0.12), two of its ends followed by 0.3 um in width."""
+    """|t| = 0.9 - 3 (width - 0.1) - 0.3 (length - 0.12), two of its ends followed by
+    0.3 um in width.
+    """
     x, y = np.meshgrid(X_UM, Y_UM, indexing="ij")
     level = 0.9 - 3 * (x - 0.1) - 0.3 * (y - 0.12)
-    spline = [interpolate.RectBivariateSpline(X_UM, Y_UM, level * part) for part in (math.cos(0.7), math.sin(0.7))]
+    spline = [
+        interpolate.RectBivariateSpline(X_UM, Y_UM, level * part)
+        for part in (math.cos(0.7), math.sin(0.7))
+    ]
     made = PairTable(X_UM, Y_UM, tuple(spline))
     found = made.t(np.array([0.6, 0.32, 0.02]), np.array([0.2, 0.2, 0.2]))
     assert found == pytest.approx(np.array([1e-3, 0.216, 1.0]) * np.exp(0.7j), rel=1e-9)
@@ -127,26 +185,40 @@ def test_a_tangent_goes_no_darker_than_a_thousandth_and_no_brighter_than_all():
 
 @pytest.mark.parametrize("light", [0, 1])
 def test_derivatives_of_a_pair_are_differences_of_its_own_light(light, monkeypatch):
-    """Three orders and one field of normals on both sides (the usual one moves with the rim, and any has the same
+    """Three orders and one field of normals on both sides (the usual one moves with the
+    rim, and any has the same
     limit); steps of 0.1 nm and 1e-4 leave 1e-6 of the second order."""
     own_tables, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
-    monkeypatch.setattr(pattern, "normal_tables", lambda outlines, cell, reach: own_tables(fixed, cell, reach))
+    monkeypatch.setattr(
+        pattern,
+        "normal_tables",
+        lambda outlines, cell, reach: own_tables(fixed, cell, reach),
+    )
     monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
     lens, (width, length) = two_sizes(5), (0.14, 0.22)
-    found = pair_rates(lens, np.array([width]), np.array([length]))["xy"[light]].rates[:, 0]
+    found = pair_rates(lens, np.array([width]), np.array([length]))["xy"[light]].rates[
+        :, 0
+    ]
 
     def log_t(x, *, height=0.0, index=0.0, wide=0.0, long=0.0):
         shape = Rectangle((length + long * x) / (width + wide * x))
         cell = Cell(0.4, 0.6 + height * x, Index(2.7 + index * x), shape=shape)
         return np.log(jones(cell, width + wide * x, 0.85, harmonics=3).t[light, light])
 
-    steps = {"height_nm": {"height": 1}, "index": {"index": 1}, "width_nm": {"wide": 1}, "length_nm": {"long": 1}}
+    steps = {
+        "height_nm": {"height": 1},
+        "index": {"index": 1},
+        "width_nm": {"wide": 1},
+        "length_nm": {"long": 1},
+    }
     for name, by in steps.items():
         want = (log_t(1e-4, **by) - log_t(-1e-4, **by)) / 2e-4
         assert found[CAUSES.index(name)] == pytest.approx(want, rel=2e-4), name
 
 
-def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(monkeypatch):
+def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(
+    monkeypatch,
+):
     lens, asked = two_sizes(), []
 
     def solved(lens, width_um, length_um):
@@ -159,32 +231,52 @@ def test_pairs_that_are_solved_lie_far_apart_and_what_lies_between_is_told_of(mo
     every = told(lens)
     assert asked[0].shape == (30, 2)
     gaps = np.linalg.norm(asked[0][:, None] - asked[0], axis=-1) + np.eye(30)
-    covered = np.linalg.norm(asked[0][:, None] - np.stack([every.width_um, every.length_um], 1), axis=-1).min(0)
-    assert covered.max() <= gaps.min()  # no pair is farther from a solved one than those are from each other
+    covered = np.linalg.norm(
+        asked[0][:, None] - np.stack([every.width_um, every.length_um], 1), axis=-1
+    ).min(0)
+    assert (
+        covered.max() <= gaps.min()
+    )  # no pair is farther from a solved one than those are from each other
     want = rates(every.width_um, every.length_um)
-    off = np.linalg.norm(found["x"].at(every.width_um, every.length_um)[:3] - want, axis=1) / np.linalg.norm(
-        want, axis=1
-    )
+    off = np.linalg.norm(
+        found["x"].at(every.width_um, every.length_um)[:3] - want, axis=1
+    ) / np.linalg.norm(want, axis=1)
     assert 0.03 + off.max() < found["x"].error < 0.2
     assert found["y"].rates == pytest.approx(2 * found["x"].rates)
-    assert pair_sensitivities(lens, count=10_000)["x"].at(every.width_um, every.length_um)[:3] == pytest.approx(want)
+    assert pair_sensitivities(lens, count=10_000)["x"].at(
+        every.width_um, every.length_um
+    )[:3] == pytest.approx(want)
 
 
 def test_fields_of_pairs_add_up_to_their_light():
     lens, process = two_sizes(51), Process(write_field=WriteField(size_um=10.0))
-    where = focus.Window(np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0]))
+    where = focus.Window(
+        np.linspace(-2, 3, 3), np.linspace(-1, 4, 3), 150.0, 0.85, np.array([1500.0])
+    )
     ready = focus.prepare(lens, where)
-    _, moments = stitching.field_moments(lens, fields.split(lens.diameters, process), ready)
+    _, moments = stitching.field_moments(
+        lens, fields.split(lens.diameters, process), ready
+    )
     wide, long = lens.diameters.diameter_um, lens.diameters.length_um
-    exact = plain_sum.field(lens, np.where(wide > 0, formula(wide, long, "x"), 0), where)
-    assert abs(ready.light(moments.sum(0)[None])[0] - exact).max() < 1e-4 * abs(exact).max()  # float32 sums
+    exact = plain_sum.field(
+        lens, np.where(wide > 0, formula(wide, long, "x"), 0), where
+    )
+    assert (
+        abs(ready.light(moments.sum(0)[None])[0] - exact).max()
+        < 1e-4 * abs(exact).max()
+    )  # float32 sums
 
 
 def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
     lens, process = two_sizes(31), Process(write_field=WriteField(size_um=6.0))
-    monkeypatch.setattr(page, "pair_sensitivities", lambda lens: {light: told(lens) for light in "xy"})
+    monkeypatch.setattr(
+        page, "pair_sensitivities", lambda lens: {light: told(lens) for light in "xy"}
+    )
     seen = []
-    for module, name, most in ((tolerance, "analyse", 10), (stitching, "stitching", 20)):
+    for module, name, most in (
+        (tolerance, "analyse", 10),
+        (stitching, "stitching", 20),
+    ):
         whole = getattr(module, name)
 
         def few(lens, *args, whole=whole, most=most, **about):
@@ -192,9 +284,23 @@ def test_the_report_has_both_lights_each_where_it_focuses(monkeypatch):
             return whole(lens, *args, draws=most, **about)
 
         monkeypatch.setattr(module, name, functools.wraps(whole)(few))
-    made = page.sections(lens, process, fields.split(lens.diameters, process), page.answers_of(lens))
-    titles = [f"{what}, light along {light}" for light in "xy" for what in ("Stitching", "Tolerance")]
+    made = page.sections(
+        lens, process, fields.split(lens.diameters, process), page.answers_of(lens)
+    )
+    titles = [
+        f"{what}, light along {light}"
+        for light in "xy"
+        for what in ("Stitching", "Tolerance")
+    ]
     assert [section.title for section in made] == titles
     assert seen == [("x", 150.0)] * 2 + [("y", 170.0)] * 2
-    tables = [item for section in made for item in section.items if isinstance(item, Table)]
-    assert all(np.isfinite(v) for table in tables for row in table.rows for v in row if isinstance(v, float))
+    tables = [
+        item for section in made for item in section.items if isinstance(item, Table)
+    ]
+    assert all(
+        np.isfinite(v)
+        for table in tables
+        for row in table.rows
+        for v in row
+        if isinstance(v, float)
+    )

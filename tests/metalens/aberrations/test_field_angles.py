@@ -1,4 +1,6 @@
-"""Distortion, vignetting and illumination by rays counted one at a time; refusals by name."""
+"""Distortion, vignetting and illumination by rays counted one at a time; refusals by
+name.
+"""
 
 import math
 
@@ -22,12 +24,21 @@ def _landing(case, angle):
 def _place(case, angle):
     """Of the source along x: um, or its tangent."""
     rays, depth = CASES[case]
-    return math.tan(math.radians(angle)) if math.isinf(depth) else float(rays.source(angle, depth)[0])
+    return (
+        math.tan(math.radians(angle))
+        if math.isinf(depth)
+        else float(rays.source(angle, depth)[0])
+    )
 
 
 @pytest.fixture(scope="module")
 def seen():
-    return {case: over_field(made(case), ANGLES, depth_um=CASES[case][1], frequencies=(41.0,)) for case in CASES}
+    return {
+        case: over_field(
+            made(case), ANGLES, depth_um=CASES[case][1], frequencies=(41.0,)
+        )
+        for case in CASES
+    }
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -39,7 +50,9 @@ def test_distortion_is_by_how_much_a_traced_image_is_not_linear(case, seen):
         assert seen[case].chief_um[n] == pytest.approx(_landing(case, angle), abs=6e-4)
         if angle:
             linear = line * (_place(case, angle) - _place(case, 0.0))
-            want = (_landing(case, angle) - _landing(case, 0.0)) @ linear / (linear @ linear) - 1
+            want = (_landing(case, angle) - _landing(case, 0.0)) @ linear / (
+                linear @ linear
+            ) - 1
             assert seen[case].distortion[n] == pytest.approx(want, abs=5e-5)
     assert seen[case].distortion[1] == 0.0
     if case == "plain":
@@ -49,10 +62,14 @@ def test_distortion_is_by_how_much_a_traced_image_is_not_linear(case, seen):
 
 
 def _counted(case, angle, step_um):
-    """(all, on the pillars) rays through the stop's hole, by places of the pillars' plane."""
+    """(all, on the pillars) rays through the stop's hole, by places of the pillars'
+    plane.
+    """
     rays, depth = CASES[case]
     middle, out = rays.middle(angle, depth), np.zeros(2)
-    reach = np.arange(-60.0, 60.1, step_um) + 0.137  # about the middle of what the hole lights
+    reach = (
+        np.arange(-60.0, 60.1, step_um) + 0.137
+    )  # about the middle of what the hole lights
     for x in reach + middle[0]:
         for y in reach + middle[1]:
             u = rays.crossing((x, y), angle, depth)
@@ -61,9 +78,13 @@ def _counted(case, angle, step_um):
     return out
 
 
-@pytest.mark.parametrize(("case", "angle"), [("stop", -22.0), ("all", 24.0), ("beside", 21.0)])
+@pytest.mark.parametrize(
+    ("case", "angle"), [("stop", -22.0), ("all", 24.0), ("beside", 21.0)]
+)
 def test_vignetting_is_the_share_of_counted_rays_that_miss_the_pillars(case, angle):
-    """800 to 1300 rays: the border of either circle is 1 % of them, and the grid cuts it at random."""
+    """800 to 1300 rays: the border of either circle is 1 % of them, and the grid cuts
+    it at random.
+    """
     through, on = _counted(case, angle, 1.8)
     got = vignetting(made(case), (math.radians(angle), 0.0), CASES[case][1])
     assert got == pytest.approx(1 - on / through, abs=0.008)
@@ -77,15 +98,25 @@ def test_without_a_stop_nothing_is_vignetted(seen):
 
 @pytest.mark.parametrize("case", ["plain", "off-centre", "glass", "stop"])
 def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
-    """Light of a square of the plane on every eleventh (third) pillar, cos⁴ / z² each, over the area of its image.
+    """Light of a square of the plane on every eleventh (third) pillar, cos⁴ / z² each,
+    over the area of its image.
 
-    An element of a plane at infinity: cos⁴ of its angle. The pillars' own angles count here, which differ over the
-    aperture by (62 / 1900)²; faces of the glass behind are as Fresnel has them, 0.2 % at 14 degrees.
+    An element of a plane at infinity: cos⁴ of its angle. The pillars' own angles count
+    here, which differ over the
+    aperture by (62 / 1900)²; faces of the glass behind are as Fresnel has them, 0.2 %
+    at 14 degrees.
     """
     rays, depth = CASES[case]
     level = made(case).diameters
-    each = 3 if rays.stop else 11  # the border of the stop's light is cut at random: 0.15 % of it
-    place = [(x, y) for x in level.x_um[1::each] for y in level.y_um[1::each] if math.hypot(x, y) <= RADIUS]
+    each = (
+        3 if rays.stop else 11
+    )  # the border of the stop's light is cut at random: 0.15 % of it
+    place = [
+        (x, y)
+        for x in level.x_um[1::each]
+        for y in level.y_um[1::each]
+        if math.hypot(x, y) <= RADIUS
+    ]
 
     def irradiance(angle):
         if math.isinf(depth):
@@ -94,8 +125,13 @@ def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
                         math.hypot(*rays.crossing(x, angle, depth)) <= rays.stop[0])  # fmt: skip
         else:
             sx, sy = rays.source(angle, depth)
-            light = sum((depth**2 / (depth**2 + (x - sx) ** 2 + (y - sy) ** 2)) ** 2 for x, y in place)
-        near = [(_landing(case, a), _place(case, a)) for a in (angle - 0.02, angle + 0.02)]
+            light = sum(
+                (depth**2 / (depth**2 + (x - sx) ** 2 + (y - sy) ** 2)) ** 2
+                for x, y in place
+            )
+        near = [
+            (_landing(case, a), _place(case, a)) for a in (angle - 0.02, angle + 0.02)
+        ]
         along = math.hypot(*(near[1][0] - near[0][0])) / abs(near[1][1] - near[0][1])
         return light / (along * _across(case, angle))
 
@@ -106,7 +142,8 @@ def test_illumination_is_light_by_light_of_an_even_plane(case, seen):
 
 
 def _across(case, angle):
-    """Growth of the image across the field: of a source moved by a small turn of the field about the axis, or, of a
+    """Growth of the image across the field: of a source moved by a small turn of the
+    field about the axis, or, of a
     lens that is not round about the axis, by tracing a source beside."""
     rays, depth = CASES[case]
     x, aside = rays.middle(angle, depth), 1e-3
@@ -123,13 +160,25 @@ def _across(case, angle):
         out = away / math.sqrt(away @ away + depth**2) + rays.slope(x)
     gap = [(1.0, rays.sensor_um - sum(t for _, t in rays.behind)), *rays.behind]
     moved = x + sum(t * out / math.sqrt(n * n - out @ out) for n, t in gap)
-    return math.hypot(*(moved - _landing(case, angle))) / (aside if math.isinf(depth) else aside * depth)
+    return math.hypot(*(moved - _landing(case, angle))) / (
+        aside if math.isinf(depth) else aside * depth
+    )
 
 
 def test_angles_of_either_sign_are_mirrored_by_a_centred_lens_alone():
-    both = {case: over_field(made(case), (-8.0, 8.0), depth_um=CASES[case][1]) for case in ("stop", "off-centre")}
+    both = {
+        case: over_field(made(case), (-8.0, 8.0), depth_um=CASES[case][1])
+        for case in ("stop", "off-centre")
+    }
     centred, aside = both["stop"], both["off-centre"]
-    for name in ("distortion", "close_um", "sharpest_um", "illumination", "vignetting", "mtf"):
+    for name in (
+        "distortion",
+        "close_um",
+        "sharpest_um",
+        "illumination",
+        "vignetting",
+        "mtf",
+    ):
         first, last = getattr(centred, name)
         assert last == pytest.approx(first, rel=1e-3, abs=2e-3)
     assert abs(aside.distortion[1] - aside.distortion[0]) > 1e-3
@@ -149,8 +198,12 @@ def test_what_has_no_chief_ray_has_its_mtf_and_says_so():
 
 def test_frequencies_left_out_are_shares_of_the_cutoff():
     lens = made("plain")
-    assert np.array(frequencies_per_mm(lens)) == pytest.approx(np.array([1, 2, 4]) / 8 * 2e3 * 0.2 / WAVE, rel=0.03)
-    assert over_field(lens, (3.0,)).frequencies_per_mm.tolist() == list(frequencies_per_mm(lens))
+    assert np.array(frequencies_per_mm(lens)) == pytest.approx(
+        np.array([1, 2, 4]) / 8 * 2e3 * 0.2 / WAVE, rel=0.03
+    )
+    assert over_field(lens, (3.0,)).frequencies_per_mm.tolist() == list(
+        frequencies_per_mm(lens)
+    )
 
 
 @pytest.mark.parametrize(

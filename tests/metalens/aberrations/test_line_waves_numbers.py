@@ -1,4 +1,6 @@
-"""Plane waves and line images of few waves, summed over places, and a lens's waves as sums over pillars."""
+"""Plane waves and line images of few waves, summed over places, and a lens's waves as
+sums over pillars.
+"""
 
 import dataclasses
 import math
@@ -6,7 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from metalens.aberrations.waves import Waves, line_image, sharpness_per_um, transfer, waves
+from metalens.aberrations.waves import (
+    Waves,
+    line_image,
+    sharpness_per_um,
+    transfer,
+    waves,
+)
 from metalens.lens import Media
 from metalens.lens import media as through
 from tests.metalens.aberrations.hyperbolic import CASES, PITCH, WAVE, made
@@ -30,20 +38,30 @@ def test_held_is_the_share_of_the_light_in_the_waves():
 
 
 def test_waves_at_a_distance_keep_the_films_and_change_the_gap():
-    """exp(ik [z √(1 - p²) + 25 √(1.6² - p²)]), z what is left of the distance; farther by a step, in air alone."""
+    """exp(ik [z √(1 - p²) + 25 √(1.6² - p²)]), z what is left of the distance; farther
+    by a step, in air alone.
+    """
     made_ = few()
     w = made_.p_x**2 + made_.p_y[:, None] ** 2
     for distance in (95.0, 60.0, 143.0):
         way = (distance - 25.0) * np.sqrt(1 - w) + 25.0 * np.sqrt(1.6**2 - w)
-        assert made_.at(distance) == pytest.approx(made_.amplitude * np.exp(1j * K * way), rel=1e-9)
+        assert made_.at(distance) == pytest.approx(
+            made_.amplitude * np.exp(1j * K * way), rel=1e-9
+        )
     ones = np.full_like(made_.amplitude, 2.0 - 1j)
-    assert made_.at(7.5, ones) == pytest.approx((2 - 1j) * np.exp(7.5j * K * np.sqrt(1 - w)), rel=1e-9)
-    assert made_.at(95.0 + 7.5) == pytest.approx(made_.at(7.5, made_.at(95.0)), rel=1e-9)
+    assert made_.at(7.5, ones) == pytest.approx(
+        (2 - 1j) * np.exp(7.5j * K * np.sqrt(1 - w)), rel=1e-9
+    )
+    assert made_.at(95.0 + 7.5) == pytest.approx(
+        made_.at(7.5, made_.at(95.0)), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_line_image_is_the_light_along_a_line_across_its_axis(axis):
-    """|Σ A exp(ik p X)|² over a period of the other axis, at its samples; of sum 1 where all is there."""
+    """|Σ A exp(ik p X)|² over a period of the other axis, at its samples; of sum 1
+    where all is there.
+    """
     made_ = few()
     field = made_.at(110.0)
     line, step = line_image(made_, field, axis)
@@ -73,8 +91,13 @@ def test_transfer_is_the_autocorrelation_of_the_waves(axis):
     field = made_.at(80.0)
     a = field if axis == 0 else field.T
     step = made_.spacing[axis] / WAVE
-    got = transfer(made_, field, axis, np.array([0.0, step, 2 * step, a.shape[1] * step]))
-    want = [abs((a[:, k:] * a[:, : a.shape[1] - k].conj()).sum()) / made_.light for k in range(3)]
+    got = transfer(
+        made_, field, axis, np.array([0.0, step, 2 * step, a.shape[1] * step])
+    )
+    want = [
+        abs((a[:, k:] * a[:, : a.shape[1] - k].conj()).sum()) / made_.light
+        for k in range(3)
+    ]
     assert got[:3] == pytest.approx(want, rel=1e-9)
     assert got[3] < 1e-9
     assert got[0] == pytest.approx(made_.held, rel=1e-9)
@@ -82,8 +105,10 @@ def test_transfer_is_the_autocorrelation_of_the_waves(axis):
 
 @pytest.mark.parametrize("case", ["off-centre", "glass"])
 def test_amplitudes_of_a_lens_are_sums_over_its_pillars(case):
-    """√T Σ t exp(ik source path - ik p x), x from the first pillar: at waves from all over, of light along both axes;
-    light and its share of an evenly lit lens, by what the faces let through in the middle of the directions."""
+    """√T Σ t exp(ik source path - ik p x), x from the first pillar: at waves from all
+    over, of light along both axes;
+    light and its share of an evenly lit lens, by what the faces let through in the
+    middle of the directions."""
     lens, (rays, depth) = made(case), CASES[case]
     angle = (math.radians(6.0), math.radians(-4.0))
     found = waves(lens, angle, depth)
@@ -99,18 +124,31 @@ def test_amplitudes_of_a_lens_are_sums_over_its_pillars(case):
         way = np.sqrt((x - source[0]) ** 2 + (y - source[1]) ** 2 + depth**2)
     t = t * np.exp(1j * K * way)
     order = (1.0, *(n for n, _ in rays.behind))
-    rows, columns = (np.linspace(3, n - 4, 5).astype(int) for n in found.amplitude.shape)
+    rows, columns = (
+        np.linspace(3, n - 4, 5).astype(int) for n in found.amplitude.shape
+    )
     whole = np.abs(found.amplitude).max()
     own = np.zeros((5, 5), complex)
     for i, row in enumerate(rows):
         for k, column in enumerate(columns):
             a, b = found.p_x[column], found.p_y[row]
-            share = 1.0 if len(order) == 1 else float(through.passed_at(order, a * a + b * b))
-            own[i, k] = math.sqrt(share) * (t * np.exp(-1j * K * (a * (x - x[0, 0]) + b * (y - y[0, 0])))).sum()
+            share = (
+                1.0
+                if len(order) == 1
+                else float(through.passed_at(order, a * a + b * b))
+            )
+            own[i, k] = (
+                math.sqrt(share)
+                * (t * np.exp(-1j * K * (a * (x - x[0, 0]) + b * (y - y[0, 0])))).sum()
+            )
     got = found.amplitude[np.ix_(rows, columns)]
     turn = np.vdot(own, got) / abs(np.vdot(own, got))
-    assert got / whole == pytest.approx(own * turn / whole, abs=1e-5)  # to a phase common to all
-    assert np.diff(found.p_x) == pytest.approx(np.full(len(found.p_x) - 1, found.spacing[0]), rel=1e-9)
+    assert got / whole == pytest.approx(
+        own * turn / whole, abs=1e-5
+    )  # to a phase common to all
+    assert np.diff(found.p_x) == pytest.approx(
+        np.full(len(found.p_x) - 1, found.spacing[0]), rel=1e-9
+    )
     power = float((np.abs(t) ** 2).sum())
     ends = [found.aperture, (found.p_x.mean(), found.p_y.mean())]
     middle = ends[1][0] ** 2 + ends[1][1] ** 2
@@ -121,16 +159,23 @@ def test_amplitudes_of_a_lens_are_sums_over_its_pillars(case):
 
 
 def test_waves_reach_a_twentieth_beyond_the_rays_and_the_field_repeats_after_eighty_lines():
-    """A lens of sine 0.196 at its rim: 80 · 0.85 / 0.196 = 347 um, more than 1.05 maps; 1.05 · 0.196 and 14 fringes of
+    """A lens of sine 0.196 at its rim: 80 · 0.85 / 0.196 = 347 um, more than 1.05 maps;
+    1.05 · 0.196 and 14 fringes of
     the map, 0.85 / 124 each, on either side of the middle of the directions."""
     lens = made("plain")
     found = waves(lens, (0.0, 0.0), math.inf)
     sine = math.sin(math.atan(62.0 / 310.0))
-    assert found.aperture == pytest.approx((sine, sine), rel=0.02)  # pieces of a 48th of the map: half of one
+    assert found.aperture == pytest.approx(
+        (sine, sine), rel=0.02
+    )  # pieces of a 48th of the map: half of one
     count = len(lens.diameters.x_um)
-    for p, spacing, wide in zip((found.p_x, found.p_y), found.spacing, found.aperture, strict=True):
+    for p, spacing, wide in zip(
+        (found.p_x, found.p_y), found.spacing, found.aperture, strict=True
+    ):
         period = WAVE / spacing
-        assert 80 * WAVE / wide <= period < 1.03 * 80 * WAVE / wide  # a length that factorises
+        assert (
+            80 * WAVE / wide <= period < 1.03 * 80 * WAVE / wide
+        )  # a length that factorises
         reach = 1.05 * wide + 14 * WAVE / (count * PITCH)
         assert reach - 1e-9 <= (p[-1] - p[0]) / 2 < reach + spacing
         assert p[0] == pytest.approx(-p[-1], abs=2.1 * spacing)

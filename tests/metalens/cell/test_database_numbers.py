@@ -1,4 +1,6 @@
-"""Formulas of database pages with the fewest coefficients and the most, their slopes, tables at and between rows."""
+"""Formulas of database pages with the fewest coefficients and the most, their slopes,
+tables at and between rows.
+"""
 
 import math
 
@@ -21,11 +23,21 @@ FEWEST = [
     (1, (0.2, 0.9, 0.15), lambda w: math.sqrt(1.2 + 0.9 * w**2 / (w**2 - 0.0225))),
     (2, (0.2, 0.9, 0.15), lambda w: math.sqrt(1.2 + 0.9 * w**2 / (w**2 - 0.15))),
     (3, (2.1, 0.3, -1.7), lambda w: math.sqrt(2.1 + 0.3 * w**-1.7)),
-    (4, (2.1, 0.3, 1.4, 0.35, 2.6), lambda w: math.sqrt(2.1 + 0.3 * w**1.4 / (w**2 - 0.35**2.6))),
+    (
+        4,
+        (2.1, 0.3, 1.4, 0.35, 2.6),
+        lambda w: math.sqrt(2.1 + 0.3 * w**1.4 / (w**2 - 0.35**2.6)),
+    ),
     (5, (1.4, 0.03, -2.2), lambda w: 1.4 + 0.03 * w**-2.2),
     (6, (0.3, 0.07, 41.0), lambda w: 1.3 + 0.07 / (41.0 - 1 / w**2)),
     (7, (1.7, 0.09), lambda w: 1.7 + 0.09 / (w**2 - 0.028)),
-    (8, (0.21, 0.06, 0.03), lambda w: (lambda p: math.sqrt((1 + 2 * p) / (1 - p)))(0.21 + 0.06 * w**2 / (w**2 - 0.03))),
+    (
+        8,
+        (0.21, 0.06, 0.03),
+        lambda w: (lambda p: math.sqrt((1 + 2 * p) / (1 - p)))(
+            0.21 + 0.06 * w**2 / (w**2 - 0.03)
+        ),
+    ),
     (9, (2.3, 0.04, 0.05), lambda w: math.sqrt(2.3 + 0.04 / (w**2 - 0.05))),
 ]
 MORE = [
@@ -49,21 +61,34 @@ def test_a_formula_is_that_of_the_database_with_its_slope(number, coefficients, 
     assert n.range_um == (0.4, 1.1)
     value, slope = n.at(W)
     assert value == pytest.approx(plain(W), rel=1e-13)
-    assert slope.real == pytest.approx((plain(W + 1e-5) - plain(W - 1e-5)) / 2e-5, rel=1e-7, abs=1e-9)
+    assert slope.real == pytest.approx(
+        (plain(W + 1e-5) - plain(W - 1e-5)) / 2e-5, rel=1e-7, abs=1e-9
+    )
     assert (value.imag, slope.imag) == (0, 0)
 
 
-@pytest.mark.parametrize(("number", "coefficients"), [(number, given) for number, given, _ in FEWEST])
+@pytest.mark.parametrize(
+    ("number", "coefficients"), [(number, given) for number, given, _ in FEWEST]
+)
 def test_one_coefficient_fewer_says_nothing(number, coefficients):
-    with pytest.raises(MaterialError, match=f"{len(coefficients) - 1} coefficients, range .* need formula 1 to 9"):
+    with pytest.raises(
+        MaterialError,
+        match=f"{len(coefficients) - 1} coefficients, range .* need formula 1 to 9",
+    ):
         database.read(page(number, coefficients[:-1]), "here")
 
 
 @pytest.mark.parametrize(("number", "most"), [(7, 6), (8, 4), (9, 6)])
 def test_as_many_coefficients_as_a_formula_has_are_taken_and_no_more(number, most):
     given = (1.2, 0.01, 0.02, 0.03, 0.9, 0.4, 0.1)
-    assert database.read(page(number, given[:most]), "here")[0].coefficients == given[:most]
-    with pytest.raises(MaterialError, match=f"{most + 1} coefficients, the last of them of no whole term"):
+    assert (
+        database.read(page(number, given[:most]), "here")[0].coefficients
+        == given[:most]
+    )
+    with pytest.raises(
+        MaterialError,
+        match=f"{most + 1} coefficients, the last of them of no whole term",
+    ):
         database.read(page(number, given[: most + 1]), "here")
 
 
@@ -82,14 +107,22 @@ def test_no_real_index_is_no_index(square):
     formula = Formula(3, (square, 0.0, 1.0), (0.4, 0.9), "here, formula 3")
     with pytest.raises(MaterialError, match="here, formula 3 gives n = "):
         formula.at(0.6)
-    assert Formula(3, (0.04, 0.0, 1.0), (0.4, 0.9), "here").at(0.6)[0] == pytest.approx(0.2, rel=1e-12)
+    assert Formula(3, (0.04, 0.0, 1.0), (0.4, 0.9), "here").at(0.6)[0] == pytest.approx(
+        0.2, rel=1e-12
+    )
 
 
 def test_tables_are_straight_between_rows_and_take_the_slope_of_the_piece_that_begins():
     """At the last row, that of the last piece."""
     table = Table(np.array([[0.4, 0.5, 0.8], [2.0, 1.7, 1.1]]))
     assert table.range_um == (0.4, 0.8)
-    for wavelength, value, slope in ((0.4, 2.0, -3), (0.46, 1.82, -3), (0.5, 1.7, -2), (0.7, 1.3, -2), (0.8, 1.1, -2)):
+    for wavelength, value, slope in (
+        (0.4, 2.0, -3),
+        (0.46, 1.82, -3),
+        (0.5, 1.7, -2),
+        (0.7, 1.3, -2),
+        (0.8, 1.1, -2),
+    ):
         got = table.at(wavelength)
         assert got[0] == pytest.approx(value, rel=1e-12)
         assert got[1] == pytest.approx(slope, rel=1e-12)
@@ -110,7 +143,9 @@ def test_tables_of_two_and_three_columns_are_told_apart_and_sorted():
     assert k.rows.tolist() == [[0.5, 0.9], [0.01, 0.07]]
     assert source == "a page of refractiveindex.info"
     both = nk(["0.5 1.5 0.2", "0.4 1.6 0.1"])
-    n, k, source = database.read("COMMENTS: at <b>20</b> C\nREFERENCES: A. B,\n" + both, "here")
+    n, k, source = database.read(
+        "COMMENTS: at <b>20</b> C\nREFERENCES: A. B,\n" + both, "here"
+    )
     assert n.rows.tolist() == [[0.4, 0.5], [1.6, 1.5]]
     assert k.rows.tolist() == [[0.4, 0.5], [0.1, 0.2]]
     assert source == "A. B, at 20 C"

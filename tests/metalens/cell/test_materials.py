@@ -1,4 +1,6 @@
-"""Materials: published values, smoothness of the interpolation, refusals that name line and range."""
+"""Materials: published values, smoothness of the interpolation, refusals that name line
+and range.
+"""
 
 import math
 from pathlib import Path
@@ -16,14 +18,24 @@ from metalens.ground.errors import MaterialError
 ROUNDING = 1e-14  # of a few sums and products below 4: 4e-16 each
 
 
-@pytest.mark.parametrize(("wavelength_um", "want"), [(0.4861327, 1.46313), (0.5875618, 1.45846), (0.6562725, 1.45637)])
+@pytest.mark.parametrize(
+    ("wavelength_um", "want"),
+    [(0.4861327, 1.46313), (0.5875618, 1.45846), (0.6562725, 1.45637)],
+)
 def test_fused_silica_at_the_fraunhofer_lines(wavelength_um, want):
-    assert abs(materials.index("SiO2", wavelength_um) - want) < 5.1e-6  # catalogue values, five decimals
+    assert (
+        abs(materials.index("SiO2", wavelength_um) - want) < 5.1e-6
+    )  # catalogue values, five decimals
 
 
 @pytest.mark.parametrize(
     ("name", "wavelength_um", "want"),
-    [("a-Si", 0.8266, 3.86 + 0.0812j), ("a-Si", 1.033, 3.61), ("Si", 0.85, 3.641 + 3.6120e-3j), ("air", 0.85, 1)],
+    [
+        ("a-Si", 0.8266, 3.86 + 0.0812j),
+        ("a-Si", 1.033, 3.61),
+        ("Si", 0.85, 3.641 + 3.6120e-3j),
+        ("air", 0.85, 1),
+    ],
 )
 def test_rows_of_the_sources_come_back(name, wavelength_um, want):
     assert abs(materials.index(name, wavelength_um) - want) < 1e-12
@@ -35,17 +47,25 @@ def test_between_rows_the_table_is_a_straight_line(name, wavelength_um):
     want = np.interp(wavelength_um, w, n) + 1j * np.interp(wavelength_um, w, k)
     assert abs(materials.index(name, wavelength_um) - want) < 1e-12
     row = w[np.argmin(np.abs(w - wavelength_um))]
-    chord = (materials.index(name, row) - materials.index(name, wavelength_um)) / (row - wavelength_um or 1)
+    chord = (materials.index(name, row) - materials.index(name, wavelength_um)) / (
+        row - wavelength_um or 1
+    )
     rate = materials.slope(name, wavelength_um)
-    assert row == wavelength_um or abs(chord - rate) < 1e-12 / abs(row - wavelength_um) + 1e-12 * abs(rate)
+    assert row == wavelength_um or abs(chord - rate) < 1e-12 / abs(
+        row - wavelength_um
+    ) + 1e-12 * abs(rate)
 
 
 @given(st.floats(0.22, 3.7))
 def test_slope_of_the_sellmeier_formula(wavelength_um):
     step = 1e-5
-    rise = materials.index("SiO2", wavelength_um + step) - materials.index("SiO2", wavelength_um - step)
+    rise = materials.index("SiO2", wavelength_um + step) - materials.index(
+        "SiO2", wavelength_um - step
+    )
     rate = materials.slope("SiO2", wavelength_um)
-    assert abs(rise / (2 * step) - rate) < 1e-4 * abs(rate) + 1e-9  # third derivative / 6 step^2, and rounding
+    assert (
+        abs(rise / (2 * step) - rate) < 1e-4 * abs(rate) + 1e-9
+    )  # third derivative / 6 step^2, and rounding
 
 
 @given(st.floats(0.31, 2.066))
@@ -58,7 +78,9 @@ def test_plain_numbers_hold_at_every_wavelength():
     assert materials.slope(Index(3.6, 0.1), 0.85) == 0
 
 
-@pytest.mark.parametrize(("name", "wavelength_um"), [("a-Si", 2.07), ("Si", 0.2499), ("SiO2", 3.8)])
+@pytest.mark.parametrize(
+    ("name", "wavelength_um"), [("a-Si", 2.07), ("Si", 0.2499), ("SiO2", 3.8)]
+)
 def test_outside_the_range_is_refused_and_the_range_is_named(name, wavelength_um):
     low, high = materials.material(name).range_um
     with pytest.raises(MaterialError, match=rf"{name} at .*from {low} to {high} um"):
@@ -67,12 +89,20 @@ def test_outside_the_range_is_refused_and_the_range_is_named(name, wavelength_um
 
 @pytest.mark.parametrize(
     ("name", "wavelength_um", "kin"),
-    [("Si", 1.55, "'Si-infrared' or 'a-Si'"), ("Ge", 3.0, "'Ge-infrared'"), ("sapphire-e", 7.0, None)],
+    [
+        ("Si", 1.55, "'Si-infrared' or 'a-Si'"),
+        ("Ge", 3.0, "'Ge-infrared'"),
+        ("sapphire-e", 7.0, None),
+    ],
 )
-def test_refusal_names_the_tables_of_the_same_substance_that_hold(name, wavelength_um, kin):
+def test_refusal_names_the_tables_of_the_same_substance_that_hold(
+    name, wavelength_um, kin
+):
     with pytest.raises(MaterialError) as refusal:
         materials.index(name, wavelength_um)
-    assert f"another material{f' ({kin} holds there)' if kin else ''}, or plain" in str(refusal.value)
+    assert f"another material{f' ({kin} holds there)' if kin else ''}, or plain" in str(
+        refusal.value
+    )
 
 
 @pytest.mark.parametrize("wavelength_um", [0.0, -1.0, math.nan, math.inf])
@@ -88,11 +118,15 @@ def test_a_misspelt_name_gets_the_nearest_one():
 
 def test_own_table_with_shuffled_columns_and_comments(tmp_path: Path):
     file = tmp_path / "mine.csv"
-    file.write_text("# run 7, ellipsometer\nk, n, wavelength_um\n0.1,3.5,0.8\n\n0.0,3.3,0.9\n")
+    file.write_text(
+        "# run 7, ellipsometer\nk, n, wavelength_um\n0.1,3.5,0.8\n\n0.0,3.3,0.9\n"
+    )
     assert materials.index(str(file), 0.8) == 3.5 + 0.1j
     assert materials.material(str(file)).source == "run 7, ellipsometer"
     file.write_text("wavelength_um,n,k\n0.8,2,0\n0.9,2,0\n")
-    assert abs(materials.index(str(file), 0.85) - 2) < ROUNDING  # a file that changed is read again
+    assert (
+        abs(materials.index(str(file), 0.85) - 2) < ROUNDING
+    )  # a file that changed is read again
 
 
 @pytest.mark.parametrize("mark", [";", "\t"])
@@ -109,12 +143,21 @@ def test_a_table_with_decimal_commas_is_the_table_with_points(tmp_path: Path, ma
     [
         ("", "empty"),
         ("wavelength_um,k\n0.8,3\n", "line 1: columns wavelength_um, k; need .* n and"),
-        ("lambda,n\n0.8,3\n", "line 1: columns lambda, n; need wavelength_um .or wavelength_nm"),
+        (
+            "lambda,n\n0.8,3\n",
+            "line 1: columns lambda, n; need wavelength_um .or wavelength_nm",
+        ),
         ("wavelength_um,n,k\n0.8,3,0\n", "1 rows"),
         ("wavelength_um,n,k\n0.8,3,0\n0.9,x,0\n", "line 3: .* not numbers"),
         ("wavelength_um,n,k\n# c\n0.8,3,0\n0.9,3\n", "line 4: 2 fields"),
-        ("wavelength_um,n,k\n0.7,3,0\n0.8,3,0\n0.8,3,0\n0.9,3,0\n", "line 4: wavelength 0.8 um follows 0.8"),
-        ("wavelength_um,n,k\n0.9,3,0\n0.95,3,0\n0.8,3,0\n", "line 3: wavelength 0.95 um follows 0.9"),
+        (
+            "wavelength_um,n,k\n0.7,3,0\n0.8,3,0\n0.8,3,0\n0.9,3,0\n",
+            "line 4: wavelength 0.8 um follows 0.8",
+        ),
+        (
+            "wavelength_um,n,k\n0.9,3,0\n0.95,3,0\n0.8,3,0\n",
+            "line 3: wavelength 0.95 um follows 0.9",
+        ),
         ("wavelength_um,n,k\n0.8,3,0\n0.9,3,-1e-3\n", "line 3: .*k >= 0"),
         ("wavelength_um,n,k\n0.8,nan,0\n0.9,3,0\n", "line 2: .*finite"),
     ],
@@ -134,24 +177,38 @@ def test_a_bad_table_is_refused_with_its_line(tmp_path: Path, text, message):
         unique_by=lambda row: row[0],
     )
 )
-def test_any_table_comes_back_at_its_rows_and_never_leaves_them_in_between(tmp_path_factory, rows):
+def test_any_table_comes_back_at_its_rows_and_never_leaves_them_in_between(
+    tmp_path_factory, rows
+):
     rows = sorted(rows)
     file = tmp_path_factory.mktemp("nk") / "any.csv"
-    file.write_text("wavelength_um,n,k\n" + "".join(f"{w!r},{n!r},{k!r}\n" for w, n, k in rows))
+    file.write_text(
+        "wavelength_um,n,k\n" + "".join(f"{w!r},{n!r},{k!r}\n" for w, n, k in rows)
+    )
     record = materials.read_csv(file)
     assert record.range_um == (rows[0][0], rows[-1][0])
     for w, n, k in rows:
         assert abs(materials.index(record, w) - complex(n, k)) < 1e-12 * (n + k)
     middle = materials.index(record, (rows[0][0] + rows[1][0]) / 2)
-    assert min(rows[0][2], rows[1][2]) * (1 - 1e-12) <= middle.imag <= max(rows[0][2], rows[1][2]) * (1 + 1e-12)
+    assert (
+        min(rows[0][2], rows[1][2]) * (1 - 1e-12)
+        <= middle.imag
+        <= max(rows[0][2], rows[1][2]) * (1 + 1e-12)
+    )
 
 
-@pytest.mark.parametrize("name", ["Wavelength (nm)", '"wavelength, nm"', "wavelength_nm", "Wavelength [nm]"])
+@pytest.mark.parametrize(
+    "name", ["Wavelength (nm)", '"wavelength, nm"', "wavelength_nm", "Wavelength [nm]"]
+)
 def test_a_table_that_falls_in_nanometres_is_the_table_that_rises(tmp_path: Path, name):
     file = tmp_path / "falls.csv"
     file.write_text(f"{name},k,n\n900,0.05,3.2\n840,0.02,3.5\n800,0.01,3.9\n")
-    assert materials.index(str(file), 0.855) == pytest.approx(3.425 + 0.0275j, abs=1e-12)  # a quarter on from 840 nm
-    assert materials.slope(str(file), 0.855) == pytest.approx(-5 + 0.5j, abs=1e-9)  # per um
+    assert materials.index(str(file), 0.855) == pytest.approx(
+        3.425 + 0.0275j, abs=1e-12
+    )  # a quarter on from 840 nm
+    assert materials.slope(str(file), 0.855) == pytest.approx(
+        -5 + 0.5j, abs=1e-9
+    )  # per um
     assert materials.material(str(file)).range_um == pytest.approx((0.8, 0.9))
 
 
@@ -164,21 +221,39 @@ def test_missing_and_binary_files_are_refused(tmp_path: Path):
 
 
 FORMULAS = [  # by hand at 0.6328 um, from the database's description of each formula
-    (1, "0.1 0.7 0.09 0.4 9.0", lambda w: (1.1 + 0.7 * w**2 / (w**2 - 0.0081) + 0.4 * w**2 / (w**2 - 81)) ** 0.5),
+    (
+        1,
+        "0.1 0.7 0.09 0.4 9.0",
+        lambda w: (
+            (1.1 + 0.7 * w**2 / (w**2 - 0.0081) + 0.4 * w**2 / (w**2 - 81)) ** 0.5
+        ),
+    ),
     (2, "0.1 0.7 0.09", lambda w: (1.1 + 0.7 * w**2 / (w**2 - 0.09)) ** 0.5),
     (3, "2.2 0.01 2 0.02 -2", lambda w: (2.2 + 0.01 * w**2 + 0.02 / w**2) ** 0.5),
     (
         4,
         "2.1 0.03 0 0.2 2 0.01 2 0.3 1 -0.01 2",
-        lambda w: (2.1 + 0.03 / (w**2 - 0.04) + 0.01 * w**2 / (w**2 - 0.3) - 0.01 * w**2) ** 0.5,
+        lambda w: (
+            (2.1 + 0.03 / (w**2 - 0.04) + 0.01 * w**2 / (w**2 - 0.3) - 0.01 * w**2)
+            ** 0.5
+        ),
     ),
     (5, "1.5 0.004 -2 0.0002 -4", lambda w: 1.5 + 0.004 / w**2 + 0.0002 / w**4),
-    (6, "0.0 0.05 230 0.002 57", lambda w: 1 + 0.05 / (230 - w**-2) + 0.002 / (57 - w**-2)),
+    (
+        6,
+        "0.0 0.05 230 0.002 57",
+        lambda w: 1 + 0.05 / (230 - w**-2) + 0.002 / (57 - w**-2),
+    ),
     (
         7,
         "3.4 0.15 -0.02 -0.001 0.0002 0.00003",
         lambda w: (
-            3.4 + 0.15 / (w**2 - 0.028) - 0.02 / (w**2 - 0.028) ** 2 - 0.001 * w**2 + 0.0002 * w**4 + 0.00003 * w**6
+            3.4
+            + 0.15 / (w**2 - 0.028)
+            - 0.02 / (w**2 - 0.028) ** 2
+            - 0.001 * w**2
+            + 0.0002 * w**4
+            + 0.00003 * w**6
         ),
     ),
     (
@@ -195,13 +270,22 @@ FORMULAS = [  # by hand at 0.6328 um, from the database's description of each fo
     (
         9,
         "2.5 0.01 0.02 0.003 1.5 0.9",
-        lambda w: (2.5 + 0.01 / (w**2 - 0.02) + 0.003 * (w - 1.5) / ((w - 1.5) ** 2 + 0.9)) ** 0.5,
+        lambda w: (
+            (2.5 + 0.01 / (w**2 - 0.02) + 0.003 * (w - 1.5) / ((w - 1.5) ** 2 + 0.9))
+            ** 0.5
+        ),
     ),
 ]
 
 
-@pytest.mark.parametrize(("number", "coefficients", "plain"), FORMULAS, ids=[f"formula {f[0]}" for f in FORMULAS])
-def test_every_formula_of_the_database_and_its_slope(tmp_path: Path, number, coefficients, plain):
+@pytest.mark.parametrize(
+    ("number", "coefficients", "plain"),
+    FORMULAS,
+    ids=[f"formula {f[0]}" for f in FORMULAS],
+)
+def test_every_formula_of_the_database_and_its_slope(
+    tmp_path: Path, number, coefficients, plain
+):
     page = tmp_path / "page.yml"
     page.write_text(
         f"REFERENCES: |\n    A. <i>B</i>\nDATA:\n  - type: formula {number}\n    wavelength_range: 0.4 0.9\n"
@@ -210,28 +294,40 @@ def test_every_formula_of_the_database_and_its_slope(tmp_path: Path, number, coe
     w, step = 0.6328, 1e-5
     assert abs(materials.index(str(page), w) - plain(w)) < 1e-13
     rise = (plain(w + step) - plain(w - step)) / (2 * step)
-    assert abs(materials.slope(str(page), w) - rise) < 1e-7 * (1 + abs(rise))  # third derivative / 6 step²
+    assert abs(materials.slope(str(page), w) - rise) < 1e-7 * (
+        1 + abs(rise)
+    )  # third derivative / 6 step²
     assert materials.material(str(page)).source == "A. B"
     with pytest.raises(MaterialError, match=r"from 0.4 to 0.9 um"):
         materials.index(str(page), 0.95)
 
 
 @pytest.mark.parametrize("count", [5, 9])
-def test_a_rational_formula_ends_after_a_term_and_holds_where_an_absent_pole_would_lie(tmp_path: Path, count):
+def test_a_rational_formula_ends_after_a_term_and_holds_where_an_absent_pole_would_lie(
+    tmp_path: Path, count
+):
     """c^0 = 1 of a term that is not there is no pole at 1 um."""
     c = (2.25, 0.4, 0.3, 0.2, 2.0, 0.01, 0.5, 0.3, 3.0)[:count]
     page = tmp_path / "page.yml"
     words = " ".join(map(str, c))
-    page.write_text(f"DATA:\n  - type: formula 4\n    wavelength_range: 0.8 1.2\n    coefficients: {words}\n")
+    page.write_text(
+        f"DATA:\n  - type: formula 4\n    wavelength_range: 0.8 1.2\n    coefficients: {words}\n"
+    )
     square = 2.25 + 0.4 / (1 - 0.2**2) + (0.01 / (1 - 0.3**3) if count > 5 else 0)
-    assert materials.index(str(page), 1.0) == pytest.approx(math.sqrt(square), rel=1e-12)
+    assert materials.index(str(page), 1.0) == pytest.approx(
+        math.sqrt(square), rel=1e-12
+    )
 
 
 def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Path):
     page = tmp_path / "falling.yml"
-    page.write_text("DATA:\n  - type: formula 2\n    wavelength_range: 0.9 0.4\n    coefficients: 0.2 0.7 0.36\n")
+    page.write_text(
+        "DATA:\n  - type: formula 2\n    wavelength_range: 0.9 0.4\n    coefficients: 0.2 0.7 0.36\n"
+    )
     assert materials.material(str(page)).range_um == (0.4, 0.9)
-    assert materials.index(str(page), 0.8) == pytest.approx(math.sqrt(1.2 + 0.7 * 0.64 / (0.64 - 0.36)), rel=1e-12)
+    assert materials.index(str(page), 0.8) == pytest.approx(
+        math.sqrt(1.2 + 0.7 * 0.64 / (0.64 - 0.36)), rel=1e-12
+    )
     with pytest.raises(MaterialError, match=r"falling.yml, formula 2 gives n = "):
         materials.index(str(page), 0.5)  # below the pole at 0.6 um n² is negative
 
@@ -239,7 +335,9 @@ def test_a_range_is_read_from_either_end_and_a_pole_names_its_file(tmp_path: Pat
 def test_noise_of_a_measured_k_below_nothing_is_no_gain(tmp_path: Path):
     """Ellipsometry has k to 1e-3; what is farther below 0 is the other sign of time."""
     page = tmp_path / "noisy.yml"
-    page.write_text("DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.4 -8e-4\n        0.6 1.5 2e-3\n")
+    page.write_text(
+        "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.4 -8e-4\n        0.6 1.5 2e-3\n"
+    )
     assert materials.index(str(page), 0.5) == pytest.approx(1.4, abs=ROUNDING)
     assert materials.index(str(page), 0.6) == pytest.approx(1.5 + 2e-3j, abs=ROUNDING)
 
@@ -250,7 +348,9 @@ def test_formula_with_a_table_of_k_holds_where_both_do(tmp_path: Path):
         "DATA:\n  - type: formula 5\n    wavelength_range: 0.3 2.0\n    coefficients: 1.5 0.01 -2\n"
         "  - type: tabulated k\n    data: |\n        0.9 3e-3\n        0.5 1e-3\n"
     )
-    assert abs(materials.index(str(page), 0.6) - (1.5 + 0.01 / 0.36 + 1.5e-3j)) < ROUNDING  # rows in any order
+    assert (
+        abs(materials.index(str(page), 0.6) - (1.5 + 0.01 / 0.36 + 1.5e-3j)) < ROUNDING
+    )  # rows in any order
     assert materials.material(str(page)).range_um == (0.5, 0.9)
 
 
@@ -268,7 +368,12 @@ def test_every_shipped_material_says_its_source_and_is_a_material(name):
 @pytest.mark.parametrize(
     ("name", "wavelength_um", "want", "off"),
     [
-        ("sapphire", 0.5893, 1.7682, 2e-4),  # handbooks: no = 1.768, ne = 1.760 at the sodium line
+        (
+            "sapphire",
+            0.5893,
+            1.7682,
+            2e-4,
+        ),  # handbooks: no = 1.768, ne = 1.760 at the sodium line
         ("sapphire-e", 0.5893, 1.7600, 2e-4),
         ("N-BK7", 0.5875618, 1.51680, 1e-5),  # catalogue nd
         ("MgF2", 0.5893, 1.3777, 1e-4),
@@ -281,7 +386,8 @@ def test_shipped_materials_against_handbook_values(name, wavelength_um, want, of
 
 
 @pytest.mark.parametrize(
-    ("name", "want"), [("tio2", "TiO2"), ("Sapphire", "sapphire"), ("hfo2", "HfO2"), ("gan", "GaN")]
+    ("name", "want"),
+    [("tio2", "TiO2"), ("Sapphire", "sapphire"), ("hfo2", "HfO2"), ("gan", "GaN")],
 )
 def test_another_case_is_the_same_material(name, want):
     with pytest.raises(MaterialError, match=f"did you mean '{want}'"):
@@ -318,8 +424,14 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
     ("text", "message"),
     [
         ("just text", "no list DATA"),
-        ("DATA:\n  - type: formula 12\n    wavelength_range: 0.4 0.9\n    coefficients: 1 2 3\n", "formula 1 to 9"),
-        ("DATA:\n  - type: formula 1\n    wavelength_range: 0.4 0.9\n    coefficients: 1 x 3\n", "not numbers"),
+        (
+            "DATA:\n  - type: formula 12\n    wavelength_range: 0.4 0.9\n    coefficients: 1 2 3\n",
+            "formula 1 to 9",
+        ),
+        (
+            "DATA:\n  - type: formula 1\n    wavelength_range: 0.4 0.9\n    coefficients: 1 x 3\n",
+            "not numbers",
+        ),
         ("DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5\n", "row 1"),
         ("DATA: [", "not YAML"),
         ("DATA: " + "[" * 3000, "not YAML"),
@@ -327,7 +439,10 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
         ("DATA: " + "9" * 5000, "not YAML"),
         ("DATA:\n  - x\n", "entry 1 of DATA is no table"),
         ("DATA:\n  - type: [formula, 1]\n    data: 3\n", "neither a formula"),
-        ("DATA:\n  - type: tabulated k\n    data: |\n        0.5 0.1\n        0.6 0.1\n", "neither a formula"),
+        (
+            "DATA:\n  - type: tabulated k\n    data: |\n        0.5 0.1\n        0.6 0.1\n",
+            "neither a formula",
+        ),
         (
             "DATA:\n  - type: tabulated n2\n    data: |\n        0.5 1e-19\n        0.6 1e-19\n",
             "need tabulated nk, n or k",
@@ -340,7 +455,10 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
             "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.4 1e-4\n        0.6 1.5 -1.5e-3\n",
             "k = -0.0015; need k",
         ),
-        ("DATA:\n  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 -1.5\n", "n = -1.5; need n"),
+        (
+            "DATA:\n  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 -1.5\n",
+            "n = -1.5; need n",
+        ),
         (
             "DATA:\n  - type: formula 5\n    wavelength_range: 0.4 0.9\n    coefficients: 1.5 0.01 -2\n"
             "  - type: tabulated n\n    data: |\n        0.5 1.4\n        0.6 1.5\n",
@@ -351,7 +469,19 @@ def test_tables_without_k_in_nanometres_and_with_k_below_n(tmp_path: Path):
                 f"DATA:\n  - type: formula {i}\n    wavelength_range: 0.4 0.9\n    coefficients: {'1.3 ' * n}\n",
                 "whole term",
             )
-            for i, n in [(1, 4), (2, 6), (3, 4), (4, 6), (4, 7), (4, 8), (5, 4), (6, 4), (7, 7), (8, 5), (9, 7)]
+            for i, n in [
+                (1, 4),
+                (2, 6),
+                (3, 4),
+                (4, 6),
+                (4, 7),
+                (4, 8),
+                (5, 4),
+                (6, 4),
+                (7, 7),
+                (8, 5),
+                (9, 7),
+            ]
         ),
     ],
 )
@@ -364,7 +494,10 @@ def test_a_bad_page_is_refused(tmp_path: Path, text, message):
 
 def test_a_page_of_lists_of_lists_by_reference_is_not_written_out(tmp_path: Path):
     """Ten lists, each of ten times the one before: their text would have 10^10 words."""
-    lists = [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10) if i else 'x'}]" for i in range(11)]
+    lists = [
+        f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 10) if i else 'x'}]"
+        for i in range(11)
+    ]
     data = "DATA:\n  - type: tabulated nk\n    data: |\n        0.5 1.5 0\n        0.6 1.4 0\n"
     file = tmp_path / "bomb.yml"
     file.write_text("\n".join([*lists, "REFERENCES: *l10", data]))
@@ -372,7 +505,9 @@ def test_a_page_of_lists_of_lists_by_reference_is_not_written_out(tmp_path: Path
 
 
 def test_blends_and_offsets():
-    """Bruggeman's equation holds for what comes out; ends of the share are the materials themselves."""
+    """Bruggeman's equation holds for what comes out; ends of the share are the
+    materials themselves.
+    """
     a, b = materials.index("TiO2", 0.6) ** 2, materials.index("SiO2", 0.6) ** 2
     e = materials.index(Blend("TiO2", "SiO2", 0.3), 0.6) ** 2
     assert abs(0.7 * (a - e) / (a + 2 * e) + 0.3 * (b - e) / (b + 2 * e)) < 1e-12
@@ -380,5 +515,7 @@ def test_blends_and_offsets():
     shifted = materials.index(Blend("TiO2", n_offset=-0.07, k_offset=0.002), 0.6)
     assert abs(shifted - (materials.index("TiO2", 0.6) - 0.07 + 0.002j)) < ROUNDING
     step, blend = 1e-5, Blend("N-BK7", "PMMA", 0.4)
-    rise = (materials.index(blend, 0.6 + step) - materials.index(blend, 0.6 - step)) / (2 * step)
+    rise = (materials.index(blend, 0.6 + step) - materials.index(blend, 0.6 - step)) / (
+        2 * step
+    )
     assert abs(materials.slope(blend, 0.6) - rise) < 1e-6

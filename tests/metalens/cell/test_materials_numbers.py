@@ -1,4 +1,6 @@
-"""Pages, tables, blends and fused silica at the ends of their ranges, with their slopes, by hand."""
+"""Pages, tables, blends and fused silica at the ends of their ranges, with their
+slopes, by hand.
+"""
 
 import cmath
 import math
@@ -17,9 +19,13 @@ def test_fused_silica_is_malitsons_from_0_21_to_3_71_um():
     terms = ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161))
     for wavelength in (0.21, 0.3, 0.8, 1.9, 3.71):
         square = 1 + sum(b * wavelength**2 / (wavelength**2 - c**2) for b, c in terms)
-        assert materials.index("SiO2", wavelength) == pytest.approx(math.sqrt(square), rel=1e-13)
+        assert materials.index("SiO2", wavelength) == pytest.approx(
+            math.sqrt(square), rel=1e-13
+        )
     for wavelength in (0.2099, 3.7101):
-        with pytest.raises(MaterialError, match=r"SiO2 at .* holds from 0\.21 to 3\.71 um"):
+        with pytest.raises(
+            MaterialError, match=r"SiO2 at .* holds from 0\.21 to 3\.71 um"
+        ):
             materials.index("SiO2", wavelength)
     assert materials.index("air", 1e-9) == materials.index("air", 1e9) == 1
     assert materials.slope("air", 0.5) == 0
@@ -30,7 +36,9 @@ def test_the_dispersion_of_fused_silica_is_its_difference(wavelength):
     step = 1e-4 * wavelength
     ends = [materials.index("SiO2", wavelength + s * step).real for s in (-2, -1, 1, 2)]
     want = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-    assert materials.slope("SiO2", wavelength) == pytest.approx(want, rel=1e-8)  # step⁴, and ε / step
+    assert materials.slope("SiO2", wavelength) == pytest.approx(
+        want, rel=1e-8
+    )  # step⁴, and ε / step
 
 
 def table():
@@ -48,7 +56,9 @@ def table():
         (0.8, 1.1 + 0.05j, -2 + 0.1j),
     ],
 )
-def test_a_table_is_straight_between_its_rows_and_holds_at_both_ends(wavelength, n, rate):
+def test_a_table_is_straight_between_its_rows_and_holds_at_both_ends(
+    wavelength, n, rate
+):
     assert materials.index(table(), wavelength) == pytest.approx(n, rel=1e-12)
     assert materials.slope(table(), wavelength) == pytest.approx(rate, rel=1e-10)
 
@@ -77,17 +87,26 @@ def test_a_page_holds_where_both_of_its_parts_do(tmp_path, n_range, k_rows, want
     assert materials.material(found).range_um == want
     middle = sum(want) / 2
     k = 0.1 + (middle - 0.5) / 0.4 * 0.1
-    assert materials.index(found, middle) == pytest.approx(1.5 + 0.01 / middle**2 + 1j * k, rel=1e-12)
-    assert materials.slope(found, middle) == pytest.approx(-0.02 / middle**3 + 0.25j, rel=1e-9)
+    assert materials.index(found, middle) == pytest.approx(
+        1.5 + 0.01 / middle**2 + 1j * k, rel=1e-12
+    )
+    assert materials.slope(found, middle) == pytest.approx(
+        -0.02 / middle**3 + 0.25j, rel=1e-9
+    )
 
 
 def test_parts_that_share_no_wavelength_are_refused(tmp_path):
-    with pytest.raises(MaterialError, match=r"n holds from 0\.3 to 0\.5 um, and k at no wavelength of these"):
+    with pytest.raises(
+        MaterialError,
+        match=r"n holds from 0\.3 to 0\.5 um, and k at no wavelength of these",
+    ):
         materials.material(page(tmp_path, "0.3 0.5", [(0.5, 0.1), (0.9, 0.2)]))
 
 
 def bruggeman(a, b, share):
-    """Root with n, k >= 0 of share (b - e)/(b + 2e) + (1 - share)(a - e)/(a + 2e) = 0, by the quadratic of numpy."""
+    """Root with n, k >= 0 of share (b - e)/(b + 2e) + (1 - share)(a - e)/(a + 2e) = 0,
+    by the quadratic of numpy.
+    """
     f = 1 - share
     roots = np.roots([-2.0, (2 * f - share) * a + (2 * share - f) * b, a * b])
     return next(n for n in map(cmath.sqrt, roots) if n.real > 0 and n.imag >= -1e-12)
@@ -103,17 +122,23 @@ BLENDS = [
 
 @pytest.mark.parametrize("blend", BLENDS)
 def test_blends_of_absorbing_materials_are_bruggemans(blend):
-    """And their slopes are differences, of tables that are straight about 0.7 um for 1e-5."""
+    """And their slopes are differences, of tables that are straight about 0.7 um for
+    1e-5.
+    """
     a, b = (materials.index(name, 0.7) ** 2 for name in (blend.base, blend.other))
     want = bruggeman(a, b, blend.share) + complex(blend.n_offset, blend.k_offset)
     assert materials.index(blend, 0.7) == pytest.approx(want, rel=1e-12)
     ends = [materials.index(blend, 0.7 + s * 1e-5) for s in (-1, 1)]
-    assert materials.slope(blend, 0.7) == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
+    assert materials.slope(blend, 0.7) == pytest.approx(
+        (ends[1] - ends[0]) / 2e-5, rel=1e-5
+    )
 
 
 def test_offsets_alone_leave_the_slope_and_may_not_turn_loss_to_gain():
     shifted = Blend("a-Si", n_offset=-0.2, k_offset=0.01)
-    assert materials.index(shifted, 0.7) == pytest.approx(materials.index("a-Si", 0.7) - 0.2 + 0.01j, rel=1e-12)
+    assert materials.index(shifted, 0.7) == pytest.approx(
+        materials.index("a-Si", 0.7) - 0.2 + 0.01j, rel=1e-12
+    )
     assert materials.slope(shifted, 0.7) == materials.slope("a-Si", 0.7)
     with pytest.raises(MaterialError, match=r"n \+ ik = .*need n > 0 and k >= 0"):
         materials.index(Blend("SiO2", k_offset=-1e-6), 0.7)
@@ -126,7 +151,9 @@ def test_kin_that_hold_at_their_very_ends_are_named():
     low, high = materials.material("Ge-infrared").range_um
     assert materials.material("Ge").range_um[1] < high
     for wavelength in (high,):
-        with pytest.raises(MaterialError, match=r"another material \('Ge-infrared' holds there\)"):
+        with pytest.raises(
+            MaterialError, match=r"another material \('Ge-infrared' holds there\)"
+        ):
             materials.index("Ge", wavelength)
     with pytest.raises(MaterialError, match="another material, or plain"):
         materials.index("Ge", high * (1 + 1e-9))
@@ -140,12 +167,21 @@ def test_plain_numbers_have_no_slope_and_absorb_as_they_say():
 
 @pytest.mark.parametrize("metal", ["Au", "Ag", "Al"])
 def test_blends_with_metals_go_from_one_to_the_other_and_absorb(metal):
-    """Both of Bruggeman's roots solve his equation; the one that absorbs at every share leads from metal to glass."""
+    """Both of Bruggeman's roots solve his equation; the one that absorbs at every share
+    leads from metal to glass.
+    """
     b, shares = materials.index("SiO2", 0.85) ** 2, np.linspace(0.0, 1.0, 81)
     a = materials.index(metal, 0.85) ** 2
-    e = np.array([materials.index(Blend(metal, "SiO2", share), 0.85) ** 2 for share in shares.tolist()])
+    e = np.array(
+        [
+            materials.index(Blend(metal, "SiO2", share), 0.85) ** 2
+            for share in shares.tolist()
+        ]
+    )
     left = (1 - shares) * (a - e) / (a + 2 * e) + shares * (b - e) / (b + 2 * e)
     assert np.abs(left).max() < 1e-12
     assert e.imag.min() > -1e-12
     assert [e[0], e[-1]] == pytest.approx([a, b], rel=1e-12)
-    assert np.abs(np.diff(e)).max() < 0.1 * abs(a - b)  # a wrong root jumps by most of it
+    assert np.abs(np.diff(e)).max() < 0.1 * abs(
+        a - b
+    )  # a wrong root jumps by most of it

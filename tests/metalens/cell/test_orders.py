@@ -17,7 +17,10 @@ def cell(pitch_um):
 
 
 def test_only_the_zero_orders_below_cutoff():
-    assert propagating(cell(0.4), 0.85) == (Order("substrate", 0, 0), Order("cover", 0, 0))
+    assert propagating(cell(0.4), 0.85) == (
+        Order("substrate", 0, 0),
+        Order("cover", 0, 0),
+    )
     check_subwavelength(cell(0.4), 0.85)
 
 
@@ -25,17 +28,23 @@ def test_exactly_at_cutoff_four_orders_graze_in_the_substrate():
     at_cutoff = cell(1.0)
     assert len(propagating(at_cutoff, 1.45)) == 6
     assert len(propagating(at_cutoff, 1.45 * (1 + 1e-12))) == 2
-    with pytest.raises(CellError, match=r"\(0, -1\) in the substrate.*need pitch_um < 1"):
+    with pytest.raises(
+        CellError, match=r"\(0, -1\) in the substrate.*need pitch_um < 1"
+    ):
         check_subwavelength(at_cutoff, 1.45)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 10.0, -10.0])
 @pytest.mark.parametrize("pitch_um", [0.5, 0.6, 0.95])
 def test_orders_are_those_that_carry_power_in_the_solver(pitch_um, angle_deg):
-    """With all orders but zero taken away, energy is missing exactly where other orders propagate."""
+    """With all orders but zero taken away, energy is missing exactly where other orders
+    propagate.
+    """
     angle_rad = math.radians(angle_deg)
     orders = propagating(cell(pitch_um), 0.85, angle_rad=angle_rad)
-    got = rcwa.solve(cell(pitch_um), 0.25, 0.85, harmonics=4, angle_rad=angle_rad, polarization="s")
+    got = rcwa.solve(
+        cell(pitch_um), 0.25, 0.85, harmonics=4, angle_rad=angle_rad, polarization="s"
+    )
     missing = got.energy - abs(got.t) ** 2 - abs(got.r) ** 2
     assert (missing > 1e-9) == (len(orders) > 2)
 

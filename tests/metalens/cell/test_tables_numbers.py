@@ -18,7 +18,13 @@ WANT = np.array([[0.8, 0.9, 1.1], [3.5, 3.3, 3.2], [0.1, 0.0, 0.02]])
         "n,k,wl\n3.2,0.02,1.1\n\n3.3,0,0.9\n3.5,0.1,0.8\n",  # falling
         "wl,n\n0.8,3.5\n0.9,3.3\n1.1,3.2\nwl, k\n0.8,0.1\n0.9,0\n1.1,0.02\n",
     ],
-    ids=["um", "nm and decimal commas", "tabs in another order", "falling", "k below n"],
+    ids=[
+        "um",
+        "nm and decimal commas",
+        "tabs in another order",
+        "falling",
+        "k below n",
+    ],
 )
 def test_a_table_is_read_however_it_is_written(text):
     found, said = tables.read(f"# grown at\n{text}# 300 C\n", "a.csv")
@@ -27,7 +33,11 @@ def test_a_table_is_read_however_it_is_written(text):
 
 
 def test_a_table_without_k_is_transparent():
-    assert tables.read("wl,n\n0.8,3.5\n0.9,3.3\n", "a")[0].tolist() == [[0.8, 0.9], [3.5, 3.3], [0, 0]]
+    assert tables.read("wl,n\n0.8,3.5\n0.9,3.3\n", "a")[0].tolist() == [
+        [0.8, 0.9],
+        [3.5, 3.3],
+        [0, 0],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +57,10 @@ def test_a_table_without_k_is_transparent():
         ("wl,n\n0.9,3\n0.8,3\n0.8,3.1\n", "a, line 4: wavelength 0.8 um follows 0.8"),
         ("wl,n\n0.9,3\n0.8,3\n0.95,3.1\n", "a, line 3: wavelength 0.8 um follows 0.9"),
         ("wl,n\n0.7,3\n0.9,3\n0.8,3.1\n", "a, line 4: wavelength 0.8 um follows 0.9"),
-        ("wl,n\n0.8,3\n0.9,3\nwl,k\n0.8,0\n0.91,0\n", "a, line 4: n and k stand at different wavelengths"),
+        (
+            "wl,n\n0.8,3\n0.9,3\nwl,k\n0.8,0\n0.91,0\n",
+            "a, line 4: n and k stand at different wavelengths",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_with_its_line(text, said):

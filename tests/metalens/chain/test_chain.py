@@ -1,4 +1,6 @@
-"""The chain from one file: which stages it asks for, its settings laid out, its module drawn."""
+"""The chain from one file: which stages it asks for, its settings laid out, its module
+drawn.
+"""
 
 import json
 import os
@@ -38,10 +40,17 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
         (tmp_path / f"{name}.toml").write_text("")
     text = 'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n'
     (tmp_path / "chain.toml").write_text(text)
-    assert _verbs(chain.load(tmp_path / "chain.toml")) == ["library", "design", "psf", "layout"]
+    assert _verbs(chain.load(tmp_path / "chain.toml")) == [
+        "library",
+        "design",
+        "psf",
+        "layout",
+    ]
     (tmp_path / "chain.toml").write_text(text + 'run = "r.toml"\npsf = "p.toml"\n')
     stages = list(chain.stages(chain.load(tmp_path / "chain.toml")))
-    (tmp_path / "chain.toml").write_text(text + 'bench_design = "d.toml"\nbench_truth = "r.toml"\n')
+    (tmp_path / "chain.toml").write_text(
+        text + 'bench_design = "d.toml"\nbench_truth = "r.toml"\n'
+    )
     own = list(chain.stages(chain.load(tmp_path / "chain.toml")))
     assert [s.words[0] for s in own[-3:]] == ["design", "capture", "fit"]
     assert "bench_lens.h5" in own[-1].words
@@ -53,12 +62,18 @@ def test_a_stage_without_its_file_is_left_out(tmp_path):
     ("text", "message"),
     [
         ('cell = "c.toml"\n', "missing key"),
-        ('cell = "absent.toml"\ndesign = "c.toml"\nprocess = "c.toml"\n', "no such file"),
+        (
+            'cell = "absent.toml"\ndesign = "c.toml"\nprocess = "c.toml"\n',
+            "no such file",
+        ),
         (
             'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_design = "c.toml"\n',
             "belongs to a bench_truth",
         ),
-        ('cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_truth = "c.toml"\n', "no lens to measure"),
+        (
+            'cell = "c.toml"\ndesign = "c.toml"\nprocess = "c.toml"\nbench_truth = "c.toml"\n',
+            "no lens to measure",
+        ),
         ('cell = "c.toml"\ndesin = "c.toml"\n', "did you mean 'design'"),
     ],
 )
@@ -73,37 +88,69 @@ def test_settings_are_laid_out_under_plain_names_with_the_aperture_put_in(tmp_pa
     source, target = tmp_path / "source", tmp_path / "target"
     source.mkdir()
     target.mkdir()
-    (source / "my.toml").write_text('profile = "cubic"\naperture_mm = 1.0\n[cubic]\nstrength_rad = 5.0\n')
+    (source / "my.toml").write_text(
+        'profile = "cubic"\naperture_mm = 1.0\n[cubic]\nstrength_rad = 5.0\n'
+    )
     for name in ("c", "p"):
         (source / f"{name}.toml").write_text(f"# {name}\n")
-    laid = chain.laid(ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")), source, aperture_mm=0.25)
+    laid = chain.laid(
+        ChainFiles(Path("c.toml"), Path("my.toml"), Path("p.toml")),
+        source,
+        aperture_mm=0.25,
+    )
     laid.write(target)
-    assert laid.files == ChainFiles(Path("cell.toml"), Path("design.toml"), Path("process.toml"))
+    assert laid.files == ChainFiles(
+        Path("cell.toml"), Path("design.toml"), Path("process.toml")
+    )
     made = config.load(target / "design.toml", Design)
-    assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (0.25, "cubic", 5.0)
+    assert (made.aperture_mm, made.profile, made.cubic.strength_rad) == (
+        0.25,
+        "cubic",
+        5.0,
+    )
 
 
 def laid_out(tmp_path, **texts):
-    """Settings of which that of the cell names tables; the folder that they are laid out in."""
+    """Settings of which that of the cell names tables; the folder that they are laid
+    out in.
+    """
     source, target = tmp_path / "source", tmp_path / "target"
     for folder in (source / "tables", target):
         folder.mkdir(parents=True, exist_ok=True)
     for name, text in ({"c.toml": "", "d.toml": "", "p.toml": ""} | texts).items():
         (source / name).write_text(text)
-    chain.laid(ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), source, aperture_mm=None).write(target)
+    chain.laid(
+        ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")),
+        source,
+        aperture_mm=None,
+    ).write(target)
     return target
 
 
 def test_tables_and_maps_that_settings_name_are_laid_out_with_them(tmp_path):
-    """Beside or below them, at any depth of the file; what the chain makes, words and whole paths are left alone."""
+    """Beside or below them, at any depth of the file; what the chain makes, words and
+    whole paths are left alone.
+    """
     (tmp_path / "mine.csv").write_text("whole path")
     cell = f'a = [{{of = "tables/si.csv"}}, "{tmp_path}/mine.csv"]\n[b]\nn = "SiO2.x"\nk = "table.csv"\n'
     tables = {"table.csv": "1,2\n", "library.h5": "none of the chain's"}
     (tmp_path / "source" / "tables").mkdir(parents=True)
     (tmp_path / "source" / "tables" / "si.csv").write_text("3,4\n")
-    target = laid_out(tmp_path, **{"c.toml": "\ufeff" + cell, "d.toml": 'library = "library.h5"\n'}, **tables)
-    found = sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
-    assert found == ["cell.toml", "design.toml", "process.toml", "table.csv", "tables/si.csv"]
+    target = laid_out(
+        tmp_path,
+        **{"c.toml": "\ufeff" + cell, "d.toml": 'library = "library.h5"\n'},
+        **tables,
+    )
+    found = sorted(
+        p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file()
+    )
+    assert found == [
+        "cell.toml",
+        "design.toml",
+        "process.toml",
+        "table.csv",
+        "tables/si.csv",
+    ]
     assert (target / "tables" / "si.csv").read_text() == "3,4\n"
     assert (target / "cell.toml").read_text() == cell
 
@@ -118,7 +165,9 @@ def test_a_table_above_its_settings_or_two_of_one_name_are_refused(tmp_path):
         (tmp_path / name / "table.csv").write_text(text)
     (tmp_path / "p.toml").write_text("")
     files = ChainFiles(Path("a/s.toml"), Path("b/s.toml"), Path("p.toml"))
-    with pytest.raises(ConfigError, match=r"s\.toml: 'table\.csv' is not the file of that name"):
+    with pytest.raises(
+        ConfigError, match=r"s\.toml: 'table\.csv' is not the file of that name"
+    ):
         chain.laid(files, tmp_path, aperture_mm=None)
     (tmp_path / "b" / "table.csv").write_text("x")
     assert chain.laid(files, tmp_path, aperture_mm=None).contents["table.csv"] == b"x"
@@ -128,23 +177,37 @@ def test_settings_that_are_no_text_are_refused_by_name(tmp_path):
     for name, content in (("c", b'n = "\xff"\n'), ("d", b""), ("p", b"")):
         (tmp_path / f"{name}.toml").write_bytes(content)
     with pytest.raises(ConfigError, match=r"c\.toml"):
-        chain.laid(ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")), tmp_path, aperture_mm=None)
+        chain.laid(
+            ChainFiles(Path("c.toml"), Path("d.toml"), Path("p.toml")),
+            tmp_path,
+            aperture_mm=None,
+        )
 
 
 def test_the_shipped_settings_are_laid_out(tmp_path):
     chain.laid(chain.shipped(), None, aperture_mm=0.25).write(tmp_path)
     assert sorted(p.stem for p in tmp_path.iterdir()) == sorted(chain.SHIPPED)
     assert config.load(tmp_path / "design.toml", Design).aperture_mm == 0.25
-    assert (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")
+    assert (
+        (tmp_path / "cell.toml").read_text(encoding="utf-8").startswith("# Amorphous")
+    )
 
 
 def test_the_drawn_module_needs_nothing_from_outside_and_grows_with_the_lens():
-    small, large = (module_view.view(aperture_mm=a, sensor_distance_mm=2.0).html for a in (0.5, 3.0))
+    small, large = (
+        module_view.view(aperture_mm=a, sensor_distance_mm=2.0).html for a in (0.5, 3.0)
+    )
     assert not re.search(r"(?:src|href)=|https?:", small)
-    parts = [json.loads(re.search(r"const parts = (\[.*?\]);\n", html)[1]) for html in (small, large)]
+    parts = [
+        json.loads(re.search(r"const parts = (\[.*?\]);\n", html)[1])
+        for html in (small, large)
+    ]
     names = [p["name"] for p in parts[0] if p["name"]]
     assert names == ["NIR filter", "substrate", "metalens", "mount", "sensor", "flex"]
-    widths = [max(x for part in p for face in part["faces"] for x, _, _ in face) for p in parts]
+    widths = [
+        max(x for part in p for face in part["faces"] for x, _, _ in face)
+        for p in parts
+    ]
     assert widths[1] > widths[0] + 0.9
     bottom = min(z for part in parts[0] for face in part["faces"] for _, _, z in face)
     assert bottom == pytest.approx(-2.7)  # 2 mm of air, 0.5 mm sensor, 0.2 mm flex
@@ -159,7 +222,9 @@ def test_an_interrupted_stage_interrupts_the_chain(monkeypatch, tmp_path):
 
 
 def begun(tmp_path, monkeypatch, config=None):
-    """A chain that was interrupted at its third stage; the words of all stages that are begun from then on."""
+    """A chain that was interrupted at its third stage; the words of all stages that are
+    begun from then on.
+    """
     seen = []
 
     def run(words):
@@ -177,18 +242,26 @@ def begun(tmp_path, monkeypatch, config=None):
 
 
 def test_settings_that_differ_are_refused_at_every_resume(tmp_path, monkeypatch):
-    """The first refusal once left the new settings in the folder: the second resume went on to a mixture."""
+    """The first refusal once left the new settings in the folder: the second resume
+    went on to a mixture.
+    """
     seen = begun(tmp_path, monkeypatch)
     for _ in range(2):
         with pytest.raises(ConfigError, match="begun with other settings"):
-            demo.run(demo.Options(tmp_path / "out", aperture_mm=0.37, resume=True, quiet=True))
+            demo.run(
+                demo.Options(
+                    tmp_path / "out", aperture_mm=0.37, resume=True, quiet=True
+                )
+            )
     assert len(seen) == 3
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
     assert seen[3] == "psf"
 
 
 def test_nothing_is_written_but_beside_the_output(tmp_path, monkeypatch):
-    """Settings that were compared in the folder for temporary files stayed there when the chain was killed."""
+    """Settings that were compared in the folder for temporary files stayed there when
+    the chain was killed.
+    """
     begun(tmp_path, monkeypatch)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
     assert demo.run(demo.Options(tmp_path / "out", resume=True, quiet=True)) == 0
@@ -201,10 +274,14 @@ def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     for name in "dp":
         (tmp_path / f"{name}.toml").write_text("")
     (tmp_path / "c.toml").write_text('n = "table.csv"\n')
-    (tmp_path / "chain.toml").write_text('cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n')
+    (tmp_path / "chain.toml").write_text(
+        'cell = "c.toml"\ndesign = "d.toml"\nprocess = "p.toml"\nbudget = false\n'
+    )
     seen = begun(tmp_path, monkeypatch, config=tmp_path / "chain.toml")
     assert (tmp_path / "out.unfinished" / "table.csv").read_text() == "1,2\n"
-    again = demo.Options(tmp_path / "out", config=tmp_path / "chain.toml", resume=True, quiet=True)
+    again = demo.Options(
+        tmp_path / "out", config=tmp_path / "chain.toml", resume=True, quiet=True
+    )
     (tmp_path / "table.csv").write_text("1,3\n")
     with pytest.raises(ConfigError, match="begun with other settings"):
         demo.run(again)
@@ -213,8 +290,12 @@ def test_a_table_that_was_edited_since_is_other_settings(tmp_path, monkeypatch):
     assert seen[3] == "psf"
 
 
-def test_an_interrupt_on_the_way_back_from_the_folder_leaves_no_scratch(tmp_path, monkeypatch):
-    """The chain's folder stays the current one then, and what was claimed by a relative path was looked for in it."""
+def test_an_interrupt_on_the_way_back_from_the_folder_leaves_no_scratch(
+    tmp_path, monkeypatch
+):
+    """The chain's folder stays the current one then, and what was claimed by a relative
+    path was looked for in it.
+    """
     change = os.chdir
 
     def interrupted(path):
@@ -230,10 +311,19 @@ def test_an_interrupt_on_the_way_back_from_the_folder_leaves_no_scratch(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["out.unfinished"]
 
 
-def test_nothing_of_other_settings_stays_where_no_stage_was_finished(tmp_path, monkeypatch):
-    """After a kill in the first stage: a bench that the second chain has not would stand in the finished folder."""
-    for name, more in (("long", 'bench_truth = "b.toml"\nbench_design = "d.toml"\n'), ("short", "")):
-        files = "".join(f'{key} = "{key[0]}.toml"\n' for key in ("cell", "design", "process"))
+def test_nothing_of_other_settings_stays_where_no_stage_was_finished(
+    tmp_path, monkeypatch
+):
+    """After a kill in the first stage: a bench that the second chain has not would
+    stand in the finished folder.
+    """
+    for name, more in (
+        ("long", 'bench_truth = "b.toml"\nbench_design = "d.toml"\n'),
+        ("short", ""),
+    ):
+        files = "".join(
+            f'{key} = "{key[0]}.toml"\n' for key in ("cell", "design", "process")
+        )
         (tmp_path / f"{name}.toml").write_text(f"{files}budget = false\n{more}")
     for name, text in (("c", 'n = "table.csv"\n'), ("d", ""), ("p", ""), ("b", "")):
         (tmp_path / f"{name}.toml").write_text(text)
@@ -242,9 +332,25 @@ def test_nothing_of_other_settings_stays_where_no_stage_was_finished(tmp_path, m
     for name in (demo.OUTCOMES, "process.toml"):
         (tmp_path / "out.unfinished" / name).unlink()
     (tmp_path / "c.toml").write_text("n = 1.5\n")
-    assert demo.run(demo.Options(tmp_path / "out", config=tmp_path / "short.toml", resume=True, quiet=True)) == 0
+    assert (
+        demo.run(
+            demo.Options(
+                tmp_path / "out",
+                config=tmp_path / "short.toml",
+                resume=True,
+                quiet=True,
+            )
+        )
+        == 0
+    )
     made = {path.name for path in (tmp_path / "out").iterdir()}
-    assert made == {"cell.toml", "design.toml", "process.toml", demo.OUTCOMES, manifest.NAME}
+    assert made == {
+        "cell.toml",
+        "design.toml",
+        "process.toml",
+        demo.OUTCOMES,
+        manifest.NAME,
+    }
 
 
 def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch):
@@ -257,7 +363,8 @@ def test_a_damaged_line_of_outcomes_is_a_stage_to_do_again(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("found", "told"), [(6043.0, "6000 counts"), (7.13e-7, "7.1e-07 counts"), ({"a": [3, 5]}, "2 counts")]
+    ("found", "told"),
+    [(6043.0, "6000 counts"), (7.13e-7, "7.1e-07 counts"), ({"a": [3, 5]}, "2 counts")],
 )
 def test_errors_of_the_page_have_no_power_of_ten_where_none_is_needed(found, told):
     stage = chain.Stage("Captures", "", ("capture",), ("peak", "counts"))

@@ -1,4 +1,6 @@
-"""``metalens library`` over two sizes: what is said, written and shown; failures of the result end with 1."""
+"""``metalens library`` over two sizes: what is said, written and shown; failures of the
+result end with 1.
+"""
 
 import dataclasses
 import json
@@ -32,42 +34,61 @@ tolerance = 0.1
 
 def made(folder, capsys, *, ratio=""):
     (folder / "cell.toml").write_text(CELL.format(ratio=ratio))
-    status = main(["library", str(folder / "cell.toml"), "-o", str(folder / "axes.h5"), "--json"])
+    status = main(
+        ["library", str(folder / "cell.toml"), "-o", str(folder / "axes.h5"), "--json"]
+    )
     told = capsys.readouterr()
     return status, json.loads(told.out) if status < 2 else told.err
 
 
-def test_a_library_over_two_sizes_is_written_shown_and_right(tmp_path, capsys, fine_pictures):
+def test_a_library_over_two_sizes_is_written_shown_and_right(
+    tmp_path, capsys, fine_pictures
+):
     status, told = made(tmp_path, capsys)
     assert status == 0
     assert told["failures"] == []
     assert told["usable"] == 1.0
     library = axes.load(tmp_path / "axes.h5")
-    assert told["entries"] == library.t_error.size == 24 * 17  # 17 steps of 150/23 nm are more than the 110 nm along x
+    assert (
+        told["entries"] == library.t_error.size == 24 * 17
+    )  # 17 steps of 150/23 nm are more than the 110 nm along x
     assert np.diff(library.x_um) == pytest.approx(np.diff(library.y_um)[0])
     assert "cell.toml" in library.provenance.inputs
     i, j = 9, 17
     x, y = float(library.x_um[i]), float(library.y_um[j])
-    exact = rcwa.jones(axes.sized(library.cell, x, y), x, 0.71, harmonics=told["harmonics"] + 3)
+    exact = rcwa.jones(
+        axes.sized(library.cell, x, y), x, 0.71, harmonics=told["harmonics"] + 3
+    )
     assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
     assert (tmp_path / "axes.png").stat().st_size > 20_000
     panels = artefacts.axes_panels(tmp_path / "axes.h5")
-    assert panels[1].values[1, 0, j, i] == pytest.approx(abs(library.t[0, i, j, 1, 1]))  # rows of the image: along y
+    assert panels[1].values[1, 0, j, i] == pytest.approx(
+        abs(library.t[0, i, j, 1, 1])
+    )  # rows of the image: along y
     assert main(["view", str(tmp_path / "axes.h5"), "--quiet"]) == 0
 
 
 def test_bars_above_the_tolerance_fail_and_a_ratio_is_refused(tmp_path, capsys):
     axis = np.array([0.1, 0.11, 0.12])
-    sweep = Sweep((0.7,), diameters_um=(0.1, 0.12), lengths_um=(0.1, 0.12), tolerance=0.03)
+    sweep = Sweep(
+        (0.7,), diameters_um=(0.1, 0.12), lengths_um=(0.1, 0.12), tolerance=0.03
+    )
     bars = np.array([0.02, 0.04, 0.05])[None, :, None] * np.ones((1, 3, 3))
     held = np.array([[0, 0.1, 0.11, 0.021, 0.02], [0, 0.11, 0.1, 0.001, 0.04]])
     t = np.ones((1, 3, 3, 2, 2), complex)
-    found = axes.AxesLibrary(Cell(0.3), sweep, np.array([0.7]), axis, axis, t, bars, held, 9, 5)
+    found = axes.AxesLibrary(
+        Cell(0.3), sweep, np.array([0.7]), axis, axis, t, bars, held, 9, 5
+    )
     assert [line.split(":")[0] for line in axes_library.failures(found)] == [
         "error bars of 67% of the pairs of sizes are above the tolerance 0.03 (median 0.04)",
         "1 of 2 pairs held out lie above their error bar",
     ]
-    assert axes_library.failures(dataclasses.replace(found, t_error=bars / 2, held_out=held[1:])) == []
+    assert (
+        axes_library.failures(
+            dataclasses.replace(found, t_error=bars / 2, held_out=held[1:])
+        )
+        == []
+    )
     status, told = made(tmp_path, capsys, ratio="\nratio = 0.5")
     assert status == 2
     assert "leave ratio out" in told

@@ -1,4 +1,6 @@
-"""``metalens design`` and ``psf`` of a lens for circular light, from a library with a known pillar."""
+"""``metalens design`` and ``psf`` of a lens for circular light, from a library with a
+known pillar.
+"""
 
 import json
 import math
@@ -38,50 +40,128 @@ def folder(tmp_path_factory):
     where = tmp_path_factory.mktemp("circular")
     c, sizes = (T_X - T_Y) / 2, np.linspace(0.2, 0.26, 20)
     t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
-    proxy = Proxy(np.array([[np.angle(c), 0.0]]), np.array([[abs(c), 0.0]]), (0.2, 0.26), (0.94, 0.94), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[np.angle(c), 0.0]]),
+        np.array([[abs(c), 0.0]]),
+        (0.2, 0.26),
+        (0.94, 0.94),
+        0.0,
+        0.0,
+    )
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
-    turned = Turned(0.23, 0.94, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None])
-    cell, sweep = Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5)), library.Sweep((0.94,), light="circular")
+    turned = Turned(
+        0.23, 0.94, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None]
+    )
+    cell, sweep = (
+        Cell(0.41, 0.5, Index(3.6), shape=Rectangle(0.5)),
+        library.Sweep((0.94,), light="circular"),
+    )
     small = np.full(t.shape, 1e-3)
     about = (t, t * 0, small, small, np.empty((0, 5)), "rcwa", 1, proxy)
-    made = library.PillarLibrary(cell, sweep, ("x", "y"), np.zeros(1), np.array([0.94]), sizes, *about, turned=turned)
+    made = library.PillarLibrary(
+        cell,
+        sweep,
+        ("x", "y"),
+        np.zeros(1),
+        np.array([0.94]),
+        sizes,
+        *about,
+        turned=turned,
+    )
     library.save(where / "known.h5", made)
     (where / "psf.toml").write_text(PSF)
     for hand in ("right", "left"):
         (where / f"{hand}.toml").write_text(DESIGN.replace("HAND", hand))
-    assert main(["design", str(where / "right.toml"), "-o", str(where / "right.h5"), "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "design",
+                str(where / "right.toml"),
+                "-o",
+                str(where / "right.h5"),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     return where
 
 
 def test_a_design_without_a_wavelength_takes_the_one_of_its_library(folder, capsys):
-    (folder / "silent.toml").write_text(DESIGN.replace("HAND", "right").replace("wavelength_nm = 940.0\n", ""))
-    assert main(["design", str(folder / "silent.toml"), "-o", str(folder / "silent.h5"), "--skip-focus-check"]) == 0
+    (folder / "silent.toml").write_text(
+        DESIGN.replace("HAND", "right").replace("wavelength_nm = 940.0\n", "")
+    )
+    assert (
+        main(
+            [
+                "design",
+                str(folder / "silent.toml"),
+                "-o",
+                str(folder / "silent.h5"),
+                "--skip-focus-check",
+            ]
+        )
+        == 0
+    )
     assert "0.021 mm, 940 nm" in capsys.readouterr().out
-    assert lenses.load(folder / "silent.h5").wavelength_um == pytest.approx(0.94, rel=1e-12)  # nm to um and back
+    assert lenses.load(folder / "silent.h5").wavelength_um == pytest.approx(
+        0.94, rel=1e-12
+    )  # nm to um and back
 
 
 @pytest.mark.parametrize("hand", ["right", "left"])
 def test_design_and_psf_of_either_hand(folder, capsys, hand):
     target = folder / f"{hand}_own.h5"
-    assert main(["design", str(folder / f"{hand}.toml"), "-o", str(target), "--json", "--skip-focus-check"]) == 0
+    assert (
+        main(
+            [
+                "design",
+                str(folder / f"{hand}.toml"),
+                "-o",
+                str(target),
+                "--json",
+                "--skip-focus-check",
+            ]
+        )
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert found["circular"]["hand"] == hand
     assert found["circular"]["converted"] == pytest.approx(abs(T_X - T_Y) ** 2 / 4)
     assert found["circular"]["isolated_error"] == pytest.approx(0, abs=1e-9)
     assert lenses.load(target).hand == hand
     out = folder / f"psf_{hand}.h5"
-    assert main(["psf", str(target), "--config", str(folder / "psf.toml"), "-o", str(out), "--json"]) == 0
+    assert (
+        main(
+            [
+                "psf",
+                str(target),
+                "--config",
+                str(folder / "psf.toml"),
+                "-o",
+                str(out),
+                "--json",
+            ]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["converged"]
 
 
 def test_the_image_is_that_of_the_converted_light(folder):
-    """Energy: |t_x - t_y|² / 4 of what falls on the aperture, 2 % of it beyond the window (Airy rings)."""
+    """Energy: |t_x - t_y|² / 4 of what falls on the aperture, 2 % of it beyond the
+    window (Airy rings).
+    """
     from metalens import psf
 
     lens = lenses.load(folder / "right.h5")
-    stack = psf.from_lens(lens, psf.View((math.inf,), window_um=24.0, samples=121), tolerance=1e-3)
-    given = np.count_nonzero(lens.diameters.diameter_um) * 0.41**2 * abs(T_X - T_Y) ** 2 / 4
+    stack = psf.from_lens(
+        lens, psf.View((math.inf,), window_um=24.0, samples=121), tolerance=1e-3
+    )
+    given = (
+        np.count_nonzero(lens.diameters.diameter_um) * 0.41**2 * abs(T_X - T_Y) ** 2 / 4
+    )
     assert 0.94 < float(stack.energy_um2[0, 0]) / given < 1.0
 
 

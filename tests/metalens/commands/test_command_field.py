@@ -35,11 +35,18 @@ def here(tmp_path, monkeypatch):
 
 
 FIRST = ["field", "cell.toml", "--diameter-um", "0.2"]
-WORDS = [*FIRST, *("--samples", "12", "--angle-deg", "12"), *("--polarization", "y", "--tolerance", "0.5")]
+WORDS = [
+    *FIRST,
+    *("--samples", "12", "--angle-deg", "12"),
+    *("--polarization", "y", "--tolerance", "0.5"),
+]
 
 
 def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
-    assert main([*WORDS, "--heights-um", "0.1", "0.3", "--around-um", "0.2", "--quiet"]) == 0
+    assert (
+        main([*WORDS, "--heights-um", "0.1", "0.3", "--around-um", "0.2", "--quiet"])
+        == 0
+    )
     stored = store.load(here / "field.h5", "near-field")
     held, step = stored.arrays, 0.34 / 12
     assert held["x_um"] == pytest.approx((np.arange(12) - 5.5) * step)
@@ -53,7 +60,9 @@ def test_the_file_holds_the_fields_of_the_engine_on_square_pixels(here):
     light = Light(0.83, np.radians(12.0), "y")
     grid = {"x_um": held["x_um"], "y_um": held["y_um"], "z_um": [0.1, 0.3]}
     same = rcwa.near_field(cell, 0.2, light, **grid, tolerance=0.5)
-    assert np.abs(held["xy/h"] - same.h).max() < 1e-9 * np.abs(same.h).max()  # products of other widths: three planes
+    assert (
+        np.abs(held["xy/h"] - same.h).max() < 1e-9 * np.abs(same.h).max()
+    )  # products of other widths: three planes
     assert np.array_equal(held["xy/index"], same.index)
     assert stored.attributes["error_xy"] == pytest.approx(same.error, rel=1e-6)
     assert stored.attributes["wavelength_um"] == 0.83
@@ -72,7 +81,9 @@ def test_info_and_view_show_it(here, capsys):
     assert across.axes[1].values == pytest.approx([102.5, 205.0, 307.5])
     assert across.step_um == pytest.approx(0.34 / 12)
     size = np.sqrt((np.abs(held["xz/e"]) ** 2).sum(axis=0))
-    assert along.values[0] == pytest.approx(size[::-1])  # light goes upwards on the page
+    assert along.values[0] == pytest.approx(
+        size[::-1]
+    )  # light goes upwards on the page
     assert other.values[2] == pytest.approx(np.abs(held["yz/e"][1])[::-1])
     assert across.values[5] == pytest.approx(held["xy/index"].real)
 
@@ -82,7 +93,10 @@ def within(*errors):
 
     def found(*about, **how):
         made = rcwa.near_fields(*about, **{**how, "harmonics": 2})
-        return [dataclasses.replace(one, error=error) for one, error in zip(made, errors, strict=True)]
+        return [
+            dataclasses.replace(one, error=error)
+            for one, error in zip(made, errors, strict=True)
+        ]
 
     return found
 
@@ -91,17 +105,30 @@ def test_a_bar_above_the_tolerance_is_a_failure(here, monkeypatch, capsys):
     monkeypatch.setattr(field, "near_fields", within(0.2, 0.49, 0.3))
     assert main([*WORDS[:-1], "1e-6"]) == 1
     told = capsys.readouterr().out
-    assert "FAILED: xz, yz, xy above the tolerance 1e-06 at 13 orders: allow a larger one; fields" in told
-    assert main([*WORDS[:-2], "--force"]) == 0  # none is stated: what is reached is told
+    assert (
+        "FAILED: xz, yz, xy above the tolerance 1e-06 at 13 orders: allow a larger one; fields"
+        in told
+    )
+    assert (
+        main([*WORDS[:-2], "--force"]) == 0
+    )  # none is stated: what is reached is told
     told = capsys.readouterr().out
-    assert "xz, yz, xy above the tolerance 0.1 at 13 orders: fields at edges converge slowly" in told
+    assert (
+        "xz, yz, xy above the tolerance 0.1 at 13 orders: fields at edges converge slowly"
+        in told
+    )
     assert "FAILED" not in told
 
 
-def test_a_field_that_is_not_known_within_half_is_a_failure_though_none_is_stated(here, monkeypatch, capsys):
+def test_a_field_that_is_not_known_within_half_is_a_failure_though_none_is_stated(
+    here, monkeypatch, capsys
+):
     monkeypatch.setattr(field, "near_fields", within(0.3, 0.51, 0.2))
     assert main(WORDS[:-2]) == 1
-    assert "FAILED: xz, yz, xy above the tolerance 0.1 at 13 orders: fields" in capsys.readouterr().out
+    assert (
+        "FAILED: xz, yz, xy above the tolerance 0.1 at 13 orders: fields"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(

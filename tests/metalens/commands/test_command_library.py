@@ -1,4 +1,6 @@
-"""``metalens library`` and ``metalens study``: what they write, what they refuse, and how they end."""
+"""``metalens library`` and ``metalens study``: what they write, what they refuse, and
+how they end.
+"""
 
 import json
 
@@ -44,7 +46,9 @@ def test_library_with_proxy_and_figure(cell, tmp_path, capsys):
     values = json.loads(capsys.readouterr().out)
     assert values["turns"] >= 1
     assert values["max_error"] <= 1e-2
-    assert values["max_phase_error_rad"] <= values["entry_error"]  # the polynomials add less than their entries err by
+    assert (
+        values["max_phase_error_rad"] <= values["entry_error"]
+    )  # the polynomials add less than their entries err by
     assert files(tmp_path) == ["cell.toml", "library.h5", "library.png"]
     made = library.load(tmp_path / "library.h5")
     assert made.proxy is not None
@@ -66,7 +70,10 @@ def test_a_material_table_is_named_in_the_provenance(cell, tmp_path, capsys):
     table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.59,0\n")
     assert cell(QUICK.replace("{ n = 3.6, k = 0.0 }", f'"{table}"'), "--quiet") == 0
     assert capsys.readouterr().out == ""
-    assert library.load(tmp_path / "library.h5").provenance.inputs.keys() == {"cell.toml", "film.csv"}
+    assert library.load(tmp_path / "library.h5").provenance.inputs.keys() == {
+        "cell.toml",
+        "film.csv",
+    }
 
 
 def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
@@ -80,9 +87,14 @@ def test_less_than_a_turn_fails_its_check(cell, tmp_path, capsys):
 def test_a_proxy_that_misses_its_tolerances_fails_its_check(cell, tmp_path, capsys):
     assert cell(QUICK + "[proxy]\nphase_tolerance_rad = 1e-15\n") == 1
     told = capsys.readouterr().out
-    assert "a lens needs 1: the pillars cover 1." in told  # more samples, not another cell
+    assert (
+        "a lens needs 1: the pillars cover 1." in told
+    )  # more samples, not another cell
     assert "where 1e-15 and" in told
-    assert any("where 1e-15 and" in note for note in library.load(tmp_path / "library.h5").notes)
+    assert any(
+        "where 1e-15 and" in note
+        for note in library.load(tmp_path / "library.h5").notes
+    )
 
 
 SQUARES = """
@@ -112,18 +124,27 @@ def known_within(d, bars):
     return swept
 
 
-def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(cell, monkeypatch, capsys):
-    """A smooth curve with bars of 0.012, wider beside one size: told, and no failure unless 1e-2 was asked for."""
+def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(
+    cell, monkeypatch, capsys
+):
+    """A smooth curve with bars of 0.012, wider beside one size: told, and no failure
+    unless 1e-2 was asked for.
+    """
     d = np.linspace(0.12, 0.2, 40)
     bars = np.where(np.abs(d - 0.13) < 3e-3, 0.05, 0.012)
     monkeypatch.setattr(library, "sweep", known_within(d, bars))
     assert cell(SQUARES, "--accept-partial-turn") == 0
     told = capsys.readouterr().out
     assert "3 of 40 error bars are above the tolerance 0.02 (largest 0.05)" in told
-    assert f"own error bars are {np.sqrt(np.mean((bars / 0.95) ** 2)):.1e} of |t|" in told
+    assert (
+        f"own error bars are {np.sqrt(np.mean((bars / 0.95) ** 2)):.1e} of |t|" in told
+    )
     assert "FAILED" not in told  # the ripple of 3 mrad lies within half of the bars
     assert cell(SQUARES + "tolerance = 1e-2\n", "--accept-partial-turn", "--force") == 1
-    assert "FAILED: 40 of 40 error bars are above the tolerance 0.01" in capsys.readouterr().out
+    assert (
+        "FAILED: 40 of 40 error bars are above the tolerance 0.01"
+        in capsys.readouterr().out
+    )
     asked = SQUARES + "[proxy]\nphase_tolerance_rad = 1e-3\n"
     assert cell(asked, "--accept-partial-turn", "--force") == 1
     assert "FAILED: the proxy follows the phase within" in capsys.readouterr().out
@@ -150,7 +171,9 @@ def test_squares_that_state_no_tolerance_have_the_bars_of_their_solver(cell, mon
         ("tolerance = 1e-2", "tolerance = ", "not valid TOML"),
     ],
 )
-def test_bad_input_ends_with_2_and_writes_nothing(cell, tmp_path, capsys, old, new, words):
+def test_bad_input_ends_with_2_and_writes_nothing(
+    cell, tmp_path, capsys, old, new, words
+):
     assert old in QUICK
     assert cell(QUICK.replace(old, new)) == 2
     assert words in capsys.readouterr().err
@@ -161,15 +184,31 @@ def test_missing_config_and_folder(tmp_path, capsys):
     assert main(["library", str(tmp_path / "none.toml")]) == 2
     assert "none.toml: no such file" in capsys.readouterr().err
     (tmp_path / "cell.toml").write_text(QUICK)
-    assert main(["library", str(tmp_path / "cell.toml"), "-o", str(tmp_path / "no" / "l.h5")]) == 2
+    assert (
+        main(
+            [
+                "library",
+                str(tmp_path / "cell.toml"),
+                "-o",
+                str(tmp_path / "no" / "l.h5"),
+            ]
+        )
+        == 2
+    )
     assert "does not exist" in capsys.readouterr().err
 
 
 def test_the_example_is_the_default_cell(request):
     example = request.config.rootpath / "examples" / "cell.toml"
     assert config.load(example, CellFile).cell == DEFAULT_CELL
-    assert config.loads("", CellFile).sweep.settled(DEFAULT_CELL) == config.load(example, CellFile).sweep
-    assert config.loads("", CellFile).proxy.settled(0.0) == config.load(example, CellFile).proxy
+    assert (
+        config.loads("", CellFile).sweep.settled(DEFAULT_CELL)
+        == config.load(example, CellFile).sweep
+    )
+    assert (
+        config.loads("", CellFile).proxy.settled(0.0)
+        == config.load(example, CellFile).proxy
+    )
 
 
 STUDY = """
@@ -188,7 +227,12 @@ def test_study(tmp_path, capsys):
     assert main(["study", str(path), "-o", str(out), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["pitch_um"], told["cells"]) == (0.3, 1)  # no other material is tried
-    assert files(out) == ["README.md", "cell_study.json", "cell_study.png", "manifest.json"]
+    assert files(out) == [
+        "README.md",
+        "cell_study.json",
+        "cell_study.png",
+        "manifest.json",
+    ]
     assert main(["study", str(path), "-o", str(out)]) == 2
     assert "give --force" in capsys.readouterr().err
     path.write_text(STUDY.replace("0.7", "0.2"))
@@ -216,19 +260,35 @@ substrate = "sapphire"
 
 
 def test_study_of_any_cell_within_a_process(tmp_path, capsys):
-    path, process, out = tmp_path / "study.toml", tmp_path / "process.toml", tmp_path / "study"
+    path, process, out = (
+        tmp_path / "study.toml",
+        tmp_path / "process.toml",
+        tmp_path / "study",
+    )
     path.write_text(ANY_CELL)
-    process.write_text("[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n")
-    assert main(["study", str(path), "--process", str(process), "-o", str(out), "--json"]) == 1  # a stretch this short
+    process.write_text(
+        "[rules]\nminimum_feature_nm = 310\nminimum_gap_nm = 240\ndiameter_step_nm = 10\n"
+    )
+    assert (
+        main(["study", str(path), "--process", str(process), "-o", str(out), "--json"])
+        == 1
+    )  # a stretch this short
     page = (out / "README.md").read_text()
-    assert "Pillars of Si-infrared on sapphire under air: circle on a square lattice" in page
+    assert (
+        "Pillars of Si-infrared on sapphire under air: circle on a square lattice"
+        in page
+    )
     found = json.loads((out / "cell_study.json").read_text())
     assert found["study"]["min_diameter_um"] >= 0.31
-    assert 0.23 <= found["study"]["min_gap_um"] < 0.24  # 0.24 between drawn polygons, whose flats lie inside the circle
+    assert (
+        0.23 <= found["study"]["min_gap_um"] < 0.24
+    )  # 0.24 between drawn polygons, whose flats lie inside the circle
     verdict = found["verdicts"][0]
     assert verdict["pitch_um"] == 0.62
     assert verdict["pillar"] == "Si-infrared"
-    assert verdict["max_angle_deg"] == pytest.approx(48.9, abs=0.4)  # sin = 1.55/0.62 - 1.7462
+    assert verdict["max_angle_deg"] == pytest.approx(
+        48.9, abs=0.4
+    )  # sin = 1.55/0.62 - 1.7462
     capsys.readouterr()
     path.write_text(ANY_CELL.replace("[cell]", 'pillar = "Si"\n[cell]'))
     assert main(["study", str(path), "-o", str(out), "--force"]) == 2
@@ -238,7 +298,9 @@ def test_study_of_any_cell_within_a_process(tmp_path, capsys):
 def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_asked(
     cell, tmp_path, monkeypatch, capsys
 ):
-    """Bars of 0.2 of |t|: no curve, tolerance or coverage that is accepted makes them good."""
+    """Bars of 0.2 of |t|: no curve, tolerance or coverage that is accepted makes them
+    good.
+    """
     d = np.linspace(0.12, 0.2, 40)
     few = np.where(np.arange(40) < 21, 0.09, 0.12)
     loose = "[proxy]\nphase_tolerance_rad = 0.5\ntransmission_tolerance = 0.5\n"
@@ -248,31 +310,55 @@ def test_pillars_that_are_hardly_known_make_no_library_and_no_lens_whatever_is_a
         assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 1
         told.append(capsys.readouterr().out)
     assert "error bars of 100% of the entries are above 0.1" in told[0]
-    assert "FAILED: the pillars' own error bars are 0.2 of |t| (root mean square)" in told[0]
+    assert (
+        "FAILED: the pillars' own error bars are 0.2 of |t| (root mean square)"
+        in told[0]
+    )
     assert "of the entries are above 0.1" not in told[1]  # 48 % of them
     many = known_within(d, np.where(np.arange(40) < 19, 0.09, 0.12))(DEFAULT_CELL)
     failures = command._failures(many, None, "", stated=False)
-    assert "error bars of 52% of the entries are above 0.1, whatever is asked for" in failures
+    assert (
+        "error bars of 52% of the entries are above 0.1, whatever is asked for"
+        in failures
+    )
     assert "FAILED: the pillars' own error bars are 0.11 of |t|" in told[1]
     config = 'library = "library.h5"\naperture_mm = 0.006\nsensor_distance_mm = 0.2\nsource_distance_mm = inf\n'
-    (tmp_path / "design.toml").write_text(config + "[limits]\nmin_diameter_nm = 80\nmin_gap_nm = 80\n")
-    words = ["design", str(tmp_path / "design.toml"), "-o", str(tmp_path / "lens.h5"), "--accept-partial-turn"]
+    (tmp_path / "design.toml").write_text(
+        config + "[limits]\nmin_diameter_nm = 80\nmin_gap_nm = 80\n"
+    )
+    words = [
+        "design",
+        str(tmp_path / "design.toml"),
+        "-o",
+        str(tmp_path / "lens.h5"),
+        "--accept-partial-turn",
+    ]
     assert main([*words, "--skip-focus-check"]) == 1
-    assert "FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out
+    assert (
+        "FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out
+    )
     monkeypatch.setattr(library, "sweep", known_within(d, 0.05 + 0 * d))
     assert cell(SQUARES + loose, "--accept-partial-turn", "--force") == 0
     assert main([*words, "--skip-focus-check", "--force"]) == 0
     assert "FAILED" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("turned", "told"), [("", True), ("angle_rad = 0.7853981633974483\n", False)])
+@pytest.mark.parametrize(
+    ("turned", "told"), [("", True), ("angle_rad = 0.7853981633974483\n", False)]
+)
 def test_light_that_a_shape_without_a_mirror_along_x_or_y_sends_elsewhere_is_told(
     cell, monkeypatch, capsys, turned, told
 ):
     """|t| of 0.95 and no reflection leave 1 - 0.95² for the other polarisation."""
-    hook = "[[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]]"
+    hook = (
+        "[[-0.5, -0.5], [0.5, -0.5], [0.5, 0.0], [0.0, 0.0], [0.0, 0.5], [-0.5, 0.5]]"
+    )
     shape = f'kind = "polygon"\ncorners = {hook}\n{turned}'
     d = np.linspace(0.12, 0.2, 40)
     monkeypatch.setattr(library, "sweep", known_within(d, 0.01 + 0 * d))
-    assert cell(SQUARES.replace('kind = "square"\n', shape), "--accept-partial-turn") == 0
-    assert ("up to 10% of it leaves along y, or is absorbed" in capsys.readouterr().out) is told
+    assert (
+        cell(SQUARES.replace('kind = "square"\n', shape), "--accept-partial-turn") == 0
+    )
+    assert (
+        "up to 10% of it leaves along y, or is absorbed" in capsys.readouterr().out
+    ) is told

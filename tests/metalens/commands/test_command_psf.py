@@ -29,10 +29,32 @@ samples = 24
 def small_lens(n=64):
     x = (np.arange(n) - (n - 1) / 2) * 0.4
     r2 = x**2 + x[:, None] ** 2
-    phase = -2 * np.pi / 0.85 * (r2 / (np.sqrt(r2 + 120.0**2) + 120) + r2 / (np.sqrt(r2 + 1300.0**2) + 1300))
-    diameter = np.where(r2 < x[-1] ** 2, 0.1 + 0.2 * np.mod(phase, 2 * np.pi) / (2 * np.pi), 0)
-    proxy = Proxy(np.array([[np.pi, np.pi]]), np.array([[0.9, 0.0]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
-    return lens.Lens(lens.DiameterMap(diameter, 0.4), Cell(pitch_um=0.4), proxy, 0.85, 120.0, 1300.0, "hyperbolic")
+    phase = (
+        -2
+        * np.pi
+        / 0.85
+        * (r2 / (np.sqrt(r2 + 120.0**2) + 120) + r2 / (np.sqrt(r2 + 1300.0**2) + 1300))
+    )
+    diameter = np.where(
+        r2 < x[-1] ** 2, 0.1 + 0.2 * np.mod(phase, 2 * np.pi) / (2 * np.pi), 0
+    )
+    proxy = Proxy(
+        np.array([[np.pi, np.pi]]),
+        np.array([[0.9, 0.0]]),
+        (0.1, 0.3),
+        (0.85, 0.85),
+        0.0,
+        0.0,
+    )
+    return lens.Lens(
+        lens.DiameterMap(diameter, 0.4),
+        Cell(pitch_um=0.4),
+        proxy,
+        0.85,
+        120.0,
+        1300.0,
+        "hyperbolic",
+    )
 
 
 @pytest.fixture
@@ -44,7 +66,15 @@ def folder(tmp_path):
 
 def command(folder, *more):
     return main(
-        ["psf", str(folder / "lens.h5"), "-o", str(folder / "psf.h5"), "--config", str(folder / "psf.toml"), *more]
+        [
+            "psf",
+            str(folder / "lens.h5"),
+            "-o",
+            str(folder / "psf.h5"),
+            "--config",
+            str(folder / "psf.toml"),
+            *more,
+        ]
     )
 
 
@@ -77,23 +107,32 @@ def test_command_writes_stack_pictures_and_report(folder, capsys):
     assert np.linalg.norm(stack.intensity[1] - want) < 1e-4 * np.linalg.norm(want)
 
 
-def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(folder, monkeypatch):
-    """Rows and tilted pillars are solved at its own aperture and the largest angle; without them it says rough.
+def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(
+    folder, monkeypatch
+):
+    """Rows and tilted pillars are solved at its own aperture and the largest angle;
+    without them it says rough.
 
-    A fifth of what the rows change is left: here they leave 0.81 of the light where it is turned by 0.2, in the PSFs
-    too. What they take meets the focus again, spread over the lens's shadow: ‖2 Re U* n‖² = 2 P ∫|U|² / area, with the
+    A fifth of what the rows change is left: here they leave 0.81 of the light where it
+    is turned by 0.2, in the PSFs
+    too. What they take meets the focus again, spread over the lens's shadow: ‖2 Re U*
+    n‖² = 2 P ∫|U|² / area, with the
     Airy disc of a lens of this aperture."""
     asked = []
 
     factor = np.full((2, 2), 0.9 + 0j)
-    known = Neighbours(np.array([0.4, 0.2]), np.zeros(2, bool), factor, factor, np.zeros(2), 0.85)
+    known = Neighbours(
+        np.array([0.4, 0.2]), np.zeros(2, bool), factor, factor, np.zeros(2), 0.85
+    )
 
     def rows(_, *, counts):
         asked.append(counts)
         return known
 
     monkeypatch.setattr("metalens.design.own_cell.neighbours", rows)
-    monkeypatch.setattr("metalens.design.own_cell.angle_change", lambda _, tilt: 0.03 * np.sin(tilt))
+    monkeypatch.setattr(
+        "metalens.design.own_cell.angle_change", lambda _, tilt: 0.03 * np.sin(tilt)
+    )
     assert command(folder, "--quiet") == 0
     rough = psf.load(folder / "psf.h5")
     (folder / "psf.toml").write_text(SETTINGS + "own_cell = true\n")
@@ -103,11 +142,25 @@ def test_the_budget_takes_the_terms_of_the_lens_s_own_cell_where_asked(folder, m
     assert rough.budget.neighbours > 0
     made = small_lens()
     edge = of_lens.aperture(made, (0.0, 0.0))
-    kept = integrate.quad(lambda s: float(abs(known.mean(np.array(s))) ** 2) * 2 * s / edge**2, 0, edge)[0]
-    airy = integrate.quad(lambda x: (2 * special.j1(x) / x) ** 4 * x, 1e-9, 60, limit=200)[0] / 2**2
+    kept = integrate.quad(
+        lambda s: float(abs(known.mean(np.array(s))) ** 2) * 2 * s / edge**2, 0, edge
+    )[0]
+    airy = (
+        integrate.quad(lambda x: (2 * special.j1(x) / x) ** 4 * x, 1e-9, 60, limit=200)[
+            0
+        ]
+        / 2**2
+    )
     wide_um2 = 2 * np.pi * (0.85 / (2 * np.pi * edge)) ** 2 / airy
-    scattered = math.sqrt(2 * (1 - kept) / kept * wide_um2 / (made.diameters.pillars * made.cell.pitch_um**2))
-    # 2 %: the cone of 15 degrees is a little narrower, and 1 / (1 - s²) is left out here
+    scattered = math.sqrt(
+        2
+        * (1 - kept)
+        / kept
+        * wide_um2
+        / (made.diameters.pillars * made.cell.pitch_um**2)
+    )
+    # 2 %: the cone of 15 degrees is a little narrower, and 1 / (1 - s²) is left out
+    # here
     assert 0.98 * scattered < own.budget.neighbours < math.hypot(1.02 * scattered, 0.05)
     assert (own.energy_um2 < 0.99 * rough.energy_um2).all()
     assert own.budget.angle == pytest.approx(0.03 * np.sin(np.deg2rad(15.0)))
@@ -124,7 +177,13 @@ def test_nothing_is_overwritten_without_force(folder):
 
 @pytest.mark.parametrize(
     "text",
-    ["depths_mm = [2.0, 1.0, 0.5]", "angles_deg = []", "toleranc = 1e-3", "tolerance = 0.0", "angles_deg = [95.0]"],
+    [
+        "depths_mm = [2.0, 1.0, 0.5]",
+        "angles_deg = []",
+        "toleranc = 1e-3",
+        "tolerance = 0.0",
+        "angles_deg = [95.0]",
+    ],
 )
 def test_bad_settings_exit_2_and_write_nothing(folder, text, capsys):
     (folder / "psf.toml").write_text(text)
@@ -143,18 +202,26 @@ def test_a_tolerance_out_of_reach_exits_1(folder):
 
 
 def test_plane_waves_windows_and_lines_from_the_command_line(folder, capsys):
-    """Options stand in place of the file; the same case by the library has the same numbers."""
+    """Options stand in place of the file; the same case by the library has the same
+    numbers.
+    """
     more = "--sources-mm inf 1.4 --angles-deg -12 --angles-y-deg 7 --window-um 12 --samples 20 --height-um 7.2"
     more += " --offset-um 1.5 -0.8 --wavelengths-nm 850"
     assert command(folder, "--json", *more.split()) == 0
-    said = json.loads(capsys.readouterr().out, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    said = json.loads(
+        capsys.readouterr().out,
+        parse_constant=lambda word: pytest.fail(f"{word} is no JSON"),
+    )
     assert said["depths_um"] == [None, 1400.0]
     stack = psf.load(folder / "psf.h5")
     assert stack.intensity.shape == (1, 2, 12, 20)
     assert np.isinf(stack.depths_um[0])
     distance = 120.0
     assert stack.centres_um[0] == pytest.approx(
-        [distance * np.tan(np.deg2rad(-12)) + 1.5, distance * np.tan(np.deg2rad(7)) - 0.8]
+        [
+            distance * np.tan(np.deg2rad(-12)) + 1.5,
+            distance * np.tan(np.deg2rad(7)) - 0.8,
+        ]
     )
     made = small_lens()
     power = np.abs(
@@ -167,18 +234,43 @@ def test_plane_waves_windows_and_lines_from_the_command_line(folder, capsys):
     want = power**2 / (power**2).sum((1, 2), keepdims=True)
     assert np.linalg.norm(stack.intensity[0] - want) < 1e-4 * np.linalg.norm(want)
     assert main(["info", str(folder / "psf.h5")]) == 0
-    assert main(["view", str(folder / "psf.h5"), "-o", str(folder / "page.html"), "--quiet"]) == 0
+    assert (
+        main(
+            ["view", str(folder / "psf.h5"), "-o", str(folder / "page.html"), "--quiet"]
+        )
+        == 0
+    )
 
 
 def test_a_finite_source_from_the_command_line(folder):
-    """Half a degree about a direction; the error of taking the PSF as alike is in the file."""
-    more = ("--angles-deg", "4", "--source-deg", "2", "--source-shape", "square", "--tolerance", "0.05", "--quiet")
+    """Half a degree about a direction; the error of taking the PSF as alike is in the
+    file.
+    """
+    more = (
+        "--angles-deg",
+        "4",
+        "--source-deg",
+        "2",
+        "--source-shape",
+        "square",
+        "--tolerance",
+        "0.05",
+        "--quiet",
+    )
     assert command(folder, *more) == 0
     stack = psf.load(folder / "psf.h5")
     assert 0 < stack.budget.source < 0.05
     size = 2 * np.tan(np.deg2rad(1))
-    view = psf.View(tuple(stack.depths_um), ((np.deg2rad(4.0), 0.0),), 16.0, 24, source=psf.Extent("square", 0.0, size))
-    assert psf.from_lens(small_lens(), view, tolerance=0.05).intensity == pytest.approx(stack.intensity, abs=1e-9)
+    view = psf.View(
+        tuple(stack.depths_um),
+        ((np.deg2rad(4.0), 0.0),),
+        16.0,
+        24,
+        source=psf.Extent("square", 0.0, size),
+    )
+    assert psf.from_lens(small_lens(), view, tolerance=0.05).intensity == pytest.approx(
+        stack.intensity, abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -197,12 +289,17 @@ def test_options_that_contradict_exit_2_and_write_nothing(folder, more, capsys):
     assert command(folder, *more) == 2
     said = capsys.readouterr().err
     assert "metalens: error" in said
-    assert any(name.strip("-").replace("-", "_") in said for name in more) or "wavelength" in said
+    assert (
+        any(name.strip("-").replace("-", "_") in said for name in more)
+        or "wavelength" in said
+    )
     assert not (folder / "psf.h5").exists()
 
 
 def test_depths_and_window_that_are_left_out_follow_the_lens():
-    """Rim 12.6 um: 1.75 waves at |1/z - 1/1.3 mm| = 2 x 1.75 x 0.85 / 12.6²; 28 wavelength / NA of 120 um."""
+    """Rim 12.6 um: 1.75 waves at |1/z - 1/1.3 mm| = 2 x 1.75 x 0.85 / 12.6²; 28
+    wavelength / NA of 120 um.
+    """
     made = small_lens()
     settings = Settings(angles_deg=(0.0,)).about(made)
     rim = made.diameters.radius_um
@@ -213,10 +310,16 @@ def test_depths_and_window_that_are_left_out_follow_the_lens():
     assert len(settings.view.depths_um) == 21
     assert step == pytest.approx((far - near) / 20)
     blur = rim * 120 * (1 / (near * 1e3) - 1 / 1300)
-    assert settings.window_um == pytest.approx(max(28 * 0.85 * 120 / rim, 8 * blur), rel=5e-3)
+    assert settings.window_um == pytest.approx(
+        max(28 * 0.85 * 120 / rim, 8 * blur), rel=5e-3
+    )
     near_only = Settings(sources_mm=(0.05, 2.0)).about(made)
-    assert near_only.window_um == pytest.approx(8 * rim * 120 * (1 / 50 - 1 / 1300), rel=5e-3)
-    assert Settings(window_um=9.0, depths_mm=(1.0, 2.0, 0.5)).about(made).view.window_um == (9.0, 9.0)
+    assert near_only.window_um == pytest.approx(
+        8 * rim * 120 * (1 / 50 - 1 / 1300), rel=5e-3
+    )
+    assert Settings(window_um=9.0, depths_mm=(1.0, 2.0, 0.5)).about(
+        made
+    ).view.window_um == (9.0, 9.0)
 
 
 def test_settings_that_wait_for_a_lens_say_so():
@@ -229,7 +332,9 @@ def test_settings_that_wait_for_a_lens_say_so():
 
 
 def test_every_setting_but_two_is_an_option():
-    """As the page on lenses says; the light of two sizes was one of the file alone, where refusals name the option."""
+    """As the page on lenses says; the light of two sizes was one of the file alone,
+    where refusals name the option.
+    """
     names = {one.name for one in fields(Settings)} - {"layers", "own_cell"}
     assert names <= {one.name for one in fields(Options)}
     assert Options(Path("lens.h5"), light="y").settings.light == "y"
@@ -237,21 +342,32 @@ def test_every_setting_but_two_is_an_option():
 
 def test_light_along_x_is_refused_of_round_pillars(folder, capsys):
     assert command(folder, "--light", "x") == 2
-    assert "light = 'x' is for pillars of two sizes; these treat x and y alike" in capsys.readouterr().err
+    assert (
+        "light = 'x' is for pillars of two sizes; these treat x and y alike"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(("bars", "code"), [(0.09, 0), (0.11, 1)])
-def test_psfs_of_hardly_known_pillars_end_1_with_the_word_that_design_gives(folder, bars, code, capsys):
+def test_psfs_of_hardly_known_pillars_end_1_with_the_word_that_design_gives(
+    folder, bars, code, capsys
+):
     """Error bars above 0.1 of |t|, the largest tolerance of a library."""
     made = small_lens()
-    lens.save(folder / "lens.h5", replace(made, proxy=replace(made.proxy, entry_error=bars)))
+    lens.save(
+        folder / "lens.h5", replace(made, proxy=replace(made.proxy, entry_error=bars))
+    )
     assert command(folder) == code
-    assert ("FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out) == bool(code)
+    assert (
+        "FAILED: the pillars' own error bars are 0.11 of |t|" in capsys.readouterr().out
+    ) == bool(code)
     assert (folder / "psf.h5").exists()
 
 
 def test_a_source_too_wide_for_the_tolerance_is_told_with_its_own_cure(folder, capsys):
-    """30 um at 2 mm are 0.86 deg: the PSF of this lens at 15 deg changes over them by more than 1e-6."""
+    """30 um at 2 mm are 0.86 deg: the PSF of this lens at 15 deg changes over them by
+    more than 1e-6.
+    """
     assert command(folder, "--source-um", "30", "--tolerance", "1e-6") == 1
     told = capsys.readouterr().out
     assert "is above the tolerance 1e-06: raise it or give a smaller source" in told

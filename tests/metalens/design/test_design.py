@@ -1,4 +1,6 @@
-"""Lenses: profiles against closed forms, pillars that make the wanted phase, refusals by name."""
+"""Lenses: profiles against closed forms, pillars that make the wanted phase, refusals
+by name.
+"""
 
 import dataclasses
 import math
@@ -37,7 +39,9 @@ def proxy():
 
 def _make(proxy, phase=None, *, aperture_um=60.0, cell=CELL, **options):
     phase = phase or design.phase_of(None, FOCUS, radius_um=aperture_um / 2)
-    return design.make(phase, FOCUS, aperture_um=aperture_um, cell=cell, proxy=proxy, **options)
+    return design.make(
+        phase, FOCUS, aperture_um=aperture_um, cell=cell, proxy=proxy, **options
+    )
 
 
 def test_hyperbolic_phase_makes_all_paths_equal():
@@ -45,7 +49,9 @@ def test_hyperbolic_phase_makes_all_paths_equal():
     path = np.hypot(x, 2000.0) + np.hypot(x, 20_000.0)
     phase = profiles.hyperbolic(x, np.zeros(1), FOCUS)
     total = phase + 2 * np.pi / 0.85 * (path - 22_000.0)
-    assert np.abs(total).max() < 1e-8  # double precision of a path of 2.2e4 um times k = 7.4: 3e-11 relative
+    assert (
+        np.abs(total).max() < 1e-8
+    )  # double precision of a path of 2.2e4 um times k = 7.4: 3e-11 relative
 
 
 @given(st.floats(1.0, 1e3), st.floats(10.0, 1e5))
@@ -53,8 +59,13 @@ def test_path_difference_keeps_its_digits(radius, distance):
     import mpmath
 
     with mpmath.workdps(40):
-        want = float(mpmath.sqrt(mpmath.mpf(radius) ** 2 + mpmath.mpf(distance) ** 2) - mpmath.mpf(distance))
-    assert float(profiles.path_difference(np.float64(radius**2), distance)) == pytest.approx(want, rel=1e-14)
+        want = float(
+            mpmath.sqrt(mpmath.mpf(radius) ** 2 + mpmath.mpf(distance) ** 2)
+            - mpmath.mpf(distance)
+        )
+    assert float(
+        profiles.path_difference(np.float64(radius**2), distance)
+    ) == pytest.approx(want, rel=1e-14)
 
 
 def test_double_helix_winds_one_three_five_times():
@@ -70,9 +81,9 @@ def test_double_helix_winds_one_three_five_times():
 
 def test_cubic_phase_is_odd_in_x_and_y():
     x = np.array([7.0, -7.0])
-    extra = profiles.cubic(x, np.zeros(1), FOCUS, Cubic(50.0), radius_um=10.0) - profiles.hyperbolic(
-        x, np.zeros(1), FOCUS
-    )
+    extra = profiles.cubic(
+        x, np.zeros(1), FOCUS, Cubic(50.0), radius_um=10.0
+    ) - profiles.hyperbolic(x, np.zeros(1), FOCUS)
     assert extra == pytest.approx([50 * 0.343, -50 * 0.343])
 
 
@@ -81,12 +92,17 @@ def test_every_pillar_makes_the_wanted_phase(proxy):
     d = made.diameters
     wanted = profiles.hyperbolic(d.x_um, d.y_um[:, None], FOCUS)
     error = np.angle(np.exp(1j * (made.phase_rad() - wanted)))[d.diameter_um > 0]
-    assert np.abs(error).max() < 2e-5  # float32 diameters: 2e-8 um x 90 rad/um, and the proxy's inverse
+    assert (
+        np.abs(error).max() < 2e-5
+    )  # float32 diameters: 2e-8 um x 90 rad/um, and the proxy's inverse
     assert quality.max_phase_error_rad < 2e-5
     assert quality.strehl == pytest.approx(
-        made.transmission()[d.diameter_um > 0].mean() ** 2 / made.transmission()[d.diameter_um > 0].mean() ** 2
+        made.transmission()[d.diameter_um > 0].mean() ** 2
+        / made.transmission()[d.diameter_um > 0].mean() ** 2
     )
-    assert quality.efficiency == pytest.approx(made.transmission()[d.diameter_um > 0].mean() ** 2, rel=1e-6)
+    assert quality.efficiency == pytest.approx(
+        made.transmission()[d.diameter_um > 0].mean() ** 2, rel=1e-6
+    )
 
 
 def test_asymmetric_map_lands_the_right_way_up(proxy, tmp_path):
@@ -151,30 +167,53 @@ def test_empty_aperture_and_unprintable_cells_are_refused(proxy):
 
 
 def test_a_turn_that_a_resonance_cut_short_is_not_laid_to_the_process():
-    short = Proxy(np.array([[0.5, 2.0, 0.1]]), np.array([[0.9]]), (0.08, 0.16), (0.85, 0.85), 0.0, 0.0)
+    short = Proxy(
+        np.array([[0.5, 2.0, 0.1]]),
+        np.array([[0.9]]),
+        (0.08, 0.16),
+        (0.85, 0.85),
+        0.0,
+        0.0,
+    )
     ends = r"prints 0\.0900-0\.\d+ um, the library's curve holds 0\.0800-0\.1600.*lies below 0\.236"
     with pytest.raises(LensError, match=ends):
         _make(short, limits=Limits(min_diameter_nm=90, min_gap_nm=80))
 
 
 def test_the_height_that_is_named_covers_a_turn_of_an_index_that_is_the_pillars_own():
-    """Phase k h n(D), n from 1.41 at 0.09 um to 2.03 at 0.32 um: 0.62 h / wavelength turns, so 1.371 um at 0.85 um."""
+    """Phase k h n(D), n from 1.41 at 0.09 um to 2.03 at 0.32 um: 0.62 h / wavelength
+    turns, so 1.371 um at 0.85 um.
+    """
 
     def guides(height_um):
         phase = 2 * np.pi / 0.85 * height_um * np.array([[1.72, 0.31]])
         return Proxy(phase, np.array([[0.9]]), (0.09, 0.32), (0.85, 0.85), 0.0, 0.0)
 
-    printed, cell = Limits(min_diameter_nm=90, min_gap_nm=80), Cell(pitch_um=0.4, height_um=0.52, pillar=Index(3.2))
-    with pytest.raises(LensError, match=r"reach 0\.379 of a turn.*; take pillars of about 1\.37 um \(0\.52 um now"):
+    printed, cell = (
+        Limits(min_diameter_nm=90, min_gap_nm=80),
+        Cell(pitch_um=0.4, height_um=0.52, pillar=Index(3.2)),
+    )
+    with pytest.raises(
+        LensError,
+        match=r"reach 0\.379 of a turn.*; take pillars of about 1\.37 um \(0\.52 um now",
+    ):
         _make(guides(0.52), limits=printed, cell=cell)
     _make(guides(1.38), limits=printed, cell=dataclasses.replace(cell, height_um=1.38))
 
 
 def test_a_phase_of_another_shape_is_refused_with_what_is_needed(proxy):
     focus = Focus(0.85, 300.0, math.inf)
-    make = partial(design.make, focus=focus, aperture_um=8.0, cell=Cell(pitch_um=0.4, pillar=Index(3.6)), proxy=proxy)
+    make = partial(
+        design.make,
+        focus=focus,
+        aperture_um=8.0,
+        cell=Cell(pitch_um=0.4, pillar=Index(3.6)),
+        proxy=proxy,
+    )
     with pytest.raises(LensError, match=r"phase of shape \(20,\) .*need \(20, 20\)"):
-        make(lambda x, y: profiles.hyperbolic(x, y, focus))  # positions along the diagonal alone
+        make(
+            lambda x, y: profiles.hyperbolic(x, y, focus)
+        )  # positions along the diagonal alone
     with pytest.raises(LensError, match=r"phase of shape \(\) "):
         make(lambda x, y: 0.0)
 
@@ -190,14 +229,18 @@ def test_blocks_of_rows_do_not_show(proxy, monkeypatch):
     monkeypatch.setattr("metalens.design.sites._BLOCK_SITES", 500)
     parts, other = _make(proxy)
     # single precision of 0.3 um: where a block ends, lanes of a loop round otherwise
-    np.testing.assert_allclose(whole.diameters.diameter_um, parts.diameters.diameter_um, rtol=0, atol=6e-8)
+    np.testing.assert_allclose(
+        whole.diameters.diameter_um, parts.diameters.diameter_um, rtol=0, atol=6e-8
+    )
     assert one.efficiency == pytest.approx(other.efficiency, rel=1e-12)
 
 
 def test_field_is_limited_by_coma_as_in_third_order_theory():
     assert design.field_angle(FOCUS, 100.0) > design.field_angle(FOCUS, 500.0)
-    # Coma of a flat hyperbolic lens at its own focus: W131 = R³ theta / (2 d²) (Aieta et al. 2013), RMS about the
-    # best tilt W131 / sqrt(72). At R/d = 1/4 the next order is (R/d)² = 6 %, astigmatism adds 3 % in quadrature.
+    # Coma of a flat hyperbolic lens at its own focus: W131 = R³ theta / (2 d²) (Aieta
+    # et al. 2013), RMS about the
+    # best tilt W131 / sqrt(72). At R/d = 1/4 the next order is (R/d)² = 6 %,
+    # astigmatism adds 3 % in quadrature.
     focus, radius = Focus(0.85, 2000.0), 500.0
     rms = math.sqrt(-math.log(0.8)) * 0.85 / (2 * math.pi)
     want = rms * math.sqrt(72) * 2 * focus.sensor_distance_um**2 / radius**3
@@ -208,14 +251,21 @@ def test_a_lens_file_comes_back(proxy, tmp_path):
     made, _ = _make(proxy)
     lens.save(tmp_path / "lens.h5", made)
     back = lens.load(tmp_path / "lens.h5")
-    np.testing.assert_array_equal(back.diameters.diameter_um, made.diameters.diameter_um)
+    np.testing.assert_array_equal(
+        back.diameters.diameter_um, made.diameters.diameter_um
+    )
     assert back.cell == made.cell
-    assert (back.wavelength_um, back.sensor_distance_um, back.source_distance_um) == (0.85, 2000.0, 20_000.0)
+    assert (back.wavelength_um, back.sensor_distance_um, back.source_distance_um) == (
+        0.85,
+        2000.0,
+        20_000.0,
+    )
     np.testing.assert_array_equal(back.phase_rad(), made.phase_rad())
 
 
 @pytest.mark.parametrize(
-    ("bad", "place"), [(np.nan, "row 2, column 3"), (-0.1, "row 2"), (0.35, "0.35"), (np.inf, "inf")]
+    ("bad", "place"),
+    [(np.nan, "row 2, column 3"), (-0.1, "row 2"), (0.35, "0.35"), (np.inf, "inf")],
 )
 def test_bad_diameters_name_row_and_column(bad, place):
     d = np.full((5, 6), 0.2)
@@ -239,26 +289,49 @@ def test_the_axis_sits_in_the_middle():
 
 
 def test_profiles_at_a_site_off_both_axes():
-    """Every term by hand at (7, -4) um: sources and sensor at unlike distances, signs of x and y unlike."""
+    """Every term by hand at (7, -4) um: sources and sensor at unlike distances, signs
+    of x and y unlike.
+    """
     focus, x, y, radius = Focus(0.94, 210.0, 930.0), 7.0, -4.0, 11.0
-    paths = sum(math.hypot(x, y, z) - z for z in (210.0, 930.0))  # 0.15 um of 210: 13 digits are left
+    paths = sum(
+        math.hypot(x, y, z) - z for z in (210.0, 930.0)
+    )  # 0.15 um of 210: 13 digits are left
     focal = -2 * math.pi / 0.94 * paths
-    assert float(profiles.hyperbolic(np.array(x), np.array(y), focus)) == pytest.approx(focal, abs=1e-10)
-    cubed = float(profiles.cubic(np.array(x), np.array(y), focus, Cubic(37.0), radius_um=radius))
+    assert float(profiles.hyperbolic(np.array(x), np.array(y), focus)) == pytest.approx(
+        focal, abs=1e-10
+    )
+    cubed = float(
+        profiles.cubic(np.array(x), np.array(y), focus, Cubic(37.0), radius_um=radius)
+    )
     assert cubed - focal == pytest.approx(37 * (343 - 64) / 1331, abs=1e-9)
     # ring: ceil(3 (sqrt 65 / 11)^(1 / 0.7)) = ceil(1.92) = 2, of charge 3
-    helix = float(profiles.double_helix(np.array(x), np.array(y), focus, DoubleHelix(3, 0.7), radius_um=radius))
+    helix = float(
+        profiles.double_helix(
+            np.array(x), np.array(y), focus, DoubleHelix(3, 0.7), radius_um=radius
+        )
+    )
     assert helix - focal == pytest.approx(3 * math.atan2(-4, 7), abs=1e-9)
 
 
 def test_less_than_a_turn_is_accepted_with_its_loss_stated(proxy):
-    """Uniform phases: the missing m rad are met at their ends, m / 2 off at most, m³ / (24 pi) mean square."""
-    lens, quality = _make(proxy, aperture_um=300.0, limits=Limits(min_diameter_nm=210), accept_partial_turn=True)
+    """Uniform phases: the missing m rad are met at their ends, m / 2 off at most, m³ /
+    (24 pi) mean square.
+    """
+    lens, quality = _make(
+        proxy,
+        aperture_um=300.0,
+        limits=Limits(min_diameter_nm=210),
+        accept_partial_turn=True,
+    )
     missing = 2 * np.pi * (1 - quality.turns)
     assert 0.4 < missing < 0.7
     assert quality.max_phase_error_rad == pytest.approx(missing / 2, rel=0.02)
-    assert quality.rms_phase_error_rad == pytest.approx(np.sqrt(missing**3 / (24 * np.pi)), rel=0.1)
-    assert lens.diameters.diameter_um[lens.diameters.diameter_um > 0].min() >= np.float32(0.21)
+    assert quality.rms_phase_error_rad == pytest.approx(
+        np.sqrt(missing**3 / (24 * np.pi)), rel=0.1
+    )
+    assert lens.diameters.diameter_um[
+        lens.diameters.diameter_um > 0
+    ].min() >= np.float32(0.21)
     whole = _make(proxy)[1]
     assert whole.turns > 1
     assert whole.rms_phase_error_rad < 1e-5
@@ -266,11 +339,15 @@ def test_less_than_a_turn_is_accepted_with_its_loss_stated(proxy):
 
 @pytest.mark.parametrize("source", [math.inf, 5100.0])
 def test_half_field_is_where_the_wave_front_leaves_four_fifths(source):
-    """Rays by hand: chief point at d tan(angle) behind and -z tan(angle) before; piston and tilt fitted out, the focus
+    """Rays by hand: chief point at d tan(angle) behind and -z tan(angle) before; piston
+    and tilt fitted out, the focus
     not, since the sensor is flat."""
     focus, radius = Focus(0.94, 1300.0, source), 170.0
     angle = design.field_angle(focus, radius)
-    rho, turn = np.sqrt((np.arange(60) + 0.5) / 60), (np.arange(90) + 0.5) * 2 * np.pi / 90  # equal areas
+    rho, turn = (
+        np.sqrt((np.arange(60) + 0.5) / 60),
+        (np.arange(90) + 0.5) * 2 * np.pi / 90,
+    )  # equal areas
     x, y = (radius * rho[:, None] * f(turn) for f in (np.cos, np.sin))
 
     def variance(tilt):
@@ -282,7 +359,9 @@ def test_half_field_is_where_the_wave_front_leaves_four_fifths(source):
             path = path + np.sqrt((x + source * math.tan(tilt)) ** 2 + y**2 + source**2)
             path = path - sum(np.sqrt(x**2 + y**2 + z**2) for z in (1300.0, source))
         terms = np.stack([np.ones_like(x), x, y], -1).reshape(-1, 3)
-        rest = path.ravel() - terms @ np.linalg.lstsq(terms, path.ravel(), rcond=None)[0]
+        rest = (
+            path.ravel() - terms @ np.linalg.lstsq(terms, path.ravel(), rcond=None)[0]
+        )
         return float((rest**2).mean()) * (2 * math.pi / 0.94) ** 2
 
     # 61 x 61 square samples of the disc against equal areas: 2 % of the variance

@@ -1,4 +1,6 @@
-"""The exact sum sees the focus of a good lens, and says so when a lens focuses elsewhere."""
+"""The exact sum sees the focus of a good lens, and says so when a lens focuses
+elsewhere.
+"""
 
 from dataclasses import replace
 
@@ -18,12 +20,18 @@ FOCUS = Focus(0.85, 200.0, 2000.0)
 @pytest.fixture(scope="module")
 def proxy():
     """A transparent pillar of 1.4 turns over 80-290 nm."""
-    return Proxy(np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0)
+    return Proxy(
+        np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0
+    )
 
 
 def _lens(proxy, phase=None):
     return design.make(
-        phase or design.phase_of(None, FOCUS, radius_um=50.0), FOCUS, aperture_um=100.0, cell=CELL, proxy=proxy
+        phase or design.phase_of(None, FOCUS, radius_um=50.0),
+        FOCUS,
+        aperture_um=100.0,
+        cell=CELL,
+        proxy=proxy,
     )[0]
 
 
@@ -32,28 +40,42 @@ def test_a_hyperbolic_lens_focuses_on_the_axis_in_the_sensor_plane(proxy):
     assert found.passed
     assert abs(found.x_um) < 0.02 * found.resolution_um
     assert abs(found.y_um) < 0.02 * found.resolution_um
-    # The brightest point of the axis lies 12 d / (pi N)² before the focus (Li and Wolf 1981), N = R² / (lambda d);
+    # The brightest point of the axis lies 12 d / (pi N)² before the focus (Li and Wolf
+    # 1981), N = R² / (lambda d);
     # the next order in NA adds 6 %.
     fresnel_number = 50.0**2 / (0.85 * 200.0)
-    assert found.z_um == pytest.approx(-12 * 200.0 / (np.pi * fresnel_number) ** 2, rel=0.1)
+    assert found.z_um == pytest.approx(
+        -12 * 200.0 / (np.pi * fresnel_number) ** 2, rel=0.1
+    )
     # every pillar makes its phase within 2e-5 rad
     assert found.strehl == pytest.approx(1.0, abs=1e-8)
 
 
 def test_a_lens_that_focuses_to_the_side_is_told_which_side(proxy):
     tilt = 0.4 / FOCUS.sensor_distance_um
-    lens = _lens(proxy, lambda x, y: hyperbolic(x, y[:, None], FOCUS) + 2 * np.pi / 0.85 * tilt * x)
+    lens = _lens(
+        proxy,
+        lambda x, y: hyperbolic(x, y[:, None], FOCUS) + 2 * np.pi / 0.85 * tilt * x,
+    )
     found = check_focus(lens, axial=False)
     assert found.x_um == pytest.approx(0.4, abs=0.05)
     assert abs(found.y_um) < 0.02
     assert np.isnan(found.z_um)
-    half_micron_further = replace(lens, sensor_distance_um=lens.sensor_distance_um - 8.0)
+    half_micron_further = replace(
+        lens, sensor_distance_um=lens.sensor_distance_um - 8.0
+    )
     assert not check_focus(half_micron_further).passed
     assert "NO FOCUS" in check_focus(half_micron_further).text
 
 
 def test_a_lens_of_less_than_a_fresnel_zone_is_judged_in_the_sensor_plane_only(proxy):
-    tiny = design.make(design.phase_of(None, FOCUS, radius_um=5.0), FOCUS, aperture_um=10.0, cell=CELL, proxy=proxy)[0]
+    tiny = design.make(
+        design.phase_of(None, FOCUS, radius_um=5.0),
+        FOCUS,
+        aperture_um=10.0,
+        cell=CELL,
+        proxy=proxy,
+    )[0]
     found = check_focus(tiny)
     assert np.isnan(found.z_um)
     assert found.passed

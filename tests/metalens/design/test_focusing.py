@@ -1,4 +1,6 @@
-"""Where the rays of a map meet: of ideal lenses known in closed form, of maps without a focus nowhere."""
+"""Where the rays of a map meet: of ideal lenses known in closed form, of maps without a
+focus nowhere.
+"""
 
 import numpy as np
 import pytest
@@ -14,31 +16,50 @@ ABOUT = {"radius_um": 130.0, "pitch_um": 0.6}
 
 
 def lens(focal_um, source_um, aside_um=0.0):
-    """An ideal lens whose middle lies ``aside_um`` along x; phase of paper Eq. 1 on both sides."""
+    """An ideal lens whose middle lies ``aside_um`` along x; phase of paper Eq. 1 on
+    both sides.
+    """
 
     def phase(x, y):
         x, y = np.meshgrid(x, y)
-        before = np.hypot(np.hypot(x, y), source_um) - source_um if np.isfinite(source_um) else 0.0
+        before = (
+            np.hypot(np.hypot(x, y), source_um) - source_um
+            if np.isfinite(source_um)
+            else 0.0
+        )
         return -K * (np.hypot(np.hypot(x - aside_um, y), focal_um) + before)
 
     return phase
 
 
 @pytest.mark.parametrize("told_um", [700.0, 2000.0])
-@pytest.mark.parametrize(("focal_um", "source_um", "aside_um"), [(900.0, np.inf, 0.0), (1100.0, 7e3, 17.0)])
-def test_rays_of_an_ideal_lens_meet_in_its_focus(focal_um, source_um, aside_um, told_um):
-    found = meeting_um(lens(focal_um, source_um, aside_um), Focus(1.31, told_um, source_um), **ABOUT)
-    # the difference over one pitch p misses the slope by p² / 24 of its second derivative: 0.015 um² / (900 um)²
+@pytest.mark.parametrize(
+    ("focal_um", "source_um", "aside_um"), [(900.0, np.inf, 0.0), (1100.0, 7e3, 17.0)]
+)
+def test_rays_of_an_ideal_lens_meet_in_its_focus(
+    focal_um, source_um, aside_um, told_um
+):
+    found = meeting_um(
+        lens(focal_um, source_um, aside_um), Focus(1.31, told_um, source_um), **ABOUT
+    )
+    # the difference over one pitch p misses the slope by p² / 24 of its second
+    # derivative: 0.015 um² / (900 um)²
     assert found == pytest.approx(focal_um, rel=1e-6)
 
 
-@pytest.mark.parametrize(("inner_um", "outer_um", "brings"), [(900.0, 300.0, False), (300.0, 900.0, True)])
+@pytest.mark.parametrize(
+    ("inner_um", "outer_um", "brings"), [(900.0, 300.0, False), (300.0, 900.0, True)]
+)
 def test_rays_from_all_over_a_lens_say_whether_it_focuses(inner_um, outer_um, brings):
-    """A fifth of the radius, 4 % of the light, has a third of the focal length, or all but that."""
+    """A fifth of the radius, 4 % of the light, has a third of the focal length, or all
+    but that.
+    """
 
     def phase(x, y):
         middle = np.hypot(*np.meshgrid(x, y)) < 0.2 * ABOUT["radius_um"]
-        return np.where(middle, lens(inner_um, np.inf)(x, y), lens(outer_um, np.inf)(x, y))
+        return np.where(
+            middle, lens(inner_um, np.inf)(x, y), lens(outer_um, np.inf)(x, y)
+        )
 
     assert focusing.focuses(phase, Focus(1.31, 900.0, np.inf), **ABOUT) is brings
 
@@ -53,7 +74,14 @@ def test_no_meeting_of_rays_that_spread_or_part():
     assert meeting_um(lens(900.0, np.inf), behind, **ABOUT) is None
 
 
-TURNS = Proxy(np.array([[0.0, 3 * np.pi]]), np.array([[1.0]]), (0.1, 0.5), (1.31, 1.31), 1e-6, 1e-6)
+TURNS = Proxy(
+    np.array([[0.0, 3 * np.pi]]),
+    np.array([[1.0]]),
+    (0.1, 0.5),
+    (1.31, 1.31),
+    1e-6,
+    1e-6,
+)
 CELL = Cell(pitch_um=0.6, pillar=Index(3.4), substrate=Index(1.45))
 
 
@@ -63,7 +91,10 @@ CELL = Cell(pitch_um=0.6, pillar=Index(3.4), substrate=Index(1.45))
         (lambda x, y: 0.0 * x * y, True),
         (lambda x, y: 0.03 * K * x + 0.0 * y, True),  # the same lens aside
         (lambda x, y: 2 * np.arctan2(y, x), False),  # dark in the middle
-        (lambda x, y: K * np.hypot(x, y) ** 2 / 600.0 + 0.1 * K * x, False),  # a deflector without power
+        (
+            lambda x, y: K * np.hypot(x, y) ** 2 / 600.0 + 0.1 * K * x,
+            False,
+        ),  # a deflector without power
         (lambda x, y: K * (x * x - y * y) / 500.0, False),  # a line
     ],
 )

@@ -1,4 +1,6 @@
-"""What a lens's own pillars leave out, from rows and tilted answers that are typed in: every term by hand."""
+"""What a lens's own pillars leave out, from rows and tilted answers that are typed in:
+every term by hand.
+"""
 
 import math
 from types import SimpleNamespace
@@ -25,7 +27,10 @@ class Rows:
 
     def __init__(self, whole, coarse=None, without=()):
         self.whole, self.coarse, self.less = whole, coarse, without
-        self.sine, self.diagonal = 0.85 / 0.37 / np.array([3.0, 5.0, 4.4]), np.array([False, False, True])
+        self.sine, self.diagonal = (
+            0.85 / 0.37 / np.array([3.0, 5.0, 4.4]),
+            np.array([False, False, True]),
+        )
         self.asked = []
 
     def share(self, sine, weight):
@@ -54,27 +59,48 @@ def test_rings_of_a_lens_are_equal_areas_that_bend_source_light_to_the_sensor():
         assert weight @ sine**power == pytest.approx(want, rel=1e-4)
 
 
-def test_the_error_of_unlike_neighbours_adds_truncation_rows_and_a_fifth_of_the_loss(monkeypatch):
-    """0.83 of the focus; 0.80 at the coarser truncation, 0.85, 0.78, 0.84 without a row: 0.03 + 0.05 + 0.2 * 0.17."""
+def test_the_error_of_unlike_neighbours_adds_truncation_rows_and_a_fifth_of_the_loss(
+    monkeypatch,
+):
+    """0.83 of the focus; 0.80 at the coarser truncation, 0.85, 0.78, 0.84 without a
+    row: 0.03 + 0.05 + 0.2 * 0.17.
+    """
     made = Rows(0.83, 0.80, (0.85, 0.78, 0.84))
     counts = []
-    monkeypatch.setattr(own_cell, "neighbours", lambda lens, *, counts, told=counts: told.append(counts) or made)
+    monkeypatch.setattr(
+        own_cell,
+        "neighbours",
+        lambda lens, *, counts, told=counts: told.append(counts) or made,
+    )
     found = own_cell.unlike(LENS, radius_um=80.0)
     assert found.share == 0.83
     assert found.error == pytest.approx(0.03 + 0.05 + 0.2 * 0.17, rel=1e-12)
     assert found.pillars == (3, 5)
     rim = round(0.85 / (0.37 * max(made.asked[0][0])))
     assert counts == [(rim, math.ceil(1.5 * rim), 2 * rim)]
-    held = SimpleNamespace(**vars(LENS) | {"neighbours": Rows(0.7, 0.7)})  # those of the lens are not solved again
-    assert own_cell.unlike(held, radius_um=80.0).error == pytest.approx(0.2 * 0.3, rel=1e-12)
+    held = SimpleNamespace(
+        **vars(LENS) | {"neighbours": Rows(0.7, 0.7)}
+    )  # those of the lens are not solved again
+    assert own_cell.unlike(held, radius_um=80.0).error == pytest.approx(
+        0.2 * 0.3, rel=1e-12
+    )
     assert len(counts) == 1
 
 
 def test_neighbours_that_gain_in_the_rough_cell_are_no_loss_below_nothing():
-    """At NA 0.1 the rough factor is above 1: the error was negative, and `-0.5%` the most that they may cost."""
-    flat = SimpleNamespace(**vars(LENS) | {"sensor_distance_um": 1600.0, "source_distance_um": math.inf})
+    """At NA 0.1 the rough factor is above 1: the error was negative, and `-0.5%` the
+    most that they may cost.
+    """
+    flat = SimpleNamespace(
+        **vars(LENS) | {"sensor_distance_um": 1600.0, "source_distance_um": math.inf}
+    )
     sine, weight = own_cell._rings(flat, 80.0)
-    share = abs((weight * (1 + (0.057 - 0.289j) * sine + (-0.523 + 0.054j) * sine**2)).sum()) ** 2
+    share = (
+        abs(
+            (weight * (1 + (0.057 - 0.289j) * sine + (-0.523 + 0.054j) * sine**2)).sum()
+        )
+        ** 2
+    )
     assert share > 1.0005
     found = own_cell.rough_unlike(flat, radius_um=80.0)
     assert found.share == pytest.approx(share, rel=1e-12)
@@ -83,11 +109,21 @@ def test_neighbours_that_gain_in_the_rough_cell_are_no_loss_below_nothing():
 
 @pytest.mark.parametrize(
     ("aperture", "counts"),
-    [(0.93, (2, 3, 4)), (0.74, (3, 5, 6)), (0.45, (5, 8, 10)), (0.2, (6, 9, 12)), (3.0, (2, 3, 4))],
+    [
+        (0.93, (2, 3, 4)),
+        (0.74, (3, 5, 6)),
+        (0.45, (5, 8, 10)),
+        (0.2, (6, 9, 12)),
+        (3.0, (2, 3, 4)),
+    ],
 )
-def test_three_rows_are_asked_for_from_the_zone_of_the_rim_to_half_its_slope(aperture, counts):
-    """Three fix a and b of 1 + a s + b s² with one to spare, whose absence is the error. Zones of the rim: 0.85 / 0.37
-    pitches over the sine; a row has two pillars or more, to tell both sides apart, and twelve at most."""
+def test_three_rows_are_asked_for_from_the_zone_of_the_rim_to_half_its_slope(
+    aperture, counts
+):
+    """Three fix a and b of 1 + a s + b s² with one to spare, whose absence is the
+    error. Zones of the rim: 0.85 / 0.37
+    pitches over the sine; a row has two pillars or more, to tell both sides apart, and
+    twelve at most."""
     assert own_cell._counts(LENS, aperture) == counts
 
 
@@ -102,11 +138,16 @@ def test_rough_neighbours_err_by_all_that_they_take():
 
 
 @pytest.mark.parametrize(
-    ("aperture", "counts"), [(0.31, (6, 9, 12)), (0.5, (5, 8, 10)), (0.9, (3, 5, 6)), (2.0, (2, 3, 4))]
+    ("aperture", "counts"),
+    [(0.31, (6, 9, 12)), (0.5, (5, 8, 10)), (0.9, (3, 5, 6)), (2.0, (2, 3, 4))],
 )
-def test_terms_of_the_budget_come_from_a_zone_of_the_rim_and_longer_ones(monkeypatch, aperture, counts):
+def test_terms_of_the_budget_come_from_a_zone_of_the_rim_and_longer_ones(
+    monkeypatch, aperture, counts
+):
     asked = []
-    monkeypatch.setattr(own_cell, "neighbours", lambda lens, *, counts: asked.append(counts) or "rows")
+    monkeypatch.setattr(
+        own_cell, "neighbours", lambda lens, *, counts: asked.append(counts) or "rows"
+    )
     monkeypatch.setattr(own_cell, "angle_change", lambda lens, angle: 0.07 * angle)
     found = own_cell.left_out(LENS, aperture=aperture, incidence_rad=0.4)
     assert asked == [counts]
@@ -116,7 +157,9 @@ def test_terms_of_the_budget_come_from_a_zone_of_the_rim_and_longer_ones(monkeyp
 
 
 def test_the_change_by_an_angle_is_what_no_common_factor_makes_up_for(monkeypatch):
-    """Two of five pillars at an angle answer as a multiple of themselves with a part at right angles; s and p apart."""
+    """Two of five pillars at an angle answer as a multiple of themselves with a part at
+    right angles; s and p apart.
+    """
     rng = np.random.default_rng(2)
     flat = rng.normal(size=5) + 1j * rng.normal(size=5)
     away = rng.normal(size=5) + 1j * rng.normal(size=5)
@@ -133,4 +176,6 @@ def test_the_change_by_an_angle_is_what_no_common_factor_makes_up_for(monkeypatc
     monkeypatch.setattr(own_cell, "printed", lambda lens: (0.12, 0.29))
     ratio = (np.abs(away) ** 2).sum() / (np.abs(flat) ** 2).sum()
     squares = [q**2 * ratio / (0.89 + q**2 * ratio) for q in parts.values()]
-    assert own_cell.angle_change(LENS, 0.3) == pytest.approx(math.sqrt(np.mean(squares)), rel=1e-9)
+    assert own_cell.angle_change(LENS, 0.3) == pytest.approx(
+        math.sqrt(np.mean(squares)), rel=1e-9
+    )

@@ -1,4 +1,6 @@
-"""Phase maps of other programs: every format gives the same phase, the right way up, or a refusal that says why."""
+"""Phase maps of other programs: every format gives the same phase, the right way up, or
+a refusal that says why.
+"""
 
 import contextlib
 
@@ -16,12 +18,18 @@ from metalens.ground.errors import ConfigError, LensError
 STEP = 2.0
 X = (np.arange(24) - 11.5) * STEP
 Y = (np.arange(20) - 9.5) * STEP
-PHASE = 0.02 * X + 0.05 * Y[:, None] + 0.001 * X * Y[:, None]  # no symmetry: a turned or mirrored axis shows
+PHASE = (
+    0.02 * X + 0.05 * Y[:, None] + 0.001 * X * Y[:, None]
+)  # no symmetry: a turned or mirrored axis shows
 
 
 def zemax_text(phase, *, step_mm=STEP * 1e-3, unit=0, dec=(0.0, 0.0), nodata=()):
-    """What OpticStudio reads: the point of least x and largest (upward) y first; our row 0 is the top."""
-    lines = [f"{phase.shape[1]} {phase.shape[0]} {step_mm:.17g} {step_mm:.17g} {unit} {dec[0]:.17g} {dec[1]:.17g}"]
+    """What OpticStudio reads: the point of least x and largest (upward) y first; our
+    row 0 is the top.
+    """
+    lines = [
+        f"{phase.shape[1]} {phase.shape[0]} {step_mm:.17g} {step_mm:.17g} {unit} {dec[0]:.17g} {dec[1]:.17g}"
+    ]
     for i, value in enumerate(phase.ravel()):
         lines.append(f"{value:.17g} 0 0 0 {int(i in nodata)}")
     return "\n".join(lines) + "\n"
@@ -35,8 +43,13 @@ def write(folder, kind):
         np.savetxt(path, PHASE, delimiter=",", fmt="%.17g")
     elif kind == "csv-semicolon":
         text = "\n".join(";".join(f"{v:.17g}" for v in row) for row in PHASE)
-        path.write_text("\ufeff" + text, encoding="utf-8")  # Excel starts with a byte-order mark
-    elif kind in ("csv-decimal-comma", "txt-decimal-comma"):  # of a spreadsheet in half of Europe
+        path.write_text(
+            "\ufeff" + text, encoding="utf-8"
+        )  # Excel starts with a byte-order mark
+    elif kind in (
+        "csv-decimal-comma",
+        "txt-decimal-comma",
+    ):  # of a spreadsheet in half of Europe
         mark = ";" if kind[0] == "c" else "\t"
         rows = (mark.join(f"{v:.17g}".replace(".", ",") for v in row) for row in PHASE)
         path.write_bytes(("\ufeff" + "\r\n".join(rows)).encode("utf-8"))
@@ -53,7 +66,18 @@ def write(folder, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["npy", "csv", "csv-semicolon", "csv-decimal-comma", "txt", "txt-decimal-comma", "mat", "mat-73", "dat"]
+    "kind",
+    [
+        "npy",
+        "csv",
+        "csv-semicolon",
+        "csv-decimal-comma",
+        "txt",
+        "txt-decimal-comma",
+        "mat",
+        "mat-73",
+        "dat",
+    ],
 )
 def test_every_format_gives_the_same_samples(tmp_path, kind):
     path = write(tmp_path, kind)
@@ -63,32 +87,46 @@ def test_every_format_gives_the_same_samples(tmp_path, kind):
     x, y = np.array([-7.3, 0.0, 12.1]), np.array([-15.2, 3.3])
     got = phase_map.interpolate(samples, x, y)
     want = 0.02 * x + 0.05 * y[:, None] + 0.001 * x * y[:, None]
-    assert got == pytest.approx(want, abs=2e-4)  # phasors turn by 0.15 rad a step: error of the chord 0.15³/60
+    assert got == pytest.approx(
+        want, abs=2e-4
+    )  # phasors turn by 0.15 rad a step: error of the chord 0.15³/60
 
 
 def test_zemax_units_and_decentre(tmp_path):
     for unit, um in enumerate((1e3, 1e4, 25.4e3, 1e6)):
-        (tmp_path / "g.dat").write_text(zemax_text(PHASE, step_mm=STEP / um, unit=unit, dec=(4 / um, 6 / um)))
+        (tmp_path / "g.dat").write_text(
+            zemax_text(PHASE, step_mm=STEP / um, unit=unit, dec=(4 / um, 6 / um))
+        )
         samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
         assert samples.step_um == pytest.approx((STEP, STEP), rel=1e-12)
-        assert samples.centre_um == pytest.approx((4.0, -6.0), rel=1e-9)  # up in the file is -y here
-        shifted = phase_map.interpolate(samples, np.array([4 + X[5]]), np.array([Y[3] - 6]))
+        assert samples.centre_um == pytest.approx(
+            (4.0, -6.0), rel=1e-9
+        )  # up in the file is -y here
+        shifted = phase_map.interpolate(
+            samples, np.array([4 + X[5]]), np.array([Y[3] - 6])
+        )
         assert shifted[0, 0] == pytest.approx(PHASE[3, 5], abs=1e-9)
 
 
 def test_points_without_data_matter_inside_the_aperture_alone(tmp_path):
-    (tmp_path / "g.dat").write_text(zemax_text(PHASE, nodata={0, 1, 24}))  # the upper left corner
+    (tmp_path / "g.dat").write_text(
+        zemax_text(PHASE, nodata={0, 1, 24})
+    )  # the upper left corner
     samples = phase_map.read(PhaseMap(tmp_path / "g.dat"))
     assert np.isnan(samples.phase_rad).sum() == 3
     x = np.linspace(-17, 17, 30)
-    assert np.isfinite(phase_map.interpolate(samples, x, x, radius_um=10.0)[10:20, 10:20]).all()
+    assert np.isfinite(
+        phase_map.interpolate(samples, x, x, radius_um=10.0)[10:20, 10:20]
+    ).all()
     with pytest.raises(LensError, match="no data near row 0"):
         phase_map.interpolate(samples, x - 5, x - 2, radius_um=60.0)
 
 
 def test_conjugate_turns_the_sign(tmp_path):
     path = write(tmp_path, "npy")
-    assert phase_map.read(PhaseMap(path, STEP, conjugate=True)).phase_rad == pytest.approx(-PHASE)
+    assert phase_map.read(
+        PhaseMap(path, STEP, conjugate=True)
+    ).phase_rad == pytest.approx(-PHASE)
 
 
 @pytest.mark.parametrize(
@@ -134,16 +172,22 @@ def test_a_matrix_is_chosen_by_name_where_there_are_several(tmp_path):
         phase_map.read(PhaseMap(tmp_path / "m.mat", STEP))
     with pytest.raises(LensError, match="did you mean 'phi'"):
         phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="ph"))
-    assert phase_map.read(PhaseMap(tmp_path / "m.mat", STEP, variable="phi")).phase_rad == pytest.approx(PHASE)
+    assert phase_map.read(
+        PhaseMap(tmp_path / "m.mat", STEP, variable="phi")
+    ).phase_rad == pytest.approx(PHASE)
 
 
 def test_an_archive_of_numpy_gives_its_only_matrix_or_the_named_one(tmp_path):
     np.savez(tmp_path / "one.npz", phase=PHASE, pitch_um=STEP, x_um=np.arange(9))
-    assert phase_map.read(PhaseMap(tmp_path / "one.npz", STEP)).phase_rad == pytest.approx(PHASE)
+    assert phase_map.read(
+        PhaseMap(tmp_path / "one.npz", STEP)
+    ).phase_rad == pytest.approx(PHASE)
     np.savez_compressed(tmp_path / "two.npz", phase=PHASE, amplitude=PHASE + 1)
     with pytest.raises(LensError, match=r"2 matrices \(amplitude, phase\); name one"):
         phase_map.read(PhaseMap(tmp_path / "two.npz", STEP))
-    assert phase_map.read(PhaseMap(tmp_path / "two.npz", STEP, variable="phase")).phase_rad == pytest.approx(PHASE)
+    assert phase_map.read(
+        PhaseMap(tmp_path / "two.npz", STEP, variable="phase")
+    ).phase_rad == pytest.approx(PHASE)
     np.savez(tmp_path / "objects.npz", phase=np.array([{}], dtype=object))
     with pytest.raises(LensError, match=r"objects\.npz: not an NPZ file: ValueError"):
         phase_map.read(PhaseMap(tmp_path / "objects.npz", STEP))
@@ -174,13 +218,17 @@ def test_damaged_matlab_files_are_refused_or_read(tmp_path_factory, data):
 
 
 def damaged(tmp_path_factory, kind, data):
-    """Truncated or with a flipped bit: a typed refusal or a map, never another exception."""
+    """Truncated or with a flipped bit: a typed refusal or a map, never another
+    exception.
+    """
     path = write(tmp_path_factory.mktemp("fuzz"), kind)
     whole = bytearray(path.read_bytes())
     if data.draw(st.booleans(), label="truncate"):
         whole = whole[: data.draw(st.integers(0, len(whole) - 1), label="length")]
     else:
-        whole[data.draw(st.integers(0, len(whole) - 1), label="byte")] ^= 1 << data.draw(st.integers(0, 7), label="bit")
+        whole[data.draw(st.integers(0, len(whole) - 1), label="byte")] ^= (
+            1 << data.draw(st.integers(0, 7), label="bit")
+        )
     path.write_bytes(bytes(whole))
     try:
         samples = phase_map.read(PhaseMap(path, None if kind == "dat" else STEP))
@@ -192,7 +240,8 @@ def damaged(tmp_path_factory, kind, data):
 @pytest.mark.parametrize("charge", [1, -2, 5])
 @pytest.mark.parametrize("count", [81, 84])
 def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
-    """exp(i m phi) beside a saddle, on pillars that stand on its axis or beside it: within half of the turn from a
+    """exp(i m phi) beside a saddle, on pillars that stand on its axis or beside it:
+    within half of the turn from a
     sample to the next beyond four samples, the phase of a sample nearby within."""
     x = (np.arange(count) - (count - 1) / 2) * 0.25
     x0, y0 = 0.31, -0.82
@@ -200,7 +249,9 @@ def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
     samples = phase_map.Samples(phase, (0.25, 0.25))
     for at in (np.arange(-25, 26) * 0.3, np.arange(-25, 25) * 0.3 + 0.15):
         found = phase_map.interpolate(samples, at + x0, at + y0, radius_um=8.0)
-        want = charge * np.arctan2(at[:, None], at) + 0.03 * (at + x0) * (at[:, None] + y0)
+        want = charge * np.arctan2(at[:, None], at) + 0.03 * (at + x0) * (
+            at[:, None] + y0
+        )
         off = np.abs(np.angle(np.exp(1j * (found - want))))
         radius = np.hypot(at, at[:, None])
         far = (radius > 1.0) & (radius < 7.0)
@@ -211,17 +262,22 @@ def test_a_vortex_is_read_however_fine_its_map_is(charge, count):
 
 
 def test_maps_that_are_too_coarse_are_refused_beside_a_vortex_too():
-    """Steps of 0.8 half-turns along x; a step of a half-turn along a line; both with a vortex of charge 2 in them."""
+    """Steps of 0.8 half-turns along x; a step of a half-turn along a line; both with a
+    vortex of charge 2 in them.
+    """
     x = np.arange(-20, 21) * 0.5
     vortex = 2 * np.arctan2(x[:, None] + 0.1, x - 0.1)
     for more in (0.8 * np.pi / 0.5 * x, np.where(x > 0.2, np.pi, 0.0)):
         samples = phase_map.Samples(vortex + more, (0.5, 0.5))
         with pytest.raises(LensError, match="finer pitch"):
-            phase_map.interpolate(samples, np.arange(-20, 20) * 0.3 + 0.25, np.arange(-20, 20) * 0.3)
+            phase_map.interpolate(
+                samples, np.arange(-20, 20) * 0.3 + 0.25, np.arange(-20, 20) * 0.3
+            )
 
 
 def test_a_ring_about_a_vortex_lies_eight_samples_from_it_at_most():
-    """Of charge m, neighbours on the nearest side of a ring of h samples differ by 2 m atan(1 / (2 h - 1)): less than a
+    """Of charge m, neighbours on the nearest side of a ring of h samples differ by 2 m
+    atan(1 / (2 h - 1)): less than a
     third of a turn for m of 15.7 at h = 8, and of 13.6 at 7 or 17.8 at 9."""
     x = np.arange(24) - 11.5
     for charge, known in ((13, True), (15, True), (16, False)):

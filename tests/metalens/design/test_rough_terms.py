@@ -1,4 +1,6 @@
-"""The rough terms of a PSF's error budget against solved rows and tilted light of the default cell."""
+"""The rough terms of a PSF's error budget against solved rows and tilted light of the
+default cell.
+"""
 
 import math
 
@@ -13,24 +15,40 @@ from metalens.psf import budget
 
 @pytest.mark.slow
 def test_the_rough_terms_are_those_of_the_default_cell():
-    """Rows of 12 and 8 pillars: amplitude and phase to 0.01, what a few more harmonics change. Tilt: to 5 %."""
+    """Rows of 12 and 8 pillars: amplitude and phase to 0.01, what a few more harmonics
+    change. Tilt: to 5 %.
+    """
     cell = library.DEFAULT_CELL
     proxy = library.proxy_of(library.sweep(cell, wavelengths_um=(0.85,)))
     sizes = np.linspace(*proxy.domain_um, 36).reshape(6, 6).astype(np.float32)
-    lens = Lens(DiameterMap(sizes, cell.pitch_um), cell, proxy, 0.85, 2000.0, 20_000.0, "map")
+    lens = Lens(
+        DiameterMap(sizes, cell.pitch_um), cell, proxy, 0.85, 2000.0, 20_000.0, "map"
+    )
     found = neighbours(lens, counts=(12, 8), diagonal=False)
     a, b = budget.NEIGHBOURS
-    assert found.sine == pytest.approx([0.85 / (12 * cell.pitch_um), 0.85 / (8 * cell.pitch_um)])
-    assert np.abs(1 + a * found.sine + b * found.sine**2 - found.factor.mean(0)).max() < 0.01
+    assert found.sine == pytest.approx(
+        [0.85 / (12 * cell.pitch_um), 0.85 / (8 * cell.pitch_um)]
+    )
+    assert (
+        np.abs(1 + a * found.sine + b * found.sine**2 - found.factor.mean(0)).max()
+        < 0.01
+    )
     angle, worst = math.radians(20), 0.0
-    sizes = tuple(np.linspace(proxy.domain_um[0], 0.19, 6).tolist())  # wider ones are near a resonance at this angle
+    sizes = tuple(
+        np.linspace(proxy.domain_um[0], 0.19, 6).tolist()
+    )  # wider ones are near a resonance at this angle
     for polarization in ("s", "p"):
         flat, tilted = (
             np.array(
                 [
                     one.t
                     for one in rcwa.solve_many(
-                        cell, sizes, 0.85, angle_rad=tilt, polarization=polarization, tolerance=1e-2
+                        cell,
+                        sizes,
+                        0.85,
+                        angle_rad=tilt,
+                        polarization=polarization,
+                        tolerance=1e-2,
                     )
                 ]
             )

@@ -1,4 +1,6 @@
-"""Pillars for several wavelengths: against all diameters tried one by one, and against plain sums of their light."""
+"""Pillars for several wavelengths: against all diameters tried one by one, and against
+plain sums of their light.
+"""
 
 import json
 import math
@@ -19,7 +21,9 @@ BLUE, GREEN, RED = 0.50, 0.55, 0.61
 
 
 def proxy(level=((0.9, 0.06), (0.03, 0.0))):
-    """2.6 to 3.3 turns over the diameters, fewer at longer wavelengths, of a curve that bends."""
+    """2.6 to 3.3 turns over the diameters, fewer at longer wavelengths, of a curve that
+    bends.
+    """
     phase = np.array([[0.5, 9.3, 0.7], [-0.8, -1.2, 0.35], [0.1, 0.2, 0.0]])
     return Proxy(phase, np.array(level), (0.08, 0.3), (BLUE, RED), 0.0, 0.0)
 
@@ -33,7 +37,14 @@ def wanted(*focuses, weights=(1.0, 1.0, 1.0)):
 
 def made(lights, given=None, **about):
     return design.make_several(
-        lights, **{"aperture_um": 10.0, "cell": CELL, "proxy": given or proxy(), "limits": LIMITS} | about
+        lights,
+        **{
+            "aperture_um": 10.0,
+            "cell": CELL,
+            "proxy": given or proxy(),
+            "limits": LIMITS,
+        }
+        | about,
     )
 
 
@@ -50,23 +61,31 @@ def answers(diameter_um, focuses):
     p = proxy()
     return np.stack(
         [
-            p.transmission(diameter_um, f.wavelength_um) * np.exp(1j * p.phase_rad(diameter_um, f.wavelength_um))
+            p.transmission(diameter_um, f.wavelength_um)
+            * np.exp(1j * p.phase_rad(diameter_um, f.wavelength_um))
             for f in focuses
         ]
     )
 
 
 def paths(lens, focus):
-    """(pillar,) diameters that stand, and their paths to the focus and from the source, um."""
+    """(pillar,) diameters that stand, and their paths to the focus and from the source,
+    um.
+    """
     d = lens.diameters
     y, x = np.meshgrid(d.y_um, d.x_um, indexing="ij")
     stand = d.diameter_um > 0
-    near, far = (np.hypot(np.hypot(x, y), z)[stand] for z in (focus.sensor_distance_um, focus.source_distance_um))
+    near, far = (
+        np.hypot(np.hypot(x, y), z)[stand]
+        for z in (focus.sensor_distance_um, focus.source_distance_um)
+    )
     return d.diameter_um[stand].astype(float), near, far
 
 
 def test_no_other_diameter_and_no_other_piston_lowers_the_sum_over_wavelengths(three):
-    """All of 20 001 diameters tried at every site: the sum of one step of that grid is within 1e-6 of the least."""
+    """All of 20 001 diameters tried at every site: the sum of one step of that grid is
+    within 1e-6 of the least.
+    """
     lens, _ = three
     weights = np.array([1.0, 2.5, 0.7])
     size, _, _ = paths(lens, ACHROMATIC[0])
@@ -75,12 +94,18 @@ def test_no_other_diameter_and_no_other_piston_lowers_the_sum_over_wavelengths(t
         _, near, far = paths(lens, focus)
         phases.append(-2 * np.pi / focus.wavelength_um * (near + far))
     t = answers(size, ACHROMATIC)
-    pistons = np.angle((t * np.exp(-1j * np.array(phases))).sum(1))  # the best for these pillars
+    pistons = np.angle(
+        (t * np.exp(-1j * np.array(phases))).sum(1)
+    )  # the best for these pillars
     goal = np.exp(1j * (np.array(phases) + pistons[:, None]))
     found = weights @ np.abs(t - goal) ** 2
     every = answers(np.linspace(*SPAN, 20_001), ACHROMATIC)
-    least = np.array([(weights @ np.abs(every - one[:, None]) ** 2).min() for one in goal.T])
-    assert (found - least).max() < 2e-3  # pistons settled to 1e-3 rad: 1e-3 times the slope of a sum, about 2
+    least = np.array(
+        [(weights @ np.abs(every - one[:, None]) ** 2).min() for one in goal.T]
+    )
+    assert (
+        (found - least).max() < 2e-3
+    )  # pistons settled to 1e-3 rad: 1e-3 times the slope of a sum, about 2
     assert (found - least).mean() < 2e-5
 
 
@@ -90,35 +115,55 @@ def test_quality_at_each_wavelength_is_that_of_its_light_in_the_focus(three):
     for focus, quality in zip(ACHROMATIC, qualities, strict=True):
         size, near, far = paths(lens, focus)
         t = answers(size, [focus])[0]
-        peak = abs((t * np.exp(2j * np.pi / focus.wavelength_um * (near + far))).sum()) ** 2
+        peak = (
+            abs((t * np.exp(2j * np.pi / focus.wavelength_um * (near + far))).sum())
+            ** 2
+        )
         assert quality.strehl == pytest.approx(peak / np.abs(t).sum() ** 2, rel=1e-5)
         assert quality.efficiency == pytest.approx(peak / len(t) ** 2, rel=1e-5)
 
 
 def test_what_serves_all_serves_the_others_better_than_a_lens_for_one():
-    """23 zones: a phase that all wavelengths share blurs what is 11 % off the design's by some two turns."""
+    """23 zones: a phase that all wavelengths share blurs what is 11 % off the design's
+    by some two turns.
+    """
     lens, qualities = made(wanted(*ACHROMATIC), aperture_um=40.0)
     alone, own = made(wanted(ACHROMATIC[0]), aperture_um=40.0)
     size, near, far = paths(alone, ACHROMATIC[2])
     t = answers(size, ACHROMATIC[2:])[0]
-    strehl = abs((t * np.exp(2j * np.pi / RED * (near + far))).sum()) ** 2 / np.abs(t).sum() ** 2
-    assert own[0].strehl > 0.99  # of one wavelength nothing is given up but for |T|, which varies
+    strehl = (
+        abs((t * np.exp(2j * np.pi / RED * (near + far))).sum()) ** 2
+        / np.abs(t).sum() ** 2
+    )
+    assert (
+        own[0].strehl > 0.99
+    )  # of one wavelength nothing is given up but for |T|, which varies
     assert strehl < 0.02
     assert min(one.strehl for one in qualities) > 0.25
     assert lens.wavelength_um == GREEN
 
 
 def test_one_wavelength_and_even_transmission_make_the_wanted_phase():
-    """A parabola between steps of 0.05 rad is off by less than 1e-4 rad, diameters in float32 by 1e-5."""
-    lens, (quality,) = made(wanted(ACHROMATIC[1]), proxy(level=((0.93, 0.0), (0.0, 0.0))))
+    """A parabola between steps of 0.05 rad is off by less than 1e-4 rad, diameters in
+    float32 by 1e-5.
+    """
+    lens, (quality,) = made(
+        wanted(ACHROMATIC[1]), proxy(level=((0.93, 0.0), (0.0, 0.0)))
+    )
     assert quality.max_phase_error_rad < 3e-4
     assert quality.efficiency == pytest.approx(0.93**2, rel=1e-6)
-    assert lens.diameters.diameter_um[lens.diameters.diameter_um > 0].min() >= SPAN[0] - 1e-7
+    assert (
+        lens.diameters.diameter_um[lens.diameters.diameter_um > 0].min()
+        >= SPAN[0] - 1e-7
+    )
 
 
 def test_weight_draws_the_compromise():
     near, far = Focus(GREEN, 31.0, math.inf), Focus(RED, 44.0, 700.0)
-    even, heavy = (made(wanted(near, far, weights=w), aperture_um=40.0)[1] for w in ((1.0, 1.0), (1.0, 30.0)))
+    even, heavy = (
+        made(wanted(near, far, weights=w), aperture_um=40.0)[1]
+        for w in ((1.0, 1.0), (1.0, 30.0))
+    )
     assert heavy[1].strehl > 0.97 > even[1].strehl > 0.5
     assert heavy[0].strehl < even[0].strehl
 
@@ -126,10 +171,16 @@ def test_weight_draws_the_compromise():
 def test_two_wavelengths_meet_at_distances_of_their_own():
     near, far = Focus(GREEN, 31.0, math.inf), Focus(RED, 44.0, 700.0)
     lens, qualities = made(wanted(near, far), aperture_um=40.0)
-    assert (lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um) == (GREEN, 31.0, math.inf)
+    assert (lens.wavelength_um, lens.sensor_distance_um, lens.source_distance_um) == (
+        GREEN,
+        31.0,
+        math.inf,
+    )
     found = design.check_focus(lens, expected=qualities[0].strehl)
     assert found.passed
-    assert found.strehl == pytest.approx(qualities[0].strehl, abs=0.02)  # weights of the paths' lengths
+    assert found.strehl == pytest.approx(
+        qualities[0].strehl, abs=0.02
+    )  # weights of the paths' lengths
 
 
 @pytest.mark.parametrize(

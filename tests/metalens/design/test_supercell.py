@@ -1,4 +1,6 @@
-"""Rows of unlike pillars: one pillar repeated is the periodic cell, energy holds, mirrors mirror, slopes cost light."""
+"""Rows of unlike pillars: one pillar repeated is the periodic cell, energy holds,
+mirrors mirror, slopes cost light.
+"""
 
 import dataclasses
 
@@ -25,7 +27,12 @@ def test_a_single_pillar_is_the_periodic_cell_of_the_modal_method():
     want = modal.solve(CELL, 0.12, WAVE, tolerance=1e-3).t
     for polarization in ("x", "y"):
         errors = [
-            abs(supercell.solve_row(CELL, [0.12], WAVE, polarization=polarization, harmonics=h).order(0) - want)
+            abs(
+                supercell.solve_row(
+                    CELL, [0.12], WAVE, polarization=polarization, harmonics=h
+                ).order(0)
+                - want
+            )
             for h in (3, 5)
         ]
         assert errors[1] < 0.01  # truncation of RCWA at 5 orders
@@ -34,8 +41,12 @@ def test_a_single_pillar_is_the_periodic_cell_of_the_modal_method():
 
 @pytest.mark.parametrize("polarization", ["x", "y"])
 def test_equal_pillars_in_a_row_are_one_pillar(polarization):
-    one = supercell.solve_row(CELL, [0.14], WAVE, polarization=polarization, harmonics=2)
-    four = supercell.solve_row(CELL, [0.14] * 4, WAVE, polarization=polarization, harmonics=2)
+    one = supercell.solve_row(
+        CELL, [0.14], WAVE, polarization=polarization, harmonics=2
+    )
+    four = supercell.solve_row(
+        CELL, [0.14] * 4, WAVE, polarization=polarization, harmonics=2
+    )
     assert four.order(0) == pytest.approx(one.order(0), abs=1e-9)
     assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 1e-9
 
@@ -44,23 +55,46 @@ def test_equal_pillars_in_a_row_are_one_pillar(polarization):
 def test_energy_holds_and_a_mirrored_row_mirrors_its_orders(polarization):
     row = [0.1, 0.12, 0.17, 0.2]
     there = supercell.solve_row(CELL, row, WAVE, polarization=polarization, harmonics=2)
-    back = supercell.solve_row(CELL, row[::-1], WAVE, polarization=polarization, harmonics=2)
+    back = supercell.solve_row(
+        CELL, row[::-1], WAVE, polarization=polarization, harmonics=2
+    )
     assert there.energy == pytest.approx(1, abs=1e-9)
     assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
-    assert abs(there.order(1) - there.order(-1)) > 0.05  # the row is not its own mirror image
+    assert (
+        abs(there.order(1) - there.order(-1)) > 0.05
+    )  # the row is not its own mirror image
 
 
 @pytest.mark.parametrize("polarization", ["x", "y"])
-def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_another(polarization):
-    """Equal pillars have the orders of their own lattice alone, every other one of a square of two (|m + n| even), and
-    light along both axes is alike; truncated to another set of waves than along the lattice, 1e-2 of t."""
+def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_another(
+    polarization,
+):
+    """Equal pillars have the orders of their own lattice alone, every other one of a
+    square of two (|m + n| even), and
+    light along both axes is alike; truncated to another set of waves than along the
+    lattice, 1e-2 of t."""
     about = dict(polarization=polarization, harmonics=2, diagonal=True)
     four = supercell.solve_row(CELL, [0.14] * 4, WAVE, **about)
     assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 1e-9
-    two = [supercell.solve_row(CELL, [0.14] * 2, WAVE, **about | dict(polarization=p)).order(0) for p in ("x", "y")]
+    two = [
+        supercell.solve_row(
+            CELL, [0.14] * 2, WAVE, **about | dict(polarization=p)
+        ).order(0)
+        for p in ("x", "y")
+    ]
     assert two == pytest.approx([four.order(0)] * 2, abs=1e-9)
-    fine = supercell.solve_row(CELL, [0.14], WAVE, polarization=polarization, harmonics=5).order(0)
-    assert abs(supercell.solve_row(CELL, [0.14] * 2, WAVE, **about | dict(harmonics=4)).order(0) - fine) < 0.02
+    fine = supercell.solve_row(
+        CELL, [0.14], WAVE, polarization=polarization, harmonics=5
+    ).order(0)
+    assert (
+        abs(
+            supercell.solve_row(
+                CELL, [0.14] * 2, WAVE, **about | dict(harmonics=4)
+            ).order(0)
+            - fine
+        )
+        < 0.02
+    )
     there = supercell.solve_row(CELL, [0.1, 0.12, 0.17, 0.2], WAVE, **about)
     back = supercell.solve_row(CELL, [0.2, 0.17, 0.12, 0.1], WAVE, **about)
     assert there.energy == pytest.approx(1, abs=1e-9)
@@ -71,15 +105,27 @@ def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_ano
 
 def test_absorbing_pillars_lose_energy():
     lossy = dataclasses.replace(CELL, pillar=Index(3.6, 0.1))
-    assert supercell.solve_row(lossy, [0.1, 0.2], WAVE, polarization="x", harmonics=2).energy < 0.98
+    assert (
+        supercell.solve_row(
+            lossy, [0.1, 0.2], WAVE, polarization="x", harmonics=2
+        ).energy
+        < 0.98
+    )
 
 
 def test_weak_pillars_do_not_feel_their_neighbours():
-    """Where scattering is weak the local periodic approximation is first-order exact: pillars add one by one."""
+    """Where scattering is weak the local periodic approximation is first-order exact:
+    pillars add one by one.
+    """
     row = np.array([0.08, 0.14, 0.2, 0.25])
     whole = supercell.solve_row(GLASS, row, WAVE, polarization="y", harmonics=2)
-    alone = [supercell.solve_row(GLASS, [d], WAVE, polarization="y", harmonics=2).order(0) for d in row]
-    assert whole.order(0) == pytest.approx(np.mean(alone), abs=2e-3)  # second order: (0.2 rad)² / 20
+    alone = [
+        supercell.solve_row(GLASS, [d], WAVE, polarization="y", harmonics=2).order(0)
+        for d in row
+    ]
+    assert whole.order(0) == pytest.approx(
+        np.mean(alone), abs=2e-3
+    )  # second order: (0.2 rad)² / 20
     assert np.abs(np.diff(alone)).max() > 0.03
 
 
@@ -100,8 +146,12 @@ def _lens():
 
 def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     found = supercell.neighbours(_lens(), counts=(6, 5, 4), harmonics=2)
-    assert found.sine[~found.diagonal] == pytest.approx(WAVE / 0.3 / np.array([6, 5, 4]))
-    assert found.sine[found.diagonal] == pytest.approx(WAVE * 2**0.5 / 0.3 / np.array([6, 8]))  # √2 of those, even
+    assert found.sine[~found.diagonal] == pytest.approx(
+        WAVE / 0.3 / np.array([6, 5, 4])
+    )
+    assert found.sine[found.diagonal] == pytest.approx(
+        WAVE * 2**0.5 / 0.3 / np.array([6, 8])
+    )  # √2 of those, even
     cosine = np.sqrt(1 - found.sine**2)
     power = found.factor * np.stack([cosine**-0.5, cosine**0.5])
     change = np.abs(power - 1)
@@ -109,35 +159,55 @@ def test_steeper_slopes_change_more_and_the_model_follows_the_rows():
     assert (change < 0.6).all()
     model = found.at(found.sine, np.where(found.diagonal, np.pi / 4, 0.0))
     assert np.abs(model - power).max() < 0.5 * change.max()  # two terms for three rows
-    assert found.at(np.array(0.0)) == pytest.approx(1.0)  # nothing turned, nothing changed
+    assert found.at(np.array(0.0)) == pytest.approx(
+        1.0
+    )  # nothing turned, nothing changed
     assert np.abs(found.coarse - found.factor).max() > 0
 
 
-def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(monkeypatch):
-    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t. Neighbours: of its rim's zone."""
+def test_the_terms_of_the_lens_s_own_cell_are_those_of_an_independent_solver(
+    monkeypatch,
+):
+    """Angle: by the modal method, which shares no code with RCWA; both to 1e-2 of t.
+    Neighbours: of its rim's zone.
+    """
     monkeypatch.setattr("metalens.design.own_cell.DIAMETERS", 2)
     counts = []
     monkeypatch.setattr(
-        "metalens.design.own_cell.neighbours", lambda _, counts, told=counts: told.append(counts) or "rows"
+        "metalens.design.own_cell.neighbours",
+        lambda _, counts, told=counts: told.append(counts) or "rows",
     )
     lens, tilt = _lens(), 0.3
     found = design.left_out(lens, aperture=0.5, incidence_rad=tilt)
-    assert counts == [(6, 9, 12)]  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim
+    assert counts == [
+        (6, 9, 12)
+    ]  # 0.85 / (0.3 · 0.5) = 5.7 pillars in a zone of the rim
     assert found.neighbours == "rows"
     changes = []
     for side in ("s", "p"):
         flat, tilted = (
             np.array(
                 [
-                    modal.solve(CELL, d, WAVE, angle_rad=angle, polarization=side, tolerance=5e-3).t
+                    modal.solve(
+                        CELL,
+                        d,
+                        WAVE,
+                        angle_rad=angle,
+                        polarization=side,
+                        tolerance=5e-3,
+                    ).t
                     for d in supercell.printed(lens)
                 ]
             )
             for angle in (0.0, tilt)
         )
         common = (flat.conj() @ tilted) / (flat.conj() @ flat)
-        changes.append((np.abs(tilted - common * flat) ** 2).sum() / (np.abs(tilted) ** 2).sum())
-    assert found.angle * np.sin(tilt) ** 2 == pytest.approx(np.sqrt(np.mean(changes)), abs=1.5e-2)
+        changes.append(
+            (np.abs(tilted - common * flat) ** 2).sum() / (np.abs(tilted) ** 2).sum()
+        )
+    assert found.angle * np.sin(tilt) ** 2 == pytest.approx(
+        np.sqrt(np.mean(changes)), abs=1.5e-2
+    )
     assert found.angle > 0.1
 
 
@@ -164,33 +234,64 @@ GREEN, NARROW, WIDE = 0.532, 0.084, 0.24
 def steep():
     """A lens of NA 0.8 of pillars as the rows' own solver has them, one by one."""
     sizes = np.linspace(NARROW, WIDE, 25)
-    alone = [supercell.solve_row(TITANIA, [d], GREEN, polarization="x", harmonics=2).order(0) for d in sizes]
-    phase = np.polynomial.Chebyshev.fit(sizes, np.unwrap(np.angle(alone)), 8, domain=[NARROW, WIDE])
-    proxy = Proxy(phase.coef[None], np.array([[0.95]]), (NARROW, WIDE), (GREEN, GREEN), 0.0, 0.0)
+    alone = [
+        supercell.solve_row(TITANIA, [d], GREEN, polarization="x", harmonics=2).order(0)
+        for d in sizes
+    ]
+    phase = np.polynomial.Chebyshev.fit(
+        sizes, np.unwrap(np.angle(alone)), 8, domain=[NARROW, WIDE]
+    )
+    proxy = Proxy(
+        phase.coef[None], np.array([[0.95]]), (NARROW, WIDE), (GREEN, GREEN), 0.0, 0.0
+    )
     focus = Focus(GREEN, 7.5)
-    wanted, limits = design.phase_of(None, focus, radius_um=10.0), design.Limits(1e3 * NARROW, 10.0)
-    return design.make(wanted, focus, aperture_um=20.0, cell=TITANIA, proxy=proxy, limits=limits)[0]
+    wanted, limits = (
+        design.phase_of(None, focus, radius_um=10.0),
+        design.Limits(1e3 * NARROW, 10.0),
+    )
+    return design.make(
+        wanted, focus, aperture_um=20.0, cell=TITANIA, proxy=proxy, limits=limits
+    )[0]
 
 
 def _solved_whole(lens, polarization, *, count=12, aperture=0.8, harmonics=2):
-    """Amplitude in the focus of a cylinder lens of ``count`` unlike pillars over what they give one by one, and the
+    """Amplitude in the focus of a cylinder lens of ``count`` unlike pillars over what
+    they give one by one, and the
     sines by which it turns light."""
-    cell, wave, place = lens.cell, lens.wavelength_um, np.arange(count) - (count - 1) / 2
+    cell, wave, place = (
+        lens.cell,
+        lens.wavelength_um,
+        np.arange(count) - (count - 1) / 2,
+    )
     width = count * cell.pitch_um
     focal = width / 2 / np.tan(np.arcsin(aperture))
     x = place * cell.pitch_um
     phase = 0.4 - 2 * np.pi / wave * (np.hypot(x, focal) - focal)
-    sizes = np.asarray(lens.proxy.diameter_um(phase, wave, within_um=supercell.printed(lens), gap="nearest"))
+    sizes = np.asarray(
+        lens.proxy.diameter_um(
+            phase, wave, within_um=supercell.printed(lens), gap="nearest"
+        )
+    )
     settings = {"polarization": polarization, "harmonics": harmonics}
     row = supercell.solve_row(cell, sizes, wave, **settings)
-    alone = np.array([supercell.solve_row(cell, [d], wave, **settings).order(0) for d in sizes])
+    alone = np.array(
+        [supercell.solve_row(cell, [d], wave, **settings).order(0) for d in sizes]
+    )
     to_orders = np.exp(-2j * np.pi * np.outer(row.orders, place) / count) / count
-    ideal = np.where(np.abs(row.orders) * wave / width < aperture, np.conj(to_orders @ np.exp(1j * phase)), 0)
-    return (ideal @ row.t) / (ideal @ (to_orders @ alone)), np.abs(x) / np.hypot(x, focal)
+    ideal = np.where(
+        np.abs(row.orders) * wave / width < aperture,
+        np.conj(to_orders @ np.exp(1j * phase)),
+        0,
+    )
+    return (ideal @ row.t) / (ideal @ (to_orders @ alone)), np.abs(x) / np.hypot(
+        x, focal
+    )
 
 
 def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(steep):
-    """Sign and size; what is left are the ends of twelve pillars and how fast their zones change."""
+    """Sign and size; what is left are the ends of twelve pillars and how fast their
+    zones change.
+    """
     found = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
     solved = [_solved_whole(steep, polarization) for polarization in ("x", "y")]
     cosine = np.sqrt(1 - solved[0][1] ** 2)
@@ -199,35 +300,58 @@ def test_the_factor_of_rows_is_that_of_a_lens_of_unlike_pillars_solved_whole(ste
     assert np.angle(predicted) < -0.3  # late, not early
     assert np.angle(whole) == pytest.approx(np.angle(predicted), abs=0.06)
     assert abs(whole) == pytest.approx(abs(predicted), abs=0.12)
-    assert abs(solved[0][0]) < abs(solved[1][0]) - 0.05  # light along the row loses more
+    assert (
+        abs(solved[0][0]) < abs(solved[1][0]) - 0.05
+    )  # light along the row loses more
     assert (np.abs(found.factor[0]) < np.abs(found.factor[1]) - 0.05)[:2].all()
 
 
-def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(steep, monkeypatch):
+def test_what_unlike_neighbours_leave_of_a_steep_lens_and_of_a_flat_one(
+    steep, monkeypatch
+):
     def kept(lens, *, counts):
-        return supercell.neighbours(lens, counts=counts, harmonics=2)  # a third of the time
+        return supercell.neighbours(
+            lens, counts=counts, harmonics=2
+        )  # a third of the time
 
     monkeypatch.setattr("metalens.design.own_cell.neighbours", kept)
     rows = design.rows(steep, radius_um=10.0)
     found = design.unlike(dataclasses.replace(steep, neighbours=rows), radius_um=10.0)
-    assert found.pillars == (2, 3, 4)  # 0.532 / (0.32 · 0.8) = 2.1 pillars in a zone of the rim
+    assert found.pillars == (
+        2,
+        3,
+        4,
+    )  # 0.532 / (0.32 · 0.8) = 2.1 pillars in a zone of the rim
     r = 10.0 * np.sqrt((np.arange(4000) + 0.5) / 4000)
-    shares = [one.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000)) for one in (rows, rows.coarser, *rows.others)]
+    shares = [
+        one.share(r / np.hypot(r, 7.5), np.full(4000, 1 / 4000))
+        for one in (rows, rows.coarser, *rows.others)
+    ]
     assert found.share == pytest.approx(shares[0], rel=1e-3)
     apart = np.abs(np.array(shares) - shares[0])
-    assert found.error == pytest.approx(apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2)
+    assert found.error == pytest.approx(
+        apart[1] + apart[2:].max() + 0.2 * (1 - shares[0]), rel=2e-2
+    )
     assert found.error < 0.4
     rough = design.rough_unlike(steep, radius_um=10.0)
-    assert abs(rough.share - found.share) < rough.error  # what is said without a solve covers it
-    flat = design.rough_unlike(dataclasses.replace(steep, sensor_distance_um=75.0), radius_um=10.0)
+    assert (
+        abs(rough.share - found.share) < rough.error
+    )  # what is said without a solve covers it
+    flat = design.rough_unlike(
+        dataclasses.replace(steep, sensor_distance_um=75.0), radius_um=10.0
+    )
     assert flat.share > 0.98
 
 
 @pytest.mark.parametrize(("count", "diagonal"), [(5, False), (8, True)])
-def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(steep, count, diagonal):
-    """A grating of the lens's pillars, as the maps of PSFs take it, against all its pillars solved as one cell.
+def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
+    steep, count, diagonal
+):
+    """A grating of the lens's pillars, as the maps of PSFs take it, against all its
+    pillars solved as one cell.
 
-    Rows of 2, 3 and 4 pillars (2, 4 and 6 along the diagonal) are known. Apart: rows whose phases begin elsewhere.
+    Rows of 2, 3 and 4 pillars (2, 4 and 6 along the diagonal) are known. Apart: rows
+    whose phases begin elsewhere.
     """
     rows = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
     block = supercell.block_of(TITANIA.pitch_um, diagonal)
@@ -236,7 +360,12 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(steep, coun
     want = solved * np.array([(1 - sine**2) ** -0.25, (1 - sine**2) ** 0.25])
     along, down = np.indices((24, 24))[::-1]
     turns = 2 * np.pi / count * (along + down if diagonal else along)
-    got = among.jones(torch.tensor(np.angle(np.exp(1j * turns))), torch.ones(24, 24).double(), rows, TITANIA.pitch_um)
+    got = among.jones(
+        torch.tensor(np.angle(np.exp(1j * turns))),
+        torch.ones(24, 24).double(),
+        rows,
+        TITANIA.pitch_um,
+    )
     middle = [complex(part[12, 12]) for part in got]
     fields = [middle[0] + middle[2], middle[0] - middle[2]] if diagonal else middle[:2]
     change = np.abs(want - 1).max()
@@ -246,4 +375,6 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(steep, coun
 
 def test_rows_of_other_cells_are_refused_by_name():
     with pytest.raises(CellError, match="square on a square lattice"):
-        supercell.solve_row(dataclasses.replace(CELL, shape=Square()), [0.1], WAVE, polarization="x")
+        supercell.solve_row(
+            dataclasses.replace(CELL, shape=Square()), [0.1], WAVE, polarization="x"
+        )

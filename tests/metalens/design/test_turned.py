@@ -1,4 +1,6 @@
-"""Lenses of turned pillars and on hexagonal lattices: phases by explicit matrices, focus and energy in closed form."""
+"""Lenses of turned pillars and on hexagonal lattices: phases by explicit matrices,
+focus and energy in closed form.
+"""
 
 import dataclasses
 import math
@@ -26,10 +28,19 @@ def library():
     sizes = np.linspace(0.2, 0.26, 20)
     t = np.stack([np.full(20, T_X), np.full(20, T_Y)])[:, None, None]
     c = (T_X - T_Y) / 2
-    proxy = Proxy(np.array([[np.angle(c), 0.0]]), np.array([[abs(c), 0.0]]), (0.2, 0.26), (0.94, 0.94), 0.0, 0.0)
+    proxy = Proxy(
+        np.array([[np.angle(c), 0.0]]),
+        np.array([[abs(c), 0.0]]),
+        (0.2, 0.26),
+        (0.94, 0.94),
+        0.0,
+        0.0,
+    )
     angles = np.radians([0, 15, 30, 45, -30, -15])
     solved = isolated(T_X, T_Y, angles)
-    turned = Turned(SIZE, WAVELENGTH, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None])
+    turned = Turned(
+        SIZE, WAVELENGTH, angles, solved, np.full(6, 0.01), 1.01 * solved[:, None]
+    )
     sweep = Sweep((WAVELENGTH,), diameters_um=(0.2, 0.26), samples=20, light="circular")
     small = np.full(t.shape, 1e-3)
     about = (t, t * 0, small, small, np.empty((0, 5)), "rcwa", 1)
@@ -38,7 +49,12 @@ def library():
 
 
 def made(hand="right", **about):
-    arguments = {"aperture_um": 17.0, "library": library(), "hand": hand, "limits": Limits(min_gap_nm=90)} | about
+    arguments = {
+        "aperture_um": 17.0,
+        "library": library(),
+        "hand": hand,
+        "limits": Limits(min_gap_nm=90),
+    } | about
     phase = design.phase_of(None, FOCUS, radius_um=8.5)
     return phase, design.make_turned(phase, FOCUS, **arguments)
 
@@ -51,14 +67,22 @@ def test_every_pillar_gives_the_light_of_its_hand_the_wanted_phase(hand, sign):
     assert (d.diameter_um[there] == np.float32(SIZE)).all()
     assert 0 <= d.angle_rad.min() <= d.angle_rad.max() < math.pi
     come = np.array([1, 1j * sign]) / math.sqrt(2)
-    leave = isolated(T_X, T_Y, d.angle_rad.astype(float)[there]) @ come @ come  # the part of the other hand
+    leave = (
+        isolated(T_X, T_Y, d.angle_rad.astype(float)[there]) @ come @ come
+    )  # the part of the other hand
     wanted = phase(d.x_um, d.y_um)[there]
-    assert np.abs(np.angle(leave * np.exp(-1j * wanted))).max() < 2e-6  # float32 turns: 2 pi 2^-24 of twice the turn
-    assert np.allclose(leave, (lens.transmission() * np.exp(1j * lens.phase_rad()))[there], atol=2e-6)
+    assert (
+        np.abs(np.angle(leave * np.exp(-1j * wanted))).max() < 2e-6
+    )  # float32 turns: 2 pi 2^-24 of twice the turn
+    assert np.allclose(
+        leave, (lens.transmission() * np.exp(1j * lens.phase_rad()))[there], atol=2e-6
+    )
     assert quality.efficiency == pytest.approx(abs(T_X - T_Y) ** 2 / 4, abs=1e-6)
     assert found.converted == pytest.approx(abs(T_X - T_Y) ** 2 / 4)
     assert found.unconverted == pytest.approx(abs(T_X + T_Y) ** 2 / 4)
-    assert found.converted_error == pytest.approx(rcwa.SAFETY * 0.0201 * abs(T_X - T_Y) ** 2 / 4)
+    assert found.converted_error == pytest.approx(
+        rcwa.SAFETY * 0.0201 * abs(T_X - T_Y) ** 2 / 4
+    )
 
 
 def test_light_of_the_other_hand_is_spread_as_much_as_the_lens_would_focus():
@@ -75,14 +99,19 @@ def test_light_of_the_other_hand_is_spread_as_much_as_the_lens_would_focus():
         samples=1,
     )
     bright, dark = (
-        abs(propagate.field_at(one.phase_rad(), one.transmission(), case, at)[0, 0]) ** 2 for one in (lens, wrong)
+        abs(propagate.field_at(one.phase_rad(), one.transmission(), case, at)[0, 0])
+        ** 2
+        for one in (lens, wrong)
     )
     assert dark < 0.05 * bright
 
 
 @pytest.mark.parametrize(
     ("limits", "words"),
-    [(Limits(min_diameter_nm=120.0), "115 nm wide"), (Limits(min_gap_nm=170.0), "turned towards each other")],
+    [
+        (Limits(min_diameter_nm=120.0), "115 nm wide"),
+        (Limits(min_gap_nm=170.0), "turned towards each other"),
+    ],
 )
 def test_pillars_that_are_not_printed_at_any_turn_are_refused(limits, words):
     with pytest.raises(LensError, match=words):
@@ -95,17 +124,28 @@ def test_a_library_without_turned_pillars_is_refused():
 
 
 HEXAGONAL = Cell(0.336, 0.7, Index(3.6), lattice=Lattice("hexagonal"))
-ROUND = Proxy(np.array([[3.4, 3.4]]), np.array([[0.91, 0.0]]), (0.08, 0.24), (0.85, 0.85), 0.0, 0.0)
+ROUND = Proxy(
+    np.array([[3.4, 3.4]]),
+    np.array([[0.91, 0.0]]),
+    (0.08, 0.24),
+    (0.85, 0.85),
+    0.0,
+    0.0,
+)
 AT = Focus(0.85, 33.0, math.inf)
 
 
 @pytest.fixture(scope="module")
 def hexagonal():
     phase = design.phase_of(None, AT, radius_um=11.0)
-    return design.make(phase, AT, aperture_um=22.0, cell=HEXAGONAL, proxy=ROUND, limits=Limits(60, 60))
+    return design.make(
+        phase, AT, aperture_um=22.0, cell=HEXAGONAL, proxy=ROUND, limits=Limits(60, 60)
+    )
 
 
-def test_sites_of_a_hexagonal_lens_fill_the_aperture_about_a_pillar_on_the_axis(hexagonal):
+def test_sites_of_a_hexagonal_lens_fill_the_aperture_about_a_pillar_on_the_axis(
+    hexagonal,
+):
     lens, quality = hexagonal
     d = lens.diameters
     assert d.steps_um == (0.168, 0.291)  # rows on the grid of the mask
@@ -113,7 +153,9 @@ def test_sites_of_a_hexagonal_lens_fill_the_aperture_about_a_pillar_on_the_axis(
     reach = np.hypot(*np.meshgrid(d.x_um, d.y_um))[d.diameter_um > 0].max()
     assert 11.0 - 0.168 - 0.336 < reach <= 11.0 - 0.168
     area = quality.pillars * d.site_um2
-    assert area == pytest.approx(math.pi * (11.0 - 0.168) ** 2, rel=0.01)  # pillars of the rim: 0.4 um of 22
+    assert area == pytest.approx(
+        math.pi * (11.0 - 0.168) ** 2, rel=0.01
+    )  # pillars of the rim: 0.4 um of 22
     assert quality.sampled_aperture == pytest.approx(0.85 / (math.sqrt(3) * 0.336))
     assert quality.steepest == pytest.approx(math.sin(math.atan(11 / 33)), rel=0.02)
 
@@ -128,18 +170,38 @@ def test_its_focus_lies_where_it_should_with_the_light_of_the_closed_form(hexago
     rows, columns = np.nonzero(d.diameter_um)
     r2 = d.x_um[columns] ** 2 + d.y_um[rows] ** 2 + 33.0**2
     k = 2 * np.pi / 0.85
-    peak = 0.91 * 0.336 * 0.291 * (33.0 / (2 * np.pi * r2) * np.hypot(1 / np.sqrt(r2), k)).sum()
-    stack = psf.from_lens(lens, psf.View((math.inf,), window_um=8.1, samples=81), tolerance=1e-5)
-    assert stack.intensity[0, 0, 40, 40] * stack.energy_um2[0, 0] / stack.step_um**2 == pytest.approx(peak**2, rel=2e-5)
+    peak = (
+        0.91
+        * 0.336
+        * 0.291
+        * (33.0 / (2 * np.pi * r2) * np.hypot(1 / np.sqrt(r2), k)).sum()
+    )
+    stack = psf.from_lens(
+        lens, psf.View((math.inf,), window_um=8.1, samples=81), tolerance=1e-5
+    )
+    assert stack.intensity[0, 0, 40, 40] * stack.energy_um2[
+        0, 0
+    ] / stack.step_um**2 == pytest.approx(peak**2, rel=2e-5)
     given = 0.91**2 * len(rows) * 0.336 * 0.291
     radius = np.hypot(*np.meshgrid(stack.x_um, stack.y_um))
-    core = stack.intensity[0, 0][radius < 0.61 * 0.85 / math.sin(math.atan(11 / 33))].sum() * stack.energy_um2[0, 0]
-    assert core / given == pytest.approx(0.838, abs=0.03)  # Airy; NA 0.32 and the edge of the pixels: 2 %
+    core = (
+        stack.intensity[0, 0][radius < 0.61 * 0.85 / math.sin(math.atan(11 / 33))].sum()
+        * stack.energy_um2[0, 0]
+    )
+    assert core / given == pytest.approx(
+        0.838, abs=0.03
+    )  # Airy; NA 0.32 and the edge of the pixels: 2 %
 
 
 def test_a_lattice_too_coarse_for_the_rim_is_told():
     far = Focus(0.85, 5.0, math.inf)
     coarse = dataclasses.replace(HEXAGONAL, pitch_um=0.56)
     phase = design.phase_of(None, far, radius_um=11.0)
-    _, quality = design.make(phase, far, aperture_um=22.0, cell=coarse, proxy=ROUND, limits=Limits(60, 60))
-    assert quality.steepest > quality.sampled_aperture == pytest.approx(0.85 / (math.sqrt(3) * 0.56))
+    _, quality = design.make(
+        phase, far, aperture_um=22.0, cell=coarse, proxy=ROUND, limits=Limits(60, 60)
+    )
+    assert (
+        quality.steepest
+        > quality.sampled_aperture
+        == pytest.approx(0.85 / (math.sqrt(3) * 0.56))
+    )

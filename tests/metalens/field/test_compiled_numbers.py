@@ -1,4 +1,6 @@
-"""Light on the nodes of pupils that are dark in places, of few depths and of many, by its formula; powers by parts."""
+"""Light on the nodes of pupils that are dark in places, of few depths and of many, by
+its formula; powers by parts.
+"""
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ draw = np.random.default_rng(41)
 
 @pytest.mark.parametrize("few", [1, 2, 4, 5, 6])
 def test_light_on_dark_and_bright_nodes_is_the_formula(few):
-    """weight exp(2πi (turns + Σ mix paths)) of each depth: five mixtures go in one pass, other numbers one by one. Rows
-    that begin and end in the dark, with a dark node inside, one that is lit at its ends alone, and one without light.
+    """weight exp(2πi (turns + Σ mix paths)) of each depth: five mixtures go in one
+    pass, other numbers one by one. Rows
+    that begin and end in the dark, with a dark node inside, one that is lit at its ends
+    alone, and one without light.
     Sines of float32: 2e-7 of weights of 3."""
     weight = draw.uniform(0.5, 3, (5, 9))
     weight[0, :2], weight[0, 7:], weight[0, 4] = 0, 0, 0
@@ -35,14 +39,20 @@ def test_powers_are_squares_of_both_parts():
 
 @pytest.mark.parametrize("depths", [1, 2, 3, 4, 7])
 def test_sheets_between_depths_take_the_polynomial_through_their_nodes(depths):
-    """Weights that are a power of the node's number come back at any place between: of a cubic where there are four
-    nodes or more. Places at nodes and at both ends; a dark pixel takes nothing from where it lies."""
+    """Weights that are a power of the node's number come back at any place between: of
+    a cubic where there are four
+    nodes or more. Places at nodes and at both ends; a dark pixel takes nothing from
+    where it lies."""
     high, wide, rank = 3, 4, 2
     order = min(3, depths - 1)
     nodes = np.arange(depths, dtype=np.float32)
     table = np.stack([nodes**order, 2.0 + 0 * nodes], 1)  # (depths, rank)
-    tables = np.ascontiguousarray(np.repeat(table[:, :, None], high * wide, axis=2), np.float32)
-    energy = np.repeat((1 + 0.5 * nodes)[:, None], high * wide, axis=1).astype(np.float32)
+    tables = np.ascontiguousarray(
+        np.repeat(table[:, :, None], high * wide, axis=2), np.float32
+    )
+    energy = np.repeat((1 + 0.5 * nodes)[:, None], high * wide, axis=1).astype(
+        np.float32
+    )
     if depths == 1:
         energy[:] = 1.0
     place = draw.uniform(0, depths - 1, (1, 1, high, wide)).astype(np.float32)
@@ -51,9 +61,13 @@ def test_sheets_between_depths_take_the_polynomial_through_their_nodes(depths):
     content[0, 0, 2, 3] = 0
     for lit in (True, False):
         out = np.full((high, rank, 1, wide), np.nan, np.float32)
-        compiled.weigh(content, place, np.array([[0, 0]]), (tables, energy), lit, 0, out)
+        compiled.weigh(
+            content, place, np.array([[0, 0]]), (tables, energy), lit, 0, out
+        )
         at = place[0, 0].astype(float)
         level = (1 + 0.5 * at if depths > 1 else 1.0) if lit else 1.0
         want = content[0, 0] * level
-        assert out[:, 0, 0] == pytest.approx(want * (at**order if depths > 1 else 1.0), rel=3e-5, abs=3e-5)
+        assert out[:, 0, 0] == pytest.approx(
+            want * (at**order if depths > 1 else 1.0), rel=3e-5, abs=3e-5
+        )
         assert out[:, 1, 0] == pytest.approx(2 * want * np.ones_like(at), rel=3e-5)

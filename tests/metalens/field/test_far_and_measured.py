@@ -1,4 +1,6 @@
-"""Scenes that reach to infinity, and spectra as measured, against plane waves and the diode that a curve samples."""
+"""Scenes that reach to infinity, and spectra as measured, against plane waves and the
+diode that a curve samples.
+"""
 
 import math
 from dataclasses import replace
@@ -25,18 +27,29 @@ def frames(grid, points, depth_um):
     light = torch.zeros(1, 2, rows, columns)
     for row, column, level in points:
         light[0, 1, row, column] = level
-    cover = torch.cat([torch.zeros(1, 1, rows, columns), torch.ones(1, 1, rows, columns)], 1)
+    cover = torch.cat(
+        [torch.zeros(1, 1, rows, columns), torch.ones(1, 1, rows, columns)], 1
+    )
     return Frames(light, cover, torch.full_like(light, depth_um))
 
 
 def test_points_at_infinity_lie_where_and_are_as_bright_as_plane_waves_make_them():
-    """A scene from 4 mm to infinity; a lens for infinity. The referee's source lies 1e6 lens distances away."""
+    """A scene from 4 mm to infinity; a lens for infinity. The referee's source lies 1e6
+    lens distances away.
+    """
     grid = Grid((9, 7), STEP, (4e3, math.inf), margin=WINDOW // 2, window=WINDOW)
     made = imager(WAVE, grid, field=(0.15, -0.08), tolerance=1e-2)
     assert float(made.plan.depths_um[-1]) == math.inf
     points = [(9, 11, 7.3), (14, 8, 2.1)]
     got = made(frames(grid, points, math.inf))[0].double().numpy()
-    judge = Referee(radius=RADIUS, distance=DISTANCE, focus=1e9, design_wavelength=0.85, fine=0.6, count=256)
+    judge = Referee(
+        radius=RADIUS,
+        distance=DISTANCE,
+        focus=1e9,
+        design_wavelength=0.85,
+        fine=0.6,
+        count=256,
+    )
     light = np.zeros((9 + 14, 7 + 14))
     for row, column, level in points:
         light[row, column] = level
@@ -45,7 +58,9 @@ def test_points_at_infinity_lie_where_and_are_as_bright_as_plane_waves_make_them
     want = judge.image(light, np.full_like(light, 1e9), **about)[7:-7, 7:-7]
     # points hold more of the fine detail than the texture of the stated error
     assert np.linalg.norm(got - want) / np.linalg.norm(want) < 2.5 * made.error
-    np.testing.assert_allclose(got, made(frames(grid, points, 1e12))[0].numpy(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        got, made(frames(grid, points, 1e12))[0].numpy(), rtol=1e-5, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("depths", [(0.0, math.inf), (math.inf, 5e3), (math.nan, 5e3)])
@@ -56,11 +71,20 @@ def test_depths_without_order_are_refused(depths):
 
 def waves(source, tolerance):
     grid = Grid((9, 7), STEP, (3e3, 9e3), margin=3, window=WINDOW)
-    return plan.waves_of(Optics(WAVE, Layers(), DISTANCE), grid, source, (30.0, -20.0), grid.half_um, tolerance)
+    return plan.waves_of(
+        Optics(WAVE, Layers(), DISTANCE),
+        grid,
+        source,
+        (30.0, -20.0),
+        grid.half_um,
+        tolerance,
+    )
 
 
 def test_a_measured_curve_gets_the_wavelengths_of_the_diode_it_samples():
-    """The same points and shares; what a curve leaves out beside the known range is added to the error, or refused."""
+    """The same points and shares; what a curve leaves out beside the known range is
+    added to the error, or refused.
+    """
     curve = spectrum.Measured(*spectrum.weight(DIODE))
     want, got = waves(DIODE, 5e-3), waves(curve, 5e-3)
     np.testing.assert_array_equal(got.wavelengths_um, want.wavelengths_um)

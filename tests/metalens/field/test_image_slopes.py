@@ -1,4 +1,6 @@
-"""The gradient from single field points and wavelengths: its mean over all draws is the whole one, exactly."""
+"""The gradient from single field points and wavelengths: its mean over all draws is the
+whole one, exactly.
+"""
 
 import numpy as np
 import pytest
@@ -29,9 +31,14 @@ WAVES = Nodes(np.array([0.842, 0.867]), np.array([0.41, 0.59]), 0.0)
 
 def _optics(strength):
     def added(x, y):
-        return strength * (x / RADIUS) * ((x / RADIUS) ** 2 + (y / RADIUS) ** 2) + 0.3 * y / RADIUS
+        return (
+            strength * (x / RADIUS) * ((x / RADIUS) ** 2 + (y / RADIUS) ** 2)
+            + 0.3 * y / RADIUS
+        )
 
-    return Optics(SmoothWave(Focus(0.85, 210.0, 5000.0), RADIUS, added), Layers(), 210.0)
+    return Optics(
+        SmoothWave(Focus(0.85, 210.0, 5000.0), RADIUS, added), Layers(), 210.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +52,21 @@ def case():
     draw = np.random.default_rng(3)
     light = torch.from_numpy(np.stack([np.zeros((5, 4)), draw.random((5, 4))])[None])
     cover = torch.from_numpy(np.stack([np.zeros((5, 4)), np.ones((5, 4))])[None])
-    return made, Frames(light, cover, torch.full((1, 2, 5, 4), 3.7e3, dtype=torch.float64))
+    return made, Frames(
+        light, cover, torch.full((1, 2, 5, 4), 3.7e3, dtype=torch.float64)
+    )
 
 
 def _pulled(made, frames):
-    """(phase strength, optics, gradient to the light of the nodes) after the first half of a step."""
+    """(phase strength, optics, gradient to the light of the nodes) after the first half
+    of a step.
+    """
     strength = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
     optics = _optics(strength)
     light = node_light(optics, made.plan)
-    (with_psfs(made, *normalised(light, optics, made.plan))(frames) ** 2).sum().backward()
+    (
+        with_psfs(made, *normalised(light, optics, made.plan))(frames) ** 2
+    ).sum().backward()
     return strength, optics, light.grad
 
 
@@ -63,54 +76,83 @@ def test_the_mean_over_all_draws_is_the_gradient_of_the_loss(case):
     points = len(made.plan.y_um) * len(made.plan.x_um)
     share = WAVES.weights / WAVES.weights.sum()
     mean = sum(
-        term(optics, made.plan, gradient, p, w) * (float(share[w]) / points) for p in range(points) for w in range(2)
+        term(optics, made.plan, gradient, p, w) * (float(share[w]) / points)
+        for p in range(points)
+        for w in range(2)
     )
     mean.backward()
     whole = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
-    (with_psfs(made, *node_psfs(_optics(whole), made.plan))(frames) ** 2).sum().backward()
+    (
+        with_psfs(made, *node_psfs(_optics(whole), made.plan))(frames) ** 2
+    ).sum().backward()
     assert abs(float(whole.grad)) > 1e-3
-    assert float(strength.grad) == pytest.approx(float(whole.grad), rel=1e-4)  # float32 sums in another order
+    assert float(strength.grad) == pytest.approx(
+        float(whole.grad), rel=1e-4
+    )  # float32 sums in another order
 
 
 def test_a_draw_is_one_of_the_terms(case):
     made, frames = case
     _, optics, gradient = _pulled(made, frames)
     draw = torch.Generator().manual_seed(5)
-    got = float(surrogate(optics, made.plan, gradient, drawn(made.plan, 1, draw)).detach())
+    got = float(
+        surrogate(optics, made.plan, gradient, drawn(made.plan, 1, draw)).detach()
+    )
     points = len(made.plan.y_um) * len(made.plan.x_um)
-    every = [float(term(optics, made.plan, gradient, p, w).detach()) for p in range(points) for w in range(2)]
+    every = [
+        float(term(optics, made.plan, gradient, p, w).detach())
+        for p in range(points)
+        for w in range(2)
+    ]
     assert min(abs(got - one) for one in every) <= 1e-5 * max(map(abs, every))
 
 
 def test_derivatives_by_depths_and_psfs_are_those_of_the_sum_over_all_nodes(case):
-    """Light and coverage of two sheets: weights of the image against the sum over every node and depth, written out."""
+    """Light and coverage of two sheets: weights of the image against the sum over every
+    node and depth, written out.
+    """
     made, _ = case
     draw, (high, wide) = np.random.default_rng(6), made.grid.frame
     light, cover = (torch.from_numpy(draw.random((1, 2, high, wide))) for _ in range(2))
-    turns = torch.from_numpy(draw.uniform(0.05, 0.95, light.shape))  # of the range of 1/z
+    turns = torch.from_numpy(
+        draw.uniform(0.05, 0.95, light.shape)
+    )  # of the range of 1/z
     near, far = (1 / float(made.plan.depths_um[i]) for i in (0, -1))
     weight = torch.from_numpy(draw.standard_normal((1, 2, 2, high, wide)))
     place, stack = turns.clone().requires_grad_(), made.stack.clone().requires_grad_()
     whole = with_psfs(made, stack, made.energy)
-    (weight * whole.even * blur(Frames(light, cover, 1 / (near + (far - near) * place)), whole)).sum().backward()
+    (
+        weight
+        * whole.even
+        * blur(Frames(light, cover, 1 / (near + (far - near) * place)), whole)
+    ).sum().backward()
     plain, nodes = turns.clone().requires_grad_(), made.stack.double().requires_grad_()
     count, half = nodes.shape[2], nodes.shape[-1] // 2
     to_y, to_x = between_nodes(made.grid, made.plan)
     deep = _between(plain.flatten() * (count - 1), count).view(*plain.shape, count)
-    lit = (torch.einsum("ya,xb,abz->yxz", to_y, to_x, made.energy.double()) * deep).sum(-1)
+    lit = (torch.einsum("ya,xb,abz->yxz", to_y, to_x, made.energy.double()) * deep).sum(
+        -1
+    )
     psfs = torch.einsum("ya,xb,fsyxz,abzhw->fsyxhw", to_y, to_x, deep, nodes)
     padded = torch.nn.functional.pad(weight, (half,) * 4)
-    seen = padded.unfold(-2, nodes.shape[-2], 1).unfold(-2, nodes.shape[-1], 1)  # (…, y, x, h, w)
+    seen = padded.unfold(-2, nodes.shape[-2], 1).unfold(
+        -2, nodes.shape[-1], 1
+    )  # (…, y, x, h, w)
     total = sum(
-        (seen[:, kind] * psfs * source[..., None, None]).sum() for kind, source in enumerate((light * lit, cover))
+        (seen[:, kind] * psfs * source[..., None, None]).sum()
+        for kind, source in enumerate((light * lit, cover))
     )
     total.backward()
     for got, want in ((place.grad, plain.grad), (stack.grad, nodes.grad)):
-        assert float((got - want).norm() / want.norm()) < 1e-5  # the energy and the kernels are of single precision
+        assert (
+            float((got - want).norm() / want.norm()) < 1e-5
+        )  # the energy and the kernels are of single precision
 
 
 def _between(place, count):
-    """(n, nodes) weights of polynomials through up to four nodes, typed in: of the place's own neighbours."""
+    """(n, nodes) weights of polynomials through up to four nodes, typed in: of the
+    place's own neighbours.
+    """
     taps = min(4, count)
     first = (place.detach().floor() - (taps // 2 - 1)).clamp(0, count - taps)
     columns = []
@@ -119,6 +161,8 @@ def _between(place, count):
         product = torch.ones_like(place)
         for j in range(count):
             near = (j >= first) & (j < first + taps) & (j != node)
-            product = torch.where(near, product * (place - j) / (node - j if j != node else 1), product)
+            product = torch.where(
+                near, product * (place - j) / (node - j if j != node else 1), product
+            )
         columns.append(torch.where(inside, product, torch.zeros_like(place)))
     return torch.stack(columns, -1)

@@ -1,4 +1,6 @@
-"""The true image on another device than the processor: the same numbers to rounding, by the same code."""
+"""The true image on another device than the processor: the same numbers to rounding, by
+the same code.
+"""
 
 import dataclasses
 import functools
@@ -12,7 +14,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from metalens.cell import Film, Index
 from metalens.design import Focus
-from metalens.field import Grid, Layers, SmoothWave, drawn, forming, imager, patches, surrogate, together
+from metalens.field import (
+    Grid,
+    Layers,
+    SmoothWave,
+    drawn,
+    forming,
+    imager,
+    patches,
+    surrogate,
+    together,
+)
 from metalens.field.points import Optics
 from metalens.image import Frames, basis, image, uniform_imager
 from tests.elsewhere import AWAY, elsewhere
@@ -20,7 +32,9 @@ from tests.elsewhere import AWAY, elsewhere
 FOCUS = Focus(0.94, 900.0, 7e3)
 GRID = Grid((33, 26), 4.0, (5e3, 9e3), margin=6, window=13)
 LAYERS = Layers(behind=(Film(Index(1.52), 210.0),))
-SINGLE = 3e-6  # rounding of sums of a few hundred single numbers, each 6e-8 of the largest
+SINGLE = (
+    3e-6  # rounding of sums of a few hundred single numbers, each 6e-8 of the largest
+)
 
 
 def _added(x, y):
@@ -39,7 +53,15 @@ def _frames(grid, seed=4):
 
 def _made(device, **about):
     wave = SmoothWave(FOCUS, 200.0, _added)
-    return imager(wave, GRID, layers=LAYERS, field=(0.11, -0.06), tolerance=0.1, device=device, **about)
+    return imager(
+        wave,
+        GRID,
+        layers=LAYERS,
+        field=(0.11, -0.06),
+        tolerance=0.1,
+        device=device,
+        **about,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +74,9 @@ def both():
 def test_psfs_and_images_are_those_of_the_processor(both):
     here, there = both
     with elsewhere() as done:
-        assert there.stack.device == there.transfer[0].device == there.even.device == AWAY
+        assert (
+            there.stack.device == there.transfer[0].device == there.even.device == AWAY
+        )
         psfs = there.stack.cpu()
         frames = _frames(GRID)
         seen = there(frames.to(AWAY))
@@ -60,7 +84,9 @@ def test_psfs_and_images_are_those_of_the_processor(both):
         seen = seen.cpu()
     want = here(frames)
     assert "_fft_r2c" in done
-    assert float((psfs - here.stack).abs().max()) <= 2e-6 * float(here.stack.max()) + 1e-9  # phases of single precision
+    assert (
+        float((psfs - here.stack).abs().max()) <= 2e-6 * float(here.stack.max()) + 1e-9
+    )  # phases of single precision
     assert torch.allclose(seen, want, rtol=0, atol=1e-5 * float(want.max()))
     assert there.parts.keys() == here.parts.keys()
     for name, value in here.parts.items():
@@ -69,22 +95,41 @@ def test_psfs_and_images_are_those_of_the_processor(both):
 
 @pytest.mark.parametrize("kinds", [1, 2])
 def test_patches_taken_together_are_those_one_by_one(both, kinds):
-    """Of unlike sizes and numbers of kernels, a few at a time; light, coverage, and the slopes of their transforms."""
+    """Of unlike sizes and numbers of kernels, a few at a time; light, coverage, and the
+    slopes of their transforms.
+    """
     here, frames = both[0], _frames(GRID, seed=6)
     about = {"patches": 3, "overlap": 3, "tolerance": 0.02}
-    cut = patches.cut(here.stack, here.energy, forming.between_nodes(GRID, here.plan), **about)
+    cut = patches.cut(
+        here.stack, here.energy, forming.between_nodes(GRID, here.plan), **about
+    )
     made = [patch.trimmed(0.2, 0.4) if i % 3 else patch for i, patch in enumerate(cut)]
     assert len({len(patch.mix) for patch in made}) > 1
     assert len({patch.coverage for patch in made}) > 1
-    made = forming.with_psfs(dataclasses.replace(here, patches=made, transfer=[], even=None), here.stack, here.energy)
-    given = frames.radiance, frames.coverage, forming.vergence(frames.depth_um, here.plan.depths_um)
+    made = forming.with_psfs(
+        dataclasses.replace(here, patches=made, transfer=[], even=None),
+        here.stack,
+        here.energy,
+    )
+    given = (
+        frames.radiance,
+        frames.coverage,
+        forming.vergence(frames.depth_um, here.plan.depths_um),
+    )
     sides = [(b - a for a, b in (patch.rows, patch.columns)) for patch in made.patches]
-    shapes = [tuple(scipy.fft.next_fast_len(n + GRID.window - 1, real=True) for n in pair) for pair in sides]
-    few = functools.partial(together.through, held_bytes=3 * 6 * 8 * made.transfer[0].numel())
+    shapes = [
+        tuple(scipy.fft.next_fast_len(n + GRID.window - 1, real=True) for n in pair)
+        for pair in sides
+    ]
+    few = functools.partial(
+        together.through, held_bytes=3 * 6 * 8 * made.transfer[0].numel()
+    )
     found = []
     for way in (few, _one_by_one):
         transfer = [part.clone().requires_grad_() for part in made.transfer]
-        out = torch.zeros(3, kinds, 2, *(n + 2 * (GRID.window // 2) for n in GRID.frame))
+        out = torch.zeros(
+            3, kinds, 2, *(n + 2 * (GRID.window // 2) for n in GRID.frame)
+        )
         way(given, made.patches, transfer, shapes, out)
         (out.square() * torch.linspace(0.2, 1.7, out.shape[-1])).sum().backward()
         found.append((out.detach(), [part.grad for part in transfer]))
@@ -109,9 +154,15 @@ class _Spectra(TorchDispatchMode):
 
 
 def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_where_there_are_patches():
-    """Seven patches of five kernels, 6 frames of two sheets: a patch's spectra are 0.63 GB, three at a time, the last
+    """Seven patches of five kernels, 6 frames of two sheets: a patch's spectra are 0.63
+    GB, three at a time, the last
     alone. Shapes without numbers."""
-    side, size, kernels, nothing = 900, 1600, 5, functools.partial(torch.empty, device=AWAY)
+    side, size, kernels, nothing = (
+        900,
+        1600,
+        5,
+        functools.partial(torch.empty, device=AWAY),
+    )
     patch = patches.Patch(
         (0, side),
         (0, side),
@@ -123,7 +174,11 @@ def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_wher
         nothing(kernels + 1),
         kernels,
     )
-    given = nothing(6, 2, side, side), nothing(6, 2, side, side), nothing(6, 2, side, side)
+    given = (
+        nothing(6, 2, side, side),
+        nothing(6, 2, side, side),
+        nothing(6, 2, side, side),
+    )
     transfer = [nothing(kernels, size, size // 2 + 1, dtype=torch.complex64)] * 7
     out = nothing(6, 1, 2, size, size)
     with _Spectra() as seen:
@@ -134,12 +189,21 @@ def test_no_more_than_two_gigabytes_of_spectra_are_held_at_once_and_no_less_wher
 
 
 @pytest.mark.parametrize(
-    ("device", "side", "sizes"), [("cpu", 250, [8, 8, 8, 8, 2]), ("cpu", 20, [32, 2]), (AWAY, 20, [34])]
+    ("device", "side", "sizes"),
+    [("cpu", 250, [8, 8, 8, 8, 2]), ("cpu", 20, [32, 2]), (AWAY, 20, [34])],
 )
-def test_a_processor_images_eight_frames_or_more_small_ones_and_a_gpu_a_hundred(monkeypatch, device, side, sizes):
-    """A million samples of two sheets are 8 frames of 250 samples along a side, and far more than 32 of 20."""
+def test_a_processor_images_eight_frames_or_more_small_ones_and_a_gpu_a_hundred(
+    monkeypatch, device, side, sizes
+):
+    """A million samples of two sheets are 8 frames of 250 samples along a side, and far
+    more than 32 of 20.
+    """
     seen = []
-    monkeypatch.setattr(forming, "blurred", lambda few, optics: seen.append(len(few.radiance)) or few.radiance[:, 0])
+    monkeypatch.setattr(
+        forming,
+        "blurred",
+        lambda few, optics: seen.append(len(few.radiance)) or few.radiance[:, 0],
+    )
     monkeypatch.setattr(forming, "returned", lambda total, grid: total)
     grid = dataclasses.replace(GRID, samples=(side, side), margin=0)
     optics = SimpleNamespace(grid=grid, stack=torch.empty(1, device=device), stray=None)
@@ -180,11 +244,26 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
         bends = bend.clone().requires_grad_()
 
         def added(x, y):
-            return _added(x, y) + bends[0].to(x.device) * (x / 200) ** 3 + bends[1].to(x.device) * (y / 200) ** 2
+            return (
+                _added(x, y)
+                + bends[0].to(x.device) * (x / 200) ** 3
+                + bends[1].to(x.device) * (y / 200) ** 2
+            )
 
-        optics = Optics(SmoothWave(FOCUS, 200.0, added), LAYERS, FOCUS.sensor_distance_um)
-        weights = torch.linspace(-1, 2, here.stack.numel()).reshape(here.stack.shape).to(device)
-        value = surrogate(optics, here.plan, weights, drawn(here.plan, 2, torch.Generator().manual_seed(3)))
+        optics = Optics(
+            SmoothWave(FOCUS, 200.0, added), LAYERS, FOCUS.sensor_distance_um
+        )
+        weights = (
+            torch.linspace(-1, 2, here.stack.numel())
+            .reshape(here.stack.shape)
+            .to(device)
+        )
+        value = surrogate(
+            optics,
+            here.plan,
+            weights,
+            drawn(here.plan, 2, torch.Generator().manual_seed(3)),
+        )
         value.backward()
         return float(value.detach()), bends.grad
 
@@ -192,7 +271,9 @@ def test_gradients_of_the_phase_come_back_to_the_processor(both):
         value, slope = found(AWAY)
     want, steep = found(torch.device("cpu"))
     assert value == pytest.approx(want, rel=1e-5)
-    assert slope.numpy() == pytest.approx(steep.numpy(), rel=1e-4)  # phases are single precision: 1e-5 of a turn
+    assert slope.numpy() == pytest.approx(
+        steep.numpy(), rel=1e-4
+    )  # phases are single precision: 1e-5 of a turn
 
 
 @pytest.mark.parametrize("points", [(1, 1), (2, 3)])
@@ -206,4 +287,6 @@ def test_one_psf_a_depth_images_elsewhere(points):
         seen = image(frames.to(AWAY), here.to(AWAY), margin=3).cpu()
     want = image(frames, here, margin=3)
     assert math.isfinite(float(want.max()))
-    assert torch.allclose(seen, want, rtol=0, atol=2 * SINGLE * float(want.max()) / 0.01)  # faint coverage: 1 / FAINT
+    assert torch.allclose(
+        seen, want, rtol=0, atol=2 * SINGLE * float(want.max()) / 0.01
+    )  # faint coverage: 1 / FAINT

@@ -1,4 +1,6 @@
-"""Pillars as the image sees them: against the PSFs summed over every pillar, and their gradient against differences."""
+"""Pillars as the image sees them: against the PSFs summed over every pillar, and their
+gradient against differences.
+"""
 
 import math
 from dataclasses import replace
@@ -11,7 +13,16 @@ import torch
 from metalens.cell import Cell, Film, Index
 from metalens.cell.shapes.straight import Rectangle
 from metalens.design import Focus, profiles
-from metalens.field import Grid, Layers, Optics, PillarWave, Window, imager, left_out, psfs
+from metalens.field import (
+    Grid,
+    Layers,
+    Optics,
+    PillarWave,
+    Window,
+    imager,
+    left_out,
+    psfs,
+)
 from metalens.field.patches import relative
 from metalens.ground.errors import SceneError
 from metalens.image import integrate
@@ -20,7 +31,14 @@ from metalens.pillars import Proxy
 from metalens.psf import View, from_lens
 
 PITCH, DISTANCE, FOCUS, STEP, SAMPLES = 0.4, 240.0, 6000.0, 4.8, 15
-PROXY = Proxy(np.array([[6.0, 3.2 * math.pi]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.85, 0.85), 1e-6, 1e-6)
+PROXY = Proxy(
+    np.array([[6.0, 3.2 * math.pi]]),
+    np.array([[0.9, -0.03]]),
+    (0.08, 0.32),
+    (0.85, 0.85),
+    1e-6,
+    1e-6,
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,37 +46,59 @@ def lens():
     x = (np.arange(251) - 125) * PITCH
     focus = Focus(0.85, DISTANCE, FOCUS)
     wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus) - 0.2, 2 * math.pi)
-    wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))  # into the range of the proxy
+    wanted += (
+        2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
+    )  # into the range of the proxy
     diameter = 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi)
     diameter = np.where(np.hypot(x, x[:, None]) <= 50.0, diameter, 0.0)
     cell = Cell(pitch_um=PITCH, pillar=Index(3.6), substrate=Index(1.45))
-    return Lens(DiameterMap(diameter, PITCH), cell, PROXY, 0.85, DISTANCE, FOCUS, "hyperbolic")
+    return Lens(
+        DiameterMap(diameter, PITCH), cell, PROXY, 0.85, DISTANCE, FOCUS, "hyperbolic"
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 9.0])
 def test_psfs_of_gathered_pillars_are_those_of_all_pillars(lens, angle):
-    """Both twice averaged over squares of a sample; apart: cells of 2.5 um, rim, light folded back (1 % each)."""
+    """Both twice averaged over squares of a sample; apart: cells of 2.5 um, rim, light
+    folded back (1 % each).
+    """
     tilt, fine = (math.radians(angle), math.radians(-0.4 * angle)), 9
     wide = SAMPLES + 4
-    made = from_lens(lens, View((4000.0,), (tilt,), wide * STEP, wide * fine), tolerance=1e-4)
-    light = torch.as_tensor(made.intensity[0, 0] * made.energy_um2[0, 0]).double() / (math.pi * 50.0**2)
+    made = from_lens(
+        lens, View((4000.0,), (tilt,), wide * STEP, wide * fine), tolerance=1e-4
+    )
+    light = torch.as_tensor(made.intensity[0, 0] * made.energy_um2[0, 0]).double() / (
+        math.pi * 50.0**2
+    )
     box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
     smooth = torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0]
     want = integrate(smooth, STEP / fine, pitch_um=STEP)[2:-2, 2:-2]
     at = torch.tensor([[DISTANCE * math.tan(t) for t in tilt]], dtype=torch.float64)
     optics = Optics(PillarWave(lens), Layers(), DISTANCE)
-    got = psfs(optics, at, depths_um=torch.tensor([4e3]), wavelength_um=0.85, window=Window(SAMPLES, STEP))[0, 0]
+    got = psfs(
+        optics,
+        at,
+        depths_um=torch.tensor([4e3]),
+        wavelength_um=0.85,
+        window=Window(SAMPLES, STEP),
+    )[0, 0]
     assert float(relative(got.double(), want)) < 3e-2
     assert float(got.sum() / want.sum()) == pytest.approx(1, abs=2.5e-2)
-    said = left_out.missing(optics, 0.85, Window(SAMPLES, STEP), (at, torch.tensor([4e3])))
+    said = left_out.missing(
+        optics, 0.85, Window(SAMPLES, STEP), (at, torch.tensor([4e3]))
+    )
     true = float(relative(got.double() / got.sum(), want / want.sum()))
-    assert 0.5 * true < said < 2 * true  # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
+    assert (
+        0.5 * true < said < 2 * true
+    )  # 3e-3; either reference errs by 1e-3 to 2e-3 of what it samples
 
 
 ROWS = Neighbours(
     np.array([0.1, 0.22, 0.16]),
     np.array([False, False, True]),
-    np.array([[0.95 - 0.2j, 0.8 - 0.5j, 0.9 - 0.3j], [1.0 - 0.1j, 0.9 - 0.3j, 0.95 - 0.25j]]),
+    np.array(
+        [[0.95 - 0.2j, 0.8 - 0.5j, 0.9 - 0.3j], [1.0 - 0.1j, 0.9 - 0.3j, 0.95 - 0.25j]]
+    ),
     np.ones((2, 3), complex),
     np.zeros(3),
     0.85,
@@ -67,10 +107,18 @@ ROWS = Neighbours(
 
 def test_the_image_holds_the_neighbours_that_the_lens_holds(lens):
     """As without them: cells, rim, light folded back; a tenth of what they change."""
-    test_psfs_of_gathered_pillars_are_those_of_all_pillars(replace(lens, neighbours=ROWS), 9.0)
+    test_psfs_of_gathered_pillars_are_those_of_all_pillars(
+        replace(lens, neighbours=ROWS), 9.0
+    )
     at, few = torch.tensor([[31.0, -7.0]], dtype=torch.float64), torch.tensor([4e3])
     with_, without = (
-        psfs(Optics(PillarWave(one), Layers(), DISTANCE), at, depths_um=few, wavelength_um=0.85, window=Window(9, STEP))
+        psfs(
+            Optics(PillarWave(one), Layers(), DISTANCE),
+            at,
+            depths_um=few,
+            wavelength_um=0.85,
+            window=Window(9, STEP),
+        )
         for one in (replace(lens, neighbours=ROWS), lens)
     )
     assert float(with_.sum() / without.sum()) < 0.95
@@ -91,26 +139,35 @@ def _differentiates(lens):
     at, window = torch.tensor([[12.0, -7.0]], dtype=torch.float64), Window(9, STEP)
     weight = torch.linspace(0.3, 1.9, 81).reshape(9, 9)
     step = torch.zeros_like(diameter)
-    step[150:200, 90:170] = (diameter[150:200, 90:170] > 0) * 1e-3  # a patch beside the axis grows
+    step[150:200, 90:170] = (
+        diameter[150:200, 90:170] > 0
+    ) * 1e-3  # a patch beside the axis grows
 
     def score(d):
         optics = Optics(PillarWave(lens, diameter_um=d), Layers(), DISTANCE)
-        light = psfs(optics, at, depths_um=torch.tensor([4e3]), wavelength_um=0.85, window=window)[0, 0]
+        light = psfs(
+            optics, at, depths_um=torch.tensor([4e3]), wavelength_um=0.85, window=window
+        )[0, 0]
         return (light * weight).double().sum()
 
     leaf = diameter.clone().requires_grad_()
     (slope,) = torch.autograd.grad(score(leaf), leaf)
     with torch.no_grad():
         wide = 0.5 * (score(diameter + step) - score(diameter - step))
-    # the value reads one cell in two of a line, the slope their mean: 5 % at a patch of 20 um (test_cells_of_pillars)
+    # the value reads one cell in two of a line, the slope their mean: 5 % at a patch of
+    # 20 um (test_cells_of_pillars)
     assert float((slope * step).sum()) == pytest.approx(float(wide), rel=8e-2)
 
 
 def test_an_image_through_pillars_of_two_sizes_is_refused_with_what_knows_them(lens):
     """Not for its lattice, which is square, nor for turns that it has not."""
     sizes = replace(lens.diameters, length_um=lens.diameters.diameter_um * 1.2)
-    paired = SimpleNamespace(diameters=sizes, pairs=object(), cell=lens.cell, one_light="", hand="")
-    with pytest.raises(SceneError, match=r"pillars of two sizes .* metalens psf LENS --light x") as refused:
+    paired = SimpleNamespace(
+        diameters=sizes, pairs=object(), cell=lens.cell, one_light="", hand=""
+    )
+    with pytest.raises(
+        SceneError, match=r"pillars of two sizes .* metalens psf LENS --light x"
+    ) as refused:
         PillarWave(paired)
     assert "lattice" not in str(refused.value)
 
@@ -128,17 +185,26 @@ def test_an_imager_of_a_lens_file_carries_its_stray_light(lens):
 
 
 def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
-    """Filter and sensor glass as the file has them, 60 um of 240: against the PSFs of all pillars through them.
+    """Filter and sensor glass as the file has them, 60 um of 240: against the PSFs of
+    all pillars through them.
 
-    As :func:`test_psfs_of_gathered_pillars_are_those_of_all_pillars`, of a lens made for its films: a carrier without
+    As :func:`test_psfs_of_gathered_pillars_are_those_of_all_pillars`, of a lens made
+    for its films: a carrier without
     them would run away from the pillars by 0.2 rad in every micrometre at the rim.
     """
-    films = Layers(front=(Film(Index(1.45), 300.0),), behind=(Film(Index(1.7), 25.0), Film(Index(1.5), 35.0)))
+    films = Layers(
+        front=(Film(Index(1.45), 300.0),),
+        behind=(Film(Index(1.7), 25.0), Film(Index(1.5), 35.0)),
+    )
     focus = Focus(0.85, DISTANCE, FOCUS, films)
     x = (np.arange(251) - 125) * PITCH
     wanted = np.remainder(profiles.hyperbolic(x, x[:, None], focus) - 0.2, 2 * math.pi)
     wanted += 2 * math.pi * np.ceil((6.0 - 3.2 * math.pi - wanted) / (2 * math.pi))
-    diameter = np.where(np.hypot(x, x[:, None]) <= 50.0, 0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi), 0.0)
+    diameter = np.where(
+        np.hypot(x, x[:, None]) <= 50.0,
+        0.2 + 0.12 * (wanted - 6.0) / (3.2 * math.pi),
+        0.0,
+    )
     glazed = replace(lens, diameters=DiameterMap(diameter, PITCH), layers=films)
     grid = Grid((5, 5), STEP, (4000.0, 4000.0), margin=SAMPLES // 2, window=SAMPLES)
     made = imager(glazed, grid, tolerance=0.1)
@@ -147,20 +213,30 @@ def test_the_films_of_a_lens_file_are_in_its_image_and_in_its_carrier(lens):
     reduced = glazed.layers.after(DISTANCE, 0.85).reduced_um
     fine, wide = 9, SAMPLES + 4
     angles = tuple(math.atan(at / reduced) for at in place)
-    seen = from_lens(glazed, View((4000.0,), (angles,), wide * STEP, wide * fine), tolerance=1e-4)
+    seen = from_lens(
+        glazed, View((4000.0,), (angles,), wide * STEP, wide * fine), tolerance=1e-4
+    )
     light = torch.as_tensor(seen.intensity[0, 0]).double()
     box = torch.ones(1, 1, fine, fine, dtype=torch.float64) / fine**2
     want = integrate(
-        torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0], STEP / fine, pitch_um=STEP
+        torch.nn.functional.conv2d(light[None, None], box, padding=fine // 2)[0, 0],
+        STEP / fine,
+        pitch_um=STEP,
     )[2:-2, 2:-2]
     got = made.stack[middle[0], middle[1], 0].double()
     assert float(relative(got, want / want.sum())) < 3e-2
-    bare = imager(glazed, grid, tolerance=0.1, layers=Layers()).stack[middle[0], middle[1], 0].double()
+    bare = (
+        imager(glazed, grid, tolerance=0.1, layers=Layers())
+        .stack[middle[0], middle[1], 0]
+        .double()
+    )
     assert float(relative(bare, want / want.sum())) > 0.1
 
 
 def test_pillars_that_answer_x_and_y_apart_are_no_unpolarised_image(lens):
-    """A rectangle's proxy is of light along x (or the mean at angles): the image of both polarisations is refused."""
+    """A rectangle's proxy is of light along x (or the mean at angles): the image of
+    both polarisations is refused.
+    """
     oblong = replace(lens, cell=replace(lens.cell, shape=Rectangle(ratio=0.6)))
     with pytest.raises(SceneError, match="the lens knows light along x alone"):
         PillarWave(oblong)

@@ -1,4 +1,6 @@
-"""Both polarisations in the image: their flux and |E|² against plane waves, and how many components are imaged."""
+"""Both polarisations in the image: their flux and |E|² against plane waves, and how
+many components are imaged.
+"""
 
 import math
 import sys
@@ -22,10 +24,24 @@ from metalens.psf import Mixed, of_flux, strongest, turned
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from referees.true_image import Referee
 
-RADIUS, DISTANCE, FOCUS, STEP, WINDOW, WAVE = 25.0, 60.0, 5000.0, 1.2, 21, 0.85  # NA 0.38
+RADIUS, DISTANCE, FOCUS, STEP, WINDOW, WAVE = (
+    25.0,
+    60.0,
+    5000.0,
+    1.2,
+    21,
+    0.85,
+)  # NA 0.38
 LENS = SmoothWave(Focus(WAVE, DISTANCE, FOCUS), RADIUS)
 OPTICS = Optics(LENS, Layers(), DISTANCE)
-REFEREE = Referee(radius=RADIUS, distance=DISTANCE, focus=FOCUS, design_wavelength=WAVE, fine=0.3, count=320)
+REFEREE = Referee(
+    radius=RADIUS,
+    distance=DISTANCE,
+    focus=FOCUS,
+    design_wavelength=WAVE,
+    fine=0.3,
+    count=320,
+)
 GRID = Grid((5, 7), STEP, (2000.0, 4000.0), window=WINDOW)
 MIDDLE = (8.0, -4.5)
 
@@ -33,20 +49,31 @@ MIDDLE = (8.0, -4.5)
 def _psf(optics, place, depth, components, *, flux):
     at, depths = torch.tensor([place], dtype=torch.float64), torch.tensor([depth])
     window = Window(WINDOW, STEP, True, components, flux)
-    light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[0, 0].double()
+    light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[
+        0, 0
+    ].double()
     return light / light.sum()
 
 
 def _true(referee, kind, place, depth):
-    want = torch.from_numpy(referee.sampled(getattr(referee, kind)(place, depth, WAVE), STEP, WINDOW).copy())
+    want = torch.from_numpy(
+        referee.sampled(getattr(referee, kind)(place, depth, WAVE), STEP, WINDOW).copy()
+    )
     return want / want.sum()
 
 
-@pytest.mark.parametrize(("place", "depth"), [((9.3, -3.9), 3000.0), ((0.0, 0.0), 900.0)])
+@pytest.mark.parametrize(
+    ("place", "depth"), [((9.3, -3.9), 3000.0), ((0.0, 0.0), 900.0)]
+)
 @pytest.mark.parametrize(("kind", "whole"), [("flux", 4), ("polarised", 6)])
 def test_psfs_of_both_polarisations_are_those_of_plane_waves(place, depth, kind, whole):
-    """In focus and far out of it. Apart: light that the rim bends out of the window and the fold takes back, 4e-3."""
-    want, other = (_true(REFEREE, name, place, depth) for name in (kind, "polarised" if kind == "flux" else "flux"))
+    """In focus and far out of it. Apart: light that the rim bends out of the window and
+    the fold takes back, 4e-3.
+    """
+    want, other = (
+        _true(REFEREE, name, place, depth)
+        for name in (kind, "polarised" if kind == "flux" else "flux")
+    )
     got = _psf(OPTICS, place, depth, whole, flux=kind == "flux")
     error = float(relative(got, want))
     assert error < 6e-3
@@ -61,36 +88,60 @@ def test_psfs_of_both_polarisations_are_those_of_plane_waves(place, depth, kind,
 
 
 def test_what_the_flux_adds_to_a_scalar_is_that_of_plane_waves():
-    """NA 0.6, 1.8e-3 of the PSF. A sixth of it is left: of the light that the fold takes back, which all but cancels.
-    The strongest of the four alone is worse than the scalar: its light weighs steep rays by (1 + cos) / (2 √cos)."""
+    """NA 0.6, 1.8e-3 of the PSF. A sixth of it is left: of the light that the fold
+    takes back, which all but cancels.
+    The strongest of the four alone is worse than the scalar: its light weighs steep
+    rays by (1 + cos) / (2 √cos)."""
     distance, step, count = 33.0, 1.2, 9
-    about = {"radius": RADIUS, "distance": distance, "focus": FOCUS, "design_wavelength": WAVE}
+    about = {
+        "radius": RADIUS,
+        "distance": distance,
+        "focus": FOCUS,
+        "design_wavelength": WAVE,
+    }
     referee = Referee(**about, fine=0.3, count=320)
-    optics = Optics(SmoothWave(Focus(WAVE, distance, FOCUS), RADIUS), Layers(), distance)
+    optics = Optics(
+        SmoothWave(Focus(WAVE, distance, FOCUS), RADIUS), Layers(), distance
+    )
     at, depths = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([4000.0])
 
     def seen(components):
         window = Window(count, step, True, components)
-        light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[0, 0].double()
+        light = psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=window)[
+            0, 0
+        ].double()
         return light / light.sum()
 
     flux, scalar = (
-        torch.from_numpy(referee.sampled(of((0.0, 0.0), 4000.0, WAVE), step, count).copy())
+        torch.from_numpy(
+            referee.sampled(of((0.0, 0.0), 4000.0, WAVE), step, count).copy()
+        )
         for of in (referee.flux, referee.intensity)
     )
     want = flux / flux.sum() - scalar / scalar.sum()
-    assert float(want.norm() / (flux / flux.sum()).norm()) == pytest.approx(1.8e-3, rel=0.1)
-    left = [float((seen(components) - seen(0) - want).norm() / want.norm()) for components in (4, 1)]
+    assert float(want.norm() / (flux / flux.sum()).norm()) == pytest.approx(
+        1.8e-3, rel=0.1
+    )
+    left = [
+        float((seen(components) - seen(0) - want).norm() / want.norm())
+        for components in (4, 1)
+    ]
     assert left[0] < 0.25
     assert left[1] > 1
 
 
 @pytest.mark.parametrize(
-    ("slope", "towards"), [((0.0, 0.0), (0.0, 0.0)), ((0.3, -0.2), (-0.1, 0.4)), ((0.5, 0.4), (0.5, 0.4))]
+    ("slope", "towards"),
+    [((0.0, 0.0), (0.0, 0.0)), ((0.3, -0.2), (-0.1, 0.4)), ((0.5, 0.4), (0.5, 0.4))],
 )
 def test_the_power_through_the_plane_is_what_left_the_lens(slope, towards):
-    """A plane wave at any angle: S_z of light whose power along z is 1 is 1 for each polarisation, |E|² 1 / cos θ."""
-    a, b = (torch.tensor([x, y, math.sqrt(1 - x * x - y * y)], dtype=torch.float64) for x, y in (slope, towards))
+    """A plane wave at any angle: S_z of light whose power along z is 1 is 1 for each
+    polarisation, |E|² 1 / cos θ.
+    """
+    a, b = (
+        torch.tensor([x, y, math.sqrt(1 - x * x - y * y)], dtype=torch.float64)
+        for x, y in (slope, towards)
+    )
     electric = turned(a, b)
     fields = of_flux(electric, b)
     signs = torch.tensor(fields.signs, dtype=torch.float64)
@@ -99,80 +150,126 @@ def test_the_power_through_the_plane_is_what_left_the_lens(slope, towards):
 
 
 def test_the_flux_of_two_rays_is_poyntings():
-    """Plane waves of four directions with chance amplitudes: Re(E x H*)_z summed over both polarisations, at places."""
+    """Plane waves of four directions with chance amplitudes: Re(E x H*)_z summed over
+    both polarisations, at places.
+    """
     draw = np.random.default_rng(5)
     p, q = draw.uniform(-0.6, 0.6, (2, 4))
     b = np.stack([p, q, np.sqrt(1 - p**2 - q**2)])
     a = torch.tensor([0.2, -0.1, math.sqrt(0.95)], dtype=torch.float64)
     electric = turned(a, torch.from_numpy(b)).numpy().reshape(2, 3, 4)
-    level, places = draw.normal(size=4) + 1j * draw.normal(size=4), draw.uniform(-3, 3, (7, 2))
+    level, places = (
+        draw.normal(size=4) + 1j * draw.normal(size=4),
+        draw.uniform(-3, 3, (7, 2)),
+    )
     fields = of_flux(torch.from_numpy(electric.reshape(6, 4)), torch.from_numpy(b))
     made = strongest(fields, torch.from_numpy(np.abs(level)), 4)
     for place in places:
         wave = level * np.exp(2j * np.pi * (p * place[0] + q * place[1]))
         want = 0.0
         for e in electric:
-            e_here, h_here = (np.asarray(v * wave).sum(1) for v in (e, np.cross(b, e, axis=0)))
+            e_here, h_here = (
+                np.asarray(v * wave).sum(1) for v in (e, np.cross(b, e, axis=0))
+            )
             want += np.cross(e_here, h_here.conj()).real[2]
-        eight = sum(s * abs((f * wave).sum()) ** 2 for s, f in zip(fields.signs, fields.pupils.numpy(), strict=True))
-        four = sum(s * abs((f * wave).sum()) ** 2 for s, f in zip(made.signs, made.pupils.numpy(), strict=True))
+        eight = sum(
+            s * abs((f * wave).sum()) ** 2
+            for s, f in zip(fields.signs, fields.pupils.numpy(), strict=True)
+        )
+        four = sum(
+            s * abs((f * wave).sum()) ** 2
+            for s, f in zip(made.signs, made.pupils.numpy(), strict=True)
+        )
         assert eight == pytest.approx(want, rel=1e-12)
         assert 2 * four == pytest.approx(want, rel=1e-9)
 
 
 def test_a_pixel_counts_flux_and_an_image_says_what_one_scalar_misses_of_it():
-    """Points, each through its own PSF of plane waves. They show more of the high frequencies than the texture of the
+    """Points, each through its own PSF of plane waves. They show more of the high
+    frequencies than the texture of the
     stated error: 2.5 times it. |E|² lies otherwise."""
     light = np.zeros(GRID.samples)
     light[1, 5], light[3, 1], light[2, 2], light[2, 4] = 6.3, 2.9, 3.7, 1.1
     depth = np.broadcast_to(np.linspace(2300.0, 3700.0, 7), GRID.samples)
     seen, cover, far = (
         torch.from_numpy(np.stack([near, whole])[None])
-        for near, whole in ((0 * light, light), (0 * light, 0 * light + 1), (depth, depth))
+        for near, whole in (
+            (0 * light, light),
+            (0 * light, 0 * light + 1),
+            (depth, depth),
+        )
     )
     about = {"step": STEP, "window": WINDOW, "waves": [(WAVE, 1.0)], "middle": MIDDLE}
-    flux, energy = (REFEREE.image(light, depth, psf=of, **about) for of in (REFEREE.flux, REFEREE.polarised))
+    flux, energy = (
+        REFEREE.image(light, depth, psf=of, **about)
+        for of in (REFEREE.flux, REFEREE.polarised)
+    )
     field = math.atan(MIDDLE[0] / DISTANCE), math.atan(MIDDLE[1] / DISTANCE)
     images = {}
     for polarisation, want in (("auto", flux), ("flux", flux), ("vector", energy)):
-        made = imager(LENS, GRID, tolerance=1e-2, field=field, polarisation=polarisation)
+        made = imager(
+            LENS, GRID, tolerance=1e-2, field=field, polarisation=polarisation
+        )
         images[polarisation] = got = made(Frames(seen, cover, far))[0].numpy()
         assert np.linalg.norm(got - want) / np.linalg.norm(want) < 2.5 * made.error
         assert (made.plan.window.components > 0) == (polarisation != "auto")
         assert made.parts["polarisation"] < 2e-3  # of the scalar at NA 0.38 too
-    apart = energy - flux  # 1e-2 of the image: what a choice of one for the other would miss
-    assert np.linalg.norm(images["vector"] - images["flux"] - apart) < 0.4 * np.linalg.norm(apart)
+    apart = (
+        energy - flux
+    )  # 1e-2 of the image: what a choice of one for the other would miss
+    assert np.linalg.norm(
+        images["vector"] - images["flux"] - apart
+    ) < 0.4 * np.linalg.norm(apart)
     assert images["flux"].sum() == pytest.approx(flux.sum(), rel=1e-2)
 
 
 def test_mixtures_of_the_components_image_as_the_components_do():
-    """Six transforms of Ex, Ey, Ez of both polarisations, added, against six mixtures; the light is kept."""
+    """Six transforms of Ex, Ey, Ez of both polarisations, added, against six mixtures;
+    the light is kept.
+    """
     draw = torch.Generator().manual_seed(3)
     weight = torch.rand(9, 11, generator=draw, dtype=torch.float64)
-    light = weight * torch.exp(7j * torch.rand(9, 11, generator=draw, dtype=torch.float64))
+    light = weight * torch.exp(
+        7j * torch.rand(9, 11, generator=draw, dtype=torch.float64)
+    )
     p = torch.linspace(-0.5, 0.6, 11, dtype=torch.float64).expand(9, 11)
     q = torch.linspace(-0.6, 0.4, 9, dtype=torch.float64)[:, None].expand(9, 11)
     slope = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
-    parts = turned(slope / slope.norm(), torch.stack([p, q, torch.sqrt(1 - p**2 - q**2)]))
+    parts = turned(
+        slope / slope.norm(), torch.stack([p, q, torch.sqrt(1 - p**2 - q**2)])
+    )
     plain = (torch.fft.fft2(light * parts).abs() ** 2).sum(0)
     made = strongest(Mixed(parts, (1.0,) * 6), weight, 6)
     assert set(made.signs) == {1.0}
     mixed = (torch.fft.fft2(light * made.pupils).abs() ** 2).sum(0)
-    assert torch.allclose(mixed / mixed.sum(), plain / plain.sum(), rtol=1e-9, atol=1e-12)
-    assert float(mixed.sum()) == pytest.approx(99 * float((weight**2).sum()), rel=1e-12)  # Parseval
+    assert torch.allclose(
+        mixed / mixed.sum(), plain / plain.sum(), rtol=1e-9, atol=1e-12
+    )
+    assert float(mixed.sum()) == pytest.approx(
+        99 * float((weight**2).sum()), rel=1e-12
+    )  # Parseval
     few = strongest(Mixed(parts, (1.0,) * 6), weight, 2)
-    assert float(((few.pupils * weight) ** 2).sum()) == pytest.approx(float((weight**2).sum()), rel=1e-12)
+    assert float(((few.pupils * weight) ** 2).sum()) == pytest.approx(
+        float((weight**2).sum()), rel=1e-12
+    )
 
 
 def test_turned_light_keeps_its_power_and_is_across_its_ray():
-    """|E|² b_z of both polarisations adds up to 2, E·b to 0; straight on it is the light that came."""
-    a, b = torch.tensor([0.3, -0.2, math.sqrt(0.87)]), torch.tensor([-0.1, 0.4, math.sqrt(0.83)])
+    """|E|² b_z of both polarisations adds up to 2, E·b to 0; straight on it is the
+    light that came.
+    """
+    a, b = (
+        torch.tensor([0.3, -0.2, math.sqrt(0.87)]),
+        torch.tensor([-0.1, 0.4, math.sqrt(0.83)]),
+    )
     found = turned(a.double(), b.double()).reshape(2, 3)
     assert float((found**2).sum() * b[2]) == pytest.approx(2, rel=1e-6)
     assert float((found @ b.double()).abs().max()) < 1e-6
     straight = turned(a.double(), a.double()).reshape(2, 3) * float(a[2]) ** 0.5
     assert float((straight @ a.double()).abs().max()) < 1e-6
-    assert torch.allclose(straight @ straight.T, torch.eye(2, dtype=torch.float64), atol=1e-6)
+    assert torch.allclose(
+        straight @ straight.T, torch.eye(2, dtype=torch.float64), atol=1e-6
+    )
 
 
 def test_the_gradient_of_both_polarisations_is_that_of_differences():
@@ -180,9 +277,21 @@ def test_the_gradient_of_both_polarisations_is_that_of_differences():
     window = replace(Window(WINDOW, STEP), components=3)
 
     def score(c):
-        added = replace(LENS, added_rad=lambda x, y: c[0] * (x / RADIUS) ** 3 + c[1] * x * y / RADIUS**2)
-        at, depths = torch.tensor([[0.7, -0.5]], dtype=torch.float64), torch.tensor([4000.0])
-        light = psfs(Optics(added, Layers(), DISTANCE), at, depths_um=depths, wavelength_um=WAVE, window=window)
+        added = replace(
+            LENS,
+            added_rad=lambda x, y: c[0] * (x / RADIUS) ** 3 + c[1] * x * y / RADIUS**2,
+        )
+        at, depths = (
+            torch.tensor([[0.7, -0.5]], dtype=torch.float64),
+            torch.tensor([4000.0]),
+        )
+        light = psfs(
+            Optics(added, Layers(), DISTANCE),
+            at,
+            depths_um=depths,
+            wavelength_um=WAVE,
+            window=window,
+        )
         return (light[0, 0] * weight).double().sum()
 
     at = torch.tensor([1.3, -0.8], dtype=torch.float64, requires_grad=True)
@@ -190,24 +299,35 @@ def test_the_gradient_of_both_polarisations_is_that_of_differences():
     step = 1e-2 * torch.eye(2, dtype=torch.float64)
     with torch.no_grad():
         wide = torch.stack([score(at + s) - score(at - s) for s in step]) / 2e-2
-    assert torch.allclose(slope, wide, rtol=5e-3, atol=5e-3 * float(wide.abs().max()))  # float32, steps of 1e-2
+    assert torch.allclose(
+        slope, wide, rtol=5e-3, atol=5e-3 * float(wide.abs().max())
+    )  # float32, steps of 1e-2
 
 
 def test_a_count_of_components_that_there_is_not_is_refused():
-    with pytest.raises(PropagationError, match="7 components of the field: need 0 to 6"):
+    with pytest.raises(
+        PropagationError, match="7 components of the field: need 0 to 6"
+    ):
         Window(5, 1.0, components=7, flux=False)
-    with pytest.raises(PropagationError, match="5 components of the field: need 0 to 4"):
+    with pytest.raises(
+        PropagationError, match="5 components of the field: need 0 to 4"
+    ):
         Window(5, 1.0, components=5)
 
 
-@pytest.mark.parametrize(("sine", "flux", "energy"), [(0.24, 7e-5, 1.3e-2), (0.6, 4e-3, 0.1)])
+@pytest.mark.parametrize(
+    ("sine", "flux", "energy"), [(0.24, 7e-5, 1.3e-2), (0.6, 4e-3, 0.1)]
+)
 def test_one_scalar_is_the_flux_to_fourth_order(sine, flux, energy):
-    """Richards and Wolf on the axis, in focus: S_z = I0² - I2², |E|² = I0² + 2 I1² + I2², the scalar whose rays carry
+    """Richards and Wolf on the axis, in focus: S_z = I0² - I2², |E|² = I0² + 2 I1² +
+    I2², the scalar whose rays carry
     their power: the numbers that the text tells, in relative L2 of PSFs of sum 1."""
     t, weight = np.polynomial.legendre.leggauss(80)
     p, at = sine * (t + 1) / 2, np.linspace(0, 60 / sine, 900)
     cosine = np.sqrt(1 - p * p)
-    level = weight * p / cosine**2  # of a lens that is lit evenly: root of the spread of rays in p
+    level = (
+        weight * p / cosine**2
+    )  # of a lens that is lit evenly: root of the spread of rays in p
     shaped = level / (2 * np.sqrt(cosine))
     i0, i1, i2 = (
         (shaped * part) @ special.jv(order, np.outer(p, at))
@@ -225,15 +345,23 @@ def test_one_scalar_is_the_flux_to_fourth_order(sine, flux, energy):
 
 @pytest.mark.parametrize("order", [(1.0, 1.5), (1.6, 1.0, 1.3)])
 def test_nodes_beyond_the_rim_and_beyond_grazing_have_finite_fields(order):
-    """No light is on them, but 0 times nan would be in every sum; those that pass carry a flux of 1 a polarisation,
+    """No light is on them, but 0 times nan would be in every sum; those that pass carry
+    a flux of 1 a polarisation,
     near the normal, where s and p are alike to p²."""
     none = torch.zeros(0)
-    aside, middle = torch.linspace(-1.4, 1.4, 29, dtype=torch.float64), torch.tensor([0.2, -0.1], dtype=torch.float64)
+    aside, middle = (
+        torch.linspace(-1.4, 1.4, 29, dtype=torch.float64),
+        torch.tensor([0.2, -0.1], dtype=torch.float64),
+    )
     rays = Rays(none, none, none, none, none, none, aside, middle, none, none)
-    found = factors(rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True)
+    found = factors(
+        rays, torch.tensor([0.1, 0.3], dtype=torch.float64), order, flux=True
+    )
     assert torch.isfinite(found.pupils).all()
     signs = torch.tensor(found.signs)[:, None, None]
     flux = (signs * found.pupils**2).sum(0)
     away = torch.hypot(aside[:, None] + middle[1], aside + middle[0])
-    torch.testing.assert_close(flux[away < 0.1], torch.full_like(flux[away < 0.1], 2.0), rtol=2e-3, atol=0)
+    torch.testing.assert_close(
+        flux[away < 0.1], torch.full_like(flux[away < 0.1], 2.0), rtol=2e-3, atol=0
+    )
     assert (away < 0.1).sum() >= 2

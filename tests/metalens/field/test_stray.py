@@ -1,4 +1,6 @@
-"""Discs of the other orders: radii by the rays that an order of a lens turns, light by its share and cos⁴."""
+"""Discs of the other orders: radii by the rays that an order of a lens turns, light by
+its share and cos⁴.
+"""
 
 import math
 from types import SimpleNamespace
@@ -26,10 +28,14 @@ class Wave:
 
 
 @pytest.mark.parametrize("glass_um", [0.0, 600.0])
-def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch, glass_um):
-    """Rays of order m land at r (1 + d/z) - m d r (1/d + 1/s): one pixel of light, off the middle of the field.
+def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(
+    monkeypatch, glass_um
+):
+    """Rays of order m land at r (1 + d/z) - m d r (1/d + 1/s): one pixel of light, off
+    the middle of the field.
 
-    Glass of index 1.5 on the sensor counts by its thickness over its index, and d stays 2 mm.
+    Glass of index 1.5 on the sensor counts by its thickness over its index, and d stays
+    2 mm.
     """
     monkeypatch.setattr(stray, "PillarWave", Wave)
     layers = Layers(behind=(Film(Index(1.5), glass_um),))
@@ -40,67 +46,126 @@ def test_a_source_gives_a_disc_an_order_with_the_light_of_its_share(monkeypatch,
     light = torch.zeros(1, 2, 90, 120)
     row, column = 40, 66
     light[0, 1, row, column] = 5.0
-    image = stray.add_stray(torch.full((1, 76, 106), 0.25), light.sum(1), made, GRID)[0].numpy() - 0.25
+    image = (
+        stray.add_stray(torch.full((1, 76, 106), 0.25), light.sum(1), made, GRID)[
+            0
+        ].numpy()
+        - 0.25
+    )
     x = (column - 59.5) * 7 + middle[0]
     y = (row - 44.5) * 7 + middle[1]
     cosine4 = (D**2 / (D**2 + x**2 + y**2)) ** 2
-    assert image.sum() == pytest.approx(5 * cosine4 * sum(SHARES.values()), rel=0.01)  # rims in steps of a pixel
-    radius = {m: max(abs(RADIUS * (1 + D / DEPTH) - m * D * RADIUS * (1 / D + 1 / FOCUS)), 7.0) for m in SHARES}
+    assert image.sum() == pytest.approx(
+        5 * cosine4 * sum(SHARES.values()), rel=0.01
+    )  # rims in steps of a pixel
+    radius = {
+        m: max(
+            abs(RADIUS * (1 + D / DEPTH) - m * D * RADIUS * (1 / D + 1 / FOCUS)), 7.0
+        )
+        for m in SHARES
+    }
     for off in ((0, 0), (0, 8), (-13, 0), (9, 12), (-20, 3)):
         away = 7 * math.hypot(*off)
-        want = 5 * cosine4 * sum(s * 49 / (math.pi * radius[m] ** 2) for m, s in SHARES.items() if away < radius[m])
+        want = (
+            5
+            * cosine4
+            * sum(
+                s * 49 / (math.pi * radius[m] ** 2)
+                for m, s in SHARES.items()
+                if away < radius[m]
+            )
+        )
         assert all(abs(away - r) > 3.5 for r in radius.values())  # clear of the rims
-        assert image[row - 7 + off[0], column - 7 + off[1]] == pytest.approx(want, rel=1e-3, abs=1e-6)
+        assert image[row - 7 + off[0], column - 7 + off[1]] == pytest.approx(
+            want, rel=1e-3, abs=1e-6
+        )
 
 
 def test_a_lens_without_a_stop_is_lit_by_the_fourth_power_of_the_cosine_at_every_pixel():
-    """Of the angle from the middle of the lens to a pixel's, whose field point is the middle of the frame."""
+    """Of the angle from the middle of the lens to a pixel's, whose field point is the
+    middle of the frame.
+    """
     found = stray._all(RADIUS, GRID, 1700.0, (310.0, -240.0))
     assert (found.radius_um, found.aside_um) == (RADIUS, None)
     assert found.illumination.shape == (90, 120)
     for row, column in ((0, 0), (40, 66), (89, 3), (12, 119)):
         x, y = (column - 59.5) * 7 + 310, (row - 44.5) * 7 - 240
         cosine = math.cos(math.atan(math.hypot(x, y) / 1700))
-        assert float(found.illumination[row, column]) == pytest.approx(cosine**4, rel=1e-6)  # float32
+        assert float(found.illumination[row, column]) == pytest.approx(
+            cosine**4, rel=1e-6
+        )  # float32
 
 
 def test_a_smooth_phase_has_one_order_alone():
-    assert stray.stray_of(SimpleNamespace(wave=object(), distance_um=D), GRID, DEPTH, (0.0, 0.0)) is None
+    assert (
+        stray.stray_of(
+            SimpleNamespace(wave=object(), distance_um=D), GRID, DEPTH, (0.0, 0.0)
+        )
+        is None
+    )
 
 
 HOLE, THICK, MIDDLE = 25.0, 80.0, (6.0, -4.0)
 
 
 def _traced(field_um, order, rng):
-    """(x, y) places on the sensor of rays that pass a hole before the lens, over those that are on the hole."""
+    """(x, y) places on the sensor of rays that pass a hole before the lens, over those
+    that are on the hole.
+    """
     tangents, across = [a / D for a in field_um], rng.uniform(-1, 1, (2, 200_000))
     across = across[:, np.hypot(*across) < 1] * HOLE + np.array(MIDDLE)[:, None]
     source = -DEPTH * np.array(tangents)[:, None]
     pillar = source + (across - source) * DEPTH / (DEPTH - THICK)
-    landed = np.array(field_um)[:, None] + pillar * (1 + D / DEPTH - order * (1 + D / FOCUS))
+    landed = np.array(field_um)[:, None] + pillar * (
+        1 + D / DEPTH - order * (1 + D / FOCUS)
+    )
     on_lens = np.hypot(*pillar) < RADIUS
     return landed[:, on_lens], on_lens.mean()
 
 
 @pytest.mark.parametrize("order", [0, 2])
-@pytest.mark.parametrize("field_um", [(310.0, -240.0), (-1450.0, -250.0), (-2150.0, 20.0)])
-def test_behind_a_stop_a_disc_is_what_rays_through_the_hole_light(monkeypatch, order, field_um):
-    """Rays drawn on the hole: 36 % of its light misses the lens from one of these fields, 95 % from another."""
+@pytest.mark.parametrize(
+    "field_um", [(310.0, -240.0), (-1450.0, -250.0), (-2150.0, 20.0)]
+)
+def test_behind_a_stop_a_disc_is_what_rays_through_the_hole_light(
+    monkeypatch, order, field_um
+):
+    """Rays drawn on the hole: 36 % of its light misses the lens from one of these
+    fields, 95 % from another.
+    """
     monkeypatch.setattr(stray, "PillarWave", Wave)
     monkeypatch.setattr(stray, "ORDERS", (order,))
     monkeypatch.setattr(Wave, "orders", lambda *_: {order: 0.04})
     layers = Layers(stop=Stop(HOLE, THICK, MIDDLE))
-    made = stray.stray_of(SimpleNamespace(wave=Wave(), distance_um=D, layers=layers), GRID, DEPTH, field_um)
+    made = stray.stray_of(
+        SimpleNamespace(wave=Wave(), distance_um=D, layers=layers),
+        GRID,
+        DEPTH,
+        field_um,
+    )
     light = torch.zeros(1, 2, 90, 120)
     light[0, 1, 44:46, 59:61] = 1.25  # about the middle
-    image = stray.add_stray(torch.zeros(1, 76, 106), light.sum(1), made, GRID)[0].double().numpy()
+    image = (
+        stray.add_stray(torch.zeros(1, 76, 106), light.sum(1), made, GRID)[0]
+        .double()
+        .numpy()
+    )
     (x, y), taken = _traced(field_um, order, np.random.default_rng(3))
-    slope2 = sum((a * DEPTH / D + m) ** 2 for a, m in zip(field_um, MIDDLE, strict=True)) / (DEPTH - THICK) ** 2
-    assert image.sum() == pytest.approx(5 * 0.04 * taken / (1 + slope2) ** 2, rel=0.02, abs=2e-4)  # rims in steps
+    slope2 = (
+        sum((a * DEPTH / D + m) ** 2 for a, m in zip(field_um, MIDDLE, strict=True))
+        / (DEPTH - THICK) ** 2
+    )
+    assert image.sum() == pytest.approx(
+        5 * 0.04 * taken / (1 + slope2) ** 2, rel=0.02, abs=2e-4
+    )  # rims in steps
     columns, rows = (np.arange(n) - (n - 1) / 2 for n in (106, 76))
     if taken > 0.5:  # a sliver is taken for a disc
-        found = (image.sum(0) @ columns, image.sum(1) @ rows) / image.sum() * GRID.step_um
-        assert found == pytest.approx([(x - field_um[0]).mean(), (y - field_um[1]).mean()], abs=0.7)
+        found = (
+            (image.sum(0) @ columns, image.sum(1) @ rows) / image.sum() * GRID.step_um
+        )
+        assert found == pytest.approx(
+            [(x - field_um[0]).mean(), (y - field_um[1]).mean()], abs=0.7
+        )
 
 
 def _lit(middle_um, stop):
@@ -109,25 +174,36 @@ def _lit(middle_um, stop):
 
 
 def test_a_hole_that_the_whole_lens_sees_lights_its_own_size():
-    """As large as the hole by the source's distances; of 64 places across the lens the rim's leave 8e-4 (2.6e-3 of
+    """As large as the hole by the source's distances; of 64 places across the lens the
+    rim's leave 8e-4 (2.6e-3 of
     half as many)."""
     found = _lit((310.0, -240.0), Stop(HOLE, THICK, MIDDLE))
     assert found.radius_um == pytest.approx(HOLE * DEPTH / (DEPTH - THICK), rel=1.3e-3)
 
 
 def test_light_through_a_hole_on_the_axis_has_the_mirrors_of_the_field():
-    """Partly beside the lens; to the last bits, so the middle direction is among those that are traced."""
+    """Partly beside the lens; to the last bits, so the middle direction is among those
+    that are traced.
+    """
     there, back = (_lit((side * 1450.0, 250.0), Stop(HOLE, THICK)) for side in (1, -1))
     assert there.aside_um[0] == pytest.approx(back.aside_um[0], abs=1e-9)
     assert there.aside_um[1] == pytest.approx(-back.aside_um[1][::-1], abs=1e-9)
     assert np.ptp(there.aside_um[1]) > 1
-    assert there.illumination.numpy() == pytest.approx(back.illumination.numpy()[:, ::-1], abs=1e-6)
+    assert there.illumination.numpy() == pytest.approx(
+        back.illumination.numpy()[:, ::-1], abs=1e-6
+    )
 
 
 def test_a_lens_that_is_lit_all_over_is_as_large_as_its_64_places_across():
-    """Middles of squares that lie on the lens: pairs of odd numbers whose squares add up to 64² or less."""
+    """Middles of squares that lie on the lens: pairs of odd numbers whose squares add
+    up to 64² or less.
+    """
     found = _lit((310.0, -240.0), Stop(300.0, THICK, MIDDLE))
     odd = np.arange(-63, 64, 2)
     count = np.count_nonzero(odd**2 + odd[:, None] ** 2 <= 64**2)
-    assert found.radius_um == pytest.approx(2 * RADIUS / 64 * math.sqrt(count / math.pi), rel=1e-9)
-    assert found.radius_um == pytest.approx(RADIUS, rel=2e-3)  # (1 / 64)^(4/3) or so, by the circle's lattice points
+    assert found.radius_um == pytest.approx(
+        2 * RADIUS / 64 * math.sqrt(count / math.pi), rel=1e-9
+    )
+    assert found.radius_um == pytest.approx(
+        RADIUS, rel=2e-3
+    )  # (1 / 64)^(4/3) or so, by the circle's lattice points

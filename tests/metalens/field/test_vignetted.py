@@ -1,4 +1,6 @@
-"""The image behind a stop that covers the lens from some fields: dark places count by their light."""
+"""The image behind a stop that covers the lens from some fields: dark places count by
+their light.
+"""
 
 import functools
 import math
@@ -18,22 +20,34 @@ from referees.true_image import Referee
 
 WAVE, DISTANCE, RADIUS, DEPTH, STEP, WINDOW = 0.85, 240.0, 50.0, 5000.0, 9.6, 9
 HOLE, GAP, MIDDLE = 25.0, 60.0, (3.0, -2.0)
-FIELD = math.radians(35.0), math.radians(-6.0)  # along x 24 to 44 degrees: from 0.8 of the light to nothing
+FIELD = (
+    math.radians(35.0),
+    math.radians(-6.0),
+)  # along x 24 to 44 degrees: from 0.8 of the light to nothing
 GRID = Grid((2, 11), STEP, (3000.0, 9000.0), margin=WINDOW // 2, window=WINDOW)
 FINE = 0.6
 
 
 class _Behind(Referee):
-    """Every point's wave through the hole, its plane waves over the gap and through the lens to the sensor."""
+    """Every point's wave through the hole, its plane waves over the gap and through the
+    lens to the sensor.
+    """
 
     hole = HOLE
 
     @functools.cached_property
     def covered(self):
-        """Share of every sample that lies within the hole, the same for every point's wave."""
+        """Share of every sample that lies within the hole, the same for every point's
+        wave.
+        """
         off = (np.arange(5) - 2) / 5 * self.fine
         return np.mean(
-            [np.hypot(self.x - MIDDLE[0] + a, self.y - MIDDLE[1] + b) <= self.hole for a in off for b in off], axis=0
+            [
+                np.hypot(self.x - MIDDLE[0] + a, self.y - MIDDLE[1] + b) <= self.hole
+                for a in off
+                for b in off
+            ],
+            axis=0,
         )
 
     @functools.cached_property
@@ -49,109 +63,241 @@ class _Behind(Referee):
         s = np.sqrt(np.maximum(1 - p**2 - q**2, 1e-6))
         runs = p**2 + q**2 < 1
         wave = np.fft.fft2(self.covered * np.exp(1j * k * (way - depth)) / way)
-        wave = np.fft.ifft2(wave * np.exp(1j * k * GAP * s) * runs) * np.sqrt(x**2 + y**2 + depth**2)
+        wave = np.fft.ifft2(wave * np.exp(1j * k * GAP * s) * runs) * np.sqrt(
+            x**2 + y**2 + depth**2
+        )
         wave = wave * self.answer
-        to = np.exp(1j * k * (DISTANCE * s + p * place[0] + q * place[1])) * runs * self._lands(p, q, s, place)
+        to = (
+            np.exp(1j * k * (DISTANCE * s + p * place[0] + q * place[1]))
+            * runs
+            * self._lands(p, q, s, place)
+        )
         out = np.fft.fftshift(np.fft.ifft2(np.fft.fft2(np.fft.ifftshift(wave)) * to))
         lit = math.pi * (self.hole * depth / (depth - GAP)) ** 2 / self.fine**2
-        slope2 = sum((m + t * depth) ** 2 for m, t in zip(MIDDLE, (tx, ty), strict=True)) / (depth - GAP) ** 2
-        # Referee.image adds cos⁴ of the ray through the lens's middle; the light's is of that through the stop's
+        slope2 = (
+            sum((m + t * depth) ** 2 for m, t in zip(MIDDLE, (tx, ty), strict=True))
+            / (depth - GAP) ** 2
+        )
+        # Referee.image adds cos⁴ of the ray through the lens's middle; the light's is
+        # of that through the stop's
         return np.abs(out) ** 2 / lit * ((1 + tx**2 + ty**2) / (1 + slope2)) ** 2
 
 
 def test_a_field_that_a_stop_darkens_is_imaged_as_well_as_it_says():
-    """Texture against every point's plane waves. Few field points serve, since light is where an image errs: 0.06 of
-    it, where dark places that count as much as bright ones say 0.20 (steep rays near the window's width). One draw
+    """Texture against every point's plane waves. Few field points serve, since light is
+    where an image errs: 0.06 of
+    it, where dark places that count as much as bright ones say 0.20 (steep rays near
+    the window's width). One draw
     may err by a quarter more than the mean."""
     lens = SmoothWave(Focus(WAVE, DISTANCE, 6000.0), RADIUS)
-    made = imager(lens, GRID, field=FIELD, tolerance=0.03, layers=Layers(stop=Stop(HOLE, GAP, MIDDLE)))
+    made = imager(
+        lens,
+        GRID,
+        field=FIELD,
+        tolerance=0.03,
+        layers=Layers(stop=Stop(HOLE, GAP, MIDDLE)),
+    )
     assert made.error < 0.08
     assert len(made.plan.x_um) <= 15
     size = tuple(n + 2 * GRID.margin for n in GRID.samples)
     light = np.random.default_rng(4).uniform(0.4, 1.6, size)
-    about = {"radius": RADIUS, "distance": DISTANCE, "focus": 6000.0, "design_wavelength": WAVE}
+    about = {
+        "radius": RADIUS,
+        "distance": DISTANCE,
+        "focus": 6000.0,
+        "design_wavelength": WAVE,
+    }
     own = _Behind(**about, fine=FINE, count=384, looked_at=WINDOW * STEP / 2 + 2)
     middle = tuple(DISTANCE * math.tan(angle) for angle in FIELD)
-    want = own.image(light, np.full(size, DEPTH), step=STEP, window=WINDOW, waves=[(WAVE, 1.0)], middle=middle)
+    want = own.image(
+        light,
+        np.full(size, DEPTH),
+        step=STEP,
+        window=WINDOW,
+        waves=[(WAVE, 1.0)],
+        middle=middle,
+    )
     edge = GRID.margin
     want = want[edge:-edge, edge:-edge]
     cover = torch.tensor([0.0, 1.0]).reshape(1, 2, 1, 1).expand(1, 2, *size)
-    got = made(Frames(cover * torch.from_numpy(light).float(), cover, torch.full_like(cover, DEPTH)))[0].numpy()
+    got = made(
+        Frames(
+            cover * torch.from_numpy(light).float(),
+            cover,
+            torch.full_like(cover, DEPTH),
+        )
+    )[0].numpy()
     assert want.max() > 5 * want.min()
     assert np.linalg.norm(got - want) < 1.25 * made.error * np.linalg.norm(want)
 
 
 def test_light_from_45_degrees_lands_beside_its_window_and_is_seen_from_there():
-    """Light of 4 ± 1 windows' samples aside, against own plane waves (0.4 um: 45 ± 13 degrees below Nyquist).
+    """Light of 4 ± 1 windows' samples aside, against own plane waves (0.4 um: 45 ± 13
+    degrees below Nyquist).
 
-    Seen from the field point the transform was wrong by 0.52 of the PSF, and a window of 9 samples held the light
-    from beyond one side on the other (0.138 for 0.015 at 47 degrees). Budget: the shadow's own error of 0.01 and that
-    of second order about the light, 0.01 (seen from a width aside), three times over at one place.
+    Seen from the field point the transform was wrong by 0.52 of the PSF, and a window
+    of 9 samples held the light
+    from beyond one side on the other (0.138 for 0.015 at 47 degrees). Budget: the
+    shadow's own error of 0.01 and that
+    of second order about the light, 0.01 (seen from a width aside), three times over at
+    one place.
     """
     hole, fine = 40.0, 0.4
     layers = Layers(stop=Stop(hole, GAP, MIDDLE))
     optics = Optics(SmoothWave(Focus(WAVE, DISTANCE, 6000.0), RADIUS), layers, DISTANCE)
-    about = {"radius": RADIUS, "distance": DISTANCE, "focus": 6000.0, "design_wavelength": WAVE}
+    about = {
+        "radius": RADIUS,
+        "distance": DISTANCE,
+        "focus": 6000.0,
+        "design_wavelength": WAVE,
+    }
     own = _Behind(**about, fine=fine, count=720, looked_at=60.0)
     own.hole = hole
     for x, samples, bound in ((240.0, 21, 0.04), (260.0, 9, 0.08)):
         place, depth = (x, 0.0), 4000.0
         want = own.sampled(own.intensity(place, depth, WAVE), STEP, samples)
-        shown = {"depths_um": torch.tensor([depth], dtype=torch.float64), "wavelength_um": WAVE}
+        shown = {
+            "depths_um": torch.tensor([depth], dtype=torch.float64),
+            "wavelength_um": WAVE,
+        }
         at = torch.tensor([place], dtype=torch.float64)
-        got = psfs(optics, at, **shown, window=Window(samples, STEP))[0, 0].double().numpy()
-        slope2 = sum((m + t / DISTANCE * depth) ** 2 for m, t in zip(MIDDLE, place, strict=True)) / (depth - GAP) ** 2
-        want = want * ((1 + slope2) / (1 + (x / DISTANCE) ** 2)) ** 2  # light alone: without the referee's cos⁴
+        got = (
+            psfs(optics, at, **shown, window=Window(samples, STEP))[0, 0]
+            .double()
+            .numpy()
+        )
+        slope2 = (
+            sum(
+                (m + t / DISTANCE * depth) ** 2
+                for m, t in zip(MIDDLE, place, strict=True)
+            )
+            / (depth - GAP) ** 2
+        )
+        want = (
+            want * ((1 + slope2) / (1 + (x / DISTANCE) ** 2)) ** 2
+        )  # light alone: without the referee's cos⁴
         assert np.linalg.norm(got - want) < bound * np.linalg.norm(want)
 
 
 def test_derivatives_of_light_through_a_stop_from_the_side_are_differences_of_plane_waves():
-    """By the strengths of a coma and of a defocus, at 24 degrees. Budget: energies 0.18 / N = 0.015 short behind the
-    stop's edge, its shadow 0.009, second order about the light 0.01, differences 1e-5."""
+    """By the strengths of a coma and of a defocus, at 24 degrees. Budget: energies 0.18
+    / N = 0.015 short behind the
+    stop's edge, its shadow 0.009, second order about the light 0.01, differences 1e-5.
+    """
     place, depth, strengths, step = (105.0, -28.0), 3600.0, (0.7, -0.5), 1e-3
 
     def added(a, b):
-        return lambda x, y: 1.3 * a * (x / RADIUS) ** 3 + 2 * b * (x**2 + 0.6 * y**2) / RADIUS**2
+        return lambda x, y: (
+            1.3 * a * (x / RADIUS) ** 3 + 2 * b * (x**2 + 0.6 * y**2) / RADIUS**2
+        )
 
-    about = {"radius": RADIUS, "distance": DISTANCE, "focus": 6000.0, "design_wavelength": WAVE}
-    slope2 = sum((m + t / DISTANCE * depth) ** 2 for m, t in zip(MIDDLE, place, strict=True)) / (depth - GAP) ** 2
-    level = ((1 + slope2) / (1 + (place[0] ** 2 + place[1] ** 2) / DISTANCE**2)) ** 2  # without the referee's cos⁴
+    about = {
+        "radius": RADIUS,
+        "distance": DISTANCE,
+        "focus": 6000.0,
+        "design_wavelength": WAVE,
+    }
+    slope2 = (
+        sum((m + t / DISTANCE * depth) ** 2 for m, t in zip(MIDDLE, place, strict=True))
+        / (depth - GAP) ** 2
+    )
+    level = (
+        (1 + slope2) / (1 + (place[0] ** 2 + place[1] ** 2) / DISTANCE**2)
+    ) ** 2  # without the referee's cos⁴
 
     def own(a, b):
-        behind = _Behind(**about, fine=FINE, count=432, looked_at=WINDOW * STEP / 2 + 2, extra=added(a, b))
-        return behind.sampled(behind.intensity(place, depth, WAVE), STEP, WINDOW) * level
+        behind = _Behind(
+            **about,
+            fine=FINE,
+            count=432,
+            looked_at=WINDOW * STEP / 2 + 2,
+            extra=added(a, b),
+        )
+        return (
+            behind.sampled(behind.intensity(place, depth, WAVE), STEP, WINDOW) * level
+        )
 
     def light(given):
-        optics = Optics(SmoothWave(Focus(WAVE, DISTANCE, 6000.0), RADIUS, added(*given)), layers, DISTANCE)
-        at, depths = (torch.tensor(part, dtype=torch.float64) for part in ([place], [depth]))
-        return psfs(optics, at, depths_um=depths, wavelength_um=WAVE, window=Window(WINDOW, STEP))[0, 0].double()
+        optics = Optics(
+            SmoothWave(Focus(WAVE, DISTANCE, 6000.0), RADIUS, added(*given)),
+            layers,
+            DISTANCE,
+        )
+        at, depths = (
+            torch.tensor(part, dtype=torch.float64) for part in ([place], [depth])
+        )
+        return psfs(
+            optics,
+            at,
+            depths_um=depths,
+            wavelength_um=WAVE,
+            window=Window(WINDOW, STEP),
+        )[0, 0].double()
 
     layers = Layers(stop=Stop(HOLE, GAP, MIDDLE))
-    found = torch.autograd.functional.jacobian(light, torch.tensor(strengths, dtype=torch.float64)).movedim(-1, 0)
+    found = torch.autograd.functional.jacobian(
+        light, torch.tensor(strengths, dtype=torch.float64)
+    ).movedim(-1, 0)
     for i, got in enumerate(found.numpy()):
-        ends = [own(*(s + sign * step * (i == j) for j, s in enumerate(strengths))) for sign in (1, -1)]
+        ends = [
+            own(*(s + sign * step * (i == j) for j, s in enumerate(strengths)))
+            for sign in (1, -1)
+        ]
         want = (ends[0] - ends[1]) / (2 * step)
         assert np.linalg.norm(got - want) < 0.05 * np.linalg.norm(want), i
 
 
 def test_an_image_deep_in_the_shadow_is_prepared_to_its_own_light():
-    """Half the lens at 45 degrees, an image ten times dimmer than its frame; every point's own PSF, of nodes three
-    windows apart, for the image's nodes, kernels and period. Prepared to the frame's light, samples more than half a
-    window from where a PSF's light lands were dark, a third of this image's light, and it erred by 0.2."""
-    lens, layers = SmoothWave(Focus(WAVE, 120.0, 3000.0), 25.0), Layers(stop=Stop(20.0, 30.0, (1.5, -1.0)))
-    grid, step, middle = Grid((1, 3), 4.8, (1500.0, 4500.0), margin=4, window=WINDOW), 4.8, 120.0
-    made = imager(lens, grid, field=(math.radians(45.0), 0.0), tolerance=0.1, layers=layers)
+    """Half the lens at 45 degrees, an image ten times dimmer than its frame; every
+    point's own PSF, of nodes three
+    windows apart, for the image's nodes, kernels and period. Prepared to the frame's
+    light, samples more than half a
+    window from where a PSF's light lands were dark, a third of this image's light, and
+    it erred by 0.2."""
+    lens, layers = (
+        SmoothWave(Focus(WAVE, 120.0, 3000.0), 25.0),
+        Layers(stop=Stop(20.0, 30.0, (1.5, -1.0))),
+    )
+    grid, step, middle = (
+        Grid((1, 3), 4.8, (1500.0, 4500.0), margin=4, window=WINDOW),
+        4.8,
+        120.0,
+    )
+    made = imager(
+        lens, grid, field=(math.radians(45.0), 0.0), tolerance=0.1, layers=layers
+    )
     size, optics = (9, 11), Optics(lens, layers, 120.0)
     light = np.random.default_rng(4).uniform(0.4, 1.6, size)
     want = np.zeros((17, 19))
     for i, j in np.ndindex(*size):
-        at = torch.tensor([[middle + (j - 5) * step, (i - 4) * step]], dtype=torch.float64)
-        shown = {"depths_um": torch.tensor([2500.0], dtype=torch.float64), "wavelength_um": WAVE}
-        psf = psfs(optics, at, **shown, window=Window(WINDOW, step, period=3.0))[0, 0].double().numpy()
-        slope2 = sum((m + a / 120 * 2500) ** 2 for m, a in zip((1.5, -1.0), at[0].tolist(), strict=True)) / 2470**2
+        at = torch.tensor(
+            [[middle + (j - 5) * step, (i - 4) * step]], dtype=torch.float64
+        )
+        shown = {
+            "depths_um": torch.tensor([2500.0], dtype=torch.float64),
+            "wavelength_um": WAVE,
+        }
+        psf = (
+            psfs(optics, at, **shown, window=Window(WINDOW, step, period=3.0))[0, 0]
+            .double()
+            .numpy()
+        )
+        slope2 = (
+            sum(
+                (m + a / 120 * 2500) ** 2
+                for m, a in zip((1.5, -1.0), at[0].tolist(), strict=True)
+            )
+            / 2470**2
+        )
         want[i : i + 9, j : j + 9] += light[i, j] * psf / (1 + slope2) ** 2
     want = want[8:9, 8:11]
     cover = torch.tensor([0.0, 1.0]).reshape(1, 2, 1, 1).expand(1, 2, *size)
-    got = made(Frames(cover * torch.from_numpy(light).float(), cover, torch.full_like(cover, 2500.0)))[0].numpy()
+    got = made(
+        Frames(
+            cover * torch.from_numpy(light).float(),
+            cover,
+            torch.full_like(cover, 2500.0),
+        )
+    )[0].numpy()
     assert np.linalg.norm(got - want) < 0.1 * np.linalg.norm(want)
     assert abs(got.sum() / want.sum() - 1) < 0.1

@@ -13,10 +13,20 @@ from metalens.ground import reading
         ("840,5;0,3", (";", True), ["840.5", "0.3"]),
         ("840.5,0.3", (",", False), ["840.5", "0.3"]),
         ("840, 0.3", (",", False), ["840", "0.3"]),
-        ("480,0.5 1.2", (",", False), ["480", "0.5", "1.2"]),  # one word with a comma is no decimal notation
-        ("wavelength,index of refraction", (",", False), ["wavelength", "index", "of", "refraction"]),
+        (
+            "480,0.5 1.2",
+            (",", False),
+            ["480", "0.5", "1.2"],
+        ),  # one word with a comma is no decimal notation
+        (
+            "wavelength,index of refraction",
+            (",", False),
+            ["wavelength", "index", "of", "refraction"],
+        ),
     ],
 )
-def test_commas_are_decimal_where_every_number_has_one_or_a_semicolon_parts(line, told, words):
+def test_commas_are_decimal_where_every_number_has_one_or_a_semicolon_parts(
+    line, told, words
+):
     assert reading.parting(line) == told
     assert reading.columns(line) == words

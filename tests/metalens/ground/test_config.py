@@ -1,4 +1,6 @@
-"""Configs: unknown keys name the nearest, wrong values name their place, and records survive the round trip."""
+"""Configs: unknown keys name the nearest, wrong values name their place, and records
+survive the round trip.
+"""
 
 import tomllib
 from dataclasses import dataclass
@@ -38,14 +40,19 @@ class Outer:
 def test_nested_tables_lists_and_defaults():
     text = 'pitch_um = 1\nsteps = [1, 2]\nfile = "a.h5"\n[inner]\nwidth_um = 2\n[[films]]\nwidth_um = 3\nname = "f"\n'
     found = config.loads(text, Outer)
-    assert found == Outer(1.0, inner=Inner(2.0), steps=(1, 2), file=Path("a.h5"), films=(Inner(3.0, "f"),))
+    assert found == Outer(
+        1.0, inner=Inner(2.0), steps=(1, 2), file=Path("a.h5"), films=(Inner(3.0, "f"),)
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("pich_um = 1", r"unknown key 'pich_um'; did you mean 'pitch_um'\?"),
-        ("pitch_um = 1\n[inner]\nwidht_um = 2", r"unknown key 'inner\.widht_um'; did you mean 'width_um'\?"),
+        (
+            "pitch_um = 1\n[inner]\nwidht_um = 2",
+            r"unknown key 'inner\.widht_um'; did you mean 'width_um'\?",
+        ),
         ("", "missing key 'pitch_um'"),
         ('pitch_um = "wide"', r"pitch_um is 'wide' \(str\), need float"),
         ("pitch_um = true", r"pitch_um is True \(bool\), need float"),
@@ -81,10 +88,22 @@ class Told:
 @pytest.mark.parametrize(
     ("text", "ends"),
     [
-        ("reach_um = [1.0]", "need 2 (reach_um: (nearest, farthest) place of the stage)"),
-        ("count = 2", "missing key 'reach_um' in Told (reach_um: (nearest, farthest) place of the stage)"),
-        ("reach_um = [1, 2]\ncount = -1", "need 0 or more (count: how many, however long it takes to say what ...)"),
-        ("reach_um = [1, 2]\n[inner]\npitch_um = true", "(bool), need float"),  # of a record that says nothing
+        (
+            "reach_um = [1.0]",
+            "need 2 (reach_um: (nearest, farthest) place of the stage)",
+        ),
+        (
+            "count = 2",
+            "missing key 'reach_um' in Told (reach_um: (nearest, farthest) place of the stage)",
+        ),
+        (
+            "reach_um = [1, 2]\ncount = -1",
+            "need 0 or more (count: how many, however long it takes to say what ...)",
+        ),
+        (
+            "reach_um = [1, 2]\n[inner]\npitch_um = true",
+            "(bool), need float",
+        ),  # of a record that says nothing
     ],
 )
 def test_a_refused_key_is_explained(monkeypatch, text, ends):
@@ -103,7 +122,9 @@ def test_missing_file_and_binary_file_are_named(tmp_path):
 
 
 def test_a_material_is_a_name_or_plain_numbers():
-    cell = config.loads('pitch_um = 0.4\npillar = {n = 3.6, k = 0.01}\nsubstrate = "SiO2"\n', Cell)
+    cell = config.loads(
+        'pitch_um = 0.4\npillar = {n = 3.6, k = 0.01}\nsubstrate = "SiO2"\n', Cell
+    )
     assert cell.pillar == Index(3.6, 0.01)
     assert cell.substrate == "SiO2"
 
@@ -116,7 +137,9 @@ def test_a_material_is_a_name_or_plain_numbers():
         pillar=st.builds(Index, st.floats(0.1, 5), st.floats(0, 3)),
         substrate=st.sampled_from(["SiO2", 'a "quoted" name', "back\\slash"]),
         sidewall_rad=st.floats(-0.7, 0.7),
-        under=st.lists(st.builds(Film, st.sampled_from(["Si", "air"]), st.floats(0, 2)), max_size=2).map(tuple),
+        under=st.lists(
+            st.builds(Film, st.sampled_from(["Si", "air"]), st.floats(0, 2)), max_size=2
+        ).map(tuple),
     )
 )
 def test_a_record_written_as_toml_reads_back_the_same(cell):
@@ -141,8 +164,18 @@ class Whole:
 
 
 def test_numbers_stay_lists_and_records_become_tables():
-    """What is written is TOML that another reader takes for the same; what is empty or left out makes no table."""
-    made = Whole((2.5, 9.0), ("a", "b"), Part(0.7, (1.0, 2.0)), (Part(0.1), Part(0.2, (3.0,))), (), None, True)
+    """What is written is TOML that another reader takes for the same; what is empty or
+    left out makes no table.
+    """
+    made = Whole(
+        (2.5, 9.0),
+        ("a", "b"),
+        Part(0.7, (1.0, 2.0)),
+        (Part(0.1), Part(0.2, (3.0,))),
+        (),
+        None,
+        True,
+    )
     read = tomllib.loads(config.dumps(made))
     assert read.pop("none", []) == []
     assert read == {

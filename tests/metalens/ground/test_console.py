@@ -1,4 +1,6 @@
-"""Output of commands: lines, JSON, silence, and progress that passes every item through."""
+"""Output of commands: lines, JSON, silence, and progress that passes every item
+through.
+"""
 
 import json
 
@@ -40,7 +42,9 @@ def test_empty_words_are_no_failure(capsys):
     assert capsys.readouterr().out == "a is 1\n"
 
 
-def test_progress_without_a_terminal_is_plain_lines_with_rate_and_time_left(capsys, monkeypatch):
+def test_progress_without_a_terminal_is_plain_lines_with_rate_and_time_left(
+    capsys, monkeypatch
+):
     import time
 
     clock = iter(range(0, 1000, 11))

@@ -20,8 +20,12 @@ def test_interpolation_is_exact_for_polynomials_and_fast_for_waves():
     errors = []
     for n in (10, 14, 18, 22):
         x, _ = legendre.nodes(n)
-        errors.append(np.abs(legendre.interpolation(n, t) @ np.exp(6j * x) - np.exp(6j * t)).max())
-    assert all(b < 0.1 * a for a, b in itertools.pairwise(errors))  # faster than geometric
+        errors.append(
+            np.abs(legendre.interpolation(n, t) @ np.exp(6j * x) - np.exp(6j * t)).max()
+        )
+    assert all(
+        b < 0.1 * a for a, b in itertools.pairwise(errors)
+    )  # faster than geometric
     assert errors[-1] < 1e-9
 
 
@@ -35,5 +39,7 @@ def test_needed_finds_the_least_count_and_says_when_it_cannot_tell():
         x, _ = legendre.nodes(n)
         fine, w = legendre.nodes(100)
         rest = legendre.interpolation(n, fine) @ np.exp(20j * x) - np.exp(20j * fine)
-        assert np.sqrt((np.abs(rest) ** 2 * w).sum() / 2) < 3 * tolerance  # interpolation: tail and its alias
+        assert (
+            np.sqrt((np.abs(rest) ** 2 * w).sum() / 2) < 3 * tolerance
+        )  # interpolation: tail and its alias
     assert legendre.needed(np.exp(80j * t)[None], 1e-3) == 65

@@ -1,4 +1,6 @@
-"""A folder's manifest by its entries, and how far into a file its maker's mark is looked for, to the byte."""
+"""A folder's manifest by its entries, and how far into a file its maker's mark is
+looked for, to the byte.
+"""
 
 import hashlib
 import json
@@ -30,7 +32,11 @@ def test_a_manifest_lists_every_file_but_others(tmp_path):
         "a.txt": {"sha256": hashlib.sha256(b"seven b").hexdigest(), "bytes": 7},
         "sub/c.bin": {"sha256": hashlib.sha256(b"xyz").hexdigest(), "bytes": 3},
     }
-    assert (told["finished"], told["others"], told["command"]) == (True, ["mine.txt"], "psf a b")
+    assert (told["finished"], told["others"], told["command"]) == (
+        True,
+        ["mine.txt"],
+        "psf a b",
+    )
     found = manifest.read(place)
     assert (found["files"], found["others"]) == (told["files"], told["others"])
     manifest.check(place)
@@ -42,7 +48,11 @@ def test_a_manifest_lists_every_file_but_others(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "content", "told"),
-    [("a.txt", b"seven c", "SHA-256 differs"), ("a.txt", b"seven", "SHA-256 differs"), ("a.txt", None, "is missing")],
+    [
+        ("a.txt", b"seven c", "SHA-256 differs"),
+        ("a.txt", b"seven", "SHA-256 differs"),
+        ("a.txt", None, "is missing"),
+    ],
 )
 def test_what_is_no_longer_as_it_was_written_is_told(tmp_path, name, content, told):
     place = folder(tmp_path)
@@ -57,7 +67,9 @@ def test_what_is_no_longer_as_it_was_written_is_told(tmp_path, name, content, to
         manifest.check(place)
 
 
-@pytest.mark.parametrize(("more", "told"), [(1, "too large"), (0, "Expecting value|decode|invalid")])
+@pytest.mark.parametrize(
+    ("more", "told"), [(1, "too large"), (0, "Expecting value|decode|invalid")]
+)
 def test_a_manifest_of_more_than_64_mebibytes_is_not_read(tmp_path, more, told):
     (tmp_path / "manifest.json").touch()
     os.truncate(tmp_path / "manifest.json", (1 << 26) + more)
@@ -82,9 +94,15 @@ PNG, MARK = b"\x89PNG", b"Software\0metalens"
 @pytest.mark.parametrize(
     ("content", "ours"),
     [
-        (PNG + b"." * (4096 - 4 - len(MARK)) + MARK + b"." * 100, True),  # ends with the first 4096 bytes
+        (
+            PNG + b"." * (4096 - 4 - len(MARK)) + MARK + b"." * 100,
+            True,
+        ),  # ends with the first 4096 bytes
         (PNG + b"." * (4097 - 4 - len(MARK)) + MARK + b"." * 100, False),
-        (b"PK" + b"." * 5000 + b"metalens" + b"." * 56, True),  # begins with the last 64
+        (
+            b"PK" + b"." * 5000 + b"metalens" + b"." * 56,
+            True,
+        ),  # begins with the last 64
         (b"PK" + b"." * 5000 + b"metalens" + b"." * 57, False),
         (b"PK" + b"." * 9 + b"metalens", True),  # of a short file too
         (b"PX" + b"." * 9 + b"metalens", False),
@@ -105,7 +123,10 @@ def test_a_mark_is_looked_for_at_a_files_beginning_and_end(tmp_path, content, ou
 
 def test_a_folder_is_ours_with_a_manifest_that_lists_all(tmp_path):
     place = folder(tmp_path)
-    assert manifest.foreign(place) == "holds a.txt and no manifest.json: not made by metalens"
+    assert (
+        manifest.foreign(place)
+        == "holds a.txt and no manifest.json: not made by metalens"
+    )
     manifest.write(place, "psf")
     assert manifest.foreign(place) == ""
     (place / "z.txt").touch()
@@ -113,7 +134,9 @@ def test_a_folder_is_ours_with_a_manifest_that_lists_all(tmp_path):
     assert manifest.foreign(place) == "holds new.txt, which metalens did not make"
     assert manifest.strange(place) == {"z.txt", "new.txt"}
     manifest.write(place, "psf", finished=False)
-    assert manifest.foreign(place) == ""  # an unfinished one may hold what it has not listed yet
+    assert (
+        manifest.foreign(place) == ""
+    )  # an unfinished one may hold what it has not listed yet
     (tmp_path / "bare").mkdir()
     assert manifest.foreign(tmp_path / "bare") == ""
     (tmp_path / "bare" / "manifest.json").write_text("{}")
@@ -134,12 +157,20 @@ def test_names_are_from_the_folder_on_and_links_to_folders_count(tmp_path):
     (place / "manifest.json").touch()
     (place / "sub" / "manifest.json").touch()
     (place / "link").symlink_to(place / "sub")
-    assert sorted(manifest.files(place)) == ["a.txt", "link", "mine.txt", "sub/c.bin", "sub/manifest.json"]
+    assert sorted(manifest.files(place)) == [
+        "a.txt",
+        "link",
+        "mine.txt",
+        "sub/c.bin",
+        "sub/manifest.json",
+    ]
     manifest.empty(place)
     assert sorted(os.listdir(place)) == ["manifest.json"]
 
 
-def test_a_journal_goes_on_under_its_own_title_and_begins_afresh_under_another(tmp_path):
+def test_a_journal_goes_on_under_its_own_title_and_begins_afresh_under_another(
+    tmp_path,
+):
     path = tmp_path / "j"
     assert manifest.journal(path, '["1", "psf"]') == []
     with open(path, "a") as file:

@@ -1,4 +1,6 @@
-"""What is damaged, endless or foreign is refused by type, before memory is taken; what nobody foresaw is one line."""
+"""What is damaged, endless or foreign is refused by type, before memory is taken; what
+nobody foresaw is one line.
+"""
 
 import math
 import os
@@ -39,12 +41,21 @@ class Record:
         ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
         ("seed = " + "9" * 5000, "4300 digits"),
         ("seed = 0x" + "f" * 9000, "seed is a number of 36000 bits"),
-        ("seed = 9999999999999999999999", "seed is 9999999999999999999999, need at most"),
+        (
+            "seed = 9999999999999999999999",
+            "seed is 9999999999999999999999, need at most",
+        ),
         ("seed = -4", "seed is -4, need 0 or more"),
         ("[inner]\nlevel = -inf", "inner.level is -inf, need a finite number"),
         ("[inner]\nlevel = nan", "inner.level is nan"),
-        ('file = "a\\u0000b"', "file is 'a\\x00b', need text without control characters"),
-        ('name = "a\\u001b[2J"', "name is 'a\\x1b[2J', need text without control characters"),
+        (
+            'file = "a\\u0000b"',
+            "file is 'a\\x00b', need text without control characters",
+        ),
+        (
+            'name = "a\\u001b[2J"',
+            "name is 'a\\x1b[2J', need text without control characters",
+        ),
         ('file = ""', "file is empty, need a name"),
         ("[inner]\nlevel = 1e20", "inner.level is 1e+20, need at most 1e+09"),
         ("[inner]\nlevel = -0.5", "inner.level is -0.5, need 0 or more"),
@@ -92,12 +103,15 @@ def test_a_file_that_ends_its_reader_ends_a_child_alone(tmp_path):
             signal.raise_signal(signal.SIGSEGV)
         return "read"
 
-    with pytest.raises(StoreError, match=r"f\.h5: damaged: reading it ended the reader with signal 11"):
+    with pytest.raises(
+        StoreError, match=r"f\.h5: damaged: reading it ended the reader with signal 11"
+    ):
         reading.survived(tmp_path / "f.h5", read)
     assert reading.survived(tmp_path / "f.h5", lambda file: file["x"][2]) == 2.0
     with pytest.raises(RuntimeError, match="y"):
         reading.survived(tmp_path / "f.h5", lambda file: file["y"])
-    # the child's limit; here that would succeed. 8 GB: what arrays of before left on the heap is used before it counts
+    # the child's limit; here that would succeed. 8 GB: what arrays of before left on
+    # the heap is used before it counts
     with pytest.raises(RuntimeError, match="allocate"):
         reading.survived(tmp_path / "f.h5", lambda file: np.zeros(1 << 30))
 
@@ -106,7 +120,9 @@ def test_an_array_that_lies_in_another_file_is_refused(tmp_path):
     (tmp_path / "secret").write_bytes(b"\1" * 64)
     store.save(tmp_path / "f.h5", "lens", {"x": np.arange(3.0)})
     with h5py.File(tmp_path / "f.h5", "r+") as file:
-        file.create_dataset("out", (8,), "f8", external=[(str(tmp_path / "secret"), 0, 64)])
+        file.create_dataset(
+            "out", (8,), "f8", external=[(str(tmp_path / "secret"), 0, 64)]
+        )
     with pytest.raises(StoreError, match="'out' lies in other files"):
         store.load(tmp_path / "f.h5")
 
@@ -114,7 +130,11 @@ def test_an_array_that_lies_in_another_file_is_refused(tmp_path):
 @pytest.mark.parametrize("value", ["nine", [1.0, 2.0], 1j])
 def test_an_attribute_of_the_wrong_kind_is_a_store_error(tmp_path, value):
     light = np.full((1, 1, 4, 4), 1 / 16)
-    axes = dict(depths_um=np.array([9.0]), angles_rad=np.zeros((1, 2)), wavelengths_um=np.array([0.8]))
+    axes = dict(
+        depths_um=np.array([9.0]),
+        angles_rad=np.zeros((1, 2)),
+        wavelengths_um=np.array([0.8]),
+    )
     stack = psf.PsfStack(
         light, np.ones((1, 1)), **axes, weights=np.ones(1), centres_um=np.zeros((1, 1, 2)), step_um=0.7,
         sensor_distance_um=30.0, tolerance=0.1, error=0.01, reason="made",

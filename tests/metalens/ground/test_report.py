@@ -16,7 +16,11 @@ def page(tmp_path):
     picture = Figure(report.png(figure), "A line <b>rising</b>")
     table = Table(("name", "value"), (("t", 0.123456), ("<script>", 3)), "numbers")
     sections = [
-        Section("One & two", "First paragraph.\n\nSecond <i>paragraph</i>.", (picture, table)),
+        Section(
+            "One & two",
+            "First paragraph.\n\nSecond <i>paragraph</i>.",
+            (picture, table),
+        ),
         Section("View", items=(Markup("<svg id='view'></svg>"),)),
         Section("End"),
     ]
@@ -25,7 +29,9 @@ def page(tmp_path):
         KeyFigure("checked", "yes", good=True),
         KeyFigure("left", "1", good=False),
     ]
-    report.write(tmp_path / "report.html", "A lens", sections, lead="Lead.", key_figures=keys)
+    report.write(
+        tmp_path / "report.html", "A lens", sections, lead="Lead.", key_figures=keys
+    )
     return (tmp_path / "report.html").read_text(encoding="utf-8")
 
 

@@ -1,4 +1,6 @@
-"""Artefact files: whole or not at all, same input same bytes, refused by name when foreign."""
+"""Artefact files: whole or not at all, same input same bytes, refused by name when
+foreign.
+"""
 
 import contextlib
 import os
@@ -18,18 +20,32 @@ from hypothesis.extra import numpy as hnp
 from metalens.ground import reading, store
 from metalens.ground.errors import StoreError
 
-ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "group/b": np.arange(40_000), "names": np.array(["x", "µm"])}
+ARRAYS = {
+    "a": np.arange(6.0).reshape(2, 3),
+    "group/b": np.arange(40_000),
+    "names": np.array(["x", "µm"]),
+}
 
 
 def test_round_trip_keeps_arrays_attributes_and_provenance(tmp_path):
     made = store.Provenance(config="x = 1\n", inputs={"cell.toml": "ab" * 32}, seed=7)
-    store.save(tmp_path / "f.h5", "lens", ARRAYS, attributes={"pitch_um": 0.4, "n": 3}, provenance=made)
+    store.save(
+        tmp_path / "f.h5",
+        "lens",
+        ARRAYS,
+        attributes={"pitch_um": 0.4, "n": 3},
+        provenance=made,
+    )
     back = store.load(tmp_path / "f.h5", "lens")
     np.testing.assert_array_equal(back.arrays["a"], ARRAYS["a"])
     np.testing.assert_array_equal(back.arrays["group/b"], ARRAYS["group/b"])
     assert [n.decode() for n in back.arrays["names"]] == ["x", "µm"]
     assert back.attributes == {"pitch_um": 0.4, "n": 3}
-    assert (back.provenance.config, dict(back.provenance.inputs), back.provenance.seed) == (
+    assert (
+        back.provenance.config,
+        dict(back.provenance.inputs),
+        back.provenance.seed,
+    ) == (
         made.config,
         dict(made.inputs),
         7,
@@ -38,7 +54,12 @@ def test_round_trip_keeps_arrays_attributes_and_provenance(tmp_path):
 
 
 @settings(max_examples=25)
-@given(hnp.arrays(st.sampled_from([np.float32, np.int64, np.complex128]), hnp.array_shapes(min_dims=0, max_dims=3)))
+@given(
+    hnp.arrays(
+        st.sampled_from([np.float32, np.int64, np.complex128]),
+        hnp.array_shapes(min_dims=0, max_dims=3),
+    )
+)
 def test_any_array_comes_back_bit_for_bit(tmp_path_factory, array):
     path = tmp_path_factory.mktemp("s") / "f.h5"
     store.save(path, "psf", {"x": array})
@@ -55,7 +76,9 @@ def test_same_input_gives_the_same_bytes(tmp_path):
 
 def test_wrong_kind_names_what_was_found_and_what_is_needed(tmp_path):
     store.save(tmp_path / "f.h5", "psf", ARRAYS)
-    with pytest.raises(StoreError, match=r"holds 'psf' version 1, need 'lens' version 1"):
+    with pytest.raises(
+        StoreError, match=r"holds 'psf' version 1, need 'lens' version 1"
+    ):
         store.load(tmp_path / "f.h5", "lens")
 
 
@@ -122,25 +145,33 @@ def test_disk_full_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
         except OSError:
             print("refused")
     """)
-    child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    child = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert child.stdout.strip() == "refused", child.stderr[-500:]
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["f.h5"]
 
 
 def test_a_file_is_written_without_a_second_copy_in_memory(tmp_path):
-    """Chunks are at most 1 MiB, and the library holds a few of them; a whole image would be 24 MB."""
+    """Chunks are at most 1 MiB, and the library holds a few of them; a whole image
+    would be 24 MB.
+    """
     light = np.random.default_rng(7).random(3 * 10**6)
     tracemalloc.start()
     store.save(tmp_path / "f.h5", "lens", {"light": light}, compress=False)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 6 << 20
-    np.testing.assert_array_equal(store.load(tmp_path / "f.h5", "lens").arrays["light"], light)
+    np.testing.assert_array_equal(
+        store.load(tmp_path / "f.h5", "lens").arrays["light"], light
+    )
 
 
 def test_the_library_never_sees_that_a_write_was_refused(tmp_path):
-    """Here by a file that is open for reading alone: after the first refusal, which is told later, none is tried."""
+    """Here by a file that is open for reading alone: after the first refusal, which is
+    told later, none is tried.
+    """
     (tmp_path / "f").write_bytes(b"abcde")
     with reading.Through(tmp_path / "f", "rb") as file:
         assert file.write(bytearray(b"fgh")) == 3
@@ -187,12 +218,16 @@ def test_a_journal_s_last_line_counts_where_it_is_whole(tmp_path):
 
 def test_what_is_no_artefact_is_named_as_what_it_is(tmp_path):
     np.save(tmp_path / "phase.npy", np.eye(3))
-    with pytest.raises(StoreError, match=r"phase\.npy: an array of NumPy, need an HDF5 file"):
+    with pytest.raises(
+        StoreError, match=r"phase\.npy: an array of NumPy, need an HDF5 file"
+    ):
         store.load(tmp_path / "phase.npy")
 
 
 def test_an_array_without_a_shape_is_refused(tmp_path):
-    """HDF5 knows entries of no values at all; of two damaged files in 1450 that `metalens info` was given."""
+    """HDF5 knows entries of no values at all; of two damaged files in 1450 that
+    `metalens info` was given.
+    """
     store.save(tmp_path / "a.h5", "lens", {"x": np.ones(3)})
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file["y"] = h5py.Empty("f8")
@@ -200,19 +235,30 @@ def test_an_array_without_a_shape_is_refused(tmp_path):
         store.load(tmp_path / "a.h5")
 
 
-@pytest.mark.parametrize(("packing", "undone"), [({"compression": "gzip"}, False), ({"compression": "lzf"}, True)])
-def test_every_block_of_a_large_file_is_looked_for_before_it_is_read(tmp_path, monkeypatch, packing, undone):
-    """By its place in the file; where it is packed by anything but gzip it is undone in the child, too."""
+@pytest.mark.parametrize(
+    ("packing", "undone"),
+    [({"compression": "gzip"}, False), ({"compression": "lzf"}, True)],
+)
+def test_every_block_of_a_large_file_is_looked_for_before_it_is_read(
+    tmp_path, monkeypatch, packing, undone
+):
+    """By its place in the file; where it is packed by anything but gzip it is undone in
+    the child, too.
+    """
     values = np.random.default_rng(5).integers(0, 900, (60, 50)).astype(np.int32)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("d", data=values, chunks=(7, 9), fletcher32=True, **packing)
         about = file["d"].id.get_chunk_info(20)
     monkeypatch.setattr(reading, "_WHOLE", 10)
-    assert np.array_equal(reading.survived(tmp_path / "a.h5", lambda file: file["d"][...]), values)
+    assert np.array_equal(
+        reading.survived(tmp_path / "a.h5", lambda file: file["d"][...]), values
+    )
     content = bytearray((tmp_path / "a.h5").read_bytes())
     content[about.byte_offset + 3] ^= 1
     (tmp_path / "a.h5").write_bytes(content)
     with h5py.File(tmp_path / "a.h5") as file, contextlib.ExitStack() as refused:
         if undone:
-            refused.enter_context(pytest.raises(OSError, match="filter returned failure"))
+            refused.enter_context(
+                pytest.raises(OSError, match="filter returned failure")
+            )
         reading._blocks(file["d"])

@@ -34,11 +34,15 @@ print(threads(), check_focus(lens).strehl > 0.9)
 """
 
 
-@pytest.mark.parametrize(("told", "count"), [("3", 3), ("0", 1), ("", len(os.sched_getaffinity(0)))])
+@pytest.mark.parametrize(
+    ("told", "count"), [("3", 3), ("0", 1), ("", len(os.sched_getaffinity(0)))]
+)
 def test_a_lens_is_designed_and_checked_where_there_is_no_torch(told, count):
     told_here = {**os.environ, "OMP_NUM_THREADS": told}
     words = [sys.executable, "-c", WITHOUT_TORCH]
-    done = subprocess.run(words, capture_output=True, text=True, env=told_here, check=False)
+    done = subprocess.run(
+        words, capture_output=True, text=True, env=told_here, check=False
+    )
     assert done.stdout.split() == [str(count), "True"], done.stderr[-2000:]
 
 
@@ -60,11 +64,18 @@ def test_every_part_is_done_once_by_torchs_threads():
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_calls_side_by_side_give_their_results_in_order(count):
-    """Where there are threads, two calls wait for each other: one after the other they would not end."""
-    before, gate = torch.get_num_threads(), threading.Barrier(2 if count > 1 else 1, timeout=20)
+    """Where there are threads, two calls wait for each other: one after the other they
+    would not end.
+    """
+    before, gate = (
+        torch.get_num_threads(),
+        threading.Barrier(2 if count > 1 else 1, timeout=20),
+    )
     torch.set_num_threads(count)
     try:
-        made = threads.beside(lambda: (gate.wait(), 7)[1], lambda: (gate.wait(), "wide")[1])
+        made = threads.beside(
+            lambda: (gate.wait(), 7)[1], lambda: (gate.wait(), "wide")[1]
+        )
     finally:
         torch.set_num_threads(before)
     assert made == [7, "wide"]
@@ -84,7 +95,11 @@ def test_parts_that_stay_apart_have_one_thread_of_torch_each_and_give_them_back(
 
     try:
         threads.apart(11, work)
-        assert (torch.get_num_threads(), inside, seen.tolist()) == (3, [1] * 3, [1] * 11)
+        assert (torch.get_num_threads(), inside, seen.tolist()) == (
+            3,
+            [1] * 3,
+            [1] * 11,
+        )
         with pytest.raises(ArithmeticError, match="of a part"):
             threads.apart(11, broken)
         assert torch.get_num_threads() == 3
@@ -123,13 +138,17 @@ def test_a_failure_or_an_interrupt_stops_what_is_beside_it_at_its_next_part(caus
     def work(item):
         begun.append(item)
         if item == 0 and cause is KeyboardInterrupt:
-            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # which wakes it, unlike a mere flag
+            signal.pthread_kill(
+                threading.main_thread().ident, signal.SIGINT
+            )  # which wakes it, unlike a mere flag
         elif item == 0:
             raise cause
         while True:
             threads.split(1, lambda *_: None)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background may ignore it
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # what runs in the background may ignore it
     try:
         with pytest.raises(cause):
             threads.each(work, range(40))
@@ -143,7 +162,10 @@ def test_one_thread_does_one_item_after_another():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        assert threads.each(lambda _: threading.current_thread(), range(2)) == [threading.current_thread()] * 2
+        assert (
+            threads.each(lambda _: threading.current_thread(), range(2))
+            == [threading.current_thread()] * 2
+        )
     finally:
         torch.set_num_threads(before)
 
@@ -166,11 +188,20 @@ print(told, held() - before)
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="what is tuned is glibc's")
-@pytest.mark.parametrize(("word", "told", "least", "most"), [("kept", "True", 47, 56), ("given back", "None", -8, 8)])
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc", reason="what is tuned is glibc's"
+)
+@pytest.mark.parametrize(
+    ("word", "told", "least", "most"),
+    [("kept", "True", 47, 56), ("given back", "None", -8, 8)],
+)
 def test_memory_that_is_kept_is_there_for_the_next_array(word, told, least, most):
-    done = subprocess.run([sys.executable, "-c", HELD, word], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", HELD, word], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     said, held = done.stdout.split()
     assert said == told
-    assert least <= int(held) <= most  # MiB; 8 for what Python itself takes or gives meanwhile
+    assert (
+        least <= int(held) <= most
+    )  # MiB; 8 for what Python itself takes or gives meanwhile

@@ -1,4 +1,6 @@
-"""How work is cut among threads, by counts: parts, threads side by side, and what the C library is told."""
+"""How work is cut among threads, by counts: parts, threads side by side, and what the C
+library is told.
+"""
 
 import os
 import sys
@@ -41,7 +43,9 @@ def test_parts_are_even_to_one_and_no_more_than_items(told, way, count, own, par
 def test_the_first_part_is_done_by_who_asks(told):
     told(3)
     seen = {}
-    threads.split(7, lambda start, stop: seen.setdefault(start, threading.current_thread()))
+    threads.split(
+        7, lambda start, stop: seen.setdefault(start, threading.current_thread())
+    )
     assert seen[0] is threading.current_thread()
     assert seen[2] is not seen[0]
     assert set(seen) == {0, 2, 4}
@@ -60,16 +64,23 @@ def test_sixteen_items_are_side_by_side_at_the_most(told):
     assert len(set(who)) == 16
     told(3)
     here = threading.current_thread()
-    assert threads.each(lambda _: threading.current_thread() is here, [1, 2]) == [False, False]
+    assert threads.each(lambda _: threading.current_thread() is here, [1, 2]) == [
+        False,
+        False,
+    ]
     assert threads.each(lambda _: threading.current_thread() is here, [1]) == [True]
     assert threads.each(str, []) == []
 
 
-@pytest.mark.parametrize(("words", "count"), [("7", 7), ("0", 1), ("two", None), ("", None), ("-3", None)])
+@pytest.mark.parametrize(
+    ("words", "count"), [("7", 7), ("0", 1), ("two", None), ("", None), ("-3", None)]
+)
 def test_without_torch_the_environment_or_the_cores_tell(monkeypatch, words, count):
     monkeypatch.delitem(sys.modules, "torch")
     monkeypatch.setenv("OMP_NUM_THREADS", words)
-    assert threads.threads() == (len(os.sched_getaffinity(0)) if count is None else count)
+    assert threads.threads() == (
+        len(os.sched_getaffinity(0)) if count is None else count
+    )
 
 
 def test_the_c_library_is_told_to_keep_a_gibibyte_and_all_of_its_heap(monkeypatch):
@@ -82,7 +93,11 @@ def test_the_c_library_is_told_to_keep_a_gibibyte_and_all_of_its_heap(monkeypatc
             asked.append((name, value))
             return answers[len(asked) - 1]
 
-        monkeypatch.setattr(threads.ctypes, "CDLL", lambda name, tune=tune: SimpleNamespace(mallopt=tune))
+        monkeypatch.setattr(
+            threads.ctypes,
+            "CDLL",
+            lambda name, tune=tune: SimpleNamespace(mallopt=tune),
+        )
         assert threads.keep_memory() is want
         assert asked == [(-3, 1 << 30), (-1, (1 << 31) - 1)][: 1 + answers[0]]
         threads.keep_memory.cache_clear()

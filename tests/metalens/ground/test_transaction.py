@@ -1,5 +1,7 @@
 # ruff: noqa: PT012 (what ends a block is the subject here)
-"""Outputs appear whole or not at all, whatever ends the work; what is not ours stays, even with force."""
+"""Outputs appear whole or not at all, whatever ends the work; what is not ours stays,
+even with force.
+"""
 
 import contextlib
 import errno
@@ -26,7 +28,11 @@ FORCE = Terms(force=True)
 
 def tree(folder):
     """{name: content} of all files below, locks and scratch included."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
 
 
 def put(target, **contents):
@@ -36,9 +42,13 @@ def put(target, **contents):
 
 
 def save(target, value, *, force=True):
-    with transaction.file(target, beside=(".png", "_old.png"), terms=Terms(force=force)) as draft:
+    with transaction.file(
+        target, beside=(".png", "_old.png"), terms=Terms(force=force)
+    ) as draft:
         store.save(draft.path, "lens", {}, attributes={"value": value})
-        draft.path.with_suffix(".png").write_bytes(b"\x89PNG....Software\0metalens" + str(value).encode())
+        draft.path.with_suffix(".png").write_bytes(
+            b"\x89PNG....Software\0metalens" + str(value).encode()
+        )
 
 
 def test_a_folder_appears_whole_with_its_manifest(tmp_path):
@@ -61,7 +71,9 @@ def test_whatever_ends_the_block_leaves_what_was_there(tmp_path, error):
     for claim in (transaction.folder, transaction.file):
         target = tmp_path / ("out" if claim is transaction.folder else "f.h5")
         with pytest.raises(error), claim(target, terms=FORCE) as draft:
-            (draft.path / "half" if draft.path.is_dir() else draft.path).write_text("half")
+            (draft.path / "half" if draft.path.is_dir() else draft.path).write_text(
+                "half"
+            )
             raise error
     assert tree(tmp_path) == before
 
@@ -75,7 +87,10 @@ def test_force_replaces_only_what_is_ours(tmp_path):
     (tmp_path / "note.h5").write_text("not HDF5")
     before = tree(tmp_path)
     for name, what in (("thesis", "chapter.tex"), ("mixed", "photo.jpg")):
-        with pytest.raises(OutputError, match=what), transaction.folder(tmp_path / name, terms=FORCE):
+        with (
+            pytest.raises(OutputError, match=what),
+            transaction.folder(tmp_path / name, terms=FORCE),
+        ):
             pass
     with pytest.raises(OutputError, match=r"photo\.png was not made by metalens"):
         save(tmp_path / "photo.h5", 1)  # its picture would replace the cat
@@ -110,10 +125,16 @@ def test_an_output_is_never_an_input(tmp_path):
     before = tree(tmp_path)
     for name in ("lens.h5", "soft.h5", "hard.h5"):
         terms = Terms(force=True, inputs=(tmp_path / "lens.h5",))
-        with pytest.raises(OutputError, match="also an input"), transaction.file(tmp_path / name, terms=terms):
+        with (
+            pytest.raises(OutputError, match="also an input"),
+            transaction.file(tmp_path / name, terms=terms),
+        ):
             pass
     terms = Terms(force=True, inputs=(tmp_path / "shots" / "a",))
-    with pytest.raises(OutputError, match="holds the input"), transaction.folder(tmp_path / "shots", terms=terms):
+    with (
+        pytest.raises(OutputError, match="holds the input"),
+        transaction.folder(tmp_path / "shots", terms=terms),
+    ):
         pass
     assert tree(tmp_path) == before
 
@@ -129,14 +150,20 @@ def test_refusals_come_before_the_work(tmp_path):
         with pytest.raises(OutputError, match=words), claim(target):
             pytest.fail("the work began")
     huge = Terms(room=1 << 60)
-    with pytest.raises(OutputError, match="MB free, need"), transaction.file(tmp_path / "f", terms=huge):
+    with (
+        pytest.raises(OutputError, match="MB free, need"),
+        transaction.file(tmp_path / "f", terms=huge),
+    ):
         pytest.fail("the work began")
 
 
 def test_a_second_writer_is_told_who_is_first(tmp_path):
     with transaction.folder(tmp_path / "out") as draft:
         (draft.path / "a").write_text("first")
-        with pytest.raises(OutputError, match=f"process {os.getpid()} on"), transaction.folder(tmp_path / "out"):
+        with (
+            pytest.raises(OutputError, match=f"process {os.getpid()} on"),
+            transaction.folder(tmp_path / "out"),
+        ):
             pytest.fail("two writers")
     assert (tmp_path / "out" / "a").read_text() == "first"
 
@@ -144,7 +171,10 @@ def test_a_second_writer_is_told_who_is_first(tmp_path):
 def test_long_work_survives_an_interruption_and_goes_on(tmp_path):
     target, keep = tmp_path / "run", ("check",)
     put(target, old="old")
-    with pytest.raises(KeyboardInterrupt) as stopped, transaction.long_work(target, keep=keep, terms=FORCE) as draft:
+    with (
+        pytest.raises(KeyboardInterrupt) as stopped,
+        transaction.long_work(target, keep=keep, terms=FORCE) as draft,
+    ):
         (draft.path / "check").write_text("half way")
         raise KeyboardInterrupt
     assert "--resume" in stopped.value.__notes__[0]
@@ -159,16 +189,25 @@ def test_long_work_survives_an_interruption_and_goes_on(tmp_path):
 
 
 def test_long_work_without_anything_to_keep_leaves_nothing(tmp_path):
-    with pytest.raises(OSError, match="bad"), transaction.long_work(tmp_path / "run", keep=("check",)):
+    with (
+        pytest.raises(OSError, match="bad"),
+        transaction.long_work(tmp_path / "run", keep=("check",)),
+    ):
         raise OSError("bad")
     assert os.listdir(tmp_path) == []
 
 
 def test_unfinished_work_is_not_thrown_away_unasked(tmp_path):
-    with pytest.raises(OSError, match="x"), transaction.long_work(tmp_path / "run", keep=("c",)) as draft:
+    with (
+        pytest.raises(OSError, match="x"),
+        transaction.long_work(tmp_path / "run", keep=("c",)) as draft,
+    ):
         (draft.path / "c").write_text("hours")
         raise OSError("x")
-    with pytest.raises(OutputError, match="--resume"), transaction.long_work(tmp_path / "run", keep=("c",)):
+    with (
+        pytest.raises(OutputError, match="--resume"),
+        transaction.long_work(tmp_path / "run", keep=("c",)),
+    ):
         pass
     assert (draft.path / "c").read_text() == "hours"
     with transaction.long_work(tmp_path / "run", keep=("c",), terms=FORCE) as draft:
@@ -177,14 +216,19 @@ def test_unfinished_work_is_not_thrown_away_unasked(tmp_path):
 
 
 @pytest.mark.parametrize("how", [{"resume": True}, {"grow": True}])
-def test_what_others_put_into_a_folder_stays_theirs_when_the_work_on_it_goes_on(tmp_path, how):
+def test_what_others_put_into_a_folder_stays_theirs_when_the_work_on_it_goes_on(
+    tmp_path, how
+):
     target = tmp_path / "run"
     put(target, ours="old")
     put(target / "part", inner="ours too")
     (target / "notes.txt").write_text("mine")
     (target / "part" / "photo.jpg").write_text("mine")
     for turn in (1, 2):  # interrupted once, then finished
-        with contextlib.suppress(KeyboardInterrupt), transaction.long_work(target, keep=("ours",), **how) as draft:
+        with (
+            contextlib.suppress(KeyboardInterrupt),
+            transaction.long_work(target, keep=("ours",), **how) as draft,
+        ):
             (draft.path / "more").write_text(str(turn))
             if turn == 1:
                 raise KeyboardInterrupt
@@ -209,7 +253,11 @@ def test_a_folder_of_others_does_not_grow(tmp_path):
     put(tmp_path / "thesis" / "part", inner="ours")
     with transaction.long_work(tmp_path / "thesis", keep=(), grow=True) as draft:
         (draft.path / "more").write_text("x")
-    assert set(manifest.read(tmp_path / "thesis")["files"]) == {"more", "part/inner", "part/manifest.json"}
+    assert set(manifest.read(tmp_path / "thesis")["files"]) == {
+        "more",
+        "part/inner",
+        "part/manifest.json",
+    }
 
 
 def test_a_changed_folder_is_refused_by_name(tmp_path):
@@ -281,10 +329,18 @@ KILLED_AS_IT_COMMITS = """
 
 
 def test_a_folder_whose_owner_is_killed_as_it_commits_stays_as_it_was(tmp_path):
-    words = [sys.executable, "-c", textwrap.dedent(KILLED_AS_IT_COMMITS), Path(__file__).parent]
+    words = [
+        sys.executable,
+        "-c",
+        textwrap.dedent(KILLED_AS_IT_COMMITS),
+        Path(__file__).parent,
+    ]
     assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 9
     assert (tmp_path / "out" / "a").read_text() == "first"
-    with pytest.raises(OutputError, match="exists"), transaction.folder(tmp_path / "out"):
+    with (
+        pytest.raises(OutputError, match="exists"),
+        transaction.folder(tmp_path / "out"),
+    ):
         pass  # the claim alone clears up
     assert os.listdir(tmp_path) == ["out"]
     assert sorted(os.listdir(tmp_path / "out")) == ["a", manifest.NAME]
@@ -292,7 +348,9 @@ def test_a_folder_whose_owner_is_killed_as_it_commits_stays_as_it_was(tmp_path):
 
 @pytest.mark.parametrize("put_aside", [False, True])
 def test_a_mark_that_the_disk_lost_moves_nothing_beside_the_output(tmp_path, put_aside):
-    """Its number is gone: before the exchange the new folder is no output yet, after it the old one none any more."""
+    """Its number is gone: before the exchange the new folder is no output yet, after it
+    the old one none any more.
+    """
     scratch = tmp_path / ".out.part-abc"
     kept = scratch / ("old" if put_aside else "new")
     kept.mkdir(parents=True)
@@ -334,19 +392,40 @@ def test_kills_at_random_moments_mix_nothing_and_leave_nothing(tmp_path, kind):
         child.stdout.close()
         if kind == "folder" and (work / "out").exists():
             manifest.check(work / "out")
-            assert len({p.read_text() for p in (work / "out").iterdir() if p.name != manifest.NAME}) == 1
-        if kind == "file" and (work / "out.h5").exists() and (work / "out.png").exists():
+            assert (
+                len(
+                    {
+                        p.read_text()
+                        for p in (work / "out").iterdir()
+                        if p.name != manifest.NAME
+                    }
+                )
+                == 1
+            )
+        if (
+            kind == "file"
+            and (work / "out.h5").exists()
+            and (work / "out.png").exists()
+        ):
             value = store.load(work / "out.h5").attributes["value"]
-            assert (work / "out.png").read_bytes().endswith(b"metalens" + str(value).encode())
+            assert (
+                (work / "out.png")
+                .read_bytes()
+                .endswith(b"metalens" + str(value).encode())
+            )
     if kind == "folder":
         put(work / "out", a="last")
     else:
         save(work / "out.h5", -1)
-    assert sorted(os.listdir(work)) == (["out"] if kind == "folder" else ["out.h5", "out.png"])
+    assert sorted(os.listdir(work)) == (
+        ["out"] if kind == "folder" else ["out.h5", "out.png"]
+    )
 
 
 @pytest.mark.parametrize("call", ["flock", "unlink"])
-def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(tmp_path, monkeypatch, call):
+def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(
+    tmp_path, monkeypatch, call
+):
     where = {"flock": fcntl, "unlink": Path}[call]
     real = getattr(where, call)
 
@@ -355,7 +434,9 @@ def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(tmp_p
         return real(*words, **more)
 
     monkeypatch.setattr(where, call, interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background inherits it ignored
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a suite in the background inherits it ignored
     try:
         with pytest.raises(KeyboardInterrupt), lock.held(tmp_path / "out.h5"):
             pass
@@ -365,12 +446,18 @@ def test_an_interrupt_while_the_lock_is_taken_or_given_back_leaves_no_lock(tmp_p
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_a_disk_that_refuses_at_any_renaming_or_flush_is_told_what_stands_now(tmp_path, monkeypatch, kind):
-    """Each in turn is refused once: the old result whole and said to be unchanged, or the new one and said so."""
+def test_a_disk_that_refuses_at_any_renaming_or_flush_is_told_what_stands_now(
+    tmp_path, monkeypatch, kind
+):
+    """Each in turn is refused once: the old result whole and said to be unchanged, or
+    the new one and said so.
+    """
     target = tmp_path / ("out.h5" if kind == "file" else "out")
 
     def make(value):
-        return save(target, value) if kind == "file" else put(target, a=f"value {value}")
+        return (
+            save(target, value) if kind == "file" else put(target, a=f"value {value}")
+        )
 
     make(1)
     old = tree(tmp_path)

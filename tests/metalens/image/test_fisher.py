@@ -1,4 +1,6 @@
-"""Information measures against closed forms, and the honest axial information against the cheat it prevents."""
+"""Information measures against closed forms, and the honest axial information against
+the cheat it prevents.
+"""
 
 import math
 
@@ -21,14 +23,20 @@ def test_matrix_is_the_inner_product_of_sensitivities():
     f = fisher.information(J)
     assert float(f[0, 1]) == pytest.approx(float((J[0] * J[1]).sum()), rel=1e-12)
     v = torch.rand(30, 40, dtype=torch.float64) + 0.5
-    assert float(fisher.information(J, v)[1, 1]) == pytest.approx(float((J[1] ** 2 / v).sum()), rel=1e-12)
+    assert float(fisher.information(J, v)[1, 1]) == pytest.approx(
+        float((J[1] ** 2 / v).sum()), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.3, math.pi / 2, 2.8, math.pi])
 def test_span_angle_of_known_directions(angle):
     e = torch.eye(2, dtype=torch.float64)
-    pair = torch.stack([5 * e[0], 0.1 * (math.cos(angle) * e[0] + math.sin(angle) * e[1])])
-    assert float(fisher.span_angle(fisher.information(pair))) == pytest.approx(angle, abs=1e-7)
+    pair = torch.stack(
+        [5 * e[0], 0.1 * (math.cos(angle) * e[0] + math.sin(angle) * e[1])]
+    )
+    assert float(fisher.span_angle(fisher.information(pair))) == pytest.approx(
+        angle, abs=1e-7
+    )
 
 
 def test_colinear_sensitivities_have_angle_zero_and_infinite_bounds():
@@ -50,8 +58,12 @@ def test_loss_floor_acts_reports_and_keeps_a_finite_gradient():
 
 def test_loss_is_equation_6():
     f = torch.tensor([[4.0, 1.0], [1.0, 9.0]], dtype=torch.float64)
-    loss = fisher.optics_loss(f, torch.tensor(0.8), orthogonality=0.5, compactness=2.0, relative=False)
-    assert float(loss.value) == pytest.approx(-math.log(36) + 0.5 * 2 + 2 * 0.2, rel=1e-6)
+    loss = fisher.optics_loss(
+        f, torch.tensor(0.8), orthogonality=0.5, compactness=2.0, relative=False
+    )
+    assert float(loss.value) == pytest.approx(
+        -math.log(36) + 0.5 * 2 + 2 * 0.2, rel=1e-6
+    )
     assert torch.autograd.gradcheck(
         lambda j: fisher.optics_loss(fisher.information(j), torch.tensor(0.5)).value,
         J[:, :3, :3].clone().requires_grad_(True),
@@ -60,7 +72,9 @@ def test_loss_is_equation_6():
 
 def test_floor_has_a_continuous_value_and_slope():
     def at(level):
-        f = torch.diag(torch.tensor([level, 1.0], dtype=torch.float64)).requires_grad_(True)
+        f = torch.diag(torch.tensor([level, 1.0], dtype=torch.float64)).requires_grad_(
+            True
+        )
         loss = fisher.optics_loss(f, torch.tensor(1.0), floor=1e-3)
         loss.value.backward()
         return float(loss.value.detach()), float(f.grad[0, 0])
@@ -72,10 +86,16 @@ def test_floor_has_a_continuous_value_and_slope():
 
 def test_bounds_match_the_scatter_of_the_best_estimate():
     rng = np.random.default_rng(3)
-    bound = fisher.cramer_rao(fisher.information(J, torch.full((30, 40), 0.25, dtype=torch.float64))).numpy()
+    bound = fisher.cramer_rao(
+        fisher.information(J, torch.full((30, 40), 0.25, dtype=torch.float64))
+    ).numpy()
     a = J.reshape(2, -1).numpy().T
-    estimates = np.linalg.lstsq(a, 0.5 * rng.standard_normal((a.shape[0], 4000)), rcond=None)[0]
-    assert estimates.std(1) == pytest.approx(bound, rel=0.05)  # 4000 draws: 1.1 % of standard error
+    estimates = np.linalg.lstsq(
+        a, 0.5 * rng.standard_normal((a.shape[0], 4000)), rcond=None
+    )[0]
+    assert estimates.std(1) == pytest.approx(
+        bound, rel=0.05
+    )  # 4000 draws: 1.1 % of standard error
 
 
 def test_nuisance_costs_the_shared_direction():
@@ -84,7 +104,9 @@ def test_nuisance_costs_the_shared_direction():
     across = J[0] - J[1] * (J[0] * J[1]).sum() / (J[1] ** 2).sum()
     assert float(left) == pytest.approx(float((across**2).sum()), rel=1e-10)
     unseen = torch.cat([pair, torch.zeros(1, 30, 40, dtype=torch.float64)])
-    assert float(fisher.without_nuisance(fisher.information(unseen), 1)) == pytest.approx(float(left), rel=1e-9)
+    assert float(
+        fisher.without_nuisance(fisher.information(unseen), 1)
+    ) == pytest.approx(float(left), rel=1e-9)
 
 
 def test_encircled_energy_of_a_gaussian():
@@ -96,14 +118,24 @@ def test_encircled_energy_of_a_gaussian():
 
 
 def test_axial_information_of_a_moving_spot_is_known():
-    """A Gaussian of width w that moves by v dz has I = v² / 2 w² in L2 normalisation, on pixels much finer than w."""
+    """A Gaussian of width w that moves by v dz has I = v² / 2 w² in L2 normalisation,
+    on pixels much finer than w.
+    """
     s = (torch.arange(240, dtype=torch.float64) - 119.5) * 0.5
     near = torch.exp(-(s[:, None] ** 2 + s**2) / (2 * 12**2))
     far = torch.exp(-(s[:, None] ** 2 + (s - 0.2) ** 2) / (2 * 12**2))
-    value = fisher.axial_information(near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5)
-    assert float(value) == pytest.approx(1.0**2 / (2 * 12**2), rel=0.01)  # pixel box widens w² by p²/12: 0.1 %
-    by_sum = fisher.axial_information(near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5, normalisation="sum")
-    ratio = 1.5**2 / (4 * math.pi * 12**2)  # sum of squares over square of sum, of a Gaussian
+    value = fisher.axial_information(
+        near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5
+    )
+    assert float(value) == pytest.approx(
+        1.0**2 / (2 * 12**2), rel=0.01
+    )  # pixel box widens w² by p²/12: 0.1 %
+    by_sum = fisher.axial_information(
+        near, far, step_um=200.0, sample_um=0.5, pixel_um=1.5, normalisation="sum"
+    )
+    ratio = 1.5**2 / (
+        4 * math.pi * 12**2
+    )  # sum of squares over square of sum, of a Gaussian
     assert float(by_sum / value) == pytest.approx(ratio, rel=0.02)
 
 
@@ -118,9 +150,13 @@ def _stacks(phase, sample_um, samples, depths=DEPTHS):
 
 
 def test_one_position_and_coarse_sampling_let_an_optimiser_cheat():
-    """Tuned on intensities every 3 um at one position, a phase claims several times the information it has."""
+    """Tuned on intensities every 3 um at one position, a phase claims several times the
+    information it has.
+    """
     generator = torch.Generator().manual_seed(1)
-    phase = (0.1 * torch.randn(128, 128, generator=generator, dtype=torch.float64)).requires_grad_(True)
+    phase = (
+        0.1 * torch.randn(128, 128, generator=generator, dtype=torch.float64)
+    ).requires_grad_(True)
     step = torch.optim.Adam([phase], lr=0.1)
     setting = dict(step_um=200.0, sample_um=3.0, pixel_um=3.0, normalisation="l2")
     for _ in range(60):
@@ -129,7 +165,9 @@ def test_one_position_and_coarse_sampling_let_an_optimiser_cheat():
         (-torch.log(claimed)).backward()
         step.step()
     near, far = _stacks(phase.detach(), 0.75, 192)
-    honest = fisher.axial_information(near, far, step_um=200.0, sample_um=0.75, pixel_um=3.0).mean()
+    honest = fisher.axial_information(
+        near, far, step_um=200.0, sample_um=0.75, pixel_um=3.0
+    ).mean()
     assert claimed.item() > 2.5 * honest.item()
 
 
@@ -141,12 +179,20 @@ def test_coarse_samples_are_refused_where_honesty_is_promised():
 
 def test_hyperbolic_lens_has_the_known_honest_information():
     flat = torch.zeros(128, 128, dtype=torch.float64)
-    near, far = _stacks(flat, 0.75, 192, torch.arange(16e3, 26.01e3, 1e3, dtype=torch.float64))
+    near, far = _stacks(
+        flat, 0.75, 192, torch.arange(16e3, 26.01e3, 1e3, dtype=torch.float64)
+    )
     honest = [
-        float(fisher.axial_information(near, far, step_um=200.0, sample_um=0.75, pixel_um=3.0 * b).mean())
+        float(
+            fisher.axial_information(
+                near, far, step_um=200.0, sample_um=0.75, pixel_um=3.0 * b
+            ).mean()
+        )
         for b in (1, 2, 3)
     ]
-    assert honest == pytest.approx([0.24, 0.09, 0.045], rel=0.06)  # measured apart, in a paraxial model
+    assert honest == pytest.approx(
+        [0.24, 0.09, 0.045], rel=0.06
+    )  # measured apart, in a paraxial model
 
 
 def test_texture_information_ignores_where_the_light_lands():
@@ -157,14 +203,17 @@ def test_texture_information_ignores_where_the_light_lands():
     drift = torch.stack([torch.roll(b, (3 * i, i), (0, 1)) for i, b in enumerate(blur)])
     setting = dict(step_um=500.0, spectrum=torch.ones(64, 33), noise=1e-4)
     assert torch.allclose(
-        fisher.texture_information(blur, **setting), fisher.texture_information(drift, **setting), rtol=1e-4
+        fisher.texture_information(blur, **setting),
+        fisher.texture_information(drift, **setting),
+        rtol=1e-4,
     )
     fixed = torch.stack([torch.roll(blur[0], (3 * i, i), (0, 1)) for i in range(3)])
     assert float(fisher.texture_information(fixed, **setting).max()) < 1e-3
 
 
 @pytest.mark.parametrize(
-    ("samples", "sample_um", "pitch_um"), [(48, 0.3, 0.9), (21, 0.7, 2.1), (50, 0.3, 1.7), (7, 0.9, 6.4)]
+    ("samples", "sample_um", "pitch_um"),
+    [(48, 0.3, 0.9), (21, 0.7, 2.1), (50, 0.3, 1.7), (7, 0.9, 6.4)],
 )
 def test_pixels_inside_a_window_are_counted_as_by_hand(samples, sample_um, pitch_um):
     """Lengths are round numbers of 0.1 um: integers say how many pixels fit."""
@@ -173,33 +222,52 @@ def test_pixels_inside_a_window_are_counted_as_by_hand(samples, sample_um, pitch
 
 
 def test_no_row_or_column_of_pixels_is_lost():
-    """Light that changes in the last row of pixels only is information; 48 samples of 0.3 um are 16 pixels of 0.9."""
+    """Light that changes in the last row of pixels only is information; 48 samples of
+    0.3 um are 16 pixels of 0.9.
+    """
     near = torch.ones(1, 48, 48, dtype=torch.float64)
     far = near.clone()
     far[:, -3:, -3:] += 0.25  # the last pixel: 9 samples of 0.25 each
-    found = pixel_information(near, far, step_um=100.0, sample_um=0.3, pixel_um=0.9, normalisation="none")
+    found = pixel_information(
+        near, far, step_um=100.0, sample_um=0.3, pixel_um=0.9, normalisation="none"
+    )
     assert float(found[0]) == pytest.approx((9 * 0.25 / 0.1) ** 2, rel=1e-9)
 
 
 def test_relative_orthogonality_of_unlike_informations():
     """F12² / (F11 F22), twice: 2 · 2.25 / 12; and the sum of the logarithms."""
     f = torch.tensor([[3.0, 1.5], [1.5, 4.0]], dtype=torch.float64)
-    loss = fisher.optics_loss(f, torch.tensor([0.2, 0.7], dtype=torch.float64), orthogonality=0.7, compactness=1.9)
+    loss = fisher.optics_loss(
+        f,
+        torch.tensor([0.2, 0.7], dtype=torch.float64),
+        orthogonality=0.7,
+        compactness=1.9,
+    )
     parts = (-math.log(12), 0.7 * 2 * 2.25 / 12, 1.9 * 0.55)
-    assert [float(v) for v in (loss.sensitivity, loss.orthogonality, loss.compactness)] == pytest.approx(parts)
+    assert [
+        float(v) for v in (loss.sensitivity, loss.orthogonality, loss.compactness)
+    ] == pytest.approx(parts)
     assert float(loss.value) == pytest.approx(sum(parts))
 
 
 def test_bounds_of_unlike_correlated_parameters_are_those_of_the_inverse():
-    f = torch.tensor([[9.0, 2.0, 0.5], [2.0, 4e4, -80.0], [0.5, -80.0, 1.7]], dtype=torch.float64)
+    f = torch.tensor(
+        [[9.0, 2.0, 0.5], [2.0, 4e4, -80.0], [0.5, -80.0, 1.7]], dtype=torch.float64
+    )
     want = np.sqrt(np.diag(np.linalg.inv(f.numpy())))
     assert fisher.cramer_rao(f).numpy() == pytest.approx(want, rel=1e-10)
     pair = torch.stack([J[0], 3 * J[0], J[1]])
-    assert torch.isinf(fisher.cramer_rao(fisher.information(pair))).tolist() == [True, True, False]
+    assert torch.isinf(fisher.cramer_rao(fisher.information(pair))).tolist() == [
+        True,
+        True,
+        False,
+    ]
 
 
 def test_encircled_energy_on_a_window_with_unlike_sides():
-    """A bright sample at (row 4, column 9) of 11 x 15, 2.24 samples from the middle: half in at its distance."""
+    """A bright sample at (row 4, column 9) of 11 x 15, 2.24 samples from the middle:
+    half in at its distance.
+    """
     spot = torch.zeros(11, 15, dtype=torch.float64)
     spot[4, 9] = 0.7
     distance = math.hypot(-1, 2) * 0.4
@@ -209,12 +277,19 @@ def test_encircled_energy_on_a_window_with_unlike_sides():
 
 
 def test_texture_information_is_that_of_differences_of_the_power():
-    """Half the squared slope of ln S over every frequency of the plane, also for an odd number of columns."""
+    """Half the squared slope of ln S over every frequency of the plane, also for an odd
+    number of columns.
+    """
     generator = torch.Generator().manual_seed(4)
     for columns in (6, 7):
         psf = torch.rand(3, 5, columns, generator=generator, dtype=torch.float64)
-        half = torch.rand(5, columns // 2 + 1, generator=generator, dtype=torch.float64) + 0.5
-        half[:, 0] = (half[:, 0] + half[:, 0].roll(1).flip(0)) / 2  # a real texture: S(f) = S(-f)
+        half = (
+            torch.rand(5, columns // 2 + 1, generator=generator, dtype=torch.float64)
+            + 0.5
+        )
+        half[:, 0] = (
+            half[:, 0] + half[:, 0].roll(1).flip(0)
+        ) / 2  # a real texture: S(f) = S(-f)
         if columns % 2 == 0:
             half[:, -1] = (half[:, -1] + half[:, -1].roll(1).flip(0)) / 2
         found = fisher.texture_information(psf, step_um=170.0, spectrum=half, noise=0.3)
@@ -228,27 +303,41 @@ def test_texture_information_is_that_of_differences_of_the_power():
         assert torch.allclose(found, want, rtol=1e-10)
 
 
-@pytest.mark.parametrize(("samples", "sample_um", "pixel_um"), [(48, 0.3, 0.9), (50, 0.3, 0.9), (35, 0.1, 0.7)])
+@pytest.mark.parametrize(
+    ("samples", "sample_um", "pixel_um"),
+    [(48, 0.3, 0.9), (50, 0.3, 0.9), (35, 0.1, 0.7)],
+)
 def test_no_pixel_is_lost_to_rounding_of_the_count(samples, sample_um, pixel_um):
-    """Flat light, twice as bright at the second depth: the plain difference counts whole pixels, each its area."""
+    """Flat light, twice as bright at the second depth: the plain difference counts
+    whole pixels, each its area.
+    """
     whole = (samples * round(sample_um * 10)) // round(pixel_um * 10)
     near = torch.ones(samples, samples, dtype=torch.float64)
-    setting = dict(step_um=300.0, sample_um=sample_um, pixel_um=pixel_um, normalisation="none")
+    setting = dict(
+        step_um=300.0, sample_um=sample_um, pixel_um=pixel_um, normalisation="none"
+    )
     light = (pixel_um / sample_um) ** 2
     got = fisher.pixel_information(near, 2 * near, **setting)
     assert float(got) == pytest.approx((whole * light / 0.3) ** 2, rel=1e-9)
 
 
 def test_information_is_formed_on_the_device_of_the_image():
-    """A device without numbers stands for any that is not the processor: nothing may be brought from there."""
-    near, far = torch.empty(2, 30, 24, device="meta"), torch.empty(2, 30, 24, device="meta")
+    """A device without numbers stands for any that is not the processor: nothing may be
+    brought from there.
+    """
+    near, far = (
+        torch.empty(2, 30, 24, device="meta"),
+        torch.empty(2, 30, 24, device="meta"),
+    )
     setting = dict(step_um=5.0, sample_um=1.0, pixel_um=3.0)
     found = [
         fisher.axial_information(near, far, **setting),
         fisher.encircled_energy(near, 1.0, radius_um=5.0),
         fisher.information(near, far),
         fisher.span_angle(torch.empty(2, 2, device="meta")),
-        fisher.texture_information(near, step_um=5.0, spectrum=torch.empty(30, 13, device="meta"), noise=0.1),
+        fisher.texture_information(
+            near, step_um=5.0, spectrum=torch.empty(30, 13, device="meta"), noise=0.1
+        ),
         fisher.without_nuisance(torch.empty(3, 3, device="meta"), 1),
     ]
     assert {one.device.type for one in found} == {"meta"}

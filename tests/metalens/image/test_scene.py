@@ -1,4 +1,6 @@
-"""Layers through depth-dependent PSFs: exact cases, invariants, and the fast path against the layer-by-layer one."""
+"""Layers through depth-dependent PSFs: exact cases, invariants, and the fast path
+against the layer-by-layer one.
+"""
 
 import pytest
 import torch
@@ -29,8 +31,12 @@ def _eye(radiance=None):
     r = torch.hypot(y, y.T)
     lid = torch.sigmoid(-(y + 15 + 0.01 * y.T**2) * 2)
     cover = torch.stack([lid, 1 - lid])[None].expand(2, 2, N, N)
-    depth = torch.stack([17e3 + 30 * y.abs(), 18e3 + (r / 48) ** 2 * 4e3])[None].expand(2, 2, N, N)
-    fine = torch.nn.functional.interpolate(torch.rand(2, 2, 24, 24), size=(N, N), mode="bicubic").double()
+    depth = torch.stack([17e3 + 30 * y.abs(), 18e3 + (r / 48) ** 2 * 4e3])[None].expand(
+        2, 2, N, N
+    )
+    fine = torch.nn.functional.interpolate(
+        torch.rand(2, 2, 24, 24), size=(N, N), mode="bicubic"
+    ).double()
     return Frames(cover * (fine if radiance is None else radiance), cover, depth)
 
 
@@ -45,48 +51,79 @@ def test_constant_radiance_stays_constant_at_every_edge():
 
 
 def _single(frames):
-    return Frames(frames.radiance.float(), frames.coverage.float(), frames.depth_um.float())
+    return Frames(
+        frames.radiance.float(), frames.coverage.float(), frames.depth_um.float()
+    )
 
 
 def test_constant_radiance_stays_constant_in_single_precision():
     """The mean is not transformed: nothing is left to round but the mean itself."""
     psf = scene.basis(STACK.float(), DEPTHS)
     assert (
-        float((scene.image(_single(_eye(radiance=0.37)), scene.uniform_imager(psf, (N, N))) / 0.37 - 1).abs().max())
+        float(
+            (
+                scene.image(
+                    _single(_eye(radiance=0.37)), scene.uniform_imager(psf, (N, N))
+                )
+                / 0.37
+                - 1
+            )
+            .abs()
+            .max()
+        )
         < 1e-6
     )
 
 
 def test_compiled_weights_give_the_image_of_the_differentiable_path():
-    """In single precision without gradients the weights are compiled; in double precision they are torch's."""
+    """In single precision without gradients the weights are compiled; in double
+    precision they are torch's.
+    """
     frames, psf = _eye(), scene.basis(STACK, DEPTHS)
     imager = scene.uniform_imager(psf, (N, N))  # rows and columns to spare on all sides
     assert imager.shape[0] > N
     exact = scene.image(frames, imager)
-    quick = scene.image(_single(frames), scene.uniform_imager(scene.basis(STACK.float(), DEPTHS), (N, N)))
-    assert float((quick - exact).norm() / exact.norm()) < 2e-5  # depths that round to the next of 4096 codes
+    quick = scene.image(
+        _single(frames),
+        scene.uniform_imager(scene.basis(STACK.float(), DEPTHS), (N, N)),
+    )
+    assert (
+        float((quick - exact).norm() / exact.norm()) < 2e-5
+    )  # depths that round to the next of 4096 codes
 
 
 def test_the_published_formula_loses_light_at_edges():
-    """A near layer in strong blur before a sharp far one: epsilon = 1e-3 loses more than a fifth beside the edge."""
+    """A near layer in strong blur before a sharp far one: epsilon = 1e-3 loses more
+    than a fifth beside the edge.
+    """
     near = torch.zeros(1, 1, N, N, dtype=torch.float64)
     near[..., : N // 2] = 1
     cover = torch.cat([near, 1 - near], 1)
     psfs = _stack(torch.tensor([7.0, 0.4]), 61)
-    lost = 1 - layered.published(Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs)[0, 30:66, 20:76]
+    lost = (
+        1
+        - layered.published(
+            Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs
+        )[0, 30:66, 20:76]
+    )
     assert lost.max() > 0.2
-    kept = layered.image_layers(Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs)
+    kept = layered.image_layers(
+        Layers(cover, cover, DEPTHS[:2], torch.tensor([True, False])), psfs
+    )
     assert (kept - 1).abs().max() < 1e-12
 
 
 def test_a_sharp_near_edge_hides_a_blurred_far_sheet():
-    """Light of the hidden sheet does not bleed onto the near one; behind the edge its colour goes on unchanged."""
+    """Light of the hidden sheet does not bleed onto the near one; behind the edge its
+    colour goes on unchanged.
+    """
     near = torch.zeros(1, 1, N, N, dtype=torch.float64)
     near[..., :, : N // 2] = 1
     cover = torch.cat([near, 1 - near], 1)
     light = torch.cat([0.2 * near, 0.8 * (1 - near)], 1)
     seen = layered.image_layers(
-        Layers(light, cover, DEPTHS[:2], torch.tensor([True, False])), _stack(torch.tensor([1e-3, 5.0]))
+        Layers(light, cover, DEPTHS[:2], torch.tensor([True, False])),
+        _stack(torch.tensor([1e-3, 5.0])),
     )
     assert (seen[..., : N // 2] - 0.2).abs().max() < 1e-9
     assert (seen[..., N // 2 :] - 0.8).abs().max() < 1e-9
@@ -99,18 +136,26 @@ def test_one_depth_is_an_ordinary_convolution():
     cover = torch.cat([none, torch.ones_like(light)], 1)
     flat = Frames(torch.cat([none, light], 1), cover, torch.full_like(cover, 20e3))
     kernel = _stack(torch.tensor([2.0]))
-    image = scene.image(flat, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N)))
+    image = scene.image(
+        flat, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N))
+    )
     want = torch.nn.functional.conv2d(light, kernel[None])[:, 0]
-    assert (image[:, 15:-15, 15:-15] - want).abs().max() < 2e-6 * want.max()  # rounding of the transforms
+    assert (
+        image[:, 15:-15, 15:-15] - want
+    ).abs().max() < 2e-6 * want.max()  # rounding of the transforms
 
 
 def test_an_off_centre_psf_moves_the_image_the_same_way():
     kernel = torch.zeros(1, 31, 31, dtype=torch.float64)
     kernel[0, 15 + 2, 15 + 5] = 1
     frames = _eye()
-    image = scene.image(frames, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N)))
+    image = scene.image(
+        frames, scene.uniform_imager(scene.basis(kernel, torch.tensor([20e3])), (N, N))
+    )
     moved = frames.radiance.sum(1)[:, 10:88, 10:85]
-    assert (image[:, 12:90, 15:90] - moved).abs().max() < 4e-3  # far sheet under 1 % of coverage fades
+    assert (
+        image[:, 12:90, 15:90] - moved
+    ).abs().max() < 4e-3  # far sheet under 1 % of coverage fades
 
 
 def _psfs_of(layers):
@@ -133,27 +178,39 @@ def test_few_kernels_meet_the_tolerance(tolerance):
 def test_only_occupied_layers_are_cut():
     layers = scene.cut(_eye(), DEPTHS)
     assert len(layers.depth_um) < 2 * len(DEPTHS)
-    assert torch.allclose(layers.coverage.sum(1), torch.ones(2, N, N, dtype=torch.float64))
+    assert torch.allclose(
+        layers.coverage.sum(1), torch.ones(2, N, N, dtype=torch.float64)
+    )
 
 
 def test_fewer_depths_need_fewer_kernels():
-    whole, part = scene.basis(STACK, DEPTHS), scene.basis(STACK, DEPTHS, occupied_um=(18e3, 20e3))
+    whole, part = (
+        scene.basis(STACK, DEPTHS),
+        scene.basis(STACK, DEPTHS, occupied_um=(18e3, 20e3)),
+    )
     assert part.kernels.shape[0] < whole.kernels.shape[0]
     assert part.depths_um[0] <= 18e3
     assert part.depths_um[-1] >= 20e3
 
 
 def test_forward_derivatives_in_single_precision_take_the_differentiable_path():
-    """The image is linear in the radiance: its derivative along a change is the image of the change."""
+    """The image is linear in the radiance: its derivative along a change is the image
+    of the change.
+    """
     frames = _single(_eye())
     imager = scene.uniform_imager(scene.basis(STACK.float(), DEPTHS), (N, N))
-    change = torch.rand(frames.radiance.shape, generator=torch.Generator().manual_seed(0)) * frames.coverage
+    change = (
+        torch.rand(frames.radiance.shape, generator=torch.Generator().manual_seed(0))
+        * frames.coverage
+    )
 
     def seen(light):
         return scene.image(Frames(light, frames.coverage, frames.depth_um), imager)
 
     slope = torch.func.jvp(seen, (frames.radiance,), (change,))[1]
-    assert float((slope - seen(change)).abs().max()) < 2e-5  # the two paths' depth codes
+    assert (
+        float((slope - seen(change)).abs().max()) < 2e-5
+    )  # the two paths' depth codes
 
 
 def test_trimmed_bases_keep_their_word_on_frames_they_have_not_seen():
@@ -162,18 +219,28 @@ def test_trimmed_bases_keep_their_word_on_frames_they_have_not_seen():
     assert len(few.kernels) < len(whole.kernels)
     assert few.error <= 1e-2
     frames = _eye()
-    other = Frames(frames.radiance.flip(3), frames.coverage.flip(3), frames.depth_um.flip(3) * 0.95)
-    exact, quick = (scene.image(other, scene.uniform_imager(psf, (N, N))) for psf in (whole, few))
-    assert float((quick - exact).norm() / exact.norm()) < 2 * few.error  # other depths of the same population
+    other = Frames(
+        frames.radiance.flip(3), frames.coverage.flip(3), frames.depth_um.flip(3) * 0.95
+    )
+    exact, quick = (
+        scene.image(other, scene.uniform_imager(psf, (N, N))) for psf in (whole, few)
+    )
+    assert (
+        float((quick - exact).norm() / exact.norm()) < 2 * few.error
+    )  # other depths of the same population
     assert few.bound > whole.bound
     assert layered.trimmed(whole, frames, tolerance=0.0) is whole
 
 
 def test_field_dependent_psfs_change_across_the_image():
-    """PSFs that differ between left and right field points: each side sees its own, the middle the mean."""
+    """PSFs that differ between left and right field points: each side sees its own, the
+    middle the mean.
+    """
     left, right = _stack(torch.full((2,), 0.5)), _stack(torch.full((2,), 3.0))
     psf = scene.basis(torch.stack([left, right])[None], DEPTHS[:2])
-    maps = scene.weight_maps(psf, torch.full((1, N, N), float(DEPTHS[0]), dtype=torch.float64))
+    maps = scene.weight_maps(
+        psf, torch.full((1, N, N), float(DEPTHS[0]), dtype=torch.float64)
+    )
     for column, want in ((0, left[0]), (N - 1, right[0])):
         built = (maps[:, 0, 5, column, None, None] * psf.kernels).sum(0)
         assert (built - want).norm() < 1e-3 * want.norm()
@@ -182,17 +249,32 @@ def test_field_dependent_psfs_change_across_the_image():
 def test_gradient_reaches_the_psfs():
     frames = _eye()
     psfs = STACK.clone().requires_grad_(True)
-    direction = torch.randn(STACK.shape[1:], generator=torch.Generator().manual_seed(0), dtype=torch.float64) * STACK
+    direction = (
+        torch.randn(
+            STACK.shape[1:],
+            generator=torch.Generator().manual_seed(0),
+            dtype=torch.float64,
+        )
+        * STACK
+    )
 
     # the same change at every depth: what the kept weights can follow
     def energy(stack):
         return (
-            scene.image(frames, scene.uniform_imager(scene.basis(stack, DEPTHS, tolerance=1e-12), (N, N))) ** 2
+            scene.image(
+                frames,
+                scene.uniform_imager(
+                    scene.basis(stack, DEPTHS, tolerance=1e-12), (N, N)
+                ),
+            )
+            ** 2
         ).sum()
 
     energy(psfs).backward()
     step = 1e-4
-    slope = (energy(STACK + step * direction) - energy(STACK - step * direction)) / (2 * step)
+    slope = (energy(STACK + step * direction) - energy(STACK - step * direction)) / (
+        2 * step
+    )
     assert float((psfs.grad * direction).sum()) == pytest.approx(
         float(slope), rel=1e-3
     )  # kink where coverage reaches 1

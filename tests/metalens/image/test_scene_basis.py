@@ -17,7 +17,9 @@ def stack(h=6, w=9):
 
 
 def texture(image):
-    """Power of what a 1/f texture shows of a transfer function, by the whole transform and its power spectrum."""
+    """Power of what a 1/f texture shows of a transfer function, by the whole transform
+    and its power spectrum.
+    """
     h, w = image.shape
     fy, fx = np.fft.fftfreq(2 * h)[:, None], np.fft.fftfreq(2 * w)
     power = 1 / (fy**2 + fx**2 + (1 / (8 * max(h, w))) ** 2)
@@ -30,16 +32,22 @@ def test_error_and_bound_are_of_the_worst_psf(tolerance):
     made = scene.basis(torch.from_numpy(psfs), DEPTHS, tolerance=tolerance)
     kept = made.weights.reshape(4, -1).numpy() @ made.kernels.flatten(1).numpy()
     left = psfs - kept.reshape(psfs.shape)
-    missing = [np.sqrt(texture(rest) / texture(psf)) for rest, psf in zip(left, psfs, strict=True)]
+    missing = [
+        np.sqrt(texture(rest) / texture(psf))
+        for rest, psf in zip(left, psfs, strict=True)
+    ]
     assert made.error == pytest.approx(max(missing), rel=1e-6)
     assert made.error <= tolerance
     assert made.bound == pytest.approx(np.abs(left).sum((1, 2)).max(), rel=1e-9)
     fewer = len(made.kernels) - 1
     if fewer:  # one kernel less would not have done
-        left_over = psfs.reshape(4, -1) - made.weights.reshape(4, -1)[:, :fewer].numpy() @ (
-            made.kernels[:fewer].flatten(1).numpy()
-        )
-        worse = [texture(a.reshape(6, 9)) / texture(b) for a, b in zip(left_over, psfs, strict=True)]
+        left_over = psfs.reshape(4, -1) - made.weights.reshape(4, -1)[
+            :, :fewer
+        ].numpy() @ (made.kernels[:fewer].flatten(1).numpy())
+        worse = [
+            texture(a.reshape(6, 9)) / texture(b)
+            for a, b in zip(left_over, psfs, strict=True)
+        ]
         assert np.sqrt(max(worse)) > tolerance
 
 
@@ -56,10 +64,14 @@ def test_weights_between_depths_are_linear_in_their_inverse():
     psfs = torch.from_numpy(stack())
     made = scene.basis(psfs, DEPTHS, tolerance=1e-9)
     at = 1 / (0.3 / 20e3 + 0.7 / 23e3)
-    maps = scene.weight_maps(made, torch.tensor([[at, 29e3], [10e3, 99e3]], dtype=torch.float64))
+    maps = scene.weight_maps(
+        made, torch.tensor([[at, 29e3], [10e3, 99e3]], dtype=torch.float64)
+    )
     rows = made.weights.reshape(4, -1)
     step = float((rows[2] - rows[1]).abs().max())
-    assert torch.allclose(maps[:, 0, 0], 0.3 * rows[1] + 0.7 * rows[2], atol=0.02 * step)  # steps of the table
+    assert torch.allclose(
+        maps[:, 0, 0], 0.3 * rows[1] + 0.7 * rows[2], atol=0.02 * step
+    )  # steps of the table
     assert torch.allclose(maps[:, 0, 1], rows[3])
     assert torch.allclose(maps[:, 1, 0], rows[0])
     assert torch.allclose(maps[:, 1, 1], rows[3])

@@ -1,4 +1,6 @@
-"""Pixels keep the light and have smooth gradients; noise and its gradients have the moments of Poisson and Gauss."""
+"""Pixels keep the light and have smooth gradients; noise and its gradients have the
+moments of Poisson and Gauss.
+"""
 
 import math
 
@@ -16,7 +18,9 @@ IMAGE = torch.rand(40, 52, dtype=torch.float64) + 0.1
 def test_coinciding_edges_give_the_exact_area_sum():
     binned = sensors.integrate(IMAGE, 1.0, pitch_um=4.0)
     want = IMAGE.reshape(10, 4, 13, 4).sum((1, 3))
-    assert (binned - want).abs().max() < 1e-12  # the cubic passes through the cumulative at every sample edge
+    assert (
+        (binned - want).abs().max() < 1e-12
+    )  # the cubic passes through the cumulative at every sample edge
 
 
 @pytest.mark.parametrize("pitch", [2.0, 2.37, math.pi, 7.77, 10.0])
@@ -33,22 +37,41 @@ def test_pitch_gradient_is_continuous_where_edges_meet():
         (pixels * torch.arange(25.0).reshape(5, 5)).sum().backward()
         return float(p.grad)
 
-    for meeting in (2.0, 4.0, 6.0, 8.0):  # pixel edges on sample edges: the kink of plain area overlap
+    for meeting in (
+        2.0,
+        4.0,
+        6.0,
+        8.0,
+    ):  # pixel edges on sample edges: the kink of plain area overlap
         jump = abs(gradient(meeting + 1e-7) - gradient(meeting - 1e-7))
         assert jump < 1e-5 * abs(gradient(meeting))
     step = 1e-5
-    pixels = [sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(5, 5)) for p in (3.3 - step, 3.3 + step)]
-    slope = ((pixels[1] - pixels[0]) / (2 * step) * torch.arange(25.0).reshape(5, 5)).sum()
+    pixels = [
+        sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(5, 5))
+        for p in (3.3 - step, 3.3 + step)
+    ]
+    slope = (
+        (pixels[1] - pixels[0]) / (2 * step) * torch.arange(25.0).reshape(5, 5)
+    ).sum()
     assert gradient(3.3) == pytest.approx(float(slope), rel=1e-8)
 
 
 def test_pitch_gradient_where_a_pixel_edge_lies_on_a_sample_edge():
-    """At a pitch of 4 samples all pixel edges lie on sample edges: the slope there is that from either side."""
+    """At a pitch of 4 samples all pixel edges lie on sample edges: the slope there is
+    that from either side.
+    """
     p = torch.tensor(4.0, dtype=torch.float64, requires_grad=True)
-    got = torch.autograd.grad((sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p)[0]
+    got = torch.autograd.grad(
+        (sensors.integrate(IMAGE, 1.0, pitch_um=p, shape=(6, 6)) ** 2).sum(), p
+    )[0]
     step = 1e-5
-    high, low = ((sensors.integrate(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum() for s in (step, -step))
-    assert float(got) == pytest.approx(float(high - low) / (2 * step), rel=1e-6)  # second derivative jumps: 1e-9
+    high, low = (
+        (sensors.integrate(IMAGE, 1.0, pitch_um=4.0 + s, shape=(6, 6)) ** 2).sum()
+        for s in (step, -step)
+    )
+    assert float(got) == pytest.approx(
+        float(high - low) / (2 * step), rel=1e-6
+    )  # second derivative jumps: 1e-9
 
 
 def test_pixel_larger_than_the_image_holds_all_its_light():
@@ -60,12 +83,19 @@ def test_pixel_larger_than_the_image_holds_all_its_light():
 def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
     assert torch.equal(sensors.integrate(IMAGE, 1.7, pitch_um=1.7), IMAGE)
     aside = sensors.integrate(IMAGE, 1.7, pitch_um=1.7, shift_um=(0.0, 1.7))
-    assert torch.allclose(aside[:, :-1], IMAGE[:, 1:], rtol=0, atol=1e-12)  # places of edges to 1e-14 of 50 samples
-    more = sensors.integrate(IMAGE, 1.7, pitch_um=1.7, shape=(len(IMAGE) + 2, IMAGE.shape[1]))
+    assert torch.allclose(
+        aside[:, :-1], IMAGE[:, 1:], rtol=0, atol=1e-12
+    )  # places of edges to 1e-14 of 50 samples
+    more = sensors.integrate(
+        IMAGE, 1.7, pitch_um=1.7, shape=(len(IMAGE) + 2, IMAGE.shape[1])
+    )
     assert more.shape == (len(IMAGE) + 2, IMAGE.shape[1])
     assert torch.allclose(more[1:-1], IMAGE, rtol=0, atol=1e-12)
     n = IMAGE.shape[1]
-    for about in ({"pitch_um": 1.7 * (1 + 1e-9)}, {"pitch_um": 1.7, "grid_um": 1.7 * (1 + 1e-9)}):
+    for about in (
+        {"pitch_um": 1.7 * (1 + 1e-9)},
+        {"pitch_um": 1.7, "grid_um": 1.7 * (1 + 1e-9)},
+    ):
         near = sensors.integrate(IMAGE, 1.7, shape=(len(IMAGE), n), **about)
         assert (
             0 < float((near - IMAGE).abs().max()) < 1e-9 * n * float(IMAGE.abs().max())
@@ -73,9 +103,16 @@ def test_pixels_of_one_sample_are_the_image_and_a_sample_aside_are_not():
     width = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
     with torch.no_grad():
         assert sensors.integrate(IMAGE, 1.7, pitch_um=width) is IMAGE
-    slope = torch.autograd.grad(sensors.integrate(IMAGE, 1.7, pitch_um=width, grid_um=1.7)[20, 30], width)[0]
-    low, high = (float(sensors.integrate(IMAGE, 1.7, pitch_um=1.7 + s, grid_um=1.7)[20, 30]) for s in (-1e-6, 1e-6))
-    assert float(slope) == pytest.approx((high - low) / 2e-6, rel=1e-5)  # it has its derivative here too
+    slope = torch.autograd.grad(
+        sensors.integrate(IMAGE, 1.7, pitch_um=width, grid_um=1.7)[20, 30], width
+    )[0]
+    low, high = (
+        float(sensors.integrate(IMAGE, 1.7, pitch_um=1.7 + s, grid_um=1.7)[20, 30])
+        for s in (-1e-6, 1e-6)
+    )
+    assert float(slope) == pytest.approx(
+        (high - low) / 2e-6, rel=1e-5
+    )  # it has its derivative here too
 
 
 def test_shift_moves_the_pixel_grid_towards_plus_x():
@@ -89,7 +126,9 @@ def test_shift_moves_the_pixel_grid_towards_plus_x():
 def test_uniform_light_grows_with_kappa():
     flat = torch.ones(60, 60, dtype=torch.float64)
     for pitch in (2.0, 3.0, 4.7):
-        mean = sensors.mean_electrons(flat, 1.0, sensor=Sensor(pitch_um=pitch, ambient_e=100))
+        mean = sensors.mean_electrons(
+            flat, 1.0, sensor=Sensor(pitch_um=pitch, ambient_e=100)
+        )
         assert float(mean[5, 5]) == pytest.approx(4100 * (pitch / 3) ** 2, rel=1e-12)
 
 
@@ -102,9 +141,12 @@ def test_photon_gradient_has_the_moments_of_poisson(mean):
     assert float(k.detach().var()) == pytest.approx(mean, rel=0.02)
     (first,) = torch.autograd.grad(k.sum(), m, retain_graph=True)
     (second,) = torch.autograd.grad((k**2).sum(), m)
-    # sampling error: sd of the slopes is 1 / (2 sqrt m) and about (1 + 3 sqrt m) per draw
+    # sampling error: sd of the slopes is 1 / (2 sqrt m) and about (1 + 3 sqrt m) per
+    # draw
     assert float(first.mean()) == pytest.approx(1, abs=5 * 0.5 / math.sqrt(mean * n))
-    assert float(second.mean()) == pytest.approx(2 * mean + 1, abs=5 * (2 + 3 * math.sqrt(mean)) / math.sqrt(n))
+    assert float(second.mean()) == pytest.approx(
+        2 * mean + 1, abs=5 * (2 + 3 * math.sqrt(mean)) / math.sqrt(n)
+    )
 
 
 def test_dark_pixels_give_zero_counts_and_finite_gradient():
@@ -117,7 +159,10 @@ def test_saturated_frame_sticks_at_full_scale_without_gradient():
     light = torch.full((6, 6), 50.0, requires_grad=True)
     sensor = Sensor(bits=8, read_noise_e=0.0)
     frame = sensors.digitise(
-        sensors.expose(sensors.mean_electrons(light, 3.0, sensor=sensor), sensor=sensor), sensor=sensor
+        sensors.expose(
+            sensors.mean_electrons(light, 3.0, sensor=sensor), sensor=sensor
+        ),
+        sensor=sensor,
     )
     frame.sum().backward()
     assert torch.equal(frame, torch.full((6, 6), 255.0))
@@ -130,7 +175,9 @@ def test_digitised_levels_are_whole_numbers_with_a_straight_gradient(bits):
     level = sensors.digitise(electrons, sensor=Sensor(bits=bits))
     level.sum().backward()
     assert torch.equal(level, level.round())
-    assert torch.allclose(electrons.grad, torch.full((50,), (2**bits - 1) / 8000, dtype=torch.float64))
+    assert torch.allclose(
+        electrons.grad, torch.full((50,), (2**bits - 1) / 8000, dtype=torch.float64)
+    )
 
 
 def test_low_snr_mode_has_the_stated_ratio():
@@ -139,61 +186,104 @@ def test_low_snr_mode_has_the_stated_ratio():
     mean = sensors.mean_electrons(flat, 3.0, sensor=dim)[2:-2, 2:-2]
     frame = sensors.expose(mean, sensor=dim, generator=torch.Generator().manual_seed(2))
     signal = float(mean.mean()) - dim.ambient_e
-    assert 20 * math.log10(signal / float(frame.std())) == pytest.approx(15, abs=0.1)  # sd of 9e4 pixels: 0.02 dB
-    assert float(sensors.variance(mean, sensor=dim).mean()) == pytest.approx(float(frame.var()), rel=0.03)
+    assert 20 * math.log10(signal / float(frame.std())) == pytest.approx(
+        15, abs=0.1
+    )  # sd of 9e4 pixels: 0.02 dB
+    assert float(sensors.variance(mean, sensor=dim).mean()) == pytest.approx(
+        float(frame.var()), rel=0.03
+    )
 
 
 def test_impossible_sensors_are_refused():
-    for bad in ({"pitch_um": 0.0}, {"read_noise_e": -1.0}, {"bits": 0}, {"full_well_e": math.inf}):
+    for bad in (
+        {"pitch_um": 0.0},
+        {"read_noise_e": -1.0},
+        {"bits": 0},
+        {"full_well_e": math.inf},
+    ):
         with pytest.raises(SceneError, match=next(iter(bad))):
             Sensor(**bad)
 
 
 # no two numbers alike, and a pitch unlike the base pitch: every factor shows
-ODD = Sensor(pitch_um=4.1, base_pitch_um=2.9, exposure_e=730.0, ambient_e=41.0, full_well_e=5200.0, read_noise_e=5.3)
+ODD = Sensor(
+    pitch_um=4.1,
+    base_pitch_um=2.9,
+    exposure_e=730.0,
+    ambient_e=41.0,
+    full_well_e=5200.0,
+    read_noise_e=5.3,
+)
 AREA = (4.1 / 2.9) ** 2
 
 
 @pytest.mark.parametrize("ambient_ratio", [0.7, 4.0])
 def test_low_snr_mode_at_a_pitch_of_its_own(ambient_ratio):
-    """The equation that it solves: signal / sqrt(signal (1 + ratio) + read²) in a pixel of kappa base pixels."""
+    """The equation that it solves: signal / sqrt(signal (1 + ratio) + read²) in a pixel
+    of kappa base pixels.
+    """
     dim = sensors.low_snr(ODD, 0.37, snr_db=11.0, ambient_ratio=ambient_ratio)
     signal = dim.exposure_e * 0.37 * AREA
     assert dim.ambient_e * AREA == pytest.approx(ambient_ratio * signal)
-    assert signal / math.sqrt(signal * (1 + ambient_ratio) + 5.3**2) == pytest.approx(10 ** (11 / 20), rel=1e-12)
+    assert signal / math.sqrt(signal * (1 + ambient_ratio) + 5.3**2) == pytest.approx(
+        10 ** (11 / 20), rel=1e-12
+    )
 
 
 def test_noise_of_a_pixel_has_photon_read_and_rounding_parts():
     sensor = Sensor(
-        **{n: getattr(ODD, n) for n in ("pitch_um", "base_pitch_um", "full_well_e", "read_noise_e")}, bits=6
+        **{
+            n: getattr(ODD, n)
+            for n in ("pitch_um", "base_pitch_um", "full_well_e", "read_noise_e")
+        },
+        bits=6,
     )
     step = 5200 * AREA / 63  # 165 e: rounding rules, 2270 of 2700 e²
-    told = float(sensors.variance(torch.tensor(401.0, dtype=torch.float64), sensor=sensor))
+    told = float(
+        sensors.variance(torch.tensor(401.0, dtype=torch.float64), sensor=sensor)
+    )
     assert told == pytest.approx(401 + 5.3**2 + step**2 / 12, rel=1e-12)
-    mean = torch.linspace(3000, 3000 + 12 * step, 400_000, dtype=torch.float64)  # over whole steps: rounding is even
+    mean = torch.linspace(
+        3000, 3000 + 12 * step, 400_000, dtype=torch.float64
+    )  # over whole steps: rounding is even
     frame = sensors.digitise(
-        sensors.expose(mean, sensor=sensor, generator=torch.Generator().manual_seed(5)), sensor=sensor
+        sensors.expose(mean, sensor=sensor, generator=torch.Generator().manual_seed(5)),
+        sensor=sensor,
     )
     scatter = float(((frame * step - mean) ** 2).mean())
-    assert scatter == pytest.approx(float(sensors.variance(mean, sensor=sensor).mean()), rel=0.01)  # 4e5 draws: 0.002
+    assert scatter == pytest.approx(
+        float(sensors.variance(mean, sensor=sensor).mean()), rel=0.01
+    )  # 4e5 draws: 0.002
 
 
 def test_reads_add_their_noise_and_the_well_caps_the_light():
     mean = torch.full((200_000,), 53.7, dtype=torch.float64)
-    frame = sensors.expose(mean, sensor=ODD, generator=torch.Generator().manual_seed(6), reads=3.0)
-    assert float(frame.mean()) == pytest.approx(53.7, abs=0.1)  # 11.8 / sqrt(2e5) = 0.026
-    assert float(frame.var()) == pytest.approx(53.7 + 3 * 5.3**2, rel=0.02)  # sqrt(2 / 2e5) = 0.003
-    full = sensors.expose(mean * 1e4, sensor=ODD, generator=torch.Generator().manual_seed(7))
+    frame = sensors.expose(
+        mean, sensor=ODD, generator=torch.Generator().manual_seed(6), reads=3.0
+    )
+    assert float(frame.mean()) == pytest.approx(
+        53.7, abs=0.1
+    )  # 11.8 / sqrt(2e5) = 0.026
+    assert float(frame.var()) == pytest.approx(
+        53.7 + 3 * 5.3**2, rel=0.02
+    )  # sqrt(2 / 2e5) = 0.003
+    full = sensors.expose(
+        mean * 1e4, sensor=ODD, generator=torch.Generator().manual_seed(7)
+    )
     assert float(full.mean()) == pytest.approx(5200 * AREA, abs=0.1)
 
 
 def test_a_narrower_box_on_the_same_grid_keeps_the_mean_of_flat_light():
-    """Box of 2.3 um on a grid of 4.1 um: flat light reads as a pixel of the grid, a ramp reads its middle value."""
+    """Box of 2.3 um on a grid of 4.1 um: flat light reads as a pixel of the grid, a
+    ramp reads its middle value.
+    """
     ramp = (torch.arange(80, dtype=torch.float64) + 0.5) * 0.31
     image = ramp[:, None] + 0 * ramp
     got = sensors.integrate(image, 0.31, pitch_um=2.3, grid_um=4.1, shape=(3, 4))
     middles = 80 * 0.31 / 2 + (torch.arange(3, dtype=torch.float64) - 1) * 4.1
-    assert torch.allclose(got, (middles * (4.1 / 0.31) ** 2)[:, None].expand(3, 4), rtol=1e-9)
+    assert torch.allclose(
+        got, (middles * (4.1 / 0.31) ** 2)[:, None].expand(3, 4), rtol=1e-9
+    )
     mean = sensors.mean_electrons(image, 0.31, sensor=ODD, count=3)
     want = 730 * middles * AREA + 41 * AREA
     assert torch.allclose(mean[:, 1], want, rtol=1e-9)
@@ -202,5 +292,10 @@ def test_a_narrower_box_on_the_same_grid_keeps_the_mean_of_flat_light():
 
 
 def test_pixels_that_cover_an_image():
-    for samples, sample, pitch, want in ((48, 0.3, 0.9, 16), (50, 0.3, 0.9, 17), (7, 0.1, 0.7, 1), (3, 0.1, 2.0, 1)):
+    for samples, sample, pitch, want in (
+        (48, 0.3, 0.9, 16),
+        (50, 0.3, 0.9, 17),
+        (7, 0.1, 0.7, 1),
+        (3, 0.1, 2.0, 1),
+    ):
         assert sensors.pixel_count(samples, sample, pitch) == want

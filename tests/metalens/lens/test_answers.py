@@ -1,4 +1,6 @@
-"""What all pillars answer, by compiled loops: against the series of the proxy summed by numpy, and cells by means."""
+"""What all pillars answer, by compiled loops: against the series of the proxy summed by
+numpy, and cells by means.
+"""
 
 import math
 from dataclasses import replace
@@ -16,15 +18,31 @@ from metalens.lens.pairs import Pairs
 from metalens.pillars import Proxy
 
 DRAW = np.random.default_rng(17)
-SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array([5.0, 3.0, 1.5, 0.7, 0.2])  # angle, wavelength, diameter
+SERIES = np.round(DRAW.normal(size=(3, 2, 5)), 2) * np.array(
+    [5.0, 3.0, 1.5, 0.7, 0.2]
+)  # angle, wavelength, diameter
 LEVEL = np.array([[[0.72, 0.1, -0.05]], [[-0.06, 0.03, 0.02]]])
-PROXY = Proxy(SERIES, LEVEL, (0.09, 0.31), (0.80, 0.93), 0.0, 0.0, power=3, max_angle_rad=0.4)
+PROXY = Proxy(
+    SERIES, LEVEL, (0.09, 0.31), (0.80, 0.93), 0.0, 0.0, power=3, max_angle_rad=0.4
+)
 WAVE, TILT = 0.871, 0.23
 
 
-def lens(rows=7, columns=1100, proxy=PROXY):  # more columns than a loop takes at once, and no whole number of parts
-    sizes = DRAW.uniform(0.09, 0.31, (rows, columns)) * (DRAW.random((rows, columns)) > 0.2)
-    return Lens(DiameterMap(sizes, 0.4), Cell(0.4, 0.7, Index(3.6), "SiO2"), proxy, 0.85, 300.0, math.inf, "map")
+def lens(
+    rows=7, columns=1100, proxy=PROXY
+):  # more columns than a loop takes at once, and no whole number of parts
+    sizes = DRAW.uniform(0.09, 0.31, (rows, columns)) * (
+        DRAW.random((rows, columns)) > 0.2
+    )
+    return Lens(
+        DiameterMap(sizes, 0.4),
+        Cell(0.4, 0.7, Index(3.6), "SiO2"),
+        proxy,
+        0.85,
+        300.0,
+        math.inf,
+        "map",
+    )
 
 
 def series(coefficients, d):
@@ -33,10 +51,14 @@ def series(coefficients, d):
     x = (2 * d**3 - a**3 - b**3) / (b**3 - a**3)
     angle = 2 * (math.sin(TILT) / math.sin(0.4)) ** 2 - 1
     wave = (2 * WAVE - 0.80 - 0.93) / (0.93 - 0.80)
-    return chebyshev.chebval(x, chebyshev.chebval(wave, chebyshev.chebval(angle, np.asarray(coefficients))))
+    return chebyshev.chebval(
+        x, chebyshev.chebval(wave, chebyshev.chebval(angle, np.asarray(coefficients)))
+    )
 
 
-@pytest.mark.parametrize(("dtype", "most"), [(np.float32, 4e-7), (np.float64, 1e-13)])  # a few digits of π
+@pytest.mark.parametrize(
+    ("dtype", "most"), [(np.float32, 4e-7), (np.float64, 1e-13)]
+)  # a few digits of π
 def test_phase_and_transmission_are_the_series_wrapped(dtype, most):
     made = lens()
     d = made.diameters.diameter_um
@@ -55,7 +77,16 @@ def test_turned_pillars_add_twice_their_turn():
     sizes = np.array([[0.12, 0.0, 0.27], [0.2, 0.21, 0.14]])
     turn = np.array([[0.3, 0.2, -1.4], [1.1, 0.0, 0.6]])
     cell = Cell(0.4, 0.7, Index(3.6), "SiO2", shape=Rectangle(0.5))
-    made = Lens(DiameterMap(sizes, 0.4, angle_rad=turn), cell, PROXY, 0.85, 300.0, math.inf, "map", hand="left")
+    made = Lens(
+        DiameterMap(sizes, 0.4, angle_rad=turn),
+        cell,
+        PROXY,
+        0.85,
+        300.0,
+        math.inf,
+        "map",
+        hand="left",
+    )
     phase, level = np.empty(sizes.shape), np.empty(sizes.shape)
     answers.fill(made, (WAVE, TILT), phase, level)
     want = np.where(sizes > 0, np.exp(1j * (series(SERIES, sizes) - 2 * turn)), 1)
@@ -63,14 +94,27 @@ def test_turned_pillars_add_twice_their_turn():
 
 
 def test_pillars_of_two_sizes_have_the_entries_of_their_table():
-    draw, x, y = np.random.default_rng(4), np.array([0.12, 0.16, 0.2]), np.array([0.11, 0.19])
-    t = 0.9 * np.exp(1j * draw.uniform(-3, 3, (1, 3, 2, 2))) * draw.uniform(0.5, 1, (1, 3, 2, 2))
+    draw, x, y = (
+        np.random.default_rng(4),
+        np.array([0.12, 0.16, 0.2]),
+        np.array([0.11, 0.19]),
+    )
+    t = (
+        0.9
+        * np.exp(1j * draw.uniform(-3, 3, (1, 3, 2, 2)))
+        * draw.uniform(0.5, 1, (1, 3, 2, 2))
+    )
     row, column = draw.integers(0, 3, (4, 5)), draw.integers(0, 2, (4, 5))
     sizes, lengths = x[row], y[column]
     sizes[2, 1] = lengths[2, 1] = 0
     table = Pairs(np.array([WAVE]), x, y, t, (210.0, 900.0))
     made = lens(4, 5)
-    made = replace(made, diameters=DiameterMap(sizes, 0.4, length_um=lengths), proxy=table.proxy, pairs=table)
+    made = replace(
+        made,
+        diameters=DiameterMap(sizes, 0.4, length_um=lengths),
+        proxy=table.proxy,
+        pairs=table,
+    )
     phase, level = np.empty((4, 5)), np.empty((4, 5))
     answers.fill(made, (WAVE, 0.0), phase, level)
     want = np.where(sizes > 0, t[0, row, column, 0], 0)
@@ -86,13 +130,19 @@ def test_what_a_proxy_does_not_know_is_refused_by_name():
     thin = made.diameters.diameter_um.copy()
     thin[1, 2] = 0.085
     with pytest.raises(DomainError, match=r"diameters run from 0\.085"):
-        answers.fill(replace(made, diameters=replace(made.diameters, diameter_um=thin)), (WAVE, TILT), *out)
+        answers.fill(
+            replace(made, diameters=replace(made.diameters, diameter_um=thin)),
+            (WAVE, TILT),
+            *out,
+        )
 
 
 def test_sites_without_a_pillar_ask_nothing_of_the_proxy_and_the_thickest_does():
     sizes = np.zeros((3, 4))
     whole = answers.polynomials(PROXY, np.full((3, 4), 0.2), (WAVE, TILT))
-    for one, other in zip(answers.polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True):
+    for one, other in zip(
+        answers.polynomials(PROXY, sizes, (WAVE, TILT)), whole, strict=True
+    ):
         assert np.array_equal(one, other)
     sizes[2, 1] = 0.315
     with pytest.raises(DomainError, match=r"0\.315"):
@@ -100,22 +150,37 @@ def test_sites_without_a_pillar_ask_nothing_of_the_proxy_and_the_thickest_does()
 
 
 def test_a_transmission_that_rounding_takes_above_1_is_1():
-    bright = Proxy(np.array([[1.0, 2.0]]), np.array([[1 - 1e-9, 0.9e-9]]), (0.09, 0.31), (0.8, 0.93), 0.0, 0.0)
+    bright = Proxy(
+        np.array([[1.0, 2.0]]),
+        np.array([[1 - 1e-9, 0.9e-9]]),
+        (0.09, 0.31),
+        (0.8, 0.93),
+        0.0,
+        0.0,
+    )
     made = lens(proxy=bright)
-    phase, level = (np.empty(made.diameters.diameter_um.shape, np.float32) for _ in range(2))
+    phase, level = (
+        np.empty(made.diameters.diameter_um.shape, np.float32) for _ in range(2)
+    )
     answers.fill(made, (WAVE, 0.0), phase, level)
     assert level.max() <= 1
 
 
 def test_cells_hold_the_mean_of_their_pillars_less_the_carrier():
-    """Cells of 3 x 3 that begin a row and two columns before the map, and end beyond it: means over nine sites."""
+    """Cells of 3 x 3 that begin a row and two columns before the map, and end beyond
+    it: means over nine sites.
+    """
     made, side, top, left = lens(10, 1200), 3, 1, 2
     d = made.diameters.diameter_um
     ideal = DRAW.uniform(0, 2 * np.pi, d.shape).astype(np.float32)
-    found = compiled.cells(d, ideal, answers.polynomials(PROXY, d, (WAVE, TILT)), (side, top, left))
+    found = compiled.cells(
+        d, ideal, answers.polynomials(PROXY, d, (WAVE, TILT)), (side, top, left)
+    )
     t = np.where(d > 0, series(LEVEL, d) * np.exp(1j * (series(SERIES, d) - ideal)), 0)
     want = np.zeros((3, 4, 401))
     for i, j in np.ndindex(d.shape):
-        want[:, (i + top) // side, (j + left) // side] += np.array([t[i, j].real, t[i, j].imag, d[i, j] > 0]) / side**2
+        want[:, (i + top) // side, (j + left) // side] += (
+            np.array([t[i, j].real, t[i, j].imag, d[i, j] > 0]) / side**2
+        )
     assert found.shape == want.shape
     assert np.abs(found - want).max() < 5e-7  # sines and cosines in single precision

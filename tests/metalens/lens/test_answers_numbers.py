@@ -1,4 +1,6 @@
-"""Phase and level of all pillars in one pass, against the polynomials written out as powers of the diameter."""
+"""Phase and level of all pillars in one pass, against the polynomials written out as
+powers of the diameter.
+"""
 
 import math
 
@@ -20,7 +22,9 @@ def proxy(power=1):
 
 
 def by_hand(d, power):
-    """Chebyshev polynomials by their cosines, of the diameter to a power between its ends."""
+    """Chebyshev polynomials by their cosines, of the diameter to a power between its
+    ends.
+    """
     low, high = RANGE[0] ** power, RANGE[1] ** power
     x = np.clip((2 * d**power - low - high) / (high - low), -1, 1)
     angle = np.arccos(x)
@@ -48,7 +52,9 @@ def test_every_pillar_has_its_wrapped_phase_and_its_level(power, columns):
     phase, level = np.full(d.shape, 9.0), np.full(d.shape, 9.0)
     answers.put_all(proxy(power), d, (0.85, 0.0), phase, level)
     want = by_hand(d, power)
-    assert phase == pytest.approx(wrapped(want[0]), abs=1e-12)  # rounding of phases of some ten
+    assert phase == pytest.approx(
+        wrapped(want[0]), abs=1e-12
+    )  # rounding of phases of some ten
     assert level == pytest.approx(want[1], abs=1e-13)
     assert np.abs(want[0]).max() > 4 * math.pi  # whole turns come off
     assert level[3, -1] == 1.0  # the polynomial reaches 1.00001 there
@@ -61,7 +67,9 @@ def test_a_turn_is_added_before_whole_turns_come_off():
     answers.put_all(proxy(), d, (0.85, 0.0), phase, level, turn)
     want = by_hand(d, 1)
     away = np.where(d > 0, want[0] + turn - phase, 0) / (2 * math.pi)
-    assert np.abs(away - np.rint(away)).max() < 1e-7  # float32: 2^-24 of half a turn, and its cast
+    assert (
+        np.abs(away - np.rint(away)).max() < 1e-7
+    )  # float32: 2^-24 of half a turn, and its cast
     assert phase[1, 2] == level[1, 2] == 0
     assert np.abs(phase).max() <= np.float32(math.pi)
     assert level == pytest.approx(want[1], abs=1e-7)
@@ -78,7 +86,9 @@ def test_a_lens_fills_maps_with_its_own_turns(hand, twice):
     phase, level = np.zeros(d.shape), np.zeros(d.shape)
     answers.fill(lens(d, map={"angle_rad": turn}, hand=hand), (0.85, 0.0), phase, level)
     want = by_hand(d, 1)
-    assert phase == pytest.approx(np.where(d > 0, wrapped(want[0] + twice * turn), 0), abs=1e-12)
+    assert phase == pytest.approx(
+        np.where(d > 0, wrapped(want[0] + twice * turn), 0), abs=1e-12
+    )
     answers.fill(lens(d), (0.85, 0.0), phase, level)
     assert phase == pytest.approx(wrapped(want[0]), abs=1e-12)
     assert level == pytest.approx(want[1], abs=1e-13)
@@ -86,7 +96,9 @@ def test_a_lens_fills_maps_with_its_own_turns(hand, twice):
 
 def test_a_table_of_two_sizes_is_wrapped_too():
     x, y = np.array([0.1, 0.2]), np.array([0.12, 0.17, 0.22])
-    t = np.random.default_rng(2).uniform(0.3, 0.9, (1, 2, 3, 2)) * np.exp(1j * np.array(3.1))
+    t = np.random.default_rng(2).uniform(0.3, 0.9, (1, 2, 3, 2)) * np.exp(
+        1j * np.array(3.1)
+    )
     d, long = np.array([[0.1, 0.2, 0.0]]), np.array([[0.22, 0.12, 0.0]])
     pairs = Pairs(np.array([0.85]), x, y, t, (100.0, 900.0))
     one = Lens(DiameterMap(d, 0.4, length_um=long), Cell(0.4, shape=Rectangle()), pairs.proxy, 0.85, 100.0, 900.0,
@@ -101,8 +113,14 @@ def test_diameters_beyond_the_proxy_are_refused_and_gaps_are_not():
     assert len(answers.polynomials(proxy(), np.zeros((2, 2)), (0.85, 0.0))) == 6
     for wrong in (0.0999, 0.3001):
         with pytest.raises(DomainError):
-            answers.polynomials(proxy(), np.array([[0.0, 0.2], [wrong, 0.25]]), (0.85, 0.0))
-    scale, shift, power, ceiling, in_phase, in_level = answers.polynomials(proxy(2), sizes(), (0.85, 0.0))
-    assert (scale, shift) == pytest.approx((25.0, -1.25))  # 0.01 to 0.09: twice over 0.08, and the middle 0.05
+            answers.polynomials(
+                proxy(), np.array([[0.0, 0.2], [wrong, 0.25]]), (0.85, 0.0)
+            )
+    scale, shift, power, ceiling, in_phase, in_level = answers.polynomials(
+        proxy(2), sizes(), (0.85, 0.0)
+    )
+    assert (scale, shift) == pytest.approx(
+        (25.0, -1.25)
+    )  # 0.01 to 0.09: twice over 0.08, and the middle 0.05
     assert (power, ceiling) == (2, 1.0)
     assert (len(in_phase), len(in_level)) == (4, 3)

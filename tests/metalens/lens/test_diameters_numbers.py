@@ -19,15 +19,22 @@ def checkered(rows, columns, size=0.2):
 
 
 def test_columns_and_rows_of_a_hexagonal_lattice():
-    """Every other site of a grid of p / 2 and √3 p / 2; the cell of a pillar is √3 / 2 p²."""
+    """Every other site of a grid of p / 2 and √3 p / 2; the cell of a pillar is √3 / 2
+    p².
+    """
     made = DiameterMap(checkered(3, 4), 0.5, HEXAGONAL)
     assert made.lattice_row_um == pytest.approx(0.5 * math.sqrt(3) / 2)
     assert made.steps_um == pytest.approx((0.25, 0.25 * math.sqrt(3)))
     assert made.site_um2 == pytest.approx(math.sqrt(3) / 2 * 0.25)
-    assert made.grid == pytest.approx(Grid(0.25, 0.25 * math.sqrt(3), math.sqrt(3) / 2 * 0.25))
+    assert made.grid == pytest.approx(
+        Grid(0.25, 0.25 * math.sqrt(3), math.sqrt(3) / 2 * 0.25)
+    )
     assert made.x_um == pytest.approx([-0.375, -0.125, 0.125, 0.375])
     assert made.y_um == pytest.approx(np.array([-1, 0, 1]) * 0.25 * math.sqrt(3))
-    assert (made.pillars, DiameterMap(checkered(3, 5), 0.5, HEXAGONAL).pillars) == (6, 8)
+    assert (made.pillars, DiameterMap(checkered(3, 5), 0.5, HEXAGONAL).pillars) == (
+        6,
+        8,
+    )
     assert not made.plain
 
 
@@ -35,7 +42,9 @@ def test_rows_of_a_mask_stand_in_for_those_of_the_lattice_within_a_tenth():
     made = DiameterMap(checkered(3, 4), 0.5, HEXAGONAL, row_um=0.43)
     assert made.steps_um == (0.25, 0.43)
     assert made.site_um2 == pytest.approx(0.5 * 0.43)
-    assert DiameterMap(np.full((2, 2), 0.2), 0.5, row_um=0.46).grid == pytest.approx(Grid(0.5, 0.46, 0.23))
+    assert DiameterMap(np.full((2, 2), 0.2), 0.5, row_um=0.46).grid == pytest.approx(
+        Grid(0.5, 0.46, 0.23)
+    )
     with pytest.raises(LensError, match="within 10 %"):
         DiameterMap(np.full((2, 2), 0.2), 0.5, row_um=0.44)
     with pytest.raises(LensError, match="within 10 %"):
@@ -68,7 +77,9 @@ def test_the_outermost_pillar_on_unlike_axes(monkeypatch, blocks):
             sizes[row, column] = 0.2
         made = DiameterMap(sizes, 0.4, lattice)
         assert made.steps_um == pytest.approx((0.4, 0.6))
-        assert made.radius_um == pytest.approx(math.hypot(0.6 * farthest[0], 0.4 * farthest[1]))
+        assert made.radius_um == pytest.approx(
+            math.hypot(0.6 * farthest[0], 0.4 * farthest[1])
+        )
 
 
 @pytest.mark.parametrize("bad", [0.5, -0.1, math.nan])

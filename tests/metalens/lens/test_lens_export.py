@@ -15,7 +15,9 @@ from metalens.profiles import PhaseMap
 from metalens.proxy import Proxy
 
 # phase 3.5 + 3.5 (d - 0.2) / 0.1: a little above a turn over the domain
-PROXY = Proxy(np.array([[3.5, 3.5]]), np.array([[0.95, 0.02]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0)
+PROXY = Proxy(
+    np.array([[3.5, 3.5]]), np.array([[0.95, 0.02]]), (0.1, 0.3), (0.85, 0.85), 0.0, 0.0
+)
 X = (np.arange(101) - 50) * 0.4
 
 
@@ -24,7 +26,15 @@ def made(phase):
     wrapped = np.mod(phase - 0.2, 2 * math.pi) + 0.2
     diameter = 0.2 + 0.1 * (wrapped - 3.5) / 3.5
     diameter[X**2 + X[:, None] ** 2 > 19.3**2] = 0
-    return Lens(DiameterMap(diameter, 0.4), Cell(0.4), PROXY, 0.85, 500.0, float("inf"), "hyperbolic")
+    return Lens(
+        DiameterMap(diameter, 0.4),
+        Cell(0.4),
+        PROXY,
+        0.85,
+        500.0,
+        float("inf"),
+        "hyperbolic",
+    )
 
 
 def smooth(x, y):
@@ -37,23 +47,34 @@ def test_unwrapping_finds_the_phase_up_to_a_constant():
     found = export.unwrapped(made(want))
     held = np.isfinite(found)
     assert held.sum() == (X**2 + X[:, None] ** 2 <= 19.3**2).sum()
-    assert np.abs(found - (want - want[50, 50]))[held].max() < 1e-11  # rounding of 40 rad through diameters
+    assert (
+        np.abs(found - (want - want[50, 50]))[held].max() < 1e-11
+    )  # rounding of 40 rad through diameters
 
 
 def test_a_grid_phase_is_read_back_as_the_same_function(tmp_path):
-    """The reader of phase maps is held to files of OpticStudio's description elsewhere; +y up there, down here."""
+    """The reader of phase maps is held to files of OpticStudio's description elsewhere;
+    +y up there, down here.
+    """
     error = export.write(tmp_path / "a.dat", made(smooth(X, X[:, None])), samples=161)
     head = (tmp_path / "a.dat").read_text().splitlines()[0].split()
     assert [int(head[0]), int(head[1]), int(head[4])] == [161, 161, 0]
-    assert float(head[2]) == pytest.approx(2 * 19.2e-3 / 160, rel=0.01)  # mm; the outermost pillar, at 19.2 um
+    assert float(head[2]) == pytest.approx(
+        2 * 19.2e-3 / 160, rel=0.01
+    )  # mm; the outermost pillar, at 19.2 um
     first = [line.split() for line in (tmp_path / "a.dat").read_text().splitlines()[1:]]
     assert first[0] == ["0", "0", "0", "0", "1"]  # the corner lies outside the disc
     middle = np.array([float(words[0]) for words in first]).reshape(161, 161)
     step = float(head[2]) * 1e3
-    below, right = 48 * step, -31 * step  # rows run from the largest y of the file, which is our least
+    below, right = (
+        48 * step,
+        -31 * step,
+    )  # rows run from the largest y of the file, which is our least
     want = smooth(right, below) - smooth(0, 0)
     # linear between pillars: curvature 0.1 rad/um² over 0.4 um, h²/8 of it
-    assert middle[80 + 48, 80 - 31] == pytest.approx(want, abs=0.1 * 0.4**2 / 8 + 0.086 * 0.4**2 / 8)
+    assert middle[80 + 48, 80 - 31] == pytest.approx(
+        want, abs=0.1 * 0.4**2 / 8 + 0.086 * 0.4**2 / 8
+    )
     assert error < 2 * 0.19 * 0.4**2 / 8
 
 
@@ -68,22 +89,46 @@ def test_arrays_hold_every_pillar_with_its_place(tmp_path, ending):
     source = made(smooth(X, X[:, None]))
     lens.save(tmp_path / "lens.h5", source)
     target = tmp_path / f"out.{ending}"
-    assert cli.main(["export", str(tmp_path / "lens.h5"), "-o", str(target), "--quiet"]) == 0
+    assert (
+        cli.main(["export", str(tmp_path / "lens.h5"), "-o", str(target), "--quiet"])
+        == 0
+    )
     read = np.load(target) if ending == "npz" else loadmat(target)
     row, column = 31, 67
     assert np.ravel(read["x_um"])[column] == pytest.approx(17 * 0.4)
     assert np.ravel(read["y_um"])[row] == pytest.approx(-19 * 0.4)
     assert read["diameter_um"][row, column] == source.diameters.diameter_um[row, column]
     want = smooth(17 * 0.4, -19 * 0.4)
-    assert math.remainder(read["phase_rad"][row, column] - want, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+    assert math.remainder(
+        read["phase_rad"][row, column] - want, 2 * math.pi
+    ) == pytest.approx(0, abs=1e-9)
     assert read["transmission"][0, 0] == 0
 
 
 def test_bad_words_are_refused_by_name(tmp_path, capsys):
     lens.save(tmp_path / "lens.h5", made(smooth(X, X[:, None])))
-    assert cli.main(["export", str(tmp_path / "lens.h5"), "-o", str(tmp_path / "lens.xyz")]) == 2
-    assert "cannot write this format; name it .npz, .mat, .dat" in capsys.readouterr().err
-    assert cli.main(["export", str(tmp_path / "lens.h5"), "-o", str(tmp_path / "a.dat"), "--samples", "3"]) == 2
+    assert (
+        cli.main(
+            ["export", str(tmp_path / "lens.h5"), "-o", str(tmp_path / "lens.xyz")]
+        )
+        == 2
+    )
+    assert (
+        "cannot write this format; name it .npz, .mat, .dat" in capsys.readouterr().err
+    )
+    assert (
+        cli.main(
+            [
+                "export",
+                str(tmp_path / "lens.h5"),
+                "-o",
+                str(tmp_path / "a.dat"),
+                "--samples",
+                "3",
+            ]
+        )
+        == 2
+    )
     assert "3 samples across the aperture: need 5 or more" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["lens.h5"]
 
@@ -95,8 +140,12 @@ def test_the_written_map_reads_in_as_the_same_phase(tmp_path):
     x, y = np.array([-7.31, 2.9, 9.02]), np.array([-11.7, 0.33, 8.6])
     found = phase_map.interpolate(read, x, y)
     want = smooth(x, y[:, None]) - smooth(0, 0)
-    # linear between pillars, then between points of 0.24 um: h²/8 of the curvatures (0.1 + 0.086) rad/um² each time
-    assert np.abs(np.angle(np.exp(1j * (found - want)))).max() < 0.19 * (0.4**2 + 0.24**2) / 8
+    # linear between pillars, then between points of 0.24 um: h²/8 of the curvatures
+    # (0.1 + 0.086) rad/um² each time
+    assert (
+        np.abs(np.angle(np.exp(1j * (found - want)))).max()
+        < 0.19 * (0.4**2 + 0.24**2) / 8
+    )
 
 
 def test_every_pillar_up_to_the_rim_can_be_read_from_the_written_map(tmp_path):
@@ -106,10 +155,15 @@ def test_every_pillar_up_to_the_rim_can_be_read_from_the_written_map(tmp_path):
     d, held = source.diameters, slice(2, -2)  # 19.2 um to each side
     at = X[held]
     found = phase_map.interpolate(read, at, at, radius_um=d.radius_um)
-    error = np.abs(np.angle(np.exp(1j * (found - (smooth(at, at[:, None]) - smooth(0, 0))))))
-    # between pillars and between points as above, with the curvatures of the rim, 0.116 and 0.086 rad/um²; the phasor's
-    # argument between points D = 0.53 rad apart is wrong by D³ sqrt(3) / 216 along either axis; beyond the rim a
-    # parabola takes the place of a cubic of derivative 2.4e-3 rad/um³, 1e-4 rad one site of 0.4 um out
+    error = np.abs(
+        np.angle(np.exp(1j * (found - (smooth(at, at[:, None]) - smooth(0, 0)))))
+    )
+    # between pillars and between points as above, with the curvatures of the rim, 0.116
+    # and 0.086 rad/um²; the phasor's
+    # argument between points D = 0.53 rad apart is wrong by D³ sqrt(3) / 216 along
+    # either axis; beyond the rim a
+    # parabola takes the place of a cubic of derivative 2.4e-3 rad/um³, 1e-4 rad one
+    # site of 0.4 um out
     assert (
         error[np.asarray(d.diameter_um)[held, held] > 0].max()
         < 0.202 * (0.4**2 + 0.24**2) / 8 + 2 * 0.53**3 * 3**0.5 / 216 + 1e-4

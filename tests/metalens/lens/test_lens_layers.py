@@ -1,4 +1,6 @@
-"""Films on the lens: kept in its file, corrected for by the design, seen by the focus check and the PSF."""
+"""Films on the lens: kept in its file, corrected for by the design, seen by the focus
+check and the PSF.
+"""
 
 from dataclasses import replace
 
@@ -15,14 +17,20 @@ from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.35, pillar=Index(3.6), substrate=Index(1.45), cover=Index(1.21))
 GLASS = Film(Index(1.52), 60.0)
-LAYERS = Layers(front=(Film(Index(1.45), 150.0),), behind=(GLASS, Film(Index(1.9), 9.0)), cover=CELL.cover)
+LAYERS = Layers(
+    front=(Film(Index(1.45), 150.0),),
+    behind=(GLASS, Film(Index(1.9), 9.0)),
+    cover=CELL.cover,
+)
 FOCUS = Focus(0.85, 200.0, 2000.0, LAYERS)
 
 
 @pytest.fixture(scope="module")
 def proxy():
     """A transparent pillar of 1.4 turns over 80-290 nm."""
-    return Proxy(np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0)
+    return Proxy(
+        np.array([[0.0, 4.5]]), np.array([[0.95]]), (0.08, 0.29), (0.85, 0.85), 0.0, 0.0
+    )
 
 
 def made(proxy, focus=FOCUS, cell=CELL):
@@ -37,12 +45,16 @@ def test_a_design_corrected_for_its_films_focuses_to_the_diffraction_limit(proxy
     assert found.strehl == pytest.approx(1.0, abs=1e-6)
     # the ray through the rim obeys Snell's law in every medium: reach = sum t tan
     angles = [np.arcsin(quality.numerical_aperture / n) for n in (1.21, 1.52, 1.9)]
-    assert sum(t * np.tan(a) for t, a in zip((131.0, 60.0, 9.0), angles, strict=True)) == pytest.approx(40.0, rel=1e-9)
+    assert sum(
+        t * np.tan(a) for t, a in zip((131.0, 60.0, 9.0), angles, strict=True)
+    ) == pytest.approx(40.0, rel=1e-9)
 
 
 def test_a_design_that_forgets_glass_or_cover_is_told_that_it_does_not_focus(proxy):
     air = Focus(0.85, 200.0, 2000.0)
-    forgotten = replace(made(proxy, air, replace(CELL, cover="air"))[0], layers=Layers(behind=(GLASS,)))
+    forgotten = replace(
+        made(proxy, air, replace(CELL, cover="air"))[0], layers=Layers(behind=(GLASS,))
+    )
     assert not check_focus(forgotten).passed
     assert not check_focus(made(proxy, air)[0]).passed  # the cell's cover alone
 
@@ -50,9 +62,14 @@ def test_a_design_that_forgets_glass_or_cover_is_told_that_it_does_not_focus(pro
 def test_the_psf_of_a_lens_goes_through_its_films(proxy):
     one, _ = made(proxy)
     view = psf.View((2000.0,), ((0.0, 0.0),), 14.0, 28)
-    corrected, bare = (psf.from_lens(lens_, view, tolerance=1e-3) for lens_ in (one, replace(one, layers=Layers())))
+    corrected, bare = (
+        psf.from_lens(lens_, view, tolerance=1e-3)
+        for lens_ in (one, replace(one, layers=Layers()))
+    )
     peaks = [float(s.intensity.max() * s.energy_um2[0, 0]) for s in (corrected, bare)]
-    assert peaks[0] > 1.5 * peaks[1]  # 69 um of glass are 15 um of focus, 0.8 of the depth of focus
+    assert (
+        peaks[0] > 1.5 * peaks[1]
+    )  # 69 um of glass are 15 um of focus, 0.8 of the depth of focus
 
 
 def test_films_are_kept_in_the_file_and_older_files_read_as_before(proxy, tmp_path):
@@ -67,7 +84,10 @@ def test_films_are_kept_in_the_file_and_older_files_read_as_before(proxy, tmp_pa
 
 def test_films_that_cannot_be_are_refused_by_name(proxy):
     one, _ = made(proxy)
-    with pytest.raises(PropagationError, match="layers: films of 201 um in the 200 um from lens to sensor"):
+    with pytest.raises(
+        PropagationError,
+        match="layers: films of 201 um in the 200 um from lens to sensor",
+    ):
         replace(one, layers=Layers(behind=(Film(Index(1.5), 201.0),)))
     with pytest.raises(PropagationError, match="source to lens"):
         Focus(0.85, 200.0, 2000.0, Layers(front=(Film(Index(1.5), 2001.0),)))
@@ -83,7 +103,9 @@ def test_maps_without_a_focus_are_known(medium):
     random = np.random.default_rng(5).uniform(-np.pi, np.pi, (700, 700))
 
     def hologram(x, y):
-        return random[np.ix_(np.rint(y * 8).astype(int) + 350, np.rint(x * 8).astype(int) + 350)]
+        return random[
+            np.ix_(np.rint(y * 8).astype(int) + 350, np.rint(x * 8).astype(int) + 350)
+        ]
 
     def turned(charge, base):
         return lambda x, y: base(x, y) + charge * np.arctan2(y[:, None], x)
@@ -95,24 +117,44 @@ def test_maps_without_a_focus_are_known(medium):
         return np.zeros((len(y), len(x)))
 
     about = dict(radius_um=40.0, pitch_um=0.35)
-    bent = lambda x, y: hyperbolic(x, y) + 5.0 * ((x / 40) ** 3 + (y[:, None] / 40) ** 3) + 0.02 * k * x  # noqa: E731
+
+    def bent(x, y):
+        cubic = (x / 40) ** 3 + (y[:, None] / 40) ** 3
+        return hyperbolic(x, y) + 5.0 * cubic + 0.02 * k * x
+
     assert design.focuses(hyperbolic, focus, **about)
     assert design.focuses(bent, focus, **about)
-    for other in (axicon, flat, hologram, turned(1, flat), turned(3, hyperbolic), turned(1, hyperbolic)):
+    for other in (
+        axicon,
+        flat,
+        hologram,
+        turned(1, flat),
+        turned(3, hyperbolic),
+        turned(1, hyperbolic),
+    ):
         assert not design.focuses(other, focus, **about)
 
 
 def test_a_stop_is_kept_in_the_file_and_seen_by_design_and_focus_check(proxy, tmp_path):
-    behind_stop = Layers(front=(Film(Index(1.45), 150.0),), stop=Stop(21.0, 150.0), cover=CELL.cover)
+    behind_stop = Layers(
+        front=(Film(Index(1.45), 150.0),), stop=Stop(21.0, 150.0), cover=CELL.cover
+    )
     focus = Focus(0.85, 200.0, 2000.0, behind_stop)
     one, quality = made(proxy, focus)
     lens.save(tmp_path / "stop.h5", one)
     assert lens.load(tmp_path / "stop.h5").layers == behind_stop
-    lit = 21.0 / (1 - (150 / 1.45) / (1850 + 150 / 1.45))  # similar triangles in reduced distances
-    assert quality.numerical_aperture == pytest.approx(1.21 * np.sin(np.arctan(lit / 200.0)), rel=1e-6)
+    lit = 21.0 / (
+        1 - (150 / 1.45) / (1850 + 150 / 1.45)
+    )  # similar triangles in reduced distances
+    assert quality.numerical_aperture == pytest.approx(
+        1.21 * np.sin(np.arctan(lit / 200.0)), rel=1e-6
+    )
     found = check_focus(one)
     assert found.passed, found.text
-    assert found.resolution_um == pytest.approx(0.85 / (2 * quality.numerical_aperture), rel=1e-6)
-    # coma of the hyperbolic lens grows with the aperture cubed: less of it, a wider field
+    assert found.resolution_um == pytest.approx(
+        0.85 / (2 * quality.numerical_aperture), rel=1e-6
+    )
+    # coma of the hyperbolic lens grows with the aperture cubed: less of it, a wider
+    # field
     whole = made(proxy, Focus(0.85, 200.0, 2000.0, behind_stop.open))[1]
     assert quality.field_of_view_rad > 1.5 * whole.field_of_view_rad

@@ -1,4 +1,6 @@
-"""Rows of unlike neighbours as a record: their factor by hand, in every azimuth, and as part of a lens file."""
+"""Rows of unlike neighbours as a record: their factor by hand, in every azimuth, and as
+part of a lens file.
+"""
 
 import math
 from dataclasses import replace
@@ -14,7 +16,10 @@ from metalens.pillars import Proxy
 
 SINE, ASIDE = np.array([0.5, 0.25, 0.6, 0.35]), np.array([False, False, True, True])
 COVER = 1.3
-A, B = np.array([[0.2 - 0.3j, 0.1j], [0.05 - 0.2j, -0.1]]), np.array([[-0.4, 0.3], [-0.2j, 0.1 + 0.2j]])
+A, B = (
+    np.array([[0.2 - 0.3j, 0.1j], [0.05 - 0.2j, -0.1]]),
+    np.array([[-0.4, 0.3], [-0.2j, 0.1 + 0.2j]]),
+)
 # (along the lattice and its diagonal, field along and across the slope)
 
 
@@ -26,42 +31,79 @@ def power(sine, aside, field):
 def rows(**more):
     """Rows whose tangential fields are such that their power follows A and B."""
     given = list(zip(SINE, ASIDE, np.sqrt(1 - (SINE / COVER) ** 2), strict=True))
-    factor = np.array([[power(s, int(d), field) * c ** (0.5 - field) for s, d, c in given] for field in (0, 1)])
-    about = dict(sine=SINE, diagonal=ASIDE, factor=factor, coarse=0.9 * factor, scatter=np.array([0.1, 0.2, 0.3, 0.4]))
+    factor = np.array(
+        [
+            [power(s, int(d), field) * c ** (0.5 - field) for s, d, c in given]
+            for field in (0, 1)
+        ]
+    )
+    about = dict(
+        sine=SINE,
+        diagonal=ASIDE,
+        factor=factor,
+        coarse=0.9 * factor,
+        scatter=np.array([0.1, 0.2, 0.3, 0.4]),
+    )
     return Neighbours(**(about | dict(wavelength_um=0.532, cover=COVER) | more))
 
 
 def test_the_factor_goes_through_the_rows_of_both_fields_and_azimuths():
     made = rows()
     for field in (0, 1):
-        assert made.at(np.array([0.31]), 0.0)[field] == pytest.approx(power(0.31, 0, field), rel=1e-12)
-        assert made.at(np.array([0.31]), 3 * math.pi / 4)[field] == pytest.approx(power(0.31, 1, field), rel=1e-12)
-        third = 0.25 * power(0.31, 0, field) + 0.75 * power(0.31, 1, field)  # sin² 2α of 30 degrees
-        assert made.at(np.array(0.31), math.radians(-60))[field] == pytest.approx(third, rel=1e-12)
+        assert made.at(np.array([0.31]), 0.0)[field] == pytest.approx(
+            power(0.31, 0, field), rel=1e-12
+        )
+        assert made.at(np.array([0.31]), 3 * math.pi / 4)[field] == pytest.approx(
+            power(0.31, 1, field), rel=1e-12
+        )
+        third = 0.25 * power(0.31, 0, field) + 0.75 * power(
+            0.31, 1, field
+        )  # sin² 2α of 30 degrees
+        assert made.at(np.array(0.31), math.radians(-60))[field] == pytest.approx(
+            third, rel=1e-12
+        )
     assert made.at(np.zeros(2)) == pytest.approx(np.ones((2, 2)))
     azimuths = (np.arange(16) + 0.3) * math.pi / 8
     mean = made.at(np.full(16, 0.4), azimuths).mean()
     assert made.mean(np.array([0.4]))[0] == pytest.approx(mean, rel=1e-12)
-    assert made.at(np.array([0.9]), 0.7) == pytest.approx(made.at(np.array([0.5]), 0.7))  # no row is steeper
-    flat = replace(made, sine=np.array([0.5, 0.25, 0.3, 0.2]))  # along the diagonal rows end before: what C differs by
-    held = flat.at(np.array(0.45), 0.0) + flat.at(np.array(0.3), math.pi / 4) - flat.at(np.array(0.3), 0.0)
+    assert made.at(np.array([0.9]), 0.7) == pytest.approx(
+        made.at(np.array([0.5]), 0.7)
+    )  # no row is steeper
+    flat = replace(
+        made, sine=np.array([0.5, 0.25, 0.3, 0.2])
+    )  # along the diagonal rows end before: what C differs by
+    held = (
+        flat.at(np.array(0.45), 0.0)
+        + flat.at(np.array(0.3), math.pi / 4)
+        - flat.at(np.array(0.3), 0.0)
+    )
     assert flat.at(np.array(0.45), math.pi / 4) == pytest.approx(held, rel=1e-12)
     assert flat.steepest == (0.5, 0.3)
 
 
 def test_without_diagonal_rows_all_azimuths_are_alike():
     made = replace(
-        rows(), **{n: getattr(rows(), n)[..., :2] for n in ("sine", "diagonal", "factor", "coarse", "scatter")}
+        rows(),
+        **{
+            n: getattr(rows(), n)[..., :2]
+            for n in ("sine", "diagonal", "factor", "coarse", "scatter")
+        },
     )
-    assert made.at(np.array([0.31]), math.pi / 4) == pytest.approx(made.at(np.array([0.31]), 0.0))
+    assert made.at(np.array([0.31]), math.pi / 4) == pytest.approx(
+        made.at(np.array([0.31]), 0.0)
+    )
 
 
 def test_the_share_left_in_the_focus_is_the_square_of_the_mean_amplitude():
     """A ring that turns by 0.31 and one, twice as large, by 0.44."""
     made = rows()
-    ring = [np.mean([power(s, d, f) for d in (0, 1) for f in (0, 1)]) for s in (0.31, 0.44)]
+    ring = [
+        np.mean([power(s, d, f) for d in (0, 1) for f in (0, 1)]) for s in (0.31, 0.44)
+    ]
     want = abs(ring[0] / 3 + 2 * ring[1] / 3) ** 2
-    assert made.share(np.array([0.31, 0.44]), np.array([1 / 3, 2 / 3])) == pytest.approx(want, rel=1e-12)
+    assert made.share(
+        np.array([0.31, 0.44]), np.array([1 / 3, 2 / 3])
+    ) == pytest.approx(want, rel=1e-12)
 
 
 def test_what_it_may_be_as_well():
@@ -70,20 +112,36 @@ def test_what_it_may_be_as_well():
     assert coarse.factor == pytest.approx(0.9 * made.factor)
     assert less.factor == pytest.approx(1 + 0.8 * (made.factor - 1))
     change = [
-        np.abs(made.without(k).mean(np.array([0.2, 0.45])) - made.mean(np.array([0.2, 0.45]))).max() for k in range(4)
+        np.abs(
+            made.without(k).mean(np.array([0.2, 0.45]))
+            - made.mean(np.array([0.2, 0.45]))
+        ).max()
+        for k in range(4)
     ]
     kept = np.delete(np.arange(4), int(np.argmax(change)))
     assert other.sine == pytest.approx(SINE[kept])
     assert other.factor == pytest.approx(made.factor[:, kept])
     assert len(made.others) == 4
     single = made.without(1)  # one row along the lattice is left: it stays
-    assert [one.diagonal.tolist() for one in single.others] == [[False, True], [False, True]]
+    assert [one.diagonal.tolist() for one in single.others] == [
+        [False, True],
+        [False, True],
+    ]
 
 
 def test_a_lens_file_carries_its_rows(tmp_path):
-    proxy = Proxy(np.array([[6.0, 10.0]]), np.array([[0.9, -0.03]]), (0.08, 0.32), (0.5, 0.6), 1e-6, 1e-6)
+    proxy = Proxy(
+        np.array([[6.0, 10.0]]),
+        np.array([[0.9, -0.03]]),
+        (0.08, 0.32),
+        (0.5, 0.6),
+        1e-6,
+        1e-6,
+    )
     cell = Cell(pitch_um=0.4, pillar=Index(3.6), substrate=Index(1.45))
-    lens = Lens(DiameterMap(np.full((3, 4), 0.21), 0.4), cell, proxy, 0.532, 240.0, 6e3, "map")
+    lens = Lens(
+        DiameterMap(np.full((3, 4), 0.21), 0.4), cell, proxy, 0.532, 240.0, 6e3, "map"
+    )
     lenses.save(tmp_path / "plain.h5", lens)
     assert lenses.load(tmp_path / "plain.h5").neighbours is None
     lenses.save(tmp_path / "lens.h5", replace(lens, neighbours=rows()))
@@ -95,7 +153,11 @@ def test_a_lens_file_carries_its_rows(tmp_path):
 
 @pytest.mark.parametrize(
     "more",
-    [dict(coarse=np.ones((2, 3))), dict(diagonal=np.ones(4, bool)), dict(sine=np.array([0.5, 0.25, 0.0, 0.35]))],
+    [
+        dict(coarse=np.ones((2, 3))),
+        dict(diagonal=np.ones(4, bool)),
+        dict(sine=np.array([0.5, 0.25, 0.0, 0.35])),
+    ],
     ids=["shapes", "only diagonal", "no slope"],
 )
 def test_rows_that_tell_nothing_are_refused(more):

@@ -1,4 +1,6 @@
-"""Rays through plates by Snell's law with angles, plate by plate, and what bundles of them spread and pass."""
+"""Rays through plates by Snell's law with angles, plate by plate, and what bundles of
+them spread and pass.
+"""
 
 import itertools
 import math
@@ -16,7 +18,9 @@ def by_angles(p):
     """(reach, optical path) of a ray with n sin θ = p."""
     angles = [math.asin(p / n) for n in INDEX]
     reach = sum(t * math.tan(a) for t, a in zip(THICK, angles, strict=True))
-    return reach, sum(n * t / math.cos(a) for n, t, a in zip(INDEX, THICK, angles, strict=True))
+    return reach, sum(
+        n * t / math.cos(a) for n, t, a in zip(INDEX, THICK, angles, strict=True)
+    )
 
 
 def test_equal_media_count_together_and_the_order_of_the_faces_is_kept():
@@ -36,7 +40,9 @@ def test_reach_and_path_are_those_of_snells_angles(p):
     assert media.whole_path(STACK.layers, p * p) == pytest.approx(path, rel=1e-12)
     h = 1e-5
     near = [by_angles(p + s * h) for s in (1, -1)]
-    assert (near[0][1] - near[1][1]) / (near[0][0] - near[1][0]) == pytest.approx(p, rel=1e-6)  # Fermat
+    assert (near[0][1] - near[1][1]) / (near[0][0] - near[1][0]) == pytest.approx(
+        p, rel=1e-6
+    )  # Fermat
     want = reach / p * (near[0][0] - near[1][0]) / (2 * h)
     assert media.spread(STACK, p) == pytest.approx(want, rel=1e-6)
 
@@ -48,7 +54,9 @@ def test_faces_pass_the_mean_of_both_polarisations_by_fresnel():
         ca, cb = math.cos(math.asin(p / a)), math.cos(math.asin(p / b))
         s_power *= 4 * a * ca * b * cb / (a * ca + b * cb) ** 2
         p_power *= 4 * a * ca * b * cb / (b * ca + a * cb) ** 2
-    assert media.passed(STACK.order, p) == pytest.approx((s_power + p_power) / 2, rel=1e-12)
+    assert media.passed(STACK.order, p) == pytest.approx(
+        (s_power + p_power) / 2, rel=1e-12
+    )
 
 
 def test_a_ray_whose_other_direction_is_known():
@@ -56,7 +64,9 @@ def test_a_ray_whose_other_direction_is_known():
     q, along = 0.37, 0.52
     w = q * q + along * along
     bend = sum(t / math.sqrt(n * n - w) for n, t in zip(INDEX, THICK, strict=True))
-    assert media.square(STACK.layers, (q * bend) ** 2, along**2) == pytest.approx(w, rel=1e-12)
+    assert media.square(STACK.layers, (q * bend) ** 2, along**2) == pytest.approx(
+        w, rel=1e-12
+    )
 
 
 def test_a_little_longer_reach_is_a_little_longer_path_without_loss_of_digits():

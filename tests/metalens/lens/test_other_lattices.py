@@ -1,4 +1,6 @@
-"""Maps on other lattices, and of turned pillars: sites against the lattice written out, and through a file."""
+"""Maps on other lattices, and of turned pillars: sites against the lattice written out,
+and through a file.
+"""
 
 import math
 
@@ -12,7 +14,9 @@ from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap, Lens, export
 from metalens.pillars import Proxy
 
-PROXY = Proxy(np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.08, 0.32), (0.94, 0.94), 0.01, 0.01)
+PROXY = Proxy(
+    np.array([[3.0, 3.0]]), np.array([[0.93]]), (0.08, 0.32), (0.94, 0.94), 0.01, 0.01
+)
 PITCH = 0.37
 
 
@@ -28,7 +32,9 @@ def test_sites_of_a_hexagonal_map_are_those_of_the_lattice():
     found = made.x_um[columns] + 1j * made.y_um[rows]
     a, b = PITCH, PITCH * np.exp(1j * np.pi / 3)
     # every site is a whole number of lattice vectors from the first
-    steps = np.linalg.solve([[a.real, b.real], [a.imag, b.imag]], np.stack([found.real, found.imag]))
+    steps = np.linalg.solve(
+        [[a.real, b.real], [a.imag, b.imag]], np.stack([found.real, found.imag])
+    )
     away = steps - steps[:, :1]
     assert np.abs(away - np.rint(away)).max() < 1e-12
     assert made.site_um2 == pytest.approx(PITCH**2 * math.sqrt(3) / 2)
@@ -54,9 +60,21 @@ def test_a_pillar_between_the_sites_and_turns_that_do_not_fit_are_refused():
 
 def turned(hand="left"):
     rng = np.random.default_rng(8)
-    d, angle = np.where(rng.random((6, 9)) < 0.8, 0.21, 0.0), rng.uniform(0, np.pi, (6, 9))
+    d, angle = (
+        np.where(rng.random((6, 9)) < 0.8, 0.21, 0.0),
+        rng.uniform(0, np.pi, (6, 9)),
+    )
     cell = Cell(PITCH, shape=Rectangle(0.6))
-    return Lens(DiameterMap(d, PITCH, angle_rad=angle), cell, PROXY, 0.94, 77.0, math.inf, "hyperbolic", hand=hand)
+    return Lens(
+        DiameterMap(d, PITCH, angle_rad=angle),
+        cell,
+        PROXY,
+        0.94,
+        77.0,
+        math.inf,
+        "hyperbolic",
+        hand=hand,
+    )
 
 
 @pytest.mark.parametrize(("hand", "sign"), [("right", 2), ("left", -2)])
@@ -72,15 +90,34 @@ def test_turned_pillars_need_a_hand_and_others_have_none():
     with pytest.raises(LensError, match="hand"):
         turned("")
     with pytest.raises(LensError, match="hand"):
-        Lens(hexagonal(), Cell(PITCH), PROXY, 0.94, 77.0, math.inf, "hyperbolic", hand="left")
+        Lens(
+            hexagonal(),
+            Cell(PITCH),
+            PROXY,
+            0.94,
+            77.0,
+            math.inf,
+            "hyperbolic",
+            hand="left",
+        )
 
 
-@pytest.mark.parametrize("made", [turned(), Lens(hexagonal(), Cell(PITCH), PROXY, 0.94, 77.0, math.inf, "cubic")])
+@pytest.mark.parametrize(
+    "made",
+    [turned(), Lens(hexagonal(), Cell(PITCH), PROXY, 0.94, 77.0, math.inf, "cubic")],
+)
 def test_a_file_keeps_lattice_turns_and_hand(tmp_path, made):
     lenses.save(tmp_path / "lens.h5", made)
     read = lenses.load(tmp_path / "lens.h5")
-    assert (read.diameters.lattice, read.diameters.steps_um) == (made.diameters.lattice, made.diameters.steps_um)
-    assert (read.hand, read.cell, read.diameters.site_um2) == (made.hand, made.cell, made.diameters.site_um2)
+    assert (read.diameters.lattice, read.diameters.steps_um) == (
+        made.diameters.lattice,
+        made.diameters.steps_um,
+    )
+    assert (read.hand, read.cell, read.diameters.site_um2) == (
+        made.hand,
+        made.cell,
+        made.diameters.site_um2,
+    )
     assert np.array_equal(read.phase_rad(), made.phase_rad())
     with pytest.raises(LensError, match="square lattice"):
         lenses.load_plain(tmp_path / "lens.h5")

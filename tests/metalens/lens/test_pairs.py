@@ -1,4 +1,6 @@
-"""A table of pillars of two sizes: each entry at its sizes, wavelength and polarisation, and nothing between."""
+"""A table of pillars of two sizes: each entry at its sizes, wavelength and
+polarisation, and nothing between.
+"""
 
 import numpy as np
 import pytest
@@ -7,7 +9,11 @@ from metalens.ground.errors import DomainError, LensError
 from metalens.lens.pairs import Pairs
 
 DRAW = np.random.default_rng(19)
-WAVES, X, Y = np.array([0.78, 0.85]), 0.1 + 0.02 * np.arange(5), 0.15 + 0.05 * np.arange(3)
+WAVES, X, Y = (
+    np.array([0.78, 0.85]),
+    0.1 + 0.02 * np.arange(5),
+    0.15 + 0.05 * np.arange(3),
+)
 T = DRAW.normal(size=(2, 5, 3, 2)) + 1j * DRAW.normal(size=(2, 5, 3, 2))
 
 
@@ -18,7 +24,10 @@ def pairs():
 @pytest.mark.parametrize("light", ["x", "y"])
 def test_every_pillar_has_its_entry_and_no_pillar_has_none(light):
     row, column = DRAW.integers(0, 5, (4, 6)), DRAW.integers(0, 3, (4, 6))
-    x, y = X[row] + 0.04 * 0.02, Y[column] - 0.04 * 0.05  # a twentieth of a step is rounding
+    x, y = (
+        X[row] + 0.04 * 0.02,
+        Y[column] - 0.04 * 0.05,
+    )  # a twentieth of a step is rounding
     x[1, 2] = y[1, 2] = 0.0
     for w, wave in enumerate(WAVES):
         found = pairs().amplitude(x, y, wave + 5e-10, light)

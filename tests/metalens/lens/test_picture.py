@@ -1,4 +1,6 @@
-"""The picture of a lens shows what a microscope of its resolution would: no lens where there is none."""
+"""The picture of a lens shows what a microscope of its resolution would: no lens where
+there is none.
+"""
 
 from dataclasses import replace
 
@@ -17,11 +19,21 @@ LINEAR = Proxy(
 
 
 def lens(diameter):
-    return Lens(DiameterMap(diameter, 0.4), Cell(0.4), LINEAR, 0.85, 500.0, float("inf"), "hyperbolic")
+    return Lens(
+        DiameterMap(diameter, 0.4),
+        Cell(0.4),
+        LINEAR,
+        0.85,
+        500.0,
+        float("inf"),
+        "hyperbolic",
+    )
 
 
 def test_a_slope_fades_as_the_mean_of_its_phases():
-    """Sites of one block lie δ apart: the mean is sin(nδ/2) / (n sin(δ/2)) at the phase of their middle."""
+    """Sites of one block lie δ apart: the mean is sin(nδ/2) / (n sin(δ/2)) at the phase
+    of their middle.
+    """
     step, n = 0.0071, 5
     diameter = 0.12 + step * np.arange(15) + np.zeros((11, 1))
     diameter[:, 14] = 0  # a hole: one site of five in the last block is dark
@@ -47,7 +59,9 @@ def test_a_stop_is_drawn_at_its_radius():
 
 
 def test_a_phase_that_turns_within_a_pixel_is_not_drawn_as_a_slow_one():
-    """A slope of one turn in 21 sites, read at every 20th site, would look like one turn in 420."""
+    """A slope of one turn in 21 sites, read at every 20th site, would look like one
+    turn in 420.
+    """
     x = np.arange(840)
     diameter = 0.12 + 2 * np.pi / 70 * ((x / 21) % 1) + np.zeros((840, 1))
     assert np.abs(mean_field(lens(diameter), 21)).max() < 1e-12

@@ -23,7 +23,16 @@ def stored(request, tmp_path):
 
 @pytest.mark.parametrize(
     "key",
-    [slice(3, 41), slice(50, 90), slice(9, 9), slice(None), 52, (slice(6, 30), slice(2, 11)), (13, 4), slice(5, 40, 3)],
+    [
+        slice(3, 41),
+        slice(50, 90),
+        slice(9, 9),
+        slice(None),
+        52,
+        (slice(6, 30), slice(2, 11)),
+        (13, 4),
+        slice(5, 40, 3),
+    ],
 )
 def test_any_rows_are_those_of_the_array(stored, key):
     rows, values = stored
@@ -45,7 +54,14 @@ IRIS = Layers(stop=Stop(7.5, 13.0, (0.7, -1.1)))  # and no film
 
 
 def write(path, d):
-    proxy = Proxy(np.array([[3.0, 3.0]]), np.array([[0.95]]), (0.08, 0.32), (0.85, 0.85), 0.01, 0.01)
+    proxy = Proxy(
+        np.array([[3.0, 3.0]]),
+        np.array([[0.95]]),
+        (0.08, 0.32),
+        (0.85, 0.85),
+        0.01,
+        0.01,
+    )
     about = (0.85, 500.0, float("inf"), "hyperbolic")
     lenses.save(path, Lens(DiameterMap(d, 0.4), Cell(0.4), proxy, *about, layers=IRIS))
 
@@ -53,9 +69,14 @@ def write(path, d):
 def test_a_large_lens_stays_in_its_file(tmp_path, monkeypatch):
     d = np.random.default_rng(2).uniform(0.1, 0.3, (61, 43))
     write(tmp_path / "lens.h5", d)
-    assert isinstance(lenses.streamed(tmp_path / "lens.h5").diameters.diameter_um, np.ndarray)
+    assert isinstance(
+        lenses.streamed(tmp_path / "lens.h5").diameters.diameter_um, np.ndarray
+    )
     monkeypatch.setattr(record, "MOST_HELD_BYTES", 100)
-    large, small = lenses.streamed(tmp_path / "lens.h5"), lenses.load(tmp_path / "lens.h5")
+    large, small = (
+        lenses.streamed(tmp_path / "lens.h5"),
+        lenses.load(tmp_path / "lens.h5"),
+    )
     assert isinstance(large.diameters.diameter_um, RowsOnDisk)
     assert large.diameters.radius_um == small.diameters.radius_um
     assert (large.profile, large.wavelength_um) == (small.profile, small.wavelength_um)

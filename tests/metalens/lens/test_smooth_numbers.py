@@ -1,4 +1,6 @@
-"""When a polynomial stands for a function of many places: how often it is asked, by series that are given."""
+"""When a polynomial stands for a function of many places: how often it is asked, by
+series that are given.
+"""
 
 import math
 
@@ -11,7 +13,9 @@ PLACES = np.linspace(2.0, 5.0, 1000)  # the middle is 3.5, the reach 1.5
 
 
 def series(asked, *terms):
-    """A function whose Chebyshev series over the places is given, and which counts what it is asked."""
+    """A function whose Chebyshev series over the places is given, and which counts what
+    it is asked.
+    """
 
     def one(u):
         asked.append(u.size)
@@ -22,7 +26,9 @@ def series(asked, *terms):
 
 @pytest.mark.parametrize(("last", "places"), [(3e-15, 9), (6e-15, 9 + 17)])
 def test_the_last_coefficients_are_to_be_rounding(last, places):
-    """4e-15 of the largest, which is that of the second degree; coefficients are known to 2e-16 of it."""
+    """4e-15 of the largest, which is that of the second degree; coefficients are known
+    to 2e-16 of it.
+    """
     asked = []
     found = smooth.over(series(asked, 0.1, 0, 2.0, 0, 0, 0, 0, 0, 2 * last), PLACES)
     assert sum(asked) == places
@@ -45,7 +51,9 @@ def test_a_thousand_places_are_enough_and_fewer_are_asked_each():
         found = smooth.over(series(asked, 0.4, -1.1, 0.3), places)
         assert sum(asked) == count
         unit = (places - 3.5) / 1.5
-        assert found == pytest.approx(0.4 - 1.1 * unit + 0.3 * (2 * unit**2 - 1), abs=1e-14)
+        assert found == pytest.approx(
+            0.4 - 1.1 * unit + 0.3 * (2 * unit**2 - 1), abs=1e-14
+        )
 
 
 def test_places_may_lie_close_together():
@@ -79,5 +87,9 @@ def test_powers_are_summed_as_horner_does():
     unit = np.array([0.3, -0.8])
     want = 0.5 - 1.2 * unit + 3.1 * unit**2 + 0.7 * unit**3
     assert smooth._horner(np.array([0.5, -1.2, 3.1, 0.7]), unit) == pytest.approx(want)
-    assert smooth._horner(np.array([0.5, -1.2]), unit) == pytest.approx(0.5 - 1.2 * unit)
-    assert math.isclose(float(smooth._horner(np.array([0.5, -1.2]), np.float64(0.3))), 0.14)
+    assert smooth._horner(np.array([0.5, -1.2]), unit) == pytest.approx(
+        0.5 - 1.2 * unit
+    )
+    assert math.isclose(
+        float(smooth._horner(np.array([0.5, -1.2]), np.float64(0.3))), 0.14
+    )

@@ -1,4 +1,6 @@
-"""Paths over many places by polynomials: to rounding where those converge, the function itself where they do not."""
+"""Paths over many places by polynomials: to rounding where those converge, the function
+itself where they do not.
+"""
 
 import math
 from typing import Any
@@ -10,9 +12,13 @@ import torch
 from metalens.lens import smooth
 
 
-@pytest.mark.parametrize(("height", "most"), [(15e3, 9), (700.0, 9 + 17), (430.0, 9 + 17 + 25)])
+@pytest.mark.parametrize(
+    ("height", "most"), [(15e3, 9), (700.0, 9 + 17), (430.0, 9 + 17 + 25)]
+)
 def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> None:
-    """√(h² + u), away from -h²: coefficients of u up to 600² fall by 6.7e3, 9.3 and 5.2 each."""
+    """√(h² + u), away from -h²: coefficients of u up to 600² fall by 6.7e3, 9.3 and 5.2
+    each.
+    """
     asked: list[int] = []
 
     def root(u: Any) -> Any:
@@ -29,7 +35,9 @@ def test_a_square_root_is_taken_at_a_few_places(height: float, most: int) -> Non
 
 def test_what_no_polynomial_reaches_is_taken_as_it_is() -> None:
     u = np.linspace(0.0, 600.0, 2000) ** 2
-    np.testing.assert_array_equal(smooth.over(np.sqrt, u), np.sqrt(u))  # singular at its end
+    np.testing.assert_array_equal(
+        smooth.over(np.sqrt, u), np.sqrt(u)
+    )  # singular at its end
     few = np.array([0.3, 7.1, 2.2])
     np.testing.assert_array_equal(smooth.over(np.cbrt, few), np.cbrt(few))
     alike = np.full(2000, 2.7)

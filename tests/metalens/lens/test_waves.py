@@ -1,4 +1,6 @@
-"""What a ray through films leaves out of its plane waves, against their sum on another line by another rule."""
+"""What a ray through films leaves out of its plane waves, against their sum on another
+line by another rule.
+"""
 
 import math
 
@@ -9,14 +11,30 @@ from metalens.lens import Media, media, saddle
 from metalens.lens.waves import WAVES, Saddle, waves
 from tests.referees import films
 
-# media from pillars to sensor, wavelength, n sin θ of the ray in units of the rarest index
+# media from pillars to sensor, wavelength, n sin θ of the ray in units of the rarest
+# index
 STACKS = [
     ((1.0, 1.52), (100.0, 300.0), 0.85, 0.31),
     ((1.31, 1.52, 2.1), (88.0, 55.0, 7.0), 0.85, 0.27),
-    ((1.0, 2.3, 1.52), (20.0, 2.0, 3.0), 0.94, 0.52),  # 25 um: what a ray alone leaves out is 1e-3
+    (
+        (1.0, 2.3, 1.52),
+        (20.0, 2.0, 3.0),
+        0.94,
+        0.52,
+    ),  # 25 um: what a ray alone leaves out is 1e-3
     ((1.31, 1.15, 1.97), (15.1, 11.4, 18.4), 0.63, 0.62),  # the rarest in the middle
-    ((1.0, 1.76, 1.43), (0.0, 11.0, 9.0), 1.3, 0.44),  # a film on the pillars: the first medium has no thickness
-    ((1.0, 1.7, 2.2, 1.52), (0.7, 1.1, 0.4, 2.1), 0.85, 0.4),  # four um, as short as it makes sense
+    (
+        (1.0, 1.76, 1.43),
+        (0.0, 11.0, 9.0),
+        1.3,
+        0.44,
+    ),  # a film on the pillars: the first medium has no thickness
+    (
+        (1.0, 1.7, 2.2, 1.52),
+        (0.7, 1.1, 0.4, 2.1),
+        0.85,
+        0.4,
+    ),  # four um, as short as it makes sense
 ]
 
 
@@ -25,12 +43,20 @@ def ray(behind, wavelength, p):
     k, layers = 2 * math.pi / wavelength, behind.layers
     length = sum(n * n * t / math.sqrt(n * n - p * p) for n, t in layers)
     out, area = media.reach(behind, p), media.spread(behind, p)
-    alone = -1j * k / (2 * math.pi) * math.sqrt(media.passed(behind.order, p) / area) * np.exp(1j * k * length)
+    alone = (
+        -1j
+        * k
+        / (2 * math.pi)
+        * math.sqrt(media.passed(behind.order, p) / area)
+        * np.exp(1j * k * length)
+    )
     return alone, out, k * length
 
 
 @pytest.mark.parametrize(("order", "thickness", "wavelength", "part"), STACKS)
-def test_a_ray_with_its_series_is_the_sum_of_all_plane_waves(order, thickness, wavelength, part):
+def test_a_ray_with_its_series_is_the_sum_of_all_plane_waves(
+    order, thickness, wavelength, part
+):
     behind = Media(order, thickness)
     p = part * min(order)
     alone, out, turns = ray(behind, wavelength, p)
@@ -49,9 +75,14 @@ def test_one_medium_needs_no_series():
     k, behind = 2 * math.pi / 0.85, Media((1.37,), (42.0,))
     found = saddle(behind, k, 60.0)
     assert found.at(0.5) == (1.0, 0.0)
-    assert (found.rarest, found.middle + found.half) == pytest.approx((1.37, 1.37), rel=1e-14)
+    assert (found.rarest, found.middle + found.half) == pytest.approx(
+        (1.37, 1.37), rel=1e-14
+    )
     assert found.error(np.array([0.5])) < 1e-27  # exact
-    assert [part.tolist() for part in found.at(np.array([0.5, 0.7]))] == [[1.0, 1.0], [0.0, 0.0]]
+    assert [part.tolist() for part in found.at(np.array([0.5, 0.7]))] == [
+        [1.0, 1.0],
+        [0.0, 0.0],
+    ]
     w = np.array([0.0, 0.2, 0.9])
     want = 1 + 1j / (k * 1.37**2 * 42.0 / np.sqrt(1.37**2 - w))
     assert waves(behind, k, w) == pytest.approx(want, rel=1e-13)
@@ -59,18 +90,25 @@ def test_one_medium_needs_no_series():
 
 def test_faces_between_equal_indices_change_nothing():
     k, w = 2 * math.pi / 0.85, np.array([0.1, 0.4])
-    one, other = Media((1.3, 1.6), (10.0, 20.0)), Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0))
+    one, other = (
+        Media((1.3, 1.6), (10.0, 20.0)),
+        Media((1.3, 1.6, 1.6), (10.0, 7.0, 13.0)),
+    )
     assert waves(one, k, w) == pytest.approx(waves(other, k, w), rel=1e-13)
 
 
 def test_the_error_is_told_where_films_are_too_thin_for_it():
-    """A steep ray through two um: the error is 1e-6 there and the estimate above it, by less than a thousand."""
+    """A steep ray through two um: the error is 1e-6 there and the estimate above it, by
+    less than a thousand.
+    """
     behind, wavelength = Media((1.0, 2.1, 1.72, 1.4), (1.0, 0.2, 0.6, 0.2)), 0.85
     p = 0.6
     alone, out, turns = ray(behind, wavelength, p)
     found = saddle(behind, 2 * math.pi / wavelength, 1.2 * out)
     ahead, aside = found.at(p * p)
-    (want,) = films.point_wave(behind.layers, behind.order, wavelength=wavelength, reach=[out])
+    (want,) = films.point_wave(
+        behind.layers, behind.order, wavelength=wavelength, reach=[out]
+    )
     error = abs(alone * (1 + 1j * (ahead + 1j * aside) / turns) / want - 1)
     assert 1e-9 < error < found.error(p * p) < 1e3 * error
 
@@ -87,7 +125,8 @@ def test_the_series_is_the_waves_at_any_ray():
     assert np.abs((other[0] - ahead[:20]) + 1j * (other[1] - aside[:20])).max() < 1e-8
 
 
-# media, wavelength, reach: through a thick stack, and through three um, where few waves do not settle
+# media, wavelength, reach: through a thick stack, and through three um, where few waves
+# do not settle
 RANGES = [
     ((1.31, 1.15, 1.97), (15.1, 11.4, 18.4), 0.63, 60.0),
     ((1.31, 2.1, 1.52), (2.0, 0.3, 1.0), 0.85, 3.0),
@@ -95,8 +134,12 @@ RANGES = [
 
 
 @pytest.mark.parametrize(("order", "thickness", "wavelength", "reach"), RANGES)
-def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(order, thickness, wavelength, reach):
-    """By the definition, from the mean over so many waves each: of two successive counts those that differ least."""
+def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(
+    order, thickness, wavelength, reach
+):
+    """By the definition, from the mean over so many waves each: of two successive
+    counts those that differ least.
+    """
     behind, k = Media(order, thickness), 2 * math.pi / wavelength
     found = saddle(behind, k, reach)
     w = found.rarest**2 - found.normal**2
@@ -104,39 +147,74 @@ def test_the_error_of_each_ray_is_its_waves_unsettled_or_its_series_missed(order
     apart = np.abs(np.diff(every, axis=0))
     settled = every[apart.argmin(0) + 1, np.arange(len(w))]
     ahead, aside = found.at(w)
-    missed = np.abs(1 + 1j * (ahead + 1j * aside) / (k * media.whole_path(behind.layers, w)) - settled)
-    assert found.error(w) == pytest.approx(np.maximum(apart.min(0), missed), rel=1e-3, abs=3e-15)
-    assert missed.max() < apart.min(0).max() / 30  # the series costs nothing beside them
+    missed = np.abs(
+        1
+        + 1j * (ahead + 1j * aside) / (k * media.whole_path(behind.layers, w))
+        - settled
+    )
+    assert found.error(w) == pytest.approx(
+        np.maximum(apart.min(0), missed), rel=1e-3, abs=3e-15
+    )
+    assert (
+        missed.max() < apart.min(0).max() / 30
+    )  # the series costs nothing beside them
 
 
 def test_the_error_between_two_rays_is_their_geometric_mean():
-    found = Saddle(1.2, 0.9, 0.3, np.ones(1), np.zeros(1), np.array([0.5, 0.7, 1.1]), np.array([4e-6, 9e-8, 0.0]))
-    s = np.array([0.5, 0.6, 0.7, 0.9])  # normal parts; half way to a ray without error, known to 1e-28
-    assert found.error(1.2**2 - s**2) == pytest.approx([4e-6, 6e-7, 9e-8, math.sqrt(9e-8 * 1e-28)], rel=1e-6)
-    assert found.error(np.array([0.0, 1.44, 1.5])) == pytest.approx([1e-28, 4e-6, 4e-6], rel=1e-6)  # beyond the ends
+    found = Saddle(
+        1.2,
+        0.9,
+        0.3,
+        np.ones(1),
+        np.zeros(1),
+        np.array([0.5, 0.7, 1.1]),
+        np.array([4e-6, 9e-8, 0.0]),
+    )
+    s = np.array(
+        [0.5, 0.6, 0.7, 0.9]
+    )  # normal parts; half way to a ray without error, known to 1e-28
+    assert found.error(1.2**2 - s**2) == pytest.approx(
+        [4e-6, 6e-7, 9e-8, math.sqrt(9e-8 * 1e-28)], rel=1e-6
+    )
+    assert found.error(np.array([0.0, 1.44, 1.5])) == pytest.approx(
+        [1e-28, 4e-6, 4e-6], rel=1e-6
+    )  # beyond the ends
 
 
 def test_the_series_ends_at_a_quarter_power_of_two_beyond_the_steepest_ray():
-    """tan² in the rarest medium, so that windows of much the same rays share one; a ray beside the axis has 1/64."""
+    """tan² in the rarest medium, so that windows of much the same rays share one; a ray
+    beside the axis has 1/64.
+    """
     ends = []
-    for order, thickness, wavelength, reach in (*RANGES, ((1.2, 1.9), (30.0, 13.0), 0.633, 0.1)):
+    for order, thickness, wavelength, reach in (
+        *RANGES,
+        ((1.2, 1.9), (30.0, 13.0), 0.633, 0.1),
+    ):
         behind, low = Media(order, thickness), min(order)
         found = saddle(behind, 2 * math.pi / wavelength, reach)
-        assert (found.rarest, found.middle + found.half) == pytest.approx((low, low), rel=1e-14)
+        assert (found.rarest, found.middle + found.half) == pytest.approx(
+            (low, low), rel=1e-14
+        )
         end = (low / (found.middle - found.half)) ** 2 - 1
         w = float(media.square(behind.layers, reach**2))
-        ends.append((4 * math.log2(end), 4 * math.log2(max(w / (low * low - w), 2**-6))))
+        ends.append(
+            (4 * math.log2(end), 4 * math.log2(max(w / (low * low - w), 2**-6)))
+        )
     found, asked = np.transpose(ends)
     assert found == pytest.approx(np.ceil(asked - 1e-9), abs=1e-9)
 
 
 def test_the_series_ends_before_a_ray_that_grazes_a_medium_of_no_thickness():
     grazing = saddle(Media((1.1, 1.8), (0.0, 5.0)), 2 * math.pi / 0.85, 20.0)
-    assert 1.8**2 - (grazing.middle - grazing.half) ** 2 == pytest.approx((0.9999 * 1.1) ** 2, rel=1e-9)
+    assert 1.8**2 - (grazing.middle - grazing.half) ** 2 == pytest.approx(
+        (0.9999 * 1.1) ** 2, rel=1e-9
+    )
 
 
 def test_beyond_a_critical_angle_power_is_cut_for_rays_and_continued_for_waves():
-    """At p = 1.2 from 1.1 into 1.8 nothing passes; the analytic function there is that of complex cosines."""
+    """At p = 1.2 from 1.1 into 1.8 nothing passes; the analytic function there is that
+    of complex cosines.
+    """
     w, order = np.array([1.44, 0.5]), (1.1, 1.8)
     s_power, p_power = media.passed_apart(order, w)
     assert (s_power[0], p_power[0]) == (0, 0)

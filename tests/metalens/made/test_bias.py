@@ -1,4 +1,6 @@
-"""Bias: forward and inverse agree, a table is its own knots, isolation has its two limits."""
+"""Bias: forward and inverse agree, a table is its own knots, isolation has its two
+limits.
+"""
 
 import numpy as np
 import pytest
@@ -15,11 +17,15 @@ TABLE = ((80.0, -6.0), (120.0, -3.5), (180.0, -1.0), (340.0, 1.0))
 
 def test_table_is_exact_at_its_knots_linear_between_and_constant_beyond():
     bias = Bias(table_nm=TABLE)
-    assert bias.at(np.array([80, 120, 100, 20, 500])) == pytest.approx([-6, -3.5, -4.75, -6, 1])
+    assert bias.at(np.array([80, 120, 100, 20, 500])) == pytest.approx(
+        [-6, -3.5, -4.75, -6, 1]
+    )
 
 
 def test_curve_is_the_polynomial_of_the_diameter_in_100_nm():
-    assert Bias(curve_nm=(-8.0, 3.0, -0.2)).at(250.0) == pytest.approx(-8 + 3 * 2.5 - 0.2 * 6.25)
+    assert Bias(curve_nm=(-8.0, 3.0, -0.2)).at(250.0) == pytest.approx(
+        -8 + 3 * 2.5 - 0.2 * 6.25
+    )
 
 
 @given(
@@ -31,7 +37,10 @@ def test_curve_is_the_polynomial_of_the_diameter_in_100_nm():
 def test_what_is_drawn_gives_what_was_designed(slopes, start, isolated, alone):
     knots = 80 + 40.0 * np.arange(len(slopes) + 1)
     values = start + np.r_[0, np.cumsum(40 * np.array(slopes))]
-    bias = Bias(table_nm=tuple(zip(knots.tolist(), values.tolist(), strict=True)), isolated_nm=isolated)
+    bias = Bias(
+        table_nm=tuple(zip(knots.tolist(), values.tolist(), strict=True)),
+        isolated_nm=isolated,
+    )
     made = bias.made_nm(bias.drawn_nm(DESIGN, alone), alone)
     assert np.abs(made - DESIGN).max() < 1e-9  # contraction by 0.49 a round, 60 rounds
 
@@ -47,7 +56,8 @@ def test_isolation_is_zero_in_a_full_lattice_and_one_alone():
 def test_isolation_at_a_straight_edge_counts_the_missing_half():
     half = np.zeros((101, 101), bool)
     half[:, 50:] = True
-    # the sites on the edge row keep themselves, their column and one half: (S - C) / 2 of S - 1 are missing,
+    # the sites on the edge row keep themselves, their column and one half: (S - C) / 2
+    # of S - 1 are missing,
     # with C the sum over the column and S = C^2 over the plane
     line = np.exp(-((np.arange(-8, 9) * 0.4) ** 2)).sum()
     want = (line**2 - line) / 2 / (line**2 - 1)
@@ -65,9 +75,19 @@ def test_isolation_matches_the_direct_sum_on_a_ragged_patch():
     weights = np.outer(steps, steps)
     weights[reach, reach] = 0
     padded = np.pad(present, reach).astype(float)
-    for row, column in [(0, 0), (39, 30), (64, 64), (63, 128), (149, 169), (100, 61), (128, 127)]:
+    for row, column in [
+        (0, 0),
+        (39, 30),
+        (64, 64),
+        (63, 128),
+        (149, 169),
+        (100, 61),
+        (128, 127),
+    ]:
         patch = padded[row : row + 2 * reach + 1, column : column + 2 * reach + 1]
-        assert got[row, column] == pytest.approx(1 - (weights * patch).sum() / weights.sum(), abs=2e-6)
+        assert got[row, column] == pytest.approx(
+            1 - (weights * patch).sum() / weights.sum(), abs=2e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -89,7 +109,8 @@ def test_an_impossible_bias_is_refused(options, words):
 @pytest.mark.parametrize(
     "text",
     [
-        "\ufeff90.5,-8\n250,1.25\n",  # a spreadsheet's byte-order mark is no reason to take numbers for a head
+        # a spreadsheet's byte-order mark is no reason to take numbers for a head
+        "\ufeff90.5,-8\n250,1.25\n",
         "\ufeffmade of D 90;at 50 kV\n90,5;-8,0\n250;1,25\n",
         "90,5\t-8\r\n250\t1,25\r\n",
         '"drawn","bias"\n"90.5","-8"\n"250","1.25"\n',
@@ -112,7 +133,9 @@ def test_a_first_row_of_broken_numbers_is_no_head(tmp_path, text):
 
 def test_csv_with_head_comments_and_a_bad_line(tmp_path):
     good = tmp_path / "bias.csv"
-    good.write_text("# from micrographs\ndiameter_nm,bias_nm\n100,-3\n200,0.5\n\n", encoding="utf-8")
+    good.write_text(
+        "# from micrographs\ndiameter_nm,bias_nm\n100,-3\n200,0.5\n\n", encoding="utf-8"
+    )
     assert read_csv(good) == ((100.0, -3.0), (200.0, 0.5))
     bad = tmp_path / "bad.csv"
     bad.write_text("100,-3\n200,abc\n", encoding="utf-8")
@@ -129,6 +152,6 @@ def test_csv_with_head_comments_and_a_bad_line(tmp_path):
 def test_a_curve_is_held_beyond_10_and_2000_nm():
     """A straight one of 3 nm per 100 nm: -7.7 and 52 nm at its ends."""
     bias = Bias(curve_nm=(-8.0, 3.0))
-    assert bias.at(np.array([4.0, 10.0, 11.0, 1999.0, 2000.0, 2600.0])) == pytest.approx(
-        [-7.7, -7.7, -7.67, 51.97, 52.0, 52.0]
-    )
+    assert bias.at(
+        np.array([4.0, 10.0, 11.0, 1999.0, 2000.0, 2600.0])
+    ) == pytest.approx([-7.7, -7.7, -7.67, 51.97, 52.0, 52.0])

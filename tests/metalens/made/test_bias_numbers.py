@@ -1,4 +1,6 @@
-"""Bias by its polynomial and table, ends of both, isolation, inverse and the slope that is refused."""
+"""Bias by its polynomial and table, ends of both, isolation, inverse and the slope that
+is refused.
+"""
 
 from pathlib import Path
 
@@ -14,24 +16,34 @@ TABLE = ((80.0, -6.0), (120.0, -3.5), (180.0, -1.0))
 def test_a_curve_is_constant_beyond_ten_nanometres_and_two_micrometres():
     bias = Bias(curve_nm=(-8.0, 3.0, -0.03))
     assert bias.at(250.0) == pytest.approx(-8 + 7.5 - 0.1875)
-    assert bias.at(np.array([3.0, 10.0])) == pytest.approx(np.array([-7.7003] * 2))  # at 0.1 of 100 nm
-    assert bias.at(np.array([2000.0, 2600.0])) == pytest.approx(np.array([40.0] * 2))  # -8 + 60 - 12 at 20
+    assert bias.at(np.array([3.0, 10.0])) == pytest.approx(
+        np.array([-7.7003] * 2)
+    )  # at 0.1 of 100 nm
+    assert bias.at(np.array([2000.0, 2600.0])) == pytest.approx(
+        np.array([40.0] * 2)
+    )  # -8 + 60 - 12 at 20
     assert Bias().at(np.array([[7.0, 9.0, 11.0]])).tolist() == [[0.0, 0.0, 0.0]]
 
 
 def test_what_is_made_adds_the_bias_and_the_share_of_isolation():
-    """At 100 nm, half way between the knots: -4.75; 0.25 of 2.2 for a pillar of some neighbours."""
+    """At 100 nm, half way between the knots: -4.75; 0.25 of 2.2 for a pillar of some
+    neighbours.
+    """
     bias = Bias(table_nm=TABLE, isolated_nm=2.2)
     assert bias.made_nm(100.0) == pytest.approx(95.25)
-    assert bias.made_nm(np.array([100.0, 300.0]), np.array([0.25, 1.0])) == pytest.approx(np.array([95.8, 301.2]))
-    assert bias.drawn_nm(np.array([95.8, 301.2]), np.array([0.25, 1.0])) == pytest.approx(
-        np.array([100.0, 300.0]), abs=1e-9
-    )
+    assert bias.made_nm(
+        np.array([100.0, 300.0]), np.array([0.25, 1.0])
+    ) == pytest.approx(np.array([95.8, 301.2]))
+    assert bias.drawn_nm(
+        np.array([95.8, 301.2]), np.array([0.25, 1.0])
+    ) == pytest.approx(np.array([100.0, 300.0]), abs=1e-9)
     assert bias.drawn_nm(np.zeros(0)).shape == (0,)
 
 
 def test_the_steepest_curve_that_is_taken_is_inverted_to_its_digits():
-    """Nearly half a nanometre a nanometre: each round leaves half of the last one's error, 60 of them 1e-16 nm."""
+    """Nearly half a nanometre a nanometre: each round leaves half of the last one's
+    error, 60 of them 1e-16 nm.
+    """
     assert STEEPEST == 0.5
     assert Bias(curve_nm=(0.0, 49.9)).drawn_nm(299.8) == pytest.approx(200.0, abs=1e-9)
     assert Bias(curve_nm=(0.0, -49.9)).drawn_nm(150.3) == pytest.approx(300.0, abs=1e-9)

@@ -1,4 +1,6 @@
-"""The table of causes in closed form: maps over the lens, derivatives of pillars, drawn lenses, t under a change."""
+"""The table of causes in closed form: maps over the lens, derivatives of pillars, drawn
+lenses, t under a change.
+"""
 
 import math
 from types import SimpleNamespace
@@ -24,7 +26,9 @@ def answering(*first):
 
 
 def test_biases_over_the_lens_by_hand():
-    """10, -4, 7, 3, 2, -5 nm of: all, x, y, bow, saddle, oblique saddle; in um at three places off every axis."""
+    """10, -4, 7, 3, 2, -5 nm of: all, x, y, bow, saddle, oblique saddle; in um at three
+    places off every axis.
+    """
     names = ("bias_nm", "bias_x_nm", "bias_y_nm", "bias_r_nm", "bias_a_nm", "bias_o_nm")
     made = State.of(dict(zip(names, (10.0, -4.0, 7.0, 3.0, 2.0, -5.0), strict=True)))
     bow = 0.5 * (2 * (U**2 + V**2) - 1)
@@ -38,7 +42,9 @@ def test_biases_over_the_lens_by_hand():
 
 
 def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
-    """Against cosines and sines of the angle; orthogonal over the disc with piston, tilt and focus."""
+    """Against cosines and sines of the angle; orthogonal over the disc with piston,
+    tilt and focus.
+    """
     radius, angle = np.hypot(U, V), np.arctan2(V, U)
     want = [
         math.sqrt(6) * radius**2 * np.cos(2 * angle),
@@ -53,49 +59,98 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
     x, w = np.polynomial.legendre.leggauss(8)
     r, turn = np.sqrt((x + 1) / 2)[:, None], np.arange(16) * math.pi / 8 + 0.1
     u, v, weight = r * np.cos(turn), r * np.sin(turn), np.repeat(w / 2 / 16, 16)
-    basis = np.concatenate([np.stack([np.ones_like(u), 2 * u, 2 * v]), causes.maps(Bends, u, v)]).reshape(10, -1)
+    basis = np.concatenate(
+        [np.stack([np.ones_like(u), 2 * u, 2 * v]), causes.maps(Bends, u, v)]
+    ).reshape(10, -1)
     assert basis * weight @ basis.T == pytest.approx(np.eye(10), abs=1e-9)
     made = State.of({"coma_y_rad": 0.3, "trefoil_x_rad": -0.2})
-    assert made.phase_rad(U, V) == pytest.approx(0.3 * want[3] - 0.2 * want[4], rel=1e-9)
+    assert made.phase_rad(U, V) == pytest.approx(
+        0.3 * want[3] - 0.2 * want[4], rel=1e-9
+    )
     assert made.bends()
 
 
 def test_answers_travel_in_micrometres_radians_and_one():
-    sides = {"width_nm": 5.0, "length_nm": -3.0, "turn_deg": 0.4, "pedestal_nm": 2.0, "cap_nm": -6.0}
+    sides = {
+        "width_nm": 5.0,
+        "length_nm": -3.0,
+        "turn_deg": 0.4,
+        "pedestal_nm": 2.0,
+        "cap_nm": -6.0,
+    }
     made = State.of({"height_nm": -7.0, "index": 0.013, "sidewall_deg": 0.9, **sides})
-    want = [-7e-3, 0.013, math.radians(0.9), 5e-3, -3e-3, math.radians(0.4), 2e-3, -6e-3]
+    want = [
+        -7e-3,
+        0.013,
+        math.radians(0.9),
+        5e-3,
+        -3e-3,
+        math.radians(0.4),
+        2e-3,
+        -6e-3,
+    ]
     assert made.answers() == pytest.approx(want, rel=1e-12)
     assert not State.of().amounts.any()
     assert len(State.of().amounts) == len(CAUSES)
 
 
 def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
-    """b(V) = 1 - exp(-V²), V the normalised frequency: n_eff² = around² + b (n² - around²)."""
+    """b(V) = 1 - exp(-V²), V the normalised frequency: n_eff² = around² + b (n² -
+    around²).
+    """
     contrast = n**2 - around**2
-    return np.sqrt(around**2 + (1 - np.exp(-((k * d / 2) ** 2) * contrast / 9)) * contrast)
+    return np.sqrt(
+        around**2 + (1 - np.exp(-((k * d / 2) ** 2) * contrast / 9)) * contrast
+    )
 
 
 def test_quick_derivatives_are_those_of_guides_of_one_mode():
-    """By differences of exp(i k n_eff h): height, index (b of D √(n² - n0²)), a wall about half height."""
-    d, h, n, wall, k = np.array([0.11, 0.17, 0.23]), 0.62, 3.1, math.radians(2.5), 2 * math.pi / 0.85
+    """By differences of exp(i k n_eff h): height, index (b of D √(n² - n0²)), a wall
+    about half height.
+    """
+    d, h, n, wall, k = (
+        np.array([0.11, 0.17, 0.23]),
+        0.62,
+        3.1,
+        math.radians(2.5),
+        2 * math.pi / 0.85,
+    )
     step = 1e-4
     up, down = effective(d + step, n), effective(d - step, n)
     here = effective(d, n)
-    guide = Guide(k, d, here, (up - down) / (2 * step), (up - 2 * here + down) / step**2, n, 1.3, h, wall)
+    guide = Guide(
+        k,
+        d,
+        here,
+        (up - down) / (2 * step),
+        (up - 2 * here + down) / step**2,
+        n,
+        1.3,
+        h,
+        wall,
+    )
     rows = {row.name: row.acts.quick(guide) for _, row in causes.of_kind(Answers)}
     assert rows["height_nm"] == pytest.approx(1j * k * here, rel=1e-9)
     by_index = (effective(d, n + 1e-5) - effective(d, n - 1e-5)) / 2e-5
     assert rows["index"] == pytest.approx(1j * k * h * by_index, rel=1e-5)
-    z = (np.arange(400) + 0.5) / 400 * h - h / 2  # a frustum: D + 2 z tan(wall), to second order in the wall
+    z = (
+        np.arange(400) + 0.5
+    ) / 400 * h - h / 2  # a frustum: D + 2 z tan(wall), to second order in the wall
 
     def phase(lean):
         at = d[:, None] + 2 * z * lean
         second = guide.effective[:, None] + (at - d[:, None]) * guide.slope[:, None]
-        return k * (second + (at - d[:, None]) ** 2 / 2 * guide.curvature[:, None]).mean(1) * h
+        return (
+            k
+            * (second + (at - d[:, None]) ** 2 / 2 * guide.curvature[:, None]).mean(1)
+            * h
+        )
 
     by_wall = (phase(wall + 1e-4) - phase(wall - 1e-4)) / 2e-4
     assert rows["sidewall_deg"] == pytest.approx(1j * by_wall, rel=1e-4)
-    by_diameter = 1j * k * h * guide.slope  # of one side, the mean of both polarisations: half of it
+    by_diameter = (
+        1j * k * h * guide.slope
+    )  # of one side, the mean of both polarisations: half of it
     assert rows["width_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert rows["length_nm"] == pytest.approx(by_diameter / 2, rel=1e-12)
     assert not rows["turn_deg"].any()
@@ -103,21 +158,36 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
 
 def test_changed_cells_have_so_much_more_of_the_cause():
     cell = Cell(0.4, 0.6, Index(3.1, 0.02), sidewall_rad=0.03)
-    rows = {row.name: row.acts.changed(cell, 0.011, 0.85) for _, row in causes.of_kind(Answers) if row.acts.changed}
+    rows = {
+        row.name: row.acts.changed(cell, 0.011, 0.85)
+        for _, row in causes.of_kind(Answers)
+        if row.acts.changed
+    }
     assert len(rows) == 3
     assert rows["height_nm"].height_um == pytest.approx(0.611)
-    assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx((3.111, 0.02))
+    assert (rows["index"].pillar.n, rows["index"].pillar.k) == pytest.approx(
+        (3.111, 0.02)
+    )
     assert rows["sidewall_deg"].sidewall_rad == pytest.approx(0.041)
 
 
 @pytest.mark.parametrize(
     ("films", "heights"),
-    [((None, "SiO2", None), (0.103, 0.2, 0.309)), (("HfO2", "SiO2", "HfO2"), (0.102, 0.204, 0.306))],
+    [
+        ((None, "SiO2", None), (0.103, 0.2, 0.309)),
+        (("HfO2", "SiO2", "HfO2"), (0.102, 0.204, 0.306)),
+    ],
 )
 def test_a_taller_layered_pillar_is_taller_in_its_own_material(films, heights):
-    """12 nm in proportion to the heights of its sections; of all where none is of the pillar's material."""
-    layers = tuple(Layer(h, material=film) for h, film in zip((0.1, 0.2, 0.3), films, strict=True))
-    acts = next(row.acts for _, row in causes.of_kind(Answers) if row.name == "height_nm")
+    """12 nm in proportion to the heights of its sections; of all where none is of the
+    pillar's material.
+    """
+    layers = tuple(
+        Layer(h, material=film) for h, film in zip((0.1, 0.2, 0.3), films, strict=True)
+    )
+    acts = next(
+        row.acts for _, row in causes.of_kind(Answers) if row.name == "height_nm"
+    )
     made = acts.changed(Cell(0.4, 0.6, layers=layers), 0.012, 0.85)
     assert [layer.height_um for layer in made.layers] == pytest.approx(heights)
     assert made.height_um == pytest.approx(0.612)
@@ -133,15 +203,22 @@ def test_slopes_go_on_along_their_tangents_beyond_the_diameters_they_were_made_f
         )
     for d, edge in ((0.05, 0.1), (0.5, 0.35)):
         o = edge - 0.2
-        want = [r[0] + r[1] * o + r[2] * o * o + (d - edge) * (r[1] + 2 * r[2] * o) for r in rows]
+        want = [
+            r[0] + r[1] * o + r[2] * o * o + (d - edge) * (r[1] + 2 * r[2] * o)
+            for r in rows
+        ]
         assert made.at(np.array([d, 0.2]))[:, 0] == pytest.approx(
             [*want, *[0] * (COUNT - 2)]
         )  # the other causes are not there
-        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx([*rows[:, 0], *[0] * (COUNT - 2)])
+        assert made.at(np.array([d, 0.2]))[:, 1] == pytest.approx(
+            [*rows[:, 0], *[0] * (COUNT - 2)]
+        )
 
 
 def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_series():
-    """Of two pillars: ln t by three causes, the middle one solved as 0.5 + 0.3 a - 2 a²; the proxy says 0.45."""
+    """Of two pillars: ln t by three causes, the middle one solved as 0.5 + 0.3 a - 2
+    a²; the proxy says 0.45.
+    """
     slopes = RNG.normal(size=(3, 2)) + 1j * RNG.normal(size=(3, 2))
     slopes[1] = 0
     flat = np.zeros((3, 3, 2), complex)
@@ -156,11 +233,17 @@ def test_a_change_multiplies_slopes_as_exponentials_and_solved_causes_by_their_s
     assert made.factor(np.zeros(3)) == pytest.approx(flat[0, 0] / proxy, rel=1e-12)
     rates = made.rates(amounts)
     assert rates[[0, 2]] == pytest.approx(slopes[[0, 2]])
-    assert rates[1] == pytest.approx((flat[1, 1] + 2 * flat[1, 2] * 0.07) / row, rel=1e-12)
+    assert rates[1] == pytest.approx(
+        (flat[1, 1] + 2 * flat[1, 2] * 0.07) / row, rel=1e-12
+    )
     step = np.array([0, 1e-6, 0])
-    by_difference = np.log(made.factor(amounts + step) / made.factor(amounts - step)) / 2e-6
+    by_difference = (
+        np.log(made.factor(amounts + step) / made.factor(amounts - step)) / 2e-6
+    )
     assert rates[1] == pytest.approx(by_difference, rel=1e-6)
-    assert Answer(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(plain, rel=1e-12)
+    assert Answer(slopes, None, np.ones(1)).factor(amounts) == pytest.approx(
+        plain, rel=1e-12
+    )
 
 
 class Line:
@@ -183,49 +266,76 @@ class Line:
 
 def test_beyond_the_proxy_phase_and_transmission_go_on_along_their_tangents():
     d = np.array([0.05, 0.2, 0.36, 1.2, -0.3])
-    phase = np.array([7 * 0.1 + 20 * 0.01 - 0.05 * 11, 7 * 0.2 + 20 * 0.04, 7 * 0.3 + 1.8 + 0.06 * 19]) + 0.1
+    phase = (
+        np.array(
+            [
+                7 * 0.1 + 20 * 0.01 - 0.05 * 11,
+                7 * 0.2 + 20 * 0.04,
+                7 * 0.3 + 1.8 + 0.06 * 19,
+            ]
+        )
+        + 0.1
+    )
     level = np.array([0.85, 0.7, 0.54])
     got = response.designed(Line(), d, 0.85, angle_rad=0.1)
     assert got[:3] == pytest.approx(level * np.exp(1j * phase), rel=1e-12)
-    assert np.abs(got[3:]) == pytest.approx([1e-3, 1], abs=1e-12)  # held within 0.001 and 1
+    assert np.abs(got[3:]) == pytest.approx(
+        [1e-3, 1], abs=1e-12
+    )  # held within 0.001 and 1
     rows = np.array([[0.3j, 0, 0], [2.0, 0, 0], [0, 0, 0]])
     response_ = Sensitivity(rows, 0.2)
-    changed = response.transmission(Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1)
+    changed = response.transmission(
+        Line(), response_, d[:3], 0.85, answering(0.5, -0.1, 3.0), angle_rad=0.1
+    )
     assert changed == pytest.approx(got[:3] * np.exp(0.15j - 0.2), rel=1e-12)
 
 
 def test_what_a_solver_has_stands_for_the_proxy_within_its_diameters():
-    """t of the middle cause solved over three diameters; its slope is not counted a second time."""
+    """t of the middle cause solved over three diameters; its slope is not counted a
+    second time.
+    """
     at = np.array([0.12, 0.18, 0.24, 0.28])
     powers = np.zeros((3, 2, 4), complex)
     powers[:, 0] = 0.8 * np.exp(1j * (7.2 * at + 19 * at**2))
     powers[1, 1] = (3 + 2j) * at
     solved = Solved(0.85, at, powers)
-    slopes = Sensitivity(np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved)
+    slopes = Sensitivity(
+        np.array([[0.3j, 0], [9.0, 1.0], [0.1, 0]]), 0.2, solved=solved
+    )
     made = response.answer(Line(), slopes, np.array([0.18, 0.24]))
     amounts = answering(0.5, 0.02, -0.3)
     want = powers[0, 0, 1:3] + 0.02 * powers[1, 1, 1:3]
     proxy = response.designed(Line(), at[1:3], 0.85)
-    assert made.factor(amounts) * proxy == pytest.approx(want * np.exp(0.15j - 0.03), rel=1e-9)
+    assert made.factor(amounts) * proxy == pytest.approx(
+        want * np.exp(0.15j - 0.03), rel=1e-9
+    )
     beyond = response.answer(Line(), slopes, np.array([0.1, 0.3]))
     ends = response.designed(Line(), at[[0, 3]], 0.85)
-    assert beyond.factor(answering()) == pytest.approx(powers[0, 0, [0, 3]] / ends, rel=1e-9)
+    assert beyond.factor(answering()) == pytest.approx(
+        powers[0, 0, [0, 3]] / ends, rel=1e-9
+    )
 
 
 def test_a_solver_s_t_stands_where_the_proxy_s_tangent_has_gone_dark():
-    """The proxy of |T| = 0.9 - D falls to nothing at 0.9 um; the solver has 0.31 there, at every height."""
+    """The proxy of |T| = 0.9 - D falls to nothing at 0.9 um; the solver has 0.31 there,
+    at every height.
+    """
     at = np.array([0.2, 0.5, 0.95, 1.1])
     powers = np.zeros((3, 2, 4), complex)
     powers[:, 0] = 0.31 * np.exp(5j * at)
     powers[0, 1] = 0.7j * powers[0, 0]
-    slopes = Sensitivity(np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers))
+    slopes = Sensitivity(
+        np.array([[9.0], [0.2j], [0.1]]), 0.2, solved=Solved(0.85, at, powers)
+    )
     amounts = answering(0.02)
     got = response.transmission(Line(), slopes, at, 0.85, amounts)
     assert got == pytest.approx(powers[0, 0] * (1 + 0.014j), rel=1e-9)
 
 
 def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylinders():
-    """phase = k n_eff h; the thinnest: Rayleigh's cylinders across the field, of a fill of 5 %."""
+    """phase = k n_eff h; the thinnest: Rayleigh's cylinders across the field, of a fill
+    of 5 %.
+    """
     cell = Cell(0.4, 0.6, Index(3.1), between=Index(1.2))
     d = np.linspace(0.1, 0.3, 21)
     made = response.guide(cell, Line(), 0.85, d)
@@ -236,7 +346,9 @@ def test_effective_indices_follow_from_the_phase_and_start_at_that_of_thin_cylin
     assert made.effective == pytest.approx(want, rel=1e-9)
     assert made.slope == pytest.approx((7 + 40 * d) / (k * 0.6), rel=1e-6)
     assert made.curvature == pytest.approx(np.full(21, 40 / (k * 0.6)), rel=1e-4)
-    assert (made.k, made.index, made.around, made.height_um) == pytest.approx((k, 3.1, 1.2, 0.6))
+    assert (made.k, made.index, made.around, made.height_um) == pytest.approx(
+        (k, 3.1, 1.2, 0.6)
+    )
 
 
 def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
@@ -249,7 +361,11 @@ def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
         wavelength_um=0.85,
     )
     made = response.sensitivity(lens)
-    assert (made.low_um, made.high_um, made.error) == (0.12, 0.3, 0.5)  # of the lens, within the proxy's
+    assert (made.low_um, made.high_um, made.error) == (
+        0.12,
+        0.3,
+        0.5,
+    )  # of the lens, within the proxy's
     d = np.linspace(0.12, 0.3, 61)
     guide = response.guide(lens.cell, lens.proxy, 0.85, d)
     for n, (_, row) in enumerate(causes.of_kind(Answers)):
@@ -258,7 +374,10 @@ def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
 
 def test_the_table_says_what_the_documents_say():
     """Prior, bound and unit of the rows that a fit opens by default."""
-    rows = {row.name: (row.scale, row.sigma, row.low, row.high, row.unit, row.free) for row in CAUSES}
+    rows = {
+        row.name: (row.scale, row.sigma, row.low, row.high, row.unit, row.free)
+        for row in CAUSES
+    }
     assert rows["bias_nm"] == (1.0, 15.0, -26.0, 26.0, 1e-3, True)
     for name in ("bias_x_nm", "bias_y_nm", "bias_r_nm"):
         assert rows[name] == (1.0, 10.0, -15.0, 15.0, 1e-3, True)
@@ -266,5 +385,12 @@ def test_the_table_says_what_the_documents_say():
         assert rows[name] == (1.0, 10.0, -15.0, 15.0, 1e-3, False)
     assert rows["height_nm"] == (5.0, 10.0, -28.0, 28.0, 1e-3, True)
     assert rows["index"] == (0.02, 0.02, -0.075, 0.075, 1.0, False)
-    assert rows["sidewall_deg"] == (0.3, 0.5, -1.6, 1.6, pytest.approx(math.pi / 180), False)
+    assert rows["sidewall_deg"] == (
+        0.3,
+        0.5,
+        -1.6,
+        1.6,
+        pytest.approx(math.pi / 180),
+        False,
+    )
     assert rows["coma_x_rad"] == (0.05, 1.0, -6.0, 6.0, 1.0, True)

@@ -1,4 +1,6 @@
-"""Pillars by their own shape: derivatives of ln t against differences of the same truncation, and their error bar."""
+"""Pillars by their own shape: derivatives of ln t against differences of the same
+truncation, and their error bar.
+"""
 
 import dataclasses
 import math
@@ -14,24 +16,51 @@ from metalens.pillars import Proxy
 from metalens.rcwa import jones, pattern
 
 WAVE, SIZE, RATIO, ANGLE = 0.85, 0.23, 0.62, 0.2
-CELL = Cell(0.4, 0.57, Index(2.6), Index(1.45), Index(1.1), Index(1.05), shape=Rectangle(RATIO, ANGLE))
+CELL = Cell(
+    0.4,
+    0.57,
+    Index(2.6),
+    Index(1.45),
+    Index(1.1),
+    Index(1.05),
+    shape=Rectangle(RATIO, ANGLE),
+)
 ROWS = named(Answers)
 
 
 def lens(cell=CELL, *, hand="", tilted_light=False):
-    phase, level, most = np.array([[4.6, 4.2, 0.5]]), np.array([[0.83, 0.02]]), 0.2 if tilted_light else 0.0
+    phase, level, most = (
+        np.array([[4.6, 4.2, 0.5]]),
+        np.array([[0.83, 0.02]]),
+        0.2 if tilted_light else 0.0,
+    )
     phase, level = (table[None] if tilted_light else table for table in (phase, level))
     proxy = Proxy(phase, level, (0.1, 0.3), (0.85, 0.85), 0.0, 0.0, max_angle_rad=most)
     sizes = np.full((3, 4), 0.2)
     turns = {"angle_rad": np.full((3, 4), 0.3)} if hand else {}
-    return Lens(DiameterMap(sizes, 0.4, **turns), cell, proxy, WAVE, 150.0, 1500.0, "map", hand=hand)
+    return Lens(
+        DiameterMap(sizes, 0.4, **turns),
+        cell,
+        proxy,
+        WAVE,
+        150.0,
+        1500.0,
+        "map",
+        hand=hand,
+    )
 
 
 @pytest.fixture
 def few_orders(monkeypatch):
-    """Three orders, and one field of normals for all: any has the same limit, and the usual one moves with its rim."""
+    """Three orders, and one field of normals for all: any has the same limit, and the
+    usual one moves with its rim.
+    """
     own_tables, fixed = pattern.normal_tables, (Ellipse(1.0).outline(0.24),)
-    monkeypatch.setattr(pattern, "normal_tables", lambda outlines, cell, reach: own_tables(fixed, cell, reach))
+    monkeypatch.setattr(
+        pattern,
+        "normal_tables",
+        lambda outlines, cell, reach: own_tables(fixed, cell, reach),
+    )
     monkeypatch.setattr(own, "_UPRIGHT", (2, 3))
 
 
@@ -43,23 +72,37 @@ def changed(name, x):
         return dataclasses.replace(CELL, pillar=Index(2.6 + x)), SIZE
     if name == "turn_deg":
         return dataclasses.replace(CELL, shape=Rectangle(RATIO, ANGLE + x)), SIZE
-    width, length = SIZE + (name == "width_nm") * x, RATIO * SIZE + (name == "length_nm") * x
+    width, length = (
+        SIZE + (name == "width_nm") * x,
+        RATIO * SIZE + (name == "length_nm") * x,
+    )
     return dataclasses.replace(CELL, shape=Rectangle(length / width, ANGLE)), width
 
 
-SEEN = {  # of the Jones matrix: light along x, the mean of both, right-handed light that leaves left-handed
+# of the Jones matrix: light along x, the mean of both, right-handed light that leaves
+# left-handed
+SEEN = {
     "along x": ({}, lambda j: j[0, 0]),
     "of any kind": ({"tilted_light": True}, lambda j: (j[0, 0] + j[1, 1]) / 2),
-    "right": ({"hand": "right"}, lambda j: (j[0, 0] - j[1, 1] + 1j * (j[0, 1] + j[1, 0])) / 2),
-    "left": ({"hand": "left"}, lambda j: (j[0, 0] - j[1, 1] - 1j * (j[0, 1] + j[1, 0])) / 2),
+    "right": (
+        {"hand": "right"},
+        lambda j: (j[0, 0] - j[1, 1] + 1j * (j[0, 1] + j[1, 0])) / 2,
+    ),
+    "left": (
+        {"hand": "left"},
+        lambda j: (j[0, 0] - j[1, 1] - 1j * (j[0, 1] + j[1, 0])) / 2,
+    ),
 }
 
 
 @pytest.mark.parametrize("edged", [True, False])
 def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged):
-    """Slopes of a few Chebyshev polynomials of the size at the nodes of the ninth: up to the fifth degree they come
-    back, what the seventh has is the error, root mean square over the nodes, where sums of products of the polynomials
-    are 9 or 9/2 or nothing. A row a millionth as large as the largest errs by more and does not count."""
+    """Slopes of a few Chebyshev polynomials of the size at the nodes of the ninth: up
+    to the fifth degree they come
+    back, what the seventh has is the error, root mean square over the nodes, where sums
+    of products of the polynomials
+    are 9 or 9/2 or nothing. A row a millionth as large as the largest errs by more and
+    does not count."""
     rows = {
         0: {0: 2.0 - 0.3j, 3: 0.7j, 5: -0.2},
         1: {0: 0.4, 1: 1.1 + 0.2j, 7: 0.09},
@@ -70,7 +113,10 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
 
     def table(terms, size_um):
         unit = (size_um - (low + high) / 2) / ((high - low) / 2)
-        return sum((c * np.cos(n * np.arccos(np.clip(unit, -1, 1))) for n, c in terms.items()), 0j * unit)
+        return sum(
+            (c * np.cos(n * np.arccos(np.clip(unit, -1, 1))) for n, c in terms.items()),
+            0j * unit,
+        )
 
     def solved(lens, size_um):
         rates = np.array([table(rows.get(i, {}), size_um) for i in range(len(ROWS))])
@@ -78,8 +124,13 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
 
     monkeypatch.setattr(response, "own_rates", solved)
     found = response.sensitivity(lens())
-    power = [sum(abs(c) ** 2 * (1 if n == 0 else 0.5) for n, c in rows[i].items()) for i in range(3)]
-    assert found.error == pytest.approx(0.013 + 0.09 * math.sqrt(0.5) / math.sqrt(power[1]), rel=1e-9)
+    power = [
+        sum(abs(c) ** 2 * (1 if n == 0 else 0.5) for n, c in rows[i].items())
+        for i in range(3)
+    ]
+    assert found.error == pytest.approx(
+        0.013 + 0.09 * math.sqrt(0.5) / math.sqrt(power[1]), rel=1e-9
+    )
     at = np.array([0.117, 0.18, 0.26])
     for i in range(3):
         kept = {n: c for n, c in rows[i].items() if n <= 5}
@@ -92,34 +143,50 @@ def test_series_over_the_sizes_err_by_what_they_cannot_follow(monkeypatch, edged
 
 
 @pytest.mark.parametrize("light", SEEN)
-def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(light, few_orders):
+def test_derivatives_are_the_differences_of_the_light_that_the_proxy_is_of(
+    light, few_orders
+):
     """Central differences over 0.1 nm, mrad, 1e-4: their order leaves 1e-6."""
     about, seen = SEEN[light]
     found = own_rates(lens(**about), np.array([0.17, SIZE]))
 
     def slope(at):
-        more, less = (np.log(seen(jones(*at(x), WAVE, harmonics=3).t)) for x in (1e-4, -1e-4))
+        more, less = (
+            np.log(seen(jones(*at(x), WAVE, harmonics=3).t)) for x in (1e-4, -1e-4)
+        )
         return (more - less) / 2e-4
 
     for name in ("height_nm", "index", "turn_deg", "width_nm", "length_nm"):
         want = slope(lambda x, name=name: changed(name, x))
         assert found.rates[ROWS.index(name), 1] == pytest.approx(want, rel=1e-4), name
-    grown = slope(lambda x: (dataclasses.replace(CELL, layers=(Layer(CELL.height_um, x),)), SIZE))
+    grown = slope(
+        lambda x: (dataclasses.replace(CELL, layers=(Layer(CELL.height_um, x),)), SIZE)
+    )
     wider = slope(lambda x: (CELL, SIZE + x))
     assert found.edges[1] == pytest.approx(grown - wider, rel=1e-4)
     assert abs(found.edges[1]) > 0.1 * abs(wider)
 
 
 @pytest.mark.parametrize(("angle", "rows"), [(0.0, 6), (1e-5, 6), (0.004, 7)])
-def test_the_error_is_the_largest_change_from_the_coarser_truncation(angle, rows, monkeypatch, few_orders):
-    """Of every row that is there, however little it does: a turn that a mirror of the cell all but forbids is not."""
+def test_the_error_is_the_largest_change_from_the_coarser_truncation(
+    angle, rows, monkeypatch, few_orders
+):
+    """Of every row that is there, however little it does: a turn that a mirror of the
+    cell all but forbids is not.
+    """
     straight = lens(dataclasses.replace(CELL, shape=Rectangle(RATIO, angle)))
     sizes = np.array([0.17, SIZE, 0.26])
     fine = own_rates(straight, sizes)
     monkeypatch.setattr(own, "_UPRIGHT", (1, 2))
     coarse = own_rates(straight, sizes)
-    pairs = zip(*(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True)
-    moved = [np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in pairs if np.abs(a).max() > 1e-4]
+    pairs = zip(
+        *(np.vstack([one.rates, one.edges]) for one in (fine, coarse)), strict=True
+    )
+    moved = [
+        np.linalg.norm(a - b) / np.linalg.norm(a)
+        for a, b in pairs
+        if np.abs(a).max() > 1e-4
+    ]
     assert len(moved) == rows
     assert fine.error == pytest.approx(max(moved), rel=1e-9)
 
@@ -135,18 +202,26 @@ def test_a_cause_of_which_no_number_tells_goes_by_differences(few_orders, monkey
     monkeypatch.setattr(causes, "CAUSES", untold)
     found = own_rates(lens(**about), sizes)
     for name in ("height_nm", "index"):
-        assert found.rates[ROWS.index(name)] == pytest.approx(exact.rates[ROWS.index(name)], rel=0.02), name
-    assert not found.rates[[ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]].any()
+        assert found.rates[ROWS.index(name)] == pytest.approx(
+            exact.rates[ROWS.index(name)], rel=0.02
+        ), name
+    assert not found.rates[
+        [ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]
+    ].any()
 
 
 def test_round_pillars_keep_their_form_as_their_edges_move(few_orders):
     found = own_rates(lens(dataclasses.replace(CELL, shape=Circle())), np.array([SIZE]))
     assert not found.edges.any()
-    assert not found.rates[[ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]].any()
+    assert not found.rates[
+        [ROWS.index(name) for name in ("width_nm", "length_nm", "turn_deg")]
+    ].any()
 
 
 def in_layers(x=0.0):
-    """Foot and pillar of its own material, 3 to 4, a spacer between them and a residual mask on top."""
+    """Foot and pillar of its own material, 3 to 4, a spacer between them and a residual
+    mask on top.
+    """
     layers = (
         Layer(0.21 + 3 / 7 * x, grow_um=0.02),
         Layer(0.04, material=Index(1.5)),
@@ -157,10 +232,17 @@ def in_layers(x=0.0):
 
 
 def test_the_height_of_a_layered_pillar_is_that_of_its_own_material(few_orders):
-    """Differences of cells whose sections are written out by hand, over 0.1 nm: their order leaves 1e-6."""
+    """Differences of cells whose sections are written out by hand, over 0.1 nm: their
+    order leaves 1e-6.
+    """
     found = own_rates(lens(in_layers()), np.array([SIZE]))
-    more, less = (np.log(jones(in_layers(x), SIZE, WAVE, harmonics=3).t[0, 0]) for x in (1e-4, -1e-4))
-    assert found.rates[ROWS.index("height_nm"), 0] == pytest.approx((more - less) / 2e-4, rel=1e-4)
+    more, less = (
+        np.log(jones(in_layers(x), SIZE, WAVE, harmonics=3).t[0, 0])
+        for x in (1e-4, -1e-4)
+    )
+    assert found.rates[ROWS.index("height_nm"), 0] == pytest.approx(
+        (more - less) / 2e-4, rel=1e-4
+    )
 
 
 def on_films(pedestal_um=0.0, cap_um=0.0):
@@ -171,7 +253,9 @@ def on_films(pedestal_um=0.0, cap_um=0.0):
         Layer(0.41),
         Layer(0.05 + cap_um, grow_um=-0.015, material=Index(1.9, 0.02)),
     )
-    return dataclasses.replace(CELL, height_um=0.55 + pedestal_um + cap_um, layers=layers)
+    return dataclasses.replace(
+        CELL, height_um=0.55 + pedestal_um + cap_um, layers=layers
+    )
 
 
 @pytest.mark.parametrize("film", ["pedestal", "cap"])
@@ -180,14 +264,18 @@ def test_films_under_and_on_a_pillar_have_heights_of_their_own(film, few_orders)
     found = own_rates(lens(on_films()), np.array([SIZE]))
     ends = (on_films(**{f"{film}_um": x}) for x in (1e-4, -1e-4))
     more, less = (np.log(jones(end, SIZE, WAVE, harmonics=3).t[0, 0]) for end in ends)
-    assert found.rates[ROWS.index(f"{film}_nm"), 0] == pytest.approx((more - less) / 2e-4, rel=1e-4)
+    assert found.rates[ROWS.index(f"{film}_nm"), 0] == pytest.approx(
+        (more - less) / 2e-4, rel=1e-4
+    )
 
 
 def test_a_pillar_has_a_pedestal_and_a_cap_where_films_of_another_material_are():
     assert lacking(on_films()) == ()
     assert lacking(in_layers()) == ("pedestal_nm",)
     assert lacking(CELL) == ("pedestal_nm", "cap_nm")
-    bare = dataclasses.replace(CELL, height_um=0.3, layers=(Layer(0.3, material=Index(1.9)),))  # nothing is its own
+    bare = dataclasses.replace(
+        CELL, height_um=0.3, layers=(Layer(0.3, material=Index(1.9)),)
+    )  # nothing is its own
     assert lacking(bare) == ("pedestal_nm", "cap_nm")
 
 
@@ -201,7 +289,9 @@ def test_a_pillar_cut_into_two_sections_answers_as_the_whole(few_orders):
 
 
 @pytest.mark.parametrize(("wall_rad", "harmonics"), [(0.0, [6, 8]), (0.02, [5, 6])])
-def test_the_truncations_are_coarser_where_a_tilted_wall_is_many_layers(monkeypatch, wall_rad, harmonics):
+def test_the_truncations_are_coarser_where_a_tilted_wall_is_many_layers(
+    monkeypatch, wall_rad, harmonics
+):
     seen = []
 
     def gather(work, about, tasks):

@@ -15,7 +15,9 @@ def test_a_table_of_the_bias_lies_beside_the_file_that_names_it(tmp_path):
     """Wherever the command runs, and in its place."""
     (tmp_path / "fab").mkdir()
     (tmp_path / "fab" / "bias.csv").write_text("drawn,bias\n90.5,-8\n250,1.25\n")
-    (tmp_path / "fab" / "p.toml").write_text('[rules]\ndiameter_step_nm = 3\n[bias]\ncsv = "bias.csv"\n')
+    (tmp_path / "fab" / "p.toml").write_text(
+        '[rules]\ndiameter_step_nm = 3\n[bias]\ncsv = "bias.csv"\n'
+    )
     made = of_process(tmp_path / "fab" / "p.toml")
     assert made.bias.table_nm == ((90.5, -8.0), (250.0, 1.25))
     assert made.bias.csv is None

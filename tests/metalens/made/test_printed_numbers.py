@@ -10,7 +10,9 @@ from metalens.made.spread import Spread
 
 def test_each_entry_is_taken_and_the_rest_is_as_ever(tmp_path):
     file = tmp_path / "p.toml"
-    file.write_text("[bias]\ncurve_nm = [-4.5, 1.5]\n[rules]\ndiameter_step_nm = 5.0\nminimum_gap_nm = 61.0\n")
+    file.write_text(
+        "[bias]\ncurve_nm = [-4.5, 1.5]\n[rules]\ndiameter_step_nm = 5.0\nminimum_gap_nm = 61.0\n"
+    )
     assert of_process(file) == Printed(Bias(curve_nm=(-4.5, 1.5)), Spread(), 5.0)
     file.write_text("[bias]\nisolated_nm = 3.5\n")
     assert of_process(file) == Printed(Bias(isolated_nm=3.5), Spread(), 2)

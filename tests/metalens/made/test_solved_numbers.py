@@ -9,7 +9,9 @@ D = np.array([0.08, 0.11, 0.15, 0.18, 0.22])
 
 
 def test_a_cubic_of_the_diameter_is_held_in_every_power_of_every_cause():
-    """(causes, orders, diameters): unlike counts, so that none of the axes can be taken for another."""
+    """(causes, orders, diameters): unlike counts, so that none of the axes can be taken
+    for another.
+    """
     factors = np.array([[1.0, 2.0 - 0.5j], [0.3j, 4.0], [-1.1, 0.7j]])
 
     def curve(d):
@@ -19,4 +21,6 @@ def test_a_cubic_of_the_diameter_is_held_in_every_power_of_every_cause():
     asked = np.array([[0.09, 0.13], [0.2, 0.08], [0.215, 0.1]])
     found = solved.series(asked)
     assert found.shape == (3, 2, 3, 2)
-    assert found == pytest.approx(factors[:, :, None, None] * curve(asked), rel=1e-12)  # rounding of the spline
+    assert found == pytest.approx(
+        factors[:, :, None, None] * curve(asked), rel=1e-12
+    )  # rounding of the spline

@@ -1,4 +1,6 @@
-"""Two half-spaces without a layer, at an angle: Fresnel's formulas by the angles of Snell's law."""
+"""Two half-spaces without a layer, at an angle: Fresnel's formulas by the angles of
+Snell's law.
+"""
 
 import math
 
@@ -11,13 +13,27 @@ from metalens.modal.case import Case, film
 @pytest.mark.parametrize("p", [False, True])
 @pytest.mark.parametrize("angle", [0.0, 0.31])
 def test_amplitudes_are_those_of_fresnel(p, angle):
-    """Light from n = 1.45 to 1.2; powers of a unit flux along the normal, so t is √(cos ratio) times the textbook's."""
+    """Light from n = 1.45 to 1.2; powers of a unit flux along the normal, so t is √(cos
+    ratio) times the textbook's.
+    """
     n1, n2, k0 = 1.45, 1.2, 2.3
     inside = math.asin(n1 * math.sin(angle) / n2)
     c1, c2 = math.cos(angle), math.cos(inside)
-    r = (n1 * c2 - n2 * c1) / (n2 * c1 + n1 * c2) if p else (n1 * c1 - n2 * c2) / (n1 * c1 + n2 * c2)
+    r = (
+        (n1 * c2 - n2 * c1) / (n2 * c1 + n1 * c2)
+        if p
+        else (n1 * c1 - n2 * c2) / (n1 * c1 + n2 * c2)
+    )
     case = Case(
-        rho=0.4, k0=k0, height=0.0, below=n1**2, above=n2**2, disc=4.0, around=1.0, bloch=k0 * n1 * math.sin(angle), p=p
+        rho=0.4,
+        k0=k0,
+        height=0.0,
+        below=n1**2,
+        above=n2**2,
+        disc=4.0,
+        around=1.0,
+        bloch=k0 * n1 * math.sin(angle),
+        p=p,
     )
     made = film(case)
     assert abs(made[0, 0]) == pytest.approx(abs(r), rel=1e-12)

@@ -1,4 +1,6 @@
-"""One modal case: a cell and a light in half pitches by hand, what is strange about it, what is refused."""
+"""One modal case: a cell and a light in half pitches by hand, what is strange about it,
+what is refused.
+"""
 
 import math
 from dataclasses import replace
@@ -10,14 +12,35 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes.round import Circle
 from metalens.ground.errors import CellError
-from metalens.modal.case import RARER, Case, Solution, case_of, check_shape, film, half_spaces, plane_of_incidence
+from metalens.modal.case import (
+    RARER,
+    Case,
+    Solution,
+    case_of,
+    check_shape,
+    film,
+    half_spaces,
+    plane_of_incidence,
+)
 
 CELL = Cell(0.4, 0.7, Index(3.0, 0.2), Index(1.5), Index(1.2), Index(1.1))
-USUAL = Case(rho=0.4, k0=1.2, height=3.0, below=2.1, above=1.4, disc=9.0, around=1.2, bloch=0.3, p=False)
+USUAL = Case(
+    rho=0.4,
+    k0=1.2,
+    height=3.0,
+    below=2.1,
+    above=1.4,
+    disc=9.0,
+    around=1.2,
+    bloch=0.3,
+    p=False,
+)
 
 
 def test_lengths_are_in_half_pitches_and_indices_are_squared():
-    """Half a pitch is 0.2: k0 = 2 pi 0.2 / 0.8, height 0.7 / 0.2, kx = k0 sin 30°, (3 + 0.2i)² = 8.96 + 1.2i."""
+    """Half a pitch is 0.2: k0 = 2 pi 0.2 / 0.8, height 0.7 / 0.2, kx = k0 sin 30°, (3 +
+    0.2i)² = 8.96 + 1.2i.
+    """
     case = case_of(CELL, 0.25, Light(0.8, math.pi / 6, "s"))
     assert case.rho == pytest.approx(0.625, rel=1e-12)
     assert case.k0 == pytest.approx(math.pi / 2, rel=1e-12)
@@ -31,10 +54,16 @@ def test_lengths_are_in_half_pitches_and_indices_are_squared():
 
 def test_light_from_the_other_side_has_the_same_phase():
     there, back = (case_of(CELL, 0.25, Light(0.8, angle, "p")) for angle in (0.2, -0.2))
-    assert there.bloch == back.bloch == pytest.approx(math.pi / 2 * math.sin(0.2), rel=1e-12)
+    assert (
+        there.bloch
+        == back.bloch
+        == pytest.approx(math.pi / 2 * math.sin(0.2), rel=1e-12)
+    )
 
 
-@pytest.mark.parametrize(("phase", "kept"), [(0.9e-6, False), (1.1e-6, True), (-1.1e-6, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("phase", "kept"), [(0.9e-6, False), (1.1e-6, True), (-1.1e-6, True), (0.0, False)]
+)
 def test_a_phase_below_a_millionth_is_normal_incidence(phase, kept):
     """k0 is pi / 2 in half pitches; of so small an angle the sine is the angle."""
     case = case_of(CELL, 0.25, Light(0.8, phase / (math.pi / 2), "s"))
@@ -43,12 +72,26 @@ def test_a_phase_below_a_millionth_is_normal_incidence(phase, kept):
 
 @pytest.mark.parametrize(
     ("azimuth", "axis"),
-    [(0.0, "x"), (0.5, "y"), (-0.5, "y"), (1.0, "x"), (1.5, "y"), (2.5, "y"), (-1.0, "x"), (2.0, "x")],
+    [
+        (0.0, "x"),
+        (0.5, "y"),
+        (-0.5, "y"),
+        (1.0, "x"),
+        (1.5, "y"),
+        (2.5, "y"),
+        (-1.0, "x"),
+        (2.0, "x"),
+    ],
 )
 def test_the_plane_of_incidence_turns_by_quarters(azimuth, axis):
-    """azimuth: in parts of pi. The field along the axis of the plane is p, and across it s."""
+    """azimuth: in parts of pi. The field along the axis of the plane is p, and across
+    it s.
+    """
     assert plane_of_incidence(Light(0.8, 0.2, "s", azimuth * math.pi)) == axis
-    p = {name: case_of(CELL, 0.25, Light(0.8, 0.2, name, azimuth * math.pi)).p for name in "xysp"}
+    p = {
+        name: case_of(CELL, 0.25, Light(0.8, 0.2, name, azimuth * math.pi)).p
+        for name in "xysp"
+    }
     assert p == {axis: True, "xy".replace(axis, ""): False, "s": False, "p": True}
 
 
@@ -66,7 +109,9 @@ def test_planes_off_the_axes_are_refused_where_there_is_an_angle():
 def test_half_spaces_have_their_indices_and_absorb_nothing():
     assert half_spaces(CELL, Light(0.8, 1.5)) == (1.5, 1.2)
     for name in ("substrate", "cover"):
-        with pytest.raises(CellError, match=rf"{name} absorbs \(index \(1.4\+1e-06j\)\)"):
+        with pytest.raises(
+            CellError, match=rf"{name} absorbs \(index \(1.4\+1e-06j\)\)"
+        ):
             half_spaces(replace(CELL, **{name: Index(1.4, 1e-6)}), Light(0.8))
 
 
@@ -108,14 +153,22 @@ def test_films_and_tilted_walls_are_no_case_of_the_elements(more):
 
 def test_holes_and_layers_are_told_by_their_names():
     for more in ({"shape": Circle(hole=True)}, {"layers": (Layer(0.3), Layer(0.4))}):
-        with pytest.raises(CellError, match="the modal engine takes round pillars on a square lattice, not"):
+        with pytest.raises(
+            CellError,
+            match="the modal engine takes round pillars on a square lattice, not",
+        ):
             case_of(replace(CELL, **more), 0.2, Light(0.8))
 
 
-@pytest.mark.parametrize(("disc", "around"), [(9.0, 4.0), (4.0, 9.0), (-9.0, 4.0), (9j, 4.0), (1.0, -5.4 + 7.2j)])
+@pytest.mark.parametrize(
+    ("disc", "around"),
+    [(9.0, 4.0), (4.0, 9.0), (-9.0, 4.0), (9j, 4.0), (1.0, -5.4 + 7.2j)],
+)
 def test_size_counts_waves_in_the_medium_of_the_larger_permittivity(disc, around):
     """A pitch is 2: k0 3 2 / 2 pi waves of index 3."""
-    assert replace(USUAL, k0=0.7, disc=disc, around=around).size == pytest.approx(0.7 * 3 / math.pi, rel=1e-12)
+    assert replace(USUAL, k0=0.7, disc=disc, around=around).size == pytest.approx(
+        0.7 * 3 / math.pi, rel=1e-12
+    )
 
 
 EDGE = 1e-9
@@ -129,11 +182,20 @@ WAVES = math.pi / 3  # k0 of one wave in a pitch, in a disc of index 3
         ({"height": 0.5}, {"height": 0.5 - EDGE}),
         ({"height": 16.0}, {"height": 16.0 + EDGE}),
         ({"k0": 2 * WAVES - EDGE}, {"k0": 2 * WAVES + EDGE}),
-        ({"k0": WAVES, "below": 9.922}, {"k0": WAVES, "below": 9.923}),  # sqrt(9.9225) / 3 = 1.05 waves
+        (
+            {"k0": WAVES, "below": 9.922},
+            {"k0": WAVES, "below": 9.923},
+        ),  # sqrt(9.9225) / 3 = 1.05 waves
         ({"k0": WAVES, "above": 9.922}, {"k0": WAVES, "above": 9.923}),
         ({"bloch": 1.0}, {"bloch": 1.0 + EDGE}),
-        ({"around": 1.2 * 2.1 - EDGE}, {"around": 1.2 * 2.1 + EDGE}),  # of the denser half-space
-        ({"around": 1.2 * 2.1 - EDGE, "below": 1.0, "above": 2.1}, {"around": 1.2 * 2.1 + EDGE, "above": 1.0}),
+        (
+            {"around": 1.2 * 2.1 - EDGE},
+            {"around": 1.2 * 2.1 + EDGE},
+        ),  # of the denser half-space
+        (
+            {"around": 1.2 * 2.1 - EDGE, "below": 1.0, "above": 2.1},
+            {"around": 1.2 * 2.1 + EDGE, "above": 1.0},
+        ),
     ],
 )
 def test_a_cell_is_strange_from_each_of_its_bounds_on(inside, outside):
@@ -156,11 +218,23 @@ def test_a_disc_of_the_rarer_medium_is_strangest():
 def test_forms_are_apart_by_waves_and_rim_together():
     one = Solution(np.eye(2), waves=0.25, rim=0.5, drift=0.1, energy=1.0, unknowns=3)
     assert one.spread == 0.75
-    assert (one.grazing, one.beside, one.bloch, one.size, one.strange, one.damping) == (0, 0, 0, 0, 0, 1)
+    assert (one.grazing, one.beside, one.bloch, one.size, one.strange, one.damping) == (
+        0,
+        0,
+        0,
+        0,
+        0,
+        1,
+    )
 
 
-@pytest.mark.parametrize(("p", "r", "t"), [(False, 1 / 3, 2 * math.sqrt(2) / 3), (True, 1 / 9, 4 * math.sqrt(5) / 9)])
+@pytest.mark.parametrize(
+    ("p", "r", "t"),
+    [(False, 1 / 3, 2 * math.sqrt(2) / 3), (True, 1 / 9, 4 * math.sqrt(5) / 9)],
+)
 def test_a_film_of_no_height_reflects_as_its_half_spaces_do(p, r, t):
-    """k0 = kx = 2, permittivities 5 and 2: kz 4 and 2. Admittances in s 4 and 2; in p 5 / 4 and 2 / 2."""
+    """k0 = kx = 2, permittivities 5 and 2: kz 4 and 2. Admittances in s 4 and 2; in p 5
+    / 4 and 2 / 2.
+    """
     found = film(replace(USUAL, k0=2.0, bloch=2.0, below=5.0, above=2.0, p=p))
     assert found == pytest.approx(np.array([[r, t], [t, -r]]), rel=1e-12)

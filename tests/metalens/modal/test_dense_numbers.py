@@ -1,4 +1,6 @@
-"""Dense symmetric algebra on matrices of a few rows, whose factors and eigenvalues are known by hand."""
+"""Dense symmetric algebra on matrices of a few rows, whose factors and eigenvalues are
+known by hand.
+"""
 
 import numpy as np
 import pytest
@@ -7,8 +9,12 @@ from metalens.modal import dense
 
 EXACT = {"rel": 1e-13, "abs": 1e-13}  # some tens of roundings of float64
 L = np.array([[2.0, 0, 0], [1, 3, 0], [-4, 0.5, 5]])
-DEFINITE = np.array([[4.0, 99, 99], [2, 10, 99], [-8, -2.5, 41.25]])  # L Lᵀ; what stands above counts for nothing
-SPIN = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1.0]])  # a turn: columns of unit length
+DEFINITE = np.array(
+    [[4.0, 99, 99], [2, 10, 99], [-8, -2.5, 41.25]]
+)  # L Lᵀ; what stands above counts for nothing
+SPIN = np.array(
+    [[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1.0]]
+)  # a turn: columns of unit length
 LEVELS = np.array([-3.0, 2.0, 7.0])
 
 
@@ -20,7 +26,9 @@ def symmetric(levels, vectors):
 
 def alike(found, want):
     """Whether columns are the same up to their signs."""
-    return np.abs(found * np.sign((found * want).sum(0))) == pytest.approx(np.abs(want), **EXACT) and np.abs(
+    return np.abs(found * np.sign((found * want).sum(0))) == pytest.approx(
+        np.abs(want), **EXACT
+    ) and np.abs(
         np.abs((found * want).sum(0)) - (want**2).sum(0)
     ).max() == pytest.approx(0, abs=1e-12)
 
@@ -42,9 +50,13 @@ def test_the_factor_is_lower_and_what_solves_with_it_inverts_it():
 
 def test_inverse_and_gram_are_lower_halves():
     whole = np.linalg.inv(L @ L.T)
-    assert dense.definite_inverse(DEFINITE.copy()) == pytest.approx(np.tril(whole), **EXACT)
+    assert dense.definite_inverse(DEFINITE.copy()) == pytest.approx(
+        np.tril(whole), **EXACT
+    )
     wide = np.array([[1.0, 2, -3], [0.5, 4, 7]])
-    assert dense.gram(wide) == pytest.approx(np.array([[1.25, 0, 0], [4, 20, 0], [0.5, 22, 58]]), **EXACT)
+    assert dense.gram(wide) == pytest.approx(
+        np.array([[1.25, 0, 0], [4, 20, 0], [0.5, 22, 58]]), **EXACT
+    )
 
 
 def test_a_congruence_leaves_out_rows_without_a_diagonal_alone():
@@ -67,7 +79,9 @@ def test_eigenvalues_rise_and_their_vectors_are_columns():
 def test_pairs_are_those_of_the_two_matrices():
     """matrix = L (turn levels turnᵀ) Lᵀ with definite = L Lᵀ has x = L⁻ᵀ turn."""
     whole = L @ ((SPIN * LEVELS) @ SPIN.T) @ L.T
-    value, vectors = dense.eigen_pairs(np.where(np.tri(3), whole, 99.0), DEFINITE.copy())
+    value, vectors = dense.eigen_pairs(
+        np.where(np.tri(3), whole, 99.0), DEFINITE.copy()
+    )
     assert value == pytest.approx(LEVELS, **EXACT)
     assert alike(vectors, np.linalg.inv(L.T) @ SPIN)
 

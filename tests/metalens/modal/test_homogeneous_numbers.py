@@ -1,4 +1,6 @@
-"""Modes of the empty cell on a coarse mesh: orthonormal, diagonal, and the disc's matrices in their coordinates."""
+"""Modes of the empty cell on a coarse mesh: orthonormal, diagonal, and the disc's
+matrices in their coordinates.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ def cell(request):
 
 @pytest.fixture(scope="module", params=["plain", "careful", "quick"])
 def made(cell, request):
-    return homogeneous.modes(cell, careful=request.param == "careful", quick=request.param == "quick")
+    return homogeneous.modes(
+        cell, careful=request.param == "careful", quick=request.param == "quick"
+    )
 
 
 TIGHT = 1e-7  # the quick way loses up to eight digits
@@ -42,7 +46,9 @@ def test_wavenumbers_are_those_of_the_dense_problems(cell, made):
     want = sl.eigh(g.T @ cell.cell.mass @ g, cell.cell.scalar, eigvals_only=True)
     assert made.tm == pytest.approx(want, rel=TIGHT, abs=TIGHT)
     every = sl.eigh(cell.cell.curl, cell.cell.mass, eigvals_only=True)
-    assert np.concatenate([np.zeros(len(made.tm)), made.te]) == pytest.approx(every, rel=TIGHT, abs=TIGHT * every[-1])
+    assert np.concatenate([np.zeros(len(made.tm)), made.te]) == pytest.approx(
+        every, rel=TIGHT, abs=TIGHT * every[-1]
+    )
     assert made.te.min() >= 0
 
 
@@ -50,11 +56,15 @@ def test_gradients_of_the_scalars_are_the_tm_modes(cell, made):
     f = made.scalar
     assert f.T @ cell.cell.scalar @ f == pytest.approx(np.eye(len(made.tm)), abs=TIGHT)
     raised = cell.gradient @ f
-    assert made.vector[:, len(made.te) :] * np.sqrt(made.tm) == pytest.approx(raised, abs=1e-6 * np.abs(raised).max())
+    assert made.vector[:, len(made.te) :] * np.sqrt(made.tm) == pytest.approx(
+        raised, abs=1e-6 * np.abs(raised).max()
+    )
 
 
 def test_the_careful_way_is_taken_where_both_are_asked(cell):
-    both, careful = (homogeneous.modes(cell, careful=True, quick=quick) for quick in (True, False))
+    both, careful = (
+        homogeneous.modes(cell, careful=True, quick=quick) for quick in (True, False)
+    )
     assert np.array_equal(both.tm, careful.tm)
     assert np.array_equal(both.te, careful.te)
 
@@ -62,12 +72,18 @@ def test_the_careful_way_is_taken_where_both_are_asked(cell):
 def test_the_discs_matrices_are_in_the_modes_coordinates(cell, made):
     v, a = made.vector, len(made.te)
     assert made.disc_mass == pytest.approx(v.T @ cell.disc.mass @ v, abs=TIGHT)
-    assert made.disc_curl == pytest.approx(v[:, :a].T @ cell.disc.curl @ v[:, :a], abs=TIGHT * made.te.max())
-    assert made.disc_scalar == pytest.approx(made.scalar.T @ cell.disc.scalar @ made.scalar, abs=TIGHT)
+    assert made.disc_curl == pytest.approx(
+        v[:, :a].T @ cell.disc.curl @ v[:, :a], abs=TIGHT * made.te.max()
+    )
+    assert made.disc_scalar == pytest.approx(
+        made.scalar.T @ cell.disc.scalar @ made.scalar, abs=TIGHT
+    )
 
 
 def test_the_zero_order_is_given_its_exact_wavenumber(cell, made):
-    """kx² of a Bloch wave, in half pitches half its phase; 0 where there is none, of the uniform field."""
+    """kx² of a Bloch wave, in half pitches half its phase; 0 where there is none, of
+    the uniform field.
+    """
     exact = (cell.half_phase_rad or 0.0) ** 2
     for found, plain in ((made.te_exact, made.te), (made.tm_exact, made.tm)):
         assert found[1:] == pytest.approx(np.maximum(plain[1:], 0), abs=1e-12)

@@ -1,4 +1,6 @@
-"""The modal engine against closed forms, invariants, its own two forms, and the slower methods."""
+"""The modal engine against closed forms, invariants, its own two forms, and the slower
+methods.
+"""
 
 import math
 from types import SimpleNamespace
@@ -26,7 +28,9 @@ COARSE = RUNGS[0].choice(0.5).plan
 
 
 def cell(height=0.7, n=3.6, k=0.0, pitch=0.4, substrate=1.4525, cover=1.0, between=1.0):
-    return Cell(pitch, height, Index(n, k), Index(substrate), Index(cover), Index(between))
+    return Cell(
+        pitch, height, Index(n, k), Index(substrate), Index(cover), Index(between)
+    )
 
 
 def rungs(errors, plans=None, told=None):
@@ -38,7 +42,12 @@ def rungs(errors, plans=None, told=None):
             return estimate
 
         plan = n if plans is None else plans[n]
-        return SimpleNamespace(name=f"n{n}", weak=0.1 * n, choice=lambda rho: SimpleNamespace(plan=plan), error=error)
+        return SimpleNamespace(
+            name=f"n{n}",
+            weak=0.1 * n,
+            choice=lambda rho: SimpleNamespace(plan=plan),
+            error=error,
+        )
 
     return tuple(one(n, estimate) for n, estimate in enumerate(errors))
 
@@ -46,9 +55,27 @@ def rungs(errors, plans=None, told=None):
 @pytest.mark.parametrize(
     ("strange", "tolerance", "errors", "last", "error"),
     [
-        (False, 0.03, (0.9, 0.9, 0.9, 0.9, 0.02, 0.01), 4, 0.02),  # 3 is where it begins
-        (True, 0.03, (0.9, 1e-9, 1e-9, 0.7, 0.02, 0.01), 4, 0.02),  # from 1 on; the first two tell nothing
-        (True, 0.03, (0.9, 1e-9, 1e-9, 0.7, 0.8, 0.75), 3, 0.7),  # none meets it: the least of those that tell
+        (
+            False,
+            0.03,
+            (0.9, 0.9, 0.9, 0.9, 0.02, 0.01),
+            4,
+            0.02,
+        ),  # 3 is where it begins
+        (
+            True,
+            0.03,
+            (0.9, 1e-9, 1e-9, 0.7, 0.02, 0.01),
+            4,
+            0.02,
+        ),  # from 1 on; the first two tell nothing
+        (
+            True,
+            0.03,
+            (0.9, 1e-9, 1e-9, 0.7, 0.8, 0.75),
+            3,
+            0.7,
+        ),  # none meets it: the least of those that tell
         (False, 0.02, (0.9, 0.9, 0.9, 0.9, 0.02, 0.01), 4, 0.02),
     ],
 )
@@ -59,9 +86,15 @@ def test_meshes_are_refined_until_an_estimate_that_tells_meets_the_tolerance(
     begun = (tolerance, 0.4) if strange else (tolerance, 0.4, 1.7)
     monkeypatch.setattr(engine, "RUNGS", rungs(errors, told=told))
     monkeypatch.setattr(engine, "first_rung", lambda *asked: 3 if asked == begun else 5)
-    monkeypatch.setattr(engine, "evaluate", lambda case, plan, weak: (plan, round(10 * weak)))
+    monkeypatch.setattr(
+        engine, "evaluate", lambda case, plan, weak: (plan, round(10 * weak))
+    )
     made = engine.climb(SimpleNamespace(strange=strange, rho=0.4, size=1.7), tolerance)
-    assert (made.solution, made.rung.name, made.error) == ((last, last), f"n{last}", error)
+    assert (made.solution, made.rung.name, made.error) == (
+        (last, last),
+        f"n{last}",
+        error,
+    )
     assert made.converged is (error <= tolerance)
     assert ("meets" in made.reason) is made.converged
     first = 1 if strange else 3
@@ -74,7 +107,9 @@ def test_a_mesh_that_is_the_one_before_is_not_solved_again(monkeypatch):
     solved = []
     monkeypatch.setattr(engine, "RUNGS", rungs((0.9, 0.5, 0.01, 0.2), plans="aabb"))
     monkeypatch.setattr(engine, "first_rung", lambda *asked: 0)
-    monkeypatch.setattr(engine, "evaluate", lambda case, plan, weak: solved.append(plan) or plan)
+    monkeypatch.setattr(
+        engine, "evaluate", lambda case, plan, weak: solved.append(plan) or plan
+    )
     made = engine.climb(SimpleNamespace(strange=False, rho=0.4, size=1.7), 0.05)
     assert solved == ["a", "b"]
     assert (made.solution, made.error) == ("b", 0.01)
@@ -88,25 +123,35 @@ def film(n, height, wavelength=WAVELENGTH, below=1.4525, above=1.0):
     return t12 * phase / (1 + r1 * r2 * phase**2)
 
 
-# --- both forms -----------------------------------------------------------------------------------------------
+# --- both forms
+# -----------------------------------------------------------------------------------------------
 
 
 def test_modes_of_both_forms_are_paired_by_nearness_not_by_order():
     """Two close modes that change places, and a third that only one form has."""
-    one, other = np.array([9.1, 4.02, 4.0 + 0.3j, 1.5]), np.array([9.0, 4.01 + 0.29j, 4.05])
+    one, other = (
+        np.array([9.1, 4.02, 4.0 + 0.3j, 1.5]),
+        np.array([9.0, 4.01 + 0.29j, 4.05]),
+    )
     pairs = nearest_pairs(one, other)
     assert sorted(map(tuple, pairs.tolist())) == [(0, 0), (1, 2), (2, 1)]
     assert nearest_pairs(one, other[:0]).shape == (0, 2)
 
 
-# --- elements -------------------------------------------------------------------------------------------------
+# --- elements
+# -------------------------------------------------------------------------------------------------
 
 
 def test_slopes_are_orthonormal_and_integrate_to_the_values():
-    for line in (plain(5, 12), rim(4, 28, (0.7, 1.3), False), rim(4, 28, (0.7, 1.3), True)):
+    for line in (
+        plain(5, 12),
+        rim(4, 28, (0.7, 1.3), False),
+        rim(4, 28, (0.7, 1.3), True),
+    ):
         gram = (line.slope * line.weight) @ line.slope.T
         assert np.abs(gram - np.eye(line.degree)).max() < 1e-11
-        # partial integration: bubbles vanish at both ends, so their mean times 1 is minus <s, slope>
+        # partial integration: bubbles vanish at both ends, so their mean times 1 is
+        # minus <s, slope>
         mean = line.value[2:] @ line.weight
         assert np.abs(mean + line.slope[1:] @ (line.weight * line.point)).max() < 1e-12
 
@@ -125,7 +170,8 @@ def test_curl_of_gradient_vanishes():
 @pytest.mark.parametrize("rho", [0.025, 0.5, 0.975])
 def test_areas_of_disc_and_cell(rho):
     geometry = assemble(rho, PLAN)
-    # constants are the sum of the vertex functions: those that the gradient sends to zero together
+    # constants are the sum of the vertex functions: those that the gradient sends to
+    # zero together
     _, _, right = np.linalg.svd(geometry.gradient)
     one = right[-1] / right[-1][np.argmax(np.abs(right[-1]))]
     assert abs(one @ geometry.cell.scalar @ one - 1) < 1e-10
@@ -134,7 +180,9 @@ def test_areas_of_disc_and_cell(rho):
 
 @pytest.mark.parametrize("half_phase", [None, 0.4])
 def test_scalars_beyond_the_disc_have_no_gradient_in_it(half_phase):
-    """And each of the others has: what counts is told by the numbering alone, and by the integrals."""
+    """And each of the others has: what counts is told by the numbering alone, and by
+    the integrals.
+    """
     one = space(assemble(0.43, PLAN), electric=True, half_phase_rad=half_phase)
     assert (one.within == np.flatnonzero(one.disc.scalar.diagonal())).all()
     assert 0.4 < len(one.within) / len(one.disc.scalar) < 0.8
@@ -146,7 +194,11 @@ def test_scalars_beyond_the_disc_have_no_gradient_in_it(half_phase):
 
 def test_every_edge_is_shared_with_one_direction():
     mesh = build(PLAN)
-    keys = {pair for patch in mesh.patches for pair in zip(patch.vector.ravel(), patch.vector.ravel(), strict=True)}
+    keys = {
+        pair
+        for patch in mesh.patches
+        for pair in zip(patch.vector.ravel(), patch.vector.ravel(), strict=True)
+    }
     assert len(keys) == len(mesh.vector_wall)
     walls = (mesh.vector_wall & (X0 | X1)) != 0
     assert 0 < walls.sum() < len(walls) / 2
@@ -161,7 +213,8 @@ def test_matrix_rates_against_central_differences():
     for got, high, low in zip(rate, plus, minus, strict=True):
         for name in ("mass", "curl", "scalar"):
             want = (getattr(high, name) - getattr(low, name)) / (2 * step)
-            # differences of order step² = 1e-10 of the matrix, rounding 1e-16 / step; a mapped core has no rate at all
+            # differences of order step² = 1e-10 of the matrix, rounding 1e-16 / step; a
+            # mapped core has no rate at all
             scale = np.abs(getattr(high, name)).max()
             assert np.abs(getattr(got, name) - want).max() < 1e-7 * scale
 
@@ -169,7 +222,11 @@ def test_matrix_rates_against_central_differences():
 @pytest.mark.parametrize("half_phase", [None, 0.3, 1.2])
 def test_empty_cell_has_plane_waves_as_modes(half_phase):
     basis = modes(space(assemble(0.5, PLAN), electric=True, half_phase_rad=half_phase))
-    along = range(1, 5) if half_phase is None else [half_phase / math.pi + m for m in range(-4, 4)]
+    along = (
+        range(1, 5)
+        if half_phase is None
+        else [half_phase / math.pi + m for m in range(-4, 4)]
+    )
     exact = np.array(sorted(m**2 + n**2 for m in along for n in range(1, 5)))[:3]
     got = basis.tm[:3] / math.pi**2
     assert np.abs(got / exact - 1).max() < 4e-2  # smooth waves on 5 cubic elements
@@ -186,13 +243,16 @@ def test_plane_waves_converge_exponentially_with_the_degree():
     assert errors[2] < errors[1] / 5
 
 
-# --- solutions with a known answer ---------------------------------------------------------------------------------
+# --- solutions with a known answer
+# ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-9, 0.01, 0.7, 5.0, 50.0])
 def test_pillar_of_air_is_a_film_of_air(height):
     got = modal.solve(cell(height, n=1.0), 0.2, WAVELENGTH)
-    assert abs(got.t - film(1.0, height)) < 1e-10 + 1e-10 * height  # q to 1e-11, times k0 h
+    assert (
+        abs(got.t - film(1.0, height)) < 1e-10 + 1e-10 * height
+    )  # q to 1e-11, times k0 h
     assert got.converged
 
 
@@ -208,12 +268,24 @@ def test_oblique_homogeneous_layer_is_fresnel(polarization):
     layer = cell(0.7, n=2.0, between=2.0)
     k0, kx = 2 * math.pi / WAVELENGTH, 2 * math.pi / WAVELENGTH * math.sin(angle)
     kz = [np.sqrt((k0 * n) ** 2 - kx**2 + 0j) for n in (1.4525, 2.0, 1.0)]
-    y = [k / n**2 if polarization == "p" else k for k, n in zip(kz, (1.4525, 2.0, 1.0), strict=True)]
+    y = [
+        k / n**2 if polarization == "p" else k
+        for k, n in zip(kz, (1.4525, 2.0, 1.0), strict=True)
+    ]
     r1, r2 = (y[0] - y[1]) / (y[0] + y[1]), (y[1] - y[2]) / (y[1] + y[2])
-    t12 = 4 * np.sqrt(y[0] * y[1]) / (y[0] + y[1]) * np.sqrt(y[1] * y[2]) / (y[1] + y[2])
+    t12 = (
+        4 * np.sqrt(y[0] * y[1]) / (y[0] + y[1]) * np.sqrt(y[1] * y[2]) / (y[1] + y[2])
+    )
     phase = np.exp(1j * kz[1] * 0.7)
     want = t12 * phase / (1 + r1 * r2 * phase**2)
-    got = modal.solve(layer, 0.2, WAVELENGTH, angle_rad=angle, polarization=polarization, tolerance=1e-3)
+    got = modal.solve(
+        layer,
+        0.2,
+        WAVELENGTH,
+        angle_rad=angle,
+        polarization=polarization,
+        tolerance=1e-3,
+    )
     assert abs(got.t - want) < got.t_error
     assert got.t_error < 1e-3
 
@@ -230,7 +302,9 @@ def test_lossless_energy_and_reciprocity(diameter):
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_lossless_energy_and_reciprocity_oblique(polarization):
-    solution = evaluate(case_of(cell(), 0.272, Light(WAVELENGTH, math.radians(5), polarization)), COARSE)
+    solution = evaluate(
+        case_of(cell(), 0.272, Light(WAVELENGTH, math.radians(5), polarization)), COARSE
+    )
     s = solution.matrix
     assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
     assert abs(s[0, 1] - s[1, 0]) < 1e-12
@@ -244,7 +318,9 @@ def test_reciprocity_with_absorption():
 
 def test_swap_of_sides_turns_the_scattering_matrix_round():
     there = evaluate(case_of(cell(), 0.2, Light(WAVELENGTH)), COARSE).matrix
-    back = evaluate(case_of(cell(substrate=1.0, cover=1.4525), 0.2, Light(WAVELENGTH)), COARSE).matrix
+    back = evaluate(
+        case_of(cell(substrate=1.0, cover=1.4525), 0.2, Light(WAVELENGTH)), COARSE
+    ).matrix
     assert np.abs(back - there[::-1, ::-1]).max() < 1e-11
 
 
@@ -256,7 +332,9 @@ def test_scaling_all_lengths_changes_nothing():
 
 def test_polarisations_are_equal_at_normal_incidence():
     answers = {
-        modal.solve(cell(), 0.2, WAVELENGTH, polarization=p, azimuth_rad=a).t for p in "xysp" for a in (0.0, 1.0)
+        modal.solve(cell(), 0.2, WAVELENGTH, polarization=p, azimuth_rad=a).t
+        for p in "xysp"
+        for a in (0.0, 1.0)
     }
     assert len(answers) == 1
 
@@ -267,11 +345,15 @@ def test_geometric_mean_of_unitary_matrices_is_unitary_and_symmetric():
     u, v = a @ a.T, a @ np.diag(np.exp(1j * np.array([0.02, -0.05]))) @ a.T
     mean = geometric_mean(u, v)
     assert np.abs(mean.conj().T @ mean - np.eye(2)).max() < 1e-14
-    assert np.abs(mean - a @ np.diag(np.exp(0.5j * np.array([0.02, -0.05]))) @ a.T).max() < 1e-14
+    assert (
+        np.abs(mean - a @ np.diag(np.exp(0.5j * np.array([0.02, -0.05]))) @ a.T).max()
+        < 1e-14
+    )
     assert np.abs(mean - mean.T).max() < 1e-14
 
 
-# --- hard cases ------------------------------------------------------------------------------------------------------
+# --- hard cases
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("height", [50.0, 1000.0])
@@ -281,25 +363,37 @@ def test_hard_tall_pillars_stay_unitary(height):
 
 
 def test_hard_touching_pillars_on_a_mesh_of_their_own():
-    """Elements that shrink towards the point of contact, up to a gap of 4 pm; RCWA takes the touching ones as they are.
+    """Elements that shrink towards the point of contact, up to a gap of 4 pm; RCWA
+    takes the touching ones as they are.
 
     t still moves by 7e-3 over the last two decades of the gap.
     """
     touching = rcwa.solve(cell(), 0.4, WAVELENGTH, harmonics=11)
     plan = MeshPlan(3, 4, 3, (0.7, 1.45), sectors=(0.15, 1.0))
-    near, nearer = (evaluate(case_of(cell(), 0.4 * (1 - gap), Light(WAVELENGTH)), plan) for gap in (1e-4, 1e-5))
+    near, nearer = (
+        evaluate(case_of(cell(), 0.4 * (1 - gap), Light(WAVELENGTH)), plan)
+        for gap in (1e-4, 1e-5)
+    )
     for solution in (near, nearer):
         s = solution.matrix
         assert np.abs(s.conj().T @ s - np.eye(2)).max() < 1e-12
-        assert abs(s[1, 0] - touching.t) < 0.03  # 377 orders near a resonance that a gap of 0.4 nm moves by 0.6
-        assert touching.t_error < 0.3  # 4.2 (11 orders) x 6 (a cusp) x what the last four truncations moved t and r by
+        assert (
+            abs(s[1, 0] - touching.t) < 0.03
+        )  # 377 orders near a resonance that a gap of 0.4 nm moves by 0.6
+        assert (
+            touching.t_error < 0.3
+        )  # 4.2 (11 orders) x 6 (a cusp) x what the last four truncations moved t and r by
         assert abs(s[0, 0] - touching.r) < touching.t_error > abs(s[1, 0] - touching.t)
     assert abs(near.matrix[1, 0] - nearer.matrix[1, 0]) < 1e-2
 
 
 def test_hard_guided_mode_of_a_thin_layer_of_low_contrast():
-    """A sharp resonance: on the coarsest mesh both forms lie 1e-3 apart, and 0.08 from what coupled waves say."""
-    layer = Cell(0.9505, 0.1774, Index(2.2762), Index(1.7968), Index(1.6359), Index(1.9933))
+    """A sharp resonance: on the coarsest mesh both forms lie 1e-3 apart, and 0.08 from
+    what coupled waves say.
+    """
+    layer = Cell(
+        0.9505, 0.1774, Index(2.2762), Index(1.7968), Index(1.6359), Index(1.9933)
+    )
     waves = rcwa.solve(layer, 0.1899, 0.86503351, harmonics=13)
     got = modal.solve(layer, 0.1899, 0.86503351, tolerance=1e-2)
     assert waves.t_error < 4e-3
@@ -311,7 +405,9 @@ def test_hard_guided_mode_of_a_thin_layer_of_low_contrast():
 def test_hard_substrate_order_at_cutoff(short):
     got = modal.solve(cell(), 0.2, 0.4 * 1.4525 / (1 - short))
     assert np.isfinite([got.t, got.r]).all()
-    assert abs(got.energy - 1) < 1e-9  # rounding times the admittance of an order at its cutoff, 1e8
+    assert (
+        abs(got.energy - 1) < 1e-9
+    )  # rounding times the admittance of an order at its cutoff, 1e8
 
 
 def test_hard_pitch_equals_wavelength():
@@ -323,7 +419,10 @@ def test_hard_pitch_equals_wavelength():
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_hard_tiny_angles_join_normal_incidence(polarization):
-    case = [case_of(cell(), 0.2, Light(WAVELENGTH, a, polarization)) for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)]
+    case = [
+        case_of(cell(), 0.2, Light(WAVELENGTH, a, polarization))
+        for a in (0.0, 1e-12, 1e-8, 1e-5, 1e-3)
+    ]
     t = [evaluate(c, COARSE).matrix[1, 0] for c in case]
     assert t[1] == t[0] == t[2]
     assert abs(t[3] - t[0]) < 1e-7
@@ -339,12 +438,24 @@ def test_hard_grazing(polarization):
 
 
 def test_angle_and_azimuth_have_the_symmetry_of_the_square():
-    one = modal.solve(cell(), 0.2, WAVELENGTH, angle_rad=0.2, polarization="p", tolerance=1e-2).t
-    two = modal.solve(cell(), 0.2, WAVELENGTH, angle_rad=-0.2, polarization="p", tolerance=1e-2).t
-    three = modal.solve(
-        cell(), 0.2, WAVELENGTH, angle_rad=0.2, azimuth_rad=math.pi / 2, polarization="y", tolerance=1e-2
+    one = modal.solve(
+        cell(), 0.2, WAVELENGTH, angle_rad=0.2, polarization="p", tolerance=1e-2
     ).t
-    assert max(abs(two - one), abs(three - one)) < 1e-12  # cos(π/2) is 6e-17; sums of 1e2 to 1e3 terms of order 1
+    two = modal.solve(
+        cell(), 0.2, WAVELENGTH, angle_rad=-0.2, polarization="p", tolerance=1e-2
+    ).t
+    three = modal.solve(
+        cell(),
+        0.2,
+        WAVELENGTH,
+        angle_rad=0.2,
+        azimuth_rad=math.pi / 2,
+        polarization="y",
+        tolerance=1e-2,
+    ).t
+    assert (
+        max(abs(two - one), abs(three - one)) < 1e-12
+    )  # cos(π/2) is 6e-17; sums of 1e2 to 1e3 terms of order 1
 
 
 def test_hard_float32_numbers_are_taken_in_double_precision():
@@ -374,11 +485,18 @@ def test_hard_float32_numbers_are_taken_in_double_precision():
 )
 def test_bad_numbers_are_refused(change, word):
     with pytest.raises(CellError, match=word):
-        modal.solve(**({"cell": cell(), "diameter_um": 0.2, "wavelength_um": 0.85} | change))
+        modal.solve(
+            **({"cell": cell(), "diameter_um": 0.2, "wavelength_um": 0.85} | change)
+        )
 
 
 @pytest.mark.parametrize(
-    "shape", [{"sidewall_rad": 0.02}, {"under": (Film("SiO2", 0.1),)}, {"over": (Film("SiO2", 0.1),)}]
+    "shape",
+    [
+        {"sidewall_rad": 0.02},
+        {"under": (Film("SiO2", 0.1),)},
+        {"over": (Film("SiO2", 0.1),)},
+    ],
 )
 def test_elements_refuse_films_and_tilted_walls_by_name(shape):
     with pytest.raises(CellError, match="upright pillar without films"):
@@ -391,8 +509,12 @@ def test_absorbing_half_space_is_refused():
 
 
 @pytest.mark.parametrize(("asked", "each"), [(4e-3, 8e-4), (6e-6, 2e-6)])
-def test_upright_pillars_that_a_tilted_one_stands_on_are_asked_for_a_fifth_of_its_tolerance(monkeypatch, asked, each):
-    """One at each of four diameters, of the light that was asked for; the modal solver holds no less than 2e-6."""
+def test_upright_pillars_that_a_tilted_one_stands_on_are_asked_for_a_fifth_of_its_tolerance(
+    monkeypatch, asked, each
+):
+    """One at each of four diameters, of the light that was asked for; the modal solver
+    holds no less than 2e-6.
+    """
     told = []
 
     def upright(bare, diameter_um, wavelength_um, **light):
@@ -400,14 +522,22 @@ def test_upright_pillars_that_a_tilted_one_stands_on_are_asked_for_a_fifth_of_it
         return diameter_um
 
     monkeypatch.setattr(engine, "solve", upright)
-    monkeypatch.setattr(engine.anchored, "solve_anchored", lambda *words, tolerance: (words, tolerance))
+    monkeypatch.setattr(
+        engine.anchored, "solve_anchored", lambda *words, tolerance: (words, tolerance)
+    )
     light = Light(0.83, 0.07, "p", math.pi / 2)
     leaning = Cell(0.4, 0.61, sidewall_rad=0.03)
-    (whole, diameter_um, lit, nodes), tolerance = engine._as_built(leaning, 0.2, light, asked)
+    (whole, diameter_um, lit, nodes), tolerance = engine._as_built(
+        leaning, 0.2, light, asked
+    )
     assert (whole, diameter_um, lit, tolerance) == (leaning, 0.2, light, asked)
     half = 0.61 * math.tan(0.03)
     assert [0.2 - half <= node <= 0.2 + half for node in nodes] == [True] * 4
     for wall, wavelength_um, given in told:
         assert (wall, wavelength_um) == (0.0, 0.83)
         assert given.pop("tolerance") == pytest.approx(each, rel=1e-12)
-        assert given == {"angle_rad": 0.07, "azimuth_rad": math.pi / 2, "polarization": "p"}
+        assert given == {
+            "angle_rad": 0.07,
+            "azimuth_rad": math.pi / 2,
+            "polarization": "p",
+        }

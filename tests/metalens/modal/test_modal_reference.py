@@ -1,4 +1,6 @@
-"""The modal engine's answers and error estimates against the committed reference values of hard pillars."""
+"""The modal engine's answers and error estimates against the committed reference values
+of hard pillars.
+"""
 
 import json
 import math
@@ -18,7 +20,11 @@ from metalens.modal.engine import evaluate
 FILE = Path(__file__).parents[3] / "benchmarks" / "results" / "reference_pillars.json"
 ENTRIES = json.loads(FILE.read_text(encoding="utf-8"))["entries"]
 TALL = [e for e in ENTRIES if e["cell"]["height_um"] > 10]
-NORMAL = [e for e in ENTRIES if e["angle_deg"] == 0.0 and e["uncertainty"] < 1e-5 and e not in TALL]
+NORMAL = [
+    e
+    for e in ENTRIES
+    if e["angle_deg"] == 0.0 and e["uncertainty"] < 1e-5 and e not in TALL
+]
 OBLIQUE = [e for e in ENTRIES if e["angle_deg"] == 5.0]
 
 
@@ -28,7 +34,9 @@ def label(entry):
 
 def solve(entry, tolerance):
     parts = entry["cell"]
-    media = [Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")]
+    media = [
+        Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")
+    ]
     return modal.solve(
         Cell(parts["pitch_um"], parts["height_um"], *media),
         entry["diameter_um"],
@@ -42,7 +50,10 @@ def solve(entry, tolerance):
 def test_the_table_is_as_good_as_it_says():
     """Subwavelength lossless cells conserve energy; most entries are known to 1e-6."""
     for entry in ENTRIES:
-        power = np.abs(np.array(entry["t"]) @ [1, 1j]) ** 2 + np.abs(np.array(entry["r"]) @ [1, 1j]) ** 2
+        power = (
+            np.abs(np.array(entry["t"]) @ [1, 1j]) ** 2
+            + np.abs(np.array(entry["r"]) @ [1, 1j]) ** 2
+        )
         lossless = entry["cell"]["pillar"][1] == 0
         assert abs(power - 1) < 1e-11 if lossless else power < 1
     assert np.mean([entry["uncertainty"] < 1e-6 for entry in ENTRIES]) > 0.6
@@ -60,7 +71,9 @@ def test_error_estimate_holds(entry, tolerance):
 
 @pytest.mark.parametrize("entry", TALL, ids=label)
 def test_hard_tall_pillars_know_their_error(entry):
-    """Wavenumbers are wrong by the same share on a mesh, phases by that times the height: estimates grow with it."""
+    """Wavenumbers are wrong by the same share on a mesh, phases by that times the
+    height: estimates grow with it.
+    """
     got = solve(entry, 0.1)
     assert abs(got.t - complex(*entry["t"])) <= got.t_error + entry["uncertainty"]
 
@@ -73,14 +86,17 @@ def test_error_estimate_holds_oblique(entry):
 
 
 def held_against(rung, where, **light):
-    """Bar and error of t: the finer mesh is known by its own estimate, which counts against the bar."""
+    """Bar and error of t: the finer mesh is known by its own estimate, which counts
+    against the bar.
+    """
     cell, diameter, wavelength = where
     case = case_of(cell, diameter, Light(wavelength, **light))
     solution = evaluate(case, rung.choice(case.rho).plan)
     return complex(solution.matrix[1, 0]), rung.error(solution, case.rho)
 
 
-ALIKE = [  # pitch, height, indices of pillar, substrate, cover, between; diameter, wavelength
+# pitch, height, indices of pillar, substrate, cover, between; diameter, wavelength
+ALIKE = [
     ((0.4364, 1.8514), (2.9316, 1.302, 1.0744, 1.1737), (0.2165, 0.8488)),
     ((0.4472, 1.6471), (2.932, 1.4258, 1.0872, 1.2877), (0.2382, 0.9113)),
     ((0.4259, 2.3275), (3.2234, 1.4864, 1.265, 1.0788), (0.187, 0.8666)),
@@ -89,7 +105,8 @@ ALIKE = [  # pitch, height, indices of pillar, substrate, cover, between; diamet
 
 @pytest.mark.parametrize(("size", "media", "where"), ALIKE)
 def test_one_guided_wave_that_both_forms_place_alike(size, media, where):
-    """Tall discs of middle size: the wavenumbers of the forms cross there, so that their difference tells nothing.
+    """Tall discs of middle size: the wavenumbers of the forms cross there, so that
+    their difference tells nothing.
 
     Half the difference of the forms is 2 to 8 times below the error.
     """
@@ -103,21 +120,32 @@ def test_one_guided_wave_that_both_forms_place_alike(size, media, where):
 
 
 def test_error_estimate_holds_for_many_waves_in_a_pitch():
-    """2.5 waves across a tall cell, against the next finer meshes: bars that knew of no dispersion lay 10 % below."""
-    case = Case(0.668, 2.3157, 8.6786, 2.9236, 1.638, 11.8613 + 0j, 1.0997 + 0j, 0.0, False)
+    """2.5 waves across a tall cell, against the next finer meshes: bars that knew of no
+    dispersion lay 10 % below.
+    """
+    case = Case(
+        0.668, 2.3157, 8.6786, 2.9236, 1.638, 11.8613 + 0j, 1.0997 + 0j, 0.0, False
+    )
     best = evaluate(case, RUNGS[3].choice(case.rho).plan)
     doubt = RUNGS[3].error(best, case.rho)
     for rung in (RUNGS[0], RUNGS[2]):
         got = evaluate(case, rung.choice(case.rho).plan)
         error = np.abs(got.matrix - best.matrix).max()
         assert 30 * error > rung.error(got, case.rho) > error - doubt
-        assert got.size == pytest.approx(math.sqrt(11.8613) * 2.3157 / math.pi, rel=1e-9)
+        assert got.size == pytest.approx(
+            math.sqrt(11.8613) * 2.3157 / math.pi, rel=1e-9
+        )
 
 
 def test_error_estimate_holds_below_an_oblique_cutoff():
-    """0.02 degrees before an order of the substrate appears, where 1/kz of that order is large."""
+    """0.02 degrees before an order of the substrate appears, where 1/kz of that order
+    is large.
+    """
     where = Cell(pitch_um=0.45), 0.2, 0.85
-    light = {"angle_rad": math.asin(0.85 / 0.45 - 1.4525) - math.radians(0.02), "polarization": "p"}
+    light = {
+        "angle_rad": math.asin(0.85 / 0.45 - 1.4525) - math.radians(0.02),
+        "polarization": "p",
+    }
     got = modal.solve(*where, **light, tolerance=1e-2)
     want, doubt = held_against(RUNGS[2], where, **light)
     assert abs(got.t - want) <= got.t_error + doubt
@@ -126,20 +154,33 @@ def test_error_estimate_holds_below_an_oblique_cutoff():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("diameter", [1e-6, 1e-12])
 def test_a_diameter_that_elements_cannot_follow_is_refused_by_name(diameter):
-    """A picometre on a pitch of 0.4 um: no error of the linear algebra, no warning, a way out."""
-    with pytest.raises(CellError, match=r"pitches: the elements .* degenerate .* use metalens\.rcwa"):
+    """A picometre on a pitch of 0.4 um: no error of the linear algebra, no warning, a
+    way out.
+    """
+    with pytest.raises(
+        CellError, match=r"pitches: the elements .* degenerate .* use metalens\.rcwa"
+    ):
         modal.solve(Cell(pitch_um=0.4), diameter, 0.85)
 
 
 @pytest.mark.parametrize(
     "entry",
-    [e for e in ENTRIES if e["name"] in ("128", "absorbing 0.1") or (e["diameter_um"], e["angle_deg"]) == (0.2, 10.0)],
+    [
+        e
+        for e in ENTRIES
+        if e["name"] in ("128", "absorbing 0.1")
+        or (e["diameter_um"], e["angle_deg"]) == (0.2, 10.0)
+    ],
     ids=label,
 )
 def test_coupled_waves_agree(entry):
-    """An independent method: Fourier harmonics instead of elements, one field form instead of two."""
+    """An independent method: Fourier harmonics instead of elements, one field form
+    instead of two.
+    """
     parts = entry["cell"]
-    media = [Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")]
+    media = [
+        Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")
+    ]
     got = rcwa.solve(
         Cell(parts["pitch_um"], parts["height_um"], *media),
         entry["diameter_um"],
@@ -153,7 +194,9 @@ def test_coupled_waves_agree(entry):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entry", [e for e in NORMAL if e["uncertainty"] < 1e-6], ids=label)
+@pytest.mark.parametrize(
+    "entry", [e for e in NORMAL if e["uncertainty"] < 1e-6], ids=label
+)
 def test_fine_tolerance(entry):
     got = solve(entry, 2e-5)
     assert got.converged
@@ -162,13 +205,17 @@ def test_fine_tolerance(entry):
 
 @pytest.mark.slow
 def test_error_estimate_holds_on_held_out_pillars():
-    """Random pillars that no factor was chosen on; truth from a mesh whose own estimate is far below."""
+    """Random pillars that no factor was chosen on; truth from a mesh whose own estimate
+    is far below.
+    """
     rng = np.random.default_rng(2024)
     held, total = 0, 0
     for _ in range(60):
         pitch = rng.uniform(0.3, 0.42)
         pillar = Index(rng.uniform(1.8, 4.0), rng.choice([0.0, 0.01, 0.1]))
-        layout = Cell(pitch, rng.uniform(0.2, 1.2), pillar, Index(1.4525), Index(1.0), Index(1.0))
+        layout = Cell(
+            pitch, rng.uniform(0.2, 1.2), pillar, Index(1.4525), Index(1.0), Index(1.0)
+        )
         where = layout, pitch * rng.uniform(0.05, 0.95), rng.uniform(0.8, 1.0)
         truth = modal.solve(*where, tolerance=5e-5)
         for tolerance in (1e-2, 1e-3):

@@ -1,4 +1,6 @@
-"""Libraries over two sizes: closed forms, exchanged axes, a finer solver, and a function with poles that move."""
+"""Libraries over two sizes: closed forms, exchanged axes, a finer solver, and a
+function with poles that move.
+"""
 
 import cmath
 import dataclasses
@@ -18,7 +20,9 @@ SQUARE = Cell(0.35, 0.4, Index(1.7), substrate=Index(1.45), shape=Rectangle())
 CELL = dataclasses.replace(
     SQUARE, lattice=Lattice("rectangular", 1.0)
 )  # the same, and nothing is exchanged to save solves
-SETTINGS = Sweep((0.7,), diameters_um=RANGE, lengths_um=RANGE, samples=35, tolerance=0.1)
+SETTINGS = Sweep(
+    (0.7,), diameters_um=RANGE, lengths_um=RANGE, samples=35, tolerance=0.1
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,19 +31,28 @@ def library():
 
 
 def moving(x, y):
-    """Two components whose common pole moves with both sizes, half-width 0.04 of the span."""
+    """Two components whose common pole moves with both sizes, half-width 0.04 of the
+    span.
+    """
     pole = 1 / (x - 0.35 - 0.3 * y + 0.04j)
-    return np.stack([np.exp(2j * x + 1j * y * x) + 0.03 * pole, np.cos(x - 2 * y) - 0.05j * pole], axis=-1)
+    return np.stack(
+        [np.exp(2j * x + 1j * y * x) + 0.03 * pole, np.cos(x - 2 * y) - 0.05j * pole],
+        axis=-1,
+    )
 
 
 @pytest.mark.parametrize(("count", "most"), [(9, 0.3), (15, 3e-3), (21, 2e-4)])
 def test_a_surface_with_a_moving_pole_converges_and_knows_its_error(count, most):
     nodes = (1 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2
     places = np.linspace(0, 1, 57)
-    made = axes.surface((nodes, nodes), moving(nodes[:, None], nodes), (places, places), tolerance=1e-4)
+    made = axes.surface(
+        (nodes, nodes), moving(nodes[:, None], nodes), (places, places), tolerance=1e-4
+    )
     error = np.abs(made.value - moving(places[:, None], places)).max(axis=-1)
     assert error.max() < most
-    assert np.count_nonzero(error > made.doubt) < 0.02 * error.size  # where neither order sees the pole yet
+    assert (
+        np.count_nonzero(error > made.doubt) < 0.02 * error.size
+    )  # where neither order sees the pole yet
 
 
 def test_a_surface_holds_its_nodes():
@@ -54,7 +67,8 @@ def test_exchanged_sizes_exchange_x_and_y(library):
     assert not axes.record.swaps(CELL, SETTINGS)
     assert axes.record.swaps(SQUARE, SETTINGS)
     t = library.t[0]
-    # solved one by one; normals of places that are as near to either edge of a corner are a matter of rounding
+    # solved one by one; normals of places that are as near to either edge of a corner
+    # are a matter of rounding
     assert np.abs(t - t.swapaxes(0, 1)[..., ::-1, ::-1]).max() < 3e-4
     assert np.abs(t[3, 30, 0, 0] - t[3, 30, 1, 1]) > 0.05  # and they do differ
     assert np.abs(t[..., 0, 1]).max() < 1e-12  # mirrors
@@ -65,16 +79,22 @@ def test_bars_hold_against_a_finer_solver(library):
     assert library.usable.mean() > 0.9
     for i, j in rng.integers(0, 35, (4, 2)):
         x, y = float(library.x_um[i]), float(library.y_um[j])
-        exact = rcwa.jones(axes.sized(SQUARE, x, y), x, 0.7, harmonics=library.harmonics + 4)
+        exact = rcwa.jones(
+            axes.sized(SQUARE, x, y), x, 0.7, harmonics=library.harmonics + 4
+        )
         assert np.abs(exact.t - library.t[0, i, j]).max() < library.t_error[0, i, j]
 
 
 def test_pairs_held_out_lie_within_their_bars(library):
     assert library.missed == 0
-    assert np.median(library.held_out[:, 4] / library.held_out[:, 3]) > 2  # the solver's part is not tried here
+    assert (
+        np.median(library.held_out[:, 4] / library.held_out[:, 3]) > 2
+    )  # the solver's part is not tried here
     assert library.held_out.shape == (24, 5)
     _, x, y, error, _ = library.held_out[7]
-    i, j = (int(np.argmin(np.abs(a - v))) for a, v in ((library.x_um, x), (library.y_um, y)))
+    i, j = (
+        int(np.argmin(np.abs(a - v))) for a, v in ((library.x_um, x), (library.y_um, y))
+    )
     exact = rcwa.jones(axes.sized(SQUARE, x, y), x, 0.7, harmonics=library.harmonics).t
     assert np.abs(exact - library.t[0, i, j]).max() == pytest.approx(error, abs=1e-9)
 
@@ -90,14 +110,24 @@ def film(permittivity, height=0.4, wavelength=0.7, below=1.45):
 
 @pytest.mark.parametrize("shape", [Rectangle(), Ellipse()], ids=lambda s: s.kind)
 def test_weak_pillars_are_a_film_of_the_mean_permittivity(shape):
-    """Beyond it terms of second order in the contrast, depolarisation among them: a quarter at half the contrast."""
+    """Beyond it terms of second order in the contrast, depolarisation among them: a
+    quarter at half the contrast.
+    """
     x, y, share = 0.21, 0.13, {"rectangle": 1.0, "ellipse": math.pi / 4}[shape.kind]
     filled, off = share * x * y / 0.35**2, []
     for contrast in (0.2, 0.1):
-        cell = dataclasses.replace(SQUARE, pillar=Index(math.sqrt(1 + contrast)), shape=shape)
-        rows = workers.work(workers.jones_task(axes.sized(cell, x, y), x, 0.7, tolerance=0.1, reach=4))
+        cell = dataclasses.replace(
+            SQUARE, pillar=Index(math.sqrt(1 + contrast)), shape=shape
+        )
+        rows = workers.work(
+            workers.jones_task(axes.sized(cell, x, y), x, 0.7, tolerance=0.1, reach=4)
+        )
         xx, xy, yx, yy = np.array(rows["t"]) @ (1, 1j)
-        off.append(np.abs([xx - film(1 + filled * contrast), yy - film(1 + filled * contrast)]).max())
+        off.append(
+            np.abs(
+                [xx - film(1 + filled * contrast), yy - film(1 + filled * contrast)]
+            ).max()
+        )
         assert max(abs(xy), abs(yx)) < 1e-12
         assert (np.angle(yy / xx) < 0) == (x > y)  # the longer axis is slower
     assert off[0] < 5e-3

@@ -16,7 +16,9 @@ from metalens.pillars import study as cell_study
 from metalens.pillars import study_plots, workers
 from metalens.pillars.study import Study
 
-SMALL = Study(pitches_um=(0.30, 0.40), heights_um=(0.7,), wavelengths_um=(0.85,), tolerance=1e-2)
+SMALL = Study(
+    pitches_um=(0.30, 0.40), heights_um=(0.7,), wavelengths_um=(0.85,), tolerance=1e-2
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +31,9 @@ def test_known_coverages(verdicts):
     assert narrow.turns == pytest.approx(1.53, abs=0.03)
     assert wide.turns == pytest.approx(0.77, abs=0.03)
     assert narrow.max_angle_deg == 90
-    assert wide.max_angle_deg == pytest.approx(42.3, abs=0.1)  # sin = 0.85/0.40 - 1.4525
+    assert wide.max_angle_deg == pytest.approx(
+        42.3, abs=0.1
+    )  # sin = 0.85/0.40 - 1.4525
     assert film.pillar == "a-Si"
     assert film.turns < 0.6  # the absorbing film of Pierce and Spicer
 
@@ -62,7 +66,9 @@ def test_page_json_and_figure(verdicts, tmp_path):
 
 def test_no_cell_is_said_plainly(verdicts):
     only = dataclasses.replace(SMALL, pitches_um=(0.40,))
-    assert "No cell covers a full turn at 850 nm" in cell_study.markdown(only, verdicts[1:2], command="x")
+    assert "No cell covers a full turn at 850 nm" in cell_study.markdown(
+        only, verdicts[1:2], command="x"
+    )
 
 
 def test_most_phase_of_runs():
@@ -79,68 +85,128 @@ def test_pitch_without_room_is_refused():
 
 def test_pitches_above_cutoff_are_refused_and_named():
     with pytest.raises(CellError, match=r"pitch 0.7 um at 0.85 um: diffraction orders"):
-        cell_study.run(Study(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,)))
+        cell_study.run(
+            Study(pitches_um=(0.3, 0.7), heights_um=(0.5,), wavelengths_um=(0.85,))
+        )
 
 
 def test_other_materials_are_tried_where_they_hold_and_never_the_own_one_again():
-    """a-Si is tabulated from 0.31 to 2.066 um, Si-infrared beyond; what does not hold is said, not stumbled over."""
-    base = dataclasses.replace(SMALL, pitches_um=(0.9,), heights_um=(2.2,), wavelengths_um=(2.5,), pillar=Index(3.48))
+    """a-Si is tabulated from 0.31 to 2.066 um, Si-infrared beyond; what does not hold
+    is said, not stumbled over.
+    """
+    base = dataclasses.replace(
+        SMALL,
+        pitches_um=(0.9,),
+        heights_um=(2.2,),
+        wavelengths_um=(2.5,),
+        pillar=Index(3.48),
+    )
     far = dataclasses.replace(base, others=("a-Si", "Si-infrared", "a-Si"))
     assert cell_study.others(far) == (("Si-infrared",), ("a-Si",))
-    own = dataclasses.replace(base, pillar="Si-infrared", others=("Si-infrared", "TiO2"), wavelengths_um=(1.5,))
+    own = dataclasses.replace(
+        base,
+        pillar="Si-infrared",
+        others=("Si-infrared", "TiO2"),
+        wavelengths_um=(1.5,),
+    )
     assert cell_study.others(own) == (("TiO2",), ())
-    full = cell_study.Verdict(0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i")
-    assert "a-Si was not tried: its source does not hold 2500 nm" in cell_study.markdown(far, [full], command="x")
+    full = cell_study.Verdict(
+        0.9, 2.2, 2.5, 1.3, 0.2, 0.5, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "n = 3.48 + 0i"
+    )
+    assert (
+        "a-Si was not tried: its source does not hold 2500 nm"
+        in cell_study.markdown(far, [full], command="x")
+    )
 
 
 @pytest.mark.parametrize(
     ("cell", "others", "says"),
     [
         (Cell(0.3), ("a_Si",), "unknown material 'a_Si'"),
-        (Cell(0.3, under=(Film("Si-infrared", 0.1),)), ("a-Si",), "Si-infrared at 0.85 um"),
+        (
+            Cell(0.3, under=(Film("Si-infrared", 0.1),)),
+            ("a-Si",),
+            "Si-infrared at 0.85 um",
+        ),
         (Cell(0.3, substrate=Index(1.5, 0.1)), ("a-Si",), "substrate absorbs"),
     ],
 )
-def test_what_cannot_be_solved_is_refused_before_any_cell_is(cell, others, says, monkeypatch):
-    monkeypatch.setattr(workers, "run", lambda tasks: pytest.fail("cells were solved first"))
+def test_what_cannot_be_solved_is_refused_before_any_cell_is(
+    cell, others, says, monkeypatch
+):
+    monkeypatch.setattr(
+        workers, "run", lambda tasks: pytest.fail("cells were solved first")
+    )
     with pytest.raises(MetalensError, match=says):
         cell_study.run(dataclasses.replace(SMALL, cell=cell, others=others))
 
 
 def test_heights_of_layered_pillars_are_made_of_their_own_material():
     """Pedestal and residual mask stay 60 and 40 nm; what they fill leaves no pillar."""
-    layers = (Layer(0.06, material=Index(1.5)), Layer(0.5), Layer(0.04, grow_um=-0.01, material=Index(1.9)))
+    layers = (
+        Layer(0.06, material=Index(1.5)),
+        Layer(0.5),
+        Layer(0.04, grow_um=-0.01, material=Index(1.9)),
+    )
     study = dataclasses.replace(SMALL, cell=Cell(0.3, 0.6, Index(3.6), layers=layers))
     made = study.made(0.33, 0.75, Index(2.4))
-    assert [layer.height_um for layer in made.layers] == pytest.approx([0.06, 0.65, 0.04])
+    assert [layer.height_um for layer in made.layers] == pytest.approx(
+        [0.06, 0.65, 0.04]
+    )
     assert (made.pitch_um, made.height_um, made.pillar) == (0.33, 0.75, Index(2.4))
-    with pytest.raises(CellError, match=r"0\.1 um of it of other films: need a larger height"):
+    with pytest.raises(
+        CellError, match=r"0\.1 um of it of other films: need a larger height"
+    ):
         study.made(0.33, 0.09)
 
 
 def test_cells_whose_foot_is_wider_are_compared_up_to_where_it_fits():
-    """The foot is 28 nm wider than the diameter: with a printable gap of 20 nm neighbours overlapped, and the study
+    """The foot is 28 nm wider than the diameter: with a printable gap of 20 nm
+    neighbours overlapped, and the study
     ended with a refusal."""
     cell = Cell(0.3, pillar=Index(3.6), sidewall_rad=0.04)
-    leaning = Study(pitches_um=(0.3,), heights_um=(0.7,), min_diameter_um=0.2, min_gap_um=0.02, cell=cell)
+    leaning = Study(
+        pitches_um=(0.3,),
+        heights_um=(0.7,),
+        min_diameter_um=0.2,
+        min_gap_um=0.02,
+        cell=cell,
+    )
     want = (0.2, 0.98 * 0.3 - 0.7 * math.tan(0.04))
-    assert cell_study._span(leaning, leaning.made(0.3, 0.7)) == pytest.approx(want, rel=1e-12)
+    assert cell_study._span(leaning, leaning.made(0.3, 0.7)) == pytest.approx(
+        want, rel=1e-12
+    )
 
 
 def test_the_page_says_what_is_printable_of_any_shape():
-    crosses = Study(pitches_um=(0.3,), heights_um=(0.7,), wavelengths_um=(0.85,), cell=Cell(0.3, shape=Cross(0.4)))
-    verdict = cell_study.Verdict(0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si")
-    page = cell_study.markdown(dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x")
-    assert "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm" in page
+    crosses = Study(
+        pitches_um=(0.3,),
+        heights_um=(0.7,),
+        wavelengths_um=(0.85,),
+        cell=Cell(0.3, shape=Cross(0.4)),
+    )
+    verdict = cell_study.Verdict(
+        0.3, 0.7, 0.85, 0.3, 0.1, 0.2, 0.9, 0.9, "|t| falls", 90.0, 1e-3, "a-Si"
+    )
+    page = cell_study.markdown(
+        dataclasses.replace(crosses, min_gap_um=0.07), [verdict], command="x"
+    )
+    assert (
+        "nothing solid narrower than 80 nm, no gap, hole or hollow narrower than 70 nm"
+        in page
+    )
     discs = dataclasses.replace(crosses, cell=Cell(0.3))
-    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.markdown(discs, [verdict], command="x")
+    assert "diameter from 80 nm to the pitch less 60 nm" in cell_study.markdown(
+        discs, [verdict], command="x"
+    )
 
 
 TWO = "pitches_um = [0.3, 0.32]\nheights_um = [0.7]\nwavelengths_um = [0.85]\ntolerance = 0.05\npillar = {n = 3.6}\n"
 
 
 def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
-    """After one of two cells the user presses Ctrl-C, and a kill cuts the line that follows; that cell is not solved
+    """After one of two cells the user presses Ctrl-C, and a kill cuts the line that
+    follows; that cell is not solved
     again, and the folder is that of a run that nobody stopped."""
     (tmp_path / "study.toml").write_text(TWO)
     monkeypatch.chdir(tmp_path)
@@ -172,13 +238,21 @@ def test_an_interrupted_study_goes_on_to_the_same_bytes(tmp_path, monkeypatch):
     assert solved == [1, 1]  # the other cell, and the chosen one of another material
     assert not journal.exists()
     (tmp_path / "whole").mkdir()
-    assert cli.main(["study", "study.toml", "-o", "whole/out", "--quiet"]) == cli.SUCCESS
+    assert (
+        cli.main(["study", "study.toml", "-o", "whole/out", "--quiet"]) == cli.SUCCESS
+    )
     for name in ("README.md", "cell_study.json", "cell_study.png"):
-        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / "out" / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (
+            tmp_path / "whole" / "out" / name
+        ).read_bytes()
 
 
-def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(tmp_path, monkeypatch):
-    """What was solved for a table of n that has been edited since does not get into the result."""
+def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
+    tmp_path, monkeypatch
+):
+    """What was solved for a table of n that has been edited since does not get into the
+    result.
+    """
     table, path = tmp_path / "film.csv", tmp_path / "out.resume"
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
     study, solved = Study(pillar=str(table)), []
@@ -186,34 +260,63 @@ def test_the_journal_of_other_settings_or_of_a_changed_material_is_begun_afresh(
     def told(tasks):
         solved.append(tasks)
         for i, _ in enumerate(tasks):
-            yield i, {"diameter_um": [0.1], "t": [[1.0, 0.5]], "r": [[0.0, 0.1]], "error": [0.2], "energy": [1.0]}
+            yield (
+                i,
+                {
+                    "diameter_um": [0.1],
+                    "t": [[1.0, 0.5]],
+                    "r": [[0.0, 0.1]],
+                    "error": [0.2],
+                    "energy": [1.0],
+                },
+            )
 
     def done(settings):
         solved.clear()
-        workers.Journal(path, settings).run([{"kind": "curve"}], Console(quiet=True), "cells")
+        workers.Journal(path, settings).run(
+            [{"kind": "curve"}], Console(quiet=True), "cells"
+        )
         return any(solved)
 
     monkeypatch.setattr(workers, "run", told)
     assert [done(study), done(study)] == [True, False]
-    assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [True, True]
+    assert [done(dataclasses.replace(study, tolerance=0.01)), done(study)] == [
+        True,
+        True,
+    ]
     table.write_text("wavelength_um,n,k\n0.8,3.61,0\n0.9,3.55,0\n")
     assert [done(study), done(study)] == [True, False]
 
 
-def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_mix(tmp_path, monkeypatch):
-    """Workers read it anew for every task; what was solved for the new one is not kept as one of the old."""
+def test_a_table_that_is_edited_while_the_sweep_works_ends_it_before_its_curves_mix(
+    tmp_path, monkeypatch
+):
+    """Workers read it anew for every task; what was solved for the new one is not kept
+    as one of the old.
+    """
     table, path = tmp_path / "film.csv", tmp_path / "out.resume"
     table.write_text("wavelength_um,n,k\n0.8,3.60,0\n0.9,3.55,0\n")
     study = Study(pillar=str(table))
 
     def told(tasks):
         for i, _ in enumerate(tasks):
-            yield i, {"diameter_um": [0.1], "t": [[1.0, 0.5]], "r": [[0.0, 0.1]], "error": [0.2], "energy": [1.0]}
+            yield (
+                i,
+                {
+                    "diameter_um": [0.1],
+                    "t": [[1.0, 0.5]],
+                    "r": [[0.0, 0.1]],
+                    "error": [0.2],
+                    "energy": [1.0],
+                },
+            )
             table.write_text("wavelength_um,n,k\n0.8,3.612,0\n0.9,3.55,0\n")
 
     monkeypatch.setattr(workers, "run", told)
     with pytest.raises(StoreError, match=r"film\.csv was changed or replaced"):
-        workers.Journal(path, study).run([{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells")
+        workers.Journal(path, study).run(
+            [{"kind": "curve"}, {"kind": "other"}], Console(quiet=True), "cells"
+        )
     assert len(path.read_text().splitlines()) == 2  # its title and the first
 
 
@@ -223,6 +326,8 @@ def test_a_damaged_entry_is_solved_again_and_a_file_that_is_no_journal_stays(tmp
     path.write_text(title + '["task", {"diameter_um": [0.1]}]\n')
     assert workers.Journal(path, SMALL)._known == {}
     path.write_text("pages of a thesis\n")
-    with pytest.raises(StoreError, match=r"out\.resume is in the way.*no journal of metalens"):
+    with pytest.raises(
+        StoreError, match=r"out\.resume is in the way.*no journal of metalens"
+    ):
         workers.Journal(path, SMALL)
     assert path.read_text() == "pages of a thesis\n"

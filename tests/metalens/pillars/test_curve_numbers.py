@@ -1,4 +1,6 @@
-"""A search for diameters on a rational function that is known: it ends where the fit tells it, and the bars hold."""
+"""A search for diameters on a rational function that is known: it ends where the fit
+tells it, and the bars hold.
+"""
 
 from types import SimpleNamespace
 
@@ -19,10 +21,19 @@ def known(diameter_um):
 def test_a_search_ends_where_two_new_nodes_are_told_by_the_fit(cheaper):
     nodes = curve.explore(known, 0.1, 0.4, tolerance=1e-6, cheaper_um=cheaper)
     assert nodes.converged
-    assert nodes.reason == f"the last 2 of {len(nodes.diameter_um)} solves were predicted within 1e-06"
-    assert nodes.diameter_um[:13] == pytest.approx(0.25 - 0.15 * np.cos(np.pi * np.arange(13) / 12))
-    assert nodes.response[:, 0] == pytest.approx([known(d).t for d in nodes.diameter_um])
-    assert len(nodes.diameter_um) == 15  # a function of one pole is told by the first thirteen
+    assert (
+        nodes.reason
+        == f"the last 2 of {len(nodes.diameter_um)} solves were predicted within 1e-06"
+    )
+    assert nodes.diameter_um[:13] == pytest.approx(
+        0.25 - 0.15 * np.cos(np.pi * np.arange(13) / 12)
+    )
+    assert nodes.response[:, 0] == pytest.approx(
+        [known(d).t for d in nodes.diameter_um]
+    )
+    assert (
+        len(nodes.diameter_um) == 15
+    )  # a function of one pole is told by the first thirteen
     first = np.sort(nodes.diameter_um[:13])
     gap = first[np.argmax(np.diff(first))], np.diff(first).max()
     assert abs(nodes.diameter_um[13] - gap[0] - gap[1] / 2) <= gap[1] / 4

@@ -1,4 +1,6 @@
-"""Library sweeps: every entry against an exact solve, resumption to the same bytes, refusals, store."""
+"""Library sweeps: every entry against an exact solve, resumption to the same bytes,
+refusals, store.
+"""
 
 import dataclasses
 import math
@@ -15,7 +17,13 @@ from metalens.cell.light import Light
 from metalens.cell.record import Cell, Film, Index, Layer
 from metalens.cell.shapes import Square
 from metalens.ground.console import Console
-from metalens.ground.errors import CellError, ConfigError, DomainError, MaterialError, StoreError
+from metalens.ground.errors import (
+    CellError,
+    ConfigError,
+    DomainError,
+    MaterialError,
+    StoreError,
+)
 from metalens.pillars import engines
 from metalens.pillars.record import DEFAULT_CELL, PillarLibrary, Sweep
 
@@ -32,8 +40,16 @@ def test_entries_lie_within_their_error_bars(made):
     assert made.converged
     for k, wavelength in enumerate(made.wavelength_um):
         for i in range(0, len(made.diameter_um), 5):
-            exact = modal.solve(DEFAULT_CELL, float(made.diameter_um[i]), float(wavelength), tolerance=5e-4)
-            assert abs(made.t[0, 0, k, i] - exact.t) <= made.t_error[0, 0, k, i] + exact.t_error
+            exact = modal.solve(
+                DEFAULT_CELL,
+                float(made.diameter_um[i]),
+                float(wavelength),
+                tolerance=5e-4,
+            )
+            assert (
+                abs(made.t[0, 0, k, i] - exact.t)
+                <= made.t_error[0, 0, k, i] + exact.t_error
+            )
 
 
 def test_one_bar_above_the_tolerance_is_enough_to_miss_it(made):
@@ -63,7 +79,9 @@ def test_axes_and_record(made):
 
 def test_store_round_trip(made, tmp_path):
     path = tmp_path / "library.h5"
-    full = dataclasses.replace(made, proxy=library.proxy_of(made), notes=("cut at 0.2 um",))
+    full = dataclasses.replace(
+        made, proxy=library.proxy_of(made), notes=("cut at 0.2 um",)
+    )
     library.save(path, full)
     again = library.load(path)
     for name in ("t", "r", "t_error", "energy", "resonances", "diameter_um"):
@@ -75,7 +93,9 @@ def test_store_round_trip(made, tmp_path):
         full.notes,
     )
     d = np.linspace(*full.proxy.domain_um, 50)
-    assert np.array_equal(library.proxy_of(again).phase_rad(d, 0.85), full.proxy.phase_rad(d, 0.85))
+    assert np.array_equal(
+        library.proxy_of(again).phase_rad(d, 0.85), full.proxy.phase_rad(d, 0.85)
+    )
     with pytest.raises(StoreError, match="no such file"):
         library.load(tmp_path / "other.h5")
 
@@ -93,10 +113,14 @@ class Interrupted(Console):
 def test_an_interrupted_sweep_goes_on_to_the_same_bytes(made, tmp_path):
     journal = tmp_path / "library.h5.resume"
     with pytest.raises(KeyboardInterrupt):
-        library.sweep(DEFAULT_CELL, COARSE, console=Interrupted(quiet=True), checkpoint=journal)
+        library.sweep(
+            DEFAULT_CELL, COARSE, console=Interrupted(quiet=True), checkpoint=journal
+        )
     kept = journal.read_text().split("\n")
     assert len(kept) >= 2
-    journal.write_text("\n".join([*kept[:2], '["cut sho']))  # as after a kill in the middle of a line
+    journal.write_text(
+        "\n".join([*kept[:2], '["cut sho'])
+    )  # as after a kill in the middle of a line
     again = library.sweep(DEFAULT_CELL, COARSE, checkpoint=journal)
     assert not journal.exists()
     library.save(tmp_path / "a.h5", made)
@@ -112,30 +136,47 @@ def test_a_journal_of_another_sweep_is_not_used(tmp_path):
 
 
 def test_oblique_polarisations_agree_at_normal_incidence():
-    sweep = Sweep(angles_deg=(0.0, 8.0), samples=20, tolerance=5e-2, diameters_um=(0.08, 0.16))
+    sweep = Sweep(
+        angles_deg=(0.0, 8.0), samples=20, tolerance=5e-2, diameters_um=(0.08, 0.16)
+    )
     made = library.sweep(DEFAULT_CELL, sweep)
     assert made.polarization == ("s", "p")
     assert np.array_equal(made.t[0, 0], made.t[1, 0])
     d, angle = float(made.diameter_um[10]), math.radians(8)
     for i, name in enumerate(("s", "p")):
-        exact = rcwa.solve(DEFAULT_CELL, d, 0.85, angle_rad=angle, polarization=name, harmonics=8)
-        assert abs(made.t[i, 1, 0, 10] - exact.t) <= made.t_error[i, 1, 0, 10] + exact.t_error
+        exact = rcwa.solve(
+            DEFAULT_CELL, d, 0.85, angle_rad=angle, polarization=name, harmonics=8
+        )
+        assert (
+            abs(made.t[i, 1, 0, 10] - exact.t)
+            <= made.t_error[i, 1, 0, 10] + exact.t_error
+        )
     assert abs(made.t[0, 1, 0, 10] - made.t[1, 1, 0, 10]) > 0
 
 
 def test_loading_a_library_needs_neither_torch_nor_matplotlib():
     code = "import sys, metalens.library; print({'torch', 'matplotlib', 'numba'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True
+        ).stdout
+        == "set()\n"
+    )
 
 
 def test_films_go_to_both_solvers_and_other_shapes_to_rcwa():
     coated = dataclasses.replace(DEFAULT_CELL, over=(Film(Index(1.45), 0.1),))
     assert engines.choose(coated) == "modal"
-    assert engines.precise(coated, Light(0.85), tolerance=5e-2, engine="modal")(0.1).engine == "anchored"
+    assert (
+        engines.precise(coated, Light(0.85), tolerance=5e-2, engine="modal")(0.1).engine
+        == "anchored"
+    )
     square = dataclasses.replace(DEFAULT_CELL, shape=Square())
     small = Sweep(samples=20, tolerance=5e-2, diameters_um=(0.08, 0.12), engine="modal")
     assert engines.choose(square) == "rcwa"
-    with pytest.raises(CellError, match="round pillars on a square lattice, not square on a square"):
+    with pytest.raises(
+        CellError, match="round pillars on a square lattice, not square on a square"
+    ):
         library.sweep(square, small)
 
 
@@ -161,7 +202,9 @@ def test_propagating_orders_are_named():
     n = 1.4525
     for pitch, angle in ((0.85 / n * 1.001, 0.0), (0.7, 0.0), (0.45, 30.0)):
         cell = Cell(pitch, 0.7, Index(3.6), substrate=Index(n))
-        with pytest.raises(CellError, match=r"orders .*\(-1, 0\) in the substrate.* propagate"):
+        with pytest.raises(
+            CellError, match=r"orders .*\(-1, 0\) in the substrate.* propagate"
+        ):
             library.check(cell, Sweep(angles_deg=(angle,)))
     library.check(Cell(0.85 / n * 0.999, 0.7, Index(3.6), substrate=Index(n)), Sweep())
 
@@ -182,11 +225,24 @@ def test_impossible_diameters_and_wavelengths_are_refused():
         library.check(Cell(0.2, 0.7, "a-Si"), Sweep(wavelengths_um=(30.0,)))
 
 
-@pytest.mark.parametrize("part", [{"material": "Si"}, {"between": "Si"}, {"coat": "Si", "coat_um": 0.01}])
+@pytest.mark.parametrize(
+    "part", [{"material": "Si"}, {"between": "Si"}, {"coat": "Si", "coat_um": 0.01}]
+)
 def test_materials_of_layers_are_asked_for_before_anything_is_solved(part):
-    """The shipped table of silicon ends below 30 um; plain numbers elsewhere hold at any wavelength."""
+    """The shipped table of silicon ends below 30 um; plain numbers elsewhere hold at
+    any wavelength.
+    """
     air = Index(1.0)
-    cell = Cell(5.0, 4.0, Index(3.0), air, air, air, shape=Square(), layers=(Layer(3.0), Layer(1.0, **part)))
+    cell = Cell(
+        5.0,
+        4.0,
+        Index(3.0),
+        air,
+        air,
+        air,
+        shape=Square(),
+        layers=(Layer(3.0), Layer(1.0, **part)),
+    )
     with pytest.raises(MaterialError, match="Si at 30"):
         library.check(cell, Sweep(wavelengths_um=(30.0,), diameters_um=(1.0, 3.0)))
 

@@ -1,4 +1,6 @@
-"""What a library and its proxy are asked for where nothing is said: as the pages say it."""
+"""What a library and its proxy are asked for where nothing is said: as the pages say
+it.
+"""
 
 import dataclasses
 
@@ -17,10 +19,16 @@ ROUND = Cell(0.3, 0.7, Index(2.1))
     [
         (ROUND, {}, 1e-3),
         (dataclasses.replace(ROUND, shape=Square()), {}, 0.02),
-        (dataclasses.replace(ROUND, shape=Square()), {"diameters_um": (0.1, 0.2), "lengths_um": (0.12, 0.23)}, 0.05),
+        (
+            dataclasses.replace(ROUND, shape=Square()),
+            {"diameters_um": (0.1, 0.2), "lengths_um": (0.12, 0.23)},
+            0.05,
+        ),
     ],
 )
-def test_a_tolerance_left_out_is_what_the_solver_of_such_pillars_reaches(cell, sizes, tolerance):
+def test_a_tolerance_left_out_is_what_the_solver_of_such_pillars_reaches(
+    cell, sizes, tolerance
+):
     assert Sweep(**sizes).settled(cell).tolerance == tolerance
     assert Sweep(tolerance=0.003, **sizes).settled(cell).tolerance == 0.003
 

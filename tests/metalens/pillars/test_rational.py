@@ -1,4 +1,6 @@
-"""Rational interpolation: functions that are rational come back exactly, with their poles."""
+"""Rational interpolation: functions that are rational come back exactly, with their
+poles.
+"""
 
 import numpy as np
 import pytest

@@ -32,7 +32,12 @@ def test_lengths_along_rows_and_columns():
     assert rows == pytest.approx([-1.2, -0.4, 0.4, 1.2])
     assert columns == pytest.approx([-1.5, -1.0, -0.5, 0, 0.5, 1.0, 1.5])
     rows, columns = CASE.window_um
-    assert (len(rows), len(columns), rows[0], columns[-1]) == (9, 14, pytest.approx(-1.2), pytest.approx(1.95))
+    assert (len(rows), len(columns), rows[0], columns[-1]) == (
+        9,
+        14,
+        pytest.approx(-1.2),
+        pytest.approx(1.95),
+    )
 
 
 def samples_of(case):
@@ -42,7 +47,8 @@ def samples_of(case):
 
 
 @pytest.mark.parametrize(
-    ("parts", "rows", "columns"), [(1, [9], [14]), (4, [2, 2, 2, 3], [3, 4, 3, 4]), (20, [1] * 9, [1] * 14)]
+    ("parts", "rows", "columns"),
+    [(1, [9], [14]), (4, [2, 2, 2, 3], [3, 4, 3, 4]), (20, [1] * 9, [1] * 14)],
 )
 def test_parts_of_a_window_hold_every_sample_once_and_in_order(parts, rows, columns):
     made = geometry.windows(CASE, parts)
@@ -50,7 +56,9 @@ def test_parts_of_a_window_hold_every_sample_once_and_in_order(parts, rows, colu
     assert [part.samples[1] for part in made[0]] == columns
     y, x = samples_of(CASE)
     assert np.concatenate([samples_of(row[-1])[0] for row in made]) == pytest.approx(y)
-    assert np.concatenate([samples_of(part)[1] for part in made[-1]]) == pytest.approx(x)
+    assert np.concatenate([samples_of(part)[1] for part in made[-1]]) == pytest.approx(
+        x
+    )
     assert {part.step_um for row in made for part in row} == {0.3}
 
 
@@ -107,10 +115,14 @@ def test_a_pillar_that_is_no_number_is_named_wherever_it_lies(which):
         maps = [np.ones(case.shape), np.ones(case.shape)]
         geometry.check_aperture(*maps, case)
         maps[which][row, 2] = math.nan
-        with pytest.raises(PropagationError, match=f"row {row}, column 2 is not finite"):
+        with pytest.raises(
+            PropagationError, match=f"row {row}, column 2 is not finite"
+        ):
             geometry.check_aperture(*maps, case)
         with pytest.raises(PropagationError, match=r"shape \(599, 3\)"):
-            geometry.check_aperture(*(part[1:] if n == which else part for n, part in enumerate(maps)), case)
+            geometry.check_aperture(
+                *(part[1:] if n == which else part for n, part in enumerate(maps)), case
+            )
 
 
 def test_an_aperture_without_light_is_refused_and_one_of_a_single_pillar_is_not():

@@ -1,6 +1,8 @@
-"""Compiled sums through films and in air: Snell and Fresnel written out for each ray, plain loops over nodes.
+"""Compiled sums through films and in air: Snell and Fresnel written out for each ray,
+plain loops over nodes.
 
-A ray of p = n sin θ through films t of index n reaches Σ t tan θ sideways, its optical path is Σ n t / cos θ.
+A ray of p = n sin θ through films t of index n reaches Σ t tan θ sideways, its optical
+path is Σ n t / cos θ.
 """
 
 import cmath
@@ -33,7 +35,8 @@ def length(p):
 
 
 def level(p):
-    """√(passed / spread): half of s and half of p light that Fresnel's reflections leave, over the area on the sensor
+    """√(passed / spread): half of s and half of p light that Fresnel's reflections
+    leave, over the area on the sensor
     per area of p, (reach / p) d reach / dp with d tan θ / dp = 1 / (n cos³ θ)."""
     through = [1.0, 1.0]
     for a, b in ((1.31, 2.1), (2.1, 1.52)):
@@ -41,19 +44,28 @@ def level(p):
         through[0] *= 1 - ((a * ca - b * cb) / (a * ca + b * cb)) ** 2
         through[1] *= 1 - ((b * ca - a * cb) / (b * ca + a * cb)) ** 2
     far = sum(t / (n * math.cos(a)) for n, t, a in zip(N, T, angles(p), strict=True))
-    slope = sum(t / (n * math.cos(a) ** 3) for n, t, a in zip(N, T, angles(p), strict=True))
+    slope = sum(
+        t / (n * math.cos(a) ** 3) for n, t, a in zip(N, T, angles(p), strict=True)
+    )
     return math.sqrt(sum(through) / 2 / (far * slope))
 
 
 def test_products_of_complex_rows_are_summed_without_a_conjugate():
     """(2 + 3i)(5 - 1i) = 13 + 13i, (-1 + 0.5i)(4 + 2i) = -5, together 8 + 13i."""
-    got = layered.product(np.array([2.0, -1.0]), np.array([3.0, 0.5]), np.array([5.0, 4.0]), np.array([-1.0, 2.0]))
+    got = layered.product(
+        np.array([2.0, -1.0]),
+        np.array([3.0, 0.5]),
+        np.array([5.0, 4.0]),
+        np.array([-1.0, 2.0]),
+    )
     assert got == pytest.approx(8 + 13j)
     assert layered.product(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)) == 0
 
 
 def test_rays_are_those_of_snell_from_any_start():
-    """From straight ahead and from tan² of other rays; tan² in the rarest medium is left for the next row."""
+    """From straight ahead and from tan² of other rays; tan² in the rarest medium is
+    left for the next row.
+    """
     reach2 = np.array([reach(p) ** 2 for p in P])
     tan2 = np.array([math.tan(angles(p)[0]) ** 2 for p in P])
     for start in (np.zeros(5), tan2[::-1].copy(), 30 * tan2 + 2):
@@ -64,13 +76,17 @@ def test_rays_are_those_of_snell_from_any_start():
 
 
 def test_rays_that_are_far_off_take_more_than_a_few_steps():
-    """One of a thousand times the thickness, begun at none and at ten thousand times its tan²."""
+    """One of a thousand times the thickness, begun at none and at ten thousand times
+    its tan².
+    """
     want = 1.31 * math.sin(math.atan(1000.0))
     far = np.array([reach(want) ** 2])
     for start in (0.0, 1e10):
         work = np.empty((6, 1))
         layered.rays(far, SQUARED, THICK, np.array([start]), work)
-        assert 1.31**2 - work[0, 0] == pytest.approx(1.31**2 / (1 + 1e6), rel=1e-8)  # 1e6 ulp of rounding
+        assert 1.31**2 - work[0, 0] == pytest.approx(
+            1.31**2 / (1 + 1e6), rel=1e-8
+        )  # 1e6 ulp of rounding
 
 
 def test_paths_and_levels_of_rays_are_those_of_their_angles():
@@ -86,13 +102,19 @@ def test_light_straight_ahead_loses_what_two_faces_reflect():
     out = np.empty(1)
     layered.levels(np.zeros(1), SQUARED, THICK, np.array(ORDER), out, np.empty((6, 1)))
     passed = (1 - (0.79 / 3.41) ** 2) * (1 - (0.58 / 3.62) ** 2)
-    assert out[0] == pytest.approx(math.sqrt(passed) / (31 / 1.31 + 12 / 1.52 + 3 / 2.1), rel=1e-13)
+    assert out[0] == pytest.approx(
+        math.sqrt(passed) / (31 / 1.31 + 12 / 1.52 + 3 / 2.1), rel=1e-13
+    )
     alone = np.empty(1)  # a single medium has no face
-    layered.levels(np.zeros(1), SQUARED, THICK, np.array(ORDER[:1]), alone, np.empty((6, 1)))
+    layered.levels(
+        np.zeros(1), SQUARED, THICK, np.array(ORDER[:1]), alone, np.empty((6, 1))
+    )
     assert alone[0] == pytest.approx(1 / (31 / 1.31 + 12 / 1.52 + 3 / 2.1), rel=1e-13)
 
 
-SERIES = np.array([[1.1, 0.4], [0.7, -0.2], [0.3, 0.9], [-0.6, 0.05]])  # (middle, half), then real and imaginary
+SERIES = np.array(
+    [[1.1, 0.4], [0.7, -0.2], [0.3, 0.9], [-0.6, 0.05]]
+)  # (middle, half), then real and imaginary
 
 
 def beside(p):
@@ -112,7 +134,9 @@ def test_what_is_beside_a_ray_is_a_power_series_in_the_cosine_of_the_rarest_medi
 def test_arrays_of_media_are_squares_thicknesses_faces_and_the_series():
     media = Media((2.1, 1.0, 1.52, 1.0), (3.0, 20.0, 0.0, 5.0))
     squared, thick, order, series = layered.media_arrays(media, K, 40.0)
-    assert squared == pytest.approx([1.0, 2.1**2])  # the rarest first, equal ones together
+    assert squared == pytest.approx(
+        [1.0, 2.1**2]
+    )  # the rarest first, equal ones together
     assert thick.tolist() == [25.0, 3.0]
     assert thick.dtype == float
     assert order.tolist() == [2.1, 1.0, 1.0]
@@ -137,18 +161,25 @@ def p_of(far):
 
 
 def wave(dx, dy):
-    """(amplitude, path) -i k/2π level (1 + iC/(kL)) of the ray that goes (dx, dy) sideways."""
+    """(amplitude, path) -i k/2π level (1 + iC/(kL)) of the ray that goes (dx, dy)
+    sideways.
+    """
     p = p_of(math.hypot(dx, dy))
     real, imaginary = beside(p)
     c = complex(real, imaginary)
-    return -1j * K / (2 * math.pi) * level(p) * (1 + 1j * c / (K * length(p))), length(p)
+    return -1j * K / (2 * math.pi) * level(p) * (1 + 1j * c / (K * length(p))), length(
+        p
+    )
 
 
 def test_light_of_pillars_through_films_is_the_sum_of_their_rays():
-    """Two depths, two rows of three columns, three points; added to what is there, each pillar worth its area. Phases
+    """Two depths, two rows of three columns, three points; added to what is there, each
+    pillar worth its area. Phases
     of 2π 60 um / 0.79 um, bisected to 1e-15 of them: 1e-11."""
     x, y, area = np.array([-2.2, 0.7, 3.1]), np.array([-1.4, 5.3]), 0.23
-    points = np.array([[4.0, -3.0], [-11.0, 0.5], [0.7, -1.4]])  # the last straight above a pillar
+    points = np.array(
+        [[4.0, -3.0], [-11.0, 0.5], [0.7, -1.4]]
+    )  # the last straight above a pillar
     rng = np.random.default_rng(5)
     light = rng.normal(size=(2, 2, 3)) + 1j * rng.normal(size=(2, 2, 3))
     want = np.full((2, 3), 0.5 - 0.25j)
@@ -186,16 +217,22 @@ NUMBERS = np.array([0.21, -0.13, 1 / 700, 6.0, -2.5, 47.0, 0.79])
 
 
 def from_source(x, y, inverse):
-    """Path from (-z tx, -z ty, -z) less that to the lens centre; at infinity a plane wave."""
+    """Path from (-z tx, -z ty, -z) less that to the lens centre; at infinity a plane
+    wave.
+    """
     tx, ty = 0.21, -0.13
     if inverse == 0:
         return (x * tx + y * ty) / math.sqrt(1 + tx * tx + ty * ty)
     z = 1 / inverse
-    return math.dist((x, y, 0.0), (-z * tx, -z * ty, -z)) - z * math.sqrt(1 + tx * tx + ty * ty)
+    return math.dist((x, y, 0.0), (-z * tx, -z * ty, -z)) - z * math.sqrt(
+        1 + tx * tx + ty * ty
+    )
 
 
 def test_light_takes_the_phase_of_every_depth_less_that_of_the_reference():
-    """2π (s_z - s_700) / 0.79 at depths of 300 um, 700 um and infinity; nothing is written where it is dark."""
+    """2π (s_z - s_700) / 0.79 at depths of 300 um, 700 um and infinity; nothing is
+    written where it is dark.
+    """
     e, x = np.array([-3.5, 0.4, 7.0, 8.0]), np.array([-6.0, -1.0, 2.5, 4.4, 9.0])
     spans = np.array([[0, 5], [2, 4], [1, 5], [0, 0]])
     inverse = np.array([1 / 300, 1 / 700, 0.0])
@@ -205,7 +242,9 @@ def test_light_takes_the_phase_of_every_depth_less_that_of_the_reference():
     layered.curved(light, e, x, NUMBERS, inverse, spans, re, im)
     for i, z, j in np.ndindex(4, 3, 5):
         if spans[i, 0] <= j < spans[i, 1]:
-            path = from_source(x[j], e[i], inverse[z]) - from_source(x[j], e[i], 1 / 700)
+            path = from_source(x[j], e[i], inverse[z]) - from_source(
+                x[j], e[i], 1 / 700
+            )
             want = light[i, j] * cmath.exp(2j * math.pi * path / 0.79)
             assert complex(re[i, z, j], im[i, z, j]) == pytest.approx(want, rel=1e-11)
         else:
@@ -214,7 +253,9 @@ def test_light_takes_the_phase_of_every_depth_less_that_of_the_reference():
 
 
 def test_light_on_nodes_is_summed_with_the_kernel_of_one_medium_over_the_lit_columns():
-    """d / (2π r²) (1/r - ik) exp(ik (r - r_w)), r and r_w from point to point; columns beyond the spans hold NaN."""
+    """d / (2π r²) (1/r - ik) exp(ik (r - r_w)), r and r_w from point to point; columns
+    beyond the spans hold NaN.
+    """
     e, x = np.array([-3.5, 0.4, 7.0]), np.array([-6.0, -1.0, 2.5, 4.4])
     spans = np.array([[0, 4], [0, 0], [1, 3]])
     points = np.array([[0.8, -0.3], [-1.9, 1.5], [14.0, -9.0]])
@@ -229,7 +270,12 @@ def test_light_on_nodes_is_summed_with_the_kernel_of_one_medium_over_the_lit_col
             for j in range(*spans[i]):
                 r = math.dist((x[j], e[i], 0.0), (6.0 + px, -2.5 + py, 47.0))
                 middle = math.dist((x[j], e[i], 0.0), (6.0, -2.5, 47.0))
-                kernel = 47.0 / (2 * math.pi * r * r) * (1 / r - 1j * K) * cmath.exp(1j * K * (r - middle))
+                kernel = (
+                    47.0
+                    / (2 * math.pi * r * r)
+                    * (1 / r - 1j * K)
+                    * cmath.exp(1j * K * (r - middle))
+                )
                 want[:, n] += light[i, :, j] * kernel
                 size = max(size, abs(kernel))
     assert size > 0.02

@@ -1,6 +1,8 @@
-"""Windowed propagation against the exact sum, case by case; its error estimate; its derivatives.
+"""Windowed propagation against the exact sum, case by case; its error estimate; its
+derivatives.
 
-Error budget: the tolerance asked for. The estimate may not be below the true error nor above three times it.
+Error budget: the tolerance asked for. The estimate may not be below the true error nor
+above three times it.
 """
 
 import dataclasses
@@ -29,14 +31,22 @@ GEOMETRY = dict(
 
 
 def lens(shape, *, kind="focus", distance=120.0, source=1300.0, pitch=PITCH, seed=0):
-    """Round lens that focuses ``source`` on the sensor; noisy, of random phases, or a double helix."""
+    """Round lens that focuses ``source`` on the sensor; noisy, of random phases, or a
+    double helix.
+    """
     random = np.random.default_rng(seed)
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     r2 = x**2 + y[:, None] ** 2
-    phase = -K * (r2 / (np.sqrt(r2 + distance**2) + distance) + r2 / (np.sqrt(r2 + source**2) + source))
+    phase = -K * (
+        r2 / (np.sqrt(r2 + distance**2) + distance)
+        + r2 / (np.sqrt(r2 + source**2) + source)
+    )
     level = (r2 <= max(x[-1], y[-1], pitch) ** 2).astype(float)
     if kind == "noisy":
-        phase, level = phase + random.normal(0, 0.3, shape), level * random.uniform(0.7, 1, shape)
+        phase, level = (
+            phase + random.normal(0, 0.3, shape),
+            level * random.uniform(0.7, 1, shape),
+        )
     if kind == "random":
         phase = random.uniform(-np.pi, np.pi, shape)
     if kind == "helix":
@@ -46,7 +56,9 @@ def lens(shape, *, kind="focus", distance=120.0, source=1300.0, pitch=PITCH, see
 
 
 def compare(phase, level, *, dtype=torch.float64, tolerance=1e-6, **geometry):
-    """(stack, true relative error); maps carry gradients so that the exact sum is never chosen."""
+    """(stack, true relative error); maps carry gradients so that the exact sum is never
+    chosen.
+    """
     arguments = GEOMETRY | geometry
     given = torch.tensor(phase, dtype=dtype, requires_grad=True)
     maps = given, torch.tensor(level, dtype=dtype)
@@ -71,14 +83,18 @@ def check(phase, level, **arguments):
 @pytest.mark.parametrize("kind", ["focus", "noisy", "random", "helix"])
 @pytest.mark.parametrize("angle_rad", [0.0, (0.3, -0.2)])
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-4, 1e-6, 1e-9])
-def test_every_lens_meets_the_tolerance_and_the_estimate_tells(kind, angle_rad, tolerance):
+def test_every_lens_meets_the_tolerance_and_the_estimate_tells(
+    kind, angle_rad, tolerance
+):
     check(*lens((96, 96), kind=kind), tolerance=tolerance, angle_rad=angle_rad)
 
 
 @pytest.mark.parametrize("kind", ["focus", "random"])
 def test_float32_inputs(kind):
     stack = check(
-        *(np.float32(m).astype(float) for m in lens((128, 128), kind=kind)), dtype=torch.float32, tolerance=1e-4
+        *(np.float32(m).astype(float) for m in lens((128, 128), kind=kind)),
+        dtype=torch.float32,
+        tolerance=1e-4,
     )
     assert stack.intensity.dtype == torch.float32
 
@@ -97,7 +113,12 @@ def test_source_1_mm_away_and_at_infinity():
 @pytest.mark.parametrize(("distance", "window"), [(20.0, 12.0), (200e3, 12000.0)])
 def test_sensor_at_20_um_and_200_mm(distance, window):
     shape = (48, 48) if distance < 100 else (96, 96)
-    check(*lens(shape, distance=distance), sensor_distance_um=distance, window_um=window, tolerance=1e-5)
+    check(
+        *lens(shape, distance=distance),
+        sensor_distance_um=distance,
+        window_um=window,
+        tolerance=1e-5,
+    )
 
 
 @pytest.mark.parametrize("shape", [(95, 95), (96, 96), (95, 96)])
@@ -109,9 +130,15 @@ def test_odd_and_even_grids(shape, samples):
 def test_window_off_by_half_a_pixel():
     shifted = check(*lens((96, 96), kind="noisy"), offset_um=(0.4, 0.0))
     centred = check(*lens((96, 96), kind="noisy"))
-    moved = shifted.numpy().intensity[..., :-1] / shifted.numpy().intensity[..., :-1].sum((-1, -2), keepdims=True)
-    other = centred.numpy().intensity[..., 1:] / centred.numpy().intensity[..., 1:].sum((-1, -2), keepdims=True)
-    assert np.linalg.norm(moved - other) > 0.1 * np.linalg.norm(other)  # half a sample of 0.8 um matters
+    moved = shifted.numpy().intensity[..., :-1] / shifted.numpy().intensity[
+        ..., :-1
+    ].sum((-1, -2), keepdims=True)
+    other = centred.numpy().intensity[..., 1:] / centred.numpy().intensity[..., 1:].sum(
+        (-1, -2), keepdims=True
+    )
+    assert np.linalg.norm(moved - other) > 0.1 * np.linalg.norm(
+        other
+    )  # half a sample of 0.8 um matters
 
 
 def test_40_degree_field():
@@ -133,7 +160,9 @@ def test_single_open_pillar_is_a_sphere():
     want = 1 / r2**2 * (1 / r2 + K**2)
     energy = (want * (0.5 * PITCH**2 * 120.0 / (2 * np.pi)) ** 2).sum() * 0.8**2
     got = stack.numpy()
-    assert np.abs(got.intensity[0] - want / want.sum()).max() < 1e-9 * got.intensity.max()
+    assert (
+        np.abs(got.intensity[0] - want / want.sum()).max() < 1e-9 * got.intensity.max()
+    )
     assert got.energy_um2 == pytest.approx(energy, rel=1e-9)
 
 
@@ -144,7 +173,15 @@ def test_one_pillar_in_all():
 def test_window_of_one_pixel():
     stack, error = compare(*lens((64, 64)), samples=1, window_um=0.8)
     assert error == 0  # the only sample holds all the light
-    want = np.abs(propagate.exact(*lens((64, 64)), **GEOMETRY | dict(samples=1, window_um=0.8))[:, 0, 0]) ** 2 * 0.64
+    want = (
+        np.abs(
+            propagate.exact(
+                *lens((64, 64)), **GEOMETRY | dict(samples=1, window_um=0.8)
+            )[:, 0, 0]
+        )
+        ** 2
+        * 0.64
+    )
     assert stack.numpy().energy_um2 == pytest.approx(want, rel=1e-6)
 
 
@@ -175,12 +212,16 @@ def test_a_large_window_is_cut_into_tiles_over_one_pass_of_the_pillars():
 @pytest.mark.slow
 def test_a_window_too_large_for_one_plan_is_computed_in_parts():
     geometry = dict(pitch_um=3.0, sensor_distance_um=3000.0, window_um=800.0, samples=6)
-    stack = check(*lens((300, 300), distance=3000.0, pitch=3.0), tolerance=1e-4, **geometry)
+    stack = check(
+        *lens((300, 300), distance=3000.0, pitch=3.0), tolerance=1e-4, **geometry
+    )
     assert "tiles" in stack.reason
 
 
 def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
-    """21 directions in turn keep their plans; where bytes for three are left, the oldest go."""
+    """21 directions in turn keep their plans; where bytes for three are left, the
+    oldest go.
+    """
     cases = [
         propagate.case(
             (31, 27),
@@ -196,7 +237,10 @@ def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
     ]
     about = 1e-3, torch.float32, torch.device("cpu")
     first = [windowed.plan(one, *about) for one in cases]
-    assert all(windowed.plan(one, *about) is kept for one, kept in zip(cases, first, strict=True))
+    assert all(
+        windowed.plan(one, *about) is kept
+        for one, kept in zip(cases, first, strict=True)
+    )
     assert all(one.bytes > sum(t.nbytes for t in one.tensors.values()) for one in first)
     monkeypatch.setattr(windowed, "KEPT_BYTES", 3.5 * max(one.bytes for one in first))
     newer = windowed.plan(cases[0], 2e-3, *about[1:])
@@ -206,16 +250,28 @@ def test_plans_are_kept_as_their_bytes_allow(monkeypatch):
 
 
 def test_energy_is_kept_in_a_large_window():
-    """All light of a small smooth lens meets the sensor: Σ|U|² dx² equals that of the exact sum to 1e-6."""
+    """All light of a small smooth lens meets the sensor: Σ|U|² dx² equals that of the
+    exact sum to 1e-6.
+    """
     y, x = np.mgrid[:32, :32] - 15.5
     level = np.exp(-(x**2 + y**2) / 40)
-    geometry = GEOMETRY | dict(sensor_distance_um=40.0, window_um=60.0, samples=48, depths_um=[1e4])
+    geometry = GEOMETRY | dict(
+        sensor_distance_um=40.0, window_um=60.0, samples=48, depths_um=[1e4]
+    )
     phase = torch.zeros(32, 32, dtype=torch.float64, requires_grad=True)
-    got = psf.psf_stack(phase, torch.tensor(level), tolerance=1e-7, **geometry).numpy().energy_um2[0]
+    got = (
+        psf.psf_stack(phase, torch.tensor(level), tolerance=1e-7, **geometry)
+        .numpy()
+        .energy_um2[0]
+    )
     step = 60.0 / 48
-    want = (np.abs(propagate.exact(np.zeros((32, 32)), level, **geometry)) ** 2).sum() * step**2
+    want = (
+        np.abs(propagate.exact(np.zeros((32, 32)), level, **geometry)) ** 2
+    ).sum() * step**2
     assert got == pytest.approx(want, rel=1e-6)
-    assert got == pytest.approx((level**2).sum() * PITCH**2, rel=2e-3)  # Parseval; the rest misses the window
+    assert got == pytest.approx(
+        (level**2).sum() * PITCH**2, rel=2e-3
+    )  # Parseval; the rest misses the window
 
 
 def test_a_batch_of_lenses_equals_the_lenses():
@@ -233,13 +289,18 @@ def test_a_tilt_moves_the_light_to_plus_x_and_a_slip_down_to_plus_y():
     tilted = phase + K * 0.02 * x * PITCH + K * 0.01 * y * PITCH
     stack = psf.psf_stack(tilted, level, **GEOMETRY)
     light = stack.intensity[1]
-    assert (light.sum(0) * stack.x_um).sum() == pytest.approx(120 * 0.02, abs=0.15)  # rings are cut by the window
+    assert (light.sum(0) * stack.x_um).sum() == pytest.approx(
+        120 * 0.02, abs=0.15
+    )  # rings are cut by the window
     assert (light.sum(1) * stack.y_um).sum() == pytest.approx(120 * 0.01, abs=0.15)
 
 
 def central(function, step):
     """Fourth-order finite difference of a scalar function at 0."""
-    return (8 * (function(step) - function(-step)) - (function(2 * step) - function(-2 * step))) / (12 * step)
+    return (
+        8 * (function(step) - function(-step))
+        - (function(2 * step) - function(-2 * step))
+    ) / (12 * step)
 
 
 def score(phase, level, **geometry):
@@ -247,7 +308,9 @@ def score(phase, level, **geometry):
     stack = psf.psf_stack(phase, level, tolerance=1e-9, **GEOMETRY | geometry)
     shape = stack.intensity.shape
     ramp = torch.arange(shape.numel(), dtype=torch.float64).view(shape)
-    return (torch.sin(0.37 * ramp) * stack.intensity).sum() + 1e-3 * stack.energy_um2.sum()
+    return (
+        torch.sin(0.37 * ramp) * stack.intensity
+    ).sum() + 1e-3 * stack.energy_um2.sum()
 
 
 def test_gradcheck_of_the_moments_and_of_the_window():
@@ -256,14 +319,29 @@ def test_gradcheck_of_the_moments_and_of_the_window():
     from metalens.propagate.window import plan, polynomials, zoom
 
     case = propagate.case((9, 70), **GEOMETRY | dict(samples=3))
-    made = moments(case, 1e-3, polynomials(case, (3, 4)), over_blocks(case), tolerance=1e-9, dtype=torch.float64)
-    assert made.blocks[1].nodes < made.blocks[1].length  # light is moved to fewer nodes than pillars
+    made = moments(
+        case,
+        1e-3,
+        polynomials(case, (3, 4)),
+        over_blocks(case),
+        tolerance=1e-9,
+        dtype=torch.float64,
+    )
+    assert (
+        made.blocks[1].nodes < made.blocks[1].length
+    )  # light is moved to fewer nodes than pillars
     maps = [torch.tensor(m).requires_grad_() for m in lens((9, 70), kind="noisy")]
-    assert torch.autograd.gradcheck(lambda p, t: torch.view_as_real(reduce(p, t, made)[0]), maps)
+    assert torch.autograd.gradcheck(
+        lambda p, t: torch.view_as_real(reduce(p, t, made)[0]), maps
+    )
     found = plan(case, 1e-4, torch.float64, torch.device("cpu"))
     count = found.tensors["turn"].shape[0]
-    light = torch.randn(count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(zoom(v, found.tensors)), light)
+    light = torch.randn(
+        count, *found.depths.basis.shape, dtype=torch.complex128, requires_grad=True
+    )
+    assert torch.autograd.gradcheck(
+        lambda v: torch.view_as_real(zoom(v, found.tensors)), light
+    )
 
 
 def test_directional_derivatives_in_phase_and_transmission():
@@ -273,7 +351,12 @@ def test_directional_derivatives_in_phase_and_transmission():
     at = [m.clone().requires_grad_() for m in (phase, level)]
     grads = torch.autograd.grad(score(*at), at)
     for i in (0, 1):
-        want = central(lambda h, i=i: score(phase + h * way[0] * (i == 0), level + h * way[1] * (i == 1)).item(), 1e-3)
+        want = central(
+            lambda h, i=i: score(
+                phase + h * way[0] * (i == 0), level + h * way[1] * (i == 1)
+            ).item(),
+            1e-3,
+        )
         assert (grads[i] * way[i]).sum().item() == pytest.approx(want, rel=1e-7)
 
 
@@ -299,14 +382,20 @@ def test_gradient_against_the_exact_sum():
     assert np.linalg.norm(got - want) < 2e-4 * np.linalg.norm(want)
 
 
-@pytest.mark.parametrize("merit", [lambda light: (light**2).sum(), lambda light: light[1, 9:11, 9:11].sum()])
+@pytest.mark.parametrize(
+    "merit", [lambda light: (light**2).sum(), lambda light: light[1, 9:11, 9:11].sum()]
+)
 def test_gradient_at_a_focus_where_it_nearly_vanishes(merit):
-    """A lens in focus with all its light on the window: what is left of the gradient is small beside its parts."""
+    """A lens in focus with all its light on the window: what is left of the gradient is
+    small beside its parts.
+    """
     phase, level = (torch.tensor(m) for m in lens((128, 128)))
     grads = []
     for tolerance in (1e-4, 1e-10):
         given = phase.clone().requires_grad_()
-        stack = psf.psf_stack(given, level, tolerance=tolerance, **GEOMETRY | dict(window_um=32.0))
+        stack = psf.psf_stack(
+            given, level, tolerance=tolerance, **GEOMETRY | dict(window_um=32.0)
+        )
         merit(stack.intensity).backward()
         grads.append(given.grad)
     assert (grads[0] - grads[1]).norm() < 2e-4 * grads[1].norm()
@@ -321,10 +410,26 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
         "depths_um": torch.tensor([1000.0, 1800.0, torch.inf], dtype=torch.float64),
     }
     moving = {name: value.clone().requires_grad_() for name, value in at.items()}
-    grads = dict(zip(moving, torch.autograd.grad(score(phase, level, **moving), list(moving.values())), strict=True))
+    grads = dict(
+        zip(
+            moving,
+            torch.autograd.grad(score(phase, level, **moving), list(moving.values())),
+            strict=True,
+        )
+    )
     assert grads["depths_um"][2] == 0
-    ways = {"sensor_distance_um": 1.0, "angle_rad": [0.6, 0.8], "offset_um": [-0.6, 0.8], "depths_um": [1.0, -1.0, 0.0]}
-    steps = {"sensor_distance_um": 0.05, "angle_rad": 5e-4, "offset_um": 0.05, "depths_um": 10.0}
+    ways = {
+        "sensor_distance_um": 1.0,
+        "angle_rad": [0.6, 0.8],
+        "offset_um": [-0.6, 0.8],
+        "depths_um": [1.0, -1.0, 0.0],
+    }
+    steps = {
+        "sensor_distance_um": 0.05,
+        "angle_rad": 5e-4,
+        "offset_um": 0.05,
+        "depths_um": 10.0,
+    }
     for name, way in ways.items():
         line = torch.tensor(way, dtype=torch.float64)
 
@@ -333,8 +438,14 @@ def test_derivatives_in_sensor_distance_angle_offset_and_depth():
             return score(phase, level, **at | {name: at[name] + step}).item()
 
         want = central(along, steps[name])
-        got = torch.where(line == 0, torch.zeros_like(line), grads[name] * line).sum().item()
-        assert got == pytest.approx(want, rel=2e-6), name  # finite differences: 1e-9 of the value over the step
+        got = (
+            torch.where(line == 0, torch.zeros_like(line), grads[name] * line)
+            .sum()
+            .item()
+        )
+        assert got == pytest.approx(want, rel=2e-6), (
+            name
+        )  # finite differences: 1e-9 of the value over the step
 
 
 @pytest.fixture
@@ -345,28 +456,43 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("shape", "count"), [((6, 9), 1), ((70, 130), 1), ((300, 20), 2)])
-def test_torch_path_for_other_devices_equals_the_compiled_loops(shape, count, monkeypatch, threads):
-    """Field on the window and gradients: pillars themselves as nodes, some rows at a time, against nodes of blocks; of
-    the last 16 nodes a block along y and single ones along x, the lower half by another thread."""
+@pytest.mark.parametrize(
+    ("shape", "count"), [((6, 9), 1), ((70, 130), 1), ((300, 20), 2)]
+)
+def test_torch_path_for_other_devices_equals_the_compiled_loops(
+    shape, count, monkeypatch, threads
+):
+    """Field on the window and gradients: pillars themselves as nodes, some rows at a
+    time, against nodes of blocks; of
+    the last 16 nodes a block along y and single ones along x, the lower half by another
+    thread."""
     from metalens.propagate import pillars
     from metalens.propagate.window import from_moments, plan
 
     monkeypatch.setattr(pillars, "DEVICE_ROWS", 32)
     threads(count)
-    made = plan(propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu"))
+    made = plan(
+        propagate.case(shape, **GEOMETRY), 1e-9, torch.float64, torch.device("cpu")
+    )
     blocks, case = made.moments, made.case
     places = zip(blocks.counts, case.pillars_um, case.half_size_um, strict=True)
     at_pillars = [torch.tensor(legendre.values(n, p / h)) for n, p, h in places]
     plain = dataclasses.replace(blocks, rows=at_pillars[0], columns=at_pillars[1])
     maps = tuple(torch.tensor(m) for m in lens(shape, kind="noisy"))
-    (first, power), (second, same) = pillars._gather(*maps, blocks), pillars._gather_plain(*maps, plain)
+    (first, power), (second, same) = (
+        pillars._gather(*maps, blocks),
+        pillars._gather_plain(*maps, plain),
+    )
     assert power == pytest.approx(same, rel=1e-12)
     fields = [from_moments(torch.complex(m[0], m[1]), made) for m in (first, second)]
     assert (fields[0] - fields[1]).norm() < 1e-10 * fields[1].norm()
     second.requires_grad_()
-    weight = torch.linspace(-1, 1, fields[1].numel(), dtype=torch.float64).view(fields[1].shape)
-    (from_moments(torch.complex(second[0], second[1]), made).abs() ** 2 * weight).sum().backward()
+    weight = torch.linspace(-1, 1, fields[1].numel(), dtype=torch.float64).view(
+        fields[1].shape
+    )
+    (
+        from_moments(torch.complex(second[0], second[1]), made).abs() ** 2 * weight
+    ).sum().backward()
     out = torch.zeros(2, 2, *shape, dtype=torch.float64)
     pillars._spread(maps, blocks, second.grad, tuple(out[0]))
     pillars._spread_plain(maps, plain, second.grad, tuple(out[1]))
@@ -380,7 +506,12 @@ def test_choose_takes_the_exact_sum_for_few_pillars_and_says_why():
     assert "64 pillars" in small.reason
     assert large.method == "windowed"
     assert "nodes" in large.reason
-    assert propagate.choose(propagate.case((8, 8), **GEOMETRY), 1e-4, differentiable=True).method == "windowed"
+    assert (
+        propagate.choose(
+            propagate.case((8, 8), **GEOMETRY), 1e-4, differentiable=True
+        ).method
+        == "windowed"
+    )
 
 
 def test_settings_that_cannot_be_met_are_reported_not_hidden():
@@ -391,16 +522,27 @@ def test_settings_that_cannot_be_met_are_reported_not_hidden():
 
 
 def test_many_depths_of_a_fast_lens_are_spanned_by_the_basis():
-    """Depths that differ by many turns at the rim need more training fields than the first few."""
+    """Depths that differ by many turns at the rim need more training fields than the
+    first few.
+    """
     many = propagate.case((512, 512), pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=200.0, window_um=12.0,
                           samples=12, depths_um=np.linspace(120.0, 900.0, 150))  # fmt: skip
     x = legendre.mapped(64, -102.4, 102.4)
     basis = depth_basis(many, (x, x), 1e-5)
     weight = np.outer(legendre.nodes(64)[1], legendre.nodes(64)[1])
     want = np.exp(
-        1j * depth_factors(many, x[:, None], x, many.tangents, np.array(many.inverse_depths_per_um)[:, None, None])
+        1j
+        * depth_factors(
+            many,
+            x[:, None],
+            x,
+            many.tangents,
+            np.array(many.inverse_depths_per_um)[:, None, None],
+        )
     )
     got = np.einsum("db,byx->dyx", basis.coefficients, basis.basis)
-    error = np.sqrt((weight * np.abs(got - want) ** 2).sum() / (weight * np.abs(want) ** 2).sum())
+    error = np.sqrt(
+        (weight * np.abs(got - want) ** 2).sum() / (weight * np.abs(want) ** 2).sum()
+    )
     assert len(basis.strength) > 48
     assert error < 3e-5

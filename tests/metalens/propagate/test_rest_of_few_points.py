@@ -1,4 +1,6 @@
-"""What is left of an error that the normalisation takes out, where few points of a window are looked at, and many."""
+"""What is left of an error that the normalisation takes out, where few points of a
+window are looked at, and many.
+"""
 
 import math
 
@@ -12,10 +14,16 @@ RNG = np.random.default_rng(41)
 
 
 @pytest.mark.parametrize(("samples", "left"), [((74, 61), 0.5), ((37, 41), 0.03)])
-def test_of_light_that_is_too_bright_everywhere_a_half_is_left_where_few_points_are_looked_at(samples, left):
-    """Of sum 1 nothing is wrong with it. 128 points of 4514 say so by chance, of 1517 (more than one in 32) they show
-    it: half of the squared error of the intensities is kept, and a thirtieth; 1.7 times its root is told."""
-    case = Case((30, 41), 0.37, 0.85, 62.0, (0.05, -0.03), (1 / 900,), (2.0, -3.5), 0.4, samples)
+def test_of_light_that_is_too_bright_everywhere_a_half_is_left_where_few_points_are_looked_at(
+    samples, left
+):
+    """Of sum 1 nothing is wrong with it. 128 points of 4514 say so by chance, of 1517
+    (more than one in 32) they show
+    it: half of the squared error of the intensities is kept, and a thirtieth; 1.7 times
+    its root is told."""
+    case = Case(
+        (30, 41), 0.37, 0.85, 62.0, (0.05, -0.03), (1 / 900,), (2.0, -3.5), 0.4, samples
+    )
     nodes = np.linspace(-5, 5, 5), np.linspace(-7, 7, 6)
     light = RNG.normal(size=(5, 6)) + 1j * RNG.normal(size=(5, 6))
     one = Sample(case, 1.0, light, 0.0, 1, nodes)

@@ -1,4 +1,6 @@
-"""Geometry of a propagation from its words: places, cells, slopes and films, each by hand, and what is refused."""
+"""Geometry of a propagation from its words: places, cells, slopes and films, each by
+hand, and what is refused.
+"""
 
 import math
 
@@ -11,17 +13,35 @@ from metalens.ground.errors import PropagationError
 from metalens.lens import Layers, Stop
 from metalens.propagate import verbs
 
-PLAIN = {"pitch_um": 0.41, "wavelength_um": 0.83, "sensor_distance_um": 900.0, "depths_um": (3e3, math.inf, 5e3)}
+PLAIN = {
+    "pitch_um": 0.41,
+    "wavelength_um": 0.83,
+    "sensor_distance_um": 900.0,
+    "depths_um": (3e3, math.inf, 5e3),
+}
 WINDOW = {"window_um": (21.0, 33.0), "samples": (7, 11)}
 
 
 def test_every_number_has_its_place():
-    found = verbs.case((5, 301, 203), **PLAIN, **WINDOW, angle_rad=(0.2, -0.1), offset_um=(3.0, -7.0), row_um=0.37)
+    found = verbs.case(
+        (5, 301, 203),
+        **PLAIN,
+        **WINDOW,
+        angle_rad=(0.2, -0.1),
+        offset_um=(3.0, -7.0),
+        row_um=0.37,
+    )
     assert found.shape == (301, 203)
-    assert (found.pitch_um, found.wavelength_um, found.sensor_distance_um) == (0.41, 0.83, 900.0)
+    assert (found.pitch_um, found.wavelength_um, found.sensor_distance_um) == (
+        0.41,
+        0.83,
+        900.0,
+    )
     assert found.tangents == pytest.approx((math.tan(0.2), -math.tan(0.1)))
     assert found.inverse_depths_per_um == pytest.approx((1 / 3e3, 0.0, 1 / 5e3))
-    assert found.centre_um == pytest.approx((900 * math.tan(0.2) + 3, -900 * math.tan(0.1) - 7))
+    assert found.centre_um == pytest.approx(
+        (900 * math.tan(0.2) + 3, -900 * math.tan(0.1) - 7)
+    )
     assert (found.step_um, found.samples) == (3.0, (11, 7))
     assert (found.row_um, found.site_um2) == (0.37, 0.0)
     assert (found.front, found.behind) == ((), None)
@@ -36,7 +56,11 @@ def test_windows_are_numbers_or_pairs_of_square_cells():
     assert verbs.window_of(21.0, 7) == (3.0, (7, 7))
     assert verbs.window_of((21.0, 33.0), (7, 11)) == (3.0, (11, 7))
     assert verbs.window_of((21.0, 33.0 * (1 + 0.8e-6)), (7, 11))[0] == 3.0
-    for wrong in (((21.0, 33.0 * (1 + 1.2e-6)), (7, 11)), ((21.0, 33.0 * (1 - 1.2e-6)), (7, 11)), ((21, 33), 7)):
+    for wrong in (
+        ((21.0, 33.0 * (1 + 1.2e-6)), (7, 11)),
+        ((21.0, 33.0 * (1 - 1.2e-6)), (7, 11)),
+        ((21, 33), 7),
+    ):
         with pytest.raises(PropagationError, match="need square ones"):
             verbs.window_of(*wrong)
     for wrong in (((1, 2, 3), 4), (4, (1, 2, 3)), (4, 2.5), (4, (2, 2.5)), ((), 4)):
@@ -45,7 +69,9 @@ def test_windows_are_numbers_or_pairs_of_square_cells():
     assert verbs.window_of(21.0, 0) == (21.0, (0, 0))  # which a case refuses
 
 
-@pytest.mark.parametrize("wrong", [math.pi / 2, -math.pi / 2, (0.1, math.nan), (0.1, 0.2, 0.3), [[0.1, 0.2]]])
+@pytest.mark.parametrize(
+    "wrong", [math.pi / 2, -math.pi / 2, (0.1, math.nan), (0.1, 0.2, 0.3), [[0.1, 0.2]]]
+)
 def test_an_angle_is_one_or_two_below_a_right_one(wrong):
     assert verbs.angles((0.3, -1.57)) == (0.3, -1.57)
     assert verbs.angles(-0.4) == (-0.4, 0.0)
@@ -68,7 +94,10 @@ def test_depths_below_0_and_odd_offsets_are_refused(depths, offset, told):
         verbs.case((9, 7), **PLAIN | {"depths_um": depths}, **WINDOW, offset_um=offset)
 
 
-FILMS = Layers(front=(Film(Index(1.5), 40.0),), behind=(Film(Index(2.1), 300.0), Film(Index(1.4), 120.0)))
+FILMS = Layers(
+    front=(Film(Index(1.5), 40.0),),
+    behind=(Film(Index(2.1), 300.0), Film(Index(1.4), 120.0)),
+)
 
 
 def snell(tangent, gap=480.0, films=((2.1, 300.0), (1.4, 120.0))):
@@ -78,9 +107,19 @@ def snell(tangent, gap=480.0, films=((2.1, 300.0), (1.4, 120.0))):
 
 
 def test_the_chief_ray_goes_through_films_by_snell():
-    found = verbs.case((9, 7), **PLAIN, **WINDOW, angle_rad=(0.4, 0.0), layers=FILMS, offset_um=(2.0, -3.0))
+    found = verbs.case(
+        (9, 7),
+        **PLAIN,
+        **WINDOW,
+        angle_rad=(0.4, 0.0),
+        layers=FILMS,
+        offset_um=(2.0, -3.0),
+    )
     assert found.front == ((1.5, 40.0),)
-    assert (found.behind.index, found.behind.thickness_um) == ((1.0, 2.1, 1.4), (480.0, 300.0, 120.0))
+    assert (found.behind.index, found.behind.thickness_um) == (
+        (1.0, 2.1, 1.4),
+        (480.0, 300.0, 120.0),
+    )
     assert found.centre_um == pytest.approx((snell(math.tan(0.4)) + 2, -3.0))
     aside = verbs.case((9, 7), **PLAIN, **WINDOW, angle_rad=(-0.3, 0.25), layers=FILMS)
     x, y = math.tan(-0.3), math.tan(0.25)
@@ -111,8 +150,10 @@ def test_films_of_no_thickness_count_for_nothing_and_a_stop_is_refused():
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("along", [0, 1])
 def test_films_that_fill_the_gap_let_through_what_their_face_does(along, sign):
-    """Air holds n sin θ below 1: in 30 um of index 2 that is a way of 30 / √3 = 17.32 um from the lens's rim to the
-    window's far corner. 20 x 12 pillars 0.5 um apart fill an ellipse, the window is 4 x 2.4 um."""
+    """Air holds n sin θ below 1: in 30 um of index 2 that is a way of 30 / √3 = 17.32
+    um from the lens's rim to the
+    window's far corner. 20 x 12 pillars 0.5 um apart fill an ellipse, the window is 4 x
+    2.4 um."""
     full = Layers(behind=(Film(Index(2.0), 30.0),))
     given = {"pitch_um": 0.5, "wavelength_um": 0.83, "sensor_distance_um": 30.0, "depths_um": math.inf,
              "window_um": (4.0, 2.4), "samples": (5, 3), "layers": full}  # fmt: skip
@@ -125,16 +166,23 @@ def test_films_that_fill_the_gap_let_through_what_their_face_does(along, sign):
         x, y = across + wide * np.cos(turn), down + high * np.sin(turn)
         return np.hypot(x + (off if along == 0 else 0), y + (off if along else 0)).max()
 
-    off = float(np.interp(30 / math.sqrt(3), [way(a) for a in (8.0, 16.0)], [8.0, 16.0]))
+    off = float(
+        np.interp(30 / math.sqrt(3), [way(a) for a in (8.0, 16.0)], [8.0, 16.0])
+    )
     for _ in range(20):  # the way grows nearly as the offset
         off += 30 / math.sqrt(3) - way(off)
-    for beside, passes in ((-0.1, True), (0.1, False)):  # 64 places of the rim miss its farthest by 0.02 um
+    for beside, passes in (
+        (-0.1, True),
+        (0.1, False),
+    ):  # 64 places of the rim miss its farthest by 0.02 um
         offset = [0.0, 0.0]
         offset[along] = sign * (off + beside)
         if passes:
             verbs.case((20, 12), **given, offset_um=tuple(offset))
         else:
-            with pytest.raises(PropagationError, match="do not leave the cover of index 1"):
+            with pytest.raises(
+                PropagationError, match="do not leave the cover of index 1"
+            ):
                 verbs.case((20, 12), **given, offset_um=tuple(offset))
 
 
@@ -143,7 +191,9 @@ GEOMETRY = {"pitch_um": 0.5, "wavelength_um": 0.7, "sensor_distance_um": 31.0, "
 
 
 def by_hand(phase, level):
-    """Rayleigh-Sommerfeld, pillar by pillar: what comes in has amplitude 1, and phase 0 at the lens's middle."""
+    """Rayleigh-Sommerfeld, pillar by pillar: what comes in has amplitude 1, and phase 0
+    at the lens's middle.
+    """
     k, d, out = 2 * math.pi / 0.7, 31.0, np.zeros((2, 3, 2), complex)
     tx, ty = math.tan(0.1), math.tan(-0.2)
     long = math.sqrt(1 + tx * tx + ty * ty)
@@ -151,11 +201,23 @@ def by_hand(phase, level):
         for n in range(2):
             u, v = d * tx + (n - 0.5) * 2.0, d * ty + (m - 1) * 2.0
             for (row, column), turn in np.ndenumerate(phase):
-                x, y = (column - (phase.shape[1] - 1) / 2) * 0.5, (row - (phase.shape[0] - 1) / 2) * 0.5
+                x, y = (
+                    (column - (phase.shape[1] - 1) / 2) * 0.5,
+                    (row - (phase.shape[0] - 1) / 2) * 0.5,
+                )
                 far = (x * tx + y * ty) / long
-                near = math.sqrt((x + 95 * tx) ** 2 + (y + 95 * ty) ** 2 + 95**2) - 95 * long
+                near = (
+                    math.sqrt((x + 95 * tx) ** 2 + (y + 95 * ty) ** 2 + 95**2)
+                    - 95 * long
+                )
                 r = math.sqrt((u - x) ** 2 + (v - y) ** 2 + d * d)
-                spread = d / (2 * math.pi * r * r) * (1 / r - 1j * k) * np.exp(1j * k * r) * 0.25
+                spread = (
+                    d
+                    / (2 * math.pi * r * r)
+                    * (1 / r - 1j * k)
+                    * np.exp(1j * k * r)
+                    * 0.25
+                )
                 pillar = level[row, column] * np.exp(1j * turn) * spread
                 out[0, m, n] += pillar * np.exp(1j * k * near)
                 out[1, m, n] += pillar * np.exp(1j * k * far)
@@ -168,11 +230,15 @@ def test_the_exact_sum_and_the_windowed_one_are_the_sum_over_pillars():
     want = by_hand(phase, level)
     found = verbs.exact(phase, level, **GEOMETRY)
     assert found.shape == (2, 3, 2)
-    assert np.abs(found - want).max() < 1e-10 * np.abs(want).max()  # rounding of phases of some 300 rad
+    assert (
+        np.abs(found - want).max() < 1e-10 * np.abs(want).max()
+    )  # rounding of phases of some 300 rad
     near = verbs.windowed(phase, level, tolerance=1e-6, **GEOMETRY)
     assert isinstance(near, np.ndarray)
     assert np.abs(near - want).max() < 3e-6 * np.abs(want).max()
-    single = verbs.windowed(torch.tensor(phase, dtype=torch.float32), torch.tensor(level), **GEOMETRY)
+    single = verbs.windowed(
+        torch.tensor(phase, dtype=torch.float32), torch.tensor(level), **GEOMETRY
+    )
     assert single.dtype == torch.complex64
     for tolerance in (0.0, 1.0, -1e-3):
         with pytest.raises(PropagationError, match="tolerance is"):

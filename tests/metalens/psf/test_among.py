@@ -1,4 +1,6 @@
-"""The factor of unlike neighbours on maps: where the phase has which slope, on which field, and its derivatives."""
+"""The factor of unlike neighbours on maps: where the phase has which slope, on which
+field, and its derivatives.
+"""
 
 import math
 
@@ -31,11 +33,15 @@ ROWS = Neighbours(
 def grating(sine, azimuth, shape=(23, 31)):
     """Phase that turns light by this sine in this azimuth."""
     y, x = np.indices(shape) * PITCH
-    return 2 * np.pi / WAVE * sine * (x * math.cos(azimuth) + y * math.sin(azimuth)) + 0.7
+    return (
+        2 * np.pi / WAVE * sine * (x * math.cos(azimuth) + y * math.sin(azimuth)) + 0.7
+    )
 
 
 def lens(distance=30.0, count=100):
-    """Wrapped phase and open pillars of a lens off the middle of its map, and the (x, y) sines by which it turns."""
+    """Wrapped phase and open pillars of a lens off the middle of its map, and the (x,
+    y) sines by which it turns.
+    """
     axis = (np.arange(count) - (count - 1) / 2) * PITCH
     x, y = axis - 0.3, (axis + 0.2)[:, None]
     path = np.sqrt(x**2 + y**2 + distance**2)
@@ -45,7 +51,9 @@ def lens(distance=30.0, count=100):
 
 @pytest.mark.parametrize("azimuth", [0.0, 0.4, math.pi / 4, 2.0])
 def test_a_grating_has_the_factor_of_its_slope_and_azimuth_on_each_field(azimuth):
-    """Wrapped, |slope| below pi / pitch; J has the fields along and across the slope as its own."""
+    """Wrapped, |slope| below pi / pitch; J has the fields along and across the slope as
+    its own.
+    """
     phase = torch.tensor(np.angle(np.exp(1j * grating(0.41, azimuth))))
     got = among.jones(phase, torch.full_like(phase, 0.8), ROWS, PITCH)
     along, across = ROWS.at(np.array(0.41), azimuth)
@@ -59,31 +67,56 @@ def test_a_grating_has_the_factor_of_its_slope_and_azimuth_on_each_field(azimuth
     assert level.numpy() == pytest.approx(0.8 * abs(mean), rel=1e-9)
 
 
-def test_slopes_of_a_lens_are_those_of_its_paths_and_shares_of_rows_make_no_difference(monkeypatch):
-    """Inside the rim to 1e-3 of the largest slope (curvature over five pillars); at it, from one side, to 2 %."""
+def test_slopes_of_a_lens_are_those_of_its_paths_and_shares_of_rows_make_no_difference(
+    monkeypatch,
+):
+    """Inside the rim to 1e-3 of the largest slope (curvature over five pillars); at it,
+    from one side, to 2 %.
+    """
     phase, level, sines = lens()
     light = torch.polar(torch.tensor(level), torch.tensor(phase))
     slopes = among.slopes(light, PITCH)
     for got, want in zip(slopes, sines, strict=True):
         error = np.abs(got.numpy() * WAVE / (2 * np.pi) - want)
-        inner = among._around(torch.tensor(level[:, 1:] * level[:, :-1]).to(light), along=-1).real.numpy() == 20
+        inner = (
+            among._around(
+                torch.tensor(level[:, 1:] * level[:, :-1]).to(light), along=-1
+            ).real.numpy()
+            == 20
+        )
         assert error[inner].max() < 1e-3 * 0.51
         assert error[level > 0].max() < 0.02 * 0.51
     whole = among.mean(light, ROWS, PITCH)
     monkeypatch.setattr(among, "ROWS", 7)
-    assert float((among.mean(light, ROWS, PITCH) - whole).abs().max()) < 1e-13  # of 1: a few roundings of other lanes
-    far = torch.tensor(np.hypot(*np.indices((100, 100)) - 2.0) > 130)  # where no pair stands: as it was
+    assert (
+        float((among.mean(light, ROWS, PITCH) - whole).abs().max()) < 1e-13
+    )  # of 1: a few roundings of other lanes
+    far = torch.tensor(
+        np.hypot(*np.indices((100, 100)) - 2.0) > 130
+    )  # where no pair stands: as it was
     assert far.any()
     assert (whole[far] == 1).all()
 
 
 def about(**more):
-    window = dict(window_um=9.0, samples=36, depths_um=[np.inf, 400.0], tolerance=1e-5, integrate=False)
-    return dict(pitch_um=PITCH, wavelength_um=WAVE, sensor_distance_um=30.0) | window | more
+    window = dict(
+        window_um=9.0,
+        samples=36,
+        depths_um=[np.inf, 400.0],
+        tolerance=1e-5,
+        integrate=False,
+    )
+    return (
+        dict(pitch_um=PITCH, wavelength_um=WAVE, sensor_distance_um=30.0)
+        | window
+        | more
+    )
 
 
 def test_a_psf_with_neighbours_is_that_of_the_maps_with_their_factor():
-    """By the lens's own paths: apart are slopes from one side at the rim, 2e-3 of what the factor changes there."""
+    """By the lens's own paths: apart are slopes from one side at the rim, 2e-3 of what
+    the factor changes there.
+    """
     phase, level, sines = lens()
     factor = ROWS.at(np.hypot(*sines), np.arctan2(sines[1], sines[0])).mean(0)
     want = psf.psf_stack(phase + np.angle(factor), level * np.abs(factor), **about())
@@ -97,7 +130,8 @@ def test_a_psf_with_neighbours_is_that_of_the_maps_with_their_factor():
 
 @pytest.mark.parametrize("kind", ["flux", "vector"])
 def test_both_polarisations_with_neighbours_are_those_of_plane_waves(kind):
-    """NA 0.51, the fields along and across the slope apart; rays to the window's middle: 9 um / distance² of second
+    """NA 0.51, the fields along and across the slope apart; rays to the window's
+    middle: 9 um / distance² of second
     order. The mean of both on both fields alike is farther off."""
     count, distance = 96, 30.0
     axis = (np.arange(count) - (count - 1) / 2) * PITCH
@@ -113,31 +147,51 @@ def test_both_polarisations_with_neighbours_are_those_of_plane_waves(kind):
     turned = vectorial.turned(x, y, distance)
     light = level * np.exp(1j * phase) * np.einsum("pqyx,qcyx->pcyx", jones, turned)
     referee = {"flux": vectorial.flux, "vector": vectorial.image}[kind]
-    want = referee(light, step=PITCH, wavelength=WAVE, distance=distance, count=480)[38:59, 38:59]
+    want = referee(light, step=PITCH, wavelength=WAVE, distance=distance, count=480)[
+        38:59, 38:59
+    ]
     half = PITCH / 2  # an odd window on an even lattice
-    seen = about(window_um=21 * PITCH, samples=21, depths_um=[np.inf], offset_um=(half, half))
+    seen = about(
+        window_um=21 * PITCH, samples=21, depths_um=[np.inf], offset_um=(half, half)
+    )
     got, plain, scalar = (
-        psf.psf_stack(phase, level, **seen, neighbours=rows, polarisation=of).intensity[0]
+        psf.psf_stack(phase, level, **seen, neighbours=rows, polarisation=of).intensity[
+            0
+        ]
         for rows, of in ((ROWS, kind), (None, kind), (ROWS, "scalar"))
     )
     want = want / want.sum()
-    error, without, mean = (np.linalg.norm(g - want) / np.linalg.norm(want) for g in (got, plain, scalar))
+    error, without, mean = (
+        np.linalg.norm(g - want) / np.linalg.norm(want) for g in (got, plain, scalar)
+    )
     assert error < 0.3 * without
     assert error < 0.7 * mean
 
 
 def test_the_flux_of_a_psf_is_poyntings_of_plane_waves():
-    """E and H summed wave by wave; |E|² is 7e-2 away, the flux 3e-3 (rays to the window's middle)."""
+    """E and H summed wave by wave; |E|² is 7e-2 away, the flux 3e-3 (rays to the
+    window's middle).
+    """
     count, distance = 96, 30.0
     axis = (np.arange(count) - (count - 1) / 2) * PITCH
     x, y = axis, axis[:, None]
     path = np.sqrt(x**2 + y**2 + distance**2)
-    level, phase = (np.hypot(x + 0.7, y) < 18.0) * 1.0, -2 * np.pi / WAVE * (path - distance) + 1.5 * x * y**2 / 18**3
+    level, phase = (
+        (np.hypot(x + 0.7, y) < 18.0) * 1.0,
+        -2 * np.pi / WAVE * (path - distance) + 1.5 * x * y**2 / 18**3,
+    )
     light = level * np.exp(1j * phase) * vectorial.turned(x, y, distance)
-    want = vectorial.flux(light, step=PITCH, wavelength=WAVE, distance=distance, count=480)[38:59, 38:59]
+    want = vectorial.flux(
+        light, step=PITCH, wavelength=WAVE, distance=distance, count=480
+    )[38:59, 38:59]
     half = PITCH / 2
-    seen = about(window_um=21 * PITCH, samples=21, depths_um=[np.inf], offset_um=(half, half))
-    flux, energy = (psf.psf_stack(phase, level, **seen, polarisation=of) for of in ("flux", "vector"))
+    seen = about(
+        window_um=21 * PITCH, samples=21, depths_um=[np.inf], offset_um=(half, half)
+    )
+    flux, energy = (
+        psf.psf_stack(phase, level, **seen, polarisation=of)
+        for of in ("flux", "vector")
+    )
     error, other = (np.linalg.norm(one.intensity[0] - want / want.sum()) / np.linalg.norm(want / want.sum())
                     for one in (flux, energy))  # fmt: skip
     assert error < 5e-3
@@ -149,36 +203,70 @@ def test_the_flux_of_a_psf_is_poyntings_of_plane_waves():
 def test_two_wavelengths_of_flux_are_those_of_each_alone():
     """Weighed by their light; of two lenses in a batch each has its own."""
     phase, level, _ = lens(distance=14.0, count=40)
-    given = about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12, polarisation="flux")
+    given = about(
+        depths_um=[200.0],
+        sensor_distance_um=14.0,
+        window_um=6.0,
+        samples=12,
+        polarisation="flux",
+    )
     bent = phase + 0.4 * np.hypot(*np.indices((40, 40)) - 17.0) / 20
     both = psf.psf_stack(
-        np.array([[phase, bent], [bent, phase]]), level, **given | dict(wavelength_um=[0.85, 0.8], weights=[1.0, 3.0])
+        np.array([[phase, bent], [bent, phase]]),
+        level,
+        **given | dict(wavelength_um=[0.85, 0.8], weights=[1.0, 3.0]),
     )
     for k, maps in enumerate(((phase, bent), (bent, phase))):
         one, other = (
-            psf.psf_stack(m, level, **given | dict(wavelength_um=w)) for m, w in zip(maps, (0.85, 0.8), strict=True)
+            psf.psf_stack(m, level, **given | dict(wavelength_um=w))
+            for m, w in zip(maps, (0.85, 0.8), strict=True)
         )
-        light = 0.25 * one.intensity * one.energy_um2 + 0.75 * other.intensity * other.energy_um2
-        assert both.intensity[k] * both.energy_um2[k] == pytest.approx(light, abs=1e-4 * light.max())
+        light = (
+            0.25 * one.intensity * one.energy_um2
+            + 0.75 * other.intensity * other.energy_um2
+        )
+        assert both.intensity[k] * both.energy_um2[k] == pytest.approx(
+            light, abs=1e-4 * light.max()
+        )
 
 
 def test_factors_made_once_serve_as_the_rows_do():
-    """Several directions share maps, and so the factors on both fields; one scalar has no use for two."""
+    """Several directions share maps, and so the factors on both fields; one scalar has
+    no use for two.
+    """
     phase, level, _ = lens(distance=14.0, count=40)
-    given = about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12, polarisation="flux")
-    fields = among.jones(torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH)
-    got, want = (psf.psf_stack(phase, level, **given, neighbours=of) for of in (fields, ROWS))
+    given = about(
+        depths_um=[200.0],
+        sensor_distance_um=14.0,
+        window_um=6.0,
+        samples=12,
+        polarisation="flux",
+    )
+    fields = among.jones(
+        torch.tensor(phase)[None], torch.tensor(level)[None], ROWS, PITCH
+    )
+    got, want = (
+        psf.psf_stack(phase, level, **given, neighbours=of) for of in (fields, ROWS)
+    )
     assert got.intensity == pytest.approx(want.intensity, abs=1e-12)  # of sum 1
-    with pytest.raises(PropagationError, match="factors on both fields, but one scalar"):
-        psf.psf_stack(phase, level, **given | dict(polarisation="scalar"), neighbours=fields)
+    with pytest.raises(
+        PropagationError, match="factors on both fields, but one scalar"
+    ):
+        psf.psf_stack(
+            phase, level, **given | dict(polarisation="scalar"), neighbours=fields
+        )
 
 
 def test_the_factor_is_one_formula_for_numpy_and_torch():
     sine, aside = np.array([0.0, 0.2, 0.55, 0.9]), np.array([0.3, 0.0, 1.0, 0.5])
     for field in (0, 1):
         got = ROWS.of_field(field, torch.tensor(sine), torch.tensor(aside))
-        assert got.numpy() == pytest.approx(ROWS.of_field(field, sine, aside), rel=1e-14)
-        assert got.numpy() == pytest.approx(ROWS.at(sine, np.arcsin(np.sqrt(aside)) / 2)[field], rel=1e-12)
+        assert got.numpy() == pytest.approx(
+            ROWS.of_field(field, sine, aside), rel=1e-14
+        )
+        assert got.numpy() == pytest.approx(
+            ROWS.at(sine, np.arcsin(np.sqrt(aside)) / 2)[field], rel=1e-12
+        )
     both = (ROWS.of_field(0, sine, aside) + ROWS.of_field(1, sine, aside)) / 2
     assert ROWS.of_both(sine, aside) == pytest.approx(both, rel=1e-14)
     assert np.abs(ROWS.of_field(0, sine, aside) - both).max() > 0.03
@@ -186,23 +274,33 @@ def test_the_factor_is_one_formula_for_numpy_and_torch():
 
 def test_a_polarisation_that_maps_cannot_tell_is_refused():
     phase, level, _ = lens(distance=14.0, count=40)
-    with pytest.raises(PropagationError, match="'auto': need one of scalar, flux, vector"):
+    with pytest.raises(
+        PropagationError, match="'auto': need one of scalar, flux, vector"
+    ):
         psf.psf_stack(phase, level, **about(polarisation="auto"))
 
 
 @pytest.mark.parametrize("polarisation", ["scalar", "flux"])
 def test_derivatives_by_phases_go_through_the_slopes(polarisation):
-    """A saddle on a lens of 40 pillars: the factor's own change is part of it; central differences."""
+    """A saddle on a lens of 40 pillars: the factor's own change is part of it; central
+    differences.
+    """
     phase, level, _ = lens(distance=14.0, count=40)
     given = dict(
-        about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12), polarisation=polarisation
+        about(depths_um=[200.0], sensor_distance_um=14.0, window_um=6.0, samples=12),
+        polarisation=polarisation,
     )
     weight = torch.linspace(0.2, 1.7, 144, dtype=torch.float64).reshape(12, 12)
     axis = torch.arange(40, dtype=torch.float64) / 20 - 1
     saddle = axis * axis[:, None] + 0.3 * axis**2
 
     def score(size, rows):
-        made = psf.psf_stack(torch.tensor(phase) + size * saddle, torch.tensor(level), **given, neighbours=rows)
+        made = psf.psf_stack(
+            torch.tensor(phase) + size * saddle,
+            torch.tensor(level),
+            **given,
+            neighbours=rows,
+        )
         return (made.intensity[0] * made.energy_um2[0] * weight).sum()
 
     found = []
@@ -210,7 +308,10 @@ def test_derivatives_by_phases_go_through_the_slopes(polarisation):
         size = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
         (slope,) = torch.autograd.grad(score(size, rows), size)
         step = 1e-3
-        wide = (score(torch.tensor(0.4 + step), rows) - score(torch.tensor(0.4 - step), rows)) / (2 * step)
+        wide = (
+            score(torch.tensor(0.4 + step), rows)
+            - score(torch.tensor(0.4 - step), rows)
+        ) / (2 * step)
         assert float(slope) == pytest.approx(float(wide), rel=1e-4)
         found.append(float(slope))
     assert abs(found[0] - found[1]) > 1e-2 * abs(found[1])

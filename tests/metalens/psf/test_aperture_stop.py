@@ -1,4 +1,6 @@
-"""Stops on the other face of a substrate, against plane waves through the glass from the stop to the pillars."""
+"""Stops on the other face of a substrate, against plane waves through the glass from
+the stop to the pillars.
+"""
 
 import math
 from dataclasses import replace
@@ -37,14 +39,20 @@ def _on_the_pillars(
     thick_um: float,
     middle: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """(y, x) field before the pillars: the source's wave through the hole, its plane waves through glass."""
+    """(y, x) field before the pillars: the source's wave through the hole, its plane
+    waves through glass.
+    """
     fine, count = PITCH / 2, 1280
-    place = (np.arange(count) - count // 2) * fine + PITCH / 2  # every second one is a pillar
+    place = (
+        np.arange(count) - count // 2
+    ) * fine + PITCH / 2  # every second one is a pillar
     x, y = np.meshgrid(place, place)
     tx, ty = (math.tan(a) for a in angle)
     slope = math.hypot(tx, ty)
     sine = slope / math.hypot(1, slope)
-    even = np.ones_like(x)  # without the fall of 1 / r over the pillars, of which PSFs know nothing
+    even = np.ones_like(
+        x
+    )  # without the fall of 1 / r over the pillars, of which PSFs know nothing
     if math.isinf(depth_um):
         wave = np.exp(1j * K / math.hypot(1, slope) * (tx * x + ty * y))
     else:  # Snell: the ray to the middle of the lens, back through glass and air
@@ -54,7 +62,9 @@ def _on_the_pillars(
         way = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + gap**2)
         wave = np.exp(1j * K * way) / way
         even = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (gap + thick_um / GLASS) ** 2)
-    wave = wave * np.clip((stop_um - np.hypot(x - middle[0], y - middle[1])) / fine + 0.5, 0, 1)
+    wave = wave * np.clip(
+        (stop_um - np.hypot(x - middle[0], y - middle[1])) / fine + 0.5, 0, 1
+    )
     f = np.fft.fftfreq(count, fine)
     along = np.sqrt((GLASS / WAVE) ** 2 - f**2 - f[:, None] ** 2 + 0j)
     behind = np.fft.ifft2(np.fft.fft2(wave) * np.exp(2j * np.pi * along * thick_um))
@@ -69,7 +79,9 @@ def _summed(
     thick_um: float = THICK,
     level: np.ndarray = LEVEL,
 ) -> np.ndarray:
-    """(y, x) irradiance on every fourth row and second column of the window, of sum 1, by a plain sum over pillars."""
+    """(y, x) irradiance on every fourth row and second column of the window, of sum 1,
+    by a plain sum over pillars.
+    """
     out = _lit(angle, depth_um, (stop_um, thick_um), level, angle)
     return out / out.sum()
 
@@ -82,25 +94,41 @@ def _lit(
     window: tuple[float, float],
     phase: np.ndarray = PHASE,
 ) -> np.ndarray:
-    """The same as it is, on the window of the chief ray of an angle; hole_um: radius, how far before the pillars,
+    """The same as it is, on the window of the chief ray of an angle; hole_um: radius,
+    how far before the pillars,
     and middle."""
-    light = (_on_the_pillars(angle, depth_um, *hole_um) * level * np.exp(1j * phase))[level > 0]
+    light = (_on_the_pillars(angle, depth_um, *hole_um) * level * np.exp(1j * phase))[
+        level > 0
+    ]
     x, y = X[level > 0], Y[level > 0]
     across, down = np.arange(41)[::2] - 20.0, np.arange(41)[::4] - 20.0
     out = np.empty((11, 21))
     for row, below in enumerate(down):
-        dx, dy = (SENSOR * math.tan(window[0]) + across)[:, None] - x, SENSOR * math.tan(window[1]) + below - y
+        dx, dy = (
+            (SENSOR * math.tan(window[0]) + across)[:, None] - x,
+            SENSOR * math.tan(window[1]) + below - y,
+        )
         r = np.sqrt(dx * dx + dy * dy + SENSOR**2)
         out[row] = np.abs((light * np.exp(1j * K * r) / r**2).sum(1)) ** 2
     return out
 
 
 def _seen(
-    angle: tuple[float, float], depth_um: float, layers: Layers, level: np.ndarray = LEVEL
+    angle: tuple[float, float],
+    depth_um: float,
+    layers: Layers,
+    level: np.ndarray = LEVEL,
 ) -> tuple[np.ndarray, float]:
     """The same by the toolchain, and the error that it says of the stop."""
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "depths_um": [depth_um]}
-    found = psf_stack(PHASE, level, layers=layers, angle_rad=angle, integrate=False, **about, **WINDOW)
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        "depths_um": [depth_um],
+    }
+    found = psf_stack(
+        PHASE, level, layers=layers, angle_rad=angle, integrate=False, **about, **WINDOW
+    )
     light = found.intensity[0, ::4, ::2]
     assert found.budget is not None
     assert found.budget.total >= found.budget.stop
@@ -111,8 +139,10 @@ def _apart(got: np.ndarray, want: np.ndarray) -> float:
     return float(np.linalg.norm(got - want) / np.linalg.norm(want))
 
 
-# Fresnel numbers 4 to 100, in focus and out of it by as much as 1/310 um. Rays alone, without the ripples of the edge,
-# are wrong by 7e-4 in focus and by up to 0.2; a straight edge by 2 to 15 times the estimate where it counts.
+# Fresnel numbers 4 to 100, in focus and out of it by as much as 1/310 um. Rays alone,
+# without the ripples of the edge,
+# are wrong by 7e-4 in focus and by up to 0.2; a straight edge by 2 to 15 times the
+# estimate where it counts.
 @pytest.mark.parametrize(
     ("angle", "depth_um", "stop_um", "thick_um", "square"),
     [((0.0, 0.0), math.inf, 33.0, 80.0, False), ((0.12, -0.07), math.inf, 33.0, 80.0, False),
@@ -123,15 +153,23 @@ def _apart(got: np.ndarray, want: np.ndarray) -> float:
      ((0.0, 0.0), 520.0, 26.0, 140.0, False), ((-0.28, -0.19), 1700.0, 31.0, 57.0, True)],
 )  # fmt: skip
 def test_psf_behind_a_stop_is_that_of_waves_through_its_glass_within_the_error_it_says(
-    angle: tuple[float, float], depth_um: float, stop_um: float, thick_um: float, square: bool
+    angle: tuple[float, float],
+    depth_um: float,
+    stop_um: float,
+    thick_um: float,
+    square: bool,
 ) -> None:
     layers = Layers(front=(Film(Index(GLASS), thick_um),), stop=Stop(stop_um, thick_um))
     level = np.ones_like(LEVEL) if square else LEVEL
     want = _summed(angle, depth_um, stop_um, thick_um, level)
     seen, said = _seen(angle, depth_um, layers, level)
     assert said / 8 < _apart(seen, want) < said + 1e-4  # of the sums
-    on_pillars = replace(layers, stop=Stop(stop_um))  # the same hole there: other light where there is an angle
-    assert _apart(_seen(angle, depth_um, on_pillars, level)[0], want) > 3 * said or angle == (0.0, 0.0)
+    on_pillars = replace(
+        layers, stop=Stop(stop_um)
+    )  # the same hole there: other light where there is an angle
+    assert _apart(
+        _seen(angle, depth_um, on_pillars, level)[0], want
+    ) > 3 * said or angle == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -142,10 +180,18 @@ def test_psf_behind_a_stop_is_that_of_waves_through_its_glass_within_the_error_i
      ((-0.28, -0.15), 2100.0, 26.0, 57.0, (11.0, 3.0)), ((0.0, 0.0), 900.0, 21.0, 95.0, (0.0, 23.0))],
 )  # fmt: skip
 def test_a_hole_beside_the_axis_lights_its_own_part_of_the_lens(
-    angle: tuple[float, float], depth_um: float, stop_um: float, thick_um: float, middle: tuple[float, float]
+    angle: tuple[float, float],
+    depth_um: float,
+    stop_um: float,
+    thick_um: float,
+    middle: tuple[float, float],
 ) -> None:
-    """As above, of a stop whose middle lies up to its own radius from the axis; on the axis it would be far off."""
-    layers = Layers(front=(Film(Index(GLASS), thick_um),), stop=Stop(stop_um, thick_um, middle))
+    """As above, of a stop whose middle lies up to its own radius from the axis; on the
+    axis it would be far off.
+    """
+    layers = Layers(
+        front=(Film(Index(GLASS), thick_um),), stop=Stop(stop_um, thick_um, middle)
+    )
     want = _lit(angle, depth_um, (stop_um, thick_um, middle), LEVEL, angle)
     want /= want.sum()
     seen, said = _seen(angle, depth_um, layers)
@@ -155,39 +201,86 @@ def test_a_hole_beside_the_axis_lights_its_own_part_of_the_lens(
 
 
 @pytest.mark.parametrize("light", ["x", "y"])
-def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(light: Literal["x", "y"]) -> None:
-    """Size along x turns light along x, size along y that along y, in 48 steps: one focuses, the other beside it."""
+def test_pillars_of_two_sizes_behind_a_stop_give_either_light_its_own_image(
+    light: Literal["x", "y"],
+) -> None:
+    """Size along x turns light along x, size along y that along y, in 48 steps: one
+    focuses, the other beside it.
+    """
     steps, shift = 48, (9.0, -5.0)
-    beside = -K * (np.sqrt((X - shift[0]) ** 2 + (Y - shift[1]) ** 2 + SENSOR**2) - SENSOR)
-    sizes = [np.rint(np.mod(phase / (2 * np.pi), 1.0) * steps).astype(int) % steps for phase in (PHASE, beside)]
-    axis, turn = 0.1 + 0.005 * np.arange(steps), np.exp(2j * np.pi * np.arange(steps) / steps)
-    table = np.stack([turn[:, None] + 0 * turn, 0.8 * turn + 0 * turn[:, None]], -1)[None]
+    beside = -K * (
+        np.sqrt((X - shift[0]) ** 2 + (Y - shift[1]) ** 2 + SENSOR**2) - SENSOR
+    )
+    sizes = [
+        np.rint(np.mod(phase / (2 * np.pi), 1.0) * steps).astype(int) % steps
+        for phase in (PHASE, beside)
+    ]
+    axis, turn = (
+        0.1 + 0.005 * np.arange(steps),
+        np.exp(2j * np.pi * np.arange(steps) / steps),
+    )
+    table = np.stack([turn[:, None] + 0 * turn, 0.8 * turn + 0 * turn[:, None]], -1)[
+        None
+    ]
     there = np.hypot(X, Y) <= 57.0
-    place = DiameterMap(np.where(there, axis[sizes[0]], 0.0), PITCH, length_um=np.where(there, axis[sizes[1]], 0.0))
+    place = DiameterMap(
+        np.where(there, axis[sizes[0]], 0.0),
+        PITCH,
+        length_um=np.where(there, axis[sizes[1]], 0.0),
+    )
     pairs = Pairs(np.array([WAVE]), axis, axis, table, (SENSOR, math.inf))
     hole = (24.0, 90.0, (7.0, -11.0))
     layers = Layers(front=(Film(Index(GLASS), hole[1]),), stop=Stop(*hole))
-    lens = Lens(place, Cell(PITCH), pairs.proxy, WAVE, SENSOR, math.inf, "two", layers=layers, pairs=pairs)
+    lens = Lens(
+        place,
+        Cell(PITCH),
+        pairs.proxy,
+        WAVE,
+        SENSOR,
+        math.inf,
+        "two",
+        layers=layers,
+        pairs=pairs,
+    )
     angle, depth = (0.11, -0.06), 1400.0
-    found = from_lens(lens.seen(light), View((depth,), (angle,), 41.0, 41), tolerance=1e-4)
+    found = from_lens(
+        lens.seen(light), View((depth,), (angle,), 41.0, 41), tolerance=1e-4
+    )
     wanted = 2 * np.pi / steps * sizes["xy".index(light)]
     want = _lit(angle, depth, hole, there.astype(float), angle, wanted)
     got = found.intensity[0, 0, ::4, ::2]
     assert found.budget is not None
     assert _apart(got / got.sum(), want / want.sum()) < found.budget.stop + 1e-4
-    other = _lit(angle, depth, hole, there.astype(float), angle, 2 * np.pi / steps * sizes["yx".index(light)])
+    other = _lit(
+        angle,
+        depth,
+        hole,
+        there.astype(float),
+        angle,
+        2 * np.pi / steps * sizes["yx".index(light)],
+    )
     assert _apart(got / got.sum(), other / other.sum()) > 0.5
 
 
 def test_the_ray_through_the_middle_of_a_hole_beside_the_axis() -> None:
-    """Forwards, from the source through the hole's middle in air; the same slopes of collimated light."""
+    """Forwards, from the source through the hole's middle in air; the same slopes of
+    collimated light.
+    """
     layers = Layers(stop=Stop(20.0, 150.0, (31.0, -12.0)))
     tangents, depth = np.array([[0.2, -0.1], [0.0, 0.0]]), 900.0
     want = (tangents * depth + np.array([31.0, -12.0])) / (depth - 150.0)
-    np.testing.assert_allclose(layers.through_middle(tangents, depth, WAVE), want, rtol=1e-12)
-    np.testing.assert_array_equal(layers.through_middle(tangents, math.inf, WAVE), tangents)
-    on_pillars = replace(layers, stop=Stop(20.0, 0.0, (31.0, -12.0))).through_middle(tangents, depth, WAVE)
-    np.testing.assert_allclose(on_pillars, tangents + np.array([31.0, -12.0]) / depth, rtol=1e-12)
+    np.testing.assert_allclose(
+        layers.through_middle(tangents, depth, WAVE), want, rtol=1e-12
+    )
+    np.testing.assert_array_equal(
+        layers.through_middle(tangents, math.inf, WAVE), tangents
+    )
+    on_pillars = replace(layers, stop=Stop(20.0, 0.0, (31.0, -12.0))).through_middle(
+        tangents, depth, WAVE
+    )
+    np.testing.assert_allclose(
+        on_pillars, tangents + np.array([31.0, -12.0]) / depth, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("middle", [(math.nan, 0.0), (0.0, math.inf)])
@@ -196,38 +289,72 @@ def test_a_hole_nowhere_is_refused(middle: tuple[float, float]) -> None:
         Stop(20.0, 150.0, middle)
 
 
-# windows that hold 0.1 to 0.2 of the light: by the blur that is seen in them they said 0.3 to 1.1 of the true error
+# windows that hold 0.1 to 0.2 of the light: by the blur that is seen in them they said
+# 0.3 to 1.1 of the true error
 @pytest.mark.parametrize(
     ("angle", "depth_um", "stop_um", "thick_um"),
-    [((-0.1745, -0.1187), 480.0, 24.0, 120.0), ((-0.21, 0.06), 480.0, 37.0, 33.0), ((0.02, 0.03), 310.0, 18.0, 45.0)],
+    [
+        ((-0.1745, -0.1187), 480.0, 24.0, 120.0),
+        ((-0.21, 0.06), 480.0, 37.0, 33.0),
+        ((0.02, 0.03), 310.0, 18.0, 45.0),
+    ],
 )
 def test_the_middle_of_a_blur_knows_how_wide_it_is(
     angle: tuple[float, float], depth_um: float, stop_um: float, thick_um: float
 ) -> None:
     layers = Layers(front=(Film(Index(GLASS), thick_um),), stop=Stop(stop_um, thick_um))
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "layers": layers}
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        "layers": layers,
+    }
     found = psf_stack(
-        PHASE, LEVEL, depths_um=[depth_um], angle_rad=angle, window_um=17.0, samples=17, integrate=False, **about
+        PHASE,
+        LEVEL,
+        depths_um=[depth_um],
+        angle_rad=angle,
+        window_um=17.0,
+        samples=17,
+        integrate=False,
+        **about,
     )
     assert found.budget is not None
     assert found.budget.outside > 0.75
-    light, want = found.intensity[0, ::4, ::2], _summed(angle, depth_um, stop_um, thick_um)[3:8, 6:15]
+    light, want = (
+        found.intensity[0, ::4, ::2],
+        _summed(angle, depth_um, stop_um, thick_um)[3:8, 6:15],
+    )
     error = _apart(light / light.sum(), want / want.sum())
     assert found.budget.stop / 5 < error < found.budget.stop
 
 
 def test_points_of_a_source_cast_shadows_of_their_own_and_the_budget_says_so() -> None:
-    """A square of 7 um by four points of it (Gauss, of third degree): their shadows lie 0.65 um apart. The PSF of the
+    """A square of 7 um by four points of it (Gauss, of third degree): their shadows lie
+    0.65 um apart. The PSF of the
     middle one, blurred, is wrong by 2.1e-2; of paths alone it would be 9e-3."""
     angle, depth, hole, size = (-0.05, 0.2), 700.0, (24.0, 150.0), 7.0
     beside = size / 2 / math.sqrt(3) / (depth - hole[1] + hole[1] / GLASS)
     want = np.zeros((11, 21))
     for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        seen = math.atan(math.tan(angle[0]) + a * beside), math.atan(math.tan(angle[1]) + b * beside)
+        seen = (
+            math.atan(math.tan(angle[0]) + a * beside),
+            math.atan(math.tan(angle[1]) + b * beside),
+        )
         want += _lit(seen, depth, hole, LEVEL, angle)
     layers = Layers(front=(Film(Index(GLASS), hole[1]),), stop=Stop(*hole))
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "depths_um": [depth]}
-    about |= {"source": Extent("square", size), "tolerance": 1e-2, "integrate": False, **WINDOW}
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        "depths_um": [depth],
+    }
+    about |= {
+        "source": Extent("square", size),
+        "tolerance": 1e-2,
+        "integrate": False,
+        **WINDOW,
+    }
     found = psf_stack(PHASE, LEVEL, layers=layers, angle_rad=angle, **about)
     light = found.intensity[0, ::4, ::2]
     error = _apart(light / light.sum(), want / want.sum())
@@ -236,34 +363,61 @@ def test_points_of_a_source_cast_shadows_of_their_own_and_the_budget_says_so() -
 
 
 def test_depths_behind_a_stop_are_each_as_alone() -> None:
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "layers": LAYERS, **WINDOW}
-    all_ = psf_stack(PHASE, LEVEL, depths_um=[900.0, 2500.0], angle_rad=[[0.1, -0.05], [0.0, 0.2]], **about)
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        "layers": LAYERS,
+        **WINDOW,
+    }
+    all_ = psf_stack(
+        PHASE,
+        LEVEL,
+        depths_um=[900.0, 2500.0],
+        angle_rad=[[0.1, -0.05], [0.0, 0.2]],
+        **about,
+    )
     for i, depth in enumerate((900.0, 2500.0)):
         one = psf_stack(PHASE, LEVEL, depths_um=[depth], angle_rad=(0.0, 0.2), **about)
         # of sum 1; depths side by side round otherwise, and phases of 1e3 rad to 1e-13
-        np.testing.assert_allclose(all_.intensity[1, i], one.intensity[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            all_.intensity[1, i], one.intensity[0], rtol=0, atol=1e-12
+        )
         assert all_.energy_um2[1, i] == pytest.approx(one.energy_um2[0], rel=1e-10)
 
 
 def test_rays_cross_the_stop_where_snell_has_them() -> None:
-    """A ray is followed forwards: from the source to a place of the stop, and on through glass to the pillars."""
-    layers = Layers(front=(Film(Index(1.3), 50.0), Film(Index(1.7), 120.0)), stop=Stop(300.0, 150.0))
+    """A ray is followed forwards: from the source to a place of the stop, and on
+    through glass to the pillars.
+    """
+    layers = Layers(
+        front=(Film(Index(1.3), 50.0), Film(Index(1.7), 120.0)), stop=Stop(300.0, 150.0)
+    )
     depth, p = 2000.0, np.array([0.11, 0.31])
-    # from the stop: 120 um of 1.7 and 30 um of 1.3; from the source 20 um of 1.3 and air before
+    # from the stop: 120 um of 1.7 and 30 um of 1.3; from the source 20 um of 1.3 and
+    # air before
     glass = sum(t * p / np.sqrt(n * n - p * p) for n, t in ((1.7, 120.0), (1.3, 30.0)))
-    before = glass + 20.0 * p / np.sqrt(1.3**2 - p * p) + (depth - 170.0) * p / np.sqrt(1 - p * p)
+    before = (
+        glass
+        + 20.0 * p / np.sqrt(1.3**2 - p * p)
+        + (depth - 170.0) * p / np.sqrt(1 - p * p)
+    )
     tangents = (0.2, 0.0)
     sine = 0.2 / math.hypot(1, 0.2)
     source = -float(media.reach(layers.before(depth, WAVE), sine))
     x, u = source + before, source + before - glass
-    hole = replace(layers, stop=Stop(float(u[1]), 150.0))  # its edge where the second ray crosses
+    hole = replace(
+        layers, stop=Stop(float(u[1]), 150.0)
+    )  # its edge where the second ray crosses
     share = hole.lit(tangents, depth, WAVE, (x, np.zeros(2)), 1e-3)
     assert share[0] == 1.0
     assert share[1] == pytest.approx(0.5, abs=1e-3)  # 1e-6 um of 1e-3
 
 
 def test_shadow_is_fresnels_edge_bent_by_its_radius() -> None:
-    """By Fresnel integrals of scipy, at narrow places: edges in the plane of the light and across it."""
+    """By Fresnel integrals of scipy, at narrow places: edges in the plane of the light
+    and across it.
+    """
     glass, thick, radius, tangents = 1.6, 350.0, 180.0, (0.21, 0.28)
     layers = Layers(front=(Film(Index(glass), thick),), stop=Stop(radius, thick))
     sine = 0.35 / math.hypot(1, 0.35)
@@ -271,41 +425,65 @@ def test_shadow_is_fresnels_edge_bent_by_its_radius() -> None:
     shift = thick * sine / glass / cosine
     from_edge = np.linspace(-40.0, 60.0, 81)
     for way, other in (((0.6, 0.8), False), ((-0.8, 0.6), True)):
-        length, along = thick / glass / cosine**3, thick / glass / cosine  # d tan / dp in the plane, tan / p across it
+        length, along = (
+            thick / glass / cosine**3,
+            thick / glass / cosine,
+        )  # d tan / dp in the plane, tan / p across it
         length, along = (along, length) if other else (length, along)
-        places = [shift * c + (radius - from_edge) * w for c, w in zip((0.6, 0.8), way, strict=True)]
+        places = [
+            shift * c + (radius - from_edge) * w
+            for c, w in zip((0.6, 0.8), way, strict=True)
+        ]
         w = from_edge * math.sqrt(2 / (WAVE * length))
         sines, cosines = fresnel(w)
         edge = 0.5 + np.exp(-0.25j * np.pi) / math.sqrt(2) * (cosines + 1j * sines)
-        slope = math.sqrt(2 / (WAVE * length)) * np.exp(-0.25j * np.pi + 0.5j * np.pi * w * w) / math.sqrt(2)
+        slope = (
+            math.sqrt(2 / (WAVE * length))
+            * np.exp(-0.25j * np.pi + 0.5j * np.pi * w * w)
+            / math.sqrt(2)
+        )
         want = edge - 1j * WAVE * along / (4 * math.pi * radius) * slope
         got = layers.shadow(tangents, math.inf, WAVE, (places[0], places[1]), 1e-2)
-        np.testing.assert_allclose(got, want, atol=2e-5)  # of the table, 1e-7 over the width in w, 8e-4
+        np.testing.assert_allclose(
+            got, want, atol=2e-5
+        )  # of the table, 1e-7 over the width in w, 8e-4
 
 
 def test_shadow_near_the_pillars_is_a_hole_there_and_far_waves_are_shared_out() -> None:
-    """Places wider than the ripples have their mean: 1 within, none behind; thickness to 0 is a smaller aperture."""
+    """Places wider than the ripples have their mean: 1 within, none behind; thickness
+    to 0 is a smaller aperture.
+    """
     x = np.linspace(-70.0, 70.0, 57)
     for thick in (1e-3, 1e-6):
         layers = Layers(front=(Film(Index(GLASS), thick),), stop=Stop(STOP, thick))
         got = layers.shadow((0.3, 0.0), 2000.0, WAVE, (x, np.zeros(57)), 0.5)
-        hole = replace(layers, stop=Stop(STOP)).shadow((0.3, 0.0), 2000.0, WAVE, (x, np.zeros(57)), 0.5)
-        assert np.abs(got - hole).max() < 0.1 * math.sqrt(thick)  # of an edge √(λ t / n) wide, of 0.5 um
+        hole = replace(layers, stop=Stop(STOP)).shadow(
+            (0.3, 0.0), 2000.0, WAVE, (x, np.zeros(57)), 0.5
+        )
+        assert np.abs(got - hole).max() < 0.1 * math.sqrt(
+            thick
+        )  # of an edge √(λ t / n) wide, of 0.5 um
     assert np.ones((2, 3)) == pytest.approx(
         Layers().shadow((0.0, 0.0), 1e3, WAVE, (np.zeros(3), np.zeros((2, 1))), 1.0)
     )
 
 
 @pytest.mark.parametrize("middle", [(0.0, 0.0), (-37.0, 11.0)])
-def test_image_engine_and_every_pillar_see_the_same_stop(middle: tuple[float, float]) -> None:
-    """PSFs by rays of a smooth wave against sums over pillars; 1.6e-2 is what both differ by without a stop as well."""
+def test_image_engine_and_every_pillar_see_the_same_stop(
+    middle: tuple[float, float],
+) -> None:
+    """PSFs by rays of a smooth wave against sums over pillars; 1.6e-2 is what both
+    differ by without a stop as well.
+    """
     layers = Layers(front=(Film(Index(GLASS), 160.0),), stop=Stop(70.0, 160.0, middle))
     radius, pitch, step, fine = 130.0, 0.45, 3.0, 7
     place = (np.arange(579) - 289) * pitch
     x, y = np.meshgrid(place, place)
 
     def bent(across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
-        return 2.0 * (across / radius) ** 3 + 1.5 * (down / radius) ** 2 * (across / radius)
+        return 2.0 * (across / radius) ** 3 + 1.5 * (down / radius) ** 2 * (
+            across / radius
+        )
 
     wave = SmoothWave(Focus(WAVE, 500.0, 6000.0, layers), radius, bent)
     spots = torch.from_numpy(x), torch.from_numpy(y)
@@ -314,9 +492,17 @@ def test_image_engine_and_every_pillar_see_the_same_stop(middle: tuple[float, fl
     points = (np.arange(22 * fine) - (22 * fine - 1) / 2) / fine
     triangles = np.maximum(1 - np.abs(points - (np.arange(21) - 10)[:, None]), 0)
     for at, depth in (((0.0, 0.0), 2500.0), ((140.0, 50.0), math.inf)):
-        where = {"depths_um": torch.tensor([depth], dtype=torch.float64), "wavelength_um": WAVE}
+        where = {
+            "depths_um": torch.tensor([depth], dtype=torch.float64),
+            "wavelength_um": WAVE,
+        }
         window = Window(21, step, curved=True)
-        got = psfs(Optics(wave, layers, 500.0), torch.tensor([at], dtype=torch.float64), **where, window=window)
+        got = psfs(
+            Optics(wave, layers, 500.0),
+            torch.tensor([at], dtype=torch.float64),
+            **where,
+            window=window,
+        )
         light = got[0, 0].double().numpy()
         stack = psf_stack(
             phase, level, pitch_um=pitch, wavelength_um=WAVE, sensor_distance_um=500.0, depths_um=[depth],
@@ -325,21 +511,36 @@ def test_image_engine_and_every_pillar_see_the_same_stop(middle: tuple[float, fl
         )  # fmt: skip
         want = triangles @ stack.intensity[0] @ triangles.T
         assert _apart(light / light.sum(), want / want.sum()) < 2e-2
-        # the light on the stop is the whole: 3 % are bent beyond 63 um, faces take nothing here
+        # the light on the stop is the whole: 3 % are bent beyond 63 um, faces take
+        # nothing here
         assert light.sum() == pytest.approx(1.0, abs=0.05)
-        assert stack.energy_um2[0] == pytest.approx(math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03)
+        assert stack.energy_um2[0] == pytest.approx(
+            math.pi * layers.footprint_um(depth, WAVE) ** 2, rel=0.03
+        )
 
 
 def test_the_error_of_a_stack_is_that_of_its_worst_shadow() -> None:
-    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray; zones by the blur over the way of the ray."""
+    """In air: N = R² cos³ / (λ L), 1/L = 1/s + 1/(z - s) along the ray; zones by the
+    blur over the way of the ray.
+    """
     layers, (tx, ty) = Layers(stop=Stop(19.0, 90.0)), (math.tan(0.2), math.tan(-0.1))
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, "layers": layers, **WINDOW}
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        "layers": layers,
+        **WINDOW,
+    }
     angles, depths = [[0.0, 0.0], [0.2, -0.1]], [220.0, 1500.0]
     phase, level = (whole[90:190, 80:200] for whole in (PHASE, LEVEL))
     stack = psf_stack(phase, level, depths_um=depths, angle_rad=angles, **about)
     assert stack.budget is not None
     places = (np.arange(120) - 59.5) * PITCH, (np.arange(100)[:, None] - 49.5) * PITCH
-    shades = [layers.shadow((math.tan(x), math.tan(y)), z, WAVE, places, PITCH) for x, y in angles for z in depths]
+    shades = [
+        layers.shadow((math.tan(x), math.tan(y)), z, WAVE, places, PITCH)
+        for x, y in angles
+        for z in depths
+    ]
     through = [(np.abs(shade * level) ** 2).sum() * PITCH**2 for shade in shades]
     held = stack.energy_um2 / np.reshape(through, (2, 2))
     assert 1 - held.min() == pytest.approx(stack.budget.outside, rel=1e-5)
@@ -347,17 +548,32 @@ def test_the_error_of_a_stack_is_that_of_its_worst_shadow() -> None:
     for i, slope in enumerate((0.0, math.hypot(tx, ty))):
         for j, z in enumerate(depths):
             number = 19.0**2 / math.hypot(1, slope) ** 3 / (WAVE * 90 * (z - 90) / z)
-            zones = 19.0 * blurs[i, j] / (SENSOR * math.hypot(1, slope)) / WAVE / held[i, j] ** 0.25
+            zones = (
+                19.0
+                * blurs[i, j]
+                / (SENSOR * math.hypot(1, slope))
+                / WAVE
+                / held[i, j] ** 0.25
+            )
             found[i, j] = (0.005 + 0.055 * zones) / number
     assert stack.budget.stop == pytest.approx(max(found.values()), rel=1e-6)
     assert len({round(value, 6) for value in found.values()}) == 4
 
 
 def test_light_that_the_stop_sends_beside_the_lens_is_lost() -> None:
-    """At 45 degrees of 80 um glass light lands 80 tan(asin(sin 45° / 1.45)) = 44.7 um aside, half beyond the rim."""
+    """At 45 degrees of 80 um glass light lands 80 tan(asin(sin 45° / 1.45)) = 44.7 um
+    aside, half beyond the rim.
+    """
     angle = (math.radians(45.0), 0.0)
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, **WINDOW}
-    seen = psf_stack(0 * PHASE, LEVEL, layers=LAYERS, angle_rad=angle, depths_um=[math.inf], **about)
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        **WINDOW,
+    }
+    seen = psf_stack(
+        0 * PHASE, LEVEL, layers=LAYERS, angle_rad=angle, depths_um=[math.inf], **about
+    )
     aside = THICK * math.tan(math.asin(math.sin(angle[0]) / GLASS))
     share = float(((np.hypot(X - aside, Y) <= STOP) & (LEVEL > 0)).sum() * PITCH**2)
     assert seen.budget is not None
@@ -371,11 +587,22 @@ def test_stops_that_cannot_be_are_refused_by_name() -> None:
         Stop(0.0, 10.0)
     with pytest.raises(ConfigError, match="distance of 0 or more"):
         Stop(5.0, -1.0)
-    about = {"pitch_um": PITCH, "wavelength_um": WAVE, "sensor_distance_um": SENSOR, **WINDOW}
+    about = {
+        "pitch_um": PITCH,
+        "wavelength_um": WAVE,
+        "sensor_distance_um": SENSOR,
+        **WINDOW,
+    }
     with pytest.raises(PropagationError, match="behind the stop"):
         psf_stack(PHASE, LEVEL, depths_um=[80.0], layers=LAYERS, **about)
     with pytest.raises(PropagationError, match=r"put Layers\.lit onto"):
         propagate.case(LEVEL.shape, depths_um=900.0, layers=LAYERS, **about)
     moving = torch.tensor(400.0, requires_grad=True)
     with pytest.raises(PropagationError, match="no derivatives in the geometry"):
-        psf_stack(PHASE, LEVEL, depths_um=[900.0], layers=LAYERS, **about | {"sensor_distance_um": moving})
+        psf_stack(
+            PHASE,
+            LEVEL,
+            depths_um=[900.0],
+            layers=LAYERS,
+            **about | {"sensor_distance_um": moving},
+        )

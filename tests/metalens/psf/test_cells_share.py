@@ -1,4 +1,6 @@
-"""How a tolerance is shared between sums and the integration over cells, and when cells are made finer."""
+"""How a tolerance is shared between sums and the integration over cells, and when cells
+are made finer.
+"""
 
 import math
 
@@ -20,20 +22,33 @@ def maps():
 
 
 def stack(tolerance, **more):
-    about = dict(pitch_um=PITCH, wavelength_um=WAVELENGTH, sensor_distance_um=DISTANCE, depths_um=[np.inf])
-    return psf.psf_stack(*maps(), **about | dict(window_um=6.0, samples=5) | more, tolerance=tolerance)
+    about = dict(
+        pitch_um=PITCH,
+        wavelength_um=WAVELENGTH,
+        sensor_distance_um=DISTANCE,
+        depths_um=[np.inf],
+    )
+    return psf.psf_stack(
+        *maps(), **about | dict(window_um=6.0, samples=5) | more, tolerance=tolerance
+    )
 
 
 @pytest.fixture(scope="module")
 def coarsest():
-    """Error of the integration over the coarsest cells, where the tolerance asks for no better."""
+    """Error of the integration over the coarsest cells, where the tolerance asks for no
+    better.
+    """
     made = stack(0.3)
-    assert "cells of 6 x 6 points" in made.reason  # 1.2 um: three of Nyquist's steps, two points in each
+    assert (
+        "cells of 6 x 6 points" in made.reason
+    )  # 1.2 um: three of Nyquist's steps, two points in each
     return made.budget.sampling
 
 
 @pytest.mark.parametrize(("share", "points"), [(0.49, 6), (0.51, 12)])
-def test_cells_are_made_finer_where_they_would_take_more_than_half_the_tolerance(coarsest, share, points):
+def test_cells_are_made_finer_where_they_would_take_more_than_half_the_tolerance(
+    coarsest, share, points
+):
     made = stack(coarsest / share)
     assert f"cells of {points} x {points} points" in made.reason
     assert made.budget.sampling <= made.tolerance / 2
@@ -41,9 +56,15 @@ def test_cells_are_made_finer_where_they_would_take_more_than_half_the_tolerance
 
 
 def test_sums_have_what_cells_leave_of_the_tolerance(monkeypatch):
-    """Errors add as squares: √(1 - 1/4) of it; all of it where samples are close enough, or are asked for."""
+    """Errors add as squares: √(1 - 1/4) of it; all of it where samples are close
+    enough, or are asked for.
+    """
     asked, plain = [], direction.intensity
-    monkeypatch.setattr(direction, "intensity", lambda *a, **k: asked.append(k["tolerance"]) or plain(*a, **k))
+    monkeypatch.setattr(
+        direction,
+        "intensity",
+        lambda *a, **k: asked.append(k["tolerance"]) or plain(*a, **k),
+    )
     stack(8e-3)
     assert asked == pytest.approx([8e-3 * math.sqrt(0.75)] * len(asked), rel=1e-12)
     assert asked

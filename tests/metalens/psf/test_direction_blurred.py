@@ -1,4 +1,6 @@
-"""A source of finite size is blurred from a picture that is truer than what is asked of the blur."""
+"""A source of finite size is blurred from a picture that is truer than what is asked of
+the blur.
+"""
 
 from types import SimpleNamespace
 
@@ -10,7 +12,9 @@ from metalens.psf.extended import Extent
 
 
 def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
-    """The errors of point and blur add: the share of the point is less than the whole, for every depth alike."""
+    """The errors of point and blur add: the share of the point is less than the whole,
+    for every depth alike.
+    """
     asked = []
     light = torch.ones(1, 9, 9)
 
@@ -26,9 +30,16 @@ def test_the_point_s_picture_is_asked_for_more_strictly(monkeypatch):
         return 0.004
 
     monkeypatch.setattr(direction.extended, "unlike", unlike)
-    given = SimpleNamespace(shaded=lambda cases: (None, None), at=lambda case: case, weights=None, mixing=None)
+    given = SimpleNamespace(
+        shaded=lambda cases: (None, None),
+        at=lambda case: case,
+        weights=None,
+        mixing=None,
+    )
     case = SimpleNamespace(samples=(9, 9))
-    made = direction._blurred(given, SimpleNamespace(case=case), case, Extent(size_um=40.0), 1e-2)[1]
+    made = direction._blurred(
+        given, SimpleNamespace(case=case), case, Extent(size_um=40.0), 1e-2
+    )[1]
     assert len(asked) == 2
     assert all(1e-2 / 20 <= one <= 1e-2 / 2 for one in asked)
     assert made.source == pytest.approx(0.005)

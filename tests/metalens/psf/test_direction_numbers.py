@@ -8,13 +8,36 @@ from metalens.lens import Media
 from metalens.propagate import Case
 from metalens.psf import direction
 
-CASE = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400, 1 / 900), (14.0, -8.5), 0.6, (9, 11))
+CASE = Case(
+    (30, 41),
+    0.37,
+    0.85,
+    62.0,
+    (0.21, -0.13),
+    (1 / 400, 1 / 900),
+    (14.0, -8.5),
+    0.6,
+    (9, 11),
+)
 
 
 def test_faces_let_through_what_fresnel_has_for_the_chief_ray():
-    """From a gel of 1.37 into glass of 1.52, light from (0.21, -0.13) in air: mean of both polarisations."""
+    """From a gel of 1.37 into glass of 1.52, light from (0.21, -0.13) in air: mean of
+    both polarisations.
+    """
     behind = Media((1.37, 1.52), (40.0, 22.0))
-    case = Case((30, 41), 0.37, 0.85, 62.0, (0.21, -0.13), (1 / 400,), (9.0, -6.0), 0.6, (3, 4), behind=behind)
+    case = Case(
+        (30, 41),
+        0.37,
+        0.85,
+        62.0,
+        (0.21, -0.13),
+        (1 / 400,),
+        (9.0, -6.0),
+        0.6,
+        (3, 4),
+        behind=behind,
+    )
     slope = math.hypot(0.21, 0.13)
     sine = math.sin(math.atan(slope))
     inner, outer = math.asin(sine / 1.37), math.asin(sine / 1.52)

@@ -1,4 +1,6 @@
-"""Far fields against closed forms (orders, sinc², Airy, Parseval), the plain sum, and what a ring should hold."""
+"""Far fields against closed forms (orders, sinc², Airy, Parseval), the plain sum, and
+what a ring should hold.
+"""
 
 import math
 from types import SimpleNamespace
@@ -16,20 +18,36 @@ from metalens.psf import directions, far_field
 from tests.referees import plain_sum
 
 WAVE, PITCH = 0.633, 0.29
-PROXY = Proxy(np.array([[1.3]]), np.array([[0.83]]), (0.1, 0.2), (WAVE, WAVE), 0.0, 0.0)  # every pillar alike, |t| 0.83
+PROXY = Proxy(
+    np.array([[1.3]]), np.array([[0.83]]), (0.1, 0.2), (WAVE, WAVE), 0.0, 0.0
+)  # every pillar alike, |t| 0.83
 RNG = np.random.default_rng(3)
 
 
 def lens(phase_rad, inside=None, *, pitch=PITCH, lattice=None, layers=None):
     """Turned pillars give any phase exactly: twice their turn."""
     there = np.ones(phase_rad.shape, bool) if inside is None else inside
-    sizes = DiameterMap(np.where(there, 0.15, 0.0), pitch, lattice or Lattice(), angle_rad=phase_rad / 2)
+    sizes = DiameterMap(
+        np.where(there, 0.15, 0.0), pitch, lattice or Lattice(), angle_rad=phase_rad / 2
+    )
     cell = Cell(pitch, lattice=lattice or Lattice())
-    return Lens(sizes, cell, PROXY, WAVE, 400.0, 900.0, "map", hand="right", layers=layers or Layers())
+    return Lens(
+        sizes,
+        cell,
+        PROXY,
+        WAVE,
+        400.0,
+        900.0,
+        "map",
+        hand="right",
+        layers=layers or Layers(),
+    )
 
 
 def axes(rows, columns, step=PITCH):
-    return (np.arange(columns) - (columns - 1) / 2) * step, ((np.arange(rows) - (rows - 1) / 2) * step)[:, None]
+    return (np.arange(columns) - (columns - 1) / 2) * step, (
+        (np.arange(rows) - (rows - 1) / 2) * step
+    )[:, None]
 
 
 def test_a_linear_phase_sends_all_light_to_the_sine_of_wavelength_over_period():
@@ -42,21 +60,31 @@ def test_a_linear_phase_sends_all_light_to_the_sine_of_wavelength_over_period():
         WAVE / period, abs=2e-5
     )  # a parabola at an eighth of a spot
     assert beam.azimuth_deg == pytest.approx(37.0, abs=0.01)
-    assert beam.angle_deg == pytest.approx(math.degrees(math.asin(WAVE / period)), abs=0.01)
+    assert beam.angle_deg == pytest.approx(
+        math.degrees(math.asin(WAVE / period)), abs=0.01
+    )
     assert found.transmitted == pytest.approx(0.83**2, rel=1e-6)
-    assert beam.share > 0.9  # a square's spot: sinc² tails along both axes, 2 / (pi² 10 w) of each beyond the circle
+    assert (
+        beam.share > 0.9
+    )  # a square's spot: sinc² tails along both axes, 2 / (pi² 10 w) of each beyond the circle
     assert found.error < 1e-5
 
 
 def test_a_wave_that_comes_at_an_angle_leaves_a_flat_lens_at_it():
-    found = far_field(lens(np.zeros((120, 90))), angle_rad=(math.radians(11), math.radians(-6)))
+    found = far_field(
+        lens(np.zeros((120, 90))), angle_rad=(math.radians(11), math.radians(-6))
+    )
     tx, ty = math.tan(math.radians(11)), math.tan(math.radians(-6))
     norm = math.sqrt(1 + tx**2 + ty**2)
-    assert (found.beams[0].sine_x, found.beams[0].sine_y) == pytest.approx((tx / norm, ty / norm), abs=5e-5)
+    assert (found.beams[0].sine_x, found.beams[0].sine_y) == pytest.approx(
+        (tx / norm, ty / norm), abs=5e-5
+    )
 
 
 def test_a_stop_leaves_the_light_of_its_hole_where_it_falls_on_the_pillars():
-    """20 um on a square of 87 um: the whole hole; at 40 degrees of so much glass half of it falls beside the square."""
+    """20 um on a square of 87 um: the whole hole; at 40 degrees of so much glass half
+    of it falls beside the square.
+    """
     hole, whole = math.pi * 20.0**2, (300 * PITCH) ** 2
     inside = math.tan(math.asin(math.sin(math.radians(40)) / 1.5))
     for angle, thick, share in ((11, 30.0, 1.0), (40, 150 * PITCH / inside, 0.5)):
@@ -66,11 +94,15 @@ def test_a_stop_leaves_the_light_of_its_hole_where_it_falls_on_the_pillars():
         assert found.transmitted == pytest.approx(
             0.83**2 * share * hole / whole, rel=0.03
         )  # ripples finer than pillars
-        assert found.beams[0].sine_y == pytest.approx(math.sin(math.radians(angle)), abs=1e-3)
+        assert found.beams[0].sine_y == pytest.approx(
+            math.sin(math.radians(angle)), abs=1e-3
+        )
 
 
 def test_a_rectangle_shows_its_sinc():
-    """sin² N u / (N sin u)² along each axis, u = pi pitch p / wavelength, in squares of 0.0025."""
+    """sin² N u / (N sin u)² along each axis, u = pi pitch p / wavelength, in squares of
+    0.0025.
+    """
     rows, columns = 31, 47
     found = far_field(lens(np.zeros((rows, columns))), samples=801)
     square = found.sines[1] - found.sines[0]
@@ -79,7 +111,9 @@ def test_a_rectangle_shows_its_sinc():
         u = math.pi * PITCH / WAVE * p
         want = want * n * PITCH / WAVE * special.diric(2 * u, n) ** 2
     density = found.share / square**2
-    assert np.abs(density - want * (found.share > 0)).max() < 3e-3 * want.max()  # middle of a square for its mean
+    assert (
+        np.abs(density - want * (found.share > 0)).max() < 3e-3 * want.max()
+    )  # middle of a square for its mean
 
 
 def test_a_round_aperture_holds_airy_s_share_in_every_circle():
@@ -91,22 +125,36 @@ def test_a_round_aperture_holds_airy_s_share_in_every_circle():
     held = np.cumsum(found.rings)
     for ring in (5, 11, 23):
         v = 2 * math.pi / WAVE * radius * ring * square
-        assert held[ring - 1] == pytest.approx(1 - special.j0(v) ** 2 - special.j1(v) ** 2, abs=8e-3)  # rim of sites
-    assert found.beams[0].share == pytest.approx(found.beam_holds, abs=5e-3)  # rim of sites
+        assert held[ring - 1] == pytest.approx(
+            1 - special.j0(v) ** 2 - special.j1(v) ** 2, abs=8e-3
+        )  # rim of sites
+    assert found.beams[0].share == pytest.approx(
+        found.beam_holds, abs=5e-3
+    )  # rim of sites
     v = 2 * math.pi / WAVE * radius * found.beam_sine
-    assert found.beam_holds == pytest.approx(1 - 2 / (math.pi * v), abs=1e-3)  # next term of the Bessel functions
+    assert found.beam_holds == pytest.approx(
+        1 - 2 / (math.pi * v), abs=1e-3
+    )  # next term of the Bessel functions
 
 
 @pytest.mark.parametrize("kind", ["square", "hexagonal"])
 def test_light_is_kept(kind):
-    """Parseval over one period of the lattice; a coarse lattice tells no direction beyond its own diffraction."""
+    """Parseval over one period of the lattice; a coarse lattice tells no direction
+    beyond its own diffraction.
+    """
     phase, inside = RNG.uniform(0, 6.28, (60, 84)), np.ones((60, 84), bool)
     if kind == "hexagonal":
         inside = (np.arange(60)[:, None] + np.arange(84)) % 2 == 0
-    found = far_field(lens(phase, inside, pitch=0.41, lattice=Lattice(kind)), samples=201)
-    assert found.share.sum() + found.beyond == pytest.approx(1.0, abs=2e-3 if kind == "hexagonal" else 1e-5)  # cut zone
+    found = far_field(
+        lens(phase, inside, pitch=0.41, lattice=Lattice(kind)), samples=201
+    )
+    assert found.share.sum() + found.beyond == pytest.approx(
+        1.0, abs=2e-3 if kind == "hexagonal" else 1e-5
+    )  # cut zone
     assert found.rings.sum() == pytest.approx(1 - found.beyond, abs=1e-5)
-    assert found.steepest == pytest.approx(WAVE / (0.41 * (math.sqrt(3) if kind == "hexagonal" else 2)), rel=1e-6)
+    assert found.steepest == pytest.approx(
+        WAVE / (0.41 * (math.sqrt(3) if kind == "hexagonal" else 2)), rel=1e-6
+    )
 
 
 def test_every_direction_is_that_of_the_plain_sum():
@@ -123,11 +171,22 @@ def test_every_direction_is_that_of_the_plain_sum():
         for j in range(3):
             at = distance / cosine[i, j]
             where = SimpleNamespace(
-                x_um=[at * px[j]], y_um=[at * py[i, 0]], distance_um=distance, wavelength_um=WAVE, depths_um=[700.0]
+                x_um=[at * px[j]],
+                y_um=[at * py[i, 0]],
+                distance_um=distance,
+                wavelength_um=WAVE,
+                depths_um=[700.0],
             )
             light = abs(plain_sum.field(made, amplitude, where)[0, 0, 0]) ** 2
-            want = light * distance**2 / cosine[i, j] ** 4 / (PITCH**2 * (np.abs(amplitude) ** 2).sum())
-            assert density[i, j] == pytest.approx(want, rel=5e-3)  # mean over a square of 0.00125, spots of 0.2
+            want = (
+                light
+                * distance**2
+                / cosine[i, j] ** 4
+                / (PITCH**2 * (np.abs(amplitude) ** 2).sum())
+            )
+            assert density[i, j] == pytest.approx(
+                want, rel=5e-3
+            )  # mean over a square of 0.00125, spots of 0.2
 
 
 def test_an_axicon_makes_a_ring_of_its_angle():
@@ -156,12 +215,26 @@ def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys)
     from metalens.ground import store
 
     x, _ = axes(64, 96)
-    lenses.save(tmp_path / "lens.h5", lens(np.broadcast_to(2 * math.pi / 2.1 * x, (64, 96)).copy()))
-    words = ["psf", str(tmp_path / "lens.h5"), "--far-field", "--report", "-o", str(tmp_path / "far.h5")]
-    assert cli.main([*words, "--angles-deg", "0", "5", "--samples", "101", "--json"]) == 0
+    lenses.save(
+        tmp_path / "lens.h5",
+        lens(np.broadcast_to(2 * math.pi / 2.1 * x, (64, 96)).copy()),
+    )
+    words = [
+        "psf",
+        str(tmp_path / "lens.h5"),
+        "--far-field",
+        "--report",
+        "-o",
+        str(tmp_path / "far.h5"),
+    ]
+    assert (
+        cli.main([*words, "--angles-deg", "0", "5", "--samples", "101", "--json"]) == 0
+    )
     told = json.loads(capsys.readouterr().out)
     sines = [field["beams"][0]["sine_x"] for field in told["fields"]]
-    assert sines == pytest.approx([WAVE / 2.1, WAVE / 2.1 + math.sin(math.radians(5))], abs=2e-4)
+    assert sines == pytest.approx(
+        [WAVE / 2.1, WAVE / 2.1 + math.sin(math.radians(5))], abs=2e-4
+    )
     kept = store.load(tmp_path / "far.h5", "far-field")
     assert kept.arrays["share"].shape == (2, 101, 101)
     assert (tmp_path / "far_far.png").exists()
@@ -171,7 +244,9 @@ def test_the_command_tells_beams_and_refuses_what_says_nothing(tmp_path, capsys)
 
 
 def test_the_check_by_a_plain_sum_looks_where_the_light_goes():
-    """Three directions with shares of 0.5, 0.3 and 0.2, each off by a part of its own; none in the dark."""
+    """Three directions with shares of 0.5, 0.3 and 0.2, each off by a part of its own;
+    none in the dark.
+    """
     power = np.zeros((6, 9))
     light = {(1, 7): 500.0, (1, 2): 300.0, (5, 8): 200.0}
     for (row, column), value in light.items():
@@ -181,14 +256,21 @@ def test_the_check_by_a_plain_sum_looks_where_the_light_goes():
 
     class Plain:
         def power(self, sine_x, sine_y):
-            at = int(np.abs(p[1] - sine_y[0]).argmin()), int(np.abs(p[0] - sine_x[0]).argmin())
+            at = (
+                int(np.abs(p[1] - sine_y[0]).argmin()),
+                int(np.abs(p[0] - sine_x[0]).argmin()),
+            )
             looked.append(at)
-            return np.array([[light[at] * {(1, 7): 1.02, (1, 2): 0.95, (5, 8): 1.0}[at]]])
+            return np.array(
+                [[light[at] * {(1, 7): 1.02, (1, 2): 0.95, (5, 8): 1.0}[at]]]
+            )
 
     found = directions._error(Plain(), p, power)
     counts = {at: looked.count(at) for at in light}
     assert sum(counts.values()) == len(looked) == 24
-    assert min(counts.values()) > 0  # a fifth of the light is missed by 24 draws once in 200 times
+    assert (
+        min(counts.values()) > 0
+    )  # a fifth of the light is missed by 24 draws once in 200 times
     for at, value in light.items():  # binomial: 24 draws scatter by 2.5
         assert abs(counts[at] - 24 * value / 1000) < 6
     wrong = counts[1, 7] * 10.0**2 + counts[1, 2] * 15.0**2

@@ -1,4 +1,6 @@
-"""Stacks of all kinds of axes in files of other programs: scales, places and orders, by numbers that are typed in."""
+"""Stacks of all kinds of axes in files of other programs: scales, places and orders, by
+numbers that are typed in.
+"""
 
 import dataclasses
 import io
@@ -51,7 +53,9 @@ def test_axes_are_named_slowest_first(shape, angles, words):
 
 
 def test_tiff_pages_run_over_depth_first_and_have_their_scale_in_centimetres():
-    """0.8 um: 12500 a centimetre. A depth at infinity is null, and all numbers stand beside the axes."""
+    """0.8 um: 12500 a centimetre. A depth at infinity is null, and all numbers stand
+    beside the axes.
+    """
     with tifffile.TiffFile(io.BytesIO(export.tiff(stack()))) as file:
         pages, tags = [page.asarray() for page in file.pages], file.pages[0].tags
         about = json.loads(file.pages[0].description)
@@ -82,18 +86,26 @@ def test_tiff_pages_run_over_depth_first_and_have_their_scale_in_centimetres():
 
 def test_the_head_of_a_matlab_file_is_116_bytes_of_text_and_its_version():
     data = export.matlab(stack())
-    assert data[:116].decode() == f"{'MATLAB 5.0 MAT-file, metalens PSF stack, um and rad':116}"
+    assert (
+        data[:116].decode()
+        == f"{'MATLAB 5.0 MAT-file, metalens PSF stack, um and rad':116}"
+    )
     assert struct.unpack("<H", data[124:126])[0] == 0x0100
     read = loadmat(io.BytesIO(data))
     assert np.array_equal(read["intensity"], LIGHT)
     assert read["depths_um"].shape == (3, 1)
     assert read["energy_um2"].tolist() == [[7.0, 8.0, 9.0], [10.0, 11.0, 12.0]]
-    numbers = {name: read[name].item() for name in ("step_um", "sensor_distance_um", "tolerance", "error", "reason")}
+    numbers = {
+        name: read[name].item()
+        for name in ("step_um", "sensor_distance_um", "tolerance", "error", "reason")
+    }
     assert list(numbers.values()) == [0.8, 123.0, 2e-4, 3e-5, "by hand"]
 
 
 def test_fits_axes_count_from_the_middle_of_an_oblong_window():
-    """Of five columns the third, of four rows between the second and the third, where pixels count from 1."""
+    """Of five columns the third, of four rows between the second and the third, where
+    pixels count from 1.
+    """
     (about, image), *parts = list(_units(export.fits(stack())))
     assert np.array_equal(image, LIGHT)
     assert [about[f"CTYPE{axis}"] for axis in (1, 2)] == ["x", "y"]
@@ -101,7 +113,11 @@ def test_fits_axes_count_from_the_middle_of_an_oblong_window():
     assert [float(about[f"CRPIX{axis}"]) for axis in (1, 2)] == [3.0, 2.5]
     assert [float(about[f"CRVAL{axis}"]) for axis in (1, 2)] == [0.0, 0.0]
     assert [float(about[f"CDELT{axis}"]) for axis in (1, 2)] == [0.8, 0.8]
-    assert [float(about[name]) for name in ("RELERR", "TOLERANC", "SENSDIST")] == [3e-5, 2e-4, 123.0]
+    assert [float(about[name]) for name in ("RELERR", "TOLERANC", "SENSDIST")] == [
+        3e-5,
+        2e-4,
+        123.0,
+    ]
     named = {cards["EXTNAME"]: values.tolist() for cards, values in parts}
     assert named == {
         "DEPTHS_UM": [np.inf, 900.0, 1300.0],
@@ -115,7 +131,12 @@ def test_fits_axes_count_from_the_middle_of_an_oblong_window():
 
 def test_the_ending_says_the_format_in_small_letters_or_capitals(tmp_path):
     made = dataclasses.replace(stack(), depths_um=np.array([800.0, 900.0, 1300.0]))
-    for name, begins in (("a.TIF", b"II"), ("a.tiff", b"II"), ("a.Mat", b"MATLAB"), ("a.fits", b"SIMPLE")):
+    for name, begins in (
+        ("a.TIF", b"II"),
+        ("a.tiff", b"II"),
+        ("a.Mat", b"MATLAB"),
+        ("a.fits", b"SIMPLE"),
+    ):
         export.write(tmp_path / name, made)
         assert (tmp_path / name).read_bytes().startswith(begins)
     export.write(tmp_path / "a.H5", made)

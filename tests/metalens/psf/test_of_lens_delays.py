@@ -1,4 +1,6 @@
-"""How far apart in delay the pillars of a lens are for a diode: slopes of their phase over the wave number."""
+"""How far apart in delay the pillars of a lens are for a diode: slopes of their phase
+over the wave number.
+"""
 
 import math
 
@@ -15,10 +17,20 @@ PROXY = Proxy(PHASE, np.array([[0.85, 0.05]]), (0.08, 0.22), (0.80, 0.90), 0.0, 
 
 
 def test_delays_are_slopes_of_phase_over_wave_number_of_pillars_that_are_there():
-    """d phase / d k by differences twenty times as wide, at the middle of a Gaussian and 1.645 sigma to both sides."""
+    """d phase / d k by differences twenty times as wide, at the middle of a Gaussian
+    and 1.645 sigma to both sides.
+    """
     size = np.random.default_rng(7).uniform(0.16, 0.21, (12, 9))
     size[3, 4] = size[7, 1] = 0.0  # whose delay of 0 would be farthest from the others
-    lens = Lens(DiameterMap(size, 0.3), Cell(0.3, 0.7, Index(3.6)), PROXY, 0.85, 200.0, math.inf, "map")
+    lens = Lens(
+        DiameterMap(size, 0.3),
+        Cell(0.3, 0.7, Index(3.6)),
+        PROXY,
+        0.85,
+        200.0,
+        math.inf,
+        "map",
+    )
     there, want = size[size > 0], []
     for off in (-1.645, 0.0, 1.645):
         middle = 0.845 + off * 0.02 / 2.3548
@@ -28,4 +40,6 @@ def test_delays_are_slopes_of_phase_over_wave_number_of_pillars_that_are_there()
         assert (np.sign(delay) == np.sign(delay[0])).all()
         want.append(np.ptp(delay))
     found = of_lens._delay_um(lens, (0.0, 0.0), Source(845.0, 20.0))
-    assert found == pytest.approx(max(want), rel=5e-3)  # sigmas of a spectrum in steps, 1 % of a delay's change
+    assert found == pytest.approx(
+        max(want), rel=5e-3
+    )  # sigmas of a spectrum in steps, 1 % of a delay's change

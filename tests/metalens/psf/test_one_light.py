@@ -1,4 +1,6 @@
-"""Pillars of one size that answer x and y apart: their library holds one light, and what is made of it says which."""
+"""Pillars of one size that answer x and y apart: their library holds one light, and
+what is made of it says which.
+"""
 
 from dataclasses import replace
 
@@ -15,18 +17,31 @@ from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 from metalens.psf import View, from_lens
 
-PROXY = Proxy(np.array([[6.0, 9.0]]), np.array([[0.9, -0.03]]), (0.08, 0.22), (0.85, 0.85), 1e-6, 1e-6)
+PROXY = Proxy(
+    np.array([[6.0, 9.0]]),
+    np.array([[0.9, -0.03]]),
+    (0.08, 0.22),
+    (0.85, 0.85),
+    1e-6,
+    1e-6,
+)
 VIEW = View((3e3,), ((0.04, -0.09),), window_um=9.0, samples=16)
 
 
 def lens(shape):
     x = (np.arange(31) - 15) * 0.4
-    diameter = np.where(np.hypot(x, x[:, None]) < 5.7, 0.14 + 0.05 * np.cos(x) * np.sin(0.7 * x[:, None]), 0.0)
+    diameter = np.where(
+        np.hypot(x, x[:, None]) < 5.7,
+        0.14 + 0.05 * np.cos(x) * np.sin(0.7 * x[:, None]),
+        0.0,
+    )
     cell = Cell(0.4, 0.7, Index(3.6), Index(1.45), shape=shape)
     return Lens(DiameterMap(diameter, 0.4), cell, PROXY, 0.85, 41.0, 3e3, "map")
 
 
-@pytest.mark.parametrize("shape", [Rectangle(ratio=0.6), Ellipse(ratio=1.3), RegularPolygon(sides=3)])
+@pytest.mark.parametrize(
+    "shape", [Rectangle(ratio=0.6), Ellipse(ratio=1.3), RegularPolygon(sides=3)]
+)
 def test_psfs_of_one_light_say_so_and_are_not_called_those_of_both(shape):
     made = lens(shape)
     found = from_lens(made, VIEW, tolerance=1e-3, polarisation="auto")
@@ -38,9 +53,13 @@ def test_psfs_of_one_light_say_so_and_are_not_called_those_of_both(shape):
     assert f"within {made.proxy.max_phase_error_rad:.1e} rad" in design_words.held(made)
 
 
-@pytest.mark.parametrize("shape", [Circle(), Rectangle(ratio=1.0), Cross(angle_rad=0.3)])
+@pytest.mark.parametrize(
+    "shape", [Circle(), Rectangle(ratio=1.0), Cross(angle_rad=0.3)]
+)
 def test_pillars_alike_for_both_take_both(shape):
-    """A quarter turn leaves them as they are, so that light along x and along y meets the same pillar."""
+    """A quarter turn leaves them as they are, so that light along x and along y meets
+    the same pillar.
+    """
     made = lens(shape)
     found = from_lens(made, VIEW, tolerance=1e-3, polarisation="flux")
     assert "light along" not in found.reason
@@ -48,23 +67,44 @@ def test_pillars_alike_for_both_take_both(shape):
 
 
 def test_at_angles_the_library_holds_the_mean_of_both_in_one_plane_of_incidence():
-    """Rectangles answer light that is tilted along y otherwise than along x, where their rows were solved."""
-    alike = {name: getattr(PROXY, name)[None] for name in ("phase_coefficients", "transmission_coefficients")}
-    made = replace(lens(Rectangle(ratio=0.6)), proxy=replace(PROXY, max_angle_rad=0.3, **alike))
+    """Rectangles answer light that is tilted along y otherwise than along x, where
+    their rows were solved.
+    """
+    alike = {
+        name: getattr(PROXY, name)[None]
+        for name in ("phase_coefficients", "transmission_coefficients")
+    }
+    made = replace(
+        lens(Rectangle(ratio=0.6)), proxy=replace(PROXY, max_angle_rad=0.3, **alike)
+    )
     found = from_lens(made, VIEW, tolerance=1e-3)
     assert "of the mean of both polarisations, tilted along x" in found.reason
 
 
 def test_round_pillars_of_unlike_periods_are_of_one_light_too():
-    assert replace(lens(Circle()), cell=Cell(0.4, lattice=Lattice("rectangular", 1.2))).one_light == "light along x"
+    assert (
+        replace(
+            lens(Circle()), cell=Cell(0.4, lattice=Lattice("rectangular", 1.2))
+        ).one_light
+        == "light along x"
+    )
 
 
 def test_the_light_that_is_asked_for_is_refused_for_its_own_reason(tmp_path):
-    """x of a rectangle is what its library holds; y is not in it; of round pillars both are the same."""
+    """x of a rectangle is what its library holds; y is not in it; of round pillars both
+    are the same.
+    """
     oblong, disc = lens(Rectangle(ratio=0.6)), lens(Circle())
     path = tmp_path / "lens.h5"
     path.write_bytes(b"0")
-    asked = Settings(sources_mm=(3.0,), angles_deg=(2.0,), window_um=9.0, samples=16, tolerance=1e-3, light="x")
+    asked = Settings(
+        sources_mm=(3.0,),
+        angles_deg=(2.0,),
+        window_um=9.0,
+        samples=16,
+        tolerance=1e-3,
+        light="x",
+    )
     assert "light along x" in psf._of_design(path, asked, oblong).reason
     with pytest.raises(ConfigError, match="these know light along x alone"):
         psf._of_design(path, replace(asked, light="y"), oblong)

@@ -1,4 +1,6 @@
-"""Pictures of stacks that are no squares, repeat a depth, or hold what is below 0 at places."""
+"""Pictures of stacks that are no squares, repeat a depth, or hold what is below 0 at
+places.
+"""
 
 import dataclasses
 
@@ -9,7 +11,12 @@ import pytest
 from metalens.psf import plots, psf_stack
 
 X, Y = (np.arange(n) - (n - 1) / 2 for n in (31, 24))
-PHASE = -2 * np.pi / 0.85 * (np.sqrt((0.4 * X) ** 2 + (0.4 * Y[:, None]) ** 2 + 900.0) - 30.0)
+PHASE = (
+    -2
+    * np.pi
+    / 0.85
+    * (np.sqrt((0.4 * X) ** 2 + (0.4 * Y[:, None]) ** 2 + 900.0) - 30.0)
+)
 
 
 def stack(depths_um=(200.0, 400.0)):
@@ -33,7 +40,9 @@ def shown(monkeypatch):
     monkeypatch.setattr(
         matplotlib.axes.Axes,
         "imshow",
-        lambda panel, image, **about: kept.append((image, about["extent"])) or draw(panel, image, **about),
+        lambda panel, image, **about: (
+            kept.append((image, about["extent"])) or draw(panel, image, **about)
+        ),
     )
     return kept
 
@@ -45,7 +54,9 @@ def test_the_montage_has_the_shape_of_the_window(shown):
 
 
 def test_flux_below_0_is_drawn_as_none(shown):
-    """Rays far off the axis may carry light back through the plane at places of no light."""
+    """Rays far off the axis may carry light back through the plane at places of no
+    light.
+    """
     made = stack()
     light = made.intensity.copy()
     light[0, 3, 7] = -1e-4 * light.max()
@@ -56,7 +67,12 @@ def test_flux_below_0_is_drawn_as_none(shown):
 
 @pytest.mark.parametrize(
     ("depths_um", "told"),
-    [((200.0, 400.0), True), ((400.0, 200.0), True), ((200.0, 200.0, 400.0), False), ((200.0,), False)],
+    [
+        ((200.0, 400.0), True),
+        ((400.0, 200.0), True),
+        ((200.0, 200.0, 400.0), False),
+        ((200.0,), False),
+    ],
 )
 def test_information_is_drawn_between_depths_that_differ(depths_um, told):
     assert ("information" in plots.pictures(stack(depths_um))) == told

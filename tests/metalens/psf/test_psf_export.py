@@ -1,4 +1,6 @@
-"""PSF stacks as TIFF, MATLAB and FITS files: read back by other readers, equal to what was written."""
+"""PSF stacks as TIFF, MATLAB and FITS files: read back by other readers, equal to what
+was written.
+"""
 
 import io
 import json
@@ -51,14 +53,20 @@ def test_matlab_variables_have_the_names_of_the_record(stack):
 
 
 def _units(data):
-    """Headers and bytes of a FITS file by the standard alone: 2880-byte blocks, 80-byte cards, big-endian values."""
+    """Headers and bytes of a FITS file by the standard alone: 2880-byte blocks, 80-byte
+    cards, big-endian values.
+    """
     while data:
         cards = {}
         while "END" not in cards:
             block, data = data[:2880], data[2880:]
             for card in (block[i : i + 80].decode("ascii") for i in range(0, 2880, 80)):
-                cards[card[:8].strip()] = card[10:].split("/")[0].strip().strip("'").strip()
-        shape = [int(cards[f"NAXIS{axis}"]) for axis in range(int(cards["NAXIS"]), 0, -1)]
+                cards[card[:8].strip()] = (
+                    card[10:].split("/")[0].strip().strip("'").strip()
+                )
+        shape = [
+            int(cards[f"NAXIS{axis}"]) for axis in range(int(cards["NAXIS"]), 0, -1)
+        ]
         kind = {"-32": ">f4", "-64": ">f8"}[cards["BITPIX"]]
         size = int(np.prod(shape)) * int(kind[2])
         yield cards, np.frombuffer(data[:size], kind).reshape(shape)
@@ -69,8 +77,14 @@ def test_fits_images_have_axes_in_um_and_the_energies_beside_them(stack):
     (about, image), *parts = list(_units(psf_export.fits(stack)))
     assert np.array_equal(image, stack.intensity.astype("f4"))
     assert about["AXES"] == "angle depth y x"
-    assert (about["CTYPE1"], about["CUNIT2"], float(about["CDELT1"])) == ("x", "um", pytest.approx(12 / 10, rel=1e-12))
-    assert float(about["CRPIX1"]) == 5.5  # pixels count from 1: the middle of ten lies between the fifth and the sixth
+    assert (about["CTYPE1"], about["CUNIT2"], float(about["CDELT1"])) == (
+        "x",
+        "um",
+        pytest.approx(12 / 10, rel=1e-12),
+    )
+    assert (
+        float(about["CRPIX1"]) == 5.5
+    )  # pixels count from 1: the middle of ten lies between the fifth and the sixth
     assert float(about["SENSDIST"]) == 120.0
     named = {cards["EXTNAME"]: values for cards, values in parts}
     assert np.array_equal(named["DEPTHS_UM"], [1000.0, 1600.0, 2500.0])

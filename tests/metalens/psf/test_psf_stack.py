@@ -1,4 +1,6 @@
-"""The PSF record: normalisation, angles, wavelengths, files, pixels, metrics; answers in closed form."""
+"""The PSF record: normalisation, angles, wavelengths, files, pixels, metrics; answers
+in closed form.
+"""
 
 import dataclasses
 
@@ -14,14 +16,21 @@ from metalens.psf import metrics as psf_metrics
 from metalens.psf import spectrum
 
 K = 2 * np.pi / 0.85
-GEOMETRY = dict(pitch_um=0.4, wavelength_um=0.85, sensor_distance_um=120.0, depths_um=[1000.0, 1600.0])
+GEOMETRY = dict(
+    pitch_um=0.4,
+    wavelength_um=0.85,
+    sensor_distance_um=120.0,
+    depths_um=[1000.0, 1600.0],
+)
 WINDOW = dict(window_um=16.0, samples=20)
 
 
 def focus(n=64, source=1300.0, distance=120.0, wavelength=0.85):
     x = (np.arange(n) - (n - 1) / 2) * 0.4
     r2 = x**2 + x[:, None] ** 2
-    path = r2 / (np.sqrt(r2 + distance**2) + distance) + r2 / (np.sqrt(r2 + source**2) + source)
+    path = r2 / (np.sqrt(r2 + distance**2) + distance) + r2 / (
+        np.sqrt(r2 + source**2) + source
+    )
     return -2 * np.pi / wavelength * path, (r2 <= x[-1] ** 2).astype(float)
 
 
@@ -34,7 +43,9 @@ def gaussian_stack(widths, step=0.5, n=81):
     depths = np.linspace(16e3, 18e3, len(widths))
     light /= light.sum((1, 2), keepdims=True)
     ones = np.ones(len(widths))
-    return dataclasses.replace(base, intensity=light, energy_um2=ones, depths_um=depths, step_um=step)
+    return dataclasses.replace(
+        base, intensity=light, energy_um2=ones, depths_um=depths, step_um=step
+    )
 
 
 def test_each_psf_has_sum_one_and_its_energy_beside_it():
@@ -48,18 +59,23 @@ def test_each_psf_has_sum_one_and_its_energy_beside_it():
 
 def test_angles_make_an_axis_and_equal_single_angles():
     phase, level = focus()
-    several = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=[[0.1, 0.0], [0.0, -0.2]])
+    several = psf.psf_stack(
+        phase, level, **GEOMETRY, **WINDOW, angle_rad=[[0.1, 0.0], [0.0, -0.2]]
+    )
     assert several.intensity.shape == (2, 2, 20, 20)
     assert several.angles_rad == pytest.approx(np.array([[0.1, 0.0], [0.0, -0.2]]))
     assert several.centres_um[1] == pytest.approx([0, 120 * np.tan(-0.2)])
     one = psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=(0.0, -0.2))
-    assert several.intensity[1] == pytest.approx(one.intensity, abs=1e-12)  # of sum 1: rounding of angles side by side
+    assert several.intensity[1] == pytest.approx(
+        one.intensity, abs=1e-12
+    )  # of sum 1: rounding of angles side by side
 
 
 def test_field_along_x_and_y_are_transposed():
     phase, level = focus()
     along_x, along_y = (
-        psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=a).intensity for a in ((0.3, 0), (0, 0.3))
+        psf.psf_stack(phase, level, **GEOMETRY, **WINDOW, angle_rad=a).intensity
+        for a in ((0.3, 0), (0, 0.3))
     )
     assert np.abs(along_x - along_y.swapaxes(1, 2)).max() < 1e-4 * along_x.max()
 
@@ -68,10 +84,23 @@ def test_wavelengths_add_incoherently_with_their_weights():
     phase, level = focus()
     waves, weights = [0.84, 0.86], [1.0, 3.0]
     other = GEOMETRY | dict(wavelength_um=waves)
-    both = psf.psf_stack(np.stack([phase, phase]), level, **other, **WINDOW, weights=weights, tolerance=1e-6)
+    both = psf.psf_stack(
+        np.stack([phase, phase]),
+        level,
+        **other,
+        **WINDOW,
+        weights=weights,
+        tolerance=1e-6,
+    )
     want = 0
     for wave, weight in zip(waves, (0.25, 0.75), strict=True):
-        one = psf.psf_stack(phase, level, **GEOMETRY | dict(wavelength_um=wave), **WINDOW, tolerance=1e-6)
+        one = psf.psf_stack(
+            phase,
+            level,
+            **GEOMETRY | dict(wavelength_um=wave),
+            **WINDOW,
+            tolerance=1e-6,
+        )
         want = want + weight * one.intensity * one.energy_um2[:, None, None]
     want /= want.sum((1, 2), keepdims=True)
     assert np.abs(both.intensity - want).max() < 1e-8
@@ -96,7 +125,11 @@ def test_file_round_trip_and_same_bytes(tmp_path):
         psf.save(tmp_path / name, stack)
     back = psf.load(tmp_path / "a.h5")
     assert np.array_equal(back.intensity, stack.intensity)
-    assert (back.reason, back.error, back.step_um) == (stack.reason, stack.error, stack.step_um)
+    assert (back.reason, back.error, back.step_um) == (
+        stack.reason,
+        stack.error,
+        stack.step_um,
+    )
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
     (tmp_path / "a.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:500])
     with pytest.raises(StoreError):
@@ -138,16 +171,29 @@ def test_pixels_are_differentiable_in_pitch():
 def test_blur_of_even_discs_is_their_radius():
     """Of two discs, one off the middle; quarters lie on whole samples, one off at most."""
     place = (np.arange(201) - 100) * 0.5
-    near, wide = (np.hypot(place - at, place[:, None] + 2 * at) <= b for at, b in ((0.0, 37.0), (7.0, 19.0)))
+    near, wide = (
+        np.hypot(place - at, place[:, None] + 2 * at) <= b
+        for at, b in ((0.0, 37.0), (7.0, 19.0))
+    )
     np.testing.assert_allclose(
-        psf_metrics.blur_um(np.stack([near, wide]).astype(float), 0.5), [37.0, 19.0], atol=0.5 / 0.404
+        psf_metrics.blur_um(np.stack([near, wide]).astype(float), 0.5),
+        [37.0, 19.0],
+        atol=0.5 / 0.404,
     )
     middle = near[80:121, 70:131].astype(float)  # lit all over, 20.5 by 30.5 um of it
     held = 20.5 * 30.5 / (np.pi * 37.0**2)
     assert psf_metrics.blur_um(middle, 0.5, held) == pytest.approx(37.0, rel=1e-12)
-    most = wide[20:, 60:].astype(float)  # a tenth of the light beside it, half on either side
-    ends = np.quantile(np.repeat(place[60:], most.sum(0).astype(int)), [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9])
-    down = np.quantile(np.repeat(place[20:], most.sum(1).astype(int)), [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9])
+    most = wide[20:, 60:].astype(
+        float
+    )  # a tenth of the light beside it, half on either side
+    ends = np.quantile(
+        np.repeat(place[60:], most.sum(0).astype(int)),
+        [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9],
+    )
+    down = np.quantile(
+        np.repeat(place[20:], most.sum(1).astype(int)),
+        [0.5 - 0.25 / 0.9, 0.5 + 0.25 / 0.9],
+    )
     want = np.hypot(np.ptp(ends), np.ptp(down)) / 2 / 0.404 / np.sqrt(2)
     assert psf_metrics.blur_um(most, 0.5, 0.9) == pytest.approx(want, abs=0.5 / 0.404)
 
@@ -157,25 +203,41 @@ def test_metrics_of_gaussians_are_closed_forms():
     f = np.linspace(0, 0.2, 9)
     for depth, width in enumerate((2.0, 3.0)):
         want = np.exp(-2 * (np.pi * width * f) ** 2)
-        assert psf_metrics.mtf(stack, frequencies_per_um=f)[depth, 0] == pytest.approx(want, abs=1e-9)
+        assert psf_metrics.mtf(stack, frequencies_per_um=f)[depth, 0] == pytest.approx(
+            want, abs=1e-9
+        )
         inside = psf_metrics.encircled(stack, radii_um=np.array([2.0, 4.0]))[depth]
-        assert inside == pytest.approx(1 - np.exp(-np.array([4.0, 16.0]) / (2 * width**2)), abs=5e-3)
+        assert inside == pytest.approx(
+            1 - np.exp(-np.array([4.0, 16.0]) / (2 * width**2)), abs=5e-3
+        )
 
 
 def test_axial_information_under_each_named_normalisation():
-    """Gaussians of width w: Σ PSF² = dx²/(4πw²) and the overlap of w and v is dx²/(2π(w² + v²))."""
+    """Gaussians of width w: Σ PSF² = dx²/(4πw²) and the overlap of w and v is
+    dx²/(2π(w² + v²)).
+    """
     w, v, dx, dz = 2.0, 2.4, 0.5, 2.0
     stack = gaussian_stack([w, v], step=dx)
-    own, cross = [dx**2 / (4 * np.pi * a * a) for a in (w, v)], dx**2 / (2 * np.pi * (w * w + v * v))
+    own, cross = (
+        [dx**2 / (4 * np.pi * a * a) for a in (w, v)],
+        dx**2 / (2 * np.pi * (w * w + v * v)),
+    )
     depth, by_sum = psf_metrics.axial_information(stack, normalisation="sum")
     assert depth == pytest.approx([17e3])
     assert by_sum == pytest.approx([(own[0] + own[1] - 2 * cross) / dz**2], rel=1e-8)
     by_l2 = psf_metrics.information_by_name(stack)["l2"]
-    assert by_l2 == pytest.approx([(2 - 2 * cross / np.sqrt(own[0] * own[1])) / dz**2], rel=1e-8)
+    assert by_l2 == pytest.approx(
+        [(2 - 2 * cross / np.sqrt(own[0] * own[1])) / dz**2], rel=1e-8
+    )
     brighter = dataclasses.replace(stack, energy_um2=np.array([2.0, 2.0]))
-    assert psf_metrics.axial_information(brighter, normalisation="none")[1] == pytest.approx(4 * by_sum)
+    assert psf_metrics.axial_information(brighter, normalisation="none")[
+        1
+    ] == pytest.approx(4 * by_sum)
     with pytest.raises(PropagationError, match="two different"):
-        psf_metrics.axial_information(dataclasses.replace(stack, depths_um=np.array([1.0, 1.0])), normalisation="sum")
+        psf_metrics.axial_information(
+            dataclasses.replace(stack, depths_um=np.array([1.0, 1.0])),
+            normalisation="sum",
+        )
 
 
 def test_polychromatic_psf_converges_with_the_nodes():
@@ -187,9 +249,19 @@ def test_polychromatic_psf_converges_with_the_nodes():
         maps = np.stack([phase] * len(found.weights))
         other = GEOMETRY | dict(wavelength_um=found.wavelengths_um.tolist())
         results.append(
-            psf.psf_stack(maps, level, **other, **WINDOW, weights=found.weights.tolist(), tolerance=1e-7).intensity
+            psf.psf_stack(
+                maps,
+                level,
+                **other,
+                **WINDOW,
+                weights=found.weights.tolist(),
+                tolerance=1e-7,
+            ).intensity
         )
-    errors = [np.linalg.norm(r - results[-1]) / np.linalg.norm(results[-1]) for r in results[:2]]
+    errors = [
+        np.linalg.norm(r - results[-1]) / np.linalg.norm(results[-1])
+        for r in results[:2]
+    ]
     assert errors[0] < 1e-2
     assert errors[1] < 1e-3
 
@@ -200,10 +272,15 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     from metalens.pillars import Proxy
     from metalens.psf.of_lens import incidence
 
-    angled = np.array([[[1.3, 4.0]], [[0.4, 0.0]]]), np.array([[[0.6, 0.3]], [[-0.05, 0.0]]])  # of sin² of the angle
+    angled = (
+        np.array([[[1.3, 4.0]], [[0.4, 0.0]]]),
+        np.array([[[0.6, 0.3]], [[-0.05, 0.0]]]),
+    )  # of sin² of the angle
     proxy = Proxy(*angled, (0.1, 0.3), (0.9, 0.98), 0.0, 0.0, max_angle_rad=0.5)
     sizes = np.array([[0.1, 0.0], [0.3, 0.22]])
-    lens = Lens(DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map")
+    lens = Lens(
+        DiameterMap(sizes, 0.4), Cell(pitch_um=0.4), proxy, 0.95, 120.0, 1300.0, "map"
+    )
     phase, level = np.empty((2, 2)), np.empty((2, 2))
     answers.fill(lens, (0.94, incidence(lens, (0.17, -0.31))), phase, level)
     direction = np.array([np.tan(0.17), np.tan(-0.31), 1.0])
@@ -212,7 +289,9 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
     want = np.where(sizes > 0, 1.3 + 4.0 * (10 * sizes - 2) + 0.4 * share, 0)
     assert np.exp(1j * phase) == pytest.approx(np.exp(1j * want), abs=1e-12)
     assert np.abs(phase).max() <= np.pi
-    assert level == pytest.approx(np.where(sizes > 0, 3 * sizes - 0.05 * share, 0), abs=1e-12)
+    assert level == pytest.approx(
+        np.where(sizes > 0, 3 * sizes - 0.05 * share, 0), abs=1e-12
+    )
     upright = Proxy(
         angled[0][0], angled[1][0], (0.1, 0.3), (0.9, 0.98), 0.0, 0.0
     )  # a library of normal incidence alone
@@ -222,13 +301,19 @@ def test_a_direction_off_both_axes_asks_the_proxy_for_its_angle_to_the_axis():
 
 
 def test_metrics_of_an_oblong_spot_off_the_middle():
-    """Gaussian of 2.1 by 1.3 um about (1.5, -2.3): each axis has its own number, radii count from the centroid."""
+    """Gaussian of 2.1 by 1.3 um about (1.5, -2.3): each axis has its own number, radii
+    count from the centroid.
+    """
     stack = gaussian_stack([2.0, 2.0], step=0.4, n=81)
     x = stack.x_um
-    light = np.exp(-((x - 1.5) ** 2) / (2 * 2.1**2) - (x[:, None] + 2.3) ** 2 / (2 * 1.3**2))
+    light = np.exp(
+        -((x - 1.5) ** 2) / (2 * 2.1**2) - (x[:, None] + 2.3) ** 2 / (2 * 1.3**2)
+    )
     light = np.stack([light, light[::-1]]) / light.sum()
     stack = dataclasses.replace(stack, intensity=light, energy_um2=np.array([3.0, 7.0]))
-    assert np.array(psf_metrics.centroid(stack)) == pytest.approx(np.array([[1.5, 1.5], [-2.3, 2.3]]), abs=1e-6)
+    assert np.array(psf_metrics.centroid(stack)) == pytest.approx(
+        np.array([[1.5, 1.5], [-2.3, 2.3]]), abs=1e-6
+    )
     f = np.array([0.03, 0.11])
     found = psf_metrics.mtf(stack, frequencies_per_um=f)
     want = [np.exp(-2 * (np.pi * s * f) ** 2) for s in (2.1, 1.3)]
@@ -237,9 +322,13 @@ def test_metrics_of_an_oblong_spot_off_the_middle():
     narrow = (np.cos(angle) / 2.1) ** 2 + (np.sin(angle) / 1.3) ** 2
     inside = (((1 - np.exp(-narrow * 2.7**2 / 2)) / narrow).mean()) / (2.1 * 1.3)
     for share, whole in ((True, 1.0), (False, np.array([3.0, 7.0]))):
-        got = psf_metrics.encircled(stack, radii_um=np.array([2.7]), of_window=share)[:, 0]
+        got = psf_metrics.encircled(stack, radii_um=np.array([2.7]), of_window=share)[
+            :, 0
+        ]
         assert got == pytest.approx(inside * whole, rel=0.01)  # samples cut by the rim
     depth, plain = psf_metrics.axial_information(stack, normalisation="none")
     step_mm = np.diff(stack.depths_um)[0] * 1e-3
     assert depth == pytest.approx([stack.depths_um.mean()])
-    assert plain == pytest.approx([((7 * light[1] - 3 * light[0]) ** 2).sum() / step_mm**2])
+    assert plain == pytest.approx(
+        [((7 * light[1] - 3 * light[0]) ** 2).sum() / step_mm**2]
+    )

@@ -1,7 +1,10 @@
-"""Wavelengths that stand for a spectrum, beside the focus too: against a hundred of them, equally spaced.
+"""Wavelengths that stand for a spectrum, beside the focus too: against a hundred of
+them, equally spaced.
 
-Light that meets a place has paths through the lens that differ by the more, the farther from the focus it lies, and
-pillars delay it by up to some micrometres more. Two wavelengths that serve a focus miss a window beside it by a tenth.
+Light that meets a place has paths through the lens that differ by the more, the farther
+from the focus it lies, and
+pillars delay it by up to some micrometres more. Two wavelengths that serve a focus miss
+a window beside it by a tenth.
 """
 
 import math
@@ -16,7 +19,9 @@ from metalens.pillars import Proxy
 from metalens.psf import Nodes, View, from_lens, spectrum
 from metalens.psf.of_lens import PILOT, lit, paths_um
 
-PHASE = np.array([[0.0, 1.15 * math.pi], [-0.4, -1.9]])  # of diameter and wavelength: delays of 0.9 to 4.3 um
+PHASE = np.array(
+    [[0.0, 1.15 * math.pi], [-0.4, -1.9]]
+)  # of diameter and wavelength: delays of 0.9 to 4.3 um
 PROXY = Proxy(PHASE, np.array([[0.85, 0.05]]), (0.08, 0.22), (0.80, 0.90), 0.0, 0.0)
 LINE = np.array([[826, 0.0], [843, 1.0], [851, 0.35], [868, 0.8], [877, 0.0]])
 
@@ -24,11 +29,15 @@ LINE = np.array([[826, 0.0], [843, 1.0], [851, 0.35], [868, 0.8], [877, 0.0]])
 def lens(count, distance_um):
     """A focus of so many columns, five rows fewer, at 850 nm."""
     x, y = (np.arange(n) - (n - 1) / 2 for n in (count, count - 5))
-    path = np.sqrt((0.3 * x) ** 2 + (0.3 * y[:, None]) ** 2 + distance_um**2) - distance_um
+    path = (
+        np.sqrt((0.3 * x) ** 2 + (0.3 * y[:, None]) ** 2 + distance_um**2) - distance_um
+    )
     wanted = np.mod(-2 * np.pi / 0.85 * path + np.pi, 2 * np.pi) - np.pi
     diameter = 0.15 + 0.07 * np.clip(wanted / (1.15 * np.pi), -0.99, 0.99)
     cell = Cell(0.3, 0.7, Index(3.6), "SiO2")
-    return Lens(DiameterMap(diameter, 0.3), cell, PROXY, 0.85, distance_um, math.inf, "map")
+    return Lens(
+        DiameterMap(diameter, 0.3), cell, PROXY, 0.85, distance_um, math.inf, "map"
+    )
 
 
 @pytest.fixture
@@ -39,7 +48,9 @@ def source(tmp_path):
 
 
 def many():
-    nm = np.linspace(826, 877, 103)  # a step of 0.5 nm: paths of 40 um turn by a sixth of a turn
+    nm = np.linspace(
+        826, 877, 103
+    )  # a step of 0.5 nm: paths of 40 um turn by a sixth of a turn
     share = np.interp(nm, *LINE.T)
     return Nodes(nm * 1e-3, share / share.sum(), 0.0)
 
@@ -47,32 +58,49 @@ def many():
 @pytest.mark.parametrize(
     ("count", "angle", "offset", "depths", "tolerance"),
     [
-        (20, (0.0, 0.0), (0.0, 0.0), (90.0,), 3e-4),  # sag of 0.3 um: the delays are what counts
+        (
+            20,
+            (0.0, 0.0),
+            (0.0, 0.0),
+            (90.0,),
+            3e-4,
+        ),  # sag of 0.3 um: the delays are what counts
         (61, (0.0, 0.0), (0.0, 21.0), (300.0, math.inf), 2e-3),
         (61, (-0.2, 0.35), (-13.0, 4.0), (math.inf, 120.0), 2e-3),
         (61, (0.0, 0.5), (0.0, 0.0), (25.0,), 1e-3),
     ],
 )
-def test_wavelengths_serve_wherever_the_window_lies(source, count, angle, offset, depths, tolerance):
+def test_wavelengths_serve_wherever_the_window_lies(
+    source, count, angle, offset, depths, tolerance
+):
     made = lens(count, 0.9 * count)
     view = View(depths, (angle,), (7.0, 4.2), (20, 12), offset)
     found = from_lens(made, view, tolerance=tolerance, spectrum=source)
     want = from_lens(made, view, tolerance=1e-6, spectrum=many())
-    error = np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(want.intensity)
+    error = np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(
+        want.intensity
+    )
     assert found.budget.spectrum <= tolerance / 2
     assert found.converged
     assert error <= found.error
 
 
 def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
-    """Two wavelengths: an error that is said, not hidden, and twice as large at least beside the focus."""
+    """Two wavelengths: an error that is said, not hidden, and twice as large at least
+    beside the focus.
+    """
     um, share = source.wavelengths_um, source.share
     two = Nodes(*spectrum.gauss(um, share, 2), 0.0, source)
     errors = []
     for offset in ((0.0, 0.0), (0.0, 21.0)):
         view = View((300.0,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset)
-        found, want = (from_lens(lens(61, 55.0), view, tolerance=1e-3, spectrum=one) for one in (two, many()))
-        error = np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(want.intensity)
+        found, want = (
+            from_lens(lens(61, 55.0), view, tolerance=1e-3, spectrum=one)
+            for one in (two, many())
+        )
+        error = np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(
+            want.intensity
+        )
         assert error <= found.budget.spectrum
         errors.append(found.budget.spectrum)
     assert errors[1] > 2 * errors[0]
@@ -83,39 +111,77 @@ def test_light_is_shared_out_to_the_nearest_places():
     light[0, 0, 3], light[1, 3, 8], light[1, 2, 4] = 1.0, 2.0, 3.0
     found = lit(light, (3, 5)) * 14
     want = np.zeros((2, 3, 5))
-    want[0, 0, 2], want[1, 2, 4], want[1, 1, 2] = 1.0, 4.0, 9.0  # 3 lies half-way between 2 and 4
+    want[0, 0, 2], want[1, 2, 4], want[1, 1, 2] = (
+        1.0,
+        4.0,
+        9.0,
+    )  # 3 lies half-way between 2 and 4
     assert found == pytest.approx(want)
     assert lit(light[:, :1, :1] + 1, (1, 1)).sum() == pytest.approx(1.0)
 
 
-def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light(monkeypatch):
-    """Paths of some 20 um ask for more wavelengths than twice the pilot's; no second try of nearly as many."""
+def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light(
+    monkeypatch,
+):
+    """Paths of some 20 um ask for more wavelengths than twice the pilot's; no second
+    try of nearly as many.
+    """
     made, waves = lens(241, 42.0), []
     plain = answers.fill
-    monkeypatch.setattr(answers, "fill", lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)))
+    monkeypatch.setattr(
+        answers,
+        "fill",
+        lambda lens, at, *out: (waves.append(at[0]), plain(lens, at, *out)),
+    )
     um = np.linspace(0.805, 0.895, 25)
     share = np.exp(-4 * np.log(2) * ((um - 0.849) / 0.031) ** 2)
     source = spectrum.Measured(um, share / share.sum())
-    found = from_lens(made, View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15), tolerance=1e-4, spectrum=source)
+    found = from_lens(
+        made,
+        View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),
+        tolerance=1e-4,
+        spectrum=source,
+    )
     assert len(found.wavelengths_um) > 2 * PILOT
     assert found.budget.spectrum <= 5e-5
     assert len(waves) == PILOT + len(found.wavelengths_um)
     fine = Nodes(um, source.share, 0.0)
-    want = from_lens(made, View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15), tolerance=1e-5, spectrum=fine)
-    assert np.linalg.norm(found.intensity - want.intensity) / np.linalg.norm(want.intensity) <= found.error
+    want = from_lens(
+        made,
+        View((math.inf,), ((0.1, 0.05),), (6.0, 6.0), 15),
+        tolerance=1e-5,
+        spectrum=fine,
+    )
+    assert (
+        np.linalg.norm(found.intensity - want.intensity)
+        / np.linalg.norm(want.intensity)
+        <= found.error
+    )
 
 
 @pytest.mark.parametrize("offset", [(3.0, 21.0), (-17.0, 5.0)])
-def test_paths_to_a_window_differ_as_those_from_the_nearest_and_the_farthest_pillar(offset):
-    """Collimated light on axis, through air and pillars of one wavelength: rims of the lens on the line from its
+def test_paths_to_a_window_differ_as_those_from_the_nearest_and_the_farthest_pillar(
+    offset,
+):
+    """Collimated light on axis, through air and pillars of one wavelength: rims of the
+    lens on the line from its
     middle, by spokes that miss it by up to 3 %."""
-    one = Proxy(PHASE[:1], np.array([[0.85, 0.05]]), (0.08, 0.22), (0.85, 0.85), 0.0, 0.0)
+    one = Proxy(
+        PHASE[:1], np.array([[0.85, 0.05]]), (0.08, 0.22), (0.85, 0.85), 0.0, 0.0
+    )
     made = replace(lens(61, 55.0), proxy=one)
     radius = made.diameters.radius_um
-    found = paths_um(made, View((math.inf,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset), (0.0, 0.0), None)[0]
+    found = paths_um(
+        made,
+        View((math.inf,), ((0.0, 0.0),), (7.0, 4.2), (20, 12), offset),
+        (0.0, 0.0),
+        None,
+    )[0]
     middle = math.hypot(*offset)
     near = max(middle - radius, 0.0)
     want = math.hypot(middle + radius, 55.0) - math.hypot(near, 55.0)
-    assert found[found.shape[0] // 2, found.shape[1] // 2] == pytest.approx(want, rel=0.03)
+    assert found[found.shape[0] // 2, found.shape[1] // 2] == pytest.approx(
+        want, rel=0.03
+    )
     down, across = np.ptp(found, axis=0).mean(), np.ptp(found, axis=1).mean()
     assert bool(down > across) is (abs(offset[1]) > abs(offset[0]))

@@ -1,4 +1,6 @@
-"""A stack of several wavelengths holds them with their weights, as they were asked for and of sum 1."""
+"""A stack of several wavelengths holds them with their weights, as they were asked for
+and of sum 1.
+"""
 
 import numpy as np
 
@@ -20,4 +22,6 @@ def test_wavelengths_and_their_weights_are_not_exchanged():
         tolerance=1e-2,
     )
     assert np.asarray(made.wavelengths_um).tolist() == [0.83, 0.87]
-    assert np.allclose(np.asarray(made.weights) / np.sum(made.weights), [0.3, 0.7], rtol=1e-12)
+    assert np.allclose(
+        np.asarray(made.weights) / np.sum(made.weights), [0.3, 0.7], rtol=1e-12
+    )

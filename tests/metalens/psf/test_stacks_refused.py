@@ -1,4 +1,6 @@
-"""What is no lens, no window and no tolerance is refused in words, by name, before anything is computed."""
+"""What is no lens, no window and no tolerance is refused in words, by name, before
+anything is computed.
+"""
 
 import numpy as np
 import pytest
@@ -12,18 +14,37 @@ from metalens.lens import Layers, media
 from metalens.psf.spectrum import measured
 
 PHASE = np.random.default_rng(2).uniform(0, 6, (12, 15))
-ABOUT = dict(pitch_um=0.41, wavelength_um=0.87, sensor_distance_um=21.0, depths_um=[190.0], window_um=5.0, samples=9)
+ABOUT = dict(
+    pitch_um=0.41,
+    wavelength_um=0.87,
+    sensor_distance_um=21.0,
+    depths_um=[190.0],
+    window_um=5.0,
+    samples=9,
+)
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (dict(tolerance=np.inf), "tolerance is inf, need a relative error above 0 and below 1"),
+        (
+            dict(tolerance=np.inf),
+            "tolerance is inf, need a relative error above 0 and below 1",
+        ),
         (dict(tolerance=3.0), "tolerance is 3.0"),
-        (dict(samples=9.5), "samples = 9.5: need a number or a pair .x, y. of each, samples whole"),
-        (dict(angle_rad=np.zeros((0, 2))), "angle_rad of shape .0, 2.: need one direction"),
+        (
+            dict(samples=9.5),
+            "samples = 9.5: need a number or a pair .x, y. of each, samples whole",
+        ),
+        (
+            dict(angle_rad=np.zeros((0, 2))),
+            "angle_rad of shape .0, 2.: need one direction",
+        ),
         (dict(wavelength_um=[]), "wavelength_um is empty"),
-        (dict(depths_um=[[190.0, 230.0]]), "depths_um of shape .1, 2., offset_um of .2,.: need .depth,. and a pair"),
+        (
+            dict(depths_um=[[190.0, 230.0]]),
+            "depths_um of shape .1, 2., offset_um of .2,.: need .depth,. and a pair",
+        ),
         (dict(offset_um=1.5), "offset_um of ..: need"),
         (dict(offset_um=(1.5,)), "offset_um of .1,.: need"),
     ],
@@ -36,11 +57,19 @@ def test_arguments_that_mean_nothing(more, words):
 @pytest.mark.parametrize(
     ("phase", "level", "words"),
     [
-        (PHASE, np.ones((3, 15)), "phase_rad of shape .12, 15., transmission of .3, 15.: need .…, y, x. of both"),
+        (
+            PHASE,
+            np.ones((3, 15)),
+            "phase_rad of shape .12, 15., transmission of .3, 15.: need .…, y, x. of both",
+        ),
         (PHASE[0], np.ones(15), "phase_rad of shape .15,.,"),
         (PHASE[None][:0], np.ones((0, 12, 15)), "phase_rad of shape .0, 12, 15."),
         (PHASE, np.ones((2, 12, 15)), "transmission of .2, 12, 15."),
-        (PHASE.astype("f2"), np.ones((12, 15)), "phase_rad is torch.float16, need float32 or float64"),
+        (
+            PHASE.astype("f2"),
+            np.ones((12, 15)),
+            "phase_rad is torch.float16, need float32 or float64",
+        ),
     ],
 )
 def test_maps_that_are_no_lens(phase, level, words):
@@ -55,7 +84,11 @@ def test_maps_that_are_no_lens(phase, level, words):
         ([0.85, np.nan], [0.4, 0.6], r"wavelengths_um is \[0\.85, nan\]"),
         ([0.84, 0.87], [1.0], r"2 wavelengths with weights \[1\.0\], need"),
         ([0.84, 0.87], [1.3, -0.3], r"weights \[1\.3, -0\.3\]"),
-        ([0.84, 0.87], [0.4, 1.4], "need one of 0 or more each, sum 1"),  # an image of 1.8 times the light
+        (
+            [0.84, 0.87],
+            [0.4, 1.4],
+            "need one of 0 or more each, sum 1",
+        ),  # an image of 1.8 times the light
     ],
 )
 def test_wavelengths_that_are_no_spectrum(waves, weights, words):
@@ -66,14 +99,21 @@ def test_wavelengths_that_are_no_spectrum(waves, weights, words):
 @pytest.mark.parametrize("spectrum", [None, psf.Source(850.0, 10.0)])
 @pytest.mark.parametrize("tolerance", [0.0, -1e-3, 2.0, np.nan])
 def test_no_lens_is_looked_at_to_such_a_tolerance(spectrum, tolerance):
-    """Below 0 its square would be that of a tolerance; a spectrum would ask for wavelengths first."""
-    with pytest.raises(PropagationError, match=f"tolerance is {tolerance}, need a relative error above 0"):
+    """Below 0 its square would be that of a tolerance; a spectrum would ask for
+    wavelengths first.
+    """
+    with pytest.raises(
+        PropagationError,
+        match=f"tolerance is {tolerance}, need a relative error above 0",
+    ):
         psf.from_lens(None, psf.View((400.0,)), tolerance=tolerance, spectrum=spectrum)
 
 
 @pytest.mark.parametrize("spectrum", [None, psf.Source(850.0, 10.0)])
 def test_no_lens_is_looked_at_from_nowhere(spectrum):
-    with pytest.raises(PropagationError, match="angles_rad is empty, need one direction"):
+    with pytest.raises(
+        PropagationError, match="angles_rad is empty, need one direction"
+    ):
         psf.from_lens(None, psf.View((400.0,), ()), spectrum=spectrum)
 
 
@@ -87,7 +127,10 @@ def test_curves_of_no_file():
     [
         (dict(field=(0.0, np.pi / 2)), "field of .0.0, 1.57.* rad, need angles"),
         (dict(field=(np.nan, 0.1)), "field of .nan"),
-        (dict(polarisation="circular"), "polarisation = 'circular': need one of scalar, flux, vector, auto"),
+        (
+            dict(polarisation="circular"),
+            "polarisation = 'circular': need one of scalar, flux, vector, auto",
+        ),
     ],
 )
 def test_images_of_no_field(more, words):
@@ -101,7 +144,10 @@ def test_second_derivatives(polarisation):
     stack = psf.psf_stack(phase, np.ones((12, 15)), polarisation=polarisation, **ABOUT)
     seen = stack.intensity[0, 4, 2] + 1e-3 * stack.energy_um2.sum()
     assert float(torch.autograd.grad(seen, phase, retain_graph=True)[0].abs().max()) > 0
-    with pytest.raises(PropagationError, match="second derivatives of sums over pillars are not known: leave create"):
+    with pytest.raises(
+        PropagationError,
+        match="second derivatives of sums over pillars are not known: leave create",
+    ):
         torch.autograd.grad(seen, phase, create_graph=True)
 
 
@@ -112,15 +158,26 @@ def test_one_transmission_serves_a_batch_of_lenses():
 
 
 def test_films_without_a_gap_refuse_rays_beyond_the_critical_angle_by_name():
-    """Glass from pillars to sensor under a cover of air: rays with n sin θ above 1, 40 degrees in 1.55, leave no
+    """Glass from pillars to sensor under a cover of air: rays with n sin θ above 1, 40
+    degrees in 1.55, leave no
     pillar."""
     level, angle = np.ones((41, 41)), (0.0, 0.9)
-    about = ABOUT | {"tolerance": 1e-3, "layers": Layers(behind=(Film(Index(1.55), 21.0),))}
-    assert np.isfinite(psf.psf_stack(0 * level, level, **about).intensity).all()  # n sin θ of the rim 0.7
-    with pytest.raises(PropagationError, match=r"the films fill .*n sin θ = 1\.\d+ .*cover of index 1: need a gap"):
+    about = ABOUT | {
+        "tolerance": 1e-3,
+        "layers": Layers(behind=(Film(Index(1.55), 21.0),)),
+    }
+    assert np.isfinite(
+        psf.psf_stack(0 * level, level, **about).intensity
+    ).all()  # n sin θ of the rim 0.7
+    with pytest.raises(
+        PropagationError,
+        match=r"the films fill .*n sin θ = 1\.\d+ .*cover of index 1: need a gap",
+    ):
         psf.psf_stack(0 * level, level, angle_rad=angle, **about)
     gap = about | {"layers": Layers(behind=(Film(Index(1.55), 20.0),))}
-    assert np.isfinite(psf.psf_stack(0 * level, level, angle_rad=angle, **gap).intensity).all()
+    assert np.isfinite(
+        psf.psf_stack(0 * level, level, angle_rad=angle, **gap).intensity
+    ).all()
 
 
 def test_no_power_passes_a_face_beyond_its_critical_angle():

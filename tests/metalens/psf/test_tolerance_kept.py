@@ -1,4 +1,6 @@
-"""The estimate of a stack is within the tolerance that was asked, or the stack says what keeps it above."""
+"""The estimate of a stack is within the tolerance that was asked, or the stack says
+what keeps it above.
+"""
 
 import math
 
@@ -13,19 +15,40 @@ ABOVE = "above the tolerance"
 
 
 def drawn(rng):
-    """(maps, arguments) of a small lens of any aperture: windows from the side, coarse, of sources of finite size."""
-    count, pitch, wave = int(rng.integers(60, 140)), rng.uniform(0.25, 0.5), rng.uniform(0.5, 1.1)
+    """(maps, arguments) of a small lens of any aperture: windows from the side, coarse,
+    of sources of finite size.
+    """
+    count, pitch, wave = (
+        int(rng.integers(60, 140)),
+        rng.uniform(0.25, 0.5),
+        rng.uniform(0.5, 1.1),
+    )
     half = count * pitch / 2
     distance, depths = half * rng.uniform(1.5, 8), half * 10 ** rng.uniform(1, 2, 2)
     y, x = (np.indices((count, count)) - (count - 1) / 2) * pitch
     path = np.sqrt(x**2 + y**2 + distance**2) + rng.normal(0, 0.05 * wave, x.shape)
     phase = np.remainder(-2 * np.pi / wave * path, 2 * np.pi)
-    about = dict(pitch_um=pitch, wavelength_um=wave, sensor_distance_um=distance, depths_um=depths)
-    about |= dict(angle_rad=tuple(rng.uniform(-0.4, 0.4, 2)), window_um=half * rng.uniform(0.2, 1.0), samples=40)
-    about |= dict(offset_um=tuple(rng.uniform(-0.2, 0.2, 2) * half), polarisation=str(rng.choice(KINDS)))
+    about = dict(
+        pitch_um=pitch,
+        wavelength_um=wave,
+        sensor_distance_um=distance,
+        depths_um=depths,
+    )
+    about |= dict(
+        angle_rad=tuple(rng.uniform(-0.4, 0.4, 2)),
+        window_um=half * rng.uniform(0.2, 1.0),
+        samples=40,
+    )
+    about |= dict(
+        offset_um=tuple(rng.uniform(-0.2, 0.2, 2) * half),
+        polarisation=str(rng.choice(KINDS)),
+    )
     if rng.random() < 0.1:
         about |= dict(source=psf.Extent("disc", size_rad=rng.uniform(0.001, 0.02)))
-    maps = phase.astype("f4"), ((np.hypot(x, y) < half) * rng.uniform(0.5, 1, x.shape)).astype("f4")
+    maps = (
+        phase.astype("f4"),
+        ((np.hypot(x, y) < half) * rng.uniform(0.5, 1, x.shape)).astype("f4"),
+    )
     return maps, about | dict(tolerance=float(10 ** rng.uniform(-6.3, -2)))
 
 
@@ -45,12 +68,18 @@ def test_random_stacks_in_single_precision_keep_the_tolerance_or_say_why_not():
 
 
 @pytest.mark.parametrize(("seen", "tries"), [(9.05e-7, 2), (9.8e-7, 2), (8.9e-7, 1)])
-def test_what_is_kept_in_single_precision_counts_before_the_last_try(monkeypatch, seen, tries):
-    """Of 1e-6: sums 4e-7 and kept intensities 1.5e-7 leave √(1 - 0.16 - 0.0225) = 0.904 for what is measured."""
+def test_what_is_kept_in_single_precision_counts_before_the_last_try(
+    monkeypatch, seen, tries
+):
+    """Of 1e-6: sums 4e-7 and kept intensities 1.5e-7 leave √(1 - 0.16 - 0.0225) = 0.904
+    for what is measured.
+    """
     found = iter([seen, 1e-8])
     monkeypatch.setattr(compute, "relative_error", lambda samples, light: next(found))
     maps, about = drawn(np.random.default_rng(7))
-    about |= dict(tolerance=1e-6, polarisation="scalar", samples=40, angle_rad=(0.1, 0.0))
+    about |= dict(
+        tolerance=1e-6, polarisation="scalar", samples=40, angle_rad=(0.1, 0.0)
+    )
     maps[0].flags.writeable = True
     phase = torch.tensor(maps[0], requires_grad=True)  # not by the exact sum
     about.pop("source", None)
@@ -62,7 +91,9 @@ def test_what_is_kept_in_single_precision_counts_before_the_last_try(monkeypatch
 
 def test_single_precision_says_what_it_cannot_hold():
     maps, about = drawn(np.random.default_rng(8))
-    about = {k: v for k, v in about.items() if k != "source"} | dict(polarisation="scalar", tolerance=1e-8)
+    about = {k: v for k, v in about.items() if k != "source"} | dict(
+        polarisation="scalar", tolerance=1e-8
+    )
     made = psf.psf_stack(*maps, **about)
     assert "float32 holds 1.5e-07, give float64 maps" in made.reason
     assert made.error < 3e-7

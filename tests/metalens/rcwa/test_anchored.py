@@ -1,4 +1,6 @@
-"""Coupled waves put right by the modal method: exact where nothing is left to put right, and honest elsewhere."""
+"""Coupled waves put right by the modal method: exact where nothing is left to put
+right, and honest elsewhere.
+"""
 
 import cmath
 import math
@@ -21,21 +23,32 @@ LIGHT = Light(WAVELENGTH)
 
 def test_upright_limit_is_the_modal_answer():
     want = modal.solve(UPRIGHT, DIAMETER, WAVELENGTH, tolerance=2e-4)
-    got = solve_anchored(UPRIGHT, DIAMETER, LIGHT, [want], tolerance=1e-3, reaches=(3, 4, 5, 6))
+    got = solve_anchored(
+        UPRIGHT, DIAMETER, LIGHT, [want], tolerance=1e-3, reaches=(3, 4, 5, 6)
+    )
     assert abs(got.t - want.t) <= got.t_error
     assert got.t_error < 1e-3
 
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 def test_films_like_the_half_spaces_only_turn_the_phase(polarization):
-    """A film of the cover's index on top and one of the substrate's below: t exp(i (kz1 d1 + kz2 d2))."""
+    """A film of the cover's index on top and one of the substrate's below: t exp(i (kz1
+    d1 + kz2 d2)).
+    """
     angle, under, over = 0.13, 0.07, 0.11
     light = {"angle_rad": angle, "polarization": polarization, "tolerance": 1e-3}
     bare = modal.solve(UPRIGHT, DIAMETER, WAVELENGTH, **light)
-    cell = replace(UPRIGHT, under=(Film(Index(1.46), under),), over=(Film(Index(1.04), over),))
+    cell = replace(
+        UPRIGHT, under=(Film(Index(1.46), under),), over=(Film(Index(1.04), over),)
+    )
     got = modal.solve(cell, DIAMETER, WAVELENGTH, **light)
     kx = math.sin(angle)
-    turn = 2 * math.pi / WAVELENGTH * (under * math.sqrt(1.46**2 - kx**2) + over * math.sqrt(1.04**2 - kx**2))
+    turn = (
+        2
+        * math.pi
+        / WAVELENGTH
+        * (under * math.sqrt(1.46**2 - kx**2) + over * math.sqrt(1.04**2 - kx**2))
+    )
     assert got.engine == "anchored"
     assert abs(got.t - bare.t * cmath.exp(1j * turn)) <= got.t_error + bare.t_error
 
@@ -45,12 +58,19 @@ def test_tilted_wall_meets_a_thousandth_and_agrees_with_more_harmonics():
     assert got.converged
     assert abs(got.energy - 1) < 1e-3
     alone = rcwa.solve(TILTED, DIAMETER, WAVELENGTH, harmonics=7)
-    assert abs(got.t - alone.t) < 6e-3  # what seven orders leave of an upright pillar of this index
+    assert (
+        abs(got.t - alone.t) < 6e-3
+    )  # what seven orders leave of an upright pillar of this index
 
 
 def test_a_tilt_to_either_side_differs():
     """Foot and top are not alike: light comes from the substrate."""
-    found = [modal.solve(replace(UPRIGHT, sidewall_rad=s), DIAMETER, WAVELENGTH, tolerance=2e-3) for s in (-0.05, 0.05)]
+    found = [
+        modal.solve(
+            replace(UPRIGHT, sidewall_rad=s), DIAMETER, WAVELENGTH, tolerance=2e-3
+        )
+        for s in (-0.05, 0.05)
+    ]
     assert abs(found[0].t - found[1].t) > 5 * max(one.t_error for one in found)
 
 
@@ -70,9 +90,13 @@ def test_walls_that_close_are_refused():
 
 
 def test_a_bar_that_knows_nothing_is_two():
-    """|t| is 1 at most, so no two answers are farther apart; an anchor whose own error is 5 leaves that."""
+    """|t| is 1 at most, so no two answers are farther apart; an anchor whose own error
+    is 5 leaves that.
+    """
     upright = modal.solve(UPRIGHT, DIAMETER, WAVELENGTH, tolerance=1e-2)
     unsure = replace(upright, t_error=5.0)
-    got = solve_anchored(UPRIGHT, DIAMETER, LIGHT, [unsure], tolerance=1e-2, reaches=(3, 4, 5, 6))
+    got = solve_anchored(
+        UPRIGHT, DIAMETER, LIGHT, [unsure], tolerance=1e-2, reaches=(3, 4, 5, 6)
+    )
     assert got.t_error == 2.0
     assert not got.converged

@@ -1,4 +1,6 @@
-"""What coupled waves refuse before they solve: pillars whose leaning walls meet or close."""
+"""What coupled waves refuse before they solve: pillars whose leaning walls meet or
+close.
+"""
 
 import math
 
@@ -10,14 +12,23 @@ from metalens.ground.errors import CellError
 from metalens.rcwa import conditions
 
 
-@pytest.mark.parametrize(("tilt", "wide", "narrow"), [(0.1, "foot", "top"), (-0.1, "top", "foot")])
+@pytest.mark.parametrize(
+    ("tilt", "wide", "narrow"), [(0.1, "foot", "top"), (-0.1, "top", "foot")]
+)
 def test_walls_that_meet_or_close_are_refused_by_where_they_do(tilt, wide, narrow):
-    """Wider by height times tangent at the foot, or at the top where the wall leans out; thinner at the other end."""
+    """Wider by height times tangent at the foot, or at the top where the wall leans
+    out; thinner at the other end.
+    """
     slant = 0.6 * math.tan(0.1)
     cell = Cell(0.4, 0.6, Index(3.5), Index(1.45), sidewall_rad=tilt)
-    with pytest.raises(CellError, match=f"overlap, {0.38 + slant:.6g} um wide at the {wide}"):
+    with pytest.raises(
+        CellError, match=f"overlap, {0.38 + slant:.6g} um wide at the {wide}"
+    ):
         rcwa.solve(cell, 0.38, 0.85)
-    with pytest.raises(CellError, match=f"closes the pillar below its {narrow}; need at least {slant:.6g} um"):
+    with pytest.raises(
+        CellError,
+        match=f"closes the pillar below its {narrow}; need at least {slant:.6g} um",
+    ):
         rcwa.solve(cell, 0.05, 0.85)
     conditions.check_diameter(cell, 0.4 - slant)
     conditions.check_diameter(cell, 1.001 * slant)

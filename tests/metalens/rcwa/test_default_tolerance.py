@@ -1,4 +1,6 @@
-"""Who asks for no tolerance gets 1e-3, as the pages say: the same bits as asked for, and less error than with 1."""
+"""Who asks for no tolerance gets 1e-3, as the pages say: the same bits as asked for,
+and less error than with 1.
+"""
 
 import pytest
 
@@ -13,7 +15,9 @@ LIGHT = {"angle_rad": 0.11, "polarization": "s"}
 def test_one_pillar(engine):
     asked = engine.solve(CELL, 0.17, 0.83, **LIGHT, tolerance=1e-3)
     assert engine.solve(CELL, 0.17, 0.83, **LIGHT) == asked
-    assert asked.t_error < engine.solve(CELL, 0.17, 0.83, **LIGHT, tolerance=1.0).t_error
+    assert (
+        asked.t_error < engine.solve(CELL, 0.17, 0.83, **LIGHT, tolerance=1.0).t_error
+    )
 
 
 def test_many_pillars():

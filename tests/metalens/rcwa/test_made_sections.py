@@ -1,4 +1,6 @@
-"""The sections of a pillar as it is made: heights, widths and polynomials in height against their formulas."""
+"""The sections of a pillar as it is made: heights, widths and polynomials in height
+against their formulas.
+"""
 
 import math
 
@@ -17,17 +19,23 @@ PLAIN = Cell(0.5, 0.6, Index(3.3), Index(1.47), sidewall_rad=0.05)
 
 
 def test_a_tilted_wall_widens_every_section_by_its_middle():
-    """Middles at 0.06, 0.32 and 0.56 um of 0.6: the foot is wider by 2 tan(tilt) for each um below 0.3."""
+    """Middles at 0.06, 0.32 and 0.56 um of 0.6: the foot is wider by 2 tan(tilt) for
+    each um below 0.3.
+    """
     slope = 2 * math.tan(0.05)
     got = made.spread(STACK)
     assert [layer for layer, _ in got] == list(LAYERS)
-    assert [grow for _, grow in got] == pytest.approx([0.24 * slope, -0.02 * slope, -0.26 * slope])
+    assert [grow for _, grow in got] == pytest.approx(
+        [0.24 * slope, -0.02 * slope, -0.26 * slope]
+    )
     assert made.spread(PLAIN)[0][1] == pytest.approx(0.0, abs=1e-15)
     assert made.widening(PLAIN) == pytest.approx(-slope)
 
 
 def test_sections_are_cut_at_their_share_of_the_height(monkeypatch):
-    """Foot to top of a section: its own widening times half its height to both sides; heights times k0."""
+    """Foot to top of a section: its own widening times half its height to both sides;
+    heights times k0.
+    """
     asked = []
 
     def slab(cell, layer, size_um, wavelength_um, *, grow_um):
@@ -37,7 +45,9 @@ def test_sections_are_cut_at_their_share_of_the_height(monkeypatch):
     monkeypatch.setattr(made.pattern, "slab", slab)
     monkeypatch.setattr(made, "interpolated", lambda sample: sample)
     walls = made.walls(STACK, 0.21, 0.85, lambda grow: (grow, 2 * grow))
-    assert [wall.reduced_height for wall in walls] == pytest.approx([2 * math.pi / 0.85 * h for h in (0.12, 0.4, 0.08)])
+    assert [wall.reduced_height for wall in walls] == pytest.approx(
+        [2 * math.pi / 0.85 * h for h in (0.12, 0.4, 0.08)]
+    )
     slope = -2 * math.tan(0.05)
     for wall, layer, middle in zip(walls, LAYERS, (-0.24, 0.02, 0.26), strict=True):
         for share in (0.0, 0.3, 1.0):
@@ -50,14 +60,22 @@ def test_upright_walls_are_not_interpolated(monkeypatch):
     monkeypatch.setattr(made, "interpolated", lambda sample: None)
     monkeypatch.setattr(made.pattern, "slab", lambda *_, grow_um: grow_um)
     upright = Cell(0.5, 0.6, Index(3.3), layers=LAYERS)
-    assert [w.sample(0.8) for w in made.walls(upright, 0.21, 0.85, lambda grow: (grow, grow))] == [(0, 0)] * 3
-    assert [w.sample for w in made.walls(STACK, 0.21, 0.85, lambda grow: (grow, grow))] == [None] * 3
+    assert [
+        w.sample(0.8)
+        for w in made.walls(upright, 0.21, 0.85, lambda grow: (grow, grow))
+    ] == [(0, 0)] * 3
+    assert [
+        w.sample for w in made.walls(STACK, 0.21, 0.85, lambda grow: (grow, grow))
+    ] == [None] * 3
 
 
 def test_polynomials_through_eight_heights_hold_what_has_degree_seven():
     """Chebyshev points of the first kind between foot and top, asked for once."""
     seen = []
-    one, other = (np.polynomial.Polynomial(v) for v in ([1, -2, 0.3, 4, -1, 2, -3, 0.7], [0.5, 1, 1, -1, 0, 2, 5, -4]))
+    one, other = (
+        np.polynomial.Polynomial(v)
+        for v in ([1, -2, 0.3, 4, -1, 2, -3, 0.7], [0.5, 1, 1, -1, 0, 2, 5, -4])
+    )
 
     def sample(share):
         seen.append(share)
@@ -69,10 +87,13 @@ def test_polynomials_through_eight_heights_hold_what_has_degree_seven():
         first, second = at(share)
         assert first == pytest.approx(np.array([[one(share), 2.0]]), abs=1e-12)
         assert second == pytest.approx([other(share)], abs=1e-12)
-    assert sorted(seen) == pytest.approx((1 - np.cos(np.pi * (np.arange(8) + 0.5) / 8)) / 2)
+    assert sorted(seen) == pytest.approx(
+        (1 - np.cos(np.pi * (np.arange(8) + 0.5) / 8)) / 2
+    )
     # the next power is missed by its Chebyshev part, 2 / 4^8 of the height^8
     worst = max(
-        abs(made.interpolated(lambda s: (np.array([s**8]),) * 2)(x)[0][0] - x**8) for x in np.linspace(0, 1, 99)
+        abs(made.interpolated(lambda s: (np.array([s**8]),) * 2)(x)[0][0] - x**8)
+        for x in np.linspace(0, 1, 99)
     )
     assert worst == pytest.approx(2 / 4**8, rel=1e-3)
 
@@ -87,20 +108,46 @@ def test_polynomials_through_eight_heights_hold_what_has_degree_seven():
         (STACK, 0.4398, True),
         (STACK, 0.4401, False),
         # a film of 8 nm on both sides
-        (Cell(0.5, 0.6, Index(3.3), layers=(Layer(0.6, 0.01, coat_um=0.008, coat=Index(2.0)),)), 0.4739, True),
-        (Cell(0.5, 0.6, Index(3.3), layers=(Layer(0.6, 0.01, coat_um=0.008, coat=Index(2.0)),)), 0.4741, False),
+        (
+            Cell(
+                0.5,
+                0.6,
+                Index(3.3),
+                layers=(Layer(0.6, 0.01, coat_um=0.008, coat=Index(2.0)),),
+            ),
+            0.4739,
+            True,
+        ),
+        (
+            Cell(
+                0.5,
+                0.6,
+                Index(3.3),
+                layers=(Layer(0.6, 0.01, coat_um=0.008, coat=Index(2.0)),),
+            ),
+            0.4741,
+            False,
+        ),
     ],
 )
 def test_the_widest_place_of_any_section_must_not_touch_its_neighbour(cell, size, fits):
     if fits:
         made.check_size(cell, size)
     else:
-        with pytest.raises(CellError, match=r"touches its neighbour on a pitch of 0\.5 um"):
+        with pytest.raises(
+            CellError, match=r"touches its neighbour on a pitch of 0\.5 um"
+        ):
             made.check_size(cell, size)
 
 
 def test_walls_that_lean_outwards_are_widest_at_their_top():
-    cell = Cell(0.5, 0.6, Index(3.3), sidewall_rad=-0.05, layers=(Layer(0.45), Layer(0.15, 0.02)))
+    cell = Cell(
+        0.5,
+        0.6,
+        Index(3.3),
+        sidewall_rad=-0.05,
+        layers=(Layer(0.45), Layer(0.15, 0.02)),
+    )
     made.check_size(cell, 0.4498)  # 0.02 and 0.3 x 2 tan(0.05)
     with pytest.raises(CellError, match=r"0\.05003 um wider"):
         made.check_size(cell, 0.4501)
@@ -110,14 +157,20 @@ def test_walls_that_lean_outwards_are_widest_at_their_top():
 
 
 def test_a_section_s_slab_is_wider_by_its_own_and_by_what_is_asked():
-    """Rectangles of 0.21 x 0.14 um grow along both edges; the film is outside of the pillar, inside of a hole."""
+    """Rectangles of 0.21 x 0.14 um grow along both edges; the film is outside of the
+    pillar, inside of a hole.
+    """
     layer = Layer(0.6, 0.03, Index(2.2), Index(1.3), 0.01, Index(1.9))
     for hole in (False, True):
-        cell = Cell(0.5, 0.6, Index(3.3), shape=Rectangle(2 / 3, hole=hole), layers=(layer,))
+        cell = Cell(
+            0.5, 0.6, Index(3.3), shape=Rectangle(2 / 3, hole=hole), layers=(layer,)
+        )
         this = pattern.slab(cell, layer, 0.21, 0.85, grow_um=0.02)
         wide = (0.05 - 0.02, 0.05) if hole else (0.05, 0.05 + 0.02)
         want = [(0.21 + w) * (0.14 + w) for w in wide]
-        assert [outline.area_um2 for outline in this.outlines] == pytest.approx(want, rel=1e-6)
+        assert [outline.area_um2 for outline in this.outlines] == pytest.approx(
+            want, rel=1e-6
+        )
         pillar, around = (1.3, 2.2) if hole else (2.2, 1.3)
         assert this.inside == pytest.approx((pillar**2, 1.9**2))
         assert this.outside == pytest.approx(around**2)

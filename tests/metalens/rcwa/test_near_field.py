@@ -1,4 +1,6 @@
-"""Fields in and around a cell: sums of a slab in closed form, Maxwell's equations, power, and the modal engine."""
+"""Fields in and around a cell: sums of a slab in closed form, Maxwell's equations,
+power, and the modal engine.
+"""
 
 import dataclasses
 import math
@@ -23,21 +25,35 @@ def _middles(count, edge):
 
 
 def _airy(indices, heights, light, z):
-    """(3, nz) E and H at x = y = 0 of plane waves up and down in every medium; light from the first one.
+    """(3, nz) E and H at x = y = 0 of plane waves up and down in every medium; light
+    from the first one.
 
-    Four unknowns an interface: tangential E and H are continuous. H = k x E with lengths over k0.
+    Four unknowns an interface: tangential E and H are continuous. H = k x E with
+    lengths over k0.
     """
-    sine, c, s = math.sin(light.angle_rad), math.cos(light.azimuth_rad), math.sin(light.azimuth_rad)
+    sine, c, s = (
+        math.sin(light.angle_rad),
+        math.cos(light.azimuth_rad),
+        math.sin(light.azimuth_rad),
+    )
     kz = [np.sqrt(n * n - sine**2 + 0j) for n in indices]
 
     def wave(n, q):
         k = np.array([sine * c, sine * s, q])
-        e = np.array([-s, c, 0.0]) if light.polarization == "s" else np.array([q * c, q * s, -sine]) / n
+        e = (
+            np.array([-s, c, 0.0])
+            if light.polarization == "s"
+            else np.array([q * c, q * s, -sine]) / n
+        )
         return e, np.cross(k, e)
 
     pairs = [(wave(n, q), wave(n, -q)) for n, q in zip(indices, kz, strict=True)]
-    feet = np.concatenate([[0.0], np.cumsum(heights)])  # every wave has its phase 0 at the lower end of its medium,
-    count = 2 * (len(indices) - 1)  # that of the substrate at the top of it; unknowns: down in 0, both, ..., up in last
+    feet = np.concatenate(
+        [[0.0], np.cumsum(heights)]
+    )  # every wave has its phase 0 at the lower end of its medium,
+    count = (
+        2 * (len(indices) - 1)
+    )  # that of the substrate at the top of it; unknowns: down in 0, both, ..., up in last
     system, right = np.zeros((2 * count, count), complex), np.zeros(2 * count, complex)
     for i in range(len(indices) - 1):
         rows = slice(4 * i, 4 * i + 4)
@@ -52,27 +68,39 @@ def _airy(indices, heights, light, z):
                     right[rows] -= values
                 elif column < count:
                     system[rows, column] = values
-    found = np.concatenate([[1.0], np.linalg.lstsq(system, right, rcond=None)[0], [0.0]]).reshape(-1, 2)
+    found = np.concatenate(
+        [[1.0], np.linalg.lstsq(system, right, rcond=None)[0], [0.0]]
+    ).reshape(-1, 2)
     place = np.searchsorted(feet, z, side="right")
     out = np.zeros((2, 3, len(z)), complex)
     for i, medium in enumerate(place):
         at = np.exp(1j * K0 * kz[medium] * (z[i] - feet[max(medium - 1, 0)]))
-        for (e, h), factor, a in zip(pairs[medium], (at, 1 / at), found[medium], strict=True):
+        for (e, h), factor, a in zip(
+            pairs[medium], (at, 1 / at), found[medium], strict=True
+        ):
             out[:, :, i] += a * factor * np.stack([e, h])
     return out
 
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
 @pytest.mark.parametrize("slab", [2.3, 1.9 + 0.3j])
-def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(polarization, slab):
-    """A pillar of the medium around it is a film; one film under it, an absorbing one over it. Rounding is left."""
+def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(
+    polarization, slab
+):
+    """A pillar of the medium around it is a film; one film under it, an absorbing one
+    over it. Rounding is left.
+    """
     medium = Index(slab.real, slab.imag)
     films = {"under": (Film(Index(1.9), 0.07),), "over": (Film(Index(1.3, 0.2), 0.11),)}
     cell = Cell(0.37, 0.47, medium, Index(1.46), Index(1.1), medium, **films)
     light = Light(WAVELENGTH, 0.5, polarization, 0.6)
     z = np.linspace(-0.43, 0.91, 24)
-    got = near_field(cell, 0.2, light, x_um=[0.03, 0.11], y_um=[-0.07], z_um=z, harmonics=2)
-    want = _airy([1.46, 1.9, slab, 1.3 + 0.2j, 1.1], [0.07, 0.47, 0.11], light, z + 0.07)
+    got = near_field(
+        cell, 0.2, light, x_um=[0.03, 0.11], y_um=[-0.07], z_um=z, harmonics=2
+    )
+    want = _airy(
+        [1.46, 1.9, slab, 1.3 + 0.2j, 1.1], [0.07, 0.47, 0.11], light, z + 0.07
+    )
     k = K0 * math.sin(0.5) * np.array([math.cos(0.6), math.sin(0.6)])
     for i, x in enumerate((0.03, 0.11)):
         turn = np.exp(1j * (k[0] * x - k[1] * 0.07))
@@ -91,31 +119,54 @@ def test_fields_in_a_stack_of_films_are_those_of_plane_waves_up_and_down(polariz
         (Light(WAVELENGTH, 0.0, "s", 0.7), (-math.sin(0.7), math.cos(0.7))),
         (Light(WAVELENGTH, 0.3, "x", math.pi / 2), (1, 0)),
         (Light(WAVELENGTH, 0.3, "y", math.pi), (0, 1)),
-        (Light(WAVELENGTH, 0.3, "p", math.pi), (-math.sqrt(1 - (math.sin(0.3) / 1.46) ** 2), 0)),
+        (
+            Light(WAVELENGTH, 0.3, "p", math.pi),
+            (-math.sqrt(1 - (math.sin(0.3) / 1.46) ** 2), 0),
+        ),
     ],
 )
 def test_the_light_that_comes_has_the_stated_amplitude_and_direction(light, incident):
-    """Into its own substrate: nothing is reflected, E at the origin is that of the light."""
+    """Into its own substrate: nothing is reflected, E at the origin is that of the
+    light.
+    """
     same = Index(1.46)
-    got = near_field(Cell(0.3, 0.2, same, same, same, same), 0.1, light, x_um=[0], y_um=[0], z_um=[0], harmonics=1)
+    got = near_field(
+        Cell(0.3, 0.2, same, same, same, same),
+        0.1,
+        light,
+        x_um=[0],
+        y_um=[0],
+        z_um=[0],
+        harmonics=1,
+    )
     assert got.e[:2, 0, 0, 0] == pytest.approx(np.array(incident), abs=1e-12)
     assert np.linalg.norm(got.e) == pytest.approx(1.0)
     assert np.linalg.norm(got.h) == pytest.approx(1.46)
 
 
 def test_power_through_every_plane_of_a_lossless_cell_is_that_which_leaves():
-    """Products on a grid finer than the orders; what (2) adds near the wall has no mean but for truncation (3e-4)."""
+    """Products on a grid finer than the orders; what (2) adds near the wall has no mean
+    but for truncation (3e-4).
+    """
     x, z = _middles(40, 0.36), [-0.3, -0.01, 0.1, 0.27, 0.44, 0.46, 0.9]
-    got = near_field(ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), x_um=x, y_um=x, z_um=z, harmonics=7)
-    flux = (got.e[0] * got.h[1].conj() - got.e[1] * got.h[0].conj()).real.mean(axis=(1, 2))
+    got = near_field(
+        ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), x_um=x, y_um=x, z_um=z, harmonics=7
+    )
+    flux = (got.e[0] * got.h[1].conj() - got.e[1] * got.h[0].conj()).real.mean(
+        axis=(1, 2)
+    )
     flux /= math.sqrt(1.46**2 - math.sin(0.3) ** 2)  # of the light that comes
     t = rcwa.jones(ROUND, SIZE, WAVELENGTH, angle_rad=0.3, harmonics=7).t
-    assert flux[[0, 1, -2, -1]] == pytest.approx(np.full(4, abs(t[1, 1]) ** 2), rel=1e-10)
+    assert flux[[0, 1, -2, -1]] == pytest.approx(
+        np.full(4, abs(t[1, 1]) ** 2), rel=1e-10
+    )
     assert flux[2:-2] == pytest.approx(np.full(3, abs(t[1, 1]) ** 2), abs=3e-3)
 
 
 def test_what_the_field_heats_is_what_the_modal_engine_misses():
-    """Absorbed share: k0 eps'' ∫ |E|² over the pillar and the flux that comes; pixels of the rim leave 0.5 %."""
+    """Absorbed share: k0 eps'' ∫ |E|² over the pillar and the flux that comes; pixels
+    of the rim leave 0.5 %.
+    """
     cell = dataclasses.replace(ROUND, pillar=Index(3.1, 0.25))
     points, weights = np.polynomial.legendre.leggauss(12)
     x, z = _middles(48, 0.36), (points + 1) / 2 * 0.45
@@ -128,13 +179,19 @@ def test_what_the_field_heats_is_what_the_modal_engine_misses():
 
 
 def test_fields_of_both_sides_give_the_derivative_of_t_that_the_modal_engine_has():
-    """dt/dn = i k0 n / (A sqrt(n_s n_c)) ∫ E1 . E2 over the pillar, E2 from the cover (reciprocity): phases too."""
+    """dt/dn = i k0 n / (A sqrt(n_s n_c)) ∫ E1 . E2 over the pillar, E2 from the cover
+    (reciprocity): phases too.
+    """
     points, weights = np.polynomial.legendre.leggauss(12)
     x, z = _middles(48, 0.36), (points + 1) / 2 * 0.45
     back = dataclasses.replace(ROUND, substrate=ROUND.cover, cover=ROUND.substrate)
     grid = {"x_um": x, "y_um": x, "z_um": z, "harmonics": 8}
-    one, other = (near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, back))
-    mirrored = other.e[:, ::-1] * np.array([1, 1, -1])[:, None, None, None]  # z -> height - z
+    one, other = (
+        near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, back)
+    )
+    mirrored = (
+        other.e[:, ::-1] * np.array([1, 1, -1])[:, None, None, None]
+    )  # z -> height - z
     inside = one.index[0].real > 2
     mean = (one.e * mirrored).sum(axis=0)[:, inside].mean(axis=1) @ weights / 2 * 0.45
     share = math.pi / 4 * SIZE**2 / 0.36**2
@@ -144,31 +201,59 @@ def test_fields_of_both_sides_give_the_derivative_of_t_that_the_modal_engine_has
 
 
 def test_fields_keep_maxwells_equations_away_from_the_wall():
-    """Central differences over 4 nm, inside and outside; derivatives of ten orders are seven per cent off."""
+    """Central differences over 4 nm, inside and outside; derivatives of ten orders are
+    seven per cent off.
+    """
     step, middles = 2e-3, ((0.01, 0.02, 0.2), (-0.12, 0.13, 0.1), (0.16, 0.02, 0.3))
     grids = [Grid(*(c + step * np.arange(-1, 2) for c in middle)) for middle in middles]
-    for got in near_fields(ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), grids, harmonics=10):
+    for got in near_fields(
+        ROUND, SIZE, Light(WAVELENGTH, 0.3, "p"), grids, harmonics=10
+    ):
         eps = got.index[1, 1, 1] ** 2
         for field, want in ((got.e, 1j * K0 * got.h), (got.h, -1j * K0 * eps * got.e)):
-            dz, dy, dx = ((field.take(2, a) - field.take(0, a)).take(1, 1).take(1, 1) / (2 * step) for a in (1, 2, 3))
+            dz, dy, dx = (
+                (field.take(2, a) - field.take(0, a)).take(1, 1).take(1, 1) / (2 * step)
+                for a in (1, 2, 3)
+            )
             curl = np.array([dy[2] - dz[1], dz[0] - dx[2], dx[1] - dy[0]])
-            assert np.abs(curl - want[:, 1, 1, 1]).max() < 0.1 * np.abs(want[:, 1, 1, 1]).max()
+            assert (
+                np.abs(curl - want[:, 1, 1, 1]).max()
+                < 0.1 * np.abs(want[:, 1, 1, 1]).max()
+            )
 
 
 def test_tangential_fields_are_continuous_and_normal_ones_jump_as_eps_does():
-    """Across the wall at 40 degrees, 0.5 nm to both sides; across foot and top H, which (2) leaves as it is."""
+    """Across the wall at 40 degrees, 0.5 nm to both sides; across foot and top H, which
+    (2) leaves as it is.
+    """
     a = math.radians(40)
     n = np.array([math.cos(a), math.sin(a)])
     light = Light(WAVELENGTH, 0.0, "x")
     inner, outer = (
-        near_field(ROUND, SIZE, light, x_um=[r * n[0]], y_um=[r * n[1]], z_um=[0.31], harmonics=9).e[:, 0, 0, 0]
+        near_field(
+            ROUND,
+            SIZE,
+            light,
+            x_um=[r * n[0]],
+            y_um=[r * n[1]],
+            z_um=[0.31],
+            harmonics=9,
+        ).e[:, 0, 0, 0]
         for r in (SIZE / 2 - 5e-4, SIZE / 2 + 5e-4)
     )
     along = np.array([-n[1], n[0]])
     assert outer[:2] @ n * 1.05**2 == pytest.approx(inner[:2] @ n * 2.3**2, rel=0.03)
     assert abs(inner[:2] @ along - outer[:2] @ along) < 0.03 * np.linalg.norm(outer)
     assert abs(inner[2] - outer[2]) < 0.03 * np.linalg.norm(outer)
-    around = near_field(ROUND, SIZE, light, x_um=[0.05], y_um=[0.09], z_um=[-1e-9, 0, 0.45 - 1e-9, 0.45], harmonics=5)
+    around = near_field(
+        ROUND,
+        SIZE,
+        light,
+        x_um=[0.05],
+        y_um=[0.09],
+        z_um=[-1e-9, 0, 0.45 - 1e-9, 0.45],
+        harmonics=5,
+    )
     assert around.h[:, 0] == pytest.approx(around.h[:, 1], abs=1e-6)
     assert around.h[:, 2] == pytest.approx(around.h[:, 3], abs=1e-6)
 
@@ -182,67 +267,126 @@ def test_fields_repeat_from_site_to_site_with_the_phase_of_the_light(lattice):
     here = Grid(x, y, z)
     there = Grid(x + step[0], y + step[1], z)
     one, other = near_fields(cell, SIZE, light, [here, there], harmonics=4)
-    turn = np.exp(1j * K0 * math.sin(0.4) * (math.cos(0.3) * step[0] + math.sin(0.3) * step[1]))
+    turn = np.exp(
+        1j * K0 * math.sin(0.4) * (math.cos(0.3) * step[0] + math.sin(0.3) * step[1])
+    )
     assert np.abs(other.e - turn * one.e).max() < 1e-9
     assert np.abs(other.h - turn * one.h).max() < 1e-9
     assert np.array_equal(one.index, other.index)
 
 
 def test_a_cell_turned_by_a_quarter_has_the_field_turned():
-    """Other mirrors, other signs of the orders: (x, y) -> (-y, x), in light that keeps one mirror and the other one."""
+    """Other mirrors, other signs of the orders: (x, y) -> (-y, x), in light that keeps
+    one mirror and the other one.
+    """
     x, y, z = np.array([-0.13, 0.02, 0.1]), np.array([0.04, 0.12]), [0.1, 0.3]
-    flat, upright = (dataclasses.replace(ROUND, shape=Rectangle(0.55, turn)) for turn in (0.0, math.pi / 2))
+    flat, upright = (
+        dataclasses.replace(ROUND, shape=Rectangle(0.55, turn))
+        for turn in (0.0, math.pi / 2)
+    )
     for angle in (0.0, 0.35):
-        one = near_field(flat, 0.24, Light(WAVELENGTH, angle, "p", 0.0), x_um=x, y_um=y, z_um=z, harmonics=4)
+        one = near_field(
+            flat,
+            0.24,
+            Light(WAVELENGTH, angle, "p", 0.0),
+            x_um=x,
+            y_um=y,
+            z_um=z,
+            harmonics=4,
+        )
         light = Light(WAVELENGTH, angle, "p", math.pi / 2)
-        other = near_field(upright, 0.24, light, x_um=-y[::-1], y_um=x, z_um=z, harmonics=4)
+        other = near_field(
+            upright, 0.24, light, x_um=-y[::-1], y_um=x, z_um=z, harmonics=4
+        )
         for a, b in ((one.e, other.e), (one.h, other.h)):
             back = b[:, :, :, ::-1].swapaxes(-1, -2)
             assert np.abs(np.stack([back[1], -back[0], back[2]]) - a).max() < 1e-9
 
 
 def test_a_wall_in_steps_that_is_all_but_upright_is_the_upright_wall():
-    """A tilt of 1e-6: fields move by less than 1e-4, through twelve slabs in place of one."""
-    grid = {"x_um": [0.03], "y_um": [-0.06], "z_um": [-0.1, 0.05, 0.22, 0.41, 0.7], "harmonics": 4}
+    """A tilt of 1e-6: fields move by less than 1e-4, through twelve slabs in place of
+    one.
+    """
+    grid = {
+        "x_um": [0.03],
+        "y_um": [-0.06],
+        "z_um": [-0.1, 0.05, 0.22, 0.41, 0.7],
+        "harmonics": 4,
+    }
     tilted = dataclasses.replace(ROUND, sidewall_rad=1e-6)
-    one, other = (near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, tilted))
+    one, other = (
+        near_field(cell, SIZE, Light(WAVELENGTH), **grid) for cell in (ROUND, tilted)
+    )
     assert np.abs(one.e - other.e).max() < 1e-4
 
 
 @pytest.mark.parametrize("tilt", [0.12, -0.08])
 def test_a_leaning_wall_is_wide_at_its_foot_in_twelve_steps(tilt):
-    """Width at half height, less twice the height above it times the tangent: each step that of its middle."""
-    cell, x = dataclasses.replace(ROUND, sidewall_rad=tilt), np.linspace(-0.17, 0.17, 341)
+    """Width at half height, less twice the height above it times the tangent: each step
+    that of its middle.
+    """
+    cell, x = (
+        dataclasses.replace(ROUND, sidewall_rad=tilt),
+        np.linspace(-0.17, 0.17, 341),
+    )
     z = (np.arange(12) + 0.3) / 12 * 0.45
-    got = near_field(cell, SIZE, Light(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1)
+    got = near_field(
+        cell, SIZE, Light(WAVELENGTH), x_um=x, y_um=[0.0], z_um=z, harmonics=1
+    )
     wide = (got.index[:, 0].real > 1.7).sum(1) * 0.001
     want = SIZE - 2 * ((np.arange(12) + 0.5) / 12 * 0.45 - 0.225) * math.tan(tilt)
     assert wide == pytest.approx(want, abs=0.0021)
 
 
 def test_the_error_bar_holds_against_more_orders():
-    """At seven orders 2.5 times the farthest of four truncations; at five, 7.8 times, as for t."""
-    grid = {"x_um": _middles(9, 0.36), "y_um": [0.02], "z_um": np.linspace(-0.1, 0.6, 15)}
-    few, many = (near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n) for n in (7, 14))
+    """At seven orders 2.5 times the farthest of four truncations; at five, 7.8 times,
+    as for t.
+    """
+    grid = {
+        "x_um": _middles(9, 0.36),
+        "y_um": [0.02],
+        "z_um": np.linspace(-0.1, 0.6, 15),
+    }
+    few, many = (
+        near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n) for n in (7, 14)
+    )
     error = np.linalg.norm(few.e - many.e) / np.linalg.norm(many.e)
     assert 0.01 < error < few.error < 0.25
-    steps = [near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n).e for n in (1, 2, 3, 4, 5, 6)]
+    steps = [
+        near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=n).e
+        for n in (1, 2, 3, 4, 5, 6)
+    ]
     farthest = max(np.linalg.norm(e - steps[4]) for e in steps[:4])
-    assert few.error == pytest.approx(2.5 * max(np.linalg.norm(e - few.e) for e in steps[2:]) / np.linalg.norm(few.e))
+    assert few.error == pytest.approx(
+        2.5 * max(np.linalg.norm(e - few.e) for e in steps[2:]) / np.linalg.norm(few.e)
+    )
     rough = near_field(ROUND, SIZE, Light(WAVELENGTH), **grid, harmonics=5)
-    assert rough.error == pytest.approx(min(2.0, 7.8 * farthest / np.linalg.norm(rough.e)))
+    assert rough.error == pytest.approx(
+        min(2.0, 7.8 * farthest / np.linalg.norm(rough.e))
+    )
 
 
 def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypatch):
-    """Told at three orders, and added to 7.8 times the farthest of four truncations; of four steps here, not twelve."""
+    """Told at three orders, and added to 7.8 times the farthest of four truncations; of
+    four steps here, not twelve.
+    """
     monkeypatch.setattr(near, "_STEPS", 4)
     cell = dataclasses.replace(ROUND, pillar=Index(1.7), sidewall_rad=0.12)
-    grid = {"x_um": _middles(4, 0.36), "y_um": [0.02], "z_um": np.linspace(-0.1, 0.6, 6)}
-    runs = [near_field(cell, SIZE, Light(WAVELENGTH), **grid, harmonics=n) for n in (1, 2, 3, 4, 5)]
+    grid = {
+        "x_um": _middles(4, 0.36),
+        "y_um": [0.02],
+        "z_um": np.linspace(-0.1, 0.6, 6),
+    }
+    runs = [
+        near_field(cell, SIZE, Light(WAVELENGTH), **grid, harmonics=n)
+        for n in (1, 2, 3, 4, 5)
+    ]
     monkeypatch.setattr(near, "_STEPS", 2)
     half = near_field(cell, SIZE, Light(WAVELENGTH), **grid, harmonics=3)
     cut = np.linalg.norm(half.e - runs[2].e) / np.linalg.norm(runs[2].e)
-    farthest = max(np.linalg.norm(run.e - runs[4].e) for run in runs[:4]) / np.linalg.norm(runs[4].e)
+    farthest = max(
+        np.linalg.norm(run.e - runs[4].e) for run in runs[:4]
+    ) / np.linalg.norm(runs[4].e)
     assert cut > 0.01
     assert runs[4].error == pytest.approx(7.8 * farthest + cut, rel=1e-9)
 
@@ -253,7 +397,9 @@ def test_what_cannot_be_computed_is_refused():
         with pytest.raises(CellError, match="y_um has shape"):
             Grid([0.0], axis, [0.0])
     with pytest.raises(CellError, match="9000000 points"):
-        near_field(ROUND, SIZE, light, x_um=np.zeros(3000), y_um=np.zeros(3000), z_um=[0.0])
+        near_field(
+            ROUND, SIZE, light, x_um=np.zeros(3000), y_um=np.zeros(3000), z_um=[0.0]
+        )
     with pytest.raises(CellError, match="0 points"):
         near_fields(ROUND, SIZE, light, [])
     with pytest.raises(CellError, match="touches its neighbour"):

@@ -1,4 +1,6 @@
-"""Slabs, heights, incident waves and sums of orders of a near field, piece by piece, by hand."""
+"""Slabs, heights, incident waves and sums of orders of a near field, piece by piece, by
+hand.
+"""
 
 import dataclasses
 import math
@@ -19,15 +21,26 @@ from metalens.rcwa.problem import problem, waves_of
 
 WAVE, SIZE = 0.81, 0.21
 K0 = 2 * math.pi / WAVE
-FILMS = {"under": (Film(Index(1.9), 0.07), Film(Index(1.6), 0.05)), "over": (Film(Index(1.3, 0.2), 0.11),)}
-ABOUT = {"height_um": 0.45, "pillar": Index(2.3), "substrate": Index(1.46), "cover": Index(1.1), "between": Index(1.05)}
+FILMS = {
+    "under": (Film(Index(1.9), 0.07), Film(Index(1.6), 0.05)),
+    "over": (Film(Index(1.3, 0.2), 0.11),),
+}
+ABOUT = {
+    "height_um": 0.45,
+    "pillar": Index(2.3),
+    "substrate": Index(1.46),
+    "cover": Index(1.1),
+    "between": Index(1.05),
+}
 CELL = Cell(0.36, lattice=Lattice("rectangular", 1.3), shape=Rectangle(0.6), layers=(Layer(0.15, 0.02), Layer(0.3)),
             sidewall_rad=0.03, **FILMS, **ABOUT)  # fmt: skip
 THIS = problem(CELL, SIZE, WAVE, 0.3, 0.7)
 
 
 def test_slabs_are_films_sections_in_equal_steps_and_films():
-    """Layers of 0.15 and 0.3 um in three steps each; their walls lean by 2 tan(0.03) of height about the middle."""
+    """Layers of 0.15 and 0.3 um in three steps each; their walls lean by 2 tan(0.03) of
+    height about the middle.
+    """
     slabs = near_waves.slabs_of(THIS, 3)
     heights = [0.07, 0.05, *[0.05] * 3, *[0.1] * 3, 0.11]
     assert [slab.height for slab in slabs] == pytest.approx([K0 * h for h in heights])
@@ -35,17 +48,53 @@ def test_slabs_are_films_sections_in_equal_steps_and_films():
     assert [slab.section is None for slab in slabs] == [True, True, *[False] * 6, True]
     lean = -2 * math.tan(0.03)
     middles = [0.025, 0.075, 0.125, 0.2, 0.3, 0.4]
-    for slab, middle, own in zip(slabs[2:8], middles, (0.02, 0.02, 0.02, 0.0, 0.0, 0.0), strict=True):
+    for slab, middle, own in zip(
+        slabs[2:8], middles, (0.02, 0.02, 0.02, 0.0, 0.0, 0.0), strict=True
+    ):
         wide = own + lean * (middle - 0.225)
-        assert slab.section.outlines[0].area_um2 == pytest.approx(CELL.outline(SIZE, grow_um=wide).area_um2, rel=1e-9)
-    assert near_waves.edges(THIS, slabs) == pytest.approx(K0 * (np.cumsum([0, *heights]) - 0.12))
+        assert slab.section.outlines[0].area_um2 == pytest.approx(
+            CELL.outline(SIZE, grow_um=wide).area_um2, rel=1e-9
+        )
+    assert near_waves.edges(THIS, slabs) == pytest.approx(
+        K0 * (np.cumsum([0, *heights]) - 0.12)
+    )
 
 
 def test_heights_belong_to_the_slab_above_an_interface():
     """The foot lies at 0; a point that rounding puts below an interface lies on it."""
     slabs = near_waves.slabs_of(THIS, 1)  # films, two sections, a film
-    z = np.array([-0.5, -0.1200001, -0.12, -0.06, -0.05, -1e-6, 0.0, 0.149, 0.15, 0.15 * (1 - 1e-13), 0.45, 0.56, 0.9])
-    assert near_waves.places(THIS, slabs, z).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 6, 6]
+    z = np.array(
+        [
+            -0.5,
+            -0.1200001,
+            -0.12,
+            -0.06,
+            -0.05,
+            -1e-6,
+            0.0,
+            0.149,
+            0.15,
+            0.15 * (1 - 1e-13),
+            0.45,
+            0.56,
+            0.9,
+        ]
+    )
+    assert near_waves.places(THIS, slabs, z).tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+        3,
+        3,
+        4,
+        4,
+        5,
+        6,
+        6,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -57,7 +106,12 @@ def test_heights_belong_to_the_slab_above_an_interface():
         ("s", 0.0, 0.4, (-math.sin(0.4), math.cos(0.4))),
         ("s", 0.3, 0.4, (1.0, 0.0)),
         ("p", 0.3, 0.4, (0.0, 1.0)),
-        ("x", 0.3, 0.0, (0.0, 1.0)),  # in the plane of x and z: p, whose unit vector is +x
+        (
+            "x",
+            0.3,
+            0.0,
+            (0.0, 1.0),
+        ),  # in the plane of x and z: p, whose unit vector is +x
         ("x", 0.3, math.pi, (0.0, -1.0)),  # -x
         ("y", 0.3, 0.0, (1.0, 0.0)),  # s = z x k is +y
         ("y", 0.3, math.pi, (-1.0, 0.0)),
@@ -65,12 +119,18 @@ def test_heights_belong_to_the_slab_above_an_interface():
         ("y", 0.3, math.pi / 2, (0.0, 1.0)),
     ],
 )
-def test_the_wave_that_comes_has_its_field_along_the_axis_that_is_named(polarization, angle, azimuth, want):
-    assert near_waves.come(Light(WAVE, angle, polarization, azimuth)) == pytest.approx(want, abs=1e-15)
+def test_the_wave_that_comes_has_its_field_along_the_axis_that_is_named(
+    polarization, angle, azimuth, want
+):
+    assert near_waves.come(Light(WAVE, angle, polarization, azimuth)) == pytest.approx(
+        want, abs=1e-15
+    )
 
 
 def test_a_film_has_the_operators_of_plane_waves():
-    """Q P of a wave is eps - kappa², its kz²; P of p waves and Q of s waves alone know kappa."""
+    """Q P of a wave is eps - kappa², its kz²; P of p waves and Q of s waves alone know
+    kappa.
+    """
     space = mirrors.orders(2, pattern.frame(CELL, (IDENTITY,)))
     ways, _ = waves_of(space, CELL, THIS.light)
     for index in (1.9, 1.3 + 0.2j):
@@ -92,7 +152,9 @@ def test_a_film_has_the_operators_of_plane_waves():
     ],
 )
 def test_sums_over_orders_unfold_the_symmetries(operations):
-    """Every order of an orbit has the amplitude over the root of their number, with the sign of its operation."""
+    """Every order of an orbit has the amplitude over the root of their number, with the
+    sign of its operation.
+    """
     straight = len(operations) > 1
     this = problem(CELL, SIZE, WAVE, 0.0, 0.0) if straight else THIS
     space = mirrors.orders(3, pattern.frame(CELL, operations))
@@ -101,16 +163,25 @@ def test_sums_over_orders_unfold_the_symmetries(operations):
     px, py = CELL.lattice.periods_um(0.36)
     rng = np.random.default_rng(2)
     for part in (space.ex, space.ey, space.hz):
-        amplitude = rng.normal(size=(2, len(part.m))) + 1j * rng.normal(size=(2, len(part.m)))
+        amplitude = rng.normal(size=(2, len(part.m))) + 1j * rng.normal(
+            size=(2, len(part.m))
+        )
         want = np.zeros((2, 2, 3), complex)
-        for i, (m, n, size) in enumerate(zip(part.m.tolist(), part.n.tolist(), part.size.tolist(), strict=True)):
-            orbit = {(g[0] * m, g[1] * n): sign for g, sign in zip(operations, part.signs, strict=True)}
+        for i, (m, n, size) in enumerate(
+            zip(part.m.tolist(), part.n.tolist(), part.size.tolist(), strict=True)
+        ):
+            orbit = {
+                (g[0] * m, g[1] * n): sign
+                for g, sign in zip(operations, part.signs, strict=True)
+            }
             assert len(orbit) == size
             for (a, b), sign in orbit.items():
-                phase = (K0 * this.light.kx + 2 * np.pi / px * a) * x + ((K0 * this.light.ky + 2 * np.pi / py * b) * y)[
-                    :, None
-                ]
-                want += (sign / math.sqrt(size) * amplitude[:, i])[:, None, None] * np.exp(1j * phase)
+                phase = (K0 * this.light.kx + 2 * np.pi / px * a) * x + (
+                    (K0 * this.light.ky + 2 * np.pi / py * b) * y
+                )[:, None]
+                want += (sign / math.sqrt(size) * amplitude[:, i])[
+                    :, None, None
+                ] * np.exp(1j * phase)
         assert points(part, amplitude) == pytest.approx(want, abs=1e-12)
 
 
@@ -125,8 +196,12 @@ def test_a_class_that_the_light_has_no_part_in_is_left_out():
 
 
 def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interface():
-    """Tangential u and w from both sides of all interfaces; the incident wave has amplitude 1 at the lowest one."""
-    upright = dataclasses.replace(CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6))))
+    """Tangential u and w from both sides of all interfaces; the incident wave has
+    amplitude 1 at the lowest one.
+    """
+    upright = dataclasses.replace(
+        CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6)))
+    )
     this = problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
     space = mirrors.orders(1, pattern.frame(upright, (IDENTITY,)))
@@ -136,7 +211,9 @@ def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interfac
     below = near_waves._heights(this, slabs, one, ends - gap)
     above = near_waves._heights(this, slabs, one, ends + gap)
     for low, high in zip(below, above, strict=True):
-        assert low == pytest.approx(high, abs=1e-6)  # of fields that turn by 2 pi n gap / wave
+        assert low == pytest.approx(
+            high, abs=1e-6
+        )  # of fields that turn by 2 pi n gap / wave
     place = int(np.flatnonzero(one.incident)[0])
     assert np.flatnonzero(one.incident).tolist() == [place]
     assert one.incident[place] == 1.0
@@ -148,26 +225,44 @@ def test_fields_below_and_above_are_plane_waves_and_continuous_at_every_interfac
     assert comes == pytest.approx(np.exp(1j * K0 * kz * (z - ends[0])), abs=1e-12)
     back = (u / U - w / V) / 2
     below = np.sqrt(1.46**2 - one.ways.kappa**2 + 0j)
-    assert back[0] == pytest.approx(back[1] * np.exp(1j * K0 * below * 0.15), abs=1e-12)  # later by 0.15 um
+    assert back[0] == pytest.approx(
+        back[1] * np.exp(1j * K0 * below * 0.15), abs=1e-12
+    )  # later by 0.15 um
     assert np.abs(back[1]).max() > 1e-2
     U, V = half_space(one.ways, 1.1)
     u, w = near_waves._heights(this, slabs, one, np.array([0.6, 0.9]))
     assert u / U == pytest.approx(w / V, abs=1e-12)  # nothing comes down
     top = np.sqrt(1.1**2 - one.ways.kappa**2 + 0j)
-    assert (u / U)[1] == pytest.approx((u / U)[0] * np.exp(1j * K0 * top * 0.3), abs=1e-12)
+    assert (u / U)[1] == pytest.approx(
+        (u / U)[0] * np.exp(1j * K0 * top * 0.3), abs=1e-12
+    )
 
 
 def test_the_displacement_across_interfaces_is_continuous():
-    """eps Ez of all orders from both sides: between films, from a film into a section, and at the half-spaces."""
-    upright = dataclasses.replace(CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6))))
+    """eps Ez of all orders from both sides: between films, from a film into a section,
+    and at the half-spaces.
+    """
+    upright = dataclasses.replace(
+        CELL, sidewall_rad=0.0, shape=Polygon(((-0.5, -0.3), (0.5, -0.35), (0.1, 0.6)))
+    )
     this = problem(upright, SIZE, WAVE, 0.3, 0.7)
     slabs = near_waves.slabs_of(this, 1)
     space = mirrors.orders(1, pattern.frame(upright, (IDENTITY,)))
     one = near_waves.solved(this, slabs, Light(WAVE, 0.3, "p", 0.7), space)
     ends, gap = near_waves.edges(this, slabs) / K0, 1e-9
-    sections = [mirrors.product(space, pattern.tables(s.section, upright, space.reach)[0], 2) for s in slabs[2:4]]
+    sections = [
+        mirrors.product(space, pattern.tables(s.section, upright, space.reach)[0], 2)
+        for s in slabs[2:4]
+    ]
     unit = np.eye(len(space.ez.m))
-    eps = [1.46**2 * unit, 1.9**2 * unit, 1.6**2 * unit, *sections, (1.3 + 0.2j) ** 2 * unit, 1.1**2 * unit]
+    eps = [
+        1.46**2 * unit,
+        1.9**2 * unit,
+        1.6**2 * unit,
+        *sections,
+        (1.3 + 0.2j) ** 2 * unit,
+        1.1**2 * unit,
+    ]
     below = near_waves.orders_at(this, slabs, one, ends - gap)
     above = near_waves.orders_at(this, slabs, one, ends + gap)
     for k in range(6):
@@ -175,18 +270,29 @@ def test_the_displacement_across_interfaces_is_continuous():
         assert np.abs(below.ez[k]).max() > 1e-2
         assert below.hz[k] == pytest.approx(above.hz[k], abs=1e-6)
         if k in (1, 2, 5):  # within a film D is eps times E
-            assert above.dx[k - 1] == pytest.approx(eps[k][0, 0] * above.ex[k - 1], abs=1e-9)
-            assert above.dy[k - 1] == pytest.approx(eps[k][0, 0] * above.ey[k - 1], abs=1e-9)
+            assert above.dx[k - 1] == pytest.approx(
+                eps[k][0, 0] * above.ex[k - 1], abs=1e-9
+            )
+            assert above.dy[k - 1] == pytest.approx(
+                eps[k][0, 0] * above.ey[k - 1], abs=1e-9
+            )
 
 
 def test_the_jump_takes_the_normal_part_of_the_field_from_d():
     rng = np.random.default_rng(3)
     angle, weight, eps = 0.7, 0.6, 2.3 - 0.4j
     n = np.array([math.cos(angle), math.sin(angle)])
-    normal = tuple(np.full((1, 1), v) for v in (weight * n[0] ** 2, weight * n[1] ** 2, weight * n[0] * n[1]))
-    e, d = (rng.normal(size=(2, 1, 1)) + 1j * rng.normal(size=(2, 1, 1)) for _ in range(2))
+    normal = tuple(
+        np.full((1, 1), v)
+        for v in (weight * n[0] ** 2, weight * n[1] ** 2, weight * n[0] * n[1])
+    )
+    e, d = (
+        rng.normal(size=(2, 1, 1)) + 1j * rng.normal(size=(2, 1, 1)) for _ in range(2)
+    )
     got = near._jump(near._Look(np.full((1, 1), eps), normal), e, d)[:, 0, 0]
-    assert got == pytest.approx(weight * n * (n @ (d[:, 0, 0] / eps - e[:, 0, 0])), rel=1e-12)
+    assert got == pytest.approx(
+        weight * n * (n @ (d[:, 0, 0] / eps - e[:, 0, 0])), rel=1e-12
+    )
     assert not near._jump(near._Look(np.full((1, 1), eps), None), e, d).any()
 
 
@@ -198,30 +304,63 @@ def test_distances_between_truncations_are_relative_to_the_second_grid_by_grid()
 
 
 def test_points_see_the_media_that_they_lie_in():
-    """Of a grid of two rows and three columns: substrate, films, sections and cover, from below."""
+    """Of a grid of two rows and three columns: substrate, films, sections and cover,
+    from below.
+    """
     slabs = near_waves.slabs_of(THIS, 1)
-    grid = Grid(np.array([0.0, 0.08, 0.15]), np.array([0.03, -0.1]), np.array([-0.5, -0.07, 0.05, 0.3, 0.5, 0.7]))
+    grid = Grid(
+        np.array([0.0, 0.08, 0.15]),
+        np.array([0.03, -0.1]),
+        np.array([-0.5, -0.07, 0.05, 0.3, 0.5, 0.7]),
+    )
     assert grid.shape == (6, 2, 3)
     looks = near._looks(THIS, slabs, grid)
-    assert [look.normal is None for look in looks] == [True, True, True, False, False, True, True]
+    assert [look.normal is None for look in looks] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
     index = near._index(THIS, slabs, looks, grid)
     for z, want in ((0, 1.46), (1, 1.9), (4, 1.3 + 0.2j), (5, 1.1)):
         assert index[z] == pytest.approx(np.full((2, 3), want))
-    # the foot, about 0.244 x 0.16 um: of its six points two columns of the first row are within
+    # the foot, about 0.244 x 0.16 um: of its six points two columns of the first row
+    # are within
     assert index[2] == pytest.approx(np.array([[2.3, 2.3, 1.05], [1.05, 1.05, 1.05]]))
-    n, weight = pattern.normals_at(slabs[2].section.outlines, CELL, *np.meshgrid([0.0, 0.08, 0.15], [0.03, -0.1]))
-    for got, part in zip(looks[3].normal, (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]), strict=True):
+    n, weight = pattern.normals_at(
+        slabs[2].section.outlines, CELL, *np.meshgrid([0.0, 0.08, 0.15], [0.03, -0.1])
+    )
+    for got, part in zip(
+        looks[3].normal,
+        (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]),
+        strict=True,
+    ):
         assert got == pytest.approx(weight * part)
 
 
 def test_normals_that_lie_between_the_axes_have_all_three_products():
-    this = problem(dataclasses.replace(CELL, shape=Ellipse(0.7, 0.2), sidewall_rad=0.0), SIZE, WAVE, 0.0, 0.0)
+    this = problem(
+        dataclasses.replace(CELL, shape=Ellipse(0.7, 0.2), sidewall_rad=0.0),
+        SIZE,
+        WAVE,
+        0.0,
+        0.0,
+    )
     slabs = near_waves.slabs_of(this, 1)
     x, y = np.array([0.07, -0.1, 0.02]), np.array([0.06, -0.03])
     looks = near._looks(this, slabs, Grid(x, y, [0.1]))
-    n, weight = pattern.normals_at(slabs[2].section.outlines, this.cell, *np.meshgrid(x, y))
+    n, weight = pattern.normals_at(
+        slabs[2].section.outlines, this.cell, *np.meshgrid(x, y)
+    )
     assert (np.abs(n).min((0, 1)) > 0.03).all()
-    for got, part in zip(looks[3].normal, (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]), strict=True):
+    for got, part in zip(
+        looks[3].normal,
+        (n[..., 0] ** 2, n[..., 1] ** 2, n[..., 0] * n[..., 1]),
+        strict=True,
+    ):
         assert got == pytest.approx(weight * part)
 
 
@@ -234,40 +373,76 @@ def test_axes_of_points_are_lists_of_finite_lengths(axis):
 
 
 def test_the_error_of_a_field_is_the_farthest_truncation_before_times_its_factor():
-    """Each truncation by itself; at least of them nothing is known but that it is below the field, doubled."""
+    """Each truncation by itself; at least of them nothing is known but that it is below
+    the field, doubled.
+    """
     cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
     light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
-    fields = {n: near.near_fields(cell, SIZE, light, [grid], harmonics=n)[0] for n in (1, 2, 3)}
+    fields = {
+        n: near.near_fields(cell, SIZE, light, [grid], harmonics=n)[0]
+        for n in (1, 2, 3)
+    }
     this = problem(cell, SIZE, WAVE, 0.0, 0.0)
     crowded = near.ladder(this, 3).crowded
     last = fields[3].e
-    farthest = max(np.linalg.norm(fields[n].e - last) for n in (1, 2)) / np.linalg.norm(last)
-    assert fields[3].error == pytest.approx(min(crowded * near.safety(3) * farthest, 2.0), rel=1e-9)
+    farthest = max(np.linalg.norm(fields[n].e - last) for n in (1, 2)) / np.linalg.norm(
+        last
+    )
+    assert fields[3].error == pytest.approx(
+        min(crowded * near.safety(3) * farthest, 2.0), rel=1e-9
+    )
     assert fields[1].error == pytest.approx(min(crowded * near.safety(1), 2.0))
     assert [fields[n].orders for n in (1, 2, 3)] == [5, 13, 29]
-    assert [fields[n].converged for n in (1, 2, 3)] == [fields[n].error <= 0.05 for n in (1, 2, 3)]
+    assert [fields[n].converged for n in (1, 2, 3)] == [
+        fields[n].error <= 0.05 for n in (1, 2, 3)
+    ]
 
 
 @pytest.mark.parametrize(("harmonics", "factor"), [(6, None), (7, 2.5)])
-def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_four(harmonics, factor):
+def test_from_seven_orders_on_the_error_is_two_and_a_half_times_the_farthest_of_four(
+    harmonics, factor
+):
     cell = Cell(0.36, shape=Rectangle(0.6), **ABOUT)
     light, grid = Light(WAVE, 0.0, "x"), Grid([0.02, 0.09], [0.05], [0.1, 0.5])
     this = problem(cell, SIZE, WAVE, 0.0, 0.0)
     stack = near._stack(this, 1, [grid])
-    every = [near._fields(this, stack, light, [grid], n)[0][0] for n in range(harmonics - 4, harmonics + 1)]
-    farthest = max(np.linalg.norm(one - every[-1]) for one in every[:-1]) / np.linalg.norm(every[-1])
-    found = near.near_fields(cell, SIZE, light, [grid], harmonics=harmonics, tolerance=1e-6)[0]
+    every = [
+        near._fields(this, stack, light, [grid], n)[0][0]
+        for n in range(harmonics - 4, harmonics + 1)
+    ]
+    farthest = max(
+        np.linalg.norm(one - every[-1]) for one in every[:-1]
+    ) / np.linalg.norm(every[-1])
+    found = near.near_fields(
+        cell, SIZE, light, [grid], harmonics=harmonics, tolerance=1e-6
+    )[0]
     crowded = near.ladder(this, harmonics).crowded
-    assert found.error == pytest.approx(crowded * (factor or near.safety(6)) * farthest, rel=1e-9)
+    assert found.error == pytest.approx(
+        crowded * (factor or near.safety(6)) * farthest, rel=1e-9
+    )
     assert found.e == pytest.approx(every[-1], abs=1e-12)
     assert near.safety(6) > 2.6
 
 
 def test_a_field_on_one_grid_is_that_of_its_axes():
-    cell, axes = Cell(0.36, shape=Rectangle(0.6), **ABOUT), ([0.02, 0.09, -0.1], [0.05], [0.1, 0.5])
+    cell, axes = (
+        Cell(0.36, shape=Rectangle(0.6), **ABOUT),
+        ([0.02, 0.09, -0.1], [0.05], [0.1, 0.5]),
+    )
     light = Light(WAVE, 0.3, "p", 0.7)
-    one = near.near_field(cell, SIZE, light, x_um=axes[0], y_um=axes[1], z_um=axes[2], harmonics=1, tolerance=0.3)
-    (same,) = near.near_fields(cell, SIZE, light, [Grid(*axes)], harmonics=1, tolerance=0.3)
+    one = near.near_field(
+        cell,
+        SIZE,
+        light,
+        x_um=axes[0],
+        y_um=axes[1],
+        z_um=axes[2],
+        harmonics=1,
+        tolerance=0.3,
+    )
+    (same,) = near.near_fields(
+        cell, SIZE, light, [Grid(*axes)], harmonics=1, tolerance=0.3
+    )
     assert one.e.shape == (3, 2, 1, 3)
     assert np.array_equal(one.e, same.e)
     assert np.array_equal(one.h, same.h)
@@ -281,7 +456,9 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
     light, grid = Light(WAVE, 0.0, "x"), Grid([0.02], [0.05], [0.1, 0.5])
     this = problem(cell, SIZE, WAVE, 0.0, 0.0)
     fields = {
-        (steps, n): near._fields(this, near._stack(this, steps, [grid]), light, [grid], n)[0][0]
+        (steps, n): near._fields(
+            this, near._stack(this, steps, [grid]), light, [grid], n
+        )[0][0]
         for steps, n in ((1, 2), (2, 2), (2, 1))
     }
     found = near.near_fields(cell, SIZE, light, [grid], harmonics=2, tolerance=1e-6)[0]
@@ -295,7 +472,11 @@ def test_the_error_of_a_leaning_wall_has_what_half_as_many_steps_change(monkeypa
     half, full = (
         near._fields(this, stack, light, [grid], 3)[0][0] for stack in stacks
     )  # the least of five, and two more
-    told = near._staircase(this, stacks[1], 2, light, [grid], near.Ladder(range(1, 6), 4, 1.0))
-    assert told == pytest.approx([np.linalg.norm(half - full) / np.linalg.norm(full)], rel=1e-9)
+    told = near._staircase(
+        this, stacks[1], 2, light, [grid], near.Ladder(range(1, 6), 4, 1.0)
+    )
+    assert told == pytest.approx(
+        [np.linalg.norm(half - full) / np.linalg.norm(full)], rel=1e-9
+    )
     assert found.error == pytest.approx(min(want, 2.0), rel=1e-9)
     assert want < 2

@@ -1,4 +1,6 @@
-"""Light, media and symmetries of small cells, and waves beside the plane waves they are, order by order."""
+"""Light, media and symmetries of small cells, and waves beside the plane waves they
+are, order by order.
+"""
 
 import math
 
@@ -15,7 +17,12 @@ from metalens.rcwa.orders.mirrors import FLIP_X, FLIP_Y, HALF_TURN, IDENTITY
 WAVE = 0.73
 OBLONG = Lattice("rectangular", 1.3)
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.3), (0.0, 0.6)))  # its mirror turns x about
-ABOUT = {"height_um": 0.53, "pillar": Index(2.7), "substrate": Index(1.45), "cover": Index(1.2)}
+ABOUT = {
+    "height_um": 0.53,
+    "pillar": Index(2.7),
+    "substrate": Index(1.45),
+    "cover": Index(1.2),
+}
 
 
 def cell(shape, **more):
@@ -24,7 +31,9 @@ def cell(shape, **more):
 
 def test_the_tangential_wave_vector_is_the_sine_in_its_azimuth():
     light = problem.tangent(WAVE, 0.3, 0.7)
-    assert (light.kx, light.ky) == pytest.approx((math.sin(0.3) * math.cos(0.7), math.sin(0.3) * math.sin(0.7)))
+    assert (light.kx, light.ky) == pytest.approx(
+        (math.sin(0.3) * math.cos(0.7), math.sin(0.3) * math.sin(0.7))
+    )
     assert (light.azimuth_rad, light.wavelength_um, light.normal) == (0.7, WAVE, False)
     along_y = problem.tangent(WAVE, 0.3, math.pi / 2)
     assert along_y.kx == 0.0
@@ -32,14 +41,24 @@ def test_the_tangential_wave_vector_is_the_sine_in_its_azimuth():
     assert not along_y.normal
     assert problem.tangent(WAVE, 0.3, 0.0).normal is False
     straight = problem.tangent(WAVE, 0.0, 0.7)
-    assert (straight.kx, straight.ky, straight.azimuth_rad, straight.normal) == (0.0, 0.0, 0.0, True)
+    assert (straight.kx, straight.ky, straight.azimuth_rad, straight.normal) == (
+        0.0,
+        0.0,
+        0.0,
+        True,
+    )
     for angle, zero in ((0.9e-12, True), (1.1e-12, False)):
         assert problem.tangent(WAVE, angle, 0.0).normal is zero
 
 
 def test_films_are_as_thick_as_the_phase_of_vacuum_in_them():
-    films = {"under": (Film(Index(1.9, 0.02), 0.07), Film(Index(1.6), 0.25)), "over": (Film(Index(1.3), 0.31),)}
-    found = problem.media(cell(Rectangle(0.6), **films), problem.tangent(WAVE, 0.3, 0.7))
+    films = {
+        "under": (Film(Index(1.9, 0.02), 0.07), Film(Index(1.6), 0.25)),
+        "over": (Film(Index(1.3), 0.31),),
+    }
+    found = problem.media(
+        cell(Rectangle(0.6), **films), problem.tangent(WAVE, 0.3, 0.7)
+    )
     k0 = 2 * math.pi / WAVE
     assert (found.substrate, found.cover) == (1.45, 1.2)
     assert [index for index, _ in found.under] == [1.9 + 0.02j, 1.6]
@@ -53,12 +72,16 @@ def test_light_comes_from_a_substrate_that_is_denser_than_its_sine():
     light = problem.tangent(WAVE, 1.2, 0.7)
     assert problem.media(thin, light).substrate == 0.94
     thinner = Cell(0.41, shape=Rectangle(0.6), **(ABOUT | {"substrate": Index(0.93)}))
-    with pytest.raises(CellError, match=r"sin\(angle_rad\) = 0\.932039 in a substrate of n = 0\.93:"):
+    with pytest.raises(
+        CellError, match=r"sin\(angle_rad\) = 0\.932039 in a substrate of n = 0\.93:"
+    ):
         problem.media(thinner, light)
 
 
 BOTH = tuple((IDENTITY, FLIP_X[way], FLIP_Y[way], HALF_TURN) for way in "xy")
-OF_X, OF_Y = (tuple((IDENTITY, table[way]) for way in "xy") for table in (FLIP_X, FLIP_Y))
+OF_X, OF_Y = (
+    tuple((IDENTITY, table[way]) for way in "xy") for table in (FLIP_X, FLIP_Y)
+)
 HALF, NONE = ((IDENTITY, HALF_TURN),), ((IDENTITY,),)
 
 
@@ -66,7 +89,11 @@ HALF, NONE = ((IDENTITY, HALF_TURN),), ((IDENTITY,),)
     ("shape", "light", "want"),
     [
         (Rectangle(0.6), (0.0, 0.0), BOTH),
-        (Rectangle(0.6), (0.2, 0.0), OF_Y),  # light in the plane of x and z is kept by the mirror of y
+        (
+            Rectangle(0.6),
+            (0.2, 0.0),
+            OF_Y,
+        ),  # light in the plane of x and z is kept by the mirror of y
         (Rectangle(0.6), (0.2, math.pi / 2), OF_X),
         (Rectangle(0.6), (0.2, 0.5), NONE),
         (Rectangle(0.6, 0.2), (0.0, 0.0), HALF),
@@ -106,19 +133,30 @@ def test_p_waves_lie_along_the_wave_vector_of_their_order_and_s_waves_across():
             assert ways.kappa[place] == pytest.approx(size, rel=1e-12)
             assert (ways.m[place], ways.n[place]) == (m, n)
     zero = orders.index((0, 0))
-    assert places == {1: (zero, 1.0), 0: (count + zero, 1.0)}  # s is the first polarisation, p the second
+    assert places == {
+        1: (zero, 1.0),
+        0: (count + zero, 1.0),
+    }  # s is the first polarisation, p the second
 
 
 @pytest.mark.parametrize("operations", [*BOTH, *OF_X, *OF_Y, *HALF, *NONE])
-def test_waves_are_an_orthogonal_basis_and_straight_light_has_its_place_in_it(operations):
-    """Light along x is one wave of the zero order, times its sign, with Ex there and nothing elsewhere."""
+def test_waves_are_an_orthogonal_basis_and_straight_light_has_its_place_in_it(
+    operations,
+):
+    """Light along x is one wave of the zero order, times its sign, with Ex there and
+    nothing elsewhere.
+    """
     this = cell(Rectangle(0.6))
     space = mirrors.orders(3, pattern.frame(this, operations))
     ways, places = problem.waves_of(space, this, problem.tangent(WAVE, 0.0, 0.0))
     count = len(space.ex.m)
     assert ways.fold.shape == (count + len(space.ey.m),) * 2
     assert ways.fold.T @ ways.fold == pytest.approx(np.eye(len(ways.m)), abs=1e-12)
-    held = [axis for axis, rows in enumerate((space.ex, space.ey)) if ((rows.m == 0) & (rows.n == 0)).any()]
+    held = [
+        axis
+        for axis, rows in enumerate((space.ex, space.ey))
+        if ((rows.m == 0) & (rows.n == 0)).any()
+    ]
     assert sorted(places) == held
     for axis, (place, sign) in places.items():
         rows = (space.ex, space.ey)[axis]
@@ -126,16 +164,26 @@ def test_waves_are_an_orthogonal_basis_and_straight_light_has_its_place_in_it(op
         want[axis * count + int(np.flatnonzero((rows.m == 0) & (rows.n == 0))[0])] = 1.0
         assert sign * ways.fold[:, place] == pytest.approx(want, abs=1e-14)
         assert ways.kappa[place] == 0
-    assert ways.p_count - len(space.ez.m) == ways.bare == int(((ways.m == 0) & (ways.n == 0))[: ways.bare].sum())
+    assert (
+        ways.p_count - len(space.ez.m)
+        == ways.bare
+        == int(((ways.m == 0) & (ways.n == 0))[: ways.bare].sum())
+    )
     assert len(ways.m) - ways.p_count - len(space.hz.m) in (0, 1)
 
 
-@pytest.mark.parametrize(("angle", "azimuth", "operations"), [(0.3, 0.0, OF_Y), (0.3, math.pi / 2, OF_X)])
-def test_light_in_a_mirror_is_p_in_one_class_and_s_in_the_other(angle, azimuth, operations):
+@pytest.mark.parametrize(
+    ("angle", "azimuth", "operations"), [(0.3, 0.0, OF_Y), (0.3, math.pi / 2, OF_X)]
+)
+def test_light_in_a_mirror_is_p_in_one_class_and_s_in_the_other(
+    angle, azimuth, operations
+):
     this, found = cell(Rectangle(0.6)), {}
     for some in operations:
         space = mirrors.orders(3, pattern.frame(this, some))
-        ways, places = problem.waves_of(space, this, problem.tangent(WAVE, angle, azimuth))
+        ways, places = problem.waves_of(
+            space, this, problem.tangent(WAVE, angle, azimuth)
+        )
         ((kind, (place, sign)),) = places.items()
         found[kind] = place < ways.p_count
         assert sign == 1.0

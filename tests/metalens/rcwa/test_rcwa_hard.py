@@ -1,6 +1,8 @@
-"""Hard cases of a pillar cell: thin, touching, flat, tall, absorbing, at cut-off, grazing, resonant.
+"""Hard cases of a pillar cell: thin, touching, flat, tall, absorbing, at cut-off,
+grazing, resonant.
 
-Values of the modal method (1e-5) where it has them; the estimate must cover the distance. Power holds to rounding.
+Values of the modal method (1e-5) where it has them; the estimate must cover the
+distance. Power holds to rounding.
 """
 
 import cmath
@@ -20,7 +22,9 @@ ROUNDING = 1e-12
 
 
 def amplitude(cell, diameter_um, wavelength_um=WAVELENGTH, *, harmonics=5, **direction):
-    return rcwa.solve(cell, diameter_um, wavelength_um, harmonics=harmonics, **direction)
+    return rcwa.solve(
+        cell, diameter_um, wavelength_um, harmonics=harmonics, **direction
+    )
 
 
 def interface(n=1.4525):
@@ -35,14 +39,24 @@ def test_hard_thinnest_pillar():
 
 
 def test_hard_ring_whose_wall_a_truncation_sees_late():
-    """A wall of 15 nm in a pitch of 279: from order 4 to 7 answers move by less than 1.2e-3 and lie 6e-3 off.
+    """A wall of 15 nm in a pitch of 279: from order 4 to 7 answers move by less than
+    1.2e-3 and lie 6e-3 off.
 
-    A bar of the moves alone had 0.57 of the error. The truth is the mean of orders 13 to 15, 1e-3 or better.
+    A bar of the moves alone had 0.57 of the error. The truth is the mean of orders 13
+    to 15, 1e-3 or better.
     """
-    about = {"pillar": Index(2.87494), "substrate": Index(1.7008), "cover": Index(1.07430), "between": Index(1.19785)}
+    about = {
+        "pillar": Index(2.87494),
+        "substrate": Index(1.7008),
+        "cover": Index(1.07430),
+        "between": Index(1.19785),
+    }
     cell = Cell(0.278778, 0.708727, **about, shape=Ring(0.674107))
     got = rcwa.jones(cell, 0.0912328, 0.745768, tolerance=2e-2)
-    want = np.mean([rcwa.jones(cell, 0.0912328, 0.745768, harmonics=n).t for n in (13, 14, 15)], axis=0)
+    want = np.mean(
+        [rcwa.jones(cell, 0.0912328, 0.745768, harmonics=n).t for n in (13, 14, 15)],
+        axis=0,
+    )
     error = float(np.abs(got.t - want).max())
     assert got.converged
     assert 4e-3 < error < got.t_error - 1e-3
@@ -81,7 +95,9 @@ def test_hard_no_height_is_the_bare_interface():
     assert abs(got.r - r) < ROUNDING
 
 
-@pytest.mark.parametrize(("k", "want"), [(0.1, -0.25646 - 0.397552j), (3, 0.501893 - 0.23536j)])
+@pytest.mark.parametrize(
+    ("k", "want"), [(0.1, -0.25646 - 0.397552j), (3, 0.501893 - 0.23536j)]
+)
 def test_hard_absorption(k, want):
     got = amplitude(replace(CELL, pillar=Index(3.6, k)), 0.2, harmonics=9)
     assert abs(got.t - want) < min(got.t_error, 2e-2)
@@ -109,7 +125,9 @@ def test_hard_layer_of_air_whose_own_orders_graze(n):
 
 
 def test_hard_below_cutoff_of_the_substrate_against_the_modal_method():
-    got = amplitude(replace(CELL, pitch_um=WAVELENGTH / 1.4525 * (1 - 1e-4)), 0.2, harmonics=9)
+    got = amplitude(
+        replace(CELL, pitch_um=WAVELENGTH / 1.4525 * (1 - 1e-4)), 0.2, harmonics=9
+    )
     assert abs(got.t - (-0.029922 - 0.999525j)) < min(got.t_error, 2e-2)
 
 
@@ -118,7 +136,13 @@ def test_hard_below_cutoff_of_the_substrate_against_the_modal_method():
 def test_hard_tiny_angles_join_normal_incidence(polarization, azimuth_rad):
     straight = amplitude(CELL, 0.2)
     for angle_rad in (1e-12, 1e-8):
-        got = amplitude(CELL, 0.2, angle_rad=angle_rad, azimuth_rad=azimuth_rad, polarization=polarization)
+        got = amplitude(
+            CELL,
+            0.2,
+            angle_rad=angle_rad,
+            azimuth_rad=azimuth_rad,
+            polarization=polarization,
+        )
         assert abs(got.t - straight.t) < ROUNDING
         assert abs(got.r - straight.r) < ROUNDING
 
@@ -131,12 +155,17 @@ def test_hard_grazing_light(polarization):
 
 
 def test_hard_dark_mode_is_seen_and_its_error_admitted():
-    got = amplitude(CELL, 0.272, harmonics=8, angle_rad=math.radians(5), polarization="p")
+    got = amplitude(
+        CELL, 0.272, harmonics=8, angle_rad=math.radians(5), polarization="p"
+    )
     assert abs(got.t - (0.19739 - 0.080822j)) < got.t_error
     assert abs(got.energy - 1) < ROUNDING
 
 
-@pytest.mark.parametrize(("diameter_um", "want"), [(0.1937, -0.014776 + 0.014716j), (0.302, 0.697059 - 0.690801j)])
+@pytest.mark.parametrize(
+    ("diameter_um", "want"),
+    [(0.1937, -0.014776 + 0.014716j), (0.302, 0.697059 - 0.690801j)],
+)
 def test_hard_dip_and_flank(diameter_um, want):
     got = amplitude(CELL, diameter_um, harmonics=10)
     assert abs(got.t - want) < min(got.t_error, 5e-2)
@@ -150,5 +179,7 @@ def test_hard_cell_on_which_public_codes_disagree():
 
 def test_hard_single_precision_input_is_computed_in_double():
     got = amplitude(CELL, np.float32(0.2), np.float32(WAVELENGTH))
-    assert abs(got.t - amplitude(CELL, 0.2).t) < 3e-5  # rounding of the input times the slopes, 130 / um and 70 / um
+    assert (
+        abs(got.t - amplitude(CELL, 0.2).t) < 3e-5
+    )  # rounding of the input times the slopes, 130 / um and 70 / um
     assert isinstance(got.t, complex)

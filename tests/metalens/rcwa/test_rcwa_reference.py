@@ -1,4 +1,6 @@
-"""RCWA against the committed reference values of hard pillars, which the modal method made."""
+"""RCWA against the committed reference values of hard pillars, which the modal method
+made.
+"""
 
 import json
 import math
@@ -19,7 +21,9 @@ def label(entry):
 
 def solve(entry, harmonics):
     parts = entry["cell"]
-    media = [Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")]
+    media = [
+        Index(*parts[name]) for name in ("pillar", "substrate", "cover", "between")
+    ]
     return rcwa.solve(
         Cell(parts["pitch_um"], parts["height_um"], *media),
         entry["diameter_um"],
@@ -35,13 +39,17 @@ def test_error_estimate_holds(entry):
     got = solve(entry, 8)
     error = abs(got.t - complex(*entry["t"]))
     assert error <= got.t_error + entry["uncertainty"]
-    assert abs(got.r - complex(*entry["r"])) <= 3 * got.t_error + entry["uncertainty"]  # the estimate is made for t
+    assert (
+        abs(got.r - complex(*entry["r"])) <= 3 * got.t_error + entry["uncertainty"]
+    )  # the estimate is made for t
     if entry["cell"]["pillar"][1] == 0:
         assert abs(got.energy - 1) < 1e-11
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entry", [e for e in ENTRIES if e["angle_deg"] == 0.0], ids=label)
+@pytest.mark.parametrize(
+    "entry", [e for e in ENTRIES if e["angle_deg"] == 0.0], ids=label
+)
 def test_error_estimate_holds_at_high_order(entry):
     got = solve(entry, 14)
     assert abs(got.t - complex(*entry["t"])) <= got.t_error + entry["uncertainty"]

@@ -1,4 +1,6 @@
-"""Cells of any shape against the modal method, against themselves turned, and against conservation laws."""
+"""Cells of any shape against the modal method, against themselves turned, and against
+conservation laws.
+"""
 
 import math
 
@@ -8,12 +10,26 @@ import pytest
 from metalens import modal, rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer, Light
 from metalens.cell.orders import check_subwavelength
-from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Polygon,
+    Rectangle,
+    RegularPolygon,
+    Ring,
+)
 from metalens.ground.errors import CellError
 from metalens.rcwa.any_shape import ladder
 from metalens.rcwa.problem import problem
 
-ABOUT = {"height_um": 0.5, "pillar": Index(2.6), "substrate": Index(1.45), "cover": Index(1.0), "between": Index(1.1)}
+ABOUT = {
+    "height_um": 0.5,
+    "pillar": Index(2.6),
+    "substrate": Index(1.45),
+    "cover": Index(1.0),
+    "between": Index(1.1),
+}
 TRIANGLE = Polygon(((-0.5, -0.3), (0.5, -0.3), (0.0, 0.6)))
 WAVE = 0.633
 RECTANGULAR = Lattice("rectangular", 1.0)  # a square that takes the general way
@@ -34,23 +50,42 @@ def test_round_pillar_by_the_general_way_agrees_with_the_modal_method():
 
 @pytest.mark.parametrize(("polarization", "place"), [("s", 0), ("p", 1)])
 def test_oblique_light_agrees_with_the_modal_method(polarization, place):
-    want = modal.solve(Cell(0.35, **ABOUT), 0.2, WAVE, angle_rad=0.2, polarization=polarization, tolerance=1e-3)
-    got = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, angle_rad=0.2, harmonics=8)
+    want = modal.solve(
+        Cell(0.35, **ABOUT),
+        0.2,
+        WAVE,
+        angle_rad=0.2,
+        polarization=polarization,
+        tolerance=1e-3,
+    )
+    got = rcwa.jones(
+        Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, angle_rad=0.2, harmonics=8
+    )
     assert abs(got.t[place, place] - want.t) < got.t_error + want.t_error
     assert abs(got.r[place, place] - want.r) < got.t_error + want.t_error
 
 
 def test_many_sides_are_a_circle_of_equal_area():
     swell = math.sqrt(2 * math.pi / 48 / math.sin(2 * math.pi / 48))
-    circle = rcwa.jones(Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, harmonics=6)
-    polygon = rcwa.jones(Cell(0.35, **ABOUT, shape=RegularPolygon(48)), 0.2 * swell, WAVE, harmonics=6)
-    assert np.abs(circle.t - polygon.t).max() < 1e-3  # of second order in the 1.3 % by which corners stand out
+    circle = rcwa.jones(
+        Cell(0.35, **ABOUT, lattice=RECTANGULAR), 0.2, WAVE, harmonics=6
+    )
+    polygon = rcwa.jones(
+        Cell(0.35, **ABOUT, shape=RegularPolygon(48)), 0.2 * swell, WAVE, harmonics=6
+    )
+    assert (
+        np.abs(circle.t - polygon.t).max() < 1e-3
+    )  # of second order in the 1.3 % by which corners stand out
 
 
-@pytest.mark.parametrize("shape", [Rectangle(0.5), Ellipse(0.6), TRIANGLE], ids=lambda s: s.kind)
+@pytest.mark.parametrize(
+    "shape", [Rectangle(0.5), Ellipse(0.6), TRIANGLE], ids=lambda s: s.kind
+)
 def test_a_quarter_turn_exchanges_x_and_y(shape):
     """Every shape meets another set of mirrors when it is turned."""
-    turned = type(shape)(*((shape.corners,) if shape is TRIANGLE else (shape.ratio,)), math.pi / 2)
+    turned = type(shape)(
+        *((shape.corners,) if shape is TRIANGLE else (shape.ratio,)), math.pi / 2
+    )
     first = rcwa.jones(Cell(0.35, **ABOUT, shape=shape), 0.25, WAVE, harmonics=5)
     second = rcwa.jones(Cell(0.35, **ABOUT, shape=turned), 0.25, WAVE, harmonics=5)
     assert np.abs(second.t - swap(first.t)).max() < 1e-9
@@ -62,20 +97,41 @@ def test_a_quarter_turn_exchanges_x_and_y(shape):
     ("shape", "size_um", "before", "factor"),
     [
         (Rectangle(0.9), 0.3, 4, 1.0),
-        (Ring(0.5), 0.32, 5, 1.0),  # walls and hole of 0.16 and 0.32 pitches: 0.75 / 0.16
+        (
+            Ring(0.5),
+            0.32,
+            5,
+            1.0,
+        ),  # walls and hole of 0.16 and 0.32 pitches: 0.75 / 0.16
         (Ring(0.75), 0.32, 6, 1.0),  # walls of 0.08
         (Cross(0.15), 0.35, 6, 1.0),  # bars of 0.105
-        (Ring(0.99), 0.45, 6, 2 - 0.0045 / 0.02),  # walls of 0.0045, below a fiftieth: up to twice
-        (Cross(0.01), 0.46, 6, 2 - 0.0092 / 0.02),  # the gap of 0.08 is seen beside bars too thin to resolve
+        (
+            Ring(0.99),
+            0.45,
+            6,
+            2 - 0.0045 / 0.02,
+        ),  # walls of 0.0045, below a fiftieth: up to twice
+        (
+            Cross(0.01),
+            0.46,
+            6,
+            2 - 0.0092 / 0.02,
+        ),  # the gap of 0.08 is seen beside bars too thin to resolve
     ],
     ids=lambda v: getattr(v, "kind", None),
 )
-def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(shape, size_um, before, factor):
-    """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are wide."""
+def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(
+    shape, size_um, before, factor
+):
+    """By hand on a pitch of 0.5: 0.75 / width of them, four to six; outlines alone are
+    wide.
+    """
     this = problem(Cell(0.5, **ABOUT, shape=shape), size_um, 0.85, 0.0, 0.0)
     found = ladder(this, None)
     assert found.before == before
-    assert found.reaches == range(7 - before, 16)  # seven orders may be the last ones; 15 of four mirrors
+    assert found.reaches == range(
+        7 - before, 16
+    )  # seven orders may be the last ones; 15 of four mirrors
     assert ladder(this, 9).reaches == range(9 - before, 10)
     assert ladder(this, 4).reaches == range(1, 5)
     assert found.crowded == pytest.approx(factor, rel=1e-3)  # curves are 64 edges
@@ -83,54 +139,95 @@ def test_walls_bars_holes_and_gaps_each_ask_for_truncations_by_their_own_width(s
 
 def test_one_truncation_alone_is_told_as_knowing_nothing():
     """Two numbers within the unit circle are two apart at most."""
-    assert rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=1).t_error == 2.0
+    assert (
+        rcwa.jones(
+            Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=1
+        ).t_error
+        == 2.0
+    )
 
 
 def test_a_ring_with_thin_walls_lies_within_its_bar():
-    """Walls of 0.018 pitches against 20 orders, which 18 and 21 are within 1.1e-4 of; its bar was the 2.3th part of the
+    """Walls of 0.018 pitches against 20 orders, which 18 and 21 are within 1.1e-4 of;
+    its bar was the 2.3th part of the
     error while it went by the diameter of the ring."""
-    cell = Cell(0.477445, 0.582459, Index(3.534595), Index(1.689445), Index(1.0), Index(1.0), shape=Ring(0.935481))
-    found, finer = (rcwa.jones(cell, 0.267746, 0.85, harmonics=count) for count in (13, 20))
+    cell = Cell(
+        0.477445,
+        0.582459,
+        Index(3.534595),
+        Index(1.689445),
+        Index(1.0),
+        Index(1.0),
+        shape=Ring(0.935481),
+    )
+    found, finer = (
+        rcwa.jones(cell, 0.267746, 0.85, harmonics=count) for count in (13, 20)
+    )
     assert np.abs(found.t - finer.t).max() + 1.1e-4 < found.t_error
     assert np.abs(found.r - finer.r).max() + 1.1e-4 < found.t_error
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 0.11])
-@pytest.mark.parametrize("shape", [Rectangle(0.5, 0.4), Polygon(TRIANGLE.corners, 0.3)], ids=lambda s: s.kind)
+@pytest.mark.parametrize(
+    "shape", [Rectangle(0.5, 0.4), Polygon(TRIANGLE.corners, 0.3)], ids=lambda s: s.kind
+)
 def test_lossless_cells_keep_the_power_whatever_their_symmetry(shape, angle_rad):
     cell = Cell(0.35, **ABOUT, shape=shape, over=(Film(Index(1.3), 0.05),))
-    got = rcwa.jones(cell, 0.25, WAVE, angle_rad=angle_rad, azimuth_rad=0.7, harmonics=4)
+    got = rcwa.jones(
+        cell, 0.25, WAVE, angle_rad=angle_rad, azimuth_rad=0.7, harmonics=4
+    )
     assert np.abs(got.energy - 1).max() < 1e-10
     assert abs(got.t[0, 1]) > 1e-3
 
 
 def test_geometric_phase_turns_by_twice_the_angle():
-    """Circular light keeps exp(2 i angle) of a turned rectangle on a lattice that hardly matters."""
+    """Circular light keeps exp(2 i angle) of a turned rectangle on a lattice that
+    hardly matters.
+    """
 
     def flipped(angle_rad):
-        got = rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.45, angle_rad)), 0.2, WAVE, harmonics=6)
+        got = rcwa.jones(
+            Cell(0.35, **ABOUT, shape=Rectangle(0.45, angle_rad)),
+            0.2,
+            WAVE,
+            harmonics=6,
+        )
         return np.array([1, 1j]) @ got.t @ np.array([1, 1j]) / 2
 
     turn = np.angle(flipped(0.3) / flipped(0.0))
-    assert abs(turn - 0.6) < 0.1  # truncation at 6 orders, and the square lattice does not turn along
+    assert (
+        abs(turn - 0.6) < 0.1
+    )  # truncation at 6 orders, and the square lattice does not turn along
 
 
 def test_hexagonal_lattice_has_no_preferred_direction_for_round_pillars():
-    got = rcwa.jones(Cell(0.38, **ABOUT, lattice=Lattice("hexagonal")), 0.2, WAVE, harmonics=9)
+    got = rcwa.jones(
+        Cell(0.38, **ABOUT, lattice=Lattice("hexagonal")), 0.2, WAVE, harmonics=9
+    )
     assert abs(got.t[0, 0] - got.t[1, 1]) < got.t_error
     assert abs(got.t[0, 1]) < 1e-12
     empty = rcwa.jones(
-        Cell(0.38, **(ABOUT | {"pillar": Index(1.1)}), lattice=Lattice("hexagonal")), 0.2, WAVE, harmonics=3
+        Cell(0.38, **(ABOUT | {"pillar": Index(1.1)}), lattice=Lattice("hexagonal")),
+        0.2,
+        WAVE,
+        harmonics=3,
     )
     film = rcwa.solve(Cell(0.38, **ABOUT), 0.0, WAVE)
     assert abs(empty.t[0, 0] - film.t) < 1e-12
 
 
 def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
-    whole = rcwa.jones(Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=5)
+    whole = rcwa.jones(
+        Cell(0.35, **ABOUT, shape=Rectangle(0.5)), 0.25, WAVE, harmonics=5
+    )
     cut = Cell(0.35, **ABOUT, shape=Rectangle(0.5), layers=(Layer(0.2), Layer(0.3)))
     assert np.abs(rcwa.jones(cut, 0.25, WAVE, harmonics=5).t - whole.t).max() < 1e-10
-    same = Cell(0.35, **ABOUT, shape=Rectangle(0.5), layers=(Layer(0.5, grow_um=-0.02, coat_um=0.01, coat=Index(2.6)),))
+    same = Cell(
+        0.35,
+        **ABOUT,
+        shape=Rectangle(0.5),
+        layers=(Layer(0.5, grow_um=-0.02, coat_um=0.01, coat=Index(2.6)),),
+    )
     assert (
         np.abs(rcwa.jones(same, 0.25, WAVE, harmonics=5).t - whole.t).max() < 2e-2
     )  # normals of the inner wall differ
@@ -138,7 +235,11 @@ def test_layers_of_one_pillar_are_the_pillar_and_a_cap_is_a_film_on_it():
 
 def test_a_hole_is_the_pillar_with_materials_exchanged():
     hole = Cell(0.35, **ABOUT, shape=Circle(hole=True))
-    swapped = Cell(0.35, **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}), lattice=RECTANGULAR)
+    swapped = Cell(
+        0.35,
+        **(ABOUT | {"pillar": Index(1.1), "between": Index(2.6)}),
+        lattice=RECTANGULAR,
+    )
     one, other = (rcwa.jones(c, 0.2, WAVE, harmonics=5) for c in (hole, swapped))
     assert np.abs(one.t - other.t).max() < 1e-12
 
@@ -148,7 +249,9 @@ def test_solve_gives_the_diagonal_and_refuses_what_touches():
     got = rcwa.jones(cell, 0.25, WAVE, harmonics=5)
     for polarization, place in (("x", 0), ("y", 1), ("p", 0), ("s", 1)):
         one = rcwa.solve(cell, 0.25, WAVE, polarization=polarization, harmonics=5).t
-        assert abs(one - got.t[place, place]) < 1e-12  # one light of the two: other sums, the same orders
+        assert (
+            abs(one - got.t[place, place]) < 1e-12
+        )  # one light of the two: other sums, the same orders
     with pytest.raises(CellError, match="touches its neighbour"):
         rcwa.solve(cell, 0.36, WAVE)
 
@@ -160,9 +263,13 @@ def test_no_harmonics_at_all_are_refused_by_every_verb(harmonics):
     for verb in (
         lambda: rcwa.jones(cell, 0.25, WAVE, **about),
         lambda: rcwa.solve(cell, 0.25, WAVE, **about),
-        lambda: rcwa.near_field(cell, 0.25, Light(WAVE), x_um=[0.0], y_um=[0.0], z_um=[0.1], **about),
+        lambda: rcwa.near_field(
+            cell, 0.25, Light(WAVE), x_um=[0.0], y_um=[0.0], z_um=[0.1], **about
+        ),
     ):
-        with pytest.raises(CellError, match=f"harmonics = {harmonics}: need at least 1"):
+        with pytest.raises(
+            CellError, match=f"harmonics = {harmonics}: need at least 1"
+        ):
             verb()
 
 
@@ -171,17 +278,23 @@ def test_orders_of_the_hexagonal_lattice():
     edge = 2 * WAVE / math.sqrt(3) / 1.45
     check_subwavelength(Cell(edge * 0.999, **ABOUT, lattice=Lattice("hexagonal")), WAVE)
     with pytest.raises(CellError, match=f"need pitch_um < {edge:.6g}"):
-        check_subwavelength(Cell(edge * 1.001, **ABOUT, lattice=Lattice("hexagonal")), WAVE)
+        check_subwavelength(
+            Cell(edge * 1.001, **ABOUT, lattice=Lattice("hexagonal")), WAVE
+        )
 
 
 def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():
-    """Index-matched pedestal, coated pillar and cap: phase k sum of h (area over that of the cell) contrast / 2n.
+    """Index-matched pedestal, coated pillar and cap: phase k sum of h (area over that
+    of the cell) contrast / 2n.
 
     What is left is of second order in the contrast: a quarter at half of it.
     """
     n, pitch, size, grow, coat, off = 1.5, 0.35, 0.2, 0.03, 0.012, []
     for contrast in (0.08, 0.04):
-        inside, film = Index(math.sqrt(n**2 + contrast)), Index(math.sqrt(n**2 + contrast / 2))
+        inside, film = (
+            Index(math.sqrt(n**2 + contrast)),
+            Index(math.sqrt(n**2 + contrast / 2)),
+        )
         layers = (
             Layer(0.11, grow_um=grow, material=film),
             Layer(0.4, coat_um=coat, coat=film),
@@ -190,7 +303,9 @@ def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():
         about = dict.fromkeys(("substrate", "cover", "between"), Index(n))
         cell = Cell(pitch, 0.58, inside, **about, shape=Rectangle(0.6), layers=layers)
         wide, deep = size, 0.6 * size
-        area = 0.11 * contrast / 2 * (wide + grow) * (deep + grow) + 0.07 * contrast * (wide - 0.02) * (deep - 0.02)
+        area = 0.11 * contrast / 2 * (wide + grow) * (deep + grow) + 0.07 * contrast * (
+            wide - 0.02
+        ) * (deep - 0.02)
         rim = (wide + 2 * coat) * (deep + 2 * coat) - wide * deep
         area += 0.4 * (contrast * wide * deep + contrast / 2 * rim)
         want = np.exp(2j * np.pi / 0.633 * (n * 0.58 + area / pitch**2 / (2 * n)))

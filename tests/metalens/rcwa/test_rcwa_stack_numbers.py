@@ -1,4 +1,6 @@
-"""Stacks of layers and films beside one system of equations for all amplitudes at once, interface by interface."""
+"""Stacks of layers and films beside one system of equations for all amplitudes at once,
+interface by interface.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +11,14 @@ from metalens.rcwa.orders import basis
 from metalens.rcwa.orders.waves import half_space, normal_component, waves
 from metalens.rcwa.stack import Media
 
-WAYS = waves(basis.basis(1, "none"), pitch_um=0.47, wavelength_um=0.83, kx=0.31, ky=-0.17, azimuth_rad=0.6)
+WAYS = waves(
+    basis.basis(1, "none"),
+    pitch_um=0.47,
+    wavelength_um=0.83,
+    kx=0.31,
+    ky=-0.17,
+    azimuth_rad=0.6,
+)
 N = len(WAYS.kappa)
 BELOW, ABOVE = 1.45, 1.2
 UNDER, OVER = ((1.9, 0.7), (1.6 + 0.1j, 1.3)), ((1.3, 0.9), (2.1, 0.4))
@@ -18,7 +27,11 @@ UNDER, OVER = ((1.9, 0.7), (1.6 + 0.1j, 1.3)), ((1.3, 0.9), (2.1, 0.4))
 def drawn(seed, *, symmetric, batch=()):
     """Operators near those of a medium, and their modes."""
     rng = np.random.default_rng(seed)
-    P, Q = (0.15 * (rng.normal(size=(*batch, N, N)) + 1j * rng.uniform(0, 1, (*batch, N, N))) for _ in range(2))
+    P, Q = (
+        0.15
+        * (rng.normal(size=(*batch, N, N)) + 1j * rng.uniform(0, 1, (*batch, N, N)))
+        for _ in range(2)
+    )
     if symmetric:
         P, Q = (A + np.swapaxes(A, -1, -2) for A in (P, Q))
     p = np.arange(N) < WAYS.p_count
@@ -34,7 +47,8 @@ def film(index, height):
 
 
 def directly(inner, incident):
-    """(r, [(up, down)], t) where every tangential field is continuous; inner: (W, V, q, height) of each layer.
+    """(r, [(up, down)], t) where every tangential field is continuous; inner: (W, V, q,
+    height) of each layer.
 
     Waves up have their phase at the foot of a layer, waves down at its top.
     """
@@ -53,7 +67,9 @@ def directly(inner, incident):
             fade = np.ones(N) if q is None else np.exp(1j * q * height)
             up = np.vstack([W, V]) * (fade if at_top else 1.0)
             down = np.vstack([W, -V]) * (1.0 if at_top else fade)
-            first = (2 * medium - 1) * N  # the substrate has waves down alone as unknowns, the cover waves up
+            first = (
+                2 * medium - 1
+            ) * N  # the substrate has waves down alone as unknowns, the cover waves up
             if medium == 0:
                 right[rows] -= sign * up @ incident
                 system[rows, :N] += sign * down
@@ -62,22 +78,34 @@ def directly(inner, incident):
                 if medium <= len(inner):
                     system[rows, first + N : first + 2 * N] += sign * down
     found = np.linalg.solve(system, right)
-    layers = [found[(2 * k + 1) * N : (2 * k + 3) * N].reshape(2, N) for k in range(len(inner))]
+    layers = [
+        found[(2 * k + 1) * N : (2 * k + 3) * N].reshape(2, N)
+        for k in range(len(inner))
+    ]
     return found[:N], layers, found[-N:]
 
 
 def inner_of(parts, heights):
-    return [(part.W, part.V, part.q, height) for part, height in zip(parts, heights, strict=True)]
+    return [
+        (part.W, part.V, part.q, height)
+        for part, height in zip(parts, heights, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
-@pytest.mark.parametrize("heights", [(1.1, 0.6), (35.0, 0.6)], ids=["thin", "one in which waves fade"])
-def test_fields_between_half_spaces_are_those_of_all_equations_at_once(symmetric, heights):
+@pytest.mark.parametrize(
+    "heights", [(1.1, 0.6), (35.0, 0.6)], ids=["thin", "one in which waves fade"]
+)
+def test_fields_between_half_spaces_are_those_of_all_equations_at_once(
+    symmetric, heights
+):
     parts = [drawn(seed, symmetric=symmetric) for seed in (1, 2)]
     rng = np.random.default_rng(4)
     incident = rng.normal(size=N) + 1j * rng.normal(size=N)
     below, above = half_space(WAYS, BELOW), half_space(WAYS, ABOVE)
-    found = stack.match(parts, heights, above, below, 2 * below[0] * below[1] * incident)
+    found = stack.match(
+        parts, heights, above, below, 2 * below[0] * below[1] * incident
+    )
     r, layers, t = directly(inner_of(parts, heights), incident)
     assert found.u == pytest.approx(below[0] * (incident + r), abs=1e-9)
     assert found.w == pytest.approx(below[1] * (incident - r), abs=1e-9)
@@ -98,24 +126,39 @@ def test_a_batch_is_each_of_its_layers_alone():
     for i in range(2):
         alone = stack.match([layer(part.P[i], part.Q[i])], (9.0,), above, below, source)
         for name in ("u", "w", "u_top", "w_top"):
-            assert getattr(both, name)[i] == pytest.approx(getattr(alone, name), abs=1e-9)
+            assert getattr(both, name)[i] == pytest.approx(
+                getattr(alone, name), abs=1e-9
+            )
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
 @pytest.mark.parametrize("layers", [0, 2])
-def test_amplitudes_of_a_whole_stack_are_those_of_all_equations_at_once(layers, symmetric):
-    """Films below and above, the first one met first; amplitudes times the roots of their power over the light's."""
+def test_amplitudes_of_a_whole_stack_are_those_of_all_equations_at_once(
+    layers, symmetric
+):
+    """Films below and above, the first one met first; amplitudes times the roots of
+    their power over the light's.
+    """
     zero = WAYS.zero_p
-    parts, heights = [drawn(seed, symmetric=symmetric) for seed in (1, 2)[:layers]], (1.1, 0.6)[:layers]
+    parts, heights = (
+        [drawn(seed, symmetric=symmetric) for seed in (1, 2)[:layers]],
+        (1.1, 0.6)[:layers],
+    )
     media = Media(BELOW, ABOVE, UNDER, OVER, heights)
     got = stack.respond(WAYS, media, parts, zero)
     incident = np.zeros(N, complex)
     incident[zero] = 1.0
-    inner = [*(film(*one) for one in UNDER), *inner_of(parts, heights), *(film(*one) for one in OVER)]
+    inner = [
+        *(film(*one) for one in UNDER),
+        *inner_of(parts, heights),
+        *(film(*one) for one in OVER),
+    ]
     r, _, t = directly(inner, incident)
     power = []
     for index in (BELOW, ABOVE):
-        kz = np.sqrt(index**2 - WAYS.kappa**2 + 0j)  # S_z of unit amplitude: kz of s, and of p as well
+        kz = np.sqrt(
+            index**2 - WAYS.kappa**2 + 0j
+        )  # S_z of unit amplitude: kz of s, and of p as well
         power.append(kz.real)
     assert got.t == pytest.approx(t * np.sqrt(power[1] / power[0][zero]), abs=1e-9)
     assert got.r == pytest.approx(r * np.sqrt(power[0] / power[0][zero]), abs=1e-9)
@@ -123,7 +166,10 @@ def test_amplitudes_of_a_whole_stack_are_those_of_all_equations_at_once(layers, 
 
 
 def test_power_is_that_of_waves_that_propagate():
-    u, v = np.array([0.8, 0.3j, 2.0, 1.0, 1.0]), np.array([1.5, 2.0, 0.5 + 0.5j, 2.9e-12 + 3j, 3.1e-12 + 3j])
+    u, v = (
+        np.array([0.8, 0.3j, 2.0, 1.0, 1.0]),
+        np.array([1.5, 2.0, 0.5 + 0.5j, 2.9e-12 + 3j, 3.1e-12 + 3j]),
+    )
     assert stack.flux((u, v)) == pytest.approx([1.2, 0.0, 1.0, 0.0, 3.1e-12], rel=1e-9)
 
 

@@ -1,4 +1,6 @@
-"""Collocation of walls that change with height: closed forms, invariants, and no growth with the harmonics."""
+"""Collocation of walls that change with height: closed forms, invariants, and no growth
+with the harmonics.
+"""
 
 import math
 
@@ -33,7 +35,12 @@ def test_uniform_wall_is_an_exponential():
     this = Wall(lambda share: (np.eye(1), q**2 * np.eye(1)), height)
     got = panel(this, 0.4, 0.5, 5).downwards
     phase = q * height * 0.1
-    want = np.array([[math.cos(phase), -1j * math.sin(phase) / q], [-1j * q * math.sin(phase), math.cos(phase)]])
+    want = np.array(
+        [
+            [math.cos(phase), -1j * math.sin(phase) / q],
+            [-1j * q * math.sin(phase), math.cos(phase)],
+        ]
+    )
     assert np.abs(got - want).max() < 1e-12
 
 
@@ -45,8 +52,13 @@ def test_panels_cover_the_wall():
 
 @pytest.mark.parametrize("reach", [3, 6])
 def test_error_of_the_wall_does_not_grow_with_the_harmonics(reach):
-    """The staircase and the commutator-free method that stood here before lost an order with every few harmonics."""
-    t = {stages: truncated(of(TILTED), np.array([0.17]), reach, stages).t[0] for stages in (4, 5, 6)}
+    """The staircase and the commutator-free method that stood here before lost an order
+    with every few harmonics.
+    """
+    t = {
+        stages: truncated(of(TILTED), np.array([0.17]), reach, stages).t[0]
+        for stages in (4, 5, 6)
+    }
     assert abs(t[5] - t[6]) < 1e-4
     assert abs(t[4] - t[5]) < 5e-3
 
@@ -56,7 +68,9 @@ def test_power_and_the_error_that_is_told():
     stages, left = wall_stages(this, np.array([0.17]), 1e-3)
     assert left <= 1e-4
     found = truncated(this, np.array([0.17]), 5, stages)
-    assert abs(found.energy[0] - 1) < 1e-10  # Gauss collocation keeps quadratic invariants
+    assert (
+        abs(found.energy[0] - 1) < 1e-10
+    )  # Gauss collocation keeps quadratic invariants
     assert abs(found.t[0] - truncated(this, np.array([0.17]), 5, 8).t[0]) <= left
 
 
@@ -69,9 +83,16 @@ def test_upright_limit_is_the_upright_pillar():
 
 
 def test_both_solvers_of_a_round_tilted_pillar_meet():
-    """Other orders, other normals, one limit: RCWA of the disc by the fast way, and of any shape."""
-    fast, any_shape = rcwa.solve(TILTED, 0.17, 0.87, harmonics=8), rcwa.jones(TILTED, 0.17, 0.87, harmonics=6)
-    assert abs(fast.t - any_shape.t[0, 0]) < 2e-2  # of truncation; the tilt itself is worth 5e-2
+    """Other orders, other normals, one limit: RCWA of the disc by the fast way, and of
+    any shape.
+    """
+    fast, any_shape = (
+        rcwa.solve(TILTED, 0.17, 0.87, harmonics=8),
+        rcwa.jones(TILTED, 0.17, 0.87, harmonics=6),
+    )
+    assert (
+        abs(fast.t - any_shape.t[0, 0]) < 2e-2
+    )  # of truncation; the tilt itself is worth 5e-2
 
 
 def test_layers_tilt_on_their_own_and_keep_power():
@@ -84,10 +105,22 @@ def test_layers_tilt_on_their_own_and_keep_power():
         shape=Rectangle(0.6, 0.3),
         layers=(Layer(0.1), Layer(0.5)),
     )
-    whole = Cell(0.36, 0.6, Index(3.3), Index(1.47), sidewall_rad=-0.02, shape=Rectangle(0.6, 0.3))
-    cut, one = (rcwa.jones(c, 0.2, 0.9, angle_rad=0.1, azimuth_rad=0.3, harmonics=2) for c in (cell, whole))
+    whole = Cell(
+        0.36,
+        0.6,
+        Index(3.3),
+        Index(1.47),
+        sidewall_rad=-0.02,
+        shape=Rectangle(0.6, 0.3),
+    )
+    cut, one = (
+        rcwa.jones(c, 0.2, 0.9, angle_rad=0.1, azimuth_rad=0.3, harmonics=2)
+        for c in (cell, whole)
+    )
     assert np.abs(cut.energy - 1).max() < 1e-9
-    assert np.abs(cut.t - one.t).max() < 2e-4  # the same pillar in one piece: what interpolation and stages leave
+    assert (
+        np.abs(cut.t - one.t).max() < 2e-4
+    )  # the same pillar in one piece: what interpolation and stages leave
 
 
 def test_stages_stop_at_the_most():

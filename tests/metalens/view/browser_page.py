@@ -1,4 +1,6 @@
-"""A page in a headless browser that tells the test what it drew: no clock, the browser is ended when it has spoken."""
+"""A page in a headless browser that tells the test what it drew: no clock, the browser
+is ended when it has spoken.
+"""
 
 import http.server
 import shutil
@@ -6,7 +8,11 @@ import subprocess
 import threading
 from pathlib import Path
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
 _PATIENCE_S = 300  # a browser that has not spoken by then has crashed
 _TELL = """<script>(async () => {
 const drawn = () => document.body.dataset.ready === "true";
@@ -36,14 +42,30 @@ def told(path: Path, script: str, *, width: int = 1440) -> str:
             pass
 
     with http.server.HTTPServer(("127.0.0.1", 0), Listener) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+        threading.Thread(
+            target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True
+        ).start()
         asking = path.with_name(f"asking_{path.name}")
         tell = _TELL % (script, server.server_address[1])
-        asking.write_text(path.read_text(encoding="utf-8").replace("</body>", tell), encoding="utf-8")
-        words = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-port=0"]
-        words += ["--disable-background-networking", f"--user-data-dir={path.parent / 'profile'}"]
+        asking.write_text(
+            path.read_text(encoding="utf-8").replace("</body>", tell), encoding="utf-8"
+        )
+        words = [
+            BROWSER,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--no-first-run",
+            "--remote-debugging-port=0",
+        ]
+        words += [
+            "--disable-background-networking",
+            f"--user-data-dir={path.parent / 'profile'}",
+        ]
         words += [f"--window-size={width},1200", asking.as_uri()]
-        with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as browser:
+        with subprocess.Popen(
+            words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as browser:
             heard = spoken.wait(_PATIENCE_S)
             browser.terminate()
         server.shutdown()
@@ -53,6 +75,17 @@ def told(path: Path, script: str, *, width: int = 1440) -> str:
 
 def printed(path: Path, target: Path) -> None:
     """A page as the browser prints it, once its scripts are still."""
-    words = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--virtual-time-budget=20000"]
-    words += [f"--user-data-dir={path.parent / 'profile'}", f"--print-to-pdf={target}", path.as_uri()]
+    words = [
+        BROWSER,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--no-first-run",
+        "--virtual-time-budget=20000",
+    ]
+    words += [
+        f"--user-data-dir={path.parent / 'profile'}",
+        f"--print-to-pdf={target}",
+        path.as_uri(),
+    ]
     subprocess.run(words, check=True, capture_output=True, timeout=_PATIENCE_S)

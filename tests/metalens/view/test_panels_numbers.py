@@ -16,7 +16,12 @@ def test_sliders_stand_at_the_brightest_image():
     axes = [Axis("a", [1, 2, 3], "nm", blink=True), Axis("b", list("wxyz"))]
     found = at_brightest(axes, values)
     assert [one.first for one in found] == [2, 1]
-    assert (found[0].name, found[0].values, found[0].unit, found[0].blink) == ("a", [1, 2, 3], "nm", True)
+    assert (found[0].name, found[0].values, found[0].unit, found[0].blink) == (
+        "a",
+        [1, 2, 3],
+        "nm",
+        True,
+    )
     assert [one.first for one in axes] == [0, 0]
     assert Axis("c", []).blink is False
 
@@ -55,7 +60,9 @@ def test_more_sizes_than_classes_go_to_the_nearest_of_equal_steps():
 def test_what_does_not_fit_together_is_refused():
     Images("a", np.zeros((3, 2, 4, 5)), [Axis("x", [1, 2, 3]), Axis("y", [1, 2])], 0.3)
     for shape in ((3, 4, 5), (2, 3, 4, 5), (3, 2, 1, 4, 5)):
-        with pytest.raises(StoreError, match=r"a: sliders \(3, 2\) do not fit images of shape"):
+        with pytest.raises(
+            StoreError, match=r"a: sliders \(3, 2\) do not fit images of shape"
+        ):
             Images("a", np.zeros(shape), [Axis("x", [1, 2, 3]), Axis("y", [1, 2])], 0.3)
     Classes("b", np.array([[0, 3]]), np.ones(3), 0.4, "nm")
     Classes("b", np.empty((0, 2), int), np.ones(0), 0.4, "nm")
@@ -66,5 +73,7 @@ def test_what_does_not_fit_together_is_refused():
     for more in ({"x": [1.0]}, {"y": [3.0, 4.0, 5.0]}, {"groups": ["g"]}, {"notes": [{}]}, {"x": [1.0, math.inf]},
                  {"y": [3.0, math.nan]}):  # fmt: skip
         good = {"x": [1.0, 2.0], "y": [3.0, 4.0], "groups": ["g", "h"]}
-        with pytest.raises(StoreError, match="c: need as many finite x, finite y, groups and notes"):
+        with pytest.raises(
+            StoreError, match="c: need as many finite x, finite y, groups and notes"
+        ):
             Points("c", x_name="x", y_name="y", **(good | more))

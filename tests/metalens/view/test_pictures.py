@@ -1,4 +1,6 @@
-"""What a browser draws, pixel by pixel, against the same picture made with numpy from the data."""
+"""What a browser draws, pixel by pixel, against the same picture made with numpy from
+the data.
+"""
 
 import base64
 import io
@@ -9,10 +11,21 @@ import pytest
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, at_brightest, page
+from metalens.view import (
+    Axis,
+    Classes,
+    Curves,
+    Images,
+    Numbers,
+    Points,
+    at_brightest,
+    page,
+)
 from tests.metalens.view.browser_page import BROWSER, printed, told
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser to draw the page in: install chromium")
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason="no browser to draw the page in: install chromium"
+)
 # cividis (Nuñez, Anderton, Renslow 2018) at nine even steps, as drawn
 CIVIDIS = np.array(
     [[0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115], [138, 134, 120], [165, 156, 116],
@@ -30,26 +43,43 @@ def _told(folder, panels, script, *, width=1440):
 
 
 def _canvas(folder, panels, which, **more):
-    url = _told(folder, panels, f"return document.querySelectorAll('{which}')[0].toDataURL();", **more)
-    picture = Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")
+    url = _told(
+        folder,
+        panels,
+        f"return document.querySelectorAll('{which}')[0].toDataURL();",
+        **more,
+    )
+    picture = Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert(
+        "RGB"
+    )
     return np.asarray(picture, float)
 
 
 def test_an_image_has_the_colours_of_its_values(tmp_path):
     values = np.random.default_rng(5).uniform(0, 3, (2, 7, 11))
     values[0] *= 0.4  # the first one is shown on its own scale
-    drawn = _canvas(tmp_path, [Images("psf", values, [Axis("depth", [1.0, 2.0], "mm")], 0.5)], "canvas.image")
+    drawn = _canvas(
+        tmp_path,
+        [Images("psf", values, [Axis("depth", [1.0, 2.0], "mm")], 0.5)],
+        "canvas.image",
+    )
     wanted = _colour(values[0] / values[0].max())
     away = np.ones((7, 11), bool)
-    away[3, :] = away[:, 5] = away[4, :] = away[:, 6] = False  # the cross and its blurred edge
-    # 256 colours: half a step of the table is at most 8 * 60 / 512 levels, and half of one for rounding
+    away[3, :] = away[:, 5] = away[4, :] = away[:, 6] = (
+        False  # the cross and its blurred edge
+    )
+    # 256 colours: half a step of the table is at most 8 * 60 / 512 levels, and half of
+    # one for rounding
     assert np.abs(drawn - wanted)[away].max() <= 1.5
 
 
 def test_images_that_blink_share_a_scale(tmp_path):
     values = np.random.default_rng(6).uniform(0, 1, (2, 2, 5, 5))
     values[1] *= 2.7  # brighter than what is shown first
-    axes = [Axis("shown", ["captured", "fitted"], blink=True), Axis("frame", ["a", "b"])]
+    axes = [
+        Axis("shown", ["captured", "fitted"], blink=True),
+        Axis("frame", ["a", "b"]),
+    ]
     drawn = _canvas(tmp_path, [Images("frames", values, axes, 0.5)], "canvas.image")
     wanted = _colour(values[0, 0] / values[:, 0].max())
     assert np.abs(drawn - wanted)[[0, 0, 4, 4], [0, 4, 0, 4]].max() <= 1.5
@@ -58,7 +88,9 @@ def test_images_that_blink_share_a_scale(tmp_path):
 def test_sliders_stand_at_the_image_with_the_highest_peak(tmp_path):
     values = np.random.default_rng(8).uniform(0, 1, (2, 3, 5, 5))
     values[1, 2, 0, 4] = 3.0
-    axes = at_brightest([Axis("field angle", ["a", "b"]), Axis("depth", [1.0, 2.0, 3.0], "mm")], values)
+    axes = at_brightest(
+        [Axis("field angle", ["a", "b"]), Axis("depth", [1.0, 2.0, 3.0], "mm")], values
+    )
     assert [axis.first for axis in axes] == [1, 2]
     drawn = _canvas(tmp_path, [Images("psf", values, axes, 0.5)], "canvas.image")
     wanted = _colour(values[1, 2] / 3.0)
@@ -68,20 +100,33 @@ def test_sliders_stand_at_the_image_with_the_highest_peak(tmp_path):
 def test_a_map_far_away_is_the_mean_over_its_sites_and_shows_no_false_lenses(tmp_path):
     n = 2048
     at = np.arange(n) - (n - 1) / 2
-    # rings of three sites at the rim: a map of every n-th site would show coarse ones, false lenses among them
+    # rings of three sites at the rim: a map of every n-th site would show coarse ones,
+    # false lenses among them
     radius = np.hypot(at, at[:, None])
-    index = np.where(radius < 1000, 1 + np.floor(radius**2 / 85) % 64, 0).astype(np.uint8)
+    index = np.where(radius < 1000, 1 + np.floor(radius**2 / 85) % 64, 0).astype(
+        np.uint8
+    )
     sizes = np.linspace(80.0, 207.0, 64)
     drawn = _canvas(tmp_path, [Classes("mask", index, sizes, 0.3, "nm")], "canvas.map")
     high, wide = drawn.shape[:2]
     scale = min(wide, high) / n * 0.98
-    rows, columns = np.arange(high // 2 - 60, high // 2 + 60), np.arange(wide // 2 + 60, wide // 2 + 220)
+    rows, columns = (
+        np.arange(high // 2 - 60, high // 2 + 60),
+        np.arange(wide // 2 + 60, wide // 2 + 220),
+    )
     values = np.where(index > 0, sizes[np.maximum(index, 1).astype(int) - 1], 0)
     assert 0.25 <= scale < 0.5
-    for _ in range(2):  # to blocks of 4 sites, a pixel or more, by the weights 1 3 3 1 along both axes
+    for _ in range(
+        2
+    ):  # to blocks of 4 sites, a pixel or more, by the weights 1 3 3 1 along both axes
         for _ in range(2):
             padded = np.pad(values, ((1, 2), (0, 0)))
-            values = (0.125 * padded[:-3] + 0.375 * padded[1:-2] + 0.375 * padded[2:-1] + 0.125 * padded[3:])[::2].T
+            values = (
+                0.125 * padded[:-3]
+                + 0.375 * padded[1:-2]
+                + 0.375 * padded[2:-1]
+                + 0.125 * padded[3:]
+            )[::2].T
     y = ((rows + 0.5 - high / 2) / scale + n / 2) / 4 - 0.5
     x = ((columns + 0.5 - wide / 2) / scale + n / 2) / 4 - 0.5
     means = map_coordinates(values, np.meshgrid(y, x, indexing="ij"), order=1)
@@ -94,10 +139,18 @@ def _everything():
     long = "a word-of-great-length_" * 9
     return [
         Images(
-            "image", np.random.default_rng(4).uniform(0, 1, (3, 40, 40)), [Axis("depth", [1, 2, 3])], 0.3, optics=True
+            "image",
+            np.random.default_rng(4).uniform(0, 1, (3, 40, 40)),
+            [Axis("depth", [1, 2, 3])],
+            0.3,
+            optics=True,
         ),
         Curves("line", x, "x", {"y": 0.99999 + 1e-7 * x}, "y", errors={"y": 1e-8 * x}),
-        Numbers("table", ("name", "value", "from", "to"), [(long, 1.2345e-11, -3.25, 4.5), ("b", 2.0, 1.0, 3.0)]),
+        Numbers(
+            "table",
+            ("name", "value", "from", "to"),
+            [(long, 1.2345e-11, -3.25, 4.5), ("b", 2.0, 1.0, 3.0)],
+        ),
     ]
 
 
@@ -106,7 +159,9 @@ def test_no_page_is_wider_than_the_screen(tmp_path):
         script = """const charts = Array.from(document.querySelectorAll(".uplot"));
         const over = charts.map((u) => u.clientWidth - u.parentElement.clientWidth);
         return [document.documentElement.scrollWidth, innerWidth, ...over];"""
-        whole, screen, *over = map(int, _told(tmp_path, _everything(), script, width=width).split(","))
+        whole, screen, *over = map(
+            int, _told(tmp_path, _everything(), script, width=width).split(",")
+        )
         assert whole <= screen
         assert max(over) <= 0
 
@@ -120,16 +175,24 @@ def test_ticks_tell_neighbours_apart(tmp_path):
 
 @pytest.mark.parametrize("gap", [np.nan, np.inf])
 def test_a_curve_with_gaps_is_drawn_but_for_these(tmp_path, gap):
-    """Of 100 pieces the first is left out with its end, and two beside a value in the middle: 3 % of the columns."""
+    """Of 100 pieces the first is left out with its end, and two beside a value in the
+    middle: 3 % of the columns.
+    """
     x = np.linspace(0.0, 1.0, 101)
     values = np.where((np.arange(101) == 0) | (np.arange(101) == 50), gap, 2.0 + x)
     wide = []
     for y in (2.0 + x, values):
-        drawn = _canvas(tmp_path, [Curves("line", x, "x", {"y": y}, "y")], ".uplot canvas")
-        wide.append(int((np.ptp(drawn, axis=-1) > 40).any(0).sum()))  # columns with colour: axes and grid are grey
+        drawn = _canvas(
+            tmp_path, [Curves("line", x, "x", {"y": y}, "y")], ".uplot canvas"
+        )
+        wide.append(
+            int((np.ptp(drawn, axis=-1) > 40).any(0).sum())
+        )  # columns with colour: axes and grid are grey
         (tmp_path / "page.html").unlink()
     assert wide[0] > 0.8 * drawn.shape[1]
-    assert 1 - wide[1] / wide[0] == pytest.approx(0.03, abs=0.005)  # ends of lines: 2 px of 1000 each
+    assert 1 - wide[1] / wide[0] == pytest.approx(
+        0.03, abs=0.005
+    )  # ends of lines: 2 px of 1000 each
 
 
 def test_colours_are_told_at_both_ends_and_the_window_in_um(tmp_path):
@@ -153,12 +216,14 @@ for (const key of ["ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowRig
   box.dispatchEvent(new KeyboardEvent("keydown", { key })); said.push(document.querySelector(".readout").textContent);
 }
 return said.map((words) => words.match(/cost ([0-9.]+)/)[1] + (words.includes("Pareto set") ? "*" : "")).join(" ");"""
-    # it opens at the dearest of the front, and stops at the cheapest; 6.5 is not of the front
+    # it opens at the dearest of the front, and stops at the cheapest; 6.5 is not of the
+    # front
     assert _told(tmp_path, [_points()], script) == "9* 6.5 4* 1* 1* 4*"
 
 
 def test_a_click_picks_the_nearest_point_and_tells_what_is_known_of_it(tmp_path):
-    # the plot spans the values and 6 % of them on either side, so a point lies at a known share of its edges
+    # the plot spans the values and 6 % of them on either side, so a point lies at a
+    # known share of its edges
     script = """const over = document.querySelector(".u-over"), r = over.getBoundingClientRect(), said = [];
 for (const [x, y] of [[4, 0.5], [6.5, 0.8], [1, 0.9]]) {
   const across = ((x - 1) / 8 + 0.06) / 1.12, up = ((y - 0.2) / 0.7 + 0.06) / 1.12;
@@ -177,14 +242,26 @@ def test_points_have_their_table(tmp_path):
     script = """const box = document.querySelector("details"); box.open = true; box.dispatchEvent(new Event("toggle"));
 const words = (row) => [...row.children].map((cell) => cell.textContent).join(",");
 return [...box.querySelectorAll("tbody tr")].map(words).join("|");"""
-    assert _told(tmp_path, [_points()], script) == "b,1,0.9,yes,0.1|a,4,0.5,yes,0.4|b,6.5,0.8,,0.65|a,9,0.2,yes,0.9"
+    assert (
+        _told(tmp_path, [_points()], script)
+        == "b,1,0.9,yes,0.1|a,4,0.5,yes,0.4|b,6.5,0.8,,0.65|a,9,0.2,yes,0.9"
+    )
 
 
 def test_a_map_reaches_the_paper(tmp_path):
-    index = np.where(np.hypot(*(np.mgrid[:300, :300] - 150)) < 140, 1, 0).astype(np.uint8)
-    page.write(tmp_path / "page.html", "page", [Classes("mask", index, np.array([120.0]), 0.3, "nm")])
+    index = np.where(np.hypot(*(np.mgrid[:300, :300] - 150)) < 140, 1, 0).astype(
+        np.uint8
+    )
+    page.write(
+        tmp_path / "page.html",
+        "page",
+        [Classes("mask", index, np.array([120.0]), 0.3, "nm")],
+    )
     printed(tmp_path / "page.html", tmp_path / "page.pdf")
     sheets = (tmp_path / "page.pdf").read_bytes()
-    wide = [int(size) for size in re.findall(rb"/Subtype /Image\s+/Width (\d+)", sheets)]
-    # 180 mm of paper at 96 px an inch: what is drawn for it is a picture as wide, beside its bar of colours at most
+    wide = [
+        int(size) for size in re.findall(rb"/Subtype /Image\s+/Width (\d+)", sheets)
+    ]
+    # 180 mm of paper at 96 px an inch: what is drawn for it is a picture as wide,
+    # beside its bar of colours at most
     assert max(wide, default=0) > 600

@@ -1,4 +1,6 @@
-"""Pages to explore artefacts: nothing is lost on the way into the page, nothing leads out of it, a browser shows it."""
+"""Pages to explore artefacts: nothing is lost on the way into the page, nothing leads
+out of it, a browser shows it.
+"""
 
 import base64
 import dataclasses
@@ -19,7 +21,16 @@ from metalens.ground.errors import OutputError, StoreError
 from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.profiles import Focus
 from metalens.proxy import Proxy
-from metalens.view import Axis, Classes, Curves, Images, Numbers, Points, artefacts, page
+from metalens.view import (
+    Axis,
+    Classes,
+    Curves,
+    Images,
+    Numbers,
+    Points,
+    artefacts,
+    page,
+)
 from metalens.view.panels import classes_of
 from tests.metalens.view.browser_page import BROWSER, told
 
@@ -31,7 +42,9 @@ def _unpacked(entry):
 
 
 def _content(text):
-    inside = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    inside = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', text, re.S
+    )
     return json.loads(inside.group(1))
 
 
@@ -39,11 +52,17 @@ def _content(text):
 def folder(tmp_path_factory):
     """A lens without symmetry and its PSFs."""
     folder = tmp_path_factory.mktemp("view")
-    coefficients = np.polynomial.Chebyshev.interpolate(lambda d: 55 * d, 2, domain=[0.08, 0.21]).coef[None]
-    proxy = Proxy(coefficients, np.array([[0.83]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0)
+    coefficients = np.polynomial.Chebyshev.interpolate(
+        lambda d: 55 * d, 2, domain=[0.08, 0.21]
+    ).coef[None]
+    proxy = Proxy(
+        coefficients, np.array([[0.83]]), (0.08, 0.21), (0.85, 0.85), 0.0, 0.0
+    )
     focus = Focus(0.85, 60.0, 900.0)
     made, _ = make(
-        lambda x, y: 1.7e-2 * x**3 + 0.4 * y[:, None] - 0.031 * (x**2 + y[:, None] ** 2),
+        lambda x, y: (
+            1.7e-2 * x**3 + 0.4 * y[:, None] - 0.031 * (x**2 + y[:, None] ** 2)
+        ),
         focus,
         aperture_um=17.0,
         cell=Cell(pitch_um=0.30, pillar=Index(3.6)),
@@ -57,24 +76,41 @@ def folder(tmp_path_factory):
 
 def test_every_pillar_is_in_the_page(folder):
     design = lens.load(folder / "lens.h5")
-    panel = _content(page.html("lens", artefacts.lens_panels(folder / "lens.h5")))["panels"][0]
+    panel = _content(page.html("lens", artefacts.lens_panels(folder / "lens.h5")))[
+        "panels"
+    ][0]
     index, sizes = _unpacked(panel["index"]), np.array([0.0, *panel["sizes"]])
     # sizes have six digits: half of the last one is 5e-4 nm
     assert np.abs(sizes[index] - 1e3 * design.diameters.diameter_um).max() < 5.1e-4
     assert panel["pitch"] == 0.3
     picked = tuple(np.argwhere(index > 0)[37])
     turns = design.phase_rad()[picked] / (2 * np.pi)
-    assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(turns, rel=1e-5)
+    assert panel["columns"]["phase / turns"][index[picked] - 1] == pytest.approx(
+        turns, rel=1e-5
+    )
 
 
 def test_bands_of_a_library_are_its_bars_and_what_they_turn_the_phase_by(tmp_path):
-    """The largest turn of t by a circle of the bar's radius around it; a quarter where the bar holds 0."""
+    """The largest turn of t by a circle of the bar's radius around it; a quarter where
+    the bar holds 0.
+    """
     d = np.linspace(0.08, 0.21, 20)
     t = (np.linspace(0.9, 0.3, 20) * np.exp(55j * d))[None, None, None]
     bar = np.linspace(0.02, 0.28, 20)[None, None, None] * np.ones(t.shape)
     bar[..., 7] = 0.95
-    parts = (np.zeros(1), np.array([0.85]), d, t, 0.4 * t, bar, np.ones(t.shape), np.array([[0, 0, 0.85, 0.12, 3e-3]]))
-    made = PillarLibrary(Cell(0.30, pillar=Index(3.6)), Sweep(), ("x",), *parts, "modal", 20)
+    parts = (
+        np.zeros(1),
+        np.array([0.85]),
+        d,
+        t,
+        0.4 * t,
+        bar,
+        np.ones(t.shape),
+        np.array([[0, 0, 0.85, 0.12, 3e-3]]),
+    )
+    made = PillarLibrary(
+        Cell(0.30, pillar=Index(3.6)), Sweep(), ("x",), *parts, "modal", 20
+    )
     libraries.save(tmp_path / "l.h5", made)
     size, phase, error = artefacts.library_panels(tmp_path / "l.h5")
     assert size.x == pytest.approx(1e3 * d)
@@ -84,18 +120,26 @@ def test_bands_of_a_library_are_its_bars_and_what_they_turn_the_phase_by(tmp_pat
     assert np.ravel(size.bands) == pytest.approx([117.0, 123.0])
     assert phase.lines["phase"] == pytest.approx(np.unwrap(np.angle(t)) / (2 * np.pi))
     circle = np.exp(1j * np.linspace(0, 2 * np.pi, 3001))
-    turned = np.abs(np.angle(1 + bar[..., None] / np.abs(t)[..., None] * circle)).max(-1) / (2 * np.pi)
+    turned = np.abs(np.angle(1 + bar[..., None] / np.abs(t)[..., None] * circle)).max(
+        -1
+    ) / (2 * np.pi)
     turned[..., 7] = 0.25
     assert phase.errors["phase"] == pytest.approx(turned, rel=1e-5)
 
 
-def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(folder, monkeypatch):
-    """Two angles of three depths of 28 x 28 samples: half of them leave the first and the last depth."""
+def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(
+    folder, monkeypatch
+):
+    """Two angles of three depths of 28 x 28 samples: half of them leave the first and
+    the last depth.
+    """
     stack = psf.load(folder / "psf.h5")
     monkeypatch.setattr(artefacts, "MOST_SAMPLES", stack.intensity.size // 2)
     images, curves, _ = artefacts.psf_panels(folder / "psf.h5")
     assert images.axes[-1].values == pytest.approx([0.7, 1.4])
-    assert images.values == pytest.approx(stack.intensity[..., ::2, :, :] / stack.intensity[..., ::2, :, :].max())
+    assert images.values == pytest.approx(
+        stack.intensity[..., ::2, :, :] / stack.intensity[..., ::2, :, :].max()
+    )
     assert curves.x == pytest.approx([0.7, 1.4])
     energy = stack.energy_um2[..., ::2]
     assert curves.lines["light in the window"] == pytest.approx(energy / energy.max())
@@ -103,7 +147,9 @@ def test_depths_of_a_stack_too_large_for_one_page_are_left_out_with_their_names(
 
 def test_psfs_keep_their_axes(folder):
     stack = psf.load(folder / "psf.h5")
-    panel = _content(page.html("psf", artefacts.psf_panels(folder / "psf.h5")))["panels"][0]
+    panel = _content(page.html("psf", artefacts.psf_panels(folder / "psf.h5")))[
+        "panels"
+    ][0]
     values = _unpacked(panel["values"])
     assert values.shape == (2, 3, 28, 28)
     assert [axis["name"] for axis in panel["axes"]] == ["field angle", "depth"]
@@ -114,8 +160,16 @@ def test_psfs_keep_their_axes(folder):
 
 
 def test_nothing_in_a_page_leads_out_of_it(folder):
-    text = page.html("a & b </script><script>alert(1)</script>", artefacts.psf_panels(folder / "psf.h5"))
-    outside = set(re.findall(r"(?:src|href)\s*=\s*[\"']?(?!data:|#)[^\s\"'>]+|@import|fetch\(|XMLHttpRequest", text))
+    text = page.html(
+        "a & b </script><script>alert(1)</script>",
+        artefacts.psf_panels(folder / "psf.h5"),
+    )
+    outside = set(
+        re.findall(
+            r"(?:src|href)\s*=\s*[\"']?(?!data:|#)[^\s\"'>]+|@import|fetch\(|XMLHttpRequest",
+            text,
+        )
+    )
     assert not outside
     assert _content(text)["title"] == "a & b </script><script>alert(1)</script>"
     assert "<script>alert" not in text
@@ -132,7 +186,9 @@ def test_few_sizes_are_kept_as_they_are_and_many_in_equal_steps():
     index, sizes = classes_of(many, most=300)
     assert index[3, 7] == 0
     held = many > 0
-    assert np.abs(sizes[index[held] - 1] - many[held]).max() <= 0.5001 * 0.13 / 299  # half a step
+    assert (
+        np.abs(sizes[index[held] - 1] - many[held]).max() <= 0.5001 * 0.13 / 299
+    )  # half a step
 
 
 def test_figures_that_do_not_fit_are_refused():
@@ -144,8 +200,17 @@ def test_figures_that_do_not_fit_are_refused():
 
 def test_psfs_of_several_lights_have_a_slider(folder, tmp_path):
     stack = psf.load(folder / "psf.h5")
-    red = dataclasses.replace(stack, intensity=0.5 * stack.intensity[..., ::-1], wavelengths_um=np.array([0.94]))
-    broad = dataclasses.replace(red, wavelengths_um=np.array([0.93, 0.95]), weights=np.array([0.5, 0.5]), error=0.03)
+    red = dataclasses.replace(
+        stack,
+        intensity=0.5 * stack.intensity[..., ::-1],
+        wavelengths_um=np.array([0.94]),
+    )
+    broad = dataclasses.replace(
+        red,
+        wavelengths_um=np.array([0.93, 0.95]),
+        weights=np.array([0.5, 0.5]),
+        error=0.03,
+    )
     for name, one in (("a", stack), ("b", red), ("c", broad)):
         psf.save(tmp_path / f"{name}.h5", one)
     assert view.kind_of(tmp_path) == "lights"
@@ -153,11 +218,15 @@ def test_psfs_of_several_lights_have_a_slider(folder, tmp_path):
     wave = f"{1e3 * float(stack.wavelengths_um[0]):.4g}"
     assert images.axes[0].values == [f"a, {wave} nm", "b, 940 nm", "c, 930 to 950 nm"]
     assert images.values.shape == (3, *stack.intensity.shape)
-    assert images.values[1] == pytest.approx(0.5 * stack.intensity[..., ::-1] / stack.intensity.max())
+    assert images.values[1] == pytest.approx(
+        0.5 * stack.intensity[..., ::-1] / stack.intensity.max()
+    )
     assert "3.0e-02" in images.caption  # of the worst
     assert len(budget.head) == 4
     assert curves.lines["peak"].shape == (3, *stack.intensity.shape[:-2])
-    psf.save(tmp_path / "d.h5", dataclasses.replace(stack, depths_um=1.5 * stack.depths_um))
+    psf.save(
+        tmp_path / "d.h5", dataclasses.replace(stack, depths_um=1.5 * stack.depths_um)
+    )
     with pytest.raises(StoreError, match=r"d.h5 has other depths_um than a.h5"):
         artefacts.lights_panels(tmp_path)
 
@@ -170,7 +239,9 @@ def test_points_need_a_place_and_a_name_each():
 
 
 def test_a_psf_tells_what_its_error_is_made_of(folder):
-    budget = {row[0]: row[1] for row in artefacts.psf_panels(folder / "psf.h5")[-1].rows}
+    budget = {
+        row[0]: row[1] for row in artefacts.psf_panels(folder / "psf.h5")[-1].rows
+    }
     held = psf.load(folder / "psf.h5").budget
     assert budget["numerical"] == held.numerical
     assert budget["outside"] == (held.outside if held.outside == held.outside else "–")
@@ -179,7 +250,9 @@ def test_a_psf_tells_what_its_error_is_made_of(folder):
 
 def test_the_command_writes_a_page_once(folder, tmp_path):
     target = tmp_path / "out.html"
-    assert view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
+    assert (
+        view.run(view.Options(file=folder / "psf.h5", output=target, quiet=True)) == 0
+    )
     assert _content(target.read_text(encoding="utf-8"))["about"]["made with"]
 
 
@@ -195,7 +268,13 @@ def test_a_far_field_keeps_its_directions(tmp_path):
         "error": np.array([1e-7, 3e-7]),
     }
     about = {"wavelength_um": 0.85}
-    store.save(tmp_path / "f.h5", "far-field", arrays, attributes=about, provenance=store.Provenance())
+    store.save(
+        tmp_path / "f.h5",
+        "far-field",
+        arrays,
+        attributes=about,
+        provenance=store.Provenance(),
+    )
     light, cones, beams = artefacts.far_field_panels(tmp_path / "f.h5")
     assert light.step_um == pytest.approx(0.1)
     assert light.across == "sine"
@@ -206,28 +285,50 @@ def test_a_far_field_keeps_its_directions(tmp_path):
 
 
 def test_a_page_goes_beside_a_report_of_the_same_name(tmp_path):
-    store.save(tmp_path / "psf.h5", "odd", {"image": np.eye(12)}, provenance=store.Provenance())
+    store.save(
+        tmp_path / "psf.h5", "odd", {"image": np.eye(12)}, provenance=store.Provenance()
+    )
     report = tmp_path / "psf.html"
-    report.write_text('<!doctype html><meta name="generator" content="metalens"><p>report</p>', encoding="utf-8")
+    report.write_text(
+        '<!doctype html><meta name="generator" content="metalens"><p>report</p>',
+        encoding="utf-8",
+    )
     options = view.Options(file=tmp_path / "psf.h5", quiet=True)
     assert view.run(options) == 0
     assert "report" in report.read_text(encoding="utf-8")
     assert "odd" in (tmp_path / "psf_view.html").read_text(encoding="utf-8")
     report.unlink()
     assert view.run(options) == 0
-    with pytest.raises(OutputError, match=r"psf\.html exists"):  # a page is not written over without a word
+    with pytest.raises(
+        OutputError, match=r"psf\.html exists"
+    ):  # a page is not written over without a word
         view.run(options)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no browser to show the page in: install chromium")
+@pytest.mark.skipif(
+    BROWSER is None, reason="no browser to show the page in: install chromium"
+)
 @pytest.mark.parametrize("what", ["lens", "psf", "all"])
 def test_a_browser_shows_every_figure(what, folder, tmp_path):
     if what == "all":
         x = np.linspace(1, 3, 17)
         panels = [
-            Curves("line", x, "x", {"y": x**2}, "y", errors={"y": 0.1 * x}, bands=[(1.5, 1.7)]),
+            Curves(
+                "line",
+                x,
+                "x",
+                {"y": x**2},
+                "y",
+                errors={"y": 0.1 * x},
+                bands=[(1.5, 1.7)],
+            ),
             Classes(
-                "map", np.array([[0, 1], [2, 1]], np.uint8), np.array([90.0, 130.0]), 0.3, "nm", marks=[(0, 0, "m")]
+                "map",
+                np.array([[0, 1], [2, 1]], np.uint8),
+                np.array([90.0, 130.0]),
+                0.3,
+                "nm",
+                marks=[(0, 0, "m")],
             ),
             Numbers("table", ("a", "b"), [(1.25, "text"), (float("nan"), "x")]),
         ]
@@ -242,6 +343,12 @@ def test_a_browser_shows_every_figure(what, folder, tmp_path):
     assert shown.count("<canvas") >= sum(not isinstance(p, Numbers) for p in panels)
     if what == "psf":  # the number under the cross is that of the file
         stack = psf.load(folder / "psf.h5").intensity
-        number = float(re.search(r"x 0.25 µm, y 0.25 µm: ([0-9.e-]+) of", shown).group(1))
-        angle, depth, *_ = np.unravel_index(int(stack.argmax()), stack.shape)  # sliders begin at the highest peak
-        assert number == pytest.approx(float(stack[angle, depth, 14, 14] / stack.max()), rel=1e-3)  # four digits
+        number = float(
+            re.search(r"x 0.25 µm, y 0.25 µm: ([0-9.e-]+) of", shown).group(1)
+        )
+        angle, depth, *_ = np.unravel_index(
+            int(stack.argmax()), stack.shape
+        )  # sliders begin at the highest peak
+        assert number == pytest.approx(
+            float(stack[angle, depth, 14, 14] / stack.max()), rel=1e-3
+        )  # four digits

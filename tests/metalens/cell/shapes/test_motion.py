@@ -1,15 +1,36 @@
-"""Fourier factors of a rim that moves, against differences of the factors themselves, and integrals done by hand."""
+"""Fourier factors of a rim that moves, against differences of the factors themselves,
+and integrals done by hand.
+"""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from metalens.cell.shapes import Circle, Cross, Ellipse, Loop, Outline, Polygon, Rectangle, RegularPolygon, Ring, motion
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Loop,
+    Outline,
+    Polygon,
+    Rectangle,
+    RegularPolygon,
+    Ring,
+    motion,
+)
 from metalens.ground.errors import CellError
 
 KITE = Polygon(((0.5, -0.3), (-0.5, -0.2), (0.1, 0.6)), 0.3)  # clockwise
-SHAPES = (Circle(), Ellipse(0.6, 0.3), Ring(0.4), Rectangle(0.5, 0.2), Cross(0.3, 0.1), RegularPolygon(5, 0.2), KITE)
+SHAPES = (
+    Circle(),
+    Ellipse(0.6, 0.3),
+    Ring(0.4),
+    Rectangle(0.5, 0.2),
+    Cross(0.3, 0.1),
+    RegularPolygon(5, 0.2),
+    KITE,
+)
 rng = np.random.default_rng(3)
 GX, GY = rng.normal(size=(2, 40)) * 20  # per um, of orders of pitches from 0.1 um on
 
@@ -26,7 +47,9 @@ def moving(shape, name):
         return lambda x: shape.outline(0.23 + x, grow_um=0.011)
     if name == "grow":
         return lambda x: shape.outline(0.23, grow_um=0.011 + x)
-    return lambda x: dataclasses.replace(shape, **{name: getattr(shape, name) + x}).outline(0.23, grow_um=0.011)
+    return lambda x: dataclasses.replace(
+        shape, **{name: getattr(shape, name) + x}
+    ).outline(0.23, grow_um=0.011)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.kind)
@@ -38,7 +61,9 @@ def test_a_moving_rim_changes_the_factors_as_their_differences(shape, name):
     rates = motion.difference(lambda x: motion.numbers(made(x)), 1e-4)
     want = differenced(lambda x: made(x).fourier(GX, GY), 3e-4)
     got = motion.pushed(made(0.0), GX, GY, rates)
-    assert np.abs(got - want).max() < 1e-7 * np.abs(want).max()  # step^4 of the differences
+    assert (
+        np.abs(got - want).max() < 1e-7 * np.abs(want).max()
+    )  # step^4 of the differences
 
 
 def test_at_no_wave_number_it_is_the_change_of_area():
@@ -48,10 +73,14 @@ def test_at_no_wave_number_it_is_the_change_of_area():
         rates = motion.difference(lambda x, made=made: motion.numbers(made(x)), 1e-4)
         area = differenced(lambda x, made=made: made(x).area_um2, 1e-3)
         small = np.array([0.0, 4e-3])  # s of 5e-4, whose square is left
-        assert motion.pushed(made(0.0), small, small, rates).real == pytest.approx(area, rel=1e-6)
+        assert motion.pushed(made(0.0), small, small, rates).real == pytest.approx(
+            area, rel=1e-6
+        )
     loop = Outline((Loop(((0.1, -0.3), (-0.1, 0.2), (0.25, 0.3)), sign=-1),))
     got = motion.pushed(loop, GX, GY, np.tile([0.3, -0.7], 3))
-    assert got == pytest.approx(-1j * (0.3 * GX - 0.7 * GY) * loop.fourier(GX, GY), rel=1e-9, abs=1e-12)
+    assert got == pytest.approx(
+        -1j * (0.3 * GX - 0.7 * GY) * loop.fourier(GX, GY), rel=1e-9, abs=1e-12
+    )
 
 
 def test_a_hole_that_is_just_closing_is_refused():

@@ -1,4 +1,6 @@
-"""Sections by theorems of Gauss and Steiner: normals, offsets, gaps, symmetries, factors near zero frequency."""
+"""Sections by theorems of Gauss and Steiner: normals, offsets, gaps, symmetries,
+factors near zero frequency.
+"""
 
 import math
 
@@ -14,10 +16,18 @@ BENT = Outline((Loop(TRIANGLE), Conic(0.04, 0.02, 0.5, -1)))
 
 
 @pytest.mark.parametrize(
-    "part", [Loop(TRIANGLE), Loop(TRIANGLE[::-1]), Conic(0.3, 0.17, 0.6), Conic(0.2, 0.4, -1.1, -1)]
+    "part",
+    [
+        Loop(TRIANGLE),
+        Loop(TRIANGLE[::-1]),
+        Conic(0.3, 0.17, 0.6),
+        Conic(0.2, 0.4, -1.1, -1),
+    ],
 )
 def test_normals_leave_a_part_everywhere(part):
-    """Gauss: the integral of n over a closed line is 0, of x n_x and of y n_y the area, of x n_y nothing."""
+    """Gauss: the integral of n over a closed line is 0, of x n_x and of y n_y the area,
+    of x n_y nothing.
+    """
     made = Outline((part,))
     step = 0.004
     points, normals = made.boundary(step)
@@ -37,29 +47,41 @@ def test_normals_leave_a_part_everywhere(part):
 def test_an_ellipse_is_drawn_with_its_area_and_turn():
     corners = Conic(0.3, 0.1, 0.4).vertices(40)
     x, y = corners.T
-    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(math.pi * 0.03, rel=1e-12)
+    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(
+        math.pi * 0.03, rel=1e-12
+    )
     far = corners[np.hypot(x, y).argmax()]
     assert abs(math.remainder(math.atan2(far[1], far[0]) - 0.4, math.pi)) < 1e-9
     assert Conic(0.3, 0.1, sign=-1).area_um2 == pytest.approx(-math.pi * 0.03)
-    assert BENT.area_um2 == pytest.approx(Loop(TRIANGLE).area_um2 - math.pi * 0.04 * 0.02)
-    assert Outline((Conic(0.3, 0.1, 0.4),)).radius_um == pytest.approx(0.3, rel=2e-3)  # 64 points of equal area
+    assert BENT.area_um2 == pytest.approx(
+        Loop(TRIANGLE).area_um2 - math.pi * 0.04 * 0.02
+    )
+    assert Outline((Conic(0.3, 0.1, 0.4),)).radius_um == pytest.approx(
+        0.3, rel=2e-3
+    )  # 64 points of equal area
 
 
-@pytest.mark.parametrize("part", [Loop(TRIANGLE), Loop(TRIANGLE, -1), Conic(0.3, 0.17, 0.6)])
+@pytest.mark.parametrize(
+    "part", [Loop(TRIANGLE), Loop(TRIANGLE, -1), Conic(0.3, 0.17, 0.6)]
+)
 def test_factors_near_zero_are_area_and_centroid(part):
-    """f(g) = A (1 - i g c) + O(g²), also where another formula takes over (|g| size 1e-4; 1e-6 for ellipses)."""
+    """f(g) = A (1 - i g c) + O(g²), also where another formula takes over (|g| size
+    1e-4; 1e-6 for ellipses).
+    """
     centre = np.mean(TRIANGLE, axis=0) if isinstance(part, Loop) else np.zeros(2)
     for size in (2e-6, 2e-4, 4e-4, 1e-3):
         gx, gy = size * 0.8, -size * 0.6
         want = part.area_um2 * (1 - 1j * (gx * centre[0] + gy * centre[1]))
-        assert abs(complex(part.fourier(np.array(gx), np.array(gy))) - want) < abs(part.area_um2) * (
-            size**2 + 1e-11 / size
-        )
+        assert abs(complex(part.fourier(np.array(gx), np.array(gy))) - want) < abs(
+            part.area_um2
+        ) * (size**2 + 1e-11 / size)
 
 
 @pytest.mark.parametrize("grow", [0.06, -0.03])
 def test_an_outline_moved_out_grows_as_steiner_says(grow):
-    """A' = A + P t + t² Σ tan(turn / 2) with mitred corners, t = grow / 2; edges stay parallel."""
+    """A' = A + P t + t² Σ tan(turn / 2) with mitred corners, t = grow / 2; edges stay
+    parallel.
+    """
     corners = np.array(TRIANGLE)
     edge = np.roll(corners, -1, axis=0) - corners
     lengths = np.hypot(*edge.T)
@@ -70,8 +92,12 @@ def test_an_outline_moved_out_grows_as_steiner_says(grow):
     made = np.array(outline.moved(corners, grow))
     assert Loop(tuple(map(tuple, made))).area_um2 == pytest.approx(want, rel=1e-9)
     after = np.roll(made, -1, axis=0) - made
-    assert edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0] == pytest.approx(np.zeros(3), abs=1e-12)
-    other = np.array(sorted(outline.moved(corners[::-1], grow)))  # clockwise corners are turned round first
+    assert edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0] == pytest.approx(
+        np.zeros(3), abs=1e-12
+    )
+    other = np.array(
+        sorted(outline.moved(corners[::-1], grow))
+    )  # clockwise corners are turned round first
     assert other == pytest.approx(np.array(sorted(made.tolist())), rel=1e-9)
     with pytest.raises(CellError, match="loses an edge"):
         outline.moved(corners, -0.5)
@@ -79,18 +105,26 @@ def test_an_outline_moved_out_grows_as_steiner_says(grow):
 
 def test_corners_are_turned_from_x_towards_y():
     assert outline.turned(np.array([[2.0, 0.0], [0.0, 1.0]]), 0.3) == pytest.approx(
-        np.array([[2 * math.cos(0.3), 2 * math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]])
+        np.array(
+            [[2 * math.cos(0.3), 2 * math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]]
+        )
     )
 
 
 def test_gaps_between_copies_are_distances():
-    """Ellipses of half width 0.3 and 0.1 at 1 along x and 0.5 along y; touching ones have none."""
+    """Ellipses of half width 0.3 and 0.1 at 1 along x and 0.5 along y; touching ones
+    have none.
+    """
     made = Outline((Conic(0.3, 0.1),))
     assert made.gap_um(((1.0, 0.0),)) == pytest.approx(0.4, rel=0.02)
     assert made.gap_um(((0.0, 0.5),)) == pytest.approx(0.3, rel=0.02)
-    assert made.gap_um(((1.0, 0.0), (0.0, 0.5), (9.0, 9.0))) == pytest.approx(0.3, rel=0.02)
+    assert made.gap_um(((1.0, 0.0), (0.0, 0.5), (9.0, 9.0))) == pytest.approx(
+        0.3, rel=0.02
+    )
     assert made.gap_um(((0.55, 0.0),)) == 0
-    assert Outline((Conic(0.3, 0.1, math.pi / 2),)).gap_um(((1.0, 0.0),)) == pytest.approx(0.8, rel=0.02)
+    assert Outline((Conic(0.3, 0.1, math.pi / 2),)).gap_um(
+        ((1.0, 0.0),)
+    ) == pytest.approx(0.8, rel=0.02)
     diagonal = Outline((Conic(0.2, 0.2),))
     assert diagonal.gap_um(((0.6, 0.45),)) == pytest.approx(0.75 - 0.4, rel=0.02)
 

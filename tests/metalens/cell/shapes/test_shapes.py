@@ -1,4 +1,6 @@
-"""Sections of pillars: Fourier factors against sums over pixels, areas, mirrors, gaps, bias, and the TOML of a cell."""
+"""Sections of pillars: Fourier factors against sums over pixels, areas, mirrors, gaps,
+bias, and the TOML of a cell.
+"""
 
 import math
 
@@ -6,7 +8,17 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Lattice, Layer
-from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, RegularPolygon, Ring, Square, straight
+from metalens.cell.shapes import (
+    Circle,
+    Cross,
+    Ellipse,
+    Polygon,
+    Rectangle,
+    RegularPolygon,
+    Ring,
+    Square,
+    straight,
+)
 from metalens.ground import config
 from metalens.ground.errors import CellError, ConfigError
 
@@ -29,7 +41,9 @@ def test_fourier_factors_and_area_against_a_sum_over_pixels(shape):
     axis = (np.arange(601) - 300) * step
     x, y = np.meshgrid(axis, axis)
     solid = outline.inside(x, y)
-    edge = 4 * outline.radius_um * step * step**0.5  # pixels on the rim are right or wrong at random
+    edge = (
+        4 * outline.radius_um * step * step**0.5
+    )  # pixels on the rim are right or wrong at random
     assert abs(solid.sum() * step**2 - outline.area_um2) < 10 * edge
     for gx, gy in ((7.0, -11.0), (0.0, 23.0), (-31.0, 4.0), (0.0, 0.0)):
         wave = (solid * np.exp(-1j * (gx * x + gy * y))).sum() * step**2
@@ -45,7 +59,10 @@ def test_mask_polygon_keeps_the_area_and_the_cell_its_toml(shape):
         made += sign * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
     assert abs(made - outline.area_um2) < 1e-12
     cell = Cell(
-        0.5, shape=shape, lattice=Lattice("hexagonal"), layers=(Layer(0.1, 0.02), Layer(0.6, coat_um=0.01, coat="SiO2"))
+        0.5,
+        shape=shape,
+        lattice=Lattice("hexagonal"),
+        layers=(Layer(0.1, 0.02), Layer(0.6, coat_um=0.01, coat="SiO2")),
     )
     assert config.loads(config.dumps(cell), Cell) == cell
 
@@ -56,15 +73,23 @@ def test_a_ring_whose_hole_is_closed_is_a_disc(grow_um, parts):
     made = Ring(0.25).outline(0.5, grow_um=grow_um)
     assert len(made.parts) == parts
     inner = max(0.125 - grow_um, 0.0)
-    assert made.area_um2 == pytest.approx(math.pi / 4 * ((0.5 + grow_um) ** 2 - inner**2))
+    assert made.area_um2 == pytest.approx(
+        math.pi / 4 * ((0.5 + grow_um) ** 2 - inner**2)
+    )
 
 
 def test_areas_in_closed_form():
     assert Ellipse(0.5).outline(0.4).area_um2 == pytest.approx(math.pi * 0.2 * 0.1)
-    assert Ring(0.25).outline(0.4).area_um2 == pytest.approx(math.pi * (0.2**2 - 0.05**2))
-    assert Rectangle(2.5, 0.7).outline(0.2, grow_um=0.02).area_um2 == pytest.approx(0.22 * 0.52)
+    assert Ring(0.25).outline(0.4).area_um2 == pytest.approx(
+        math.pi * (0.2**2 - 0.05**2)
+    )
+    assert Rectangle(2.5, 0.7).outline(0.2, grow_um=0.02).area_um2 == pytest.approx(
+        0.22 * 0.52
+    )
     assert Cross(0.3).outline(0.5).area_um2 == pytest.approx(2 * 0.5 * 0.15 - 0.15**2)
-    assert RegularPolygon(6).outline(0.4).area_um2 == pytest.approx(1.5 * math.sqrt(3) * 0.2**2)
+    assert RegularPolygon(6).outline(0.4).area_um2 == pytest.approx(
+        1.5 * math.sqrt(3) * 0.2**2
+    )
 
 
 def test_mirrors_and_half_turns():
@@ -79,8 +104,12 @@ def test_mirrors_and_half_turns():
 def test_gap_to_the_neighbours_and_touching():
     assert Cell(0.5).gap_um(0.2) == pytest.approx(0.3, abs=0.003)
     assert Cell(0.5, shape=Rectangle(2.0)).gap_um(0.2) == pytest.approx(0.1, abs=0.003)
-    assert Cell(0.5, shape=Square(math.pi / 4)).gap_um(0.3) == pytest.approx(0.5 - 0.3 * math.sqrt(2), abs=0.003)
-    assert Cell(0.5, lattice=Lattice("rectangular", 0.6)).gap_um(0.2) == pytest.approx(0.1, abs=0.003)
+    assert Cell(0.5, shape=Square(math.pi / 4)).gap_um(0.3) == pytest.approx(
+        0.5 - 0.3 * math.sqrt(2), abs=0.003
+    )
+    assert Cell(0.5, lattice=Lattice("rectangular", 0.6)).gap_um(0.2) == pytest.approx(
+        0.1, abs=0.003
+    )
     assert Cell(0.5, shape=Square()).gap_um(0.55) == 0.0
 
 
@@ -97,7 +126,10 @@ def test_a_cell_without_a_shape_is_a_round_pillar_and_old_text_still_reads():
         ('kind = "circel"', "did you mean 'circle'"),
         ("ratio = 2.0", "shape.kind is None"),
         ('kind = "rectangle"\nratio = 0.0', "rectangle ratio"),
-        ('kind = "polygon"\ncorners = [[0, 0], [1, 1], [1, 0], [0, 1]]', "edges 0 and 2 cross"),
+        (
+            'kind = "polygon"\ncorners = [[0, 0], [1, 1], [1, 0], [0, 1]]',
+            "edges 0 and 2 cross",
+        ),
     ],
 )
 def test_bad_shapes_are_refused_with_the_key(text, message):
@@ -118,7 +150,9 @@ def test_bias_that_eats_the_outline_is_refused():
 
 
 def test_edges_cross_where_both_hold_the_same_point():
-    """Random edges anywhere: the point that lies on both lines, by solving for its shares along them."""
+    """Random edges anywhere: the point that lies on both lines, by solving for its
+    shares along them.
+    """
     rng, met = np.random.default_rng(14), 0
     for _ in range(300):
         a, b, c, d = rng.uniform(-1, 1, (4, 2)) + rng.uniform(-3, 3, 2)
@@ -129,30 +163,55 @@ def test_edges_cross_where_both_hold_the_same_point():
     assert 40 < met < 260
 
 
-U = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (0.2, 0.5), (0.2, -0.2), (-0.3, -0.2), (-0.3, 0.5), (-0.5, 0.5))
+U = (
+    (-0.5, -0.5),
+    (0.5, -0.5),
+    (0.5, 0.5),
+    (0.2, 0.5),
+    (0.2, -0.2),
+    (-0.3, -0.2),
+    (-0.3, 0.5),
+    (-0.5, 0.5),
+)
 
 
 @pytest.mark.parametrize(
     ("shape", "width", "space"),
     [
         (Circle(), 0.3, math.inf),
-        (Ellipse(0.3, 0.7), 0.09, math.inf),  # its shortest chord at right angles to a rim is shorter, and no width
+        (
+            Ellipse(0.3, 0.7),
+            0.09,
+            math.inf,
+        ),  # its shortest chord at right angles to a rim is shorter, and no width
         (Ring(0.4), 0.09, 0.12),
         (Square(0.2), 0.3, math.inf),
-        (Cross(0.3, 0.1), 0.09, math.inf),  # sides of two arms stand at right angles and face nowhere
+        (
+            Cross(0.3, 0.1),
+            0.09,
+            math.inf,
+        ),  # sides of two arms stand at right angles and face nowhere
         (RegularPolygon(6, 0.2), 0.15 * math.sqrt(3), math.inf),
-        (Polygon(TRIANGLE), 0.3 * 1.0 * 0.9 / math.hypot(0.5, 0.9), math.inf),  # the height on its longest edge
+        (
+            Polygon(TRIANGLE),
+            0.3 * 1.0 * 0.9 / math.hypot(0.5, 0.9),
+            math.inf,
+        ),  # the height on its longest edge
         (Polygon(U, 0.4), 0.06, 0.15),
     ],
     ids=lambda s: getattr(s, "kind", None),
 )
 def test_walls_bars_holes_and_hollows_are_as_wide_as_they_are(shape, width, space):
-    """Sizes of 0.3: by hand from the corners; curves are 64 edges of the same area (1e-3 of a radius)."""
+    """Sizes of 0.3: by hand from the corners; curves are 64 edges of the same area
+    (1e-3 of a radius).
+    """
     found = shape.outline(0.3).spans_um
     assert found == pytest.approx((width, space), rel=1e-3)
     cell = Cell(0.5, shape=shape)
     if not cell.round:  # what a process prints: 80 nm of width, 70 of space
-        assert cell.size_um(0.08, 0.07) == pytest.approx(0.3 * max(0.08 / width, 0.07 / space), rel=1e-3)
+        assert cell.size_um(0.08, 0.07) == pytest.approx(
+            0.3 * max(0.08 / width, 0.07 / space), rel=1e-3
+        )
 
 
 def test_edges_of_one_line_do_not_cross_and_edges_that_lie_on_each_other_do():
@@ -165,4 +224,6 @@ def test_edges_of_one_line_do_not_cross_and_edges_that_lie_on_each_other_do():
 def test_the_line_around_a_section_for_pictures_encloses_its_area(shape):
     outline = shape.outline(0.31)
     x, y = outline.line(48).T
-    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(outline.area_um2, rel=1e-12)
+    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(
+        outline.area_um2, rel=1e-12
+    )

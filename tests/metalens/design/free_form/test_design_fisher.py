@@ -1,4 +1,6 @@
-"""Free-form design: the spline against closed forms, and a short design that beats its start at the energy asked."""
+"""Free-form design: the spline against closed forms, and a short design that beats its
+start at the energy asked.
+"""
 
 import dataclasses
 import math
@@ -21,7 +23,9 @@ from metalens.image.pupil import Pupil
 
 SMALL = Pupil(radius_um=400.0, nodes=136)
 FOCUS = Focus(0.85, 2000.0, 20e3)
-QUICK = Fisher(grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0)).about(FOCUS, 400.0)
+QUICK = Fisher(
+    grids=(6, 10), iterations=28, starts=1, zones=(2,), focus_mm=(20.0, 20.0)
+).about(FOCUS, 400.0)
 
 
 def test_spline_makes_constants_lines_and_is_smooth():
@@ -37,7 +41,9 @@ def test_spline_makes_constants_lines_and_is_smooth():
 def test_vortices_carry_their_charges():
     turn = np.linspace(-math.pi, math.pi, 1000, endpoint=False)
     for radius, charge in ((100.0, 1), (390.0, 3)):
-        phase = free.vortices(radius * np.cos(turn), radius * np.sin(turn), radius_um=400.0, zones=2)
+        phase = free.vortices(
+            radius * np.cos(turn), radius * np.sin(turn), radius_um=400.0, zones=2
+        )
         winding = np.angle(np.exp(1j * np.diff(phase))).sum() / (2 * math.pi)
         assert winding == pytest.approx(charge, abs=0.01)
 
@@ -48,25 +54,41 @@ def test_a_short_design_gains_information_and_keeps_the_energy():
     made = free.optimise(SMALL, QUICK)
     assert made.converged
     assert float(made.score.encircled.min()) >= 0.499
-    assert float(made.score.information.mean()) > 1.15 * float(before.information.mean())
+    assert float(made.score.information.mean()) > 1.15 * float(
+        before.information.mean()
+    )
 
 
 def test_depths_that_no_image_tells_apart_are_worth_the_least_logarithm():
-    """A kilometre away images do not change: both terms are the log of the floor of 1e-4 per mm²."""
+    """A kilometre away images do not change: both terms are the log of the floor of
+    1e-4 per mm².
+    """
     far = dataclasses.replace(QUICK, depths_mm=(1e6, 2e6))
-    loss, _ = AxialObjective(SMALL, far).loss(torch.zeros(136, 136, dtype=torch.float64), 20e3, None)
-    assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)  # 1e-7 of information over the floor
+    loss, _ = AxialObjective(SMALL, far).loss(
+        torch.zeros(136, 136, dtype=torch.float64), 20e3, None
+    )
+    assert float(loss) == pytest.approx(
+        -math.log(1e-4), abs=1e-3
+    )  # 1e-7 of information over the floor
 
 
 def test_the_same_seed_gives_the_same_phase():
     brief = Fisher(grids=(5,), iterations=2, starts=1).about(FOCUS, 400.0)
-    assert torch.equal(free.optimise(SMALL, brief).controls, free.optimise(SMALL, brief).controls)
+    assert torch.equal(
+        free.optimise(SMALL, brief).controls, free.optimise(SMALL, brief).controls
+    )
 
 
 def test_the_lens_phase_is_the_designed_one():
-    """The function of position and the pupil model give the same phase at the same places."""
-    quick = Fisher(grids=(5,), iterations=1, starts=1, zones=(0,), focus_mm=(20.0, 20.0))
-    phase, found = free.fisher_profile(Focus(0.85, 2000.0, 20e3), radius_um=300.0, settings=quick)
+    """The function of position and the pupil model give the same phase at the same
+    places.
+    """
+    quick = Fisher(
+        grids=(5,), iterations=1, starts=1, zones=(0,), focus_mm=(20.0, 20.0)
+    )
+    phase, found = free.fisher_profile(
+        Focus(0.85, 2000.0, 20e3), radius_um=300.0, settings=quick
+    )
     x = np.array([-200.0, 0.0, 123.0])
     from metalens.design.profiles import hyperbolic
 
@@ -76,20 +98,28 @@ def test_the_lens_phase_is_the_designed_one():
 
 
 def test_the_phase_of_cells_is_that_of_the_nearest_node():
-    brief = Fisher(grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0).about(FOCUS, 400.0)
+    brief = Fisher(
+        grids=(6, 0), iterations=3, starts=1, zones=(0,), encircled=0.0
+    ).about(FOCUS, 400.0)
     found = free.optimise(SMALL, brief)
     assert found.cells
     x, y = (c.numpy() for c in pupils.coordinates(SMALL))
-    there = free.free_form(found.controls.numpy(), SMALL, cells=True)(x[20, 10:15] + 0.5, y[20:21, 12] - 0.5)
+    there = free.free_form(found.controls.numpy(), SMALL, cells=True)(
+        x[20, 10:15] + 0.5, y[20:21, 12] - 0.5
+    )
     assert np.array_equal(there[0], found.controls.numpy()[20, 10:15])
     assert torch.equal(free.phase_on(SMALL, found), found.controls)
 
 
 def test_nlopt_lowers_the_loss_and_holds_the_energy():
-    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12).about(FOCUS, 400.0)
+    settings = Fisher(grids=(6,), zones=(0,), encircled=0.6, refine=12).about(
+        FOCUS, 400.0
+    )
     objective = AxialObjective(SMALL, settings)
     build = free._Phase(SMALL, 6, 0)
-    start = 0.3 * torch.randn(6, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    start = 0.3 * torch.randn(
+        6, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     better = refine(start, build, objective, settings, 20e3)
     before, after = (objective.loss(build(c), 20e3, None) for c in (start, better))
     assert float(after[0]) < float(before[0]) - 0.02
@@ -102,61 +132,105 @@ def test_a_design_for_the_process_judges_its_worst_lens():
     plain = AxialObjective(SMALL, settings)
     flat = torch.zeros(136, 136, dtype=torch.float64)
     still = Robust(plain, SMALL, Variation()).judge(flat, 20e3)
-    assert torch.allclose(still.information, plain.judge(flat, 20e3).information, rtol=1e-4)
+    assert torch.allclose(
+        still.information, plain.judge(flat, 20e3).information, rtol=1e-4
+    )
     moved = Robust(plain, SMALL, Variation(distance_um=40.0)).judge(flat, 20e3)
     nominal = plain.judge(flat, 20e3)
     assert bool((moved.encircled <= nominal.encircled + 1e-6).all())
-    # a sensor 40 um further off is in focus for nearer sources: 1/z = 1/f - 1/d puts 20 mm at 16.7 mm, and 25 mm
-    shifted = [plain.judge(flat, focus).encircled for focus in (20e3 / (1 + 0.2), 20e3 / (1 - 0.2))]
+    # a sensor 40 um further off is in focus for nearer sources: 1/z = 1/f - 1/d puts 20
+    # mm at 16.7 mm, and 25 mm
+    shifted = [
+        plain.judge(flat, focus).encircled
+        for focus in (20e3 / (1 + 0.2), 20e3 / (1 - 0.2))
+    ]
     worst = torch.minimum(nominal.encircled, torch.minimum(*shifted))
-    assert float((moved.encircled - worst).abs().max()) < 0.08  # d changes by 2 %, and with it the blur's scale
+    assert (
+        float((moved.encircled - worst).abs().max()) < 0.08
+    )  # d changes by 2 %, and with it the blur's scale
 
 
 def test_coarse_sampling_at_one_position_claims_what_is_not_there():
-    """Read every 3 um at one position, a climb "reaches" 1.4 where the lens has less than 0.37.
+    """Read every 3 um at one position, a climb "reaches" 1.4 where the lens has less
+    than 0.37.
 
-    Over seeds 0 and 1 it claims 4.0 and 4.3 after 40 steps where 0.07 is there, and 1.5 and 1.8 after 20.
+    Over seeds 0 and 1 it claims 4.0 and 4.3 after 40 steps where 0.07 is there, and 1.5
+    and 1.8 after 20.
     """
     gain = coarse_climb(SMALL, iterations=40)
     assert gain.claimed > 1.4
     assert gain.honest < 0.37
-    assert gain.history[-1, 0] > gain.history[0, 0] * 5  # what it climbs is the claim, from 0.19
+    assert (
+        gain.history[-1, 0] > gain.history[0, 0] * 5
+    )  # what it climbs is the claim, from 0.19
     assert gain.history[-1, 1] < 1.5 * gain.history[0, 1]  # and not the truth
 
 
 def test_impossible_wishes_are_refused():
-    wishes = ("encircled = 1.2", "grids = [2]", "depths_mm = [26.0, 16.0]", "pixel_um = 0.0", "focus_mm = [9.0, 8.0]")
+    wishes = (
+        "encircled = 1.2",
+        "grids = [2]",
+        "depths_mm = [26.0, 16.0]",
+        "pixel_um = 0.0",
+        "focus_mm = [9.0, 8.0]",
+    )
     for wish in wishes:
         with pytest.raises(ConfigError, match=wish.split(" ")[0]):
             config.loads(wish, Fisher)
 
 
 def test_what_is_left_out_follows_the_lens():
-    """The paper's lens as it was; depths scale as the aperture squared, spots as wavelength over NA."""
+    """The paper's lens as it was; depths scale as the aperture squared, spots as
+    wavelength over NA.
+    """
     paper = Fisher().about(Focus(0.85, 2000.0, 20e3), 500.0)
-    assert (paper.depths_mm, paper.focus_mm, paper.radius_um) == ((16.0, 26.0), (18.0, 22.0), 18.0)
+    assert (paper.depths_mm, paper.focus_mm, paper.radius_um) == (
+        (16.0, 26.0),
+        (18.0, 22.0),
+        18.0,
+    )
     assert paper.pixel_um == 3.0
-    assert (paper.window_um, paper.climb_window_um, paper.sample_um, paper.step_um) == (144.0, 96.0, 0.75, 200.0)
+    assert (paper.window_um, paper.climb_window_um, paper.sample_um, paper.step_um) == (
+        144.0,
+        96.0,
+        0.75,
+        200.0,
+    )
     half = Fisher(pixel_um=1.3).about(Focus(0.633, 1500.0, 20e3), 250.0)
     waves = [250.0**2 * abs(1e-3 / z - 1 / 20e3) / (2 * 0.633) for z in half.depths_mm]
     assert waves == pytest.approx([1.75, 1.75], rel=0.08)  # depths of two digits
-    assert half.depths_mm[0] < half.focus_mm[0] < 20.0 < half.focus_mm[1] < half.depths_mm[1]
+    assert (
+        half.depths_mm[0]
+        < half.focus_mm[0]
+        < 20.0
+        < half.focus_mm[1]
+        < half.depths_mm[1]
+    )
     assert half.radius_um == pytest.approx(5.3 * 0.633 * 1500 / 250, rel=0.03)
     assert half.sample_um == pytest.approx(1.3 / 4, rel=0.03)
     own = Fisher(depths_mm=(7.0, 8.0)).about(Focus(0.85, 2000.0, 20e3), 500.0)
     assert 7.0 < own.focus_mm[0] < own.focus_mm[1] < 8.0
-    assert own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99  # holds the blur of a lens for 20 mm
+    assert (
+        own.window_um > 8 * 500.0 * 2000.0 * (1 / 7e3 - 1 / 20e3) * 0.99
+    )  # holds the blur of a lens for 20 mm
 
 
 def test_a_fast_lens_is_judged_on_samples_that_hold_its_band():
-    """Twice finer samples tell the same: at NA 0.6 samples of 0.75 um, as fit a lens of NA 0.24, lost half of it."""
+    """Twice finer samples tell the same: at NA 0.6 samples of 0.75 um, as fit a lens of
+    NA 0.24, lost half of it.
+    """
     focus, radius = Focus(0.85, 133.0, 2e3), 100.0
     asked = Fisher(pixel_um=1.1).about(focus, radius)
     pupil = free.design_pupil(focus, radius, asked)
     flat = torch.zeros(pupil.nodes, pupil.nodes, dtype=torch.float64)
     fine = dataclasses.replace(asked, sample_um=asked.sample_um / 2)
-    got, want = (free.score(flat, pupil, focus_um=2e3, settings=s, depths=3).information.mean() for s in (asked, fine))
-    assert float(got) == pytest.approx(float(want), rel=0.02)  # interpolation between samples when pixels are cut
+    got, want = (
+        free.score(flat, pupil, focus_um=2e3, settings=s, depths=3).information.mean()
+        for s in (asked, fine)
+    )
+    assert float(got) == pytest.approx(
+        float(want), rel=0.02
+    )  # interpolation between samples when pixels are cut
 
 
 def test_pixels_wider_than_a_spot_are_refused():
@@ -166,8 +240,12 @@ def test_pixels_wider_than_a_spot_are_refused():
 
 @pytest.mark.parametrize("even", [0.0, 0.3, 1.0])
 def test_information_of_nothing_counts_as_a_ten_thousandth(even):
-    """Of objects 5 to 9 m away an aperture of 0.8 mm tells no depth, by fewer than 1e-7 per mm²: log 1e-4 of all."""
-    settings = dataclasses.replace(QUICK, depths_mm=(5000.0, 9000.0), step_um=1e5, even=even, angles_deg=(0.0, 3.0))
+    """Of objects 5 to 9 m away an aperture of 0.8 mm tells no depth, by fewer than 1e-7
+    per mm²: log 1e-4 of all.
+    """
+    settings = dataclasses.replace(
+        QUICK, depths_mm=(5000.0, 9000.0), step_um=1e5, even=even, angles_deg=(0.0, 3.0)
+    )
     phase = torch.zeros_like(pupils.radius(SMALL))
     loss, _ = AxialObjective(SMALL, settings).loss(phase, 20e3, None)
     assert float(loss) == pytest.approx(-math.log(1e-4), abs=1e-3)

@@ -1,4 +1,6 @@
-"""A free-form lens from the command line, beside tuned lenses, and a design that is made for field angles too."""
+"""A free-form lens from the command line, beside tuned lenses, and a design that is
+made for field angles too.
+"""
 
 import json
 
@@ -29,30 +31,45 @@ angles_deg = [0.0, 10.0]
 """
 
 
-def test_the_command_compares_with_tuned_lenses_and_draws(tmp_path, capsys, monkeypatch):
+def test_the_command_compares_with_tuned_lenses_and_draws(
+    tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr(baselines, "ZONES", (1,))
     (tmp_path / "design.toml").write_text(TOML)
     out = tmp_path / "lens.h5"
-    assert cli.main(["design", str(tmp_path / "design.toml"), "-o", str(out), "--json"]) == 0
+    assert (
+        cli.main(["design", str(tmp_path / "design.toml"), "-o", str(out), "--json"])
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)["fisher"]
     names = list(found["lenses"])
     assert names[0] == "free form"
     assert "hyperbolic" in names[1]
     assert "helix" in names[2]
     means = [np.mean(v["information_per_mm2"]) for v in found["lenses"].values()]
-    assert found["times_the_better_baseline"] == pytest.approx(means[0] / max(means[1:]))
+    assert found["times_the_better_baseline"] == pytest.approx(
+        means[0] / max(means[1:])
+    )
     assert np.shape(found["lenses"]["free form"]["encircled_energy"]) == (2, 11)
     assert (tmp_path / "lens_fisher.png").read_bytes().startswith(b"\x89PNG")
     assert lens.load(out).profile == "fisher"
 
 
 def test_the_table_names_every_angle_and_the_energy():
-    settings = Fisher(angles_deg=(0.0, 8.0), iterations=4, starts=1, grids=(5,), encircled=0.0).about(FOCUS, 150.0)
+    settings = Fisher(
+        angles_deg=(0.0, 8.0), iterations=4, starts=1, grids=(5,), encircled=0.0
+    ).about(FOCUS, 150.0)
     made = free.optimise(SMALL, settings)
     assert made.score.information.shape == (2, 11)
     flat = torch.zeros(80, 80, dtype=torch.float64)
-    scores = [free.score(p, SMALL, focus_um=20e3, settings=settings) for p in (free.phase_on(SMALL, made), flat)]
-    lenses = tuple(design_fisher_report.Judged(n, flat, 20e3, s) for n, s in zip("ab", scores, strict=True))
+    scores = [
+        free.score(p, SMALL, focus_um=20e3, settings=settings)
+        for p in (free.phase_on(SMALL, made), flat)
+    ]
+    lenses = tuple(
+        design_fisher_report.Judged(n, flat, 20e3, s)
+        for n, s in zip("ab", scores, strict=True)
+    )
     text = design_fisher_report.text(lenses, settings)
     assert "8°" in text
     assert f"{float(scores[0].information[1].mean()):.3f}" in text
@@ -60,7 +77,9 @@ def test_the_table_names_every_angle_and_the_energy():
 
 
 def test_a_design_for_field_angles_gains_at_both():
-    """From random noise, 24 steps: more information off axis than a focused lens, the energy kept at all angles."""
+    """From random noise, 24 steps: more information off axis than a focused lens, the
+    energy kept at all angles.
+    """
     settings = Fisher(
         depths_mm=(16.0, 26.0),
         pixel_um=3.0,
@@ -73,8 +92,15 @@ def test_a_design_for_field_angles_gains_at_both():
         focus_mm=(20.0, 20.0),
     ).about(FOCUS, 150.0)
     made = free.optimise(SMALL, settings)
-    plain = free.score(torch.zeros(80, 80, dtype=torch.float64), SMALL, focus_um=20e3, settings=settings)
-    assert bool((made.score.information.mean(1) > 1.1 * plain.information.mean(1)).all())
+    plain = free.score(
+        torch.zeros(80, 80, dtype=torch.float64),
+        SMALL,
+        focus_um=20e3,
+        settings=settings,
+    )
+    assert bool(
+        (made.score.information.mean(1) > 1.1 * plain.information.mean(1)).all()
+    )
     assert float(made.score.encircled.min()) > 0.39
 
 

@@ -1,4 +1,6 @@
-"""What the solver of the last steps is told: values, slopes, what is missing, bounds; and which point is kept."""
+"""What the solver of the last steps is told: values, slopes, what is missing, bounds;
+and which point is kept.
+"""
 
 from types import SimpleNamespace
 
@@ -13,7 +15,9 @@ ASKED = SimpleNamespace(encircled=0.6, refine=17)
 
 
 class Known:
-    """Loss Σ (x - 1)², energies 0.7 - x₀ / 4 and 0.8 + x₃ / 2 of what is built, twice the controls."""
+    """Loss Σ (x - 1)², energies 0.7 - x₀ / 4 and 0.8 + x₃ / 2 of what is built, twice
+    the controls.
+    """
 
     def __init__(self):
         self.asked = 0
@@ -26,7 +30,9 @@ class Known:
 
 
 def told(monkeypatch, points):
-    """The result of a solver that looks at these points, what it was given, and what it saw."""
+    """The result of a solver that looks at these points, what it was given, and what it
+    saw.
+    """
     given, seen = {}, []
 
     def climb(start, value, constraint, **about):
@@ -46,7 +52,8 @@ def told(monkeypatch, points):
 
 
 def test_the_solver_is_told_loss_and_missing_energy_with_their_slopes(monkeypatch):
-    """0.601 less the energies: a thousandth more is asked for than is held. Once a point is known it is not asked
+    """0.601 less the energies: a thousandth more is asked for than is held. Once a
+    point is known it is not asked
     again, whatever of it is wanted."""
     x = np.array([0.3, 0.5, -0.2, -0.1, 0.9, 0.4])
     _, given, seen, known = told(monkeypatch, [x])
@@ -56,7 +63,9 @@ def test_the_solver_is_told_loss_and_missing_energy_with_their_slopes(monkeypatc
     value, slope, missing, slopes = seen[0]
     assert value == pytest.approx(((x - 1) ** 2).sum(), rel=1e-12)
     assert slope == pytest.approx(2 * (x - 1), rel=1e-12)
-    assert missing == pytest.approx([0.601 - 0.7 + 0.3 / 4, 0.601 - 0.8 + 0.1 / 2], rel=1e-9)
+    assert missing == pytest.approx(
+        [0.601 - 0.7 + 0.3 / 4, 0.601 - 0.8 + 0.1 / 2], rel=1e-9
+    )
     want = np.zeros((2, 6))
     want[0, 0], want[1, 3] = 0.25, -0.5
     assert slopes == pytest.approx(want, abs=1e-12)
@@ -64,7 +73,9 @@ def test_the_solver_is_told_loss_and_missing_energy_with_their_slopes(monkeypatc
 
 
 def test_the_best_point_that_holds_its_energy_is_kept(monkeypatch):
-    """x₀ up to 0.4 holds 0.6, to the margin of a thousandth: 0.3999 is kept and 0.4001 is not, however low."""
+    """x₀ up to 0.4 holds 0.6, to the margin of a thousandth: 0.3999 is kept and 0.4001
+    is not, however low.
+    """
     best = np.array([0.3999, 0.6, 0.6, 0.6, 0.6, 0.6])
     lost = np.array([0.4001, 0.9, 0.9, 0.9, 0.9, 0.9])
     worse = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.5])
@@ -77,7 +88,9 @@ def test_the_best_point_that_holds_its_energy_is_kept(monkeypatch):
 
 
 def test_the_solver_stays_within_half_a_radian_and_its_evaluations():
-    """A slope to +∞ in the first number and to -∞ in the second; a constraint that never binds."""
+    """A slope to +∞ in the first number and to -∞ in the second; a constraint that
+    never binds.
+    """
     seen = []
 
     def value(x, gradient):

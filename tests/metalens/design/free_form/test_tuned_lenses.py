@@ -16,13 +16,17 @@ ASKED = Fisher().about(Focus(0.85, 2000.0, 20e3), PUPIL.radius_um)
 
 
 def test_the_hyperbolic_lens_is_best_focused_in_mid_range():
-    """Best of a scan of foci within 2 % of the value measured apart in a paraxial model (0.24); the first three, at 14,
+    """Best of a scan of foci within 2 % of the value measured apart in a paraxial model
+    (0.24); the first three, at 14,
     16.8 and 21 mm, are not."""
     found = baselines.tuned(PUPIL, ASKED, foci_mm=(14.0, 21.0), count=3)
     assert found.information == pytest.approx(0.24, rel=0.02)
     assert 17.5e3 < found.focus_um < 21e3
     for focus in (17e3, 22e3):
-        assert baselines.judged(PUPIL, ASKED, zones=0, focus_um=focus).information <= found.information
+        assert (
+            baselines.judged(PUPIL, ASKED, zones=0, focus_um=focus).information
+            <= found.information
+        )
 
 
 def test_a_helix_beats_the_hyperbolic_lens_and_winds():
@@ -32,7 +36,10 @@ def test_a_helix_beats_the_hyperbolic_lens_and_winds():
     assert focus.source_distance_um == 20e3
     turn = np.linspace(-math.pi, math.pi, 721)
     x, y = 100 * np.cos(turn), 100 * np.sin(turn)
-    extra = [float(phase(a[None], b[None])[0, 0] - hyperbolic(a, b, focus)) for a, b in zip(x, y, strict=True)]
+    extra = [
+        float(phase(a[None], b[None])[0, 0] - hyperbolic(a, b, focus))
+        for a, b in zip(x, y, strict=True)
+    ]
     winding = np.angle(np.exp(1j * np.diff(extra))).sum() / (2 * math.pi)
     assert winding == pytest.approx(1, abs=0.01)
 

@@ -1,4 +1,6 @@
-"""Fourier orders of a disc's cell: coefficients and normals by sums over a fine grid, mirrors against all orders."""
+"""Fourier orders of a disc's cell: coefficients and normals by sums over a fine grid,
+mirrors against all orders.
+"""
 
 import numpy as np
 import pytest
@@ -33,9 +35,14 @@ def test_orders_lie_in_a_circle_and_are_one_of_every_mirror_image():
     assert list(zip(one.ex.m.tolist(), one.ex.n.tolist(), one.ex.size.tolist(), strict=True)) == [
         (0, 0, 1), (0, 1, 2), (0, 2, 2), (1, 0, 2), (1, 1, 4), (2, 0, 2),
     ]  # fmt: skip
-    assert list(zip(one.ey.m.tolist(), one.ey.n.tolist(), strict=True)) == [(1, 1)]  # odd under both
+    assert list(zip(one.ey.m.tolist(), one.ey.n.tolist(), strict=True)) == [
+        (1, 1)
+    ]  # odd under both
     half = basis.basis(2, "p")
-    assert set(zip(half.ey.n.tolist(), half.ey.size.tolist(), strict=True)) == {(1, 2), (2, 2)}
+    assert set(zip(half.ey.n.tolist(), half.ey.size.tolist(), strict=True)) == {
+        (1, 2),
+        (2, 2),
+    }
 
 
 def test_a_disc_s_coefficients_are_its_mean_over_the_cell():
@@ -48,7 +55,9 @@ def test_a_disc_s_coefficients_are_its_mean_over_the_cell():
 
 @pytest.mark.parametrize("diameter", [DIAMETER, 0.002])
 def test_normals_are_the_radial_field_softened_inside_the_disc(diameter):
-    """(xx, yy, xy) of r r / max(r, R)²: continuous, so that a grid of 1e-3 errs by its corner at the rim alone."""
+    """(xx, yy, xy) of r r / max(r, R)²: continuous, so that a grid of 1e-3 errs by its
+    corner at the rim alone.
+    """
     radius = diameter / 2 / PITCH
     scale = np.maximum(np.hypot(X, Y), radius) ** 2
     got = basis.normals(WHOLE, np.array(diameter), PITCH)
@@ -58,21 +67,33 @@ def test_normals_are_the_radial_field_softened_inside_the_disc(diameter):
     assert np.abs(got[2]).max() > 0.01
 
 
-@pytest.mark.parametrize(("diameter", "share", "near"), [(DIAMETER, 1e-3, 1e-5), (0.0009, 0.01, 1e-3)])
+@pytest.mark.parametrize(
+    ("diameter", "share", "near"), [(DIAMETER, 1e-3, 1e-5), (0.0009, 0.01, 1e-3)]
+)
 def test_rates_are_differences(diameter, share, near):
-    """The thin one lies below x = 0.01, where series stand for Bessel functions; its differences are rounding."""
+    """The thin one lies below x = 0.01, where series stand for Bessel functions; its
+    differences are rounding.
+    """
     step = share * diameter
-    up, down = (basis.normals(WHOLE, np.array(diameter + s), PITCH) for s in (step, -step))
-    for one, a, b in zip(basis.normals_rate(WHOLE, np.array(diameter), PITCH), up, down, strict=True):
+    up, down = (
+        basis.normals(WHOLE, np.array(diameter + s), PITCH) for s in (step, -step)
+    )
+    for one, a, b in zip(
+        basis.normals_rate(WHOLE, np.array(diameter), PITCH), up, down, strict=True
+    ):
         want = (a - b) / (2 * step)
         assert np.abs(one - want).max() < near * np.abs(want).max()
     up, down = (basis.disc(WHOLE, np.array(diameter + s), PITCH) for s in (step, -step))
     want = (up - down) / (2 * step)
-    assert np.abs(basis.disc_rate(WHOLE, np.array(diameter), PITCH) - want).max() < near * np.abs(want).max()
+    assert (
+        np.abs(basis.disc_rate(WHOLE, np.array(diameter), PITCH) - want).max()
+        < near * np.abs(want).max()
+    )
 
 
 def test_squares_of_the_radial_field_add_to_one_at_every_truncation():
-    """x² / r² + y² / r² = 1, whatever the order: its coefficients are 1 at (0, 0) and 0 elsewhere. Cosines of 60 turns
+    """x² / r² + y² / r² = 1, whatever the order: its coefficients are 1 at (0, 0) and 0
+    elsewhere. Cosines of 60 turns
     across the cell on a rule that is exact to rounding."""
     even, odd = basis._radial_field(60)
     whole = even + even.T
@@ -84,12 +105,20 @@ def test_squares_of_the_radial_field_add_to_one_at_every_truncation():
 
 
 def test_series_and_bessel_functions_meet():
-    """On both sides of x = 0.01 for every shell: no jump but that of the next term, x⁴ / 3000."""
+    """On both sides of x = 0.01 for every shell: no jump but that of the next term, x⁴
+    / 3000.
+    """
     for shell in (1, 5, 8):
         edge = 0.01 / np.sqrt(shell) * PITCH / np.pi
-        a, b = (np.stack(basis.normals(WHOLE, np.array(edge * s), PITCH)) for s in (1 - 1e-9, 1 + 1e-9))
+        a, b = (
+            np.stack(basis.normals(WHOLE, np.array(edge * s), PITCH))
+            for s in (1 - 1e-9, 1 + 1e-9)
+        )
         assert np.abs(a - b).max() < 1e-12
-        a, b = (np.stack(basis.normals_rate(WHOLE, np.array(edge * s), PITCH)) for s in (1 - 1e-9, 1 + 1e-9))
+        a, b = (
+            np.stack(basis.normals_rate(WHOLE, np.array(edge * s), PITCH))
+            for s in (1 - 1e-9, 1 + 1e-9)
+        )
         assert np.abs(a - b).max() < 1e-9
 
 
@@ -100,7 +129,9 @@ def spread(some):
         for sx in (1, -1) if some.parity[0] else (1,):
             for sy in (1, -1) if some.parity[1] else (1,):
                 at = np.flatnonzero((WHOLE.ex.m == sx * m) & (WHOLE.ex.n == sy * n))
-                sign = (some.parity[0] if sx < 0 else 1) * (some.parity[1] if sy < 0 else 1)
+                sign = (some.parity[0] if sx < 0 else 1) * (
+                    some.parity[1] if sy < 0 else 1
+                )
                 out[at, k] = sign
     return out / np.linalg.norm(out, axis=0)
 
@@ -109,11 +140,16 @@ def spread(some):
 def test_mirrors_reduce_the_matrices_of_all_orders(symmetry):
     some = basis.basis(2, symmetry)
     table = basis.disc(WHOLE, np.array(DIAMETER), PITCH)
-    every = [basis.products(WHOLE, table, basis.EX), *basis.normals(WHOLE, np.array(DIAMETER), PITCH)]
+    every = [
+        basis.products(WHOLE, table, basis.EX),
+        *basis.normals(WHOLE, np.array(DIAMETER), PITCH),
+    ]
     few = basis.disc(some, np.array(DIAMETER), PITCH)
     for link, one in ((basis.EX, some.ex), (basis.EY, some.ey), (basis.EZ, some.ez)):
         way = spread(one)
-        assert basis.products(some, few, link) == pytest.approx(way.T @ every[0] @ way, abs=1e-12)
+        assert basis.products(some, few, link) == pytest.approx(
+            way.T @ every[0] @ way, abs=1e-12
+        )
     x, y = spread(some.ex), spread(some.ey)
     xx, yy, xy = basis.normals(some, np.array(DIAMETER), PITCH)
     assert xx == pytest.approx(x.T @ every[1] @ x, abs=1e-12)

@@ -1,4 +1,6 @@
-"""Integrals over the height of a layer between any two modes, by quadrature, and fields at its foot."""
+"""Integrals over the height of a layer between any two modes, by quadrature, and fields
+at its foot.
+"""
 
 from types import SimpleNamespace
 
@@ -12,7 +14,9 @@ from metalens.rcwa.rates.regions import Fields, Modes
 
 HEIGHT = 2.3
 ROWS = np.array([1.7 + 0.02j, 2.9, 0.4j, 1.31 + 0.6j])
-COLUMNS = np.array([1.7 + 0.02j, 1.7 + 0.03j, 1.9, 2.9 + 0.26j, 2.9 + 0.27j, 0.5j, 3.3])  # alike, near, at 0.3, apart
+COLUMNS = np.array(
+    [1.7 + 0.02j, 1.7 + 0.03j, 1.9, 2.9 + 0.26j, 2.9 + 0.27j, 0.5j, 3.3]
+)  # alike, near, at 0.3, apart
 
 
 def modes(q):
@@ -21,34 +25,52 @@ def modes(q):
 
 def quadrature(wave):
     parts = (
-        integrate.quad(lambda z, p=part: getattr(wave(z), p), 0, HEIGHT, epsabs=1e-13) for part in ("real", "imag")
+        integrate.quad(lambda z, p=part: getattr(wave(z), p), 0, HEIGHT, epsabs=1e-13)
+        for part in ("real", "imag")
     )
     return complex(*(value for value, _ in parts))
 
 
 @pytest.mark.parametrize(
-    ("integrals", "factor"), [(kernels.plain, lambda z: 1.0), (kernels.sloped, lambda z: z / HEIGHT - 0.5)]
+    ("integrals", "factor"),
+    [(kernels.plain, lambda z: 1.0), (kernels.sloped, lambda z: z / HEIGHT - 0.5)],
 )
 def test_integrals_of_two_modes_are_those_of_their_exponentials(integrals, factor):
     same, opposite = integrals(modes(ROWS), modes(COLUMNS))
     for i, q in enumerate(ROWS):
         for j, p in enumerate(COLUMNS):
             one = quadrature(lambda z, q=q, p=p: factor(z) * np.exp(1j * (q + p) * z))
-            other = quadrature(lambda z, q=q, p=p: factor(z) * np.exp(1j * q * z + 1j * p * (HEIGHT - z)))
+            other = quadrature(
+                lambda z, q=q, p=p: (
+                    factor(z) * np.exp(1j * q * z + 1j * p * (HEIGHT - z))
+                )
+            )
             assert same[i, j] == pytest.approx(one, abs=1e-12)
-            assert opposite[i, j] == pytest.approx(other, abs=1e-11)  # 0.3⁹ / 4e6: the series' next term
+            assert opposite[i, j] == pytest.approx(
+                other, abs=1e-11
+            )  # 0.3⁹ / 4e6: the series' next term
 
 
 def test_slopes_between_modes_that_hardly_differ_follow_their_series_to_its_end():
-    """h² / 12 (q - p) for straight ones; half phases of 0.02 to 0.34 to the digits of a quadrature."""
+    """h² / 12 (q - p) for straight ones; half phases of 0.02 to 0.34 to the digits of a
+    quadrature.
+    """
     q = np.array([1.1])
     for half in (0.0, 0.02, 0.17, 0.29, 0.31, 0.34):
         p = q - 2 * half / HEIGHT
         _, opposite = kernels.sloped(modes(q), modes(p))
-        want = quadrature(lambda z, p=p: complex((z / HEIGHT - 0.5) * np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z))))
-        assert opposite[0, 0] == pytest.approx(want, abs=1e-11)  # 0.3⁹ / 4e6: the next term
+        want = quadrature(
+            lambda z, p=p: complex(
+                (z / HEIGHT - 0.5) * np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z))
+            )
+        )
+        assert opposite[0, 0] == pytest.approx(
+            want, abs=1e-11
+        )  # 0.3⁹ / 4e6: the next term
         _, opposite = kernels.plain(modes(q), modes(p))
-        want = quadrature(lambda z, p=p: complex(np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z))))
+        want = quadrature(
+            lambda z, p=p: complex(np.exp(1j * q[0] * z + 1j * p[0] * (HEIGHT - z)))
+        )
         assert opposite[0, 0] == pytest.approx(want, abs=1e-12)
 
 
@@ -64,7 +86,9 @@ def layer(seed, n=3):
 
 
 def waves(rng, n, k):
-    up, down = (rng.normal(size=(n, k)) + 1j * rng.normal(size=(n, k)) for _ in range(2))
+    up, down = (
+        rng.normal(size=(n, k)) + 1j * rng.normal(size=(n, k)) for _ in range(2)
+    )
     return Fields(up, down, np.zeros((1, 0, k)))
 
 
@@ -76,7 +100,8 @@ def field(part, waves, z):
 
 
 def test_rates_of_an_upright_layer_are_the_integrals_of_its_fields():
-    """i times the integral of u~ dQ u - w~ dP w, dP between some waves alone; dP and dQ even in height, or as the share
+    """i times the integral of u~ dQ u - w~ dP w, dP between some waves alone; dP and dQ
+    even in height, or as the share
     of it above its middle, where modes that go down see the other sign."""
     rng = np.random.default_rng(5)
     back, light = layer(1), layer(2)
@@ -87,11 +112,19 @@ def test_rates_of_an_upright_layer_are_the_integrals_of_its_fields():
     heights = HEIGHT * (nodes + 1) / 2
     sides = Modes(back, HEIGHT), Modes(light, HEIGHT)
     turned = kernels.in_modes(*sides, z, (dP, dQ))
-    for integrals, sign, factor in ((kernels.plain, 1, 1 + 0 * nodes), (kernels.sloped, -1, nodes / 2)):
+    for integrals, sign, factor in (
+        (kernels.plain, 1, 1 + 0 * nodes),
+        (kernels.sloped, -1, nodes / 2),
+    ):
         want = 0
         for height, weight in zip(heights, weights * factor * HEIGHT / 2, strict=True):
-            (u_back, w_back), (u, w) = field(back, sent, height), field(light, comes, height)
-            want = want + weight * 1j * (u_back.T @ dQ @ u - w_back[z[0]].T @ dP @ w[z[1]])
+            (u_back, w_back), (u, w) = (
+                field(back, sent, height),
+                field(light, comes, height),
+            )
+            want = want + weight * 1j * (
+                u_back.T @ dQ @ u - w_back[z[0]].T @ dP @ w[z[1]]
+            )
         got = kernels.upright(turned, integrals(*sides), sign, sent, comes)
         assert got == pytest.approx(want, abs=1e-10)
 
@@ -100,12 +133,25 @@ def test_a_unit_of_height_adds_what_the_operators_make_of_the_fields_at_the_foot
     rng = np.random.default_rng(6)
     part, n = layer(3), 3
     turned = Modes(
-        Layer(part.P.T, part.Q.T, part.q, np.linalg.inv(part.V).T, np.linalg.inv(part.W).T, symmetric=False), HEIGHT
+        Layer(
+            part.P.T,
+            part.Q.T,
+            part.q,
+            np.linalg.inv(part.V).T,
+            np.linalg.inv(part.W).T,
+            symmetric=False,
+        ),
+        HEIGHT,
     )
     sent, comes = waves(rng, n, 2), waves(rng, n, 4)
     (u, w), (u_back, w_back) = field(part, comes, 0.0), field(turned.part, sent, 0.0)
     want = 1j * (u_back.T @ part.Q @ u - w_back.T @ part.P @ w)
     this = SimpleNamespace(plain=Modes(part, HEIGHT), transposed=turned)
     assert kernels.stretch(this, sent, comes) == pytest.approx(want, rel=1e-10)
-    (later, late), (back, backs) = field(part, comes, 0.7), field(turned.part, sent, 0.7)
-    assert 1j * (back.T @ part.Q @ later - backs.T @ part.P @ late) == pytest.approx(want, rel=1e-9)  # at any height
+    (later, late), (back, backs) = (
+        field(part, comes, 0.7),
+        field(turned.part, sent, 0.7),
+    )
+    assert 1j * (back.T @ part.Q @ later - backs.T @ part.P @ late) == pytest.approx(
+        want, rel=1e-9
+    )  # at any height

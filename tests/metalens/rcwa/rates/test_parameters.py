@@ -1,4 +1,6 @@
-"""Every number of a pillar by its name: a change of it is a change of that number alone, and steps are of its kind."""
+"""Every number of a pillar by its name: a change of it is a change of that number
+alone, and steps are of its kind.
+"""
 
 import dataclasses
 
@@ -16,13 +18,16 @@ CELL = Cell(
     layers=(Layer(0.1, 0.03, Index(1.6)), Layer(0.43, between=Index(1.2, 0.01), coat=Index(1.9), coat_um=0.012)),
 )  # fmt: skip
 SIZE, WAVE = 0.23, 0.73
-STEPS = {  # times 1e-4: of 1 for angles, coordinates and indices, of the size for widths, of itself for lengths
+# times 1e-4: of 1 for angles, coordinates and indices, of the size for widths, of
+# itself for lengths
+STEPS = {
     "size_um": SIZE, "grow_um": SIZE, "sidewall_rad": 1.0, "shape.angle_rad": 1.0, "pillar.n": 1.0, "between.n": 1.0,
     **{f"shape.corners.{i}.{axis}": 1.0 for i in range(3) for axis in "xy"},
     "layers.0.height_um": 0.1, "layers.0.grow_um": SIZE, "layers.0.material.n": 1.0,
     "layers.1.height_um": 0.43, "layers.1.grow_um": SIZE, "layers.1.between.n": 1.0, "layers.1.coat_um": 0.012,
     "layers.1.coat.n": 1.0,
-    "under.0.thickness_um": 0.1, "under.1.thickness_um": 0.25, "over.0.thickness_um": 0.31,  # of 0.1 um at least
+    # of 0.1 um at least
+    "under.0.thickness_um": 0.1, "under.1.thickness_um": 0.25, "over.0.thickness_um": 0.31,
 }  # fmt: skip
 
 
@@ -30,22 +35,30 @@ def flat(value, path=""):
     """{path: number} of a record of records."""
     if isinstance(value, dict | tuple):
         named = value.items() if isinstance(value, dict) else enumerate(value)
-        return {key: number for name, part in named for key, number in flat(part, f"{path}.{name}").items()}
+        return {
+            key: number
+            for name, part in named
+            for key, number in flat(part, f"{path}.{name}").items()
+        }
     return {path[1:]: value}
 
 
 def test_a_pillar_has_these_numbers_and_no_other():
-    assert {name: one.step for name, one in parameters(CELL, SIZE, WAVE).items()} == pytest.approx(
-        {name: 1e-4 * of for name, of in STEPS.items()}, rel=1e-12
-    )
+    assert {
+        name: one.step for name, one in parameters(CELL, SIZE, WAVE).items()
+    } == pytest.approx({name: 1e-4 * of for name, of in STEPS.items()}, rel=1e-12)
     plain = dataclasses.replace(CELL, layers=(), under=(Film(Index(1.9), 0.0),))
     assert parameters(plain, SIZE, WAVE)["height_um"].step == pytest.approx(1e-4 * 0.53)
-    assert parameters(plain, SIZE, WAVE)["height_um"].moved(0.01).cell.height_um == pytest.approx(0.54)
+    assert parameters(plain, SIZE, WAVE)["height_um"].moved(
+        0.01
+    ).cell.height_um == pytest.approx(0.54)
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_a_number_that_changes_is_that_one_alone(name):
-    """The height of a pillar is that of its layers; a film thinner than 0.1 um is looked at as if it had that."""
+    """The height of a pillar is that of its layers; a film thinner than 0.1 um is
+    looked at as if it had that.
+    """
     changed = parameters(CELL, SIZE, WAVE)[name].moved(0.007)
     was, now = flat(dataclasses.asdict(CELL)), flat(dataclasses.asdict(changed.cell))
     assert now.keys() == was.keys()
