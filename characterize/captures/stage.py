@@ -4,6 +4,7 @@
 
 import csv
 import difflib
+import io
 import json
 import math
 import re
@@ -158,7 +159,7 @@ def _about(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = reading.read_text(path)
         about = (
             tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
         )
@@ -256,12 +257,12 @@ def ome_positions(xml: str) -> Array:
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            table: list[dict[str, Any]] = list(
-                csv.DictReader(file, skipinitialspace=True)
-            )
+        lines = io.StringIO(reading.read_text(path), newline="")
+        table: list[dict[str, Any]] = list(csv.DictReader(lines, skipinitialspace=True))
     except (csv.Error, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not a table in UTF-8 text: {error}") from None
+        raise CaptureError(
+            f"{path}: not a table in UTF-8 or UTF-16 text: {error}"
+        ) from None
     while table and not any(table[-1].values()):  # as spreadsheets leave below theirs
         table.pop()
     return table
@@ -269,7 +270,7 @@ def _read_csv(path: Path) -> list[dict[str, Any]]:
 
 def _read_json(path: Path) -> list[dict[str, Any]]:
     try:
-        table = json.loads(path.read_text(encoding="utf-8-sig"))
+        table = json.loads(reading.read_text(path))
     except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: not valid JSON: {error}") from None
     if not isinstance(table, list) or not all(isinstance(row, dict) for row in table):

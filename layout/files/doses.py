@@ -15,7 +15,7 @@ from typing import Protocol
 
 from layout.files.content import MaskContent
 from layout.process import LayerNumber, Process
-from metalens.ground import store
+from metalens.ground import reading, store
 from metalens.ground.errors import MaskFileError
 
 HEAD = ("layer", "datatype", "relative_dose", "dose_uC_cm2", "step", "name")
@@ -64,7 +64,7 @@ def read(path: str | Path) -> dict[LayerNumber, float]:
     """
     path = Path(path)
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+        rows = list(csv.DictReader(reading.read_text(path).splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise MaskFileError(
             f"{path}: cannot be read as a dose table ({error})"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import DAMAGE, MaterialError
 
@@ -125,9 +126,15 @@ class Formula:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Table:
-    """Straight lines between rows: (2, rows) wavelength_um and values."""
+    """Linear interpolation between the rows of a tabulated n or k.
+
+    rows: (2, rows) wavelength_um, rising, and value. Two rows at one wavelength are a
+    step.
+    faults: (low_um, high_um, what is wrong) of the intervals that a bad row spoils.
+    """
 
     rows: Array
+    faults: tuple[tuple[float, float, str], ...] = ()
 
     @property
     def range_um(self) -> tuple[float, float]:
@@ -135,8 +142,21 @@ class Table:
         return float(self.rows[0, 0]), float(self.rows[0, -1])
 
     def at(self, wavelength_um: float) -> tuple[complex, complex]:
-        """Value and slope."""
+        """Value and slope.
+
+        Raises:
+            MaterialError: the value there would come from a bad row.
+        """
         x, y = self.rows
+        good = bool((x == wavelength_um).any())
+        for low, high, fault in self.faults:
+            if (
+                low < wavelength_um < high and not good
+            ) or low == wavelength_um == high:
+                raise MaterialError(
+                    f"{fault}; the page says nothing usable at {wavelength_um} um: "
+                    "mend the row, or take a wavelength of other rows"
+                )
         i = int(
             np.clip(np.searchsorted(x, wavelength_um, side="right") - 1, 0, len(x) - 2)
         )
@@ -198,16 +218,8 @@ def _parts(block: dict[str, Any], where: str) -> tuple[Part | None, Part | None]
     columns = kind.split()[-1]
     if columns not in ("nk", "n", "k"):
         raise MaterialError(f"{where}: type {kind!r}, need tabulated nk, n or k")
-    table = _rows(_words(block, "data"), len(columns) + 1, f"{where}, {kind}")
-    if "n" in columns and table[1].min() <= 0:
-        raise MaterialError(f"{where}, {kind}: n = {table[1].min():g}; need n above 0")
-    if "k" in columns and table[-1].min() < -_NOISE:
-        raise MaterialError(
-            f"{where}, {kind}: k = {table[-1].min():g}; need k of 0 or above (exp(-iwt))"
-        )
-    return Table(table[:2]) if "n" in columns else None, Table(
-        table[[0, -1]]
-    ) if "k" in columns else None
+    tables = _tables(_words(block, "data"), columns, f"{where}, {kind}")
+    return tables.get("n"), tables.get("k")
 
 
 def _words(block: dict[str, Any], key: str) -> str:
@@ -255,26 +267,80 @@ def _complete(number: int, count: int, where: str) -> None:
         )
 
 
-def _rows(text: str, width: int, where: str) -> Array:
-    rows = []
+def _tables(text: str, columns: str, where: str) -> dict[str, Table]:
+    """Tables of n and k. A bad row spoils the wavelengths up to its neighbours only.
+
+    Raises:
+        MaterialError: fewer than two good rows.
+    """
+    rows: list[list[float]] = []
+    bad: list[tuple[float, str]] = []  # wavelength (nan: unreadable) and what is wrong
+    unreadable: list[tuple[int, str]] = []  # place among the good rows
     for i, line in enumerate(filter(str.strip, text.splitlines()), 1):
-        try:
-            row = [float(v) for v in line.replace(",", " ").split()]
-        except ValueError:
-            row = []
-        if len(row) != width or not all(map(math.isfinite, row)) or row[0] <= 0:
-            raise MaterialError(
-                f"{where}, row {i}: {line.strip()!r}; need {width} finite numbers, wavelength in um"
-            )
-        rows.append(row)
-    table = np.array(rows).reshape(-1, width).T
-    if table.size:
-        table = table[:, np.argsort(table[0], kind="stable")]
-    if table.shape[1] < 2 or (np.diff(table[0]) <= 0).any():
+        fault = f"{where}, row {i}: {line.strip()!r}"
+        row = _numbers(line)
+        if len(row) != len(columns) + 1 or not row[0] > 0:
+            words = f"{fault}; need {len(columns) + 1} finite numbers, wavelength in um"
+            unreadable.append((len(rows), words))
+        elif "n" in columns and row[1] <= 0:
+            bad.append((row[0], f"{fault}: n = {row[1]:g}; need n above 0"))
+        elif "k" in columns and row[-1] < -_NOISE:
+            words = f"{fault}: k = {row[-1]:g}; need k of 0 or above (exp(-iwt))"
+            bad.append((row[0], words))
+        else:
+            rows.append(row)
+    distinct = {row[0] for row in rows}
+    if len(distinct) < 2:
+        first = [words for _, words in (*unreadable, *bad)][:3]
         raise MaterialError(
-            f"{where}: {table.shape[1]} rows; need two or more at distinct wavelengths"
+            f"{where}: {len(distinct)} good rows; need two or more at distinct "
+            "wavelengths" + "".join(f" ({words})" for words in first)
         )
-    return np.asarray(table)
+    faults = []
+    for place, words in unreadable:
+        around = [row[0] for row in rows[max(place - 1, 0) : place + 1]]
+        if len(around) == 2:
+            faults.append((min(around), max(around), words))
+    for wavelength, words in bad:
+        low = max((w for w in distinct if w < wavelength), default=wavelength)
+        high = min((w for w in distinct if w > wavelength), default=wavelength)
+        if wavelength not in distinct:
+            faults.append((low, high, words))
+    rows = sorted(dict.fromkeys(map(tuple, rows)), key=lambda row: row[0])  # type: ignore[arg-type]
+    rows, steps = _joined(rows, where)
+    table = np.array(rows).T
+    return {
+        name: Table(table[[0, 1 + columns.index(name)]], (*faults, *steps))
+        for name in columns
+    }
+
+
+def _numbers(line: str) -> list[float]:
+    """The finite numbers of a row; empty where it holds anything else."""
+    try:
+        row = [float(v) for v in line.replace(",", " ").split()]
+    except ValueError:
+        return []
+    return row if all(map(math.isfinite, row)) else []
+
+
+def _joined(
+    rows: list[list[float]], where: str
+) -> tuple[list[list[float]], list[tuple[float, float, str]]]:
+    """Rows with at most two at one wavelength, and a fault at each such step."""
+    kept: list[list[float]] = []
+    faults = []
+    for row in rows:
+        if len(kept) > 1 and kept[-1][0] == kept[-2][0] == row[0]:
+            kept[-1] = row
+            continue
+        if kept and kept[-1][0] == row[0]:
+            values = f"{kept[-1][1:]} and {row[1:]}"
+            faults.append(
+                (row[0], row[0], f"{where}: two rows at {row[0]} um, {values}")
+            )
+        kept.append(row)
+    return kept, faults
 
 
 def _source(page: dict[str, Any]) -> str:
@@ -293,7 +359,7 @@ def load(path: Path, where: str) -> tuple[Part, Part | None, str]:
         MaterialError: also where the file is missing or no text.
     """
     try:
-        return read(path.read_text(encoding="utf-8-sig"), where)
+        return read(reading.read_text(path), where)
     except (OSError, UnicodeDecodeError) as error:
         raise MaterialError(
             f"{where}: not a readable text file ({error}); need a YAML page"

@@ -17,6 +17,7 @@ import numpy as np
 from metalens import cell
 from metalens.cell import database, tables
 from metalens.cell.database import Part
+from metalens.ground import reading
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaterialError, nearest
 
@@ -251,7 +252,7 @@ def read_csv(path: str | Path) -> Material:
 @lru_cache(maxsize=64)
 def _read_csv(path: Path, stamp: tuple[int, int]) -> Material:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = reading.read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise MaterialError(
             f"{path}: not a readable text file ({error}); need a CSV table"

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from metalens.ground import config, store
+from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
 
 MADE = ("library.h5", "lens.h5", "bench_lens.h5", "asbuilt.h5")  # by the chain itself
@@ -148,7 +148,7 @@ def laid(files: ChainFiles, source: Path | None, *, aperture_mm: float | None) -
             )
         else:
             _bring(contents, source / value)  # refuses what is no settings file
-            text = (source / value).read_text(encoding="utf-8-sig")
+            text = reading.read_text(source / value)
         if name == "design" and aperture_mm is not None:
             lines = [
                 line for line in text.splitlines() if not line.startswith("aperture_mm")

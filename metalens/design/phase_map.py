@@ -1,8 +1,7 @@
-"""Phase maps made elsewhere: NumPy, text, MATLAB, and grid-phase files of Zemax
-OpticStudio, sampled at the pillars.
-"""
+"""Phase maps of other programs (NumPy, text, MATLAB, Zemax grid phase)."""
 
 import math
+import re
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,14 @@ CORE, MANY = (
     8,
     256,
 )  # samples from a vortex to a ring that is fine enough; places in all of them
+_COMMENT = re.compile(r"\s*(#|%|//)")
 SAME_STEP = 1e-6  # relative difference within which two spacings are one
+EVEN_STEP = 1e-3  # of a step, by which printed coordinates may leave an even grid
+PERIODS = {  # of 2 pi, by what the setting of a map that is not in radians should say
+    360.0: "degrees: unit = 'deg'",
+    256.0: "levels of 8 bits: levels = 256",
+    1.0: "waves: unit = 'waves'",
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,17 +45,24 @@ class Samples:
 
 
 def read(shape: PhaseMap) -> Samples:
-    """The file of a :class:`metalens.profiles.PhaseMap`, by the ending of its name.
+    """Read the file of a phase map, by the ending of its name, in radians.
 
     ``.npy``; ``.npz`` and ``.mat`` (MATLAB 4 to 7.3), the only matrix or the one named;
-    ``.dat`` (Zemax grid phase,
-    which brings its own spacing); anything else is text: rows of numbers parted by
-    commas, or by
-    semicolons, tabs or blanks with decimal commas.
+    ``.dat`` (Zemax grid phase, which brings its own spacing); anything else is text.
+    Text is a matrix of numbers, or three columns x (um), y (um, down) and phase.
+    Columns are separated by commas, or by semicolons, tabs or blanks with decimal
+    commas; lines after #, % or // are comments. A first row or column that counts
+    (0, 1, 2 ... of a table) is no phase.
+
+    Args:
+        shape: file, spacing and unit.
+
+    Returns:
+        Phase in radians with nan where there is no data.
 
     Raises:
-        LensError: missing or unreadable file, no pitch, not 2-D, or a value that is not
-            finite (row and column named).
+        LensError: missing or unreadable file, no pitch, not 2-D, an infinite value, or
+            values that look like another unit than radians and none is stated.
     """
     path = shape.file
     if not path.is_file():
@@ -59,19 +72,68 @@ def read(shape: PhaseMap) -> Samples:
     ending = path.suffix.lower()
     if ending == ".dat":
         samples = _zemax(path, shape.pitch_um)
+    elif ending in (".npy", ".npz", ".mat"):
+        reader = {".npy": _npy, ".npz": _npz, ".mat": _mat}[ending]
+        _require_pitch(path, shape.pitch_um)
+        samples = _square(reader(path, shape.variable), path, shape)
     else:
-        if shape.pitch_um is None:
-            raise LensError(
-                f"{path}: a {ending or 'text'} file does not tell its spacing; give pitch_um"
-            )
-        reader = {".npy": _npy, ".npz": _npz, ".mat": _mat}.get(ending, _text)
-        phase = _checked(reader(path, shape.variable), path)
-        samples = Samples(phase, (shape.pitch_um, shape.pitch_um))
-    return (
-        Samples(-samples.phase_rad, samples.step_um, samples.centre_um)
-        if shape.conjugate
-        else samples
+        samples = _text(path, shape)
+    phase = samples.phase_rad if ending == ".dat" else _radians(samples, path, shape)
+    phase = -phase if shape.conjugate else phase
+    return Samples(phase, samples.step_um, samples.centre_um)
+
+
+def _require_pitch(path: Path, pitch_um: float | None) -> None:
+    if pitch_um is None:
+        raise LensError(
+            f"{path}: a {path.suffix.lower() or 'text'} file does not tell its spacing; give pitch_um"
+        )
+
+
+def _square(values: Any, path: Path, shape: PhaseMap) -> Samples:
+    """A matrix with the same stated spacing along x and y."""
+    _require_pitch(path, shape.pitch_um)
+    pitch_um = float(shape.pitch_um or 0)
+    return Samples(_checked(values, path, shape), (pitch_um, pitch_um))
+
+
+def _radians(samples: Samples, path: Path, shape: PhaseMap) -> Array:
+    """Values of a file in radians, by the stated unit.
+
+    Raises:
+        LensError: no unit is stated and the values look like another one.
+    """
+    values = samples.phase_rad
+    if shape.levels is not None:
+        return values * (2 * np.pi / shape.levels)
+    if shape.unit is None:
+        _refuse_other_unit(values, path)
+    scale = {None: 1.0, "rad": 1.0, "deg": np.pi / 180, "waves": 2 * np.pi}
+    return values * scale[shape.unit]
+
+
+def _refuse_other_unit(values: Array, path: Path) -> None:
+    """Refuse integers, and wraps by the period of another unit than radians."""
+    finite = values[np.isfinite(values)]
+    low, high = float(finite.min()), float(finite.max())
+    if high > low and (finite == np.rint(finite)).all():
+        raise LensError(
+            f"{path}: holds whole numbers from {low:g} to {high:g}, which are rarely "
+            "radians; state levels = 256 (8 bits; phase = 2 pi value / levels) or "
+            "unit = 'deg', 'waves' or 'rad'"
+        )
+    steps = np.concatenate(
+        [np.abs(np.diff(values, axis=axis)).ravel() for axis in (0, 1)]
     )
+    steps = steps[np.isfinite(steps)]
+    span = high - low
+    for period, words in PERIODS.items():
+        wraps = 0.9 * period < span <= 1.001 * period
+        if wraps and steps.max() > 0.75 * span and np.median(steps) < 0.25 * span:
+            raise LensError(
+                f"{path}: the phase wraps by {span:.4g}, as in {words}; state that, or "
+                "unit = 'rad'"
+            )
 
 
 def interpolate(
@@ -109,9 +171,14 @@ def interpolate(
             f"the phase map covers {columns * step_x:.1f} x {rows * step_y:.1f} um about ({x0:.1f}, {y0:.1f}) um, "
             "less than the aperture"
         )
-    between = _blend(_blend(np.exp(1j * samples.phase_rad), row).T, column).T
-    inside = x_um**2 + y_um[:, None] ** 2 <= radius_um**2
-    empty = np.isnan(between) & inside
+    between, known_share = _blended(samples.phase_rad, row, column)
+    radius2 = x_um**2 + y_um[:, None] ** 2
+    inside = radius2 <= radius_um**2
+    nearest_row = np.clip(np.rint(row).astype(int), 0, rows - 1)
+    nearest_column = np.clip(np.rint(column).astype(int), 0, columns - 1)
+    hole = np.isnan(samples.phase_rad[np.ix_(nearest_row, nearest_column)])
+    by_the_rim = radius2 > max(radius_um - math.hypot(step_x, step_y), 0.0) ** 2
+    empty = inside & (known_share == 0) | inside & hole & ~by_the_rim
     size = np.where(inside & ~empty, np.abs(between), 1.0)
     worst = np.unravel_index(int(np.where(empty, -1.0, size).argmin()), size.shape)
     place = f"near row {row[worst[0]]:.1f}, column {column[worst[1]]:.1f}"
@@ -127,7 +194,8 @@ def interpolate(
     if len(coarse) > MANY or None in known:
         raise LensError(
             f"the phase map turns by more than 2/3 of half a turn between samples {place}; "
-            f"give it on a finer pitch than {max(step_x, step_y)} um"
+            f"give it on a finer pitch than {max(step_x, step_y)} um, or state the unit "
+            "of its phase if that is not radians"
         )
     found = np.angle(between)
     for (i, k), phase in zip(coarse, known, strict=True):
@@ -159,6 +227,17 @@ def _vortex(phase_rad: Array, row: float, column: float) -> float | None:
     return None
 
 
+def _blended(phase_rad: Array, row: Array, column: Array) -> tuple[Array, Array]:
+    """Phasors between the samples that hold data, and the weight of those samples."""
+    known = np.isfinite(phase_rad)
+    phasor = np.where(known, np.exp(1j * np.where(known, phase_rad, 0.0)), 0.0)
+    total, weight = (
+        _blend(_blend(values, row).T, column).T
+        for values in (phasor, known.astype(float))
+    )
+    return total / np.where(weight > 0, weight, 1.0), weight
+
+
 def _blend(samples: Array, position: Array) -> Array:
     """Linear interpolation along the first axis; positions beyond the ends take the end
     sample.
@@ -168,7 +247,7 @@ def _blend(samples: Array, position: Array) -> Array:
     return np.asarray(samples[low] * (1 - weight) + samples[low + 1] * weight)
 
 
-def _checked(values: Any, path: Path) -> Array:
+def _checked(values: Any, path: Path, shape: PhaseMap) -> Array:
     phase = np.asarray(values)
     if phase.dtype.kind == "c":
         raise LensError(
@@ -178,10 +257,14 @@ def _checked(values: Any, path: Path) -> Array:
         raise LensError(
             f"{path}: holds {phase.dtype} of shape {phase.shape}, need real (y, x) of 2 by 2 or more"
         )
-    if not np.isfinite(phase).all():
+    if np.isinf(phase).any() or not np.isfinite(phase).any():
         row, column = (int(i) for i in np.argwhere(~np.isfinite(phase))[0])
         raise LensError(
-            f"{path}: phase at row {row}, column {column} is {phase[row, column]}, need finite radians"
+            f"{path}: phase at row {row}, column {column} is {phase[row, column]}, need numbers (nan where there is no data)"
+        )
+    if shape.levels is not None and np.nanmax(phase) > shape.levels:
+        raise LensError(
+            f"{path}: holds {np.nanmax(phase):g}, but levels = {shape.levels}"
         )
     return np.asarray(phase, float)
 
@@ -202,28 +285,119 @@ def _npy(path: Path, variable: str | None) -> Any:
         raise LensError(f"{path}: not a phase map: {error}") from error
 
 
-def _text(path: Path, variable: str | None) -> Any:
-    _no_variable(path, variable)
+def _text(path: Path, shape: PhaseMap) -> Samples:
+    """A matrix, or rows of x, y and phase."""
+    _no_variable(path, shape.variable)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        first = next(
-            (
-                line
-                for line in lines
-                if line.strip() and not line.lstrip().startswith("#")
-            ),
-            "",
-        )
-        if not first:
-            raise LensError(f"{path}: not a phase map: it holds no numbers")
-        mark, decimal = reading.parting(first)
-        return np.loadtxt(
-            [line.replace(",", ".") for line in lines] if decimal else lines,
-            delimiter=mark,
-            ndmin=2,
-        )
-    except ValueError as error:
+        lines = reading.read_text(path).splitlines()
+    except UnicodeDecodeError as error:
         raise LensError(f"{path}: not a phase map: {error}") from error
+    rows = [line for line in lines if line.strip() and not _COMMENT.match(line)]
+    if len(rows) < 2:
+        raise LensError(
+            f"{path}: not a phase map: it holds {len(rows)} rows of numbers"
+        )
+    mark, decimal = reading.parting(max(*rows[:2], rows[-1], key=len))
+    if decimal:
+        rows = [line.replace(",", ".") for line in rows]
+    if mark and rows[0].startswith(mark):  # the corner of a table with named rows
+        rows[0] = "nan" + rows[0]
+    header = _header(rows[0].split(mark))
+    try:
+        table = np.loadtxt(rows[1:] if header else rows, delimiter=mark, ndmin=2)
+    except ValueError as error:
+        raise LensError(
+            f"{path}: not a phase map: {error}; need rows of numbers, or columns x, y "
+            "and phase"
+        ) from error
+    if table.shape[1] == 3 and len(table) > 3 and _is_triple(header, table):
+        return _gridded(path, table, header, shape)
+    return _square(_without_counts(table, header), path, shape)
+
+
+def _header(words: list[str]) -> list[str]:
+    """Names of the columns of a table, where its first row holds such."""
+    names = [word.strip().strip('"').strip() for word in words]
+    return names if any(name and not _is_number(name) for name in names) else []
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _counts(values: Array) -> bool:
+    """Whether numbers are 0, 1, 2 ... or 1, 2, 3 ..., three or more."""
+    start = values[0] if values[0] in (0, 1) else 0
+    return len(values) > 2 and bool((values == start + np.arange(len(values))).all())
+
+
+def _without_counts(table: Array, header: list[str]) -> Array:
+    """A matrix without the numbers of its columns and rows, as tables are saved."""
+    if len(table) > 2 and min(table.shape) > 2:
+        named = np.isnan(table[0, 0]) and _counts(table[0, 1:])
+        rest = table[1:, 1:]
+        whole = bool((rest == np.rint(rest)).all())
+        if (named or _counts(table[0])) and not whole:
+            table = table[1:]
+        if (named or header or _counts(table[:, 0])) and not whole:
+            table = table[:, 1:] if _counts(table[:, 0]) else table
+    return table
+
+
+def _is_triple(header: list[str], table: Array) -> bool:
+    """Whether three columns are x, y and phase: by their names, or by a grid of x, y."""
+    if header:
+        return header[0][:1].lower() == "x" and header[1][:1].lower() == "y"
+    x, y = np.unique(table[:, 0]), np.unique(table[:, 1])
+    return min(len(x), len(y)) > 1 and len(x) * len(y) == len(table)
+
+
+def _length_scale(name: str) -> float:
+    """um in the unit that the name of a column ends in; um where it names none."""
+    found = re.search(r"(?<![a-zA-Z])_?(nm|mm|m)[)\]\s]*$", name)
+    return {"nm": 1e-3, "mm": 1e3, "m": 1e6}[found.group(1)] if found else 1.0
+
+
+def _gridded(path: Path, table: Array, header: list[str], shape: PhaseMap) -> Samples:
+    """Rows of x, y (down) and phase on an even grid, in any order.
+
+    x and y are in um, or in the unit that their names end in: x (nm), x_mm.
+
+    Raises:
+        LensError: not one phase at every place of an even grid.
+    """
+    axes, steps = [], []
+    scales = [_length_scale(name) for name in header[:2]] or [1.0, 1.0]
+    for name, values, scale in zip("xy", table.T[:2], scales, strict=True):
+        at = np.unique(values) * scale
+        step = np.diff(at)
+        if len(at) < 2 or np.ptp(step) > EVEN_STEP * step.mean():
+            raise LensError(
+                f"{path}: {len(at)} values of {name}, not evenly spaced; need x, y and "
+                "phase on an even grid, or a matrix of the phase"
+            )
+        axes.append(at)
+        steps.append(float((at[-1] - at[0]) / (len(at) - 1)))
+    x, y = axes
+    phase = np.full((len(y), len(x)), np.nan)
+    place = tuple(
+        np.unique(table[:, k], return_inverse=True)[1].ravel() for k in (1, 0)
+    )
+    if len(np.unique(place[0] * len(x) + place[1])) < len(table):
+        raise LensError(f"{path}: two rows have the same x and y; need one phase each")
+    phase[place] = table[:, 2]
+    pitch_um = shape.pitch_um
+    if pitch_um is not None and max(abs(s / pitch_um - 1) for s in steps) > EVEN_STEP:
+        raise LensError(
+            f"{path}: spacing of {steps[0]:g} x {steps[1]:g} um, but pitch_um = "
+            f"{pitch_um}; leave pitch_um out (x and y are um)"
+        )
+    centre = (float(x[0] + x[-1]) / 2, float(y[0] + y[-1]) / 2)
+    return Samples(_checked(phase, path, shape), (steps[0], steps[1]), centre)
 
 
 def _no_variable(path: Path, variable: str | None) -> None:
@@ -306,7 +480,7 @@ def _zemax(path: Path, pitch_um: float | None) -> Samples:
     the file points up, ours down.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = reading.read_text(path).splitlines()
     except UnicodeDecodeError as error:
         raise LensError(
             f"{path}: not a text file; a binary .dat of an interferometer is no grid phase"

@@ -9,6 +9,7 @@ phase.
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -133,9 +134,13 @@ class PhaseMap:
     """Phase read from a file in radians, (y, x), +y down, for exp(-iwt); see
     :mod:`metalens.design.phase_map`.
 
-    file: its path (.npy, .npz, .mat, a Zemax grid phase .dat, else text).
-    pitch_um: sampling of the map; a grid phase brings its own. Interpolated through the
-    phasor exp(i phase).
+    file: its path (.npy, .npz, .mat, a Zemax grid phase .dat, else text: a matrix, or
+    rows of x, y and phase).
+    pitch_um: sampling of the map; a grid phase and rows of x, y and phase bring their
+    own. Interpolated through the phasor exp(i phase).
+    unit: of the phase: "rad", "deg" or "waves" (1 is 2 pi). Not stated: radians, unless
+    the values look like another unit; then the map is refused.
+    levels: number of levels of 2 pi, for maps of integers (256 for 8 bits).
     add_focus: whether the hyperbolic focus is added to the map.
     variable: name of the matrix in a .mat or .npz file that holds several.
     conjugate: change the sign, for maps made with exp(+iwt).
@@ -146,8 +151,15 @@ class PhaseMap:
     add_focus: bool = False
     variable: str | None = None
     conjugate: bool = False
+    unit: Literal["rad", "deg", "waves"] | None = None
+    levels: int | None = None
 
     def __post_init__(self) -> None:
+        if self.levels is not None and (self.levels < 2 or self.unit is not None):
+            raise ConfigError(
+                f"levels = {self.levels}, unit = {self.unit} of the phase map: "
+                "need 2 levels or more, and no unit beside them"
+            )
         if self.pitch_um is not None and not self.pitch_um > 0:
             raise ConfigError(
                 f"pitch_um = {self.pitch_um} of the phase map: need a length above 0"

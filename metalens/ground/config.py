@@ -24,6 +24,10 @@ _LARGEST = 1 << 24  # bytes of a config
 _WORDS = re.compile(
     r"[^\x00-\x08\x0b-\x1f\x7f]*"
 )  # text: blanks and line ends, no other control characters
+_BACKSLASH = (
+    "a backslash in double quotes begins an escape: write a path of Windows in single "
+    "quotes ('C:\\maps\\a.npy') or with /"
+)
 _LONGEST = 500  # characters of what a record says of its values
 _TEXT = 160  # characters of what a key means, in a refusal
 _KEY = re.compile(r"(?<!\S)((?:\w+,\s+)*\w+):\s")  # in the docstring of a record
@@ -71,7 +75,7 @@ def read(path: str | Path, record: type[Any], *, empty: bool = True) -> dict[str
                 f"{path}: more than {_LARGEST} bytes; need a TOML config ({record.__name__})"
             )
         reading.note(path, before, content)
-        text = content.decode("utf-8-sig")
+        text = reading.decode_text(content)
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such file; need a TOML config ({record.__name__})"
@@ -131,11 +135,20 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except ValueError as error:  # of TOML, or an integer of thousands of digits
+        words = str(error).partition("; use sys")[0]
         raise ConfigError(
-            f"{where}: not valid TOML: {str(error).partition('; use sys')[0]}"
+            f"{where}: not valid TOML: {words}{_path_hint(text, words)}"
         ) from None
     except RecursionError:
         raise ConfigError(f"{where}: not valid TOML: nested too deep") from None
+
+
+def _path_hint(text: str, words: str) -> str:
+    """The cure where the line of an error holds a backslash in double quotes."""
+    place = re.search(r"line (\d+)", words)
+    lines = text.split("\n")
+    line = lines[int(place.group(1)) - 1] if place else ""
+    return f"; {_BACKSLASH}" if re.search(r'"[^"]*\\', line) else ""
 
 
 def _build(table: dict[str, Any], record: Any, where: str, prefix: str) -> Any:
@@ -391,6 +404,8 @@ def _convert_scalar(value: Any, hint: Any, where: str, key: str) -> Any:
             f"{where}: {key} is {_shown(value)}, need text without control characters"
         )
     if hint is Path and isinstance(value, str):
+        if re.search(r"[\t\n]", value):
+            raise ConfigError(f"{where}: {key} is {_shown(value)}; {_BACKSLASH}")
         return Path(value)
     if isinstance(value, int) and not -_MOST <= value <= _MOST:
         raise ConfigError(
@@ -456,6 +471,8 @@ def _escaped(c: str) -> str:
 
 
 def _text(value: Any) -> str:
+    if hasattr(value, "item"):  # a scalar of NumPy
+        value = value.item()
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

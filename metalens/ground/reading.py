@@ -10,6 +10,7 @@ the same or not: it is never
 asked which of two is later, since clocks are set back.
 """
 
+import codecs
 import contextlib
 import dataclasses
 import faulthandler
@@ -61,6 +62,25 @@ def remembered() -> Iterator[None]:
         yield
     finally:
         _noted.reset(token)
+
+
+def decode_text(content: bytes) -> str:
+    """Text of UTF-8, or of UTF-16 with its byte-order mark (as spreadsheets save it).
+
+    Raises:
+        UnicodeDecodeError: neither of them.
+    """
+    if not content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-8-sig")
+    text = content.decode("utf-16")
+    if len(text) and not re.search(r"[0-9A-Za-z]", text):
+        raise UnicodeDecodeError("utf-16", content, 0, len(content), "no plain letter")
+    return text
+
+
+def read_text(path: str | Path) -> str:
+    """Text of a file, by :func:`decode_text`."""
+    return decode_text(Path(path).read_bytes())
 
 
 def parting(line: str) -> tuple[str | None, bool]:

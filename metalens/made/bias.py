@@ -124,7 +124,7 @@ def read_csv(path: str | Path) -> tuple[tuple[float, float], ...]:
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
+        lines = reading.read_text(path).replace('"', "").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ProcessError(f"{path}: cannot be read as a table ({error})") from None
     rows = [

@@ -199,7 +199,7 @@ def _curve(file: Path) -> Array:
     """(n, [nm, value]) of a file, ascending."""
     rows = []
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
+        lines = reading.read_text(file).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PropagationError(
             f"{file}: cannot be read as a table of wavelength and value: {error}"

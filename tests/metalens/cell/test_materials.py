@@ -519,3 +519,41 @@ def test_blends_and_offsets():
         2 * step
     )
     assert abs(materials.slope(blend, 0.6) - rise) < 1e-6
+
+
+def write_page(folder: Path, rows: list[str]) -> str:
+    """A page with one table of n and k; its path."""
+    file = folder / "page.yml"
+    data = "".join(f"        {row}\n" for row in rows)
+    file.write_text(f"DATA:\n  - type: tabulated nk\n    data: |\n{data}")
+    return str(file)
+
+
+def test_a_bad_row_of_a_page_spoils_the_wavelengths_beside_it_alone(tmp_path: Path):
+    rows = ["0.4 2.0 0.5", "0.5 1.8 -0.003", "0.6 1.6 0.1", "0.9 1.3 0.1"]
+    page = write_page(tmp_path, rows)
+    assert materials.index(page, 0.75) == pytest.approx(1.45 + 0.1j, abs=1e-15)
+    assert materials.index(page, 0.6) == 1.6 + 0.1j
+    assert materials.index(page, 0.4) == 2.0 + 0.5j
+    for wavelength_um in (0.41, 0.5, 0.59):
+        with pytest.raises(MaterialError, match=r"row 2: '0.5 1.8 -0.003'.*k = -0.003"):
+            materials.index(page, wavelength_um)
+
+
+@pytest.mark.parametrize("row", ["0.5 1.8 x", "0.5 1.8", "0.5 nan 0.1", "0.5 -1.8 0.1"])
+def test_a_row_that_is_no_index_is_named_where_it_is_asked_for(tmp_path: Path, row):
+    page = write_page(tmp_path, ["0.9 1.3 0.1", "0.6 1.6 0.1", row, "0.4 2.0 0.5"])
+    assert materials.index(page, 0.75) == pytest.approx(1.45 + 0.1j, abs=1e-15)
+    with pytest.raises(MaterialError, match=r"row 3: .*0\.47 um"):
+        materials.index(page, 0.47)
+
+
+def test_repeated_wavelengths_of_a_page_are_one_row_or_a_step(tmp_path: Path):
+    """Between the rows values are straight lines on each side of a step."""
+    rows = ["0.4 2.0 0.4", "0.5 1.8 0.2", "0.5 1.8 0.2", "0.6 1.6 0.1", "0.6 1.2 0.3"]
+    page = write_page(tmp_path, [*rows, "0.7 1.0 0.5"])
+    assert materials.index(page, 0.5) == 1.8 + 0.2j
+    assert materials.index(page, 0.55) == pytest.approx(1.7 + 0.15j, abs=1e-15)
+    assert materials.index(page, 0.65) == pytest.approx(1.1 + 0.4j, abs=1e-15)
+    with pytest.raises(MaterialError, match=r"two rows at 0.6 um"):
+        materials.index(page, 0.6)

@@ -86,29 +86,6 @@ def test_half_way_between_samples_two_thirds_of_half_a_turn_is_the_most(
         phase_map.interpolate(samples, *given)
 
 
-def test_outside_the_aperture_a_coarse_map_and_one_without_data_are_let_be():
-    """A step of half a turn right of 4 um, nothing right of 6; the aperture ends at 3.4
-    in the first two.
-    """
-    x = np.arange(-8, 9) * 1.0
-    phase = np.where(x > 4, math.pi, 0.0) + 0 * x[:, None]
-    phase[:, x > 6] = math.nan
-    at = np.array([-3.0, 0.4, 4.5, 6.5]), np.array([0.3, -1.0])
-    for radius in (3.4, 4.6):
-        if radius < 4:
-            assert (
-                phase_map.interpolate(
-                    Samples(phase, (1.0, 1.0)), *at, radius_um=radius
-                )[:, :2].tolist()
-                == [[0, 0]] * 2
-            )
-        else:
-            with pytest.raises(LensError, match=r"finer pitch than 1\.0 um"):
-                phase_map.interpolate(Samples(phase, (1.0, 1.0)), *at, radius_um=radius)
-    with pytest.raises(LensError, match=r"no data near row 8\.3, column 14\.5"):
-        phase_map.interpolate(Samples(phase, (1.0, 1.0)), *at, radius_um=7.0)
-
-
 def grid(folder, head, values):
     path = folder / "g.dat"
     path.write_text(
@@ -209,22 +186,6 @@ def test_rows_and_columns_of_numbers_are_no_map(tmp_path):
     found = phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9))
     assert np.array_equal(found.phase_rad, PHASE)
     assert (found.step_um, found.centre_um) == ((0.9, 0.9), (0.0, 0.0))
-
-
-def test_numbers_that_are_not_finite_are_named_by_row_and_column(tmp_path):
-    broken = PHASE.copy()
-    broken[3, 1] = math.inf
-    np.save(tmp_path / "m.npy", broken)
-    with pytest.raises(LensError, match="phase at row 3, column 1 is inf"):
-        phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9))
-    np.save(tmp_path / "m.npy", PHASE + 1j)
-    with pytest.raises(LensError, match="holds complex numbers"):
-        phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9))
-    np.save(tmp_path / "m.npy", np.array([[1, 2], [3, 4]]))
-    assert phase_map.read(PhaseMap(tmp_path / "m.npy", 0.9)).phase_rad.tolist() == [
-        [1, 2],
-        [3, 4],
-    ]
 
 
 def test_steps_of_a_ring_below_a_third_of_a_turn_tell_a_vortex_and_one_turn_is_enough():

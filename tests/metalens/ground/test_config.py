@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -186,3 +187,30 @@ def test_numbers_stay_lists_and_records_become_tables():
         "parts": [{"size_um": 0.1, "at_um": []}, {"size_um": 0.2, "at_um": [3.0]}],
     }
     assert config.loads(config.dumps(made), Whole) == made
+
+
+@dataclass(frozen=True)
+class Files:
+    """Names a file and a length."""
+
+    file: Path = Path("a")
+    size_um: float = 0.1
+
+
+@pytest.mark.parametrize("path", [r"C:\Users\lab\a.npy", r"C:\temp\new.npy"])
+def test_a_path_of_windows_in_double_quotes_gets_its_cure(path):
+    """\\U begins an escape that fails; \\t and \\n are a tab and a line end."""
+    with pytest.raises(ConfigError, match="single quotes .* or with /"):
+        config.loads(f'file = "{path}"', Files)
+    assert config.loads(f"file = '{path}'", Files).file == Path(path)
+
+
+def test_numbers_of_numpy_are_written_as_numbers():
+    text = config.dumps(Files(size_um=np.float64(0.08)))
+    assert config.loads(text, Files).size_um == 0.08
+    assert tomllib.loads(text)["size_um"] == 0.08
+
+
+def test_settings_in_utf_16_are_settings(tmp_path):
+    (tmp_path / "s.toml").write_text("size_um = 0.3\n", encoding="utf-16")
+    assert config.load(tmp_path / "s.toml", Files).size_um == 0.3
