@@ -200,7 +200,7 @@ class Files:
 @pytest.mark.parametrize("path", [r"C:\Users\lab\a.npy", r"C:\temp\new.npy"])
 def test_a_path_of_windows_in_double_quotes_gets_its_cure(path):
     """\\U begins an escape that fails; \\t and \\n are a tab and a line end."""
-    with pytest.raises(ConfigError, match="single quotes .* or with /"):
+    with pytest.raises(ConfigError, match=r"single quotes .* or with /"):
         config.loads(f'file = "{path}"', Files)
     assert config.loads(f"file = '{path}'", Files).file == Path(path)
 
