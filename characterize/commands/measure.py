@@ -44,7 +44,8 @@ class Options(Common):
             for the focusing efficiency.
         edge_um: pixel of a picture of a slanted edge, on the sensor: the modulation
             transfer across it (ISO 12233).
-        pixel_nm: size of a micrograph's pixel.
+        pixel_nm: size of a micrograph's pixel; by default that of the instrument's
+            tag, where a TIFF of Zeiss or FEI has one.
         bar_nm: length of a micrograph's white scale bar, where the pixel is unknown.
         pitch_nm: distance of neighbouring pillars; found in the picture without it.
         edge_bias_nm: by which edges appear outside the true ones, from a calibration
@@ -70,6 +71,10 @@ def run(options: Options) -> int:
     """Measure and write; exit 0, or 1 where no pillar could be measured or most sites
     hold what is no round one.
     """
+    if options.pixel_nm is None and options.bar_nm is None and options.edge_um is None:
+        options = dataclasses.replace(
+            options, pixel_nm=sem.instrument_pixel_nm(options.source)
+        )
     of_pillars = options.pixel_nm is not None or options.bar_nm is not None
     if of_pillars and options.edge_um is not None:
         raise ConfigError(

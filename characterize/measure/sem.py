@@ -15,6 +15,7 @@ lattice may be of any kind.
 import dataclasses
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
@@ -24,7 +25,7 @@ from characterize.measure.lattice import Lattice, find
 from characterize.measure.radial import RAYS
 from characterize.model import Known
 from metalens.ground.arrays import Array
-from metalens.ground.errors import CaptureError
+from metalens.ground.errors import DAMAGE, CaptureError
 
 _ROUND = (
     2 / 3
@@ -233,6 +234,47 @@ def _flattened(image: Array, pitch: float) -> Array:
     steady = steady - ndimage.gaussian_filter(steady, 1.5 * pitch)
     low, high = np.percentile(steady, [10, 90])
     return np.asarray((steady - low) / max(high - low, 1e-12))
+
+
+def instrument_pixel_nm(path: Path) -> float | None:
+    """Pixel size of a micrograph in nm, from the instrument's own TIFF tags.
+
+    Read are Zeiss SmartSEM (tag 34118, ``AP_PIXEL_SIZE``) and FEI / Thermo Fisher
+    (tags 34680 and 34682, ``PixelWidth`` of ``[Scan]``, m).
+
+    Returns:
+        None for other files.
+
+    Raises:
+        CaptureError: pixels that are not square, or a size that is no length above 0.
+    """
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            zeiss, fei = file.sem_metadata or {}, file.fei_metadata or {}
+    except (tifffile.TiffFileError, *DAMAGE):
+        return None
+    sizes: list[float] = []
+    if "ap_pixel_size" in zeiss:
+        _, value, unit = zeiss["ap_pixel_size"]
+        scale = {"pm": 1e-3, "nm": 1.0, "um": 1e3, "\xb5m": 1e3, "mm": 1e6}.get(unit)
+        sizes = [value * scale] if scale else []
+    elif "PixelWidth" in fei.get("Scan", {}):
+        scan = fei["Scan"]
+        sizes = [scan[k] * 1e9 for k in ("PixelWidth", "PixelHeight") if k in scan]
+    if not sizes:
+        return None
+    if not (
+        min(sizes) > 0 and max(sizes) < math.inf and max(sizes) < 1.01 * min(sizes)
+    ):
+        raise CaptureError(
+            f"{path}: pixels of {' x '.join(f'{s:.4g}' for s in sizes)} nm by the "
+            "instrument's tag; need square ones: give --pixel-nm"
+        )
+    return float(sizes[0])
 
 
 def scale_from_bar(image: Array, bar_nm: float) -> float:
