@@ -148,7 +148,7 @@ def _layer(
     ee, oo, oe = sectors
     inside, around = (
         _plain(materials.index(name, wavelength_um) ** 2)
-        for name in (cell.pillar, cell.between)
+        for name in (cell.pillar, cell.fill)
     )
     step = wavelength_um / (len(diameters_um) * cell.pitch_um)
     disc = _discs(diameters_um, cell.pitch_um, ee.reach)

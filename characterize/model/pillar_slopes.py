@@ -136,7 +136,7 @@ def _about(lens: Lens, tolerance: float, wanted: Sequence[str]) -> str:
         for one in (layer.material, layer.between, layer.coat)
         if one is not None
     ]
-    media = cell.pillar, cell.between, cell.substrate, cell.cover, *films, *sections
+    media = cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *sections
     indices = [index(medium, lens.wavelength_um) for medium in media]
     proxy = {
         name: np.asarray(value).tolist()

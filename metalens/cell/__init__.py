@@ -16,8 +16,12 @@ if TYPE_CHECKING:
     from metalens.cell.light import check_tolerance as check_tolerance
     from metalens.cell.materials import index as index
     from metalens.cell.materials import slope as slope
+    from metalens.cell.orders import Order as Order
     from metalens.cell.orders import check_subwavelength as check_subwavelength
+    from metalens.cell.orders import describe_order_loss as describe_order_loss
+    from metalens.cell.orders import named_orders as named_orders
     from metalens.cell.orders import no_resonance_um as no_resonance_um
+    from metalens.cell.orders import substrate_orders as substrate_orders
     from metalens.cell.record import Blend as Blend
     from metalens.cell.record import Cell as Cell
     from metalens.cell.record import Film as Film
@@ -37,12 +41,16 @@ __getattr__, __dir__, __all__ = attach(
         "Layer": "record",
         "Light": "light",
         "Material": "record",
+        "Order": "orders",
         "Polarization": "light",
         "Response": "response",
         "check_direction": "light",
         "check_subwavelength": "orders",
+        "named_orders": "orders",
         "no_resonance_um": "orders",
+        "substrate_orders": "orders",
         "check_tolerance": "light",
+        "describe_order_loss": "orders",
         "index": "materials",
         "materials": "",
         "shapes": "",

@@ -1,8 +1,9 @@
-"""Which diffraction orders of a lattice carry power, and the refusal of cells where
-others than zero do.
+"""Propagating diffraction orders of a lattice: those of the cover are refused, those of
+the substrate are a loss.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -91,9 +92,53 @@ def no_resonance_um(cell: Cell, wavelength_um: float) -> float:
         for m in (layer.material, layer.between, layer.coat)
         if m is not None
     ]
-    every = (cell.pillar, cell.between, cell.substrate, cell.cover, *films, *layered)
+    every = (cell.pillar, cell.fill, cell.substrate, cell.cover, *films, *layered)
     densest = max(materials.index(material, wavelength_um).real for material in every)
     return cell.lattice.least_order * wavelength_um / densest
+
+
+def substrate_orders(
+    cell: Cell,
+    wavelength_um: float,
+    *,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+) -> tuple[Order, ...]:
+    """Orders other than zero that propagate in the substrate: what they carry is lost.
+
+    Arguments and errors as for :func:`propagating`.
+    """
+    orders = propagating(
+        cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad
+    )
+    return tuple(
+        order for order in orders if order.side == "substrate" and (order.m or order.n)
+    )
+
+
+def named_orders(orders: Sequence[Order], most: int = 8) -> str:
+    """Orders in words: "(1, 0), (0, -1) and 3 more"."""
+    named = ", ".join(f"({order.m}, {order.n})" for order in orders[:most])
+    more = f" and {len(orders) - most} more" if len(orders) > most else ""
+    return named + more
+
+
+def describe_order_loss(
+    cell: Cell, wavelength_um: float, share: float | None = None
+) -> str:
+    """Which orders of the substrate take light at normal incidence, in a line; empty
+    where none propagates.
+
+    share: of the light that they and absorption take, where it is known.
+    """
+    orders = substrate_orders(cell, wavelength_um)
+    if not orders:
+        return ""
+    known = "" if share is None else f", with absorption {share:.1%} in the mean"
+    return (
+        f"\n  diffraction orders {named_orders(orders)} propagate in the substrate and "
+        f"take light{known}: a loss that |T| of the pillars includes"
+    )
 
 
 def check_subwavelength(
@@ -103,7 +148,10 @@ def check_subwavelength(
     angle_rad: float = 0.0,
     azimuth_rad: float = 0.0,
 ) -> None:
-    """Refuse a cell that sends light into other orders than zero.
+    """Refuse a cell that transmits orders other than zero into the cover.
+
+    They would reach the sensor beside the image. Orders of the substrate alone are a
+    loss: :func:`substrate_orders` lists them, the solvers' ``energy`` includes them.
 
     Raises:
         CellError: names the orders, and the pitch below which none propagates.
@@ -112,24 +160,21 @@ def check_subwavelength(
     orders = propagating(
         cell, wavelength_um, angle_rad=angle_rad, azimuth_rad=azimuth_rad
     )
-    stray = [order for order in orders if order.m or order.n]
+    stray = [
+        order for order in orders if order.side == "cover" and (order.m or order.n)
+    ]
     if not stray:
         return
-    n_side = max(
-        materials.index(m, wavelength_um).real for m in (cell.substrate, cell.cover)
-    )
+    n_cover = materials.index(cell.cover, wavelength_um).real
     limit = _limit_um(
         cell.lattice,
-        wavelength_um / n_side,
-        min(abs(math.sin(angle_rad)) / n_side, 1.0),
+        wavelength_um / n_cover,
+        min(abs(math.sin(angle_rad)) / n_cover, 1.0),
         azimuth_rad,
     )
-    named = ", ".join(
-        f"({order.m}, {order.n}) in the {order.side}" for order in stray[:8]
-    )
-    more = f" and {len(stray) - 8} more" if len(stray) > 8 else ""
     raise CellError(
-        f"pitch {cell.pitch_um:.6g} um at {wavelength_um:.6g} um: diffraction orders {named}{more} propagate; "
+        f"pitch {cell.pitch_um:.6g} um at {wavelength_um:.6g} um: diffraction orders "
+        f"{named_orders(stray)} propagate in the cover; "
         f"need pitch_um < {limit:.6g}, or a longer wavelength"
     )
 

@@ -93,8 +93,8 @@ class Layer:
 
     height_um: of the section. grow_um: its width less that of the mask, along every
     edge pair.
-    material: of the section; None for that of the cell's pillar. between: likewise,
-    around it.
+    material: of the section; None for that of the cell's pillar.
+    between: around the section; None for the fill of the cell.
     coat_um, coat: a conformal film on its wall.
     """
 
@@ -130,8 +130,8 @@ class Cell:
 
     pitch_um: lattice constant (along x).
     height_um: of the pillar.
-    pillar, substrate, cover, between: materials (``between`` fills the space around the
-    pillar).
+    pillar, substrate, cover, between: materials. ``between`` fills the space around the
+    pillar; None: the cover does, see :attr:`fill`.
     sidewall_rad: tilt of the wall from the vertical, above 0 where the foot is wider
     than the top; the
         diameter of a pillar is the one at half its height.
@@ -149,7 +149,7 @@ class Cell:
     pillar: Material = "a-Si"
     substrate: Material = "SiO2"
     cover: Material = "air"
-    between: Material = "air"
+    between: Material | None = None
     sidewall_rad: float = 0.0
     under: tuple[Film, ...] = ()
     over: tuple[Film, ...] = ()
@@ -171,6 +171,11 @@ class Cell:
             raise CellError(
                 f"layers add up to {total:.6g} um, height_um is {self.height_um:.6g}: need the same height"
             )
+
+    @property
+    def fill(self) -> Material:
+        """Material around the pillar: ``between``, or the cover where none is stated."""
+        return self.cover if self.between is None else self.between
 
     @property
     def round(self) -> bool:

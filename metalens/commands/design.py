@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from metalens import design, lens, library
-from metalens.cell import Cell
+from metalens.cell import Cell, describe_order_loss
 from metalens.commands import design_words as words
 from metalens.commands import paired, several
 from metalens.commands.common import Common, Output
@@ -175,14 +175,16 @@ def run(options: Options) -> int:
         )
     with options.claim(target, beside=(".png", "_fisher.png"), inputs=read) as draft:
         made = _make(wanted, options, draft.path)
+    focus = made.wanted.focus
+    lost = describe_order_loss(made.lens.cell, focus.wavelength_um, made.loss)
     head, layers = (
-        _head(made.wanted, target, made.quality) + words.held(made.lens),
+        _head(made.wanted, target, made.quality) + words.held(made.lens) + lost,
         made.wanted.layers,
     )
     values = words.values(made.quality, made.check, made.unlike) | several.numbers(
         made.beside
     )
-    values |= words.curve(made.lens.proxy)
+    values |= words.curve(made.lens.proxy) | {"loss": made.loss}
     text = words.text(
         head, layers, made.quality, made.check, made.unlike, several=bool(made.beside)
     )
@@ -255,6 +257,7 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         lens.save(draft.path, made)
         write_bytes(draft.path.with_suffix(".png"), lens_plot.picture(made))
     head = _head(wanted, options.output, split.x)
+    head += describe_order_loss(made_of.cell, wanted.focus.wavelength_um)
     told = paired.values(split, checks), paired.text(head, wanted.layers, split, checks)
     return options.console.judged(*told, words.unfocused(checks))
 
@@ -337,7 +340,10 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
-    return Outcome(wanted, quality, check, judged, conversion, found, made, beside)
+    lost = made_of.mean_loss(made.diameters.diameter_um, wanted.focus.wavelength_um)
+    return Outcome(
+        wanted, quality, check, judged, conversion, found, made, beside, lost
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,7 +351,7 @@ class Outcome:
     """What a design is worth. wanted: as it was filled in; check: of its focus; judged:
     of a free form; conversion: of
     circular light; unlike: what neighbours leave of the efficiency; beside: of the
-    other wavelengths."""
+    other wavelengths; loss: mean share that is absorbed or in other orders."""
 
     wanted: Design
     quality: Quality
@@ -355,6 +361,7 @@ class Outcome:
     unlike: design.Unlike | None
     lens: Lens
     beside: tuple[several.Judged, ...]
+    loss: float
 
 
 def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:

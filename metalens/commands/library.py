@@ -13,7 +13,13 @@ import numpy as np
 import tyro
 
 from metalens import library
-from metalens.cell import Cell, no_resonance_um
+from metalens.cell import (
+    Cell,
+    Order,
+    named_orders,
+    no_resonance_um,
+    substrate_orders,
+)
 from metalens.commands import axes_library
 from metalens.commands.common import Distributed, Output
 from metalens.ground import config, reading, store
@@ -206,6 +212,9 @@ def _values(
         "median_error": float(np.median(made.t_error)),
         "polarizations": list(made.polarization),
     }
+    if _orders(made):
+        lost = made.lost
+        values["lost"] = {"mean": float(lost.mean()), "most": float(lost.max())}
     if made.turned is not None:
         values["circular"] = _circular(made.turned)
     if fitted is not None:
@@ -259,6 +268,7 @@ def _text(
             f"  {_above(made)}, which the file does not state: beside resonances as a rule, "
             "of narrow walls and shapes without mirrors in more places"
         )
+    lines += _lost_lines(made)
     if made.turned is not None:
         lines += _turned_lines(made.turned)
     elif made.polarization == ("x",) and not made.cell.alike:
@@ -267,6 +277,27 @@ def _text(
         )
         lines += _elsewhere(made)
     return "\n".join(lines)
+
+
+def _orders(made: PillarLibrary) -> tuple[Order, ...]:
+    """Orders of the substrate, at the shortest wavelength and the widest angle."""
+    return substrate_orders(
+        made.cell,
+        float(made.wavelength_um[0]),
+        angle_rad=float(made.angle_rad[-1]),
+    )
+
+
+def _lost_lines(made: PillarLibrary) -> list[str]:
+    """What orders of the substrate take, in words; nothing where none propagates."""
+    orders, lost = _orders(made), made.lost
+    if not orders:
+        return []
+    return [
+        f"  diffraction orders {named_orders(orders)} propagate in the substrate: with "
+        f"absorption they take {lost.mean():.1%} of the light in the mean, "
+        f"{lost.max():.1%} at most"
+    ]
 
 
 def _elsewhere(made: PillarLibrary) -> list[str]:

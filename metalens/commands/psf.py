@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from metalens import design, lens, psf
+from metalens.cell import describe_order_loss
 from metalens.commands import far_field
 from metalens.commands.common import Common, MaybeOutput
 from metalens.commands.psf_settings import Settings, read
@@ -155,6 +156,7 @@ def run(options: Options) -> int:
         f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts
     )
     text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})\n  {_budget(stack).text}"
+    text += describe_order_loss(made.cell, float(stack.wavelengths_um.min()))
     above = f"the relative error {stack.error:.2g} is above the tolerance {stack.tolerance:g}: {_budget(stack).cure}"
     failures = ["" if stack.converged else above, made.proxy.doubt]
     return options.console.judged(

@@ -189,8 +189,7 @@ def _layer(
     """
     m, n, kx, ky = grid
     inside, around = (
-        materials.index(name, wavelength_um) ** 2
-        for name in (cell.pillar, cell.between)
+        materials.index(name, wavelength_um) ** 2 for name in (cell.pillar, cell.fill)
     )
     dm, dn = m[:, None] - m, n[:, None] - n
     disc = _discs(dm, dn, np.asarray(diameters_um), block)

@@ -243,7 +243,7 @@ def guide(
 
     index, outer = (
         m.n if isinstance(m, Index) else materials.index(m, wavelength_um).real
-        for m in (cell.pillar, cell.between)
+        for m in (cell.pillar, cell.fill)
     )
     k, h = 2 * math.pi / wavelength_um, cell.height_um
     fill = math.pi * diameter_um[0] ** 2 / 4 / cell.pitch_um**2

@@ -136,7 +136,7 @@ def case_of(cell: Cell, diameter_um: float, light: Light) -> Case:
     check_shape(cell, diameter_um)
     along = plane_of_incidence(light)
     below, above = half_spaces(cell, light)
-    disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.between))
+    disc, around = (index(m, light.wavelength_um) for m in (cell.pillar, cell.fill))
     k0, half, sine = (
         2 * math.pi / light.wavelength_um,
         cell.pitch_um / 2,

@@ -202,7 +202,7 @@ def gradient(
     refraction = index(cell.pillar, wavelength_um)
     parts = {
         "disc": cell.pillar,
-        "around": cell.between,
+        "around": cell.fill,
         "below": cell.substrate,
         "above": cell.cover,
     }

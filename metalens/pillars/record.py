@@ -11,7 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens.cell import Cell, Index, Polarization, check_subwavelength, index
+from metalens.cell import (
+    Cell,
+    Index,
+    Polarization,
+    check_subwavelength,
+    index,
+)
 from metalens.ground import config, store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, ConfigError, DomainError
@@ -177,7 +183,8 @@ class PillarLibrary:
     t, r: (polarization, angle, wavelength, diameter) complex amplitudes of the zero
     order.
     t_error: as t; estimate of |t - exact|, not below the true error.
-    energy: as t; |t|² + |r|², 1 where nothing absorbs.
+    energy: as t; |t|² + |r|² of the zero orders, 1 where nothing absorbs and no other
+        order propagates.
     resonances: (k, 5) polarization index, angle_rad, wavelength_um, diameter_um,
     half-width in um of the poles of
         t(D) near the real axis.
@@ -225,14 +232,31 @@ class PillarLibrary:
         """Whether every error bar meets the tolerance."""
         return bool(self.t_error.max() <= self.sweep.bar)
 
+    @property
+    def lost(self) -> Array:
+        """As t: share of the power that is absorbed or leaves in orders other than zero
+        (of a shape without a mirror along x or y, or in the other polarisation).
+        """
+        return np.maximum(1 - self.energy, 0.0)
+
+    def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
+        """Mean of :attr:`lost` over pillars, at the least angle of the library.
+
+        diameter_um: of the pillars, 0 where there is none. wavelength_um: the nearest
+        of the library is taken; polarisations are averaged.
+        """
+        wave = int(np.argmin(np.abs(self.wavelength_um - wavelength_um)))
+        pillars = np.ravel(diameter_um)[np.ravel(diameter_um) > 0]
+        of_size = self.lost[:, 0, wave].mean(axis=0)
+        return float(np.interp(pillars, self.diameter_um, of_size).mean())
+
 
 def check(cell: Cell, sweep: Sweep) -> None:
     """Refuse a sweep that cannot be computed, before anything is computed.
 
     Raises:
-        CellError: pillars touch, or diffraction orders propagate (named);
-            MaterialError: a wavelength outside
-        the range of a material.
+        CellError: pillars touch, or diffraction orders propagate in the cover (named).
+        MaterialError: a wavelength outside the range of a material.
     """
     span = sweep.span_um(cell)
     if sweep.lengths_um is not None:
@@ -246,7 +270,7 @@ def check(cell: Cell, sweep: Sweep) -> None:
 
 def check_light(cell: Cell, sweep: Sweep) -> None:
     """Refuse wavelengths that a material does not hold, half-spaces that absorb, and
-    orders that propagate.
+    orders that propagate in the cover.
 
     Raises:
         CellError, MaterialError: as :func:`check`.
@@ -259,7 +283,7 @@ def check_light(cell: Cell, sweep: Sweep) -> None:
         if m is not None
     ]
     for wavelength in sweep.wavelengths_um:
-        for material in (cell.pillar, cell.between, *films, *layered):
+        for material in (cell.pillar, cell.fill, *films, *layered):
             index(material, wavelength)
         for side in ("substrate", "cover"):
             n = index(getattr(cell, side), wavelength)

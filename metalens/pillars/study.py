@@ -111,7 +111,8 @@ class Verdict:
     diameters.
     least_transmission: smallest |t| on it; mean_power: mean |t|² over it, even in phase.
     ends: what bounds it above.
-    max_angle_deg: of incidence in air up to which no diffraction order propagates.
+    max_angle_deg: of incidence in air up to which no diffraction order propagates, in
+        substrate or cover.
     error: largest error estimate of t on the stretch.
     pillar: name of the material, or n + ik.
     """
@@ -141,9 +142,8 @@ def run(
             same.
 
     Raises:
-        CellError: a pitch at which diffraction orders propagate; it is named, with the
-            largest that has none. Sizes
-            that do not fit.
+        CellError: a pitch at which diffraction orders propagate in the cover; it is
+            named, with the largest that has none. Sizes that do not fit.
         MaterialError: unknown, or a wavelength outside the range of a material of the
             cell.
     """
@@ -272,8 +272,8 @@ def judge(study: Study, cell: Cell, wavelength_um: float, curve: Curve) -> Verdi
 
 
 def max_angle_deg(cell: Cell, wavelength_um: float) -> float:
-    """Angle of incidence in air up to which no order propagates: sin = wavelength /
-    spacing of rows - largest n.
+    """Angle of incidence in air up to which no other order propagates on either side:
+    sin = wavelength / spacing of rows - largest n.
     """
     n = max(
         index(material, wavelength_um).real for material in (cell.substrate, cell.cover)

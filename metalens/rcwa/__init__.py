@@ -1,5 +1,6 @@
 """Rigorous coupled-wave analysis of one pillar cell.
 
+``solve_textbook_rcwa`` is the plain reference: a page of formulae without symmetries.
 ``jones`` gives both polarisations of a cell of any shape, lattice and layers,
 ``jones_derivatives`` also their exact
 derivatives by every number of it, ``near_field`` the fields in it.
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from metalens.rcwa.rates.verb import JonesDerivatives as JonesDerivatives
     from metalens.rcwa.rates.verb import Rate as Rate
     from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
+    from metalens.rcwa.reference import OrderResponse as OrderResponse
+    from metalens.rcwa.reference import solve_textbook_rcwa as solve_textbook_rcwa
     from metalens.rcwa.verbs import derivatives as derivatives
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
@@ -62,6 +65,8 @@ __getattr__, __dir__, __all__ = attach(
         "most_harmonics": "any_shape",
         "near_field": "near",
         "near_fields": "near",
+        "OrderResponse": "reference",
+        "solve_textbook_rcwa": "reference",
         "solve": "verbs",
         "solve_many": "verbs",
     },

@@ -75,7 +75,7 @@ def case(cell: Cell, light: Light) -> Case:
             f"sin(angle_rad) = {math.hypot(kx, ky):.6g} in a substrate of n = {media.substrate.real:.6g}: the light "
             "cannot come from there; need a smaller angle_rad or another substrate"
         )
-    pillar, between = index(cell.pillar), index(cell.between)
+    pillar, between = index(cell.pillar), index(cell.fill)
     return Case(
         cell,
         light.wavelength_um,

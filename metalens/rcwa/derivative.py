@@ -298,7 +298,7 @@ def _by_wavelength(problem: _Problem) -> complex:
 
     def pattern(diameter: Array, lift: float) -> Change:
         bulk = changes.indices(
-            this, ways, diameter, slope(cell.pillar), slope(cell.between)
+            this, ways, diameter, slope(cell.pillar), slope(cell.fill)
         )
         return changes.add(changes.turned_pattern(this, ways, diameter, turn), bulk)
 

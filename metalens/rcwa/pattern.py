@@ -68,7 +68,7 @@ def slab(
     )
     around = (
         materials.index(
-            cell.between if layer.between is None else layer.between, wavelength_um
+            cell.fill if layer.between is None else layer.between, wavelength_um
         )
         ** 2
     )

@@ -89,7 +89,8 @@ def _of_indices(cell: Cell, size_um: float, wavelength_um: float) -> list[Parame
         return Index(now.real + x, now.imag)
 
     def of_cell(name: str, x: float) -> Moved:
-        return Moved(_with(cell, name, beside(getattr(cell, name), x)), size_um)
+        now = cell.fill if name == "between" else cell.pillar
+        return Moved(_with(cell, name, beside(now, x)), size_um)
 
     def of_layer(i: int, name: str, x: float) -> Moved:
         changed = _with(cell.layers[i], name, beside(getattr(cell.layers[i], name), x))

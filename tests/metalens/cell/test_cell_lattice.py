@@ -189,7 +189,7 @@ def test_the_pitch_named_for_light_aslant_in_azimuth_is_the_limit():
     true = wave / (kx + math.sqrt(n**2 - ky**2))
 
     def cell(pitch_um):
-        return Cell(pitch_um, pillar=Index(3.6), substrate=Index(n))
+        return Cell(pitch_um, pillar=Index(3.6), cover=Index(n), substrate=Index(1.0))
 
     with pytest.raises(CellError, match="need pitch_um <") as refused:
         check_subwavelength(

@@ -5,7 +5,12 @@ import math
 import pytest
 
 from metalens import rcwa
-from metalens.cell.orders import Order, check_subwavelength, propagating
+from metalens.cell.orders import (
+    Order,
+    check_subwavelength,
+    propagating,
+    substrate_orders,
+)
 from metalens.cell.record import Cell, Index
 from metalens.ground.errors import CellError
 
@@ -14,6 +19,11 @@ GLASS = Index(1.45)
 
 def cell(pitch_um):
     return Cell(pitch_um, pillar=Index(3.6), substrate=GLASS)
+
+
+def immersed(pitch_um):
+    """The same with glass as the cover: its orders are the refused ones."""
+    return Cell(pitch_um, pillar=Index(3.6), substrate=GLASS, cover=GLASS)
 
 
 def test_only_the_zero_orders_below_cutoff():
@@ -28,10 +38,10 @@ def test_exactly_at_cutoff_four_orders_graze_in_the_substrate():
     at_cutoff = cell(1.0)
     assert len(propagating(at_cutoff, 1.45)) == 6
     assert len(propagating(at_cutoff, 1.45 * (1 + 1e-12))) == 2
-    with pytest.raises(
-        CellError, match=r"\(0, -1\) in the substrate.*need pitch_um < 1"
-    ):
-        check_subwavelength(at_cutoff, 1.45)
+    with pytest.raises(CellError, match=r"\(0, -1\).* in the cover; need pitch_um < 1"):
+        check_subwavelength(immersed(1.0), 1.45)
+    check_subwavelength(at_cutoff, 1.45)  # orders of the substrate are a loss
+    assert len(substrate_orders(at_cutoff, 1.45)) == 4
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 10.0, -10.0])
@@ -52,9 +62,9 @@ def test_orders_are_those_that_carry_power_in_the_solver(pitch_um, angle_deg):
 def test_the_pitch_that_the_refusal_names_is_the_limit():
     angle_rad = math.radians(12)
     limit = 0.85 / (1.45 + math.sin(angle_rad))
-    check_subwavelength(cell(limit * (1 - 1e-9)), 0.85, angle_rad=angle_rad)
+    check_subwavelength(immersed(limit * (1 - 1e-9)), 0.85, angle_rad=angle_rad)
     with pytest.raises(CellError, match=f"pitch_um < {limit:.6g}"):
-        check_subwavelength(cell(limit * (1 + 1e-9)), 0.85, angle_rad=angle_rad)
+        check_subwavelength(immersed(limit * (1 + 1e-9)), 0.85, angle_rad=angle_rad)
 
 
 def test_many_orders_are_counted_not_listed():

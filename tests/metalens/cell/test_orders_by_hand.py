@@ -86,7 +86,7 @@ def test_the_pitch_that_a_refusal_names_is_the_limit_for_any_lattice_and_light(
 ):
     """Other orders propagate from that pitch on and none below it; six digits are told."""
     light = {"angle_rad": angle_rad, "azimuth_rad": azimuth_rad}
-    coarse = Cell(1.3, substrate=Index(1.45), cover=Index(1.2), lattice=lattice)
+    coarse = Cell(1.3, substrate=Index(1.2), cover=Index(1.45), lattice=lattice)
     with pytest.raises(CellError) as refused:
         check_subwavelength(coarse, 0.85, **light)
     limit = float(re.search(r"need pitch_um < ([\d.]+),", str(refused.value))[1])

@@ -201,12 +201,10 @@ def test_bad_sweeps_are_refused(change, words):
 def test_propagating_orders_are_named():
     n = 1.4525
     for pitch, angle in ((0.85 / n * 1.001, 0.0), (0.7, 0.0), (0.45, 30.0)):
-        cell = Cell(pitch, 0.7, Index(3.6), substrate=Index(n))
-        with pytest.raises(
-            CellError, match=r"orders .*\(-1, 0\) in the substrate.* propagate"
-        ):
+        cell = Cell(pitch, 0.7, Index(3.6), cover=Index(n))
+        with pytest.raises(CellError, match=r"orders .*\(-1, 0\).* in the cover"):
             library.check(cell, Sweep(angles_deg=(angle,)))
-    library.check(Cell(0.85 / n * 0.999, 0.7, Index(3.6), substrate=Index(n)), Sweep())
+    library.check(Cell(0.85 / n * 0.999, 0.7, Index(3.6), cover=Index(n)), Sweep())
 
 
 def test_orders_at_grazing_are_refused_too():

@@ -276,11 +276,10 @@ def test_no_harmonics_at_all_are_refused_by_every_verb(harmonics):
 def test_orders_of_the_hexagonal_lattice():
     """The first one appears at pitch = 2 wavelength / (sqrt(3) n)."""
     edge = 2 * WAVE / math.sqrt(3) / 1.45
-    check_subwavelength(Cell(edge * 0.999, **ABOUT, lattice=Lattice("hexagonal")), WAVE)
+    about = ABOUT | {"cover": Index(1.45), "lattice": Lattice("hexagonal")}
+    check_subwavelength(Cell(edge * 0.999, **about), WAVE)
     with pytest.raises(CellError, match=f"need pitch_um < {edge:.6g}"):
-        check_subwavelength(
-            Cell(edge * 1.001, **ABOUT, lattice=Lattice("hexagonal")), WAVE
-        )
+        check_subwavelength(Cell(edge * 1.001, **about), WAVE)
 
 
 def test_weak_layers_of_rectangles_turn_the_phase_by_their_areas():

@@ -1,0 +1,182 @@
+"""Textbook RCWA: what the engine computes, in one page, without its shortcuts."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from metalens.cell import Cell, Layer, index
+from metalens.ground.arrays import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OrderResponse:
+    """Amplitudes and powers of all retained diffraction orders.
+
+    m, n: (k,) orders along x and y.
+    t, r: (2, 2) power-normalised zero-order Jones matrices, row: leaving, column:
+        incident; x, y at normal incidence, else s, p (as in ``metalens.rcwa.Jones``).
+    transmitted, reflected: (k, 2) power of each order for unit power incident.
+    """
+
+    m: Array
+    n: Array
+    t: Array
+    r: Array
+    transmitted: Array
+    reflected: Array
+
+
+def solve_textbook_rcwa(
+    cell: Cell,
+    size_um: float,
+    wavelength_um: float,
+    *,
+    harmonics: int,
+    angle_rad: float = 0.0,
+    azimuth_rad: float = 0.0,
+    steps: int = 8,
+) -> OrderResponse:
+    """Rigorous coupled-wave analysis by Laurent's rule (Moharam et al., J. Opt. Soc.
+    Am. A 12, 1068 and 1077 (1995)), exp(-iwt), light from the substrate.
+
+    In each layer e' = i P h, h' = i Q e with tangential fields e, h; layers are matched
+    by one linear system for all amplitudes.
+
+    Args:
+        size_um: of the shape (its diameter).
+        harmonics: M; orders -M to M along x and y.
+        angle_rad: outside, in vacuum. azimuth_rad: of the plane of incidence.
+        steps: layers of equal height that a tilted wall is cut into (staircase).
+
+    Accuracy: error of t falls slowly, as 1/M for high contrast; the engine's normal
+        vectors (``metalens.rcwa.jones``) have the same limit.
+
+    >>> from metalens.cell import Cell, Index
+    >>> cell = Cell(0.35, 0.5, pillar=Index(2.0), substrate=Index(1.45))
+    >>> found = solve_textbook_rcwa(cell, 0.2, 0.85, harmonics=3)
+    >>> round(float((found.transmitted + found.reflected)[:, 0].sum()), 9)
+    1.0
+    """
+    k0 = 2 * math.pi / wavelength_um
+    px, py = cell.lattice.periods_um(cell.pitch_um)
+    span = np.arange(-harmonics, harmonics + 1)
+    m, n = (order.ravel() for order in np.meshgrid(span, span, indexing="ij"))
+    sine = math.sin(angle_rad)
+    kx = sine * math.cos(azimuth_rad) + m * wavelength_um / px
+    ky = sine * math.sin(azimuth_rad) + n * wavelength_um / py
+    one = np.eye(len(m))
+
+    def matrices(eps: Array) -> tuple[Array, Array]:
+        inverse = np.linalg.inv(eps)
+        x, y = np.diag(kx), np.diag(ky)
+        P = [
+            [x @ inverse @ y, one - x @ inverse @ x],
+            [y @ inverse @ y - one, -y @ inverse @ x],
+        ]
+        Q = [[-x @ y, x @ x - eps], [eps - y @ y, y @ x]]
+        return np.block(P), np.block(Q)
+
+    def modes(eps: Array) -> tuple[Array, Array, Array]:
+        P, Q = matrices(eps)
+        square, W = np.linalg.eig(P @ Q)
+        q = np.sqrt(square.astype(complex))
+        q = np.where((q.imag < 0) | ((abs(q.imag) < 1e-12) & (q.real < 0)), -q, q)
+        return q, W, Q @ W / q
+
+    def half_space(index_of: complex) -> tuple[Array, Array]:
+        kz = np.sqrt(index_of**2 - kx**2 - ky**2 + 0j)
+        kz = np.where(kz == 0, 1e-9, kz)
+        return kz, matrices(index_of**2 * one)[1] / np.concatenate([kz, kz])
+
+    def toeplitz(layer: Layer) -> Array:
+        gx, gy = 2 * np.pi / px * (m[:, None] - m), 2 * np.pi / py * (n[:, None] - n)
+        inside = index(layer.material or cell.pillar, wavelength_um) ** 2
+        around = index(layer.between or cell.fill, wavelength_um) ** 2
+        if cell.shape.hole:
+            inside, around = around, inside
+        sites = 1 + np.exp(1j * (gx * px + gy * py) / 2) if cell.lattice.centred else 1
+
+        def pattern(grow_um: float) -> Array:
+            outline = cell.outline(size_um, grow_um=grow_um)
+            return np.asarray(sites * outline.fourier(gx, gy) / (px * py))
+
+        eps = around * one + (inside - around) * pattern(layer.grow_um)
+        if layer.coat is not None:
+            film = index(layer.coat, wavelength_um) ** 2
+            side = -2 if cell.shape.hole else 2
+            coated = pattern(layer.grow_um + side * layer.coat_um)
+            eps = eps + (film - (inside if side < 0 else around)) * (
+                side / 2 * (coated - pattern(layer.grow_um))
+            )
+        return np.asarray(eps)
+
+    def film_eps(material: object) -> Array:
+        return index(material, wavelength_um) ** 2 * one  # type: ignore[arg-type]
+
+    slabs = [(modes(film_eps(f.material)), f.thickness_um) for f in cell.under]
+    for layer in staircase(cell, steps):
+        slabs.append((modes(toeplitz(layer)), layer.height_um))
+    slabs += [(modes(film_eps(f.material)), f.thickness_um) for f in cell.over]
+
+    (kz_s, V_s), (kz_c, V_c) = (
+        half_space(index(side, wavelength_um)) for side in (cell.substrate, cell.cover)
+    )
+    size = 2 * len(m)
+    unit = np.eye(size)
+    # unknowns: reflected e, (up, down) amplitudes of each slab, transmitted e
+    total = size * (2 + 2 * len(slabs))
+    system = np.zeros((total, total), complex)
+    system[: 2 * size, :size] = np.vstack([-unit, V_s])
+    for i, ((q, W, V), height) in enumerate(slabs):
+        fade = np.exp(1j * q * height * k0)
+        row, column = 2 * size * i, size * (1 + 2 * i)
+        foot = np.block([[W, W * fade], [V, -V * fade]])
+        top = np.block([[W * fade, W], [V * fade, -V]])
+        system[row : row + 2 * size, column : column + 2 * size] = foot
+        system[row + 2 * size : row + 4 * size, column : column + 2 * size] = -top
+    system[-2 * size :, -size:] += np.vstack([unit, V_c])
+
+    zero = int(np.flatnonzero((m == 0) & (n == 0))[0])
+    direction = np.eye(2)
+    if angle_rad:
+        c, s = math.cos(azimuth_rad), math.sin(azimuth_rad)
+        direction = np.array([[-s, c], [c, s]])  # s, then p along the layers
+    come = np.zeros((size, 2), complex)
+    come[[zero, zero + len(m)]] = direction.T
+    source = np.zeros((total, 2), complex)
+    source[: 2 * size] = np.vstack([come, V_s @ come])
+    found = np.linalg.solve(system, source)
+    back, on = found[:size], found[-size:]
+
+    def power(e: Array, V: Array) -> Array:
+        h = V @ e
+        k = len(m)
+        return np.asarray((e[:k] * h[k:].conj() - e[k:] * h[:k].conj()).real)
+
+    incident = power(come, V_s)[zero]
+    pair = [zero, zero + len(m)]
+    own = _admittance(index(cell.substrate, wavelength_um), kz_s[zero], angle_rad)
+    leaving = _admittance(index(cell.cover, wavelength_um), kz_c[zero], angle_rad)
+    t = np.sqrt(leaving[:, None] / own) * (direction @ on[pair])
+    r = np.sqrt(own[:, None] / own) * (direction @ back[pair])
+    reflected = -power(back, -V_s) / incident
+    return OrderResponse(m, n, t, r, power(on, V_c) / incident, reflected)
+
+
+def staircase(cell: Cell, steps: int) -> list[Layer]:
+    """The sections of a pillar, each of a tilted wall cut into ``steps`` upright ones."""
+    slope, foot, found = -2 * math.tan(cell.sidewall_rad), -cell.height_um / 2, []
+    for layer in cell.sections:
+        count = steps if cell.sidewall_rad else 1
+        each = layer.height_um / count
+        for i in range(count):
+            grow = layer.grow_um + slope * (foot + (i + 0.5) * each)
+            found.append(replace(layer, height_um=each, grow_um=grow))
+        foot += layer.height_um
+    return found
+
+
+def _admittance(medium: complex, kz: complex, angle_rad: float) -> Array:
+    """(2,) h over e along the layers of x and y at normal incidence, else of s and p."""
+    return np.array([kz, medium**2 / kz] if angle_rad else [kz, kz])
