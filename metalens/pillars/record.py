@@ -237,7 +237,7 @@ class PillarLibrary:
         """As t: share of the power that is absorbed or leaves in orders other than zero
         (of a shape without a mirror along x or y, or in the other polarisation).
         """
-        return np.maximum(1 - self.energy, 0.0)
+        return np.asarray(np.maximum(1 - self.energy, 0.0))
 
     def mean_loss(self, diameter_um: Array, wavelength_um: float) -> float:
         """Mean of :attr:`lost` over pillars, at the least angle of the library.
