@@ -8,16 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
+import numpy as np
 import pytest
 
 from metalens.ground import report
+from tests import small
 
-# No clock decides a test: no deadline, no complaint of slow data. With CI set, as
-# .ci/run does, every run draws alike.
+# No clock decides a test: no deadline, no complaint of slow data. Every run draws anew;
+# a failure prints the line that repeats it.
 hypothesis.settings.register_profile(
     "house",
     deadline=None,
-    derandomize="CI" in os.environ,
+    print_blob=True,
     suppress_health_check=[
         hypothesis.HealthCheck.too_slow,
         hypothesis.HealthCheck.function_scoped_fixture,
@@ -56,6 +58,40 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 str(item.path),
             )
         )
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--draws SEED`` repeats the random draws of a run."""
+    parser.addoption("--draws", type=int, default=None, help="seed of the rng fixture")
+
+
+def _seed(config: pytest.Config) -> int:
+    """Of this run: the same for all its workers."""
+    given = config.getoption("--draws")
+    if given is None and hasattr(config, "workerinput"):
+        given = int(config.workerinput["testrunuid"][:7], 16)
+    if given is None:
+        given = int.from_bytes(os.urandom(3), "big")
+    config.option.draws = given
+    return int(given)
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Random numbers of a test: by the seed of the run and the name of the test.
+
+    The report of a failing test names the seed.
+    """
+    seed = _seed(request.config)
+    request.node.add_report_section("setup", "draws", f"repeat with --draws {seed}")
+    name = list(request.node.nodeid.encode())
+    return np.random.default_rng([seed, *name])
+
+
+@pytest.fixture(scope="session")
+def small_chain(tmp_path_factory: pytest.TempPathFactory) -> small.Chain:
+    """Files of one small lens without symmetry; each is made when first asked for."""
+    return small.Chain(tmp_path_factory.mktemp("small"))
 
 
 @pytest.fixture(scope="session", autouse=True)
