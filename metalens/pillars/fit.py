@@ -137,11 +137,26 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         DomainError: no stretch of diameters without resonance holds enough entries.
     """
     wanted = wanted or Wanted()
+    found = _fitted(library, wanted, across_resonances=False)
+    if any(width < wanted.least_half_width_um for *_, width in library.resonances):
+        with contextlib.suppress(DomainError):
+            across = _fitted(library, wanted, across_resonances=True)
+            crosses = bool(across.proxy.gaps_um) and not across.shortfall
+            if crosses and across.turns > found.turns:
+                return across
+    return found
+
+
+def _fitted(
+    library: PillarLibrary, wanted: Wanted, *, across_resonances: bool
+) -> ProxyFit:
+    """The proxy on one side of all narrow resonances, or across them."""
     smooth = stretch(
         library,
         least_transmission=wanted.least_transmission,
         least_half_width_um=wanted.least_half_width_um,
         within_um=wanted.within_um,
+        across_resonances=across_resonances,
     )
     wanted = wanted.settled(entry_error(library, smooth.diameter_um))
     data = Data(
@@ -152,7 +167,12 @@ def fit(library: PillarLibrary, wanted: Wanted | None = None) -> ProxyFit:
         library.angle_rad,
     )
     kept, proxy, terms = _followed(data, wanted)
-    proxy = dataclasses.replace(proxy, entry_error=entry_error(library, kept.diameter))
+    low, high = proxy.domain_um
+    proxy = dataclasses.replace(
+        proxy,
+        entry_error=entry_error(library, kept.diameter),
+        gaps_um=tuple((a, b) for a, b in smooth.gaps_um if low < a and b < high),
+    )
     counts = range(4, max(18, 2 * terms + 5), 2)
     trials = (
         _trial(kept, proxy.power, count)

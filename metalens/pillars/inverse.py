@@ -24,10 +24,21 @@ HALVINGS = 54
 TURN = 2 * math.pi
 
 
+Intervals = tuple[tuple[float, float], ...]
+
+
 def diameter(
-    p: Curve, phase_rad: Values, *, within_um: tuple[float, float] | None, gap: str
+    p: Curve,
+    phase_rad: Values,
+    *,
+    within_um: tuple[float, float] | None,
+    gap: str,
+    excluded_um: Intervals = (),
 ) -> Values:
-    """Diameters on a curve of the phase; see :meth:`metalens.proxy.Proxy.diameter_um`."""
+    """Diameters on a curve of the phase; see :meth:`metalens.proxy.Proxy.diameter_um`.
+
+    excluded_um: (least, largest) of diameters that are moved to the nearer end.
+    """
     low, high = within_um or (p.low, p.high)
     if not p.low - 1e-9 <= low < high <= p.high + 1e-9:
         raise DomainError(
@@ -38,13 +49,19 @@ def diameter(
             f"the phase is not monotone between {low} and {high} um: no unique diameter; give a narrower within_um"
         )
     if type(phase_rad).__module__.partition(".")[0] == "torch":
-        return cast(Values, _torch(p, phase_rad, (low, high), gap))
+        return cast(Values, _torch(p, phase_rad, (low, high), gap, excluded_um))
     phase = np.asarray(phase_rad)
     phase = phase if phase.dtype.kind == "f" else phase.astype(float)
-    return cast(Values, _solve(p, phase, (low, high), gap)[()])
+    return cast(Values, _solve(p, phase, (low, high), gap, excluded_um)[()])
 
 
-def _solve(p: Curve, phase: Array, within: tuple[float, float], gap: str) -> Array:
+def _solve(
+    p: Curve,
+    phase: Array,
+    within: tuple[float, float],
+    gap: str,
+    excluded: Intervals,
+) -> Array:
     if not np.isfinite(phase).all():
         raise DomainError(f"phase at index {_first(~np.isfinite(phase))} is not finite")
     ends = polynomial.value(p, np.array(within))
@@ -66,9 +83,21 @@ def _solve(p: Curve, phase: Array, within: tuple[float, float], gap: str) -> Arr
             target[beyond] = np.where(
                 target[beyond] - cover <= TURN - target[beyond], cover, 0.0
             )
-        return _newton(p, target, start, cover, table).astype(chunk.dtype)
+        found = _newton(p, target, start, cover, table)
+        return _moved(found, excluded, within).astype(chunk.dtype)
 
     return polynomial.over_chunks(work, phase)
+
+
+def _moved(d: Array, excluded: Intervals, within: tuple[float, float]) -> Array:
+    """Diameters out of the excluded intervals, to the nearer end inside ``within``."""
+    for low, high in excluded:
+        ends = [end for end in (low, high) if within[0] <= end <= within[1]]
+        inside = (d > low) & (d < high)
+        if ends and inside.any():
+            choice = np.array(ends)
+            d[inside] = choice[np.abs(d[inside][:, None] - choice).argmin(axis=1)]
+    return d
 
 
 def _newton(p: Curve, target: Array, start: float, cover: float, table: Array) -> Array:
@@ -107,14 +136,20 @@ def _table(p: Curve, within: tuple[float, float]) -> Array:
     return np.asarray((left + right) / 2)
 
 
-def _torch(p: Curve, phase: Any, within: tuple[float, float], gap: str) -> Any:
+def _torch(
+    p: Curve,
+    phase: Any,
+    within: tuple[float, float],
+    gap: str,
+    excluded: Intervals,
+) -> Any:
     """One differentiable Newton step on the detached answer: its derivative is exactly
     1 / (dphase/dD).
     """
     import torch
 
     values = phase.detach().cpu().numpy()
-    found = _solve(p, values, within, gap)
+    found = _solve(p, values, within, gap, excluded)
     rise = torch.from_numpy(polynomial.slope(p, found)).to(phase.device)
     return torch.from_numpy(found).to(phase.device) + (phase - phase.detach()) / rise
 

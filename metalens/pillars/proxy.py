@@ -50,6 +50,8 @@ class Proxy:
     of its sine.
     entry_error: what the entries may be wrong by themselves, relative to |t|: their
     error bars' root mean square.
+    gaps_um: (least, largest) diameters around narrow resonances inside the domain,
+    which :meth:`diameter_um` never returns.
 
     Raises:
         DomainError: |T| leaves [0, 1] inside the domain, or an empty domain.
@@ -64,6 +66,7 @@ class Proxy:
     power: int = 1
     max_angle_rad: float = 0.0
     entry_error: float = 0.0
+    gaps_um: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         low, high = self.domain_um
@@ -134,14 +137,18 @@ class Proxy:
 
         Accuracy:
             phase of the answer within 1e-10 rad in float64, 1e-5 rad in float32. Torch
-            gradients are exact.
+            gradients are exact. A diameter in one of ``gaps_um`` moves to its nearer end.
 
         Raises:
             DomainError: the phase is not monotone within ``within_um``, or no pillar
                 has a phase.
         """
         return inverse.diameter(
-            self.at(wavelength_um, angle_rad), phase_rad, within_um=within_um, gap=gap
+            self.at(wavelength_um, angle_rad),
+            phase_rad,
+            within_um=within_um,
+            gap=gap,
+            excluded_um=self.gaps_um,
         )
 
     def coverage_rad(
@@ -265,6 +272,7 @@ class Proxy:
             "power": np.array(self.power),
             "max_angle_rad": np.array(self.max_angle_rad),
             "entry_error": np.array(self.entry_error),
+            "gaps_um": np.array(self.gaps_um, float).reshape(-1, 2),
         }
 
     @classmethod
@@ -282,7 +290,8 @@ class Proxy:
             error[1],
             int(arrays["power"]),
             float(arrays["max_angle_rad"]),
-            float(arrays.get("entry_error", 0.0)),  # older files hold none
+            float(arrays["entry_error"]),
+            tuple((low, high) for low, high in arrays["gaps_um"].tolist()),
         )
 
 

@@ -23,6 +23,8 @@ class Stretch:
     level: |t|, as phase.
     notes: what bounds the stretch. polarization_spread: largest |t_s - t_p| / 2; t is
     their mean.
+    gaps_um: (least, largest) diameters inside the stretch around narrow resonances,
+    which no pillar of a lens should have.
     """
 
     diameter_um: Array
@@ -30,6 +32,7 @@ class Stretch:
     level: Array
     notes: tuple[str, ...]
     polarization_spread: float
+    gaps_um: tuple[tuple[float, float], ...] = ()
 
 
 def stretch(
@@ -38,13 +41,15 @@ def stretch(
     least_transmission: float,
     least_half_width_um: float,
     within_um: tuple[float, float] | None = None,
+    across_resonances: bool = False,
 ) -> Stretch:
     """The stretch of most phase over which, at all wavelengths, angles and
     polarisations, |t| stays above
     ``least_transmission``, the phase rises (of openings, which leave less film the
     wider they are, falls), and no
     resonance is narrower than ``least_half_width_um`` and no error bar above half of
-    |t|.
+    |t|. With ``across_resonances`` it goes on behind narrow resonances, without the
+    entries nearer to one than ``least_half_width_um`` or two half-widths.
 
     Raises:
         DomainError: fewer than 12 entries in any such stretch; the message says what is
@@ -55,7 +60,12 @@ def stretch(
     d = library.diameter_um[inside]
     t = library.t[..., inside]
     phase = np.unwrap(np.angle(t), axis=-1)
-    faults = _faults(library, d, t, phase, least_transmission, least_half_width_um)
+    gaps = _gaps(library, d, least_half_width_um) if across_resonances else ()
+    away = ~np.any([(d >= a) & (d <= b) for a, b in (*gaps, (1.0, 0.0))], axis=0)
+    d, t, phase = d[away], t[..., away], np.unwrap(np.angle(t[..., away]), axis=-1)
+    faults = _faults(
+        library, d, t, phase, least_transmission, 0 if gaps else least_half_width_um
+    )
     bad = np.any([mask for mask, _ in faults], axis=0)
     runs = [run for run in _runs(~bad) if run.stop - run.start >= LEAST_ENTRIES]
     if not runs:
@@ -76,9 +86,31 @@ def stretch(
         d[best],
         _unwrapped(np.angle(mean)),
         np.abs(mean),
-        _notes(best, d, faults),
+        _notes(best, d, faults) + tuple(f"passes over {_words(a, b)}" for a, b in gaps),
         spread,
+        tuple((a, b) for a, b in gaps if a < d[best][-1] and b > d[best][0]),
     )
+
+
+def _words(low: float, high: float) -> str:
+    return f"a narrow resonance between {low:.4f} and {high:.4f} um"
+
+
+def _gaps(
+    library: PillarLibrary, d: Array, half_width: float
+) -> tuple[tuple[float, float], ...]:
+    """Diameters too near to a narrow resonance, joined where they overlap."""
+    gaps: list[tuple[float, float]] = []
+    for _, _, _, centre, width in sorted(
+        library.resonances.tolist(), key=lambda r: r[3]
+    ):
+        if width < half_width and len(d) and d[0] < centre < d[-1]:
+            reach = max(half_width, REACH * width)
+            low, high = centre - reach, centre + reach
+            if gaps and low <= gaps[-1][1]:
+                low, high = gaps[-1][0], max(high, gaps.pop()[1])
+            gaps.append((low, high))
+    return tuple(gaps)
 
 
 def _faults(

@@ -211,7 +211,9 @@ def test_few_entries_beside_a_resonance_are_left_to_it_for_the_tolerances():
 
 
 def test_the_longer_side_of_a_resonance_is_kept():
-    early = synthetic(resonances=[(0, 0.0, 0.85, 0.08, 0.0005)])
+    early = synthetic(
+        resonances=[(0, 0.0, 0.85, 0.08, 0.0005)], factor=blaschke(0.08, 0.0005)
+    )
     assert proxy.fit(early).domain_um[0] > 0.08
 
 
@@ -431,3 +433,29 @@ def test_errors_of_phase_and_transmission_stand_each_in_its_place():
     )  # between the samples
     assert made.max_transmission_error == pytest.approx(level, rel=0.1)
     assert abs(phase / level - 1) > 0.3
+
+
+def test_pillars_on_both_sides_of_a_very_narrow_resonance_are_used():
+    """Of 0.003 nm: at 5 nm its tail turns the phase by 1.5 x 0.003 / 5 = 9e-4 rad."""
+    centre, width = 0.1731, 3e-6
+    library = synthetic(
+        resonances=[(0, 0.0, 0.85, centre, width)], factor=blaschke(centre, width)
+    )
+    found = proxy_fit.fit(library)
+    assert found.proxy.domain_um[1] > 0.21
+    assert (
+        found.turns
+        > 1.2 * proxy_fit.fit(library, Wanted(within_um=(0.06, 0.172))).turns
+    )
+    (gap,) = found.proxy.gaps_um
+    assert gap == pytest.approx((centre - 0.005, centre + 0.005))
+    phase = np.linspace(-3, 3, 4001)
+    made = found.proxy.diameter_um(phase, 0.85, gap="nearest")
+    assert (np.abs(made - centre) > 0.005 - 1e-12).all()
+    reached = np.angle(np.exp(1j * (phase_of(made, 0.85, 0.0) - phase)))
+    steepest = np.diff(phase_of(np.array([0.168, 0.178]), 0.85, 0.0))[0]
+    # half of the gap, or the tolerance and the resonance's tail
+    assert np.abs(reached).max() < steepest / 2 + 3e-3
+    assert np.median(np.abs(reached)) < 3e-3
+    again = proxy.Proxy.from_arrays(found.proxy.to_arrays())
+    assert again.gaps_um == found.proxy.gaps_um
