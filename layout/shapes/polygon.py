@@ -1,11 +1,9 @@
 """Pillar polygons: the area of the circle, on the mask grid, centred exactly, symmetric
 under the square.
 
-A polygon is built from one eighth of a turn and mirrored, so its centroid is the site
-to the last digit and any
-of the eight mirrored placements gives the same shape. Odd diameters need no half grid
-step: the flats stand on
-whole steps and the other vertices carry the area.
+A polygon is one eighth of a turn and its mirror images, so its centroid is the site to
+the last digit. Its half width is the radius to the nearest grid step; the other
+vertices carry the area. Widths and areas therefore rise with the diameter.
 """
 
 import functools
@@ -17,6 +15,11 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
+
+_FREE = 1e-3  # area error below which the nearer outline is taken
+_FEWER = (48, 32, 24, 20, 16, 12, 8)  # a coarse grid suits few vertices better
+_EITHER = 0.24  # of a grid step: both half widths are tried within this of a half one
+_REGULAR = math.sqrt(math.pi / (8 * (math.sqrt(2) - 1)))  # half width of an octagon
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,6 +47,11 @@ class PillarShape:
         return self.area / (math.pi * self.diameter**2 / 4) - 1
 
     @property
+    def width(self) -> int:
+        """Along x and along y, in grid steps."""
+        return int(np.ptp(self.points[:, 0]))
+
+    @property
     def edge_error(self) -> float:
         """Largest distance between outline and circle, in grid steps."""
         return edge_error(self.points, self.diameter / 2)
@@ -58,6 +66,9 @@ class PillarShape:
 
 def pillar(diameter: float, *, vertices: int = 32, shape: str = "round") -> PillarShape:
     """Polygon of the area of a circle.
+
+    For diameters that differ by a grid step or more, widths along both axes and areas
+    do not fall as the diameter rises.
 
     Args:
         diameter: in grid steps; any real number, at least 4.
@@ -78,143 +89,85 @@ def pillar(diameter: float, *, vertices: int = 32, shape: str = "round") -> Pill
     return _pillar(float(diameter), 8 if shape == "shot" else vertices)
 
 
-_GOOD = 1e-3  # area error at which fewer vertices are not tried
-_FEWER = (48, 32, 24, 20, 16, 12)  # a coarse grid suits few vertices better
-
-
 @functools.lru_cache(maxsize=70000)
 def _pillar(diameter: float, vertices: int) -> PillarShape:
-    best: PillarShape | None = None
+    """The most vertices whose area fits; where none does, the outline of the best area."""
+    wide = diameter / 2 * (_REGULAR if vertices == 8 else 1.0)
+    halves = sorted({round(wide - _EITHER), round(wide + _EITHER)})
+    best: tuple[tuple[float, float], Array] | None = None
     for count in (vertices, *(n for n in _FEWER if n < vertices)):
-        points = mirrored(_octagon(diameter) if count == 8 else _round(diameter, count))
-        points.setflags(write=False)
-        made = PillarShape(points, diameter)
-        if best is None or abs(made.area_error) < 0.7 * abs(best.area_error):
-            best = made
-        if abs(best.area_error) <= _GOOD:
+        for half in halves:
+            found = _eighth(diameter, count, max(half, 2))
+            if found is not None and (best is None or found[0] < best[0]):
+                best = found
+        if best is not None and best[0][0] <= _FREE:
             break
-    return best or made
+    if best is None:
+        raise ProcessError(f"no polygon for {diameter} grid steps; take a finer grid")
+    points = mirrored(best[1])
+    points.setflags(write=False)
+    return PillarShape(points, diameter)
 
 
-def _octagon(diameter: float) -> Array:
-    """(1, 2) vertex (a, b), 0 < b < a, of the octagon of area 4 a^2 - 2 (a - b)^2
-    nearest to the circle's.
-
-    Edges along x, y and the diagonals follow from the mirror images alone.
+def _eighth(
+    diameter: float, count: int, half: int
+) -> tuple[tuple[float, float], Array] | None:
+    """The best first eighth of a convex polygon, 0 < angle <= 45 degrees, of this half
+    width: ((area error, edge error), (m, 2)); None where the grid holds none.
     """
-    goal = math.pi * diameter**2 / 4
-    regular = math.sqrt(
-        goal / (8 * (math.sqrt(2) - 1))
-    )  # half width of the regular octagon
-    cut = (2 - math.sqrt(2)) * regular
-    a = np.arange(max(2, math.floor(regular * 0.96)), math.ceil(regular * 1.04) + 1)[
-        :, None
-    ]
-    c = np.arange(1, math.ceil(cut * 1.4) + 2)[None, :]
-    error = np.abs((4 * a**2 - 2 * c**2) / goal - 1)
-    lopsided = (a - regular) ** 2 + 0.25 * (c - cut) ** 2
-    cost = np.where(
-        c < a, np.maximum(error / 5e-4 - 1, 0) ** 2 * 4 + error * 100 + lopsided, np.inf
-    )
-    i, j = np.unravel_index(int(cost.argmin()), cost.shape)
-    return np.array([[a[i, 0], a[i, 0] - c[0, j]]], np.int64)
-
-
-def _round(diameter: float, vertices: int) -> Array:
-    """(m, 2) vertices of the first eighth, 0 < angle <= 45 degrees: rounded, then moved
-    until the area fits.
-    """
-    step = 2 * math.pi / vertices
-    angle = np.arange(0.5, vertices / 8 + 0.25) * step
-    radius = diameter / 2 * math.sqrt(math.pi / (vertices / 2 * math.sin(step)))
-    start = np.round(radius * np.column_stack([np.cos(angle), np.sin(angle)])).astype(
-        np.int64
-    )
-    if vertices % 8:
-        start[-1] = round(radius / math.sqrt(2))
-    start[:, 1] = np.maximum(start[:, 1], 1)
-    return _refine(_without_dents(start), diameter)
-
-
-def _without_dents(eighth: Array) -> Array:
-    """The vertices without those that rounding has moved onto, or inside the line of,
-    their neighbours.
-    """
-    eighth = eighth[np.append(True, np.any(np.diff(eighth, axis=0) != 0, axis=1))]
-    while len(eighth) > 1:
-        on_diagonal = int(eighth[-1, 0] == eighth[-1, 1])
-        line = np.concatenate(
-            [eighth[:1] * (1, -1), eighth, eighth[-1 - on_diagonal :][:1, ::-1]]
-        )
-        step = np.diff(line, axis=0)
-        turn = step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0]
-        if turn.min() >= 0:
-            break
-        eighth = np.delete(eighth, int(turn.argmin()), axis=0)
-    return eighth
-
-
-def _refine(eighth: Array, diameter: float) -> Array:
-    """Move vertices by whole steps to the least cost: all combinations for few
-    vertices, else pairs in turn.
-    """
-    diagonal = bool(eighth[-1, 0] == eighth[-1, 1])
-    moves = _moves(len(eighth), diagonal)
-    here = eighth[..., None]
-    cost = float(_cost(here, diameter)[0]) if _sound(here, diagonal)[0] else math.inf
-    for _ in range(12):
-        trials = here + moves
-        costs = _cost(trials, diameter)
-        better = np.flatnonzero(costs < cost - 1e-12)
-        better = better[_sound(trials[..., better], diagonal)]
-        if not len(better):
-            break
-        best = better[costs[better].argmin()]
-        cost, here = float(costs[best]), trials[..., best : best + 1]
-    return np.asarray(here[..., 0])
-
-
-@functools.lru_cache(maxsize=64)
-def _moves(count: int, diagonal: bool) -> Array:
-    """(count, 2, t) trial moves; the last vertex stays on the diagonal where it stands
-    on it.
-    """
-    free = 2 * count - diagonal
-    if free <= 8:
-        steps = np.arange(-2, 3) if free <= 4 else np.arange(-1, 2)
-        flat = np.stack(np.meshgrid(*[steps] * free, indexing="ij"), axis=-1).reshape(
-            -1, free
-        )
+    step = 2 * math.pi / count
+    angle = np.arange(0.5, count / 8 + 0.25) * step
+    radius = diameter / 2 * math.sqrt(math.pi / (count / 2 * math.sin(step)))
+    if count == 8:
+        y = np.arange(1, half)
+        trials = np.stack([np.full(len(y), half), y])[None]
     else:
-        single = np.concatenate(
-            [np.eye(free, dtype=np.int64), -np.eye(free, dtype=np.int64)]
-        )
-        first, second = np.triu_indices(len(single), 1)
-        flat = np.concatenate([single, single[first] + single[second]])
+        trials = _trials(angle, radius, half, diagonal=count % 8 != 0)
+    trials = trials[..., _sound(trials, count % 8 != 0)]
+    if not trials.shape[-1]:
+        return None
+    area, spread = _measures(trials, diameter, radius)
+    order = np.lexsort((spread, np.maximum(area, _FREE)))
+    n = int(order[0])
+    return (max(float(area[n]), _FREE), float(spread[n])), trials[..., n]
+
+
+def _trials(angle: Array, radius: float, half: int, *, diagonal: bool) -> Array:
+    """(m, 2, t) vertices on circles about the equal-area one, rounded to the grid, and
+    single vertices of these moved by a step; the first one's x is ``half``.
+    """
+    rings = radius + np.linspace(-0.9, 0.9, 19)
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)[..., None] * rings
+    start = np.round(ring).astype(np.int64)
     if diagonal:
-        flat = np.concatenate([flat, flat[:, -1:]], axis=1)
-    return np.ascontiguousarray(np.moveaxis(flat.reshape(-1, count, 2), 0, -1))
+        start[-1] = np.round(rings / math.sqrt(2)).astype(np.int64)
+    start[0, 1] = np.maximum(start[0, 1], 1)
+    made = [start]
+    for vertex in range(len(angle)):
+        for axis in (0, 1):
+            for way in (-1, 1):
+                moved = start.copy()
+                both = diagonal and vertex == len(angle) - 1
+                moved[vertex, slice(None) if both else axis] += way
+                made.append(moved)
+    every = np.concatenate(made, axis=-1)
+    every[0, 0] = half
+    return np.unique(every.reshape(-1, every.shape[-1]), axis=1).reshape(
+        len(angle), 2, -1
+    )
 
 
-def _cost(eighths: Array, diameter: float) -> Array:
-    """(t,) cost of (m, 2, t) trials: area errors beyond 0.05 % first, then the mean
-    square of the edge error.
+def _measures(eighths: Array, diameter: float, radius: float) -> tuple[Array, Array]:
+    """(t,) relative area error of (m, 2, t) eighths, and mean square distance of their
+    vertices from the circle on which an equal-area polygon has them.
     """
     x, y = eighths[:, 0].astype(float), eighths[:, 1].astype(float)
     middle = (x[-1] + y[-1]) / 2
-    eighth = (
-        x[0] * y[0] + (x[-1] - y[-1]) * middle
-    )  # twice the area, from the x axis to the diagonal
+    twice = x[0] * y[0] + (x[-1] - y[-1]) * middle  # from the x axis to the diagonal
     for k in range(len(x) - 1):
-        eighth += x[k] * y[k + 1] - x[k + 1] * y[k]
-    area = 4 * eighth / (math.pi * diameter**2 / 4) - 1
-    lean = (
-        1 + 3.3 / (8 * len(x)) ** 2
-    )  # vertices of an equal-area polygon stand outside the circle
-    spread = ((np.hypot(x, y) - diameter / 2 * lean) ** 2).mean(0)
-    return np.asarray(
-        np.maximum(np.abs(area) / 5e-4 - 1, 0) ** 2 * 4 + np.abs(area) * 100 + spread
-    )
+        twice += x[k] * y[k + 1] - x[k + 1] * y[k]
+    area = np.abs(4 * twice / (math.pi * diameter**2 / 4) - 1)
+    return area, ((np.hypot(x, y) - radius) ** 2).mean(0)
 
 
 def _sound(eighths: Array, diagonal: bool) -> Array:

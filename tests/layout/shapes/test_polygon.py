@@ -2,6 +2,7 @@
 the grid.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -91,17 +92,23 @@ def test_impossible_polygons_are_refused(diameter, vertices):
         polygon.pillar(diameter, vertices=vertices)
 
 
-def test_equal_area_vertices_stand_outside_the_circle_and_cost_little_there():
-    """The ideal polygon of a large pillar, on the grid, is cheap; one with its vertices
-    on the circle is not.
-    """
-    diameter, n = 4001.3, 32
-    ideal = diameter / 2 * math.sqrt(math.pi / (n / 2 * math.sin(2 * math.pi / n)))
-    angle = (np.arange(n // 8) + 0.5) * 2 * math.pi / n
-    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    out, on = (
-        np.rint(radius * ring).astype(np.int64) for radius in (ideal, diameter / 2)
-    )
-    cost = polygon._cost(np.stack([out, on], -1), diameter)
-    assert cost[0] < 0.5  # rounding: 1/6 in the mean square, area 1e-4
-    assert cost[1] > 100  # 0.64 % of the area: 12 times the 0.05 % that is free
+@pytest.mark.parametrize("shape", ["round", "shot"])
+@pytest.mark.parametrize("vertices", [12, 32, 64])
+def test_widths_and_areas_never_fall_as_the_diameter_rises(shape, vertices):
+    """Grid steps: 100, 105, 110, 120 nm on a grid of 5 nm are 20, 21, 22, 24."""
+    made = [
+        polygon.pillar(float(d), vertices=vertices, shape=shape).points
+        for d in range(4, 160)
+    ]
+    for axis in (0, 1):
+        widths = [int(np.ptp(p[:, axis])) for p in made]
+        assert all(a <= b for a, b in itertools.pairwise(widths))
+        off = [abs(w - d) for d, w in enumerate(widths, 4)]
+        if shape == "round":
+            assert max(off) <= 1  # the nearest even number of steps
+    areas = []
+    for p in made:
+        x, y = p.T
+        after = np.roll(p, -1, axis=0).T
+        areas.append(int((x * after[1] - after[0] * y).sum()) / 2)
+    assert all(a < b for a, b in itertools.pairwise(areas[1:]))
