@@ -158,7 +158,8 @@ class Wafer:
 
     diameter_mm: of the wafer. edge_exclusion_mm: from its edge, flat or notch, where no
     part of a die may lie.
-    flat_mm: length of the flat; 0: none. notch_mm: depth of the notch; 0: none.
+    flat_mm: length of the flat; 0: none. notch_mm: depth of the notch (a V
+    of 90 degrees, SEMI M1: 1 mm); 0: none.
     pitch_um: (x, y) from die to die. offset_um: of the middle of a die from the middle
     of the wafer.
     mark_um, mark_width_um: arm length and line width of the wafer's alignment crosses,

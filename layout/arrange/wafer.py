@@ -13,6 +13,7 @@ from layout.files import Copies
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
+NOTCH_RADIUS_MM = 0.9  # of the bottom of a notch, SEMI M1
 Box = tuple[float, float, float, float]  # left, bottom, right, top
 
 
@@ -30,8 +31,7 @@ def dies(wafer: Wafer, die_um: Box, *, around_marks_um: float = 0.0) -> Dies:
     """Dies that lie whole within the usable part of the wafer and clear of its marks.
 
     A point is usable where it is at least ``edge_exclusion_mm`` from the edge of the
-    wafer: its circle, the chord of
-    the flat, the tip of the notch. Without rounding, corner by corner.
+    wafer: its circle, the chord of the flat, the notch (:func:`notch_distance_um`).
 
     Args:
         die_um: left, bottom, right, top of all that a die draws, about its middle.
@@ -104,9 +104,26 @@ def _usable(wafer: Wafer, boxes: Array) -> Array:
         boxes[:, 1] >= -chord_um(wafer) + exclusion - 1e-6
     )
     if wafer.notch_mm:
-        tip = -radius + 1e3 * wafer.notch_mm
-        inside &= _apart(boxes, (0.0, tip, 0.0, tip)) >= exclusion - 1e-6
+        inside &= notch_distance_um(wafer, boxes) >= exclusion - 1e-6
     return np.asarray(inside)
+
+
+def notch_distance_um(wafer: Wafer, boxes: Array) -> Array:
+    """(n,) distances of boxes (n, 4) from the notch; 0 or less where they overlap.
+
+    SEMI M1: a V of 90 degrees with a bottom of radius 0.9 mm, ``notch_mm`` deep. That
+    is a sharp V with its corner at the middle of the bottom's circle, widened by the
+    radius; a box is nearest to it at a corner or an edge of either.
+    """
+    radius = 1e3 * NOTCH_RADIUS_MM
+    corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius
+    left, bottom, right, top = boxes.T
+    x = np.maximum(np.maximum(left, -right), 0.0)  # of the point nearest to the axis
+    up = bottom - corner
+    side = (x + up) / math.sqrt(2)  # from the line of a wall, above 0 outside
+    along = (x - up) / math.sqrt(2)  # down the wall from the corner
+    away = np.where(along >= 0, np.maximum(side, 0.0), np.hypot(x, np.maximum(up, 0)))
+    return np.asarray(away - radius)
 
 
 def _apart(boxes: Array, box: Box) -> Array:

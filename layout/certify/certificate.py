@@ -1,5 +1,8 @@
-"""The exposure certified: what the written files and their dose table make, by a
-simulator that the correction lacks.
+"""The exposure verified: what the written files and their dose table make.
+
+Shared with the correction: the Gaussians of the process file and the threshold of half
+of a wide area. Its own: shapes and doses as read back, the sums over neighbours, the
+background on pixels, the edges.
 
 See :mod:`layout.certify.exposed` for the model. Of marks, labels and any other shape
 the edges are sampled.
@@ -114,7 +117,13 @@ def _surveyed(
     top, foot = process.top_foot_nm(0.0, height_um / nm)
     edges = _edges(points, scene.others, simulation.far_of_points, terms)
     return Survey(
-        scene.places.count, total, box, edges, float(foot - top) / 2, scene.undosed
+        scene.places.count,
+        total,
+        box,
+        edges,
+        float(foot - top) / 2,
+        process.exposure.tolerance,
+        scene.undosed,
     )
 
 

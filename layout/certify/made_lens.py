@@ -26,7 +26,7 @@ class MadeRows:
     def __init__(self, plan: MaskPlan) -> None:
         self._lattice, self._unit = plan.lattices[0], plan.unit_nm * nm
         self._layers = sorted(
-            {made.layer[0] for made in plan.classes if made.name[0] not in "TW"}
+            {made.layer[0] for made in plan.classes if made.role == "pillar"}
         )
         self._diameter_um = np.zeros(
             (self._lattice.rows, self._lattice.columns), np.float32

@@ -103,13 +103,24 @@ class Assigned:
     near: Sequence[Array]
 
 
-def ladder(fields: Fields, settings: Exposure) -> tuple[Ladder, int]:
-    """The doses, and how many the tolerance needs.
+@dataclass(frozen=True, slots=True)
+class DoseRange:
+    """What some shapes need of the doses.
 
-    A quarter of it is left for the background of rounded doses and for what changes
-    across a piece of a mark. Where the
-    edge is so soft that the tolerance moves it by more than a nanometre of width, as
-    much finer steps are taken.
+    least, most: relative doses. share: the largest share of the edge's exposure that
+    rounded doses change, over the relative error that is allowed there.
+    """
+
+    least: float
+    most: float
+    share: float
+
+
+def dose_range(fields: Fields, settings: Exposure) -> DoseRange:
+    """The doses that pillars and pieces want, and how finely they must be met.
+
+    Where the edge is so soft that the tolerance moves it by more than a nanometre of
+    width, as much finer steps are needed.
     """
     span = np.array(
         [np.inf, 0.0, 0.0]
@@ -144,17 +155,22 @@ def ladder(fields: Fields, settings: Exposure) -> tuple[Ladder, int]:
                 max(span[2], (left / goal / allowed).max()),
             ]
         )
-    least, most_dose, share = span.tolist()
-    needed = max(
-        1,
-        int(
-            np.ceil(np.log(most_dose / least) / (2 * np.log1p(_ROUNDED / share)) - 1e-9)
-        ),
-    )
+    return DoseRange(*span.tolist())
+
+
+def dose_ladder(ranges: Sequence[DoseRange], settings: Exposure) -> tuple[Ladder, int]:
+    """The doses of a job (at most ``maximum_classes``), and how many its tolerance
+    needs.
+
+    A quarter of the tolerance is left for the background of rounded doses and for what
+    changes across a piece of a mark.
+    """
+    least = min(one.least for one in ranges)
+    span = max(one.most for one in ranges) / least
+    step = 2 * np.log1p(_ROUNDED / max(one.share for one in ranges))
+    needed = max(1, int(np.ceil(np.log(span) / step - 1e-9)))
     count = min(needed, settings.maximum_classes)
-    return Ladder(
-        least * (most_dose / least) ** ((np.arange(count) + 0.5) / count)
-    ), needed
+    return Ladder(least * span ** ((np.arange(count) + 0.5) / count)), needed
 
 
 def straight_edge_error(point: PointExposure) -> float:
@@ -189,19 +205,10 @@ def _span(
 
 
 def classes(
-    fields: Fields,
-    number: int,
-    first: int,
-    block: Array,
-    steps: Ladder,
-    *,
-    aside: float = 0.0,
+    fields: Fields, number: int, first: int, block: Array, steps: Ladder
 ) -> Array:
     """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is
     none.
-
-    aside: steps of the ladder by which the wanted doses are moved before they are
-    rounded.
     """
     t, out = fields.table, np.empty(block.shape, np.uint8)
     field = fields.at(fields.far, number, first, len(block), fields.near)
@@ -211,7 +218,7 @@ def classes(
         field,
         shift,
         CLEARS * t.goal,
-        (steps.per_log, aside),
+        steps.per_log,
         len(steps.factors),
         out,
     )
@@ -224,11 +231,10 @@ def _classes(
     field: Array,
     shift: Array,
     goal: Array,
-    scale: tuple[float, float],
+    per_log: float,
     count: int,
     out: Array,
 ) -> None:
-    per_log, aside = scale
     for row in range(block.shape[0]):
         for column in range(block.shape[1]):
             k = block[row, column]
@@ -236,7 +242,7 @@ def _classes(
                 out[row, column] = 255
                 continue
             left = max(goal[k] - field[row, column], 1e-9)
-            level = np.rint((np.log(left) - shift[k]) * per_log + aside)
+            level = np.rint((np.log(left) - shift[k]) * per_log)
             out[row, column] = min(max(level, 0.0), count - 1.0)
 
 

@@ -87,18 +87,23 @@ class Solution:
     point: PointExposure
     _fields: assign.Fields
 
-    def classes(
-        self, number: int, first: int, block: Array, *, aside: float = 0.0
-    ) -> Array:
+    def classes(self, number: int, first: int, block: Array) -> Array:
         """(rows, columns) uint8 dose class of the pillars of a block of body
         ``number``, 255 where there is none.
-
-        aside: steps of the ladder by which the wanted doses are moved before they are
-            rounded.
         """
-        return assign.classes(
-            self._fields, number, first, block, self.ladder, aside=aside
-        )
+        return assign.classes(self._fields, number, first, block, self.ladder)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Wanted:
+    """Doses that give every edge its exposure, before they are rounded to classes.
+
+    fields: backgrounds that belong to them. range: what they need of a ladder.
+    """
+
+    fields: assign.Fields
+    range: assign.DoseRange
+    point: PointExposure
 
 
 def solve(
@@ -108,9 +113,8 @@ def solve(
     settings: Exposure,
     *,
     cut: Rects | None = None,
-    samples: int = 8,
-) -> Solution:
-    """Dose classes for pillars and rectangles that are exposed together.
+) -> Wanted:
+    """The wanted doses of pillars and rectangles that are exposed together.
 
     Args:
         parts: lattices; the first is the lens, over which uniformity is told.
@@ -127,7 +131,20 @@ def solve(
     ranges = bodies.split(point, kinds, number, densest)
     drawn = bodies.table(kinds, goal, number, point=point, ranges=ranges, body=densest)
     fields = _fields(parts, drawn, ranges, cut or Rects.none())
-    ladder, needed = assign.ladder(fields, settings)
+    return Wanted(fields, assign.dose_range(fields, settings), point)
+
+
+def round_doses(
+    wanted: Wanted, ladder: Ladder, needed: int, *, samples: int = 8
+) -> Solution:
+    """Every wanted dose rounded to the nearest of a ladder.
+
+    Args:
+        ladder, needed: of :func:`layout.dose.assign.dose_ladder`, over all that is
+            written in one job.
+        samples: pillars at which the exposure is summed exactly.
+    """
+    fields, point = wanted.fields, wanted.point
     pairs, rect_class, after = assign.assign(fields, ladder)
     error = sampled_error(fields, ladder, after, point=point, samples=samples)
     return Solution(
@@ -183,13 +200,11 @@ def correct_table(
     """
     refuse_negative(process)
     body = Body.of(index, pitch_um)
-    found = solve(
-        [body],
-        Discs(diameter_um),
-        np.ones(len(diameter_um)),
-        process.exposure,
-        samples=samples,
+    wanted = solve(
+        [body], Discs(diameter_um), np.ones(len(diameter_um)), process.exposure
     )
+    ladder, needed = assign.dose_ladder([wanted.range], process.exposure)
+    found = round_doses(wanted, ladder, needed, samples=samples)
     classes = np.empty(index.shape, np.uint8)
     for first, block in body.blocks():
         classes[first : first + len(block)] = found.classes(0, first, block)

@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from layout.dose import Solution
+from layout.dose.assign import dose_ladder
 from layout.mask import cells, die, dosed, shaped, tone
 from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
 from layout.process import LayerNumber, Process, names
@@ -25,14 +27,15 @@ Furniture = Literal[
 class MadePlan:
     """A plan and what was found while it was made.
 
-    rounding_nm: largest difference between wanted and drawn diameter. dose: None where
-    no correction was asked for.
+    wanted: its doses before they are rounded to classes; None where no correction was
+    asked for. dose: the rounded ones; None before :func:`assign_doses`.
     """
 
     plan: MaskPlan
     cells: cells.Cells
-    dose: Solution | None
     radius_um: float
+    wanted: dosed.Wanted | None = None
+    dose: Solution | None = None
 
 
 def plan(
@@ -76,6 +79,38 @@ def prepare(
     """As :func:`plan`, with everything that a report needs; ``with_doses``: with the
     correction of the process.
     """
+    made = draw(source, process, name=name, furniture=furniture, with_doses=with_doses)
+    return assign_doses([made], process)[0]
+
+
+def assign_doses(made: Sequence[MadePlan], process: Process) -> list[MadePlan]:
+    """Plans that are written in one job, each dose rounded to the nearest of one
+    geometric series for all.
+
+    Raises:
+        ProcessError: datatypes of the doses that are layers of something else.
+    """
+    ranges = [one.wanted.doses.range for one in made if one.wanted is not None]
+    found = []
+    steps = dose_ladder(ranges, process.exposure) if ranges else None
+    for one in made:
+        if one.wanted is not None and steps is not None:
+            plan, dose = dosed.corrected(one.wanted, process, *steps)
+            one = dataclasses.replace(one, plan=plan, dose=dose)
+        _check_layers(one.plan, process)
+        found.append(one)
+    return found
+
+
+def draw(
+    source: Lens | DiameterMap,
+    process: Process,
+    *,
+    name: str = "METALENS",
+    furniture: Furniture = "die",
+    with_doses: bool = True,
+) -> MadePlan:
+    """As :func:`prepare`, before the doses are rounded to classes."""
     names.check(name)
     diameters = source.diameters if isinstance(source, Lens) else source
     steps = (
@@ -109,11 +144,10 @@ def prepare(
         bare = die.opened(bare, process, radius_um=radius_um)
     if process.tone == "negative":
         bare = tone.inverted(bare, process)
-    solution = None
+    wanted = None
     if with_doses and process.exposure.corrected:
-        bare, solution = dosed.corrected(bare, process)
-    _check_layers(bare, process)
-    return MadePlan(bare, found, solution, radius_um)
+        wanted = dosed.want(bare, process)
+    return MadePlan(bare, found, radius_um, wanted)
 
 
 def _word(source: Lens | DiameterMap) -> str:
@@ -143,7 +177,7 @@ def surroundings(
     own = dataclasses.replace(
         process, die=dataclasses.replace(process.die, size_um=size_um, label=label)
     )
-    made = prepare(source, own, name=name, furniture="none", with_doses=False)
+    made = draw(source, own, name=name, furniture="none", with_doses=False)
     whole = die.furnish(made.plan, own, radius_um=clear_um, label=label, around=True)
     figures = [f for f in whole.figures if f.name != "APERTURE"]
     aperture = next(f for f in whole.figures if f.name == "APERTURE")
@@ -154,7 +188,7 @@ def surroundings(
         lattices=whole.lattices[:0:-1],
         figures=(dataclasses.replace(aperture, polygons=openings), *figures),
     )
-    return _dosed(bare, made, own)
+    return _wanting(bare, made, own)
 
 
 def wafer_mark(
@@ -170,18 +204,15 @@ def wafer_mark(
     Raises:
         ProcessError: as :func:`plan`.
     """
-    made = prepare(source, process, name=name, furniture="none", with_doses=False)
+    made = draw(source, process, name=name, furniture="none", with_doses=False)
     bare = die.wafer_mark(made.plan, process, mark_um=mark_um, width_um=width_um)
-    return _dosed(bare, made, process)
+    return _wanting(bare, made, process)
 
 
-def _dosed(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
-    """A plan without its lens, corrected where the process asks for it."""
-    solution = None
-    if process.exposure.corrected:
-        bare, solution = dosed.corrected(bare, process)
-    _check_layers(bare, process)
-    return MadePlan(bare, made.cells, solution, made.radius_um)
+def _wanting(bare: MaskPlan, made: MadePlan, process: Process) -> MadePlan:
+    """A plan without its lens, with the doses that it wants where the process asks."""
+    wanted = dosed.want(bare, process) if process.exposure.corrected else None
+    return MadePlan(bare, made.cells, made.radius_um, wanted)
 
 
 def _drawn(
@@ -242,9 +273,8 @@ def _check_layers(plan: MaskPlan, process: Process) -> None:
     fixed = {getattr(layers, f.name): f.name for f in dataclasses.fields(layers)}
     kinds = {getattr(layers, f.name)[0]: f.name for f in dataclasses.fields(layers)}
     seen: dict[LayerNumber, str] = {}
-    drawn = [
-        (made.layer, {"T": "dose", "W": "witness"}.get(made.name[0], "pillar"))
-        for made in plan.classes
+    drawn: list[tuple[LayerNumber, str]] = [
+        (made.layer, made.role) for made in plan.classes
     ]
     drawn += [
         (layer, kinds[layer[0]])

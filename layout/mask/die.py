@@ -15,7 +15,7 @@ import numpy as np
 
 from layout.mask import font, marks
 from layout.mask.marks import CLEAR_UM, Box, Units
-from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass
+from layout.mask.plan import Figure, Lattice, MaskPlan, PillarClass, Role
 from layout.process import Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -123,7 +123,7 @@ def wafer_mark(
     unit, layers = Units(plan), process.layers
     sizes = sorted(plan.classes, key=lambda made: made.diameter_units)
     some = [
-        _variant(made, f"W{n}", layers.witness, 1.0)
+        _variant(made, "witness", f"W{n}", layers.witness, 1.0)
         for n, made in enumerate(_spread(sizes, _ON_WAFER))
     ]
     sites = _blocks(
@@ -183,6 +183,7 @@ def _tests(
     doses = [
         _variant(
             made,
+            "dose",
             f"T{k}{made.name[1:4]}_{n}",
             (process.layers.dose[0], process.layers.dose[1] + k),
             dose,
@@ -191,7 +192,7 @@ def _tests(
         for n, made in enumerate(_spread(sizes, _TESTED))
     ]
     witnesses = [
-        _variant(made, f"W{n}", process.layers.witness, 1.0)
+        _variant(made, "witness", f"W{n}", process.layers.witness, 1.0)
         for n, made in enumerate(_spread(sizes, _WITNESSED))
     ]
     first = len(plan.classes) + 1
@@ -273,9 +274,11 @@ def _refuse_overlaps(
 
 
 def _variant(
-    made: PillarClass, name: str, layer: tuple[int, int], dose: float
+    made: PillarClass, role: Role, name: str, layer: tuple[int, int], dose: float
 ) -> PillarClass:
-    return dataclasses.replace(made, name=name, layer=layer, dose=dose, goal=dose)
+    return dataclasses.replace(
+        made, role=role, name=name, layer=layer, dose=dose, goal=dose
+    )
 
 
 def _same_length(classes: list[PillarClass], plan: MaskPlan) -> list[PillarClass]:

@@ -4,12 +4,13 @@ datatype for each dose.
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from layout.dose import Body, Discs, Drawn, Outlines, Rects, Solution
 from layout.dose import correct as dose
-from layout.mask import symmetry
+from layout.dose.assign import Ladder
 from layout.mask.held import hold
 from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
 from layout.process import LayerNumber, Process
@@ -17,16 +18,24 @@ from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
 from metalens.ground.units import nm
 
-_KINDS = {"T": "dose", "W": "witness"}  # by the first letter of a class
 _BLOCK_SITES = 1 << 22
-_ALIKE = (
-    1e-2  # of a step of the doses: images of a pillar that differ by less get one dose
-)
 
 
-def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
-    """``plan`` with corrected doses: classes of diameter and dose, marks and labels in
-    pieces of one dose each.
+@dataclass(frozen=True, eq=False, slots=True)
+class Wanted:
+    """A plan and the doses that it wants.
+
+    boxes: (n, 4) pieces of its figures; of: (n, 2) figure and layer number of each.
+    """
+
+    plan: MaskPlan
+    doses: dose.Wanted
+    boxes: Array
+    of: Array
+
+
+def want(plan: MaskPlan, process: Process) -> Wanted:
+    """The doses that everything on a plan needs, before they are rounded to classes.
 
     Raises:
         ProcessError: as :func:`layout.dose.correct.correct`.
@@ -38,6 +47,19 @@ def corrected(plan: MaskPlan, process: Process) -> tuple[MaskPlan, Solution]:
     boxes, of, group = _pieces(plan, parts, process)
     cut = Rects(boxes * unit, group, np.ones(len(boxes)))
     found = dose.solve(parts, _drawn(plan, unit), goals, process.exposure, cut=cut)
+    return Wanted(plan, found, boxes, of)
+
+
+def corrected(
+    wanted: Wanted, process: Process, ladder: Ladder, needed: int
+) -> tuple[MaskPlan, Solution]:
+    """The plan with corrected doses: classes of diameter and dose, marks and labels in
+    pieces of one dose each.
+
+    ladder, needed: of all that is written in one job.
+    """
+    plan, boxes, of = wanted.plan, wanted.boxes, wanted.of
+    found = dose.round_doses(wanted.doses, ladder, needed)
     classes, lookup, names = _classes(plan, found, process)
     lattices = tuple(_redrawn(l, n, found, lookup) for n, l in enumerate(plan.lattices))
     figures, more = _figures(plan, found, (boxes, of))
@@ -138,18 +160,29 @@ def _pieces(
 
 
 def _touching(boxes: Array) -> Array:
-    """(n,) number of the connected shape that each rectangle belongs to."""
+    """(n,) number of the connected shape that each rectangle belongs to.
+
+    A sweep along the longer side of them all: memory grows with the touching pairs.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    low, high = (
-        boxes[:, None, :2] <= boxes[None, :, 2:],
-        boxes[:, None, 2:] >= boxes[None, :, :2],
-    )
-    i, j = np.nonzero((low & high).all(-1))
-    return np.asarray(
-        connected_components(coo_matrix((np.ones(len(i)), (i, j))))[1], np.int64
-    )
+    axis = int(np.argmax(boxes[:, 2:].max(0) - boxes[:, :2].min(0)))
+    order = np.argsort(boxes[:, axis], kind="stable")
+    swept = boxes[order]
+    ends = np.searchsorted(swept[:, axis], swept[:, 2 + axis], side="right")
+    other, first, second = 1 - axis, [], []
+    for n, end in enumerate(ends.tolist()):
+        ahead = swept[n + 1 : end]
+        met = (ahead[:, other] <= swept[n, 2 + other]) & (
+            ahead[:, 2 + other] >= swept[n, other]
+        )
+        touched = order[n + 1 : end][met]
+        second.append(touched)
+        first.append(np.full(len(touched), order[n]))
+    i, j = np.concatenate(first), np.concatenate(second)
+    pairs = coo_matrix((np.ones(len(i)), (i, j)), (len(boxes), len(boxes)))
+    return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
 
 
 def _classes(
@@ -164,7 +197,7 @@ def _classes(
     }
     datatypes: dict[str, list[int]] = {kind: [] for kind in bases}
     for k, j in used.tolist():
-        kind = _kind(plan.classes[k - 1])
+        kind = plan.classes[k - 1].role
         if j not in datatypes[kind]:
             datatypes[kind].append(j)
     number = {
@@ -177,7 +210,7 @@ def _classes(
     digits = max(6, len(str(len(used))))
     for n, (k, j) in enumerate(used.tolist(), 1):
         old = plan.classes[k - 1]
-        kind, level = _kind(old), float(found.ladder.factors[j])
+        kind, level = old.role, float(found.ladder.factors[j])
         layer = (bases[kind][0], bases[kind][1] + number[kind][j])
         names[layer] = title({"dose": "dose_test"}.get(kind, kind), level)
         name = f"{old.name[0]}{old.diameter_units:0{digits}}N{n:0{digits}}"
@@ -186,55 +219,20 @@ def _classes(
     return tuple(made), lookup, names
 
 
-def _kind(made: PillarClass) -> str:
-    return _KINDS.get(made.name[0], "pillar")
-
-
 def _redrawn(lattice: Lattice, number: int, found: Solution, lookup: Array) -> Lattice:
-    levels = _levels(lattice, number, found)
-    if symmetry.is_square_symmetric(lattice):
-        levels = _alike(lattice, number, found, levels)
-    blocks = ((first, lookup[block, level]) for first, block, level in levels)
-    kept = hold((lattice.rows, lattice.columns), lookup.dtype, blocks)
+    """A lattice with the classes of diameter and dose, in blocks of rows."""
+
+    def blocks() -> Iterator[tuple[int, Array]]:
+        size = max(1, _BLOCK_SITES // max(1, lattice.columns))
+        for first, block in lattice.blocks(size):
+            whole = np.ascontiguousarray(block)
+            yield first, lookup[whole, found.classes(number, first, whole)]
+
+    kept = hold((lattice.rows, lattice.columns), lookup.dtype, blocks())
     made = kept.lattice(lattice.name, pitch=lattice.pitch, x0=lattice.x0, y0=lattice.y0)
     return dataclasses.replace(
         made, row_pitch=lattice.row_pitch, centred=lattice.centred
     )
-
-
-def _levels(
-    lattice: Lattice, number: int, found: Solution
-) -> Iterator[tuple[int, Array, Array]]:
-    """(first row, class numbers, dose classes) of blocks of rows."""
-    for first, block in lattice.blocks(max(1, _BLOCK_SITES // max(1, lattice.columns))):
-        whole = np.ascontiguousarray(block)
-        yield first, whole, found.classes(number, first, whole)
-
-
-def _alike(
-    lattice: Lattice,
-    number: int,
-    found: Solution,
-    levels: Iterator[tuple[int, Array, Array]],
-) -> Iterator[tuple[int, Array, Array]]:
-    """The doses of a lens whose eighths are alike, alike as well where only rounding
-    parts them.
-
-    Images of a pillar whose doses lie on either side of the middle of a step get the
-    lower one; a lens whose
-    surroundings ask for more than :data:`_ALIKE` of a step keeps its own doses. Without
-    that a handful of millions of
-    pillars keeps a lens from being stored as an eighth.
-    """
-    whole = lattice.whole()
-    own = np.concatenate([level for _, _, level in levels])
-    least = symmetry.least(own)
-    for row in np.flatnonzero((own != least).any(1)):
-        block = np.ascontiguousarray(whole[row : row + 1])
-        if (found.classes(number, int(row), block, aside=-_ALIKE) > least[row]).any():
-            yield 0, whole, own
-            return
-    yield 0, whole, least
 
 
 def _figures(

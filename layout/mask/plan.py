@@ -16,6 +16,7 @@ pillar, k for ``classes[k - 1]``.
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
 MOST_CLASSES = 65535
+Role = Literal["pillar", "dose", "witness"]
 FARTHEST = 2**31 - 1
 UNDRAWN = ("OUTLINE", "FIELDS")  # figures for people: no resist sees them
 EXPOSED = (
@@ -52,6 +54,7 @@ class PillarClass:
     test). round: whether the outline stands for a circle of that diameter; else the
     diameter is the size of the shape.
     holes: what is left out of the outline, clockwise.
+    role: a pillar of the lens, of the dose test or of the witness cells.
     """
 
     name: str
@@ -64,6 +67,7 @@ class PillarClass:
     goal: float = 1.0
     round: bool = True
     holes: tuple[Array, ...] = ()
+    role: Role = "pillar"
 
     @property
     def contours(self) -> tuple[Array, ...]:

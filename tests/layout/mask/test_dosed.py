@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from layout.dose.assign import dose_ladder
 from layout.mask import MaskPlan, dosed
 from layout.mask.plan import Figure, Lattice, pillar_classes
 from layout.process import Exposure, Process
@@ -38,8 +39,9 @@ def plan():
     apart, a label, and an outline.
     """
     kinds = {"D": ([120, 200, 260], (1, 0)), "T": ([200], (5, 0)), "W": ([160], (6, 0))}
+    roles = {"D": "pillar", "T": "dose", "W": "witness"}
     classes = [
-        made
+        dataclasses.replace(made, role=roles[letter])
         for letter, (sizes, layer) in kinds.items()
         for made in pillar_classes(
             np.array(sizes),
@@ -88,7 +90,9 @@ def plan():
 @pytest.fixture(scope="module")
 def made():
     before = plan()
-    return (before, *dosed.corrected(before, PROCESS))
+    wanted = dosed.want(before, PROCESS)
+    steps = dose_ladder([wanted.doses.range], PROCESS.exposure)
+    return (before, *dosed.corrected(wanted, PROCESS, *steps))
 
 
 def test_every_pillar_keeps_its_shape_and_gets_the_dose_that_was_found_for_it(made):
