@@ -1,4 +1,4 @@
-"""Several lenses and cells on a die, dies on a wafer, a lens in an existing file."""
+"""Several lenses and cells on a die, dies on a wafer."""
 
 from typing import TYPE_CHECKING
 
@@ -6,6 +6,7 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from layout.arrange import apart as apart
+    from layout.arrange import job_file as job_file
     from layout.arrange import joined as joined
     from layout.arrange import parts as parts
     from layout.arrange import readback as readback
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from layout.arrange.record import At as At
     from layout.arrange.record import CellPart as CellPart
     from layout.arrange.record import Furniture as Furniture
-    from layout.arrange.record import Into as Into
     from layout.arrange.record import LensPart as LensPart
     from layout.arrange.record import Wafer as Wafer
 
@@ -26,10 +26,10 @@ __getattr__, __dir__, __all__ = attach(
         "At": "record",
         "CellPart": "record",
         "Furniture": "record",
-        "Into": "record",
         "LensPart": "record",
         "Wafer": "record",
         "apart": "",
+        "job_file": "",
         "joined": "",
         "parts": "",
         "readback": "",

@@ -79,31 +79,23 @@ class Layers:
 
 
 def die(
-    name: str,
-    placed: Sequence[Placing],
-    *,
-    kept: frozenset[LayerNumber],
-    into: Part | None = None,
+    name: str, placed: Sequence[Placing], *, kept: frozenset[LayerNumber]
 ) -> Assembly:
-    """All parts in one cell ``name``, or in the top cell of a file that takes them."""
+    """All parts in one cell ``name``."""
     layers = Layers(kept)
     cells: dict[str, CellContent] = {}
     copies: dict[str, tuple[Copies, ...]] = {}
     sites: dict[str, Sites] = {}
-    top = name
-    if into is not None:
-        _take(into, layers, cells, copies, sites)
-        top = into.top
     here: list[Copies] = []
     for one in placed:
         new = _take(one.part, layers, cells, copies, sites)
         here += one.copies(new[one.part.top])
-    if into is None and name in cells:
+    if name in cells:
         raise ProcessError(
             f"a part holds a cell {name!r}, the name of the arrangement; give the arrangement another"
         )
-    cells.setdefault(top, CellContent(top))
-    copies[top] = (*copies.get(top, ()), *here)
+    cells[name] = CellContent(name)
+    copies[name] = tuple(here)
     return Assembly(name, cells, copies, UNIT_NM, layers.names, layers.doses, sites)
 
 

@@ -21,7 +21,7 @@ from layout.files import (
 )
 from layout.mask import UNDRAWN, Lattice, MaskPlan
 from layout.process import LayerNumber, Process
-from layout.shapes import rectilinear
+from layout.shapes import polygon, rectilinear, region
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
@@ -35,15 +35,14 @@ _TILES = 64  # squares of a lattice, each way
 class Part:
     """A cell with all below it, in nanometres.
 
-    name: of the part. top: its cell. cells: by name, as they will be written. doses:
-    relative dose of each layer that
-    is exposed. layer_names: shown by viewers. boxes: {exposure: (n, 4) left, bottom,
-    right, top of its shapes}; of a
-    lattice, of some thousand squares of its pillars. extent: (4,) around everything,
-    outline included. corrected:
-    whether its doses make up for the scattered electrons of its own shapes, and of no
-    others. texts: that are left out,
-    as they draw nothing.
+    name: of the part. top: its cell. cells: by name, as they will be written.
+    doses: relative dose of each layer that is exposed. layer_names: shown by viewers.
+    boxes: {exposure: (n, 4) left, bottom, right, top of its shapes}; of a lattice, of
+    some thousand squares of its pillars. extent: (4,) around everything, outline too.
+    corrected: whether its doses make up for the scattered electrons of its own shapes,
+    and of no others.
+    uncorrected: {layer: shapes} beside pillars whose one dose corrects nothing.
+    texts, empty: texts and shapes without area that are left out: they draw nothing.
     sites: of cells, beside what their content places.
     """
 
@@ -55,8 +54,16 @@ class Part:
     boxes: Mapping[str, Array]
     extent: Array
     corrected: bool = False
+    uncorrected: Mapping[LayerNumber, int] = field(default_factory=dict)
     texts: int = 0
+    empty: int = 0
     sites: Mapping[str, Sites] = field(default_factory=dict)
+
+
+def sketch(name: str, plan: MaskPlan, process: Process) -> Part:
+    """Where the shapes of a plan lie, without its cells."""
+    boxes, extent = _plan_boxes(plan, process)
+    return Part(name, name, {}, plan.doses, plan.layer_names, boxes, extent)
 
 
 def of_plan(
@@ -76,6 +83,27 @@ def of_plan(
         cell: name if cell == plan.name else f"{name}_{cell}" for cell in content.cells
     }
     cells = {new[cell.name]: _renamed(cell, new) for cell in content.cells.values()}
+    classes = tuple(new.get(made.name, "") for made in plan.classes)
+    known = lattices or {}
+    sites = {
+        new[c.name]: Sites(known[c.name], classes)
+        for c in content.cells.values()
+        if c.sums is not None
+    }
+    return Part(
+        name,
+        name,
+        cells,
+        plan.doses,
+        plan.layer_names,
+        *_plan_boxes(plan, process),
+        corrected,
+        sites=sites,
+    )
+
+
+def _plan_boxes(plan: MaskPlan, process: Process) -> tuple[dict[str, Array], Array]:
+    """{exposure: (n, 4) boxes}, and (4,) around everything."""
     boxes = {
         PILLARS: [box for l in plan.lattices for box in _lattice_boxes(plan, l)],
         APERTURE: [],
@@ -93,24 +121,7 @@ def of_plan(
                 boxes[
                     APERTURE if layer[0] == process.layers.aperture[0] else PILLARS
                 ] += some
-    classes = tuple(new.get(made.name, "") for made in plan.classes)
-    known = lattices or {}
-    sites = {
-        new[c.name]: Sites(known[c.name], classes)
-        for c in content.cells.values()
-        if c.sums is not None
-    }
-    return Part(
-        name,
-        name,
-        cells,
-        plan.doses,
-        plan.layer_names,
-        {k: _stacked(v) for k, v in boxes.items()},
-        _around(np.array(every)),
-        corrected,
-        sites=sites,
-    )
+    return {k: _stacked(v) for k, v in boxes.items()}, _around(np.array(every))
 
 
 def of_file(
@@ -121,14 +132,12 @@ def of_file(
     *,
     cell: str,
     relative_dose: float,
-    keep_top: bool,
 ) -> Part:
-    """A cell of a file, or all of the file with this cell as its ``top``.
+    """A cell of a file with all below it; shapes without area are left out.
 
     Args:
         cell: its name; empty: the only top cell. relative_dose: of its layers, where
             the file has no doses.csv.
-        keep_top: all cells of the file, not those below ``cell`` alone.
 
     Raises:
         MaskFileError: no such cell, several top cells and none named, coordinates that
@@ -136,8 +145,13 @@ def of_file(
     """
     top = _chosen(path, content, cell)
     whole = scaled(content, UNIT_NM, str(path))
-    wanted = set(content.cells) if keep_top else _below(content, top)
-    cells = {key: each for key, each in whole.cells.items() if key in wanted}
+    wanted = _below(content, top)
+    cells = {key: _drawing(each) for key, each in whole.cells.items() if key in wanted}
+    empty = sum(
+        len(shapes) - len(cells[key].polygons.get(layer, ()))
+        for key in cells
+        for layer, shapes in whole.cells[key].polygons.items()
+    )
     layers = process.layers
     undrawn = {layers.outline, layers.fields}
     table = path.with_name("doses.csv")
@@ -146,16 +160,43 @@ def of_file(
         layer for each in cells.values() for layer in (*each.polygons, *each.circles)
     }
     dosed = {layer: known.get(layer, relative_dose) for layer in sorted(used - undrawn)}
-    found = _file_boxes(dataclasses.replace(whole, cells=cells), top, process)
+    found, counts = _file_boxes(dataclasses.replace(whole, cells=cells), top, process)
     every = np.concatenate(
         [box for box in found.values() if len(box)] or [np.zeros((1, 4))]
     )
     exposed = {key: box for key, box in found.items() if key in (PILLARS, APERTURE)}
-    texts = sum(each.texts for each in cells.values())
     names = {
         layer: text for layer, text in content.layer_names.items() if layer in used
     }
-    return Part(name, top, cells, dosed, names, exposed, _around(every), texts=texts)
+    return Part(
+        name,
+        top,
+        cells,
+        dosed,
+        names,
+        exposed,
+        _around(every),
+        uncorrected={
+            layer: count
+            for layer, count in sorted(counts.items())
+            if layer in dosed and layer not in known and layer[0] != layers.aperture[0]
+        },
+        texts=sum(each.texts for each in cells.values()),
+        empty=empty,
+    )
+
+
+def _drawing(cell: CellContent) -> CellContent:
+    """A cell without its shapes that have no area, doubled corners taken out."""
+    kept: dict[LayerNumber, list[Array]] = {}
+    for layer, shapes in cell.polygons.items():
+        for shape in shapes:
+            corners = shape[(shape != np.roll(shape, 1, axis=0)).any(1)]
+            if len(corners) > 2 and (
+                polygon.twice_area(corners) or region.union([corners])
+            ):
+                kept.setdefault(layer, []).append(corners)
+    return dataclasses.replace(cell, polygons=kept)
 
 
 def _chosen(path: Path, content: MaskContent, cell: str) -> str:
@@ -289,9 +330,11 @@ def _lattice_boxes(plan: MaskPlan, lattice: Lattice) -> list[Array]:
     return found
 
 
-def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, Array]:
-    """Boxes of all shapes below ``top`` by exposure; layers that no exposure of ours
-    knows by their number.
+def _file_boxes(
+    content: MaskContent, top: str, process: Process
+) -> tuple[dict[str, Array], dict[LayerNumber, int]]:
+    """Boxes of all shapes below ``top`` by exposure (layers that no exposure of ours
+    knows by their number), and the shapes of each layer.
     """
     layers = process.layers
     ours = {layers.aperture[0]: APERTURE}
@@ -306,7 +349,10 @@ def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, A
         )
     }
     found: dict[str, list[Array]] = {}
+    counts: dict[LayerNumber, int] = {}
     for stack in flat.stacks(content, top):
+        number = len(stack.outlines) * len(stack.x)
+        counts[stack.layer] = counts.get(stack.layer, 0) + number
         pieces = np.concatenate(
             [rectilinear.covering(outline) for outline in stack.outlines]
         )
@@ -315,7 +361,7 @@ def _file_boxes(content: MaskContent, top: str, process: Process) -> dict[str, A
         found.setdefault(
             ours.get(stack.layer[0], f"layer {stack.layer[0]}"), []
         ).append(every)
-    return {key: np.concatenate(some) for key, some in found.items()}
+    return {key: np.concatenate(some) for key, some in found.items()}, counts
 
 
 def _stacked(boxes: Sequence[Array]) -> Array:

@@ -61,8 +61,7 @@ class LensPart:
     file: lens.h5, beside the arrangement. name: of its cell, and the beginning of the
     names of its pillars' cells.
     furnished: with marks, label, dose test and witness cells of its own, else with its
-    aperture alone; left out: where
-        neither [die] nor [into] is given.
+    aperture alone; left out: where no [die] is given.
     at: where it stands; left out: once, at (0, 0).
     """
 
@@ -82,8 +81,8 @@ class CellPart:
     file: beside the arrangement. cell: what is placed, with all below it; left out: the
     file's only top cell.
     name: of the part in reports. relative_dose: of its layers, where no doses.csv of
-    these lies beside the file.
-    checked: whether it has to keep the design rules too.
+    these lies beside the file; a single dose is no proximity correction.
+    checked: whether its design rules are checked; where not, every verdict says so.
     at: where it stands; left out: once, at (0, 0).
     """
 
@@ -96,27 +95,6 @@ class CellPart:
 
     def __post_init__(self) -> None:
         _named(self.name)
-        if not 0 < self.relative_dose < 1e6:
-            raise ProcessError(
-                f"relative_dose = {self.relative_dose}: need a finite dose above 0"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Into:
-    """An existing file that everything is placed into; its cells, layers and datatypes
-    stay as they are.
-
-    file: GDSII or OASIS, beside the arrangement. cell: that takes the new parts; left
-    out: the file's only top cell.
-    relative_dose: of its layers, where no doses.csv of these lies beside the file.
-    """
-
-    file: Path
-    cell: str = ""
-    relative_dose: float = field(default=1.0, metadata={"above": 0})
-
-    def __post_init__(self) -> None:
         if not 0 < self.relative_dose < 1e6:
             raise ProcessError(
                 f"relative_dose = {self.relative_dose}: need a finite dose above 0"
@@ -206,26 +184,20 @@ class Arrangement:
     """Lenses and cells on a die, the die alone or on a wafer.
 
     name: of the top cell; ``NAME_DIE`` is the die on a wafer.
-    lens, cell: what stands on the die. die: furniture for all lenses together. into: a
-    file that takes everything.
-    wafer: step and repeat of the die.
+    lens, cell: what stands on the die. die: furniture for all lenses together. wafer:
+    step and repeat of the die.
     """
 
     name: str = "ARRANGED"
     lens: tuple[LensPart, ...] = ()
     cell: tuple[CellPart, ...] = ()
     die: Furniture | None = None
-    into: Into | None = None
     wafer: Wafer | None = None
 
     def __post_init__(self) -> None:
         _named(self.name)
         if not self.lens and not self.cell:
             raise ProcessError("nothing to arrange: need a [[lens]] or a [[cell]]")
-        if self.into is not None and self.wafer is not None:
-            raise ProcessError(
-                "[into] and [wafer] together: place into the file first, then step it as a [[cell]]"
-            )
         if self.die is not None and not self.lens:
             raise ProcessError(
                 "[die] needs a [[lens]]: its dose test and witness cells are made of the lens's pillars"
@@ -241,11 +213,7 @@ class Arrangement:
 
     def furnished(self, part: LensPart) -> bool:
         """Whether a lens brings marks, label and test structures of its own."""
-        return (
-            (self.die is None and self.into is None)
-            if part.furnished is None
-            else part.furnished
-        )
+        return self.die is None if part.furnished is None else part.furnished
 
 
 def _named(name: str) -> None:

@@ -117,7 +117,7 @@ def notch_distance_um(wafer: Wafer, boxes: Array) -> Array:
     """
     radius = 1e3 * NOTCH_RADIUS_MM
     corner = -500 * wafer.diameter_mm + 1e3 * wafer.notch_mm - radius
-    left, bottom, right, top = boxes.T
+    left, bottom, right, _ = boxes.T
     x = np.maximum(np.maximum(left, -right), 0.0)  # of the point nearest to the axis
     up = bottom - corner
     side = (x + up) / math.sqrt(2)  # from the line of a wall, above 0 outside

@@ -10,18 +10,30 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from layout.arrange import Arrangement, At, Wafer, apart, joined, readback, wafer
+from layout.arrange import (
+    Arrangement,
+    At,
+    Wafer,
+    apart,
+    job_file,
+    joined,
+    parts,
+    readback,
+    wafer,
+)
 from layout.commands import arranged_page, make
 from layout.commands import placed as standing
 from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.placed import Work
 from layout.commands.stages import Stages
-from layout.files import Assembly, doses
+from layout.files import Assembly, doses, handover
 from layout.gdsii import assemble as gdsii_assemble
+from layout.mask import build
 from layout.oasis import assemble as oasis_assemble
 from layout.process import LayerNumber, noticed
 from layout.process import process as processes
+from layout.rules import markers
 from metalens.ground import config, store
 from metalens.ground.errors import ProcessError
 
@@ -34,7 +46,6 @@ def run(options: Options) -> int:
     """
     record = config.load(options.lens, Arrangement)
     named = [part.file for part in record.lens] + [part.file for part in record.cell]
-    named += [] if record.into is None else [record.into.file]
     process = (
         processes.Process()
         if options.process is None
@@ -64,11 +75,11 @@ def _refuse_negative(work: Work) -> None:
     """
     record, size = work.record, work.record.wafer
     alone = all(record.furnished(part) for part in record.lens) and not record.cell
-    alone &= record.die is None and record.into is None and not (size and size.marks)
+    alone &= record.die is None and not (size and size.marks)
     if work.process.tone == "negative" and not alone:
         raise ProcessError(
-            "tone = 'negative' draws the die around each lens: need lenses that are furnished, and no [die], [[cell]], "
-            "[into] or wafer.marks"
+            "tone = 'negative' draws the die around each lens: need lenses that are furnished, "
+            "and no [die], [[cell]] or wafer.marks"
         )
 
 
@@ -78,22 +89,9 @@ def _whole(work: Work) -> Assembly:
     _refuse_negative(work)
     if record.wafer is not None:
         wafer.refuse_marks_off(record.wafer)
-    placed = [
-        joined.Placing(standing.lens_part(work, part), part.at) for part in record.lens
-    ]
-    placed += [
-        joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell
-    ]
-    if record.die is not None:
-        placed.append(
-            joined.Placing(standing.surroundings(work, record.die, placed), (At(),))
-        )
-    into = (
-        None if record.into is None else standing.file_part(work, "INTO", record.into)
-    )
-    every = placed if into is None else [*placed, joined.Placing(into, (At(),))]
+    placed, marks = _parts(work)
     with work.stages("room between parts"):
-        work.placed, work.near = every, apart.check(every, work.process)
+        work.placed, work.near = placed, apart.check(placed, work.process)
     told = [
         f"{v.text}: {v.value / 1e3:.3f} um apart, need {v.limit / 1e3:.4g}"
         for v in work.near
@@ -104,14 +102,52 @@ def _whole(work: Work) -> Assembly:
     layers = work.process.layers
     name = record.name if record.wafer is None else f"{record.name}_DIE"
     kept: frozenset[LayerNumber] = frozenset({layers.outline, layers.fields})
-    one = joined.die(name, placed, kept=kept, into=into)
-    return one if record.wafer is None else _stepped(work, record.wafer, one, placed)
+    one = joined.die(name, placed, kept=kept)
+    if record.wafer is None:
+        return one
+    return _stepped(work, record.wafer, one, marks)
+
+
+def _parts(work: Work) -> tuple[list[joined.Placing], parts.Part | None]:
+    """What stands on the die, and the alignment mark of the wafer.
+
+    Everything that is corrected here is drawn first, so that all of it shares one
+    series of doses.
+    """
+    record, process = work.record, work.process
+    files = [
+        joined.Placing(standing.cell_part(work, part), part.at) for part in record.cell
+    ]
+    lenses = [standing.draw_lens(work, part) for part in record.lens]
+    made = [drawing.made for drawing in lenses]
+    if record.die is not None:
+        sketches = [
+            joined.Placing(parts.sketch(part.name, one.plan, process), part.at)
+            for part, one in zip(record.lens, made, strict=True)
+        ]
+        made.append(standing.draw_surroundings(work, record.die, sketches + files))
+    has_marks = record.wafer is not None and bool(record.wafer.marks)
+    if record.wafer is not None and has_marks:
+        made.append(standing.draw_wafer_mark(work, record.wafer))
+    with work.stages("dose classes"):
+        made = build.assign_doses(made, process)
+    mark = standing.written_part(work, made.pop()) if has_marks else None
+    placed = [
+        joined.Placing(standing.lens_part(work, drawing, one), part.at)
+        for part, drawing, one in zip(record.lens, lenses, made, strict=False)
+    ]
+    placed += files
+    if record.die is not None:
+        around = standing.written_part(work, made[-1])
+        placed.append(joined.Placing(around, (At(),)))
+    return placed, mark
 
 
 def _stepped(
-    work: Work, size: Wafer, one: Assembly, placed: list[joined.Placing]
+    work: Work, size: Wafer, one: Assembly, mark: parts.Part | None
 ) -> Assembly:
     """The wafer: as many whole dies as it holds, and its marks."""
+    placed = work.placed
     box = apart.extent(placed) / joined.PER_UM
     scattered = apart.reach_um(work.process)
     inner = apart.extent(placed, exposed=True) / joined.PER_UM
@@ -129,10 +165,8 @@ def _stepped(
         around_marks_um=max(scattered, joined.MARGIN_UM),
     )
     steps = wafer.stepped(one.name, work.dies, units_per_um=joined.PER_UM)
-    marks = None
-    if size.marks:
-        at = tuple(At(1e3 * mark.x_mm, 1e3 * mark.y_mm) for mark in size.marks)
-        marks = joined.Placing(standing.wafer_mark(work, size), at)
+    at = tuple(At(1e3 * place.x_mm, 1e3 * place.y_mm) for place in size.marks)
+    marks = None if mark is None else joined.Placing(mark, at)
     return joined.wafer(work.record.name, one, steps, marks)
 
 
@@ -160,12 +194,19 @@ def _one(
 
 
 def _accompany(work: Work, made: Assembly) -> None:
-    """Dose table, list of dies, job sheet, values, report."""
+    """Dose table, layers, write fields, list of dies, job sheet, values, report."""
+    fields = list(job_file.place_fields(work.placed, work.splits))
+    job_file.write_fields(fields, work.folder / "fields.csv")
+    turned = job_file.without_fields(work.placed, work.splits)
+    work.notes += [
+        f"{name}: copies that are turned by no quarter have no write fields"
+        for name in turned
+    ]
+    markers.write_lyp(made, work.folder / "mask.lyp")
     doses.write(made, work.process, work.folder / "doses.csv")
-    most, held = (
-        work.process.exposure.maximum_classes,
-        len({round(dose, 6) for dose in made.doses.values()}),
-    )
+    most = work.process.exposure.maximum_classes
+    aperture = work.process.layers.aperture[0]
+    held = len({round(d, 6) for (n, _), d in made.doses.items() if n != aperture})
     if held > most:
         work.failures.append(
             f"{held} doses on the mask, exposure.maximum_classes = {most}"
@@ -181,7 +222,9 @@ def _accompany(work: Work, made: Assembly) -> None:
         store.write_text(work.folder / "dies.csv", text.getvalue())
     store.write_text(work.folder / "process.toml", config.dumps(work.process))
     store.write_text(work.folder / "arrangement.toml", config.dumps(work.record))
-    store.write_text(work.folder / "job.txt", "\n".join(_sheet(work, made)) + "\n")
+    store.write_text(
+        work.folder / "job.txt", "\n".join(_sheet(work, made, len(fields))) + "\n"
+    )
     store.write_text(
         work.folder / "layout.json", json.dumps(_values(work, made), indent=1) + "\n"
     )
@@ -193,6 +236,8 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
         "ok": not work.failures,
         "failures": work.failures,
         "notes": work.notes,
+        "unchecked": work.unchecked,
+        "charge_uC": _charges(work, made),
         "dies": 1 if work.dies is None else len(work.dies.index),
         "cells": len(made.cells),
         "doses": len(made.doses),
@@ -202,7 +247,12 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
     }
 
 
-def _sheet(work: Work, made: Assembly) -> list[str]:
+def _charges(work: Work, made: Assembly) -> dict[str, float]:
+    """{step: charge} of the whole mask."""
+    return handover.charge_uC(job_file.areas_um2(made), made.doses, work.process)
+
+
+def _sheet(work: Work, made: Assembly, fields: int) -> list[str]:
     """The job sheet: what stands where, and its doses; what is said of each lens lies
     in its folder.
     """
@@ -243,21 +293,24 @@ def _sheet(work: Work, made: Assembly) -> list[str]:
                 for mark in size.marks
             ),
         ]
-    lines += [
+    areas = job_file.areas_um2(made)
+    charges = handover.charge_uC(areas, made.doses, process)
+    many = "" if work.dies is None else f" of a die, {len(work.dies.index)} dies"
+    return [
+        *lines,
         "",
-        "Doses (layer/datatype, relative, uC/cm2, name); the same in doses.csv:",
+        *handover.charge_lines(charges),
+        f"Write fields: {fields}{many}, part by part, in the order of fields.csv",
+        "  they cover the pillars of the lenses alone",
+        "",
+        *handover.dose_lines(areas, made.doses, made.layer_names, process),
     ]
-    for layer, dose in sorted(made.doses.items()):
-        absolute = dose * process.exposure.base_uC_cm2
-        lines.append(
-            f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f}  {made.layer_names.get(layer, '')}"
-        )
-    return lines
 
 
 def _text(work: Work, made: Assembly) -> str:
     target = work.options.output
-    lines = [*([] if work.failures else [work.verdict]), *work.notes]
+    lines = [*([] if work.failures and not work.unchecked else [work.verdict])]
+    lines += work.notes
     lines += [
         f"  {target / name}: {size / 1e6:.3g} MB, read back"
         for name, size in work.written.items()

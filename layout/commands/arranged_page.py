@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from layout.arrange import apart, joined, seen
+from layout.arrange import apart, job_file, joined, seen
 from layout.commands.placed import Work
-from layout.files import Assembly
+from layout.files import Assembly, handover
 from layout.rules import told
 from layout.shapes import rectilinear
 from metalens.ground import report
@@ -186,6 +186,7 @@ def _checks(work: Work) -> Section:
             broken,
         ]
         rows.append([name, *sizes, "", "", "FAILS" if broken else "passes"])
+    rows += [[name, *[""] * 6, "NOT CHECKED"] for name in work.unchecked]
     head = (
         "part",
         "shapes",
@@ -210,11 +211,22 @@ def _checks(work: Work) -> Section:
                 "Parts that stand too near each other.",
             )
         )
-    wrong = (
-        "\n\n".join(work.failures)
-        or "Every part keeps its rules, and all stand far enough from each other."
-    )
-    return Section("Checks", wrong, items)
+    return Section("Checks", _verdicts(work), items)
+
+
+def _verdicts(work: Work) -> str:
+    """What fails and what was not checked, in words."""
+    said = list(work.failures)
+    said += [
+        f"NOT CHECKED: the design rules of {name} (checked = false)."
+        for name in work.unchecked
+    ]
+    if not work.failures:
+        who = "Every part that was checked" if work.unchecked else "Every part"
+        said.append(
+            f"{who} is within the design rules, and all stand far enough from each other."
+        )
+    return "\n\n".join(said)
 
 
 def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
@@ -244,10 +256,17 @@ def _doses(work: Work, made: Assembly) -> Section:
         for layer, dose in sorted(made.doses.items())
     ]
     head = ("layer", "datatype", "relative dose", "µC/cm²", "name")
+    charges = handover.charge_uC(job_file.areas_um2(made), made.doses, work.process)
+    charge = Table(
+        ("step", "charge / µC", "hours at 1 nA"),
+        [[step, f"{q:.4g}", f"{q / 3.6:.3g}"] for step, q in charges.items()],
+        "Of the whole mask, without stage and settling times.",
+    )
     return Section(
         "Dose",
-        "One dose for each layer and datatype, as in doses.csv.",
-        [Table(head, rows)],
+        "One dose for each layer and datatype, as in doses.csv; write fields of the "
+        "lenses in fields.csv.",
+        [charge, Table(head, rows)],
     )
 
 

@@ -24,7 +24,7 @@ def run(options: Options) -> int:
         options.shared(),
         noticed(options.console.say),
     ):
-        job = make.make(options, draft.path)
+        job = make.make(make.draw(options), draft.path)
     return options.console.judged(
         make.values_of(job),
         _text(job, options.output),

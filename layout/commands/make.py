@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,55 @@ KEPT = (
 MOST_READ = 2**40
 
 
-def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") -> Job:
-    """Write the mask of ``options.lens`` and all that goes with it into a folder.
+@dataclass(frozen=True, eq=False, slots=True)
+class Drawing:
+    """A lens as it is drawn, with the doses that it wants."""
+
+    options: Options
+    source: Lens
+    process: processes.Process
+    made: build.MadePlan
+    stages: Stages
+
+
+def draw(options: Options, *, furniture: build.Furniture = "die") -> Drawing:
+    """The plan of ``options.lens``, before its doses are rounded to those of the job.
 
     furniture: what stands on the die beside the lens.
     """
-    job = _prepare(options, furniture)
+    stages = Stages(options.console.say)
+    with stages("read"):
+        source = (lenses.load if options.study else lenses.streamed)(options.lens)
+        if options.study:
+            from layout import study
+
+            study.check(source)
+        process = (
+            processes.Process()
+            if options.process is None
+            else processes.load(options.process)
+        )
+        transaction.check_room(options.output, _room(options, source))
+    with stages("classes and dose"):
+        made = build.draw(
+            source,
+            process,
+            name=options.name,
+            furniture=furniture,
+            with_doses=options.dose,
+        )
+    return Drawing(options, source, process, made, stages)
+
+
+def make(drawing: Drawing, folder: Path, made: build.MadePlan | None = None) -> Job:
+    """Write the mask of a lens and all that goes with it into a folder.
+
+    made: with the doses of a job of several masks; left out: of this mask alone.
+    """
+    if made is None:
+        with drawing.stages("dose classes"):
+            (made,) = build.assign_doses([drawing.made], drawing.process)
+    job = _checked(drawing, made)
     doses.write(job.plan, job.process, folder / "doses.csv")
     with ThreadPoolExecutor(1, thread_name_prefix="pictures") as pool:
         shots = pool.submit(page.drawn, job.stages.rows.unwatched(job.plan), job.drc)
@@ -58,34 +102,15 @@ def make(options: Options, folder: Path, *, furniture: build.Furniture = "die") 
     return job
 
 
-def _prepare(options: Options, furniture: build.Furniture) -> Job:
-    stages = Stages(options.console.say)
-    with stages("read"):
-        source = (lenses.load if options.study else lenses.streamed)(options.lens)
-        if options.study:
-            from layout import study
-
-            study.check(source)
-        rules = (
-            processes.Process()
-            if options.process is None
-            else processes.load(options.process)
-        )
-        transaction.check_room(options.output, _room(options, source))
-    with stages("classes and dose"):
-        made = build.prepare(
-            source,
-            rules,
-            name=options.name,
-            furniture=furniture,
-            with_doses=options.dose,
-        )
+def _checked(drawing: Drawing, made: build.MadePlan) -> Job:
+    """A job whose write fields are planned and whose design rules are checked."""
+    source, rules, stages = drawing.source, drawing.process, drawing.stages
     with stages("write fields"):
         split = fields.split(source.diameters, rules, drawn=made.cells)
         plan = stages.rows.watched(with_fields(made.plan, split, rules))
     with stages("check"):
         found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
-    return Job(options, source, rules, made, split, plan, found, stages)
+    return Job(drawing.options, source, rules, made, split, plan, found, stages)
 
 
 def _room(options: Options, source: Lens) -> int:

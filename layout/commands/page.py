@@ -342,12 +342,13 @@ def _certified(job: Job) -> Section | None:
         "worst exposure / %",
         "worst width / nm",
         "thinnest top to widest foot / nm",
-        "within 1 % and 1 nm",
+        f"within {100 * job.process.exposure.tolerance:g} % and 1 nm",
     )
     picture = pictures.certified(next(iter(job.certified.values())))
     text = (
-        "The files and doses.csv, read back and exposed again by a simulator that shares nothing with the correction: "
-        "threshold at half of what a wide area receives. Pillars of lens and witness cells and the edges of marks and "
+        "The files and doses.csv, read back and exposed again. The simulator shares the Gaussians of the process file "
+        "and the threshold (half of what a wide area receives) with the correction; shapes, doses, sums over "
+        "neighbours and edges are its own. Pillars of lens and witness cells and the edges of marks and "
         "labels; the dose test is predicted and not judged. made.h5 (up to 16 million sites) is the lens of "
         "the predicted diameters: give it to metalens psf, or to this command with --study."
     )
@@ -383,7 +384,9 @@ def _fields(job: Job) -> Section:
     )
     charges = [
         [step, f"{charge:.4g}", f"{charge * 1e3 / 3600:.3g}"]
-        for step, charge in handover.charge_uC(job.plan, job.process).items()
+        for step, charge in handover.charge_uC(
+            handover.areas_um2(job.plan), job.plan.doses, job.process
+        ).items()
     ]
     charge = Table(
         ("step", "charge / µC", "hours at 1 nA"),

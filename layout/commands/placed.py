@@ -11,7 +11,6 @@ from layout.arrange import (
     Arrangement,
     CellPart,
     Furniture,
-    Into,
     LensPart,
     Wafer,
     apart,
@@ -25,7 +24,7 @@ from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.stages import Stages
 from layout.files import MaskContent, hierarchy, verify
-from layout.mask import build
+from layout.mask import FieldPlan, build
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
 from layout.rules import DrcReport, Violation, check, foreign
@@ -40,10 +39,10 @@ class Work:
     """What is known so far of an arrangement.
 
     failures: what keeps the mask from the writer. notes: what a person should know.
-    placed: parts on the die. near:
-    those that stand too near each other. rules: what was found of each part that is
-    checked here. unlike: files that do
-    not read back as planned.
+    unchecked: parts whose design rules nobody checked here.
+    placed: parts on the die. near: those that stand too near each other.
+    rules: what was found of each part that is checked here. splits: write fields of
+    each lens. unlike: files that do not read back as planned.
     """
 
     options: Options
@@ -53,22 +52,28 @@ class Work:
     stages: Stages
     failures: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    unchecked: list[str] = field(default_factory=list)
     lenses: dict[str, dict[str, Any]] = field(default_factory=dict)
     written: dict[str, int] = field(default_factory=dict)
     dies: wafer.Dies | None = None
     placed: list[joined.Placing] = field(default_factory=list)
     near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
+    splits: dict[str, FieldPlan] = field(default_factory=dict)
     unlike: set[str] = field(default_factory=set)
 
     @property
     def verdict(self) -> str:
         """First line of everything that tells about the mask."""
-        return (
-            "FAILS: " + "; ".join(self.failures)
-            if self.failures
-            else "The mask passes its own checks."
+        unchecked = "".join(
+            f" NOT CHECKED: the design rules of {name} (checked = false)."
+            for name in self.unchecked
         )
+        if self.failures:
+            return "FAILS: " + "; ".join(self.failures) + unchecked
+        if unchecked:
+            return f"No fault was found by the checks that were made.{unchecked}"
+        return "The mask passes its own checks."
 
     def broken(self, name: str, found: DrcReport) -> None:
         """Enter what was found of the rules of a part."""
@@ -81,42 +86,45 @@ class Work:
         return self.options.lens.parent / file
 
 
-def lens_part(work: Work, part: LensPart) -> parts.Part:
-    """A lens, with mask, report and job sheet in a folder of its own."""
-    folder = work.folder / part.name
-    folder.mkdir()
+def draw_lens(work: Work, part: LensPart) -> make.Drawing:
+    """A lens as it is drawn, before the doses of the job are known."""
     options = dataclasses.replace(
         work.options, lens=work.beside(part.file), name=part.name
     )
     work.options.console.say(f"{part.name}: {part.file}")
-    job = make.make(
-        options, folder, furniture="die" if work.record.furnished(part) else "aperture"
-    )
-    work.failures += [f"{part.name}: {text}" for text in job.failures]
-    work.lenses[part.name] = make.values_of(job)
+    furniture: build.Furniture = "die" if work.record.furnished(part) else "aperture"
+    return make.draw(options, furniture=furniture)
+
+
+def lens_part(work: Work, drawing: make.Drawing, made: build.MadePlan) -> parts.Part:
+    """A lens, with mask, report and job sheet in a folder of its own."""
+    name = drawing.options.name
+    folder = work.folder / name
+    folder.mkdir()
+    work.options.console.say(f"{name}: mask and report")
+    job = make.make(drawing, folder, made)
+    work.failures += [f"{name}: {text}" for text in job.failures]
+    work.lenses[name] = make.values_of(job)
+    work.splits[name] = job.fields
     for stage, seconds in job.seconds.items():
-        work.stages.seconds[f"{part.name}: {stage}"] = seconds
+        work.stages.seconds[f"{name}: {stage}"] = seconds
     path = next(
         path for path in (folder / "mask.oas", folder / "mask.gds") if path.is_file()
     )
-    content, lattices = (
-        read(path, make.MOST_READ, keep=make.KEPT),
-        oasis_write.placed_lattices(job.plan),
-    )
-    corrected = job.made.dose is not None
+    content = read(path, make.MOST_READ, keep=make.KEPT)
     return parts.of_plan(
-        part.name,
+        name,
         job.plan,
         content,
         work.process,
-        corrected=corrected,
-        lattices=lattices,
+        corrected=made.dose is not None,
+        lattices=oasis_write.placed_lattices(job.plan),
     )
 
 
 def cell_part(work: Work, part: CellPart) -> parts.Part:
     """A cell of a file made elsewhere, held to the rules where it is to be."""
-    made = file_part(work, part.name, part)
+    made = _file_part(work, part)
     if part.checked:
         layers = work.process.layers
         with work.stages(f"{part.name}: check"):
@@ -129,12 +137,30 @@ def cell_part(work: Work, part: CellPart) -> parts.Part:
                 most=foreign.most_of(work.beside(part.file)),
             )
         work.broken(part.name, found)
+    else:
+        work.unchecked.append(part.name)
+    if work.process.exposure.corrected and made.uncorrected:
+        work.failures.append(_uncorrected(part, made))
     return made
 
 
-def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
-    """A cell of a file, or all of a file that takes the others."""
-    path, keep = work.beside(record.file), isinstance(record, Into)
+def _uncorrected(part: CellPart, made: parts.Part) -> str:
+    """That shapes of a file get doses that correct nothing, and the cure."""
+    shapes = sum(made.uncorrected.values())
+    names = ", ".join(f"{a}/{b}" for a, b in list(made.uncorrected)[:8])
+    more = ", ..." if len(made.uncorrected) > 8 else ""
+    doses = sorted({made.doses[layer] for layer in made.uncorrected})
+    return (
+        f"{part.name}: {shapes:,} shapes on {names}{more} of {part.file} get the "
+        f"relative dose {', '.join(f'{dose:g}' for dose in doses)} without proximity "
+        f"correction; correct the file and lay its doses.csv beside it, or set "
+        f"exposure.correct = false"
+    )
+
+
+def _file_part(work: Work, record: CellPart) -> parts.Part:
+    """A cell of a file."""
+    path = work.beside(record.file)
     if not path.is_file():
         raise MaskFileError(
             f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
@@ -143,27 +169,27 @@ def file_part(work: Work, name: str, record: CellPart | Into) -> parts.Part:
     content = read(path, most)
     hierarchy.refuse_beyond(content, most)
     made = parts.of_file(
-        name,
+        record.name,
         path,
         content,
         work.process,
         cell=record.cell,
         relative_dose=record.relative_dose,
-        keep_top=keep,
     )
-    if made.texts:
-        work.notes.append(
-            f"{made.texts} texts of {path.name} are left out: they draw nothing"
-        )
+    for number, what in ((made.texts, "texts"), (made.empty, "shapes without area")):
+        if number:
+            work.notes.append(
+                f"{number} {what} of {path.name} are left out: they draw nothing"
+            )
     return made
 
 
-def surroundings(
+def draw_surroundings(
     work: Work, die: Furniture, placed: list[joined.Placing]
-) -> parts.Part:
+) -> build.MadePlan:
     """Marks, label and test structures around all that is placed."""
     box = apart.extent(placed, exposed=True) / joined.PER_UM
-    made = build.surroundings(
+    return build.surroundings(
         _source(work),
         work.process,
         name="DIE",
@@ -171,19 +197,17 @@ def surroundings(
         clear_um=max(-float(box[0]), float(box[2])) + apart.reach_um(work.process),
         label=die.label or work.record.name,
     )
-    return _written(work, made)
 
 
-def wafer_mark(work: Work, size: Wafer) -> parts.Part:
+def draw_wafer_mark(work: Work, size: Wafer) -> build.MadePlan:
     """The alignment mark of a wafer."""
-    made = build.wafer_mark(
+    return build.wafer_mark(
         _source(work),
         work.process,
         name="WMARK",
         mark_um=size.mark_um,
         width_um=size.mark_width_um,
     )
-    return _written(work, made)
 
 
 def _source(work: Work) -> Lens:
@@ -191,7 +215,7 @@ def _source(work: Work) -> Lens:
     return lenses.streamed(work.beside(work.record.lens[0].file))
 
 
-def _written(work: Work, made: build.MadePlan) -> parts.Part:
+def written_part(work: Work, made: build.MadePlan) -> parts.Part:
     """What stands beside the lenses: checked, written, read back and certified as they
     are.
     """

@@ -108,6 +108,15 @@ class Assembly:
     doses: Mapping[LayerNumber, float] = field(default_factory=dict)
     sites: Mapping[str, Sites] = field(default_factory=dict)
 
+    @property
+    def layers(self) -> set[LayerNumber]:
+        """All that are drawn on."""
+        return {
+            layer
+            for cell in self.cells.values()
+            for layer in (*cell.polygons, *cell.circles)
+        }
+
 
 def arrays(placed: Placed) -> tuple[tuple[Copies, ...], Placed]:
     """Rows and rectangles of equally spaced copies as arrays, and the placements that

@@ -7,8 +7,10 @@ layer and datatype. Same input, same bytes.
 """
 
 import io
+import threading
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from metalens.ground.errors import MaskFileError, ProcessError
 
 MOST_PILLARS = 200_000
 _UM = 13  # of $INSUNITS
+_STAMPS = threading.Lock()
 # of the colour index that have names: red, yellow, green, cyan, blue, magenta, white
 _COLOURS = 7
 
@@ -56,20 +59,21 @@ def write(plan: MaskPlan, path: str | Path, *, window: Window) -> int:
             f"{len(sites)} pillars in a window of {window.size_um} um: DXF holds each as a polyline of its own; take "
             f"at most {MOST_PILLARS}, or OASIS for the whole mask"
         )
-    drawing = _ezdxf().new("R2000", units=_UM)
-    for n, (layer, name) in enumerate(_names(plan).items()):
-        made = drawing.layers.add(name, color=1 + n % _COLOURS)
-        made.description = f"{layer[0]}/{layer[1]}"
-    space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
-    for name, points in _drawn(plan, sites):
-        space.add_lwpolyline(
-            (points * scale).tolist(),
-            format="xy",
-            close=True,
-            dxfattribs={"layer": name},
-        )
-    text = io.StringIO()
-    drawing.write(text)
+    with _fixed_stamps():
+        drawing = _ezdxf().new("R2000", units=_UM)
+        for n, (layer, name) in enumerate(_names(plan).items()):
+            made = drawing.layers.add(name, color=1 + n % _COLOURS)
+            made.description = f"{layer[0]}/{layer[1]}"
+        space, scale = drawing.modelspace(), plan.unit_nm * 1e-3
+        for name, points in _drawn(plan, sites):
+            space.add_lwpolyline(
+                (points * scale).tolist(),
+                format="xy",
+                close=True,
+                dxfattribs={"layer": name},
+            )
+        text = io.StringIO()
+        drawing.write(text)
     store.write_text(path, text.getvalue())
     return len(sites)
 
@@ -112,11 +116,22 @@ def _ezdxf() -> Any:
         raise ProcessError(
             "DXF needs ezdxf: pip install 'metalens-toolchain[cad]'"
         ) from None
-    options = vars(ezdxf)["options"]  # exported, and not said to be
-    options.write_fixed_meta_data_for_testing = (
-        True  # no time stamps, no random identifiers
-    )
     return ezdxf
+
+
+@contextmanager
+def _fixed_stamps() -> Iterator[None]:
+    """No time stamps and no random identifiers while a drawing is made and written; the
+    option of ezdxf, which all its users share, is as before afterwards.
+    """
+    options = vars(_ezdxf())["options"]  # exported, and not said to be
+    with _STAMPS:
+        before = options.write_fixed_meta_data_for_testing
+        options.write_fixed_meta_data_for_testing = True
+        try:
+            yield
+        finally:
+            options.write_fixed_meta_data_for_testing = before
 
 
 def _sites(plan: MaskPlan, window: Window) -> list[tuple[int, int, int]]:

@@ -78,13 +78,50 @@ def areas_um2(plan: MaskPlan) -> dict[LayerNumber, float]:
     return found
 
 
-def charge_uC(plan: MaskPlan, process: Process) -> dict[str, float]:
-    """{step: charge} of the two steps, base dose times relative dose times area."""
-    areas, found = areas_um2(plan), {"pillars": 0.0, "aperture": 0.0}
-    for layer, dose in plan.doses.items():
+def charge_uC(
+    areas: Mapping[LayerNumber, float],
+    doses: Mapping[LayerNumber, float],
+    process: Process,
+) -> dict[str, float]:
+    """{step: charge} of the two steps: base dose times relative dose times area.
+
+    areas: um^2 of each layer.
+    """
+    found = {"pillars": 0.0, "aperture": 0.0}
+    for layer, dose in doses.items():
         step = "aperture" if layer[0] == process.layers.aperture[0] else "pillars"
-        found[step] += areas[layer] * 1e-8 * dose * process.exposure.base_uC_cm2
+        area_cm2 = areas.get(layer, 0.0) * 1e-8
+        found[step] += area_cm2 * dose * process.exposure.base_uC_cm2
     return found
+
+
+def charge_lines(charges: Mapping[str, float]) -> Iterator[str]:
+    """Charge of each step and its time at 1 nA, for the job sheet."""
+    for step, charge in charges.items():
+        hours = charge * 1e3 / 3600
+        yield (
+            f"Step {step}: charge {charge:.4g} uC ({hours:.3g} h at 1 nA, without the "
+            f"stage); beam current {_OPEN}"
+        )
+
+
+def dose_lines(
+    areas: Mapping[LayerNumber, float],
+    doses: Mapping[LayerNumber, float],
+    names: Mapping[LayerNumber, str],
+    process: Process,
+) -> Iterator[str]:
+    """The dose table with the area of each layer, for the job sheet."""
+    yield (
+        "Doses (layer/datatype, relative, uC/cm2, area um2, name); the same in "
+        "doses.csv:"
+    )
+    for layer, dose in sorted(doses.items()):
+        absolute = dose * process.exposure.base_uC_cm2
+        yield (
+            f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} "
+            f"{areas.get(layer, 0.0):>14,.1f}  {names.get(layer, '')}"
+        )
 
 
 def marks_um(plan: MaskPlan) -> list[tuple[float, float, float, float]]:
@@ -142,18 +179,10 @@ def _lines(
     yield f"  top cell {plan.name}, {plan.unit_nm:g} nm; coordinates in um below: lens axis at (0, 0), +y up"
     yield ""
     yield f"Writer {_OPEN}   resist {_OPEN}   base dose {process.exposure.base_uC_cm2:g} uC/cm2"
-    for step, charge in charge_uC(plan, process).items():
-        hours = charge * 1e3 / 3600  # at 1 nA
-        yield f"Step {step}: charge {charge:.4g} uC ({hours:.3g} h at 1 nA, without the stage); beam current {_OPEN}"
-    yield ""
-    yield "Doses (layer/datatype, relative, uC/cm2, area um2, name); the same in doses.csv:"
     areas = areas_um2(plan)
-    for layer, dose in sorted(plan.doses.items()):
-        absolute, name = (
-            dose * process.exposure.base_uC_cm2,
-            plan.layer_names.get(layer, ""),
-        )
-        yield f"  {layer[0]:>4}/{layer[1]:<4} {dose:.6f} {absolute:>10.3f} {areas[layer]:>14,.1f}  {name}"
+    yield from charge_lines(charge_uC(areas, plan.doses, process))
+    yield ""
+    yield from dose_lines(areas, plan.doses, plan.layer_names, process)
     yield ""
     steps = sequence(split)
     yield f"Write fields: {len(steps)} ({split.mode}), in the order of fields.csv"

@@ -239,6 +239,12 @@ class MaskPlan:
             *(lattice.name for lattice in self.lattices),
         ]
 
+    @property
+    def layers(self) -> set[LayerNumber]:
+        """All that are drawn on."""
+        used = {made.layer for made in self.classes}
+        return used | {layer for f in self.figures for layer in f.polygons}
+
     def counts(self) -> Array:
         """(classes + 1,) sites of each class number in all lattices."""
         total = np.zeros(len(self.classes) + 1, np.int64)

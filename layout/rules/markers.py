@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from layout.files import Assembly
 from layout.mask import MaskPlan
 from layout.rules.report import DrcReport, Violation
 from metalens.ground import store
@@ -36,10 +37,10 @@ _HOLLOW = "I1"
 _DOTTED = "I9"
 
 
-def write_lyp(plan: MaskPlan, path: str | Path) -> None:
+def write_lyp(plan: MaskPlan | Assembly, path: str | Path) -> None:
     """Layer properties: a name and a colour for each layer of the mask."""
     root = ElementTree.Element("layer-properties")
-    for n, layer in enumerate(layers(plan)):
+    for n, layer in enumerate(sorted(plan.layers)):
         name = plan.layer_names.get(layer, f"layer_{layer[0]}_{layer[1]}")
         colour = _COLOURS[n % len(_COLOURS)]
         entry = ElementTree.SubElement(root, "properties")
@@ -56,13 +57,6 @@ def write_lyp(plan: MaskPlan, path: str | Path) -> None:
         ):
             ElementTree.SubElement(entry, key).text = value
     store.write_text(path, _text(root))
-
-
-def layers(plan: MaskPlan) -> list[tuple[int, int]]:
-    """All layers that the mask uses, rising."""
-    used = {made.layer for made in plan.classes}
-    used |= {layer for figure in plan.figures for layer in figure.polygons}
-    return sorted(used)
 
 
 def write_lyrdb(plan: Named, report: DrcReport, path: str | Path) -> None:

@@ -76,20 +76,6 @@ def test_cells_of_one_name_are_told_apart_and_placed_where_they_were():
     assert (copies.columns, copies.rows, copies.across) == (3, 1, (10_000, 0))
 
 
-def test_into_keeps_the_cells_and_numbers_of_the_file():
-    chip = part("INTO", {(1, 0): 1.0}, cell="CHIP")
-    made = joined.die(
-        "NAME",
-        [joined.Placing(part("A", {(1, 0): 1.3}), (At(),))],
-        kept=frozenset(),
-        into=chip,
-    )
-    assert set(made.cells) == {"CHIP", "SHAPE"}
-    assert set(made.cells["CHIP"].polygons) == {(1, 0)}
-    assert set(made.cells["SHAPE"].polygons) == {(1, 1)}
-    assert [one.child for one in made.copies["CHIP"]] == ["SHAPE"]
-
-
 def content(unit_nm, shape, place=(0, 0)):
     top = Placed(
         ("P",), *(np.array([v], np.int32) for v in (0, *place)), np.zeros(1, np.uint8)
@@ -185,7 +171,6 @@ def test_a_disc_is_sliced_so_that_its_corners_stay_free():
         PLAIN,
         cell="",
         relative_dose=1.0,
-        keep_top=False,
     ).boxes[parts.APERTURE]
     assert len(made) == 40  # slices of 5 um
     held = (made[:, 0] <= disc[:, None, 0]) & (disc[:, None, 0] <= made[:, 2])

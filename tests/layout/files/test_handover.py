@@ -88,7 +88,7 @@ def test_the_charge_is_dose_times_area(made):
         * 1e-8
         * 370.0
     )
-    found = handover.charge_uC(plan, PROCESS)
+    found = handover.charge_uC(areas, plan.doses, PROCESS)
     assert found["pillars"] == pytest.approx(want, rel=1e-12)
     assert found["aperture"] == pytest.approx(areas[2, 0] * 1e-8 * 370.0, rel=1e-12)
 

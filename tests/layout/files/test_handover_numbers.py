@@ -103,7 +103,8 @@ def test_charges_are_doses_times_areas_in_square_centimetres():
     """Base 270 uC/cm2: (0.76 x 1.25 + 0.3 x 0.8 + (10 + 4.8) x 1.1) um2 and 12 000 um2
     x 1.5.
     """
-    found = handover.charge_uC(plan((LARGE, TIMES)), PROCESS)
+    areas = handover.areas_um2(plan((LARGE, TIMES)))
+    found = handover.charge_uC(areas, plan((LARGE, TIMES)).doses, PROCESS)
     assert found["pillars"] == pytest.approx(
         (0.76 * 1.25 + 0.3 * 0.8 + 14.8 * 1.1) * 270e-8, rel=1e-12
     )
