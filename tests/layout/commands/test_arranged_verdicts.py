@@ -270,7 +270,7 @@ def test_one_series_of_doses_serves_all_parts_and_gives_dose_to_size(
         [rng.choice(g, 20, replace=False) for g in (lens_a, lens_b, witness)]
     )
     around = plain_exposure(pillars[some, :2], np.array(boxes), pillars[:, :4])
-    x, y, area, dose = pillars[some, :4].T
+    _, _, area, dose = pillars[some, :4].T
     radius = np.sqrt(area / np.pi)
     itself = dose * area / (np.pi * BETA_UM**2) * ETA / (1 + ETA)
     core = dose / (1 + ETA) * (1 - i0e(2 * (radius / ALPHA_UM) ** 2)) / 2
