@@ -7,6 +7,8 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from layout.dose import correct as correct
     from layout.dose import exposure as exposure
+    from layout.dose.assign import Ladder as Ladder
+    from layout.dose.assign import dose_ladder as dose_ladder
     from layout.dose.bodies import Body as Body
     from layout.dose.bodies import Rects as Rects
     from layout.dose.correct import DoseResult as DoseResult
@@ -23,11 +25,13 @@ __getattr__, __dir__, __all__ = attach(
         "Discs": "drawn",
         "DoseResult": "correct",
         "Drawn": "drawn",
+        "Ladder": "assign",
         "Outlines": "drawn",
         "Rects": "bodies",
         "Solution": "correct",
         "Uniformity": "uniformity",
         "correct": "",
+        "dose_ladder": "assign",
         "exposure": "",
     },
 )

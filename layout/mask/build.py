@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from layout.dose import Solution
-from layout.dose.assign import dose_ladder
+from layout.dose import Solution, dose_ladder
 from layout.mask import cells, die, dosed, shaped, tone
 from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
 from layout.process import LayerNumber, Process, names

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose import Body, Discs, Drawn, Outlines, Rects, Solution
+from layout.dose import Body, Discs, Drawn, Ladder, Outlines, Rects, Solution
 from layout.dose import correct as dose
-from layout.dose.assign import Ladder
 from layout.mask.held import hold
 from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
 from layout.process import LayerNumber, Process
