@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks import Row, fastest
 from metalens.cell.light import Light
 from metalens.cell.record import Cell, Index
-from metalens.modal import gradient, solve
+from metalens.modal import solve
 from metalens.modal.case import case_of
 from metalens.modal.engine import evaluate, geometry, kept, kept_long
 from metalens.modal.ladder import RUNGS
@@ -182,32 +182,6 @@ def sweep() -> Row:
     )
 
 
-def slopes() -> Row:
-    wanted = references(0.0)
-
-    def work() -> None:
-        forget()
-        for d, _ in wanted:
-            gradient(CELL, d, WAVELENGTH_UM, tolerance=1e-2)
-
-    value = gradient(CELL, 0.2, WAVELENGTH_UM, tolerance=10.0)
-    step = 1e-4
-    apart = [
-        solve(CELL, 0.2 + s, WAVELENGTH_UM, tolerance=10.0).t
-        for s in (-2 * step, -step, step, 2 * step)
-    ]
-    want = (8 * (apart[2] - apart[1]) - (apart[3] - apart[0])) / (12 * step)
-    error = abs(value.diameter_um - want) / abs(want)
-    seconds = fastest(work) / len(wanted)
-    return Row(
-        "t and six derivatives",
-        "tolerance 0.01",
-        seconds,
-        error,
-        "relative, differences in diameter",
-    )
-
-
 def rows() -> list[Row]:
     return [
         *(mesh(name) for name in ("coarse", "fair", "even", "good", "fine", "finer")),
@@ -215,7 +189,6 @@ def rows() -> list[Row]:
         oblique(1e-2),
         oblique(1e-3),
         sweep(),
-        slopes(),
     ]
 
 

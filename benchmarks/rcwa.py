@@ -33,7 +33,7 @@ def rows() -> list[Row]:
             truncated_row(cell, wavelength_um, exact, harmonics)
             for harmonics in (7, 9, 11, 13, 16)
         ]
-    return [*found, oblique_row(), tilted_row(), film_row(), derivative_row()]
+    return [*found, oblique_row(), tilted_row(), film_row()]
 
 
 def reference(cell: Cell, wavelength_um: float) -> np.ndarray[Any, np.dtype[Any]]:
@@ -145,31 +145,6 @@ def film_row() -> Row:
         error,
         "|r|^2 of colour-science multilayer_tmm",
         goal="1e-10",
-    )
-
-
-def derivative_row() -> Row:
-    """All six derivatives, in one call; differences of eighth order check the one in
-    the wavelength.
-    """
-    cell, step = CELLS[0.85], 3e-4
-    weights = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
-
-    def t(wavelength_um: float) -> complex:
-        return rcwa.derivatives(cell, 0.15, wavelength_um, harmonics=6).t
-
-    pairs = enumerate(weights, 1)
-    want = sum(w * (t(0.85 + i * step) - t(0.85 - i * step)) for i, w in pairs) / step
-    got = rcwa.derivatives(cell, 0.15, 0.85, harmonics=6).wavelength_um
-    seconds = fastest(lambda: rcwa.derivatives(cell, 0.15, 0.85, harmonics=6))
-    error = abs(got - want) / abs(want)
-    return Row(
-        "six derivatives of t",
-        "orders within 6",
-        seconds,
-        error,
-        "central differences, relative",
-        goal="1e-8",
     )
 
 

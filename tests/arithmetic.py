@@ -54,7 +54,6 @@ QUICK = (
     "tests/metalens/propagate",
     "tests/metalens/psf/test_psf_stack.py",
     "tests/metalens/rcwa/test_rcwa.py",
-    "tests/metalens/modal/test_modal_derivatives.py",
     "tests/characterize/model",
     "tests/characterize/measure",
     "tests/layout/dose",

@@ -2,14 +2,12 @@
 they are quick, else slopes.
 """
 
-import functools
 from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from characterize.model import kept, solving
-from metalens import modal, rcwa
 from metalens.cell import Cell, index
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, FitError, MaterialError
@@ -23,6 +21,7 @@ from metalens.made import (
     Solved,
     lacking,
     of_kind,
+    own_rates,
     pair_sensitivities,
     sensitivity,
 )
@@ -47,53 +46,38 @@ def slopes(
     of a lens, or t itself.
 
     Upright round pillars whose proxy is that of the cell: t by the modal method at
-    every diameter that a bias can
-    lead to and at five heights and seven indices within the bounds of the fit
-    (:class:`metalens.made.Solved`), to 3e-3
-    there and up to 0.03 between them where a resonance moves by. No slope is taken for
-    a curve, and past the proxy's
-    domain, where pillars begin to resonate, nothing is extrapolated.
+    every diameter that a bias can lead to and at five heights and seven indices within
+    the bounds of the fit (:class:`metalens.made.Solved`), to 3e-3 there and up to 0.03
+    between them where a resonance moves by. The slopes beside the table are polynomials
+    of the least degree below 15 that meets ``tolerance`` at held-out diameters.
 
-    Other round ones: exact derivatives at 25 Chebyshev diameters (RCWA for films or
-    tilted walls), as the
-    polynomial of least degree whose error on diameters that it was not made from meets
-    ``tolerance``, relative to
-    the largest change of the slope across the lens; the best one below degree 15 where
-    none does. The error reached
-    is in ``error``. Cells that no solver takes get the effective-index slopes of
-    :func:`metalens.made.sensitivity`, and
-    pillars that are not round on a square lattice, those of their own shape that it
-    has; pillars of two sizes those of
-    up to 24 pairs of them, for the light of the lens.
+    Other round ones: derivatives by RCWA at a fixed truncation
+    (:func:`metalens.made.own_rates`) as such polynomials; ``error`` adds what the
+    truncation leaves. Cells that no solver takes get the effective-index slopes of
+    :func:`metalens.made.sensitivity`, pillars that are not round those of their own
+    shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
+    lens.
 
     What was solved once is kept in the user's cache folder
     (:mod:`characterize.model.kept`).
 
     Args:
-        wanted: names of causes whose slope no solver knows in closed form (the
-            sidewall) and that are wanted all the
-            same: by differences of the RCWA solver (half a degree of wall: 0.1 deg² of
-                curvature); zero without.
+        wanted: names of causes that a table lacks (the sidewall) and that are wanted
+            all the same; zero without.
 
     Raises:
         FitError: a cause is wanted that pillars of this shape cannot have. CellError,
-            MaterialError: pillars that are
-            not round, and that no solver takes.
+            MaterialError: pillars that are not round, and that no solver takes.
     """
     for name in lacking(lens.cell):
         if name in wanted:
             raise FitError(f"{name}: a {lens.cell.described} has none; leave it out")
     if lens.pairs is not None:
         return _of_pairs(lens)
-    if not lens.cell.round:
-        about = _about(lens, tolerance, ["own shape"])
-        return _unpacked(
-            kept.kept("pillars", about, _SOURCES, lambda: _packed(sensitivity(lens)))
-        )
+    about = _about(
+        lens, tolerance, [row.name for row in _unknown() if row.name in wanted]
+    )
     try:
-        about = _about(
-            lens, tolerance, [row.name for row in _unknown() if row.name in wanted]
-        )
         return _unpacked(
             kept.kept(
                 "pillars",
@@ -103,6 +87,8 @@ def slopes(
             )
         )
     except (CellError, MaterialError):
+        if not lens.cell.round:
+            raise
         return sensitivity(lens)
 
 
@@ -197,29 +183,50 @@ def _unpacked(arrays: Mapping[str, Array]) -> Sensitivity:
 
 def _solve(lens: Lens, tolerance: float, wanted: Container[str]) -> Sensitivity:
     """:func:`slopes` by the solvers."""
+    if not lens.cell.round:
+        return sensitivity(lens)
+    table = solving.solved(lens) if _upright(lens.cell) else None
     d = lens.diameters.diameter_um[lens.diameters.diameter_um > 0]
     low, high = float(d.min()), float(d.max())
     low, high = (low, high) if high > low else (low - 1e-3, high + 1e-3)
     unit = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     diameters = (low + high) / 2 + (high - low) / 2 * unit
-    found = solving.solved(lens) if _upright(lens.cell) else None
-    rows = np.array(
-        [
-            _exact(lens.cell, float(one), lens.wavelength_um, wanted, found)
-            for one in diameters
-        ]
-    ).T
+    truncation = 0.0
+    if table is None:
+        found = own_rates(lens, diameters)
+        rows, truncation = found.rates, found.error
+    else:
+        rows = _table_slopes(lens, table, diameters, wanted)
     degree, error = _degree(unit, rows, tolerance)
     fits = [chebyshev.cheb2poly(chebyshev.chebfit(unit, row, degree)) for row in rows]
     scale = (2 / (high - low)) ** np.arange(degree + 1)
     padded = [np.pad(fit, (0, degree + 1 - len(fit))) for fit in fits]
+    error += truncation
     return Sensitivity(
-        np.array(padded) * scale, (low + high) / 2, error, low, high, found
+        np.array(padded) * scale, (low + high) / 2, error, low, high, table
     )
 
 
+def _table_slopes(
+    lens: Lens, table: Solved, diameter_um: Array, wanted: Container[str]
+) -> Array:
+    """(answering causes, n) d ln t at design by a table, by RCWA where it has none and
+    the cause is wanted.
+    """
+    series = table.series(diameter_um)
+    rows = np.zeros((len(series), len(diameter_um)), complex)
+    unknown = [row.name for row in _unknown() if row.name in wanted]
+    rates = own_rates(lens, diameter_um).rates if unknown else rows
+    for n, (_, row) in enumerate(of_kind(Answers)):
+        if isinstance(row.acts, Answers) and row.acts.exact:
+            rows[n] = series[n, 1] / series[n, 0]
+        elif row.name in unknown:
+            rows[n] = rates[n]
+    return rows
+
+
 def _unknown() -> list[Cause]:
-    """Answering causes of which no solver knows the slope in closed form."""
+    """Answering causes that a table of the modal method lacks."""
     return [
         row
         for _, row in of_kind(Answers)
@@ -229,52 +236,6 @@ def _unknown() -> list[Cause]:
 
 def _upright(cell: Cell) -> bool:
     return cell.round and not (cell.under or cell.over or cell.sidewall_rad)
-
-
-def _exact(
-    cell: Cell,
-    diameter_um: float,
-    wavelength_um: float,
-    wanted: Container[str],
-    table: Solved | None,
-) -> list[complex]:
-    """d ln t by each answering cause: the solver's own derivative, or its differences
-    where that is wanted.
-    """
-    if table is not None:
-        series = table.series(np.array(diameter_um))
-        slope = dict(
-            zip(
-                (row.name for _, row in of_kind(Answers)),
-                series[:, 1] / series[:, 0],
-                strict=True,
-            )
-        )
-    else:
-        solve = (
-            functools.partial(modal.gradient, tolerance=1e-2)
-            if _upright(cell)
-            else rcwa.derivatives
-        )
-        found = solve(cell, diameter_um, wavelength_um)
-
-    def by(row: Cause) -> complex:
-        if not isinstance(row.acts, Answers) or not (
-            row.acts.exact or row.name in wanted
-        ):
-            return 0.0
-        if row.acts.exact and table is not None:
-            return complex(slope[row.name])
-        if row.acts.exact:
-            return complex(getattr(found, row.acts.exact) / found.t)
-        if row.acts.changed is None:
-            return 0.0
-        step, changed = row.acts.step, row.acts.changed
-        ends = (changed(cell, sign * step, wavelength_um) for sign in (1, -1))
-        up, down = (rcwa.derivatives(end, diameter_um, wavelength_um).t for end in ends)
-        return complex(np.log(up / down) / (2 * step))
-
-    return [by(row) for _, row in of_kind(Answers)]
 
 
 def _degree(unit: Array, rows: Array, tolerance: float) -> tuple[int, float]:

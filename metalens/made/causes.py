@@ -62,8 +62,8 @@ class Answers:
     quick: from the effective index, (n,) complex for the diameters of a guide. changed:
     the cell with so much more of
     the cause; None where a pillar of the same size has no more of it. step: of
-    differences through a solver. exact:
-    where :class:`metalens.modal.Gradient` has dt/d(cause).
+    differences through a solver. exact: the number of the cell that tables of t follow
+    by powers (:class:`metalens.made.Solved`), empty where none does.
     numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives`
     names them, by cell and size of
     the pillar; {} where such a pillar cannot have the cause. None: by differences, step

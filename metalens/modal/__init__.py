@@ -1,8 +1,7 @@
 """A modal method for round pillars: exact along z, elements that follow the disc
 across.
 
-``solve`` gives one response with its error estimate, ``gradient`` the exact derivatives
-of t.
+``solve`` gives one response with its error estimate.
 """
 
 from typing import TYPE_CHECKING
@@ -11,8 +10,6 @@ from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
     from metalens.modal.case import case_of as case_of
-    from metalens.modal.derivatives import Gradient as Gradient
-    from metalens.modal.derivatives import gradient as gradient
     from metalens.modal.engine import evaluate as evaluate
     from metalens.modal.engine import solve as solve
     from metalens.modal.ladder import RUNGS as RUNGS
@@ -22,13 +19,11 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "Gradient": "derivatives",
         "RUNGS": "ladder",
         "Rung": "ladder",
         "case_of": "case",
         "evaluate": "engine",
         "first_rung": "ladder",
-        "gradient": "derivatives",
         "solve": "engine",
     },
 )

@@ -71,28 +71,6 @@ def metric(patch: Patch, rho: float) -> Metric:
     return Metric(g22 * inverse, g11 * inverse, -g12 * inverse, inverse, area)
 
 
-def metric_rate(patch: Patch, rho: float) -> Metric:
-    """Derivative of ``metric`` in rho."""
-    xi, eta = rho * patch.rho_xi + patch.rest_xi, rho * patch.rho_eta + patch.rest_eta
-    d_xi, d_eta = patch.rho_xi, patch.rho_eta
-    g11, g22, g12 = (xi * xi).sum(-1), (eta * eta).sum(-1), (xi * eta).sum(-1)
-    d11, d22 = 2 * (xi * d_xi).sum(-1), 2 * (eta * d_eta).sum(-1)
-    d12 = (d_xi * eta + xi * d_eta).sum(-1)
-    area = xi[..., 0] * eta[..., 1] - xi[..., 1] * eta[..., 0]
-    d_area = d_xi[..., 0] * eta[..., 1] + xi[..., 0] * d_eta[..., 1]
-    d_area = d_area - d_xi[..., 1] * eta[..., 0] - xi[..., 1] * d_eta[..., 0]
-    d_area, area = d_area * np.sign(area), np.abs(area)
-    inverse = 1 / area
-    d_inverse = -d_area * inverse**2
-    return Metric(
-        d22 * inverse + g22 * d_inverse,
-        d11 * inverse + g11 * d_inverse,
-        -(d12 * inverse + g12 * d_inverse),
-        d_inverse,
-        d_area,
-    )
-
-
 def element_matrices(
     patch: Patch, m: Metric
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -142,17 +120,15 @@ def gradient(plan: MeshPlan) -> np.ndarray:
     return out
 
 
-def integrate(mesh: Mesh, rho: float, *, rate: bool = False) -> tuple[Part, Part]:
-    """Matrices of the cell and of the disc, or (``rate``) their derivatives in rho."""
+def integrate(mesh: Mesh, rho: float) -> tuple[Part, Part]:
+    """Matrices of the cell and of the disc."""
     nv, ns = len(mesh.vector_wall), len(mesh.scalar_wall)
     sums = {
         inside: [np.zeros((nv, nv)), np.zeros((nv, nv)), np.zeros((ns, ns))]
         for inside in (True, False)
     }
     for patch in mesh.patches:
-        mass, curl, scalar = element_matrices(
-            patch, (metric_rate if rate else metric)(patch, rho)
-        )
+        mass, curl, scalar = element_matrices(patch, metric(patch, rho))
         total = sums[patch.inside]
         total[0] += scatter(patch.vector, mass, nv)
         total[1] += scatter(patch.vector, curl, nv)

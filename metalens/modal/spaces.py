@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg as sl
 import scipy.sparse
 
-from metalens.modal.assembly import Geometry, Part, assemble, gradient, integrate
+from metalens.modal.assembly import Geometry, Part, assemble, gradient
 from metalens.modal.mesh import X0, X1, Y0, Y1, MeshPlan, build
 
 PHASE_STEP = 0.25  # rad: phases that share a choice of cotree
@@ -90,29 +90,21 @@ def select(
     )
 
 
-def restrict(
-    matrix: np.ndarray, rows: Selection, columns: Selection, *, rate: bool = False
-) -> np.ndarray:
+def restrict(matrix: np.ndarray, rows: Selection, columns: Selection) -> np.ndarray:
     """The quarter-cell matrix acting on the real and imaginary parts of the unknowns.
 
-    rate: its derivative in the half phase, which enters by the weights at x = pitch /
-    2.
+    The half phase enters by the weights at x = pitch / 2.
     """
     picked = matrix.take(rows.order, 0).take(columns.order, 1)
     if not rows.periodic:
-        return np.zeros_like(picked) if rate else picked
+        return picked
     out = np.zeros((rows.size, columns.size))
     r, c = rows.inside, columns.inside
     first, second = r + rows.start, c + columns.start
-    cos, sin = (
-        (-columns.imaginary, columns.real)
-        if rate
-        else (columns.real, columns.imaginary)
-    )
-    if not rate:
-        out[:first, :second] = picked[:first, :second]
-        out[first : first + r, second : second + c] = picked[:r, :c]
-        out[first + r :, second + c :] = picked[first:, second:]
+    cos, sin = columns.real, columns.imaginary
+    out[:first, :second] = picked[:first, :second]
+    out[first : first + r, second : second + c] = picked[:r, :c]
+    out[first + r :, second + c :] = picked[first:, second:]
     out[:first, second + c :] = cos * picked[:first, second:]
     out[first : first + r, second + c :] = sin * picked[:r, second:]
     out[first + r :, :second] = cos * picked[first:, :second]
@@ -217,44 +209,4 @@ def space(geometry: Geometry, *, electric: bool, half_phase_rad: float | None) -
         known.transposed,
         known.within,
         known.within_transposed,
-    )
-
-
-def space_rates(
-    geometry: Geometry, *, electric: bool, half_phase_rad: float | None
-) -> tuple[Space, Space]:
-    """Derivatives of ``space`` in the radius rho and in the half phase (zero without
-    one).
-    """
-    known = topology(geometry.mesh.plan, electric, half_phase_rad)
-    vectors, scalars = known.vectors, known.scalars
-
-    def by_radius(p: Part) -> Part:
-        return Part(
-            restrict(p.mass, vectors, vectors),
-            restrict(p.curl, vectors, vectors),
-            restrict(p.scalar, scalars, scalars),
-        )
-
-    def by_phase(p: Part) -> Part:
-        return Part(
-            restrict(p.mass, vectors, vectors, rate=True),
-            restrict(p.curl, vectors, vectors, rate=True),
-            restrict(p.scalar, scalars, scalars, rate=True),
-        )
-
-    cell, disc = integrate(geometry.mesh, geometry.rho, rate=True)
-    still = np.zeros((vectors.size, scalars.size))
-    turned = restrict(geometry.gradient, vectors, scalars, rate=True)
-    rest = np.zeros(0, int), known.transposed, known.within, known.within_transposed
-    return (
-        Space(by_radius(cell), by_radius(disc), still, electric, half_phase_rad, *rest),
-        Space(
-            by_phase(geometry.cell),
-            by_phase(geometry.disc),
-            turned,
-            electric,
-            half_phase_rad,
-            *rest,
-        ),
     )

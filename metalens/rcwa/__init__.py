@@ -5,9 +5,7 @@
 ``jones_derivatives`` also their exact
 derivatives by every number of it, ``near_field`` the fields in it.
 ``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares
-the work over diameters,
-``derivatives`` differentiates it exactly (round pillars). Light comes from the
-substrate.
+the work over diameters. Light comes from the substrate.
 """
 
 from typing import TYPE_CHECKING
@@ -17,7 +15,6 @@ from metalens.ground.lazy import attach
 if TYPE_CHECKING:
     from metalens.rcwa import anchored as anchored
     from metalens.rcwa import any_shape as any_shape
-    from metalens.rcwa import derivative as derivative
     from metalens.rcwa import layer as layer
     from metalens.rcwa import made as made
     from metalens.rcwa import pattern as pattern
@@ -37,7 +34,6 @@ if TYPE_CHECKING:
     from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
     from metalens.rcwa.reference import OrderResponse as OrderResponse
     from metalens.rcwa.reference import solve_textbook_rcwa as solve_textbook_rcwa
-    from metalens.rcwa.verbs import derivatives as derivatives
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
 
@@ -49,14 +45,12 @@ __getattr__, __dir__, __all__ = attach(
         "Jones": "any_shape",
         "anchored": "",
         "any_shape": "",
-        "derivative": "",
         "layer": "",
         "made": "",
         "pattern": "",
         "problem": "",
         "stack": "",
         "wall": "",
-        "derivatives": "verbs",
         "jones": "any_shape",
         "jones_derivatives": "metalens.rcwa.rates.verb",
         "JonesDerivatives": "metalens.rcwa.rates.verb",

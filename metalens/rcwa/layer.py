@@ -15,7 +15,7 @@ import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.rcwa.orders import basis as fourier
-from metalens.rcwa.orders.waves import Waves
+from metalens.rcwa.orders.waves import Waves, normal_component
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,6 +54,26 @@ def layer(P: Array, Q: Array, *, symmetric: bool = True) -> Layer:
 
 
 _TINY = 1e-9  # a mode exactly at its cut-off: up and down waves may not coincide
+
+
+def film_layer(ways: Waves, index: complex, *, symmetric: bool = True) -> Layer:
+    """A homogeneous layer with its plane waves as modes, the longest-lived first.
+
+    symmetric: whether P and Q of all layers that it is matched with are.
+    """
+    kz = normal_component(ways.kappa, index)
+    kz = np.where(np.abs(kz) < _TINY, _TINY, kz)
+    is_p = np.arange(len(kz)) < ways.p_count
+    P, Q = np.where(is_p, kz**2 / index**2, 1.0), np.where(is_p, index**2, kz**2)
+    order = np.argsort(kz.imag, kind="stable")
+    return Layer(
+        np.diag(P),
+        np.diag(Q),
+        kz[order],
+        np.eye(len(kz))[:, order],
+        np.diag(Q / kz)[:, order],
+        symmetric,
+    )
 
 
 def operators(

@@ -16,7 +16,6 @@ from metalens.cell import Cell, Light, Polarization, Response, check_tolerance
 from metalens.ground.errors import CellError
 from metalens.rcwa.any_shape import co_polarised
 from metalens.rcwa.conditions import case, check_diameter
-from metalens.rcwa.derivative import Derivatives, differentiate
 from metalens.rcwa.solver import solve_case
 
 
@@ -101,43 +100,3 @@ def solve_many(
         ]
     this = case(cell, light)
     return solve_case(this, diameters, tolerance=tolerance, harmonics=harmonics)
-
-
-def derivatives(
-    cell: Cell,
-    diameter_um: float,
-    wavelength_um: float,
-    *,
-    angle_rad: float = 0.0,
-    azimuth_rad: float = 0.0,
-    polarization: Polarization = "x",
-    harmonics: int = 9,
-) -> Derivatives:
-    """Transmission at a fixed truncation, with its exact derivatives in every number of
-    the cell.
-
-    Args: as for :func:`solve`.
-
-    Accuracy: rounding (1e-10 of the derivative) with respect to the truncated result;
-    as the result itself with
-        respect to the exact one. A tilted wall is taken in eight steps of fourth order.
-
-    Raises:
-        CellError, MaterialError: as :func:`solve`; also where substrate or cover
-            absorb.
-    """
-    check_diameter(cell, float(diameter_um))
-    if harmonics < 1:
-        raise CellError(f"harmonics = {harmonics}: need at least 1")
-    this = case(
-        cell,
-        Light(float(wavelength_um), float(angle_rad), polarization, float(azimuth_rad)),
-    )
-    steps = 8 if cell.sidewall_rad else 0
-    return differentiate(
-        this,
-        float(diameter_um),
-        harmonics=harmonics,
-        steps=steps,
-        angle_rad=float(angle_rad),
-    )

@@ -12,7 +12,7 @@ from metalens import modal, propagate, psf, rcwa
 @pytest.mark.parametrize(
     ("verbs", "tolerance"),
     [
-        ((modal.solve, modal.gradient, rcwa.solve, rcwa.solve_many, rcwa.jones), 1e-3),
+        ((modal.solve, rcwa.solve, rcwa.solve_many, rcwa.jones), 1e-3),
         ((psf.psf_stack, psf.from_lens, propagate.windowed), 1e-4),
     ],
 )

@@ -173,16 +173,6 @@ def disc(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
     return np.asarray(share * np.where(x == 0, 1.0, 2 * _bessel(1, safe) / safe))
 
 
-def disc_rate(space: Basis, diameter_um: Array, pitch_um: float) -> Array:
-    """d(disc)/d(diameter_um) = (pi D / 2 pitch²) J0(x): the rim moves outwards
-    everywhere alike.
-    """
-    radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
-    return np.asarray(
-        radius / (2 * pitch_um) * _bessel(0, np.sqrt(space.shells) * radius)
-    )
-
-
 def _bessel(order: int, x: Array) -> Array:
     if np.iscomplexobj(x) or order > 1:
         return np.asarray(jv(order, x))
@@ -211,20 +201,6 @@ def normals(
         whole - part
         for whole, part in zip(space.normal, _directed(space, a, b), strict=True)
     )
-    return xx, yy, xy
-
-
-def normals_rate(
-    space: Basis, diameter_um: Array, pitch_um: float
-) -> tuple[Array, Array, Array]:
-    """Derivative of :func:`normals` with respect to diameter_um."""
-    radius = np.pi * np.asarray(diameter_um)[..., None] / pitch_um
-    x, y, small = _argument(space, radius)
-    j1, j2 = _bessel(1, y), _bessel(2, y)
-    scale = radius / (4 * pitch_um)  # d(radius)/d(diameter) is pi / pitch
-    a = scale * np.where(small, 0.5 - x**2 / 12, 2 * (j1 - 2 * j2 / y) / y)
-    b = -scale * np.where(small, x**2 / 24, (8 * j2 / y - 2 * j1) / y)
-    xx, yy, xy = (-part for part in _directed(space, a, b))
     return xx, yy, xy
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from metalens.ground.arrays import Array
 from metalens.rcwa import layer as modes
 from metalens.rcwa import made, pattern
-from metalens.rcwa.derivative import film_layer
+from metalens.rcwa.layer import film_layer
 from metalens.rcwa.orders import mirrors
 from metalens.rcwa.orders.mirrors import Operation, Orders
 from metalens.rcwa.orders.waves import Waves, half_space

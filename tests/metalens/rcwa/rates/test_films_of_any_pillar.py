@@ -8,9 +8,6 @@ import pytest
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index
 from metalens.cell.shapes import Ellipse, Polygon
-from metalens.rcwa.derivative import film_layer
-from metalens.rcwa.orders import basis
-from metalens.rcwa.orders.waves import waves
 
 WAVE, SIZE = 0.73, 0.25
 ABOUT = {
@@ -69,49 +66,3 @@ def test_the_value_beside_derivatives_is_that_of_jones_and_power_is_kept(
             np.abs((np.conj(value) * change).real.sum(0)).max()
             < 1e-9 * np.abs(change).max()
         )
-
-
-@pytest.mark.parametrize(
-    ("angle_rad", "polarization"), [(0.0, "x"), (0.2, "s"), (0.2, "p")]
-)
-def test_round_pillars_between_films_in_which_waves_fade_have_the_t_of_solve(
-    angle_rad, polarization
-):
-    """And its differences by the thickness of nothing but the pillar: 1e-5 um, of
-    fourth order.
-    """
-    about = {"angle_rad": angle_rad, "polarization": polarization, "harmonics": 3}
-    cell = Cell(0.41, **THICK, **ABOUT)
-    found = rcwa.derivatives(cell, SIZE, WAVE, **about)
-    assert found.t == pytest.approx(rcwa.solve(cell, SIZE, WAVE, **about).t, abs=1e-11)
-
-    def at(height_um):
-        return rcwa.solve(
-            Cell(0.41, **THICK, **(ABOUT | {"height_um": height_um})),
-            SIZE,
-            WAVE,
-            **about,
-        ).t
-
-    ends = [at(0.53 + k * 1e-4) - at(0.53 - k * 1e-4) for k in (1, 2)]
-    assert found.height_um == pytest.approx((8 * ends[0] - ends[1]) / 12e-4, rel=1e-6)
-
-
-def test_waves_of_a_film_stand_by_how_long_they_live_and_keep_its_operators():
-    """P V = W q and Q W = V q, column by column, in the order of fading."""
-    ways = waves(
-        basis.basis(2, "none"),
-        pitch_um=0.41,
-        wavelength_um=WAVE,
-        kx=0.15,
-        ky=0.07,
-        azimuth_rad=0.4,
-    )
-    for index in (1.6, 1.9 + 0.1j):
-        film = film_layer(ways, index)
-        assert (np.diff(film.q.imag) >= 0).all()
-        assert (
-            np.abs(film.P @ film.V - film.W * film.q).max() < 1e-12
-        )  # of 3.6, to rounding
-        assert np.abs(film.Q @ film.W - film.V * film.q).max() < 1e-12
-        assert film.symmetric
