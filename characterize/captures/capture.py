@@ -368,7 +368,7 @@ def _join(stacks: Sequence[Array], files: Sequence[Path]) -> Array:
 
 def _read_hdf5(path: Path) -> Array:
     try:
-        return reading.survived(path, lambda file: _frames_of(path, file))
+        return reading.read_hdf5(path, lambda file: _frames_of(path, file))
     except MetalensError:
         raise
     except store.DAMAGE as error:

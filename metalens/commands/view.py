@@ -12,7 +12,7 @@ import tyro
 from metalens.commands.common import MASKS, Common, MaybeOutput
 from metalens.ground import manifest, store
 from metalens.ground.errors import ConfigError
-from metalens.view import Panel, html, serve, write
+from metalens.view import Panel, write
 
 VIEWS: dict[
     str, str
@@ -50,24 +50,14 @@ class Options(Common):
         output: the page to write; by default the file's name with .html, beside it, or
             with _view.html where a report
             of that name stands there.
-        serve: show the page in a browser on this machine and follow what grows, until
-            Ctrl-C; nothing is written. A
-            folder of several artefacts begins with a list of them.
-        port: of --serve on 127.0.0.1; 0: any that is free.
     """
 
     file: tyro.conf.Positional[Path]
     output: MaybeOutput = None
-    serve: bool = False
-    port: int = 0
 
 
 def run(options: Options) -> int:
-    """Write the page, or serve it until interrupted; exit 0."""
-    if options.serve:
-        return _served(options)
-    if options.port:
-        raise ConfigError("--port: only with --serve")
+    """Write the page; exit 0."""
     target = options.output or _beside(options.file)
     with options.claim(target) as draft:
         title, panels = _shown(options.file)
@@ -92,30 +82,6 @@ def _beside(path: Path) -> Path:
     with open(target, encoding="utf-8", errors="replace") as file:
         head = file.read(_HEAD)
     return target if GENERATOR in head else target.with_name(f"{target.stem}_view.html")
-
-
-def _served(options: Options) -> int:
-    if options.output or options.force:
-        raise ConfigError("--serve writes nothing: leave out --output and --force")
-
-    def made(path: Path) -> str:
-        title, panels = _shown(path)
-        return html(title, panels, about=_about(path))
-
-    def listed() -> list[Path]:
-        return (
-            []
-            if _folder_kind(options.file) or not options.file.is_dir()
-            else _inside(options.file)
-        )
-
-    def ready(address: str) -> None:
-        options.console.result(
-            {"address": address}, f"{options.file} at {address} until Ctrl-C"
-        )
-
-    serve(options.file, made, listed, port=options.port, ready=ready)
-    return 0
 
 
 def _shown(path: Path) -> tuple[str, list[Panel]]:

@@ -32,6 +32,12 @@ try:
     given = io.BytesIO(sys.stdin.buffer.read())
     if kind == "NPZ":
         held = dict(np.load(given, allow_pickle=False))
+    elif b"\\x89HDF\\r\\n\\x1a\\n" in given.getbuffer()[:4096].tobytes():  # MATLAB 7.3
+        import h5py
+        file = h5py.File(given)
+        inside = [k for k in file if isinstance(file.get(k, getlink=True), h5py.HardLink)]
+        items = {k: file[k] for k in inside if isinstance(file[k], h5py.Dataset)}
+        held = {k: v[...].T for k, v in items.items() if not (v.is_virtual or v.external)}
     else:
         from scipy.io import loadmat
         held = loadmat(given)
@@ -46,7 +52,7 @@ except BaseException as error:
 
 
 def arrays(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Array]:
-    """Numeric arrays of a MATLAB 4 or 5 file, or of an NPZ file of NumPy, by name.
+    """Numeric arrays of a MATLAB file (4 to 7.3), or of an NPZ file of NumPy, by name.
 
     Raises:
         StoreError: no such file, damaged, or more than the child may take.

@@ -409,11 +409,7 @@ def _no_variable(path: Path, variable: str | None) -> None:
 
 def _mat(path: Path, variable: str | None) -> Any:
     """A matrix of a MATLAB file; the only 2-D one where no name is given."""
-    import h5py
-
-    return _named(
-        path, _mat73(path) if h5py.is_hdf5(path) else _held(path, "MATLAB"), variable
-    )
+    return _named(path, _held(path, "MATLAB"), variable)
 
 
 def _npz(path: Path, variable: str | None) -> Any:
@@ -446,28 +442,6 @@ def _held(path: Path, kind: Literal["MATLAB", "NPZ"]) -> dict[str, Any]:
         return dict(limited.arrays(path, kind))
     except StoreError as error:
         raise LensError(str(error)) from None
-
-
-def _mat73(path: Path) -> dict[str, Any]:
-    """Matrices at the top of an HDF5 file of MATLAB, which keeps columns first."""
-    try:
-        return reading.survived(path, lambda file: _matrices(path, file))
-    except StoreError as error:
-        raise LensError(str(error)) from None
-    except store.DAMAGE as error:
-        raise LensError(f"{path}: not a MATLAB file: {error}") from error
-
-
-def _matrices(path: Path, file: Any) -> dict[str, Any]:
-    import h5py
-
-    inside = [
-        k for k in file if isinstance(file.get(k, getlink=True), h5py.HardLink)
-    ]  # links may leave the file
-    held = {k: file[k] for k in inside if isinstance(file[k], h5py.Dataset)}
-    for name, item in held.items():
-        store.check_claim(path, item, name)
-    return {k: v[...].T for k, v in held.items()}
 
 
 def _zemax(path: Path, pitch_um: float | None) -> Samples:

@@ -1,25 +1,13 @@
-"""Loaders that fail by type: whatever a damaged or edited file does, the answer is one
-error that names the file.
-
-The HDF5 library ends its process on some damaged files. So a forked child with little
-to lose reads a file first; and
-it writes to a file that never refuses, since it may end its process on a full disk too.
-
-An input that is replaced or edited while it is read is refused. A stamp tells, which is
-the same or not: it is never
-asked which of two is later, since clocks are set back.
-"""
+"""Reading inputs: damaged or changing files end in one error that names the file."""
 
 import codecs
 import contextlib
 import dataclasses
-import faulthandler
 import functools
 import hashlib
 import io
 import os
 import re
-import resource
 import typing
 import warnings
 from collections.abc import Callable, Iterator
@@ -29,25 +17,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from metalens.ground import errors
 from metalens.ground.errors import DAMAGE, MetalensError, StoreError
 
 Made = TypeVar("Made")
-_ROOM, _SECONDS = (
-    600 << 20,
-    60,
-)  # address space beyond what this process has, time of the processor, for a probe
-_DENSEST = (
-    1100  # more of it for a byte of the file: what deflate can do at best, and copies
-)
-_MOST_WORDS = 4000
-_WHOLE = 1 << 26  # bytes of a file up to which a probe reads all of it
 _WITH_COMMA = re.compile(r"[+-]?(\d+([.,]\d*)?|\.\d+)([eE][+-]?\d+)?")
-_PLAIN = {
-    1,
-    2,
-    3,
-}  # deflate, shuffle, Fletcher's checksum: packing that the HDF5 library undoes without harm
 Stamp = tuple[tuple[int, ...], ...]
 _noted: ContextVar[dict[str, tuple[Stamp, str]] | None] = ContextVar(
     "_noted", default=None
@@ -191,7 +164,7 @@ class Through(io.FileIO):
     nothing is written from then on.
     """
 
-    refused: OSError | None = None
+    refused: BaseException | None = None
 
     def check(self) -> None:
         """Raise what a write was refused with."""
@@ -204,7 +177,7 @@ class Through(io.FileIO):
         try:
             while view and self.refused is None:
                 view = view[super().write(view) :]
-        except OSError as error:
+        except (OSError, KeyboardInterrupt, SystemExit) as error:
             self.refused = error
         return len(content)
 
@@ -272,83 +245,19 @@ def _check_types(record: Any) -> None:
         _check_types(value)
 
 
-def survived(path: str | Path, read: Callable[[Any], Made]) -> Made:
-    """What ``read`` makes of an open HDF5 file, after a child process with limits has
-    done the same and lived.
-
-    What the child raised is raised here, without reading: a damaged file takes the
-    child's memory alone. Of a file
-    above 64 MB the child reads every header, where each block of the arrays lies, and
-    their corners; all of them where
-    they are packed otherwise than by gzip.
+def read_hdf5(path: str | Path, read: Callable[[Any], Made]) -> Made:
+    """What ``read`` makes of an open HDF5 file.
 
     Raises:
-        StoreError: the child died, as this process would have; the file was replaced
-            meanwhile; or what ``read``
-            refuses (a MetalensError as it is, anything else as a RuntimeError).
+        StoreError: no plain file, or it was replaced meanwhile. What ``read`` raises.
     """
     import h5py
 
-    def opened(work: Callable[[Any], Any]) -> Any:
-        with h5py.File(path, "r") as file:
-            return work(file)
-
     plain = os.path.isfile(path)
-    if os.path.exists(path) and not (
-        plain or os.path.isdir(path)
-    ):  # a pipe that nobody writes to would be waited for
-        raise StoreError(f"{path}: {absent(Path(path))}")
-    size = os.path.getsize(path) if plain else 0
-    with steady(path):
-        _probe(
-            path,
-            lambda: opened(read if size <= _WHOLE else read_through),
-            _ROOM + _DENSEST * size,
-        )
-        made: Made = opened(read)
-    return made
-
-
-def _probe(path: str | Path, read: Callable[[], object], room: int) -> None:
-    """Call ``read`` in a forked child and raise what it raised."""
-    from h5py._objects import phil
-
-    out, into = os.pipe()
-    try:
-        with (
-            phil,
-            warnings.catch_warnings(),
-        ):  # the lock of h5py: no other thread is inside the library when it is copied
-            warnings.simplefilter("ignore", DeprecationWarning)
-            child = os.fork()
-    except OSError:  # no room for another process
-        os.close(out)
-        os.close(into)
-        return
-    if child == 0:
-        _child(read, room, into)
-    os.close(into)
-    with open(out, "rb") as pipe:
-        told = pipe.read()
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status < 0:
-        raise StoreError(
-            f"{path}: damaged: reading it ended the reader with signal {-status}; make it again"
-        )
-    if told:
-        name, _, words = told.decode("utf-8", "replace").partition("\n")
-        raise getattr(errors, name, RuntimeError)(words)
-
-
-def _child(read: Callable[[], object], room: int, into: int) -> None:
-    """Read with limits, tell what was raised, and end."""
-    try:
-        _limit(room)
-        read()
-    except BaseException as error:  # noqa: BLE001 (told to the parent)
-        os.write(into, shown(f"{type(error).__name__}\n{error}").encode()[:_MOST_WORDS])
-    finally:
-        os._exit(0)
+    if os.path.exists(path) and not (plain or os.path.isdir(path)):
+        raise StoreError(f"{path}: {absent(Path(path))}")  # a pipe would be waited for
+    with steady(path), h5py.File(path, "r") as file:
+        return read(file)
 
 
 def shown(text: str) -> str:
@@ -365,68 +274,6 @@ def shown(text: str) -> str:
         )
     except UnicodeEncodeError:  # surrogates that stand for no byte
         return text.encode("utf-8", "backslashreplace").decode()
-
-
-def _limit(room: int) -> None:
-    """Of the child: memory, time, no core file, no words."""
-    faulthandler.disable()
-    told = Path("/proc/self/statm")  # of Linux
-    have = (
-        int(told.read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        if told.is_file()
-        else room
-    )
-    used = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-    limits = {
-        resource.RLIMIT_AS: have + room,
-        resource.RLIMIT_CPU: int(used) + _SECONDS,
-        resource.RLIMIT_CORE: 0,
-    }
-    for kind, most in limits.items():
-        hard = resource.getrlimit(kind)[1]
-        resource.setrlimit(
-            kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard)
-        )
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-
-
-def read_through(file: Any) -> None:
-    """Every attribute of a file, the place of every block of its data sets, and their
-    corners.
-    """
-    import h5py
-
-    def visit(name: str, item: Any) -> None:
-        for key in item.attrs:
-            with contextlib.suppress(Exception):  # the next may yet end the reader
-                item.attrs[key]
-        if (
-            isinstance(item, h5py.Dataset)
-            and item.ndim
-            and item.size
-            and not (item.is_virtual or item.external)
-        ):
-            with contextlib.suppress(Exception):
-                item[(0,) * item.ndim], item[(-1,) * item.ndim]
-            with contextlib.suppress(Exception):
-                _blocks(item)
-
-    visit("/", file)
-    file.visititems(visit)
-
-
-def _blocks(item: Any) -> None:
-    """Go through the index of a data set's blocks; read them where a rare packing is to
-    be undone.
-    """
-    if item.chunks is None:
-        return
-    plan = item.id.get_create_plist()
-    if {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= _PLAIN:
-        item.id.chunk_iter(bool)
-        return
-    for block in item.iter_chunks():
-        item[block]
 
 
 def absent(path: Path) -> str:

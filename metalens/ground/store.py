@@ -125,7 +125,7 @@ def clear(path: Path) -> None:
         if (
             entry.name.startswith(start)
             and entry.name.endswith(end)
-            and lock.free(Path(entry.path))
+            and lock.is_free(Path(entry.path))
         ):
             os.unlink(entry.path)
 
@@ -197,18 +197,15 @@ def save(
         OSError: the target cannot be written (the old file stays).
     """
     with replacing(path) as part, reading.Through(part, "wb+") as file:
-        with (
-            lock.undisturbed()
-        ):  # an interrupt inside the library is a failed write too
-            _write(
-                file,
-                kind,
-                version,
-                attributes or {},
-                arrays,
-                provenance or Provenance(),
-                compress,
-            )
+        _write(
+            file,
+            kind,
+            version,
+            attributes or {},
+            arrays,
+            provenance or Provenance(),
+            compress,
+        )
         file.check()
 
 
@@ -240,7 +237,7 @@ def load(
             f"{path}: {reading.absent(path)}; need a {kind or 'toolchain'} file"
         )
     try:
-        return reading.survived(
+        return reading.read_hdf5(
             path, lambda file: _read(path, file, kind, version, without)
         )
     except StoreError:
@@ -258,7 +255,7 @@ def load(
 def kind_of(path: str | Path) -> str:
     """The kind that an artefact file says it is; '' for any other file."""
     try:
-        found, units = reading.survived(
+        found, units = reading.read_hdf5(
             path, lambda file: [_plain(file.attrs.get(k)) for k in ("kind", "units")]
         )
     except DAMAGE:

@@ -1,18 +1,15 @@
-"""One transaction for every output, a file with its companions or a folder.
+"""Outputs appear whole or not at all: written beside their target, synced, renamed.
 
-    claim      lock with its owner, input is not output, what exists is ours, room, permission; unique scratch beside
-    write      into the scratch, by whoever asked
-    commit     manifest (folders), flush, rename as one; what was there is moved aside until the new one stands
-    recover    the next run on the same output ends or undoes what a killed one left
-
-Whatever ends the work early, the output is what it was before.
+A lock keeps a second writer away. What exists is replaced only with force, and only if
+this toolchain made it. A killed process leaves the old output or the new one; its
+scratch goes with the next writing of the same output.
 """
 
 import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +21,6 @@ UNFINISHED, JOURNAL = (
     ".unfinished",
     ".resume",
 )  # endings of what an interruption leaves for the next run
-IN_PLACE = "the new one is in place, but the disk did not confirm it"
-_READY = "ready"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,25 +62,35 @@ def file(
     block succeeds.
 
     Args:
+        target: the file.
         beside: endings of the companions: ``_xz.png`` is NAME_xz.png for NAME.h5.
+        terms: what the claim allows.
 
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
-    target = _real(target)
+    target = _followed(target)
     names = [target.stem + end for end in beside]
-    if target.name.lower() in (
-        name.lower() for name in names
-    ):  # one file where the system tells no case apart
+    if target.name.lower() in (name.lower() for name in names):
         raise OutputError(
             f"{target}: a file of that name is written beside the result; give another ending, as .h5"
         )
-    with _claimed(target, terms, is_folder=False):
+    with _claim(target, terms, is_folder=False) as scratch:
         _refuse(target, names, terms, is_folder=False)
-        with _scratch(target) as scratch:
-            (scratch / "new").mkdir()
-            yield Draft(scratch / "new" / target.name, target)
-            _commit_file(scratch, target, names, terms)
+        new = scratch / "new"
+        new.mkdir()
+        yield Draft(new / target.name, target)
+        made = sorted(p.name for p in new.iterdir())
+        manifest.flush(new)
+        _refuse(target, {*names, *made} - {target.name}, terms, is_folder=False)
+        (new / target.name).replace(target)
+        for name in {*names, *made} - {target.name}:
+            place = target.with_name(name)
+            if name in made:
+                (new / name).replace(place)
+            else:
+                place.unlink(missing_ok=True)  # of the file that stood here before
+        store.sync_folder(target.parent)
 
 
 @contextlib.contextmanager
@@ -93,17 +98,22 @@ def folder(target: Path, *, terms: Terms = Terms()) -> Iterator[Draft]:
     """Claim a folder, give a scratch folder to fill, and put it in place with a
     manifest if the block succeeds.
 
+    Args:
+        target: the folder.
+        terms: what the claim allows.
+
     Raises:
         OutputError: see :func:`_refuse`; OSError: it cannot be written.
     """
-    target = _real(target)
-    with _claimed(target, terms, is_folder=True):
+    target = _followed(target)
+    with _claim(target, terms, is_folder=True) as scratch:
         _refuse(target, (), terms, is_folder=True)
-        with _scratch(target) as scratch:
-            new = scratch / "new"
-            new.mkdir()
-            yield Draft(new, target)
-            _commit_folder(scratch, new, target, terms)
+        new = scratch / "new"
+        new.mkdir()
+        yield Draft(new, target)
+        _finish(new)
+        _refuse(target, (), terms, is_folder=True)
+        _put(scratch, new, target)
 
 
 @contextlib.contextmanager
@@ -119,23 +129,24 @@ def long_work(
     beside the target.
 
     That folder survives an interruption if it holds a file that matches a pattern of
-    ``keep``; with ``resume`` the next
-    run goes on in it, or in a copy of the finished folder. What stands at ``target``
-    stays until the end.
+    ``keep``; with ``resume`` the next run goes on in it, or in a copy of the finished
+    folder. What stands at ``target`` stays until the end. What others put into a folder
+    of ours goes with it, and does not become ours.
 
     Args:
+        target: the folder.
+        keep: patterns of files that are worth keeping.
+        resume: go on with unfinished work.
         grow: always go on, from a copy of what stands at ``target``, and put the whole
-            back; it must have a manifest,
-            or hold nothing but folders that have one.
-
-    What others put into a folder of ours goes with it, and does not become ours.
+            back; it must have a manifest, or hold nothing but folders that have one.
+        terms: what the claim allows.
 
     Raises:
         OutputError: nothing to resume, or unfinished work that would be lost; see
             :func:`_refuse`.
     """
-    target = _real(target)
-    with _claimed(target, terms, is_folder=True), _scratch(target) as scratch:
+    target = _followed(target)
+    with _claim(target, terms, is_folder=True) as scratch:
         work = unfinished(target)
         if not (resume or grow):
             _refuse(target, (), terms, is_folder=True)
@@ -143,7 +154,10 @@ def long_work(
         resumed = _open_work(scratch, target, terms, resume=resume or grow, grow=grow)
         try:
             yield Draft(work, target, resumed=resumed)
-            _commit_folder(scratch, work, target, terms, whoever=resume or grow)
+            _finish(work)
+            if not (resume or grow):
+                _refuse(target, (), terms, is_folder=True)
+            _put(scratch, work, target)
         except BaseException as error:
             if any(True for pattern in keep for _ in work.glob(pattern)):
                 how = "the same command" if grow else "--resume"
@@ -155,14 +169,29 @@ def long_work(
 
 def unfinished(target: Path) -> Path:
     """Where the work on a folder is done until it is finished."""
-    target = _real(target)
+    target = _followed(target)
     return target.with_name(target.name + UNFINISHED)
 
 
-def _real(target: Path) -> Path:
-    """What a link leads to, also where that does not stand yet: lock and scratch are
-    beside it, as for who names it.
+def check_room(target: Path, room: int) -> None:
+    """Refuse an output that its disk has no room for; for sizes known after the claim.
+
+    Args:
+        target: the output.
+        room: bytes that it needs.
+
+    Raises:
+        OutputError: naming what is free and what is needed.
     """
+    spare = shutil.disk_usage(target.parent).free
+    if spare < room:
+        raise OutputError(
+            f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
+        )
+
+
+def _followed(target: Path) -> Path:
+    """What a link leads to, also where that does not stand yet."""
     try:
         return target.resolve() if os.path.islink(target) else target
     except (OSError, RuntimeError) as error:
@@ -172,8 +201,8 @@ def _real(target: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
-    """The lock of an output, with leftovers of dead owners cleared."""
+def _claim(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[Path]:
+    """Lock an output and give a scratch folder beside it, which goes in the end."""
     if "\0" in str(target) or target.name in ("", ".", ".."):
         raise OutputError(
             f"{str(target)!r}: need the name of a {'folder' if is_folder else 'file'} to write"
@@ -182,35 +211,46 @@ def _claimed(target: Path, terms: Terms, *, is_folder: bool) -> Iterator[None]:
         raise OutputError(
             f"{target}: names that end in {UNFINISHED} or {JOURNAL} are those of interrupted work"
         )
-    with contextlib.ExitStack() as held:
-        if terms.parents:
-            held.enter_context(lock.parents(target))
-        if not target.parent.is_dir():
-            how = (
-                "is a file: give"
-                if target.parent.exists()
-                else "does not exist; make it or give"
-            )
-            raise OutputError(f"{target}: folder {target.parent} {how} another name")
+    missing = [one for one in target.parents if not one.exists()] * terms.parents
+    if terms.parents:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with _scratch(target) as scratch:
+            yield scratch
+    except BaseException as error:
+        for one in missing:  # those that were made here and hold nothing
+            with contextlib.suppress(OSError):
+                one.rmdir()
+        if isinstance(error, OSError) and error.filename is None:  # a full disk
+            error.add_note(f"{target} could not be made")
+        raise
+
+
+@contextlib.contextmanager
+def _scratch(target: Path) -> Iterator[Path]:
+    """The lock, and a scratch folder; that of dead owners goes first."""
+    if not target.parent.is_dir():
+        how = (
+            "is a file: give"
+            if target.parent.exists()
+            else "does not exist; make it or give"
+        )
+        raise OutputError(f"{target}: folder {target.parent} {how} another name")
+    with contextlib.ExitStack() as stack:
         try:
-            held.enter_context(lock.held(target))
+            stack.enter_context(lock.hold_lock(target))
+            for left in target.parent.glob(".*.part-*"):
+                if left.name[1:].rpartition(".part-")[0] == target.name:
+                    shutil.rmtree(left, ignore_errors=True)
+            store.clear(target.with_name(target.name + JOURNAL))
+            prefix = f".{target.name}.part-"
+            scratch = Path(tempfile.mkdtemp(prefix=prefix, dir=target.parent))
         except OSError as error:
             raise OutputError(
                 f"{target}: its folder cannot be written ({error.strerror}); give another"
             ) from error
-        for left in lock.left(target):
-            _recover(left, target)
-        store.clear(
-            target.with_name(target.name + JOURNAL)
-        )  # scratch of a journal whose writer was killed
-        try:
-            yield
-        except OSError as error:
-            if error.filename is None:  # a full disk
-                error.add_note(
-                    f"{target} could not be made; what stood there is unchanged"
-                )
-            raise
+        stack.callback(shutil.rmtree, scratch, ignore_errors=True)
+        yield scratch
 
 
 def _refuse(
@@ -231,7 +271,7 @@ def _refuse(
             is_folder
             and path.exists()
             and target.resolve() in path.resolve().parents
-            and _something(target)
+            and _is_taken(target)
         ):
             raise OutputError(
                 f"{target} holds the input {path}: it would be replaced; give another name"
@@ -241,10 +281,10 @@ def _refuse(
             f"{target} is a mount point, which cannot be replaced whole; give another name"
         )
     if target.exists() and target.is_dir() != is_folder:
-        raise OutputError(f"{target} is a {'folder' if target.is_dir() else 'file'}; need the name of a "
-                          f"{'folder' if is_folder else 'file'}")  # fmt: skip
+        found, needed = ("folder", "file") if target.is_dir() else ("file", "folder")
+        raise OutputError(f"{target} is a {found}; need the name of a {needed}")
     for path in (target, *(target.with_name(name) for name in beside)):
-        if not _something(path):
+        if not _is_taken(path):
             continue
         if not terms.force:
             raise OutputError(f"{path} exists; give --force to overwrite it")
@@ -256,94 +296,19 @@ def _refuse(
     check_room(target, terms.room)
 
 
-def check_room(target: Path, room: int) -> None:
-    """Refuse an output of ``room`` bytes that its disk has no room for; for sizes that
-    are known after the claim.
-
-    Raises:
-        OutputError: naming what is free and what is needed.
-    """
-    spare = shutil.disk_usage(target.parent).free
-    if spare < room:
-        raise OutputError(
-            f"{target}: {spare / 1e6:.3g} MB free, need {room / 1e6:.3g} MB; make room first"
-        )
-
-
-def _something(path: Path) -> bool:
+def _is_taken(path: Path) -> bool:
     """Whether a path is taken by more than an empty folder."""
     if path.is_dir():
         return any(path.iterdir())
     return path.exists() or path.is_symlink()
 
 
-@contextlib.contextmanager
-def _scratch(target: Path) -> Iterator[Path]:
-    scratch = None
-    try:
-        with (
-            lock.undisturbed()
-        ):  # a signal that comes here is answered inside the block that clears up
-            scratch = Path(
-                tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent)
-            )
-        yield scratch
-    finally:
-        with lock.undisturbed():
-            if scratch is not None:
-                _recover(scratch, target)
-
-
-def _commit_file(
-    scratch: Path, target: Path, beside: Sequence[str], terms: Terms
-) -> None:
-    """Companions that stand are moved aside, then the file is replaced (from here on it
-    is the new one), then theirs.
-
-    So at no moment does a companion lie beside a file that it does not belong to.
-    """
-    new, old = scratch / "new", scratch / "old"
-    old.mkdir()
-    made = sorted(p.name for p in new.iterdir())
-    manifest.flush(new)
-    with lock.undisturbed(), lock.folder(target.parent):
-        others = {*beside, *made} - {target.name}
-        _refuse(target, others, terms, is_folder=False)
-        (scratch / _READY).touch()
-        store.sync_folder(scratch)
-        with _finished(target, lambda: not (new / target.name).exists()):
-            for name in others:
-                if target.with_name(name).exists():
-                    target.with_name(name).rename(old / name)
-            (new / target.name).replace(target)
-            for name in made:
-                if name != target.name:
-                    (new / name).replace(target.with_name(name))
-            store.sync_folder(target.parent)
-
-
-def _commit_folder(
-    scratch: Path, new: Path, target: Path, terms: Terms, *, whoever: bool = False
-) -> None:
-    """Give the folder its manifest and exchange it with what stands."""
-    begun = manifest.read(new)
-    manifest.write(new, lock.COMMAND.get(), others=begun["others"] if begun else ())
-    manifest.flush(new)
-    with lock.undisturbed(), lock.folder(target.parent):
-        if not whoever:
-            _refuse(target, (), terms, is_folder=True)
-        number, ready, old = new.stat().st_ino, scratch / _READY, scratch / "old"
-        with _finished(
-            target,
-            lambda: (
-                old.exists() or (target.exists() and target.stat().st_ino == number)
-            ),
-            ready,
-        ):
-            store.write_bytes(
-                ready, b"%d" % number
-            )  # whole or not at all: an empty one is a file's
-            _put(scratch, new, target)
+def _finish(folder: Path) -> None:
+    """Give a folder its manifest, and sync all that is in it."""
+    begun = manifest.read(folder)
+    others = begun["others"] if begun else ()
+    manifest.write(folder, lock.COMMAND.get(), others=others)
+    manifest.flush(folder)
 
 
 def _put(scratch: Path, new: Path, target: Path) -> None:
@@ -356,27 +321,6 @@ def _put(scratch: Path, new: Path, target: Path) -> None:
         target.rename(scratch / "old")
         new.rename(target)
     store.sync_folder(target.parent)
-
-
-@contextlib.contextmanager
-def _finished(
-    target: Path, placed: Callable[[], bool], ready: Path | None = None
-) -> Iterator[None]:
-    """Where the disk refuses something: all is undone, or the new output is in place,
-    and the error says so.
-    """
-    try:
-        yield
-    except OSError as error:
-        if placed():
-            raise OutputError(
-                f"{target}: {IN_PLACE} ({error.strerror}); check it when the disk is well"
-            ) from error
-        if ready is not None:
-            ready.unlink(
-                missing_ok=True
-            )  # or leaving would put the new one in place after all
-        raise
 
 
 def _open_work(
@@ -398,7 +342,7 @@ def _open_work(
     if found is not None:
         work.rename(scratch / "given_up")
     fresh = scratch / "work"
-    copied, others = resume and _something(target), set[str]()
+    copied, others = resume and _is_taken(target), set[str]()
     if copied:
         others = manifest.strange(target)
         if others and manifest.read(target) is None:
@@ -413,33 +357,3 @@ def _open_work(
     manifest.write(fresh, lock.COMMAND.get(), finished=False, others=others)
     fresh.rename(work)
     return copied
-
-
-def _recover(scratch: Path, target: Path) -> None:
-    """End what a killed owner had committed, undo what it had not, clear the rest."""
-    new, old, ready = scratch / "new", scratch / "old", scratch / _READY
-    if ready.is_file() and ready.stat().st_size:
-        _recover_folder(scratch, target, int(ready.read_text(encoding="ascii")))
-    elif (
-        ready.is_file() and new.is_dir() and old.is_dir()
-    ):  # of a file: both are made before
-        done = not (new / target.name).exists()
-        for path in (new if done else old).iterdir():
-            if not target.with_name(path.name).exists():
-                path.rename(target.with_name(path.name))
-    ready.unlink(
-        missing_ok=True
-    )  # first: what a kill leaves of the rest is scratch and nothing more
-    shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _recover_folder(scratch: Path, target: Path, inode: int) -> None:
-    """Put a folder in place that was finished when its owner was killed, or clear what
-    it had replaced.
-    """
-    for path in (scratch / "new", unfinished(target)):
-        if path.is_dir() and path.stat().st_ino == inode:
-            if not (target.exists() and manifest.foreign(target)):
-                _put(scratch, path, target)
-        elif path.is_dir() and target.is_dir() and target.stat().st_ino == inode:
-            path.rename(scratch / "replaced")

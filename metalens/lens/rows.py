@@ -20,7 +20,7 @@ class RowsOnDisk:
     ``numpy.asarray`` first. The band
     of rows read last is kept, whole chunks of the file. The file is to have been read
     with
-    :func:`metalens.ground.reading.survived` before; reading rows of one that was
+    :func:`metalens.ground.reading.read_hdf5` before; reading rows of one that was
     written to since is a StoreError.
     """
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from metalens.view.panels import Panel as Panel
     from metalens.view.panels import Points as Points
     from metalens.view.panels import at_brightest as at_brightest
-    from metalens.view.server import serve as serve
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -37,7 +36,6 @@ __getattr__, __dir__, __all__ = attach(
         "at_brightest": "panels",
         "html": "page",
         "lens_panels": "artefacts",
-        "serve": "server",
         "write": "page",
     },
 )

@@ -3,8 +3,6 @@ nobody foresaw is one line.
 """
 
 import math
-import os
-import signal
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +15,7 @@ from scipy.io import savemat
 from metalens import cli, psf
 from metalens.commands import design
 from metalens.design import limited
-from metalens.ground import config, reading, store
+from metalens.ground import config, store
 from metalens.ground.errors import ConfigError, StoreError
 
 
@@ -92,28 +90,6 @@ def test_an_array_that_the_file_cannot_hold_is_refused_unread(tmp_path):
         file.create_dataset("huge", (1 << 20, 1 << 20), dtype="f8", chunks=(64, 64))
     with pytest.raises(StoreError, match=r"'huge' claims 8\.79609e"):
         store.load(tmp_path / "f.h5")
-
-
-def test_a_file_that_ends_its_reader_ends_a_child_alone(tmp_path):
-    store.save(tmp_path / "f.h5", "lens", {"x": np.arange(3.0)})
-    here = os.getpid()
-
-    def read(file):
-        if os.getpid() != here:
-            signal.raise_signal(signal.SIGSEGV)
-        return "read"
-
-    with pytest.raises(
-        StoreError, match=r"f\.h5: damaged: reading it ended the reader with signal 11"
-    ):
-        reading.survived(tmp_path / "f.h5", read)
-    assert reading.survived(tmp_path / "f.h5", lambda file: file["x"][2]) == 2.0
-    with pytest.raises(RuntimeError, match="y"):
-        reading.survived(tmp_path / "f.h5", lambda file: file["y"])
-    # the child's limit; here that would succeed. 8 GB: what arrays of before left on
-    # the heap is used before it counts
-    with pytest.raises(RuntimeError, match="allocate"):
-        reading.survived(tmp_path / "f.h5", lambda file: np.zeros(1 << 30))
 
 
 def test_an_array_that_lies_in_another_file_is_refused(tmp_path):

@@ -2,7 +2,6 @@
 foreign.
 """
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -233,32 +232,3 @@ def test_an_array_without_a_shape_is_refused(tmp_path):
         file["y"] = h5py.Empty("f8")
     with pytest.raises(StoreError, match=r"a\.h5: 'y' is empty, without even a shape"):
         store.load(tmp_path / "a.h5")
-
-
-@pytest.mark.parametrize(
-    ("packing", "undone"),
-    [({"compression": "gzip"}, False), ({"compression": "lzf"}, True)],
-)
-def test_every_block_of_a_large_file_is_looked_for_before_it_is_read(
-    tmp_path, monkeypatch, packing, undone
-):
-    """By its place in the file; where it is packed by anything but gzip it is undone in
-    the child, too.
-    """
-    values = np.random.default_rng(5).integers(0, 900, (60, 50)).astype(np.int32)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("d", data=values, chunks=(7, 9), fletcher32=True, **packing)
-        about = file["d"].id.get_chunk_info(20)
-    monkeypatch.setattr(reading, "_WHOLE", 10)
-    assert np.array_equal(
-        reading.survived(tmp_path / "a.h5", lambda file: file["d"][...]), values
-    )
-    content = bytearray((tmp_path / "a.h5").read_bytes())
-    content[about.byte_offset + 3] ^= 1
-    (tmp_path / "a.h5").write_bytes(content)
-    with h5py.File(tmp_path / "a.h5") as file, contextlib.ExitStack() as refused:
-        if undone:
-            refused.enter_context(
-                pytest.raises(OSError, match="filter returned failure")
-            )
-        reading._blocks(file["d"])
