@@ -11,8 +11,8 @@ import numpy as np
 import layout
 from benchmarks import Row, fastest
 from benchmarks.layout import NAN, PITCH, RULES, lens_of, plan
+from layout.drc import check_plan
 from layout.mask.plan import Lattice, MaskPlan
-from layout.rules import check as drc
 
 
 def measured(target: Path) -> list[Row]:
@@ -169,13 +169,13 @@ def _klayout_check(db: object, mask: MaskPlan) -> Row:
     overlap = region.merged(False, 2).count()
     seconds = time.perf_counter() - start
     plan_of_patch = lens_of(Lattice.of("LENS", patch.copy(), pitch=PITCH, x0=0, y0=0))
-    own = drc.check(plan_of_patch, RULES).counts
+    own = check_plan(plan_of_patch, RULES).counts
     wrong = (
-        abs(count - own["gap"])
-        + abs(min(thin, 1) - min(own["feature"], 1))
+        abs(count - own["space"])
+        + abs(min(thin, 1) - min(own["width"], 1))
         + abs(overlap - own["overlap"])
     )
-    whole = fastest(lambda: drc.check(mask, RULES))
+    whole = fastest(lambda: check_plan(mask, RULES))
     ratio = seconds / patch.size / (whole / np.count_nonzero(mask.lattices[0].whole()))
     return Row(
         "240 100 pillars",

@@ -22,12 +22,12 @@ from IPython.display import Image, display
 from scipy.signal import resample
 
 from layout.dose import correct as dose
+from layout.drc import check_plan
 from layout.files import verify
 from layout.mask import build, fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import process
-from layout.rules import check as drc
 from layout.solid import verbs as solid
 from layout.study import sensitivity, stitching, tolerance, tolerant
 from metalens import design, library
@@ -79,7 +79,7 @@ plt.show()
 
 # %%
 made = build.prepare(lens, rules, with_doses=False)
-report = drc.check(made.plan, rules.rules)
+report = check_plan(made.plan, rules.rules)
 print(report.summary)
 folder = Path(tempfile.mkdtemp())
 oasis_write.write(made.plan, folder / "mask.oas", form="small")

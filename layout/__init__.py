@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from layout.drc.lattice import check_plan as check_plan
     from layout.files.dxf import write as write_dxf
     from layout.files.verify import compare as compare
     from layout.gdsii.read import read as read_gdsii
@@ -19,13 +20,12 @@ if TYPE_CHECKING:
     from layout.oasis.write import write as write_oasis
     from layout.process.process import Process as Process
     from layout.process.process import load as load_process
-    from layout.rules.check import check as check
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Process": "layout.process.process",
-        "check": "layout.rules.check",
+        "check_plan": "layout.drc.lattice",
         "compare": "layout.files.verify",
         "load_process": "layout.process.process:load",
         "plan": "layout.mask.build",

@@ -83,8 +83,8 @@ INTERPRETED = (
     "tests/layout/files/test_gdsii_numbers.py",
     "tests/layout/oasis",
     *(
-        f"tests/layout/rules/test_{name}.py"
-        for name in ("apart", "check_foreign", "drc", "facing_edges", "near")
+        f"tests/layout/drc/test_{name}.py"
+        for name in ("check_file", "drc", "separation")
     ),
     "tests/metalens/field/test_compiled_weights.py",
     "tests/metalens/field/test_shared_rays.py",

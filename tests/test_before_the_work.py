@@ -91,7 +91,7 @@ NEEDS = {
     "evaluate": ("optics lens.h5", "codesign.commands.evaluate_optics:_measure"),
     "budget": ("lens.h5", "codesign.commands.budget:bench"),
     "plan": ("--gaze-error 1deg", "codesign.budget.floor:floor"),
-    "check": ("mask.gds", "layout.rules.foreign:check"),
+    "check": ("mask.gds", "layout.drc:check_library"),
     "study": ("", "metalens.pillars.study:run"),
     "view": ("lens.h5", "metalens.commands.view:_shown"),
 }
@@ -267,8 +267,8 @@ def test_a_process_is_refused_whole_by_those_who_read_a_part_of_it(
 def test_options_that_would_do_nothing_are_refused(inputs, capsys):
     assert main(["export", "lens.h5", "-o", "o.npz", "--samples", "31"]) == BAD_INPUT
     assert "--samples 31: counts the points of a .dat" in capsys.readouterr().err
-    assert main(["check", "mask.gds", "--ignore", "-3"]) == BAD_INPUT
-    assert "--ignore -3: need numbers of layers" in capsys.readouterr().err
+    assert main(["check", "mask.gds", "--layers", "3:1"]) == BAD_INPUT
+    assert "--layers 3:1: need LAYER or LAYER/DATATYPE" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("verb", ["library", "study", "capture", "layout"])

@@ -11,9 +11,9 @@ import numpy as np
 from layout.arrange.joined import PER_UM, Placing
 from layout.arrange.parts import APERTURE, Part
 from layout.dose import exposure
+from layout.drc import Violation
 from layout.files import Copies, Turn
 from layout.process import Process
-from layout.rules import Violation
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
@@ -159,7 +159,7 @@ def _between(
         else:
             limit = need * 1e3 / PER_UM
             text = f"{one.text} to {two.text}: backscatter of one that the doses of the other do not know of"
-        yield Violation("structures", (left, bottom, right, top), nm, limit, text)
+        yield Violation("clearance", (left, bottom, right, top), nm, limit, text)
 
 
 def _around(boxes: Array) -> Array:

@@ -27,13 +27,13 @@ from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.placed import Work
 from layout.commands.stages import Stages
+from layout.drc import write_lyp
 from layout.files import Assembly, doses, handover
 from layout.gdsii import assemble as gdsii_assemble
 from layout.mask import build
 from layout.oasis import assemble as oasis_assemble
 from layout.process import LayerNumber, noticed
 from layout.process import process as processes
-from layout.rules import markers
 from metalens.ground import config, store
 from metalens.ground.errors import ProcessError
 
@@ -202,7 +202,7 @@ def _accompany(work: Work, made: Assembly) -> None:
         f"{name}: copies that are turned by no quarter have no write fields"
         for name in turned
     ]
-    markers.write_lyp(made, work.folder / "mask.lyp")
+    write_lyp(made, work.folder / "mask.lyp")
     doses.write(made, work.process, work.folder / "doses.csv")
     most = work.process.exposure.maximum_classes
     aperture = work.process.layers.aperture[0]

@@ -8,8 +8,8 @@ import numpy as np
 
 from layout.arrange import apart, job_file, joined, seen
 from layout.commands.placed import Work
+from layout.drc import format_size
 from layout.files import Assembly, handover
-from layout.rules import told
 from layout.shapes import rectilinear
 from metalens.ground import report
 from metalens.ground.arrays import Array
@@ -180,9 +180,9 @@ def _checks(work: Work) -> Section:
     for name, found in work.rules.items():
         broken = sum(found.counts.values())
         sizes = [
-            f"{found.pillars:,}",
-            told(found.minimum_gap_nm),
-            told(found.minimum_feature_nm),
+            f"{found.shapes:,}",
+            format_size(found.minimum_space_nm),
+            format_size(found.minimum_width_nm),
             broken,
         ]
         rows.append([name, *sizes, "", "", "FAILS" if broken else "passes"])
@@ -238,8 +238,8 @@ def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     same = "DIFFERENT" if any(values["differences"].values()) else "as planned"
     sizes = [
         f"{values['pillars']:,}",
-        told(values["minimum_gap_nm"]),
-        told(values["minimum_feature_nm"]),
+        format_size(values["minimum_space_nm"]),
+        format_size(values["minimum_width_nm"]),
     ]
     found = [
         sum(values["violations"].values()),

@@ -1,9 +1,8 @@
-"""Design rules on a mask made anywhere (GDSII or OASIS): gaps, features, grid;
-violations as markers for KLayout.
-"""
+"""Design rules of any mask file (GDSII or OASIS): ``metalens check``."""
 
 import contextlib
-import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,27 @@ from typing import Any
 import tyro
 
 from layout.commands.validate import validate
-from layout.files import MaskContent, hierarchy, mapped
+from layout.drc import (
+    DrcReport,
+    LayerChoice,
+    Metric,
+    check_library,
+    format_size,
+    write_lyrdb,
+)
+from layout.files import MaskContent, hierarchy, mapped, placement_limit
 from layout.gdsii import read as gdsii_read
 from layout.oasis import bytes as oasis_bytes
 from layout.oasis import read as oasis_read
 from layout.process import process as processes
-from layout.rules import DrcReport, foreign, markers, told
 from metalens.commands import Common, MaybeOutput
 from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
+
+_OTHER_FORMATS = {  # how text formats of other programs begin: their name
+    rb"\s*(0|999)\r?\n|AutoCAD Binary DXF": "a DXF drawing (convert it)",
+    rb"[\t-\r -~]*;": "a CIF file (convert it)",
+}
 
 
 @dataclass(frozen=True)
@@ -27,134 +38,190 @@ class Options(Common):
     """Options of ``metalens check``.
 
     Attributes:
-        mask: GDSII or OASIS file, told apart by its first bytes.
-        process: PROCESS.toml with the rules; left out: the defaults.
-        output: marker database to write (.lyrdb for KLayout); left out: none.
-        ignore: layer numbers that are not drawn in the resist, besides outline and
-            write fields of the process.
-        most_shapes: shapes that may be taken apart, some 25 bytes of memory for each
-            copy of a cell and 150 for each
-            shape that is drawn by itself; a large cell that is placed again and again
-            counts once. Left out: 4
-            million, and 20 more for each byte of the file.
+        mask: GDSII or OASIS file, distinguished by its first bytes.
+        process: PROCESS.toml with the rules; omitted: the defaults.
+        output: marker database to write (.lyrdb for KLayout); omitted: none.
+        layers: layers to check, as 1 (all datatypes together) or 1/0; omitted: every
+            layer of the file.
+        top: cell to check with all below it; omitted: all top cells.
+        metric: of spaces: projection (edges that face each other) or euclidean (also
+            from corner to corner).
+        max_shapes: shapes and cell references that may be expanded, some 100 bytes of
+            memory each; omitted: 4 million, and 20 more for each byte of the file.
         strict: also what readers let pass and a mask shop might not: names of cells,
-            one top cell, doubled vertices,
-            strict tables and the checksum of OASIS.
+            one top cell, doubled vertices, strict tables and the checksum of OASIS.
     """
 
     mask: tyro.conf.Positional[Path]
     process: Path | None = None
     output: MaybeOutput = None
-    ignore: tuple[int, ...] = ()
-    most_shapes: int | None = None
+    layers: tuple[str, ...] = ()
+    top: str | None = None
+    metric: Metric = "projection"
+    max_shapes: int | None = None
     strict: bool = False
 
 
 def run(options: Options) -> int:
-    """Check the mask; exit 1 where a rule is broken."""
-    if min(options.ignore, default=0) < 0:
-        raise MaskFileError(
-            f"--ignore {min(options.ignore)}: need numbers of layers, 0 or more"
-        )
+    """Check the mask; exit 1 where a rule is violated or no shape was checked."""
+    layers = [parse_layer(text) for text in options.layers]
     process = (
         processes.Process()
         if options.process is None
         else processes.load(options.process)
     )
-    if not options.mask.is_file():
-        raise MaskFileError(
-            f"{options.mask}: {reading.absent(options.mask)}; need a GDSII or OASIS mask"
-        )
     output = (
         options.claim(options.output)
         if options.output is not None
         else contextlib.nullcontext()
     )
     with output as draft:
-        most = (
-            foreign.most_of(options.mask)
-            if options.most_shapes is None
-            else options.most_shapes
-        )
-        content = read(options.mask, most)
-        skip = (process.layers.outline[0], process.layers.fields[0], *options.ignore)
+        content = read(options.mask, options.max_shapes)
+        if options.top is not None:
+            content = content.below(options.top)
         form = validate(options.mask, content) if options.strict else []
-        negative, tops = _negative(content, process), content.tops
-        found = foreign.check(
-            content, process.rules, skip=skip, negative=negative, most=most, last=True
+        report = check_library(
+            content,
+            process.rules,
+            layers=layers or None,
+            negative=_negative_layers(content, process),
+            metric=options.metric,
+            max_elements=options.max_shapes or placement_limit(options.mask),
         )
         if draft is not None:
-            markers.write_lyrdb(
-                markers.Top(tops[0], content.unit_nm), found, draft.path
-            )
-    values = _values(found) | (
-        {"form": [finding.text for finding in form]} if options.strict else {}
-    )
-    failures = [f"design rules broken: {found.broken}"] if found.broken else []
-    failures += [f"form: {finding.text}" for finding in form]
-    return options.console.judged(values, _text(options.mask, found), failures)
+            write_lyrdb(report, content.tops[0], draft.path)
+    values = _values(content, report)
+    failures = _failures(options, report, layers)
+    if options.strict:
+        values["form"] = [finding.text for finding in form]
+        failures += [f"form: {finding.text}" for finding in form]
+    text = _text(options.mask, content, report)
+    return options.console.judged(values, text, failures)
 
 
-def _negative(content: MaskContent, process: processes.Process) -> set[int]:
-    """Layer numbers whose clear areas stay: with tone ``negative`` all but the openings
-    of the aperture.
+def parse_layer(text: str) -> LayerChoice:
+    """Layer number and datatype of "1" (datatype None: all) or "1/0".
+
+    Raises:
+        MaskFileError: neither of these.
     """
+    number, slash, datatype = text.partition("/")
+    if not number.isdigit() or (slash and not datatype.isdigit()):
+        raise MaskFileError(
+            f"--layers {text}: need LAYER or LAYER/DATATYPE, as 1 or 1/0"
+        )
+    return int(number), int(datatype) if slash else None
+
+
+def _negative_layers(content: MaskContent, process: processes.Process) -> set[int]:
+    """Layer numbers exposed with a negative tone, whose clear areas remain."""
     if process.tone == "positive":
         return set()
-    return {number for number, _ in hierarchy.shapes(content)} - {
-        process.layers.aperture[0]
-    }
+    layers = process.layers
+    others = {layers.aperture[0], layers.outline[0], layers.fields[0]}
+    return {number for number, _ in hierarchy.shapes(content)} - others
 
 
 def read(
-    path: Path, most: int | None = None, *, keep: int | None = None
+    path: Path, limit: int | None = None, *, keep: int | None = None
 ) -> MaskContent:
-    """A mask of either format; more placements than ``most`` (by default what its size
-    allows) are not taken apart.
+    """A GDSII or OASIS mask.
 
-    keep: most placements of a cell that are kept; of more only their sums. None: all.
+    Args:
+        path: of the file.
+        limit: placements and shapes that are read; None: as its size allows.
+        keep: placements of one cell that are kept, of more only their sums; None: all.
 
     Raises:
-        MaskFileError: more than these, or a file that cannot be read.
+        MaskFileError: no such file, of another format, more than ``limit`` placements,
+            or a file that cannot be read.
     """
-    if found := reading.foreign(path):
-        raise MaskFileError(f"{path}: {found}, need GDSII or OASIS")
-    is_oasis = mapped(path)[: len(oasis_bytes.MAGIC)].tobytes() == oasis_bytes.MAGIC
-    return (oasis_read.read if is_oasis else gdsii_read.read)(
-        path, limit=foreign.most_of(path) if most is None else most, keep=keep
+    if not path.is_file():
+        raise MaskFileError(
+            f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
+        )
+    start = mapped(path)[:64].tobytes()
+    other = reading.foreign(path) or _text_format(start)
+    if other:
+        raise MaskFileError(f"{path}: {other}; need GDSII or OASIS")
+    is_oasis = start.startswith(oasis_bytes.MAGIC)
+    reader = oasis_read.read if is_oasis else gdsii_read.read
+    return reader(
+        path, limit=placement_limit(path) if limit is None else limit, keep=keep
     )
 
 
-def _values(found: DrcReport) -> dict[str, Any]:
+def _text_format(start: bytes) -> str:
+    """Which text format a file that begins so has; empty for none."""
+    named = (name for form, name in _OTHER_FORMATS.items() if re.match(form, start))
+    return next(named, "")
+
+
+def _values(content: MaskContent, report: DrcReport) -> dict[str, Any]:
+    sizes = {n: v for n, v in report.sizes.items() if "foot" not in n}
+    layers = {
+        f"{layer}/{datatype}": {"checked": one.checked, "shapes": one.shapes}
+        for (layer, datatype), one in (report.layers or {}).items()
+    }
     return {
-        "ok": found.ok,
-        "shapes": found.pillars,
-        **{
-            name: size
-            for name, size in found.sizes.items()
-            if name != "minimum_foot_gap_nm"
-        },
-        "violations": found.counts,
+        "ok": report.ok,
+        "tops": content.tops,
+        "shapes": report.shapes,
+        "layers": layers,
+        "skipped": dict(content.skipped),
+        **sizes,
+        "violations": report.counts,
+        "worst": report.worst,
     }
 
 
-def _gap(found: DrcReport) -> str:
-    """Only gaps that break the rule are all looked at."""
-    least = found.minimum_gap_nm
-    return (
-        f"smallest gap {told(least)}"
-        if math.isfinite(least)
-        else f"no gap below {found.limits['gap']:g} nm"
+def format_counts(counts: Mapping[str, int]) -> str:
+    """Numbers of elements by kind, for a person."""
+    return ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
+
+
+def _failures(
+    options: Options, report: DrcReport, layers: list[LayerChoice]
+) -> list[str]:
+    """What keeps the mask from being passed, in words."""
+    drawn = report.layers or {}
+    missing = [
+        text
+        for text, (number, datatype) in zip(options.layers, layers, strict=True)
+        if not any(n == number and datatype in (None, d) for n, d in drawn)
+    ]
+    failures = [f"nothing is drawn on layer {text}" for text in missing]
+    if report.is_empty:
+        failures.append("no shape was checked")
+    if report.violated:
+        failures.append(f"design rules violated: {report.violated}")
+    return failures
+
+
+def _text(path: Path, content: MaskContent, report: DrcReport) -> str:
+    verdict = "keeps" if report.ok else "does not keep"
+    space = (
+        f"minimum space {format_size(report.minimum_space_nm)}"
+        if report.sizes["minimum_space_nm"] is not None
+        else f"no space below {report.limits['space']:g} nm"
     )
-
-
-def _text(path: Path, found: DrcReport) -> str:
+    width = format_size(report.minimum_width_nm)
     lines = [
-        f"{path}: {'keeps' if found.ok else 'breaks'} the design rules",
-        f"  {found.pillars:,} shapes; {_gap(found)}, thinnest {told(found.minimum_feature_nm)}",
+        f"{path}: {verdict} the design rules; top cells {', '.join(content.tops[:8])}",
+        f"  {report.shapes:,} shapes checked; {space}, minimum width {width}",
+    ]
+    for (layer, datatype), one in (report.layers or {}).items():
+        state = "checked" if one.checked else "NOT CHECKED"
+        lines.append(f"  layer {layer}/{datatype}: {one.shapes:,} shapes, {state}")
+    if content.skipped:
+        lines.append(f"  draw nothing: {format_counts(content.skipped)}")
+    lines += [
+        f"  {e['count']:,} {e['rule']} in {e['cell']}, layer {e['layer']}: worst "
+        f"{e['worst']:.4g}, need {e['limit']:.4g}"
+        for e in report.worst[:20]
     ]
     lines += [
-        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.value:.4g} nm, need {v.limit:.4g}; {v.text}"
-        for v in found.violations[:10]
+        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}): {v.summary}"
+        for v in report.violations[:10]
     ]
     return "\n".join(lines)

@@ -5,24 +5,24 @@ of every layer.
 from pathlib import Path
 from typing import Any
 
-from layout.commands.check import read
+from layout.commands.check import format_counts, read
 from layout.files import hierarchy
-from metalens.ground import reading
-from metalens.ground.errors import MaskFileError
 
 
-def told(path: Path) -> dict[str, Any]:
-    """Format, unit_nm, cells, top cells, and {"LAYER/DATATYPE": name and shapes}, the
-    hierarchy counted by products.
+def told(path: Path, top: str | None = None) -> dict[str, Any]:
+    """Format, unit, cells and the shapes of each layer, the hierarchy not expanded.
+
+    Args:
+        path: GDSII or OASIS file.
+        top: cell to count with all below it; None: all top cells.
 
     Raises:
-        MaskFileError: no such file, one that cannot be read, or of which one cell
-            claims more placements than the size
-            of the file allows.
+        MaskFileError: no such file or cell, a file that cannot be read, or of which one
+            cell claims more placements than the size of the file allows.
     """
-    if not path.is_file():
-        raise MaskFileError(f"{path}: {reading.absent(path)}")
     content = read(path)
+    if top is not None:
+        content = content.below(top)
     counts = hierarchy.shapes(content)
     layers = {
         f"{layer[0]}/{layer[1]}": {
@@ -31,28 +31,28 @@ def told(path: Path) -> dict[str, Any]:
         }
         for layer in sorted(counts)
     }
-    about = {
+    return {
         "file": path.name,
         "kind": f"{content.kind} mask",
         "unit_nm": content.unit_nm,
-    }
-    return about | {
         "cells": len(content.cells),
         "tops": content.tops,
         "shapes": counts.total(),
         "layers": layers,
+        "skipped": dict(content.skipped),
     }
 
 
 def text(found: dict[str, Any]) -> str:
     """Lines for people."""
     lines = [
-        f"{found['file']}: {found['kind']}, {found['shapes']:,} shapes in {found['cells']} cells, database unit "
-        f"{found['unit_nm']:g} nm",
+        f"{found['file']}: {found['kind']}, {found['shapes']:,} shapes in "
+        f"{found['cells']} cells, database unit {found['unit_nm']:g} nm",
         f"  top cell{'s' * (len(found['tops']) > 1)} {', '.join(found['tops'][:8])}",
     ]
-    lines += [
-        f"  {number} {e['name']}: {e['shapes']:,}"
-        for number, e in found["layers"].items()
-    ]
-    return "\n".join(line.replace(" :", ":") for line in lines)
+    for number, entry in found["layers"].items():
+        name = f" {entry['name']}" if entry["name"] else ""
+        lines.append(f"  {number}{name}: {entry['shapes']:,}")
+    if found["skipped"]:
+        lines.append(f"  draw nothing: {format_counts(found['skipped'])}")
+    return "\n".join(lines)

@@ -9,11 +9,11 @@ import tyro
 
 from layout.certify import MadeRows, Survey
 from layout.commands.stages import Stages
+from layout.drc import DrcReport
 from layout.files import Window, handover, verify
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
-from layout.rules import DrcReport
 from metalens.commands import Distributed, Output
 from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
@@ -140,7 +140,7 @@ class Job:
                 if not c.ok
             ]
         return found + (
-            [f"design rules broken: {self.drc.broken}"] if self.drc.broken else []
+            [f"design rules violated: {self.drc.violated}"] if self.drc.violated else []
         )
 
     @property

@@ -47,7 +47,7 @@ def _text(job: Job, target: Path) -> str:
         if outcome is not None:
             lines += [f"    {difference}" for difference in outcome.differences[:10]]
     lines += [
-        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}) nm: {v.value:.4g}, need {v.limit:.4g}; {v.text}"
+        f"  {v.rule} at ({v.centre[0]:.0f}, {v.centre[1]:.0f}) nm: {v.summary}"
         for v in job.drc.violations[:10]
     ]
     lines.append(f"  {target / 'report.html'}; {sum(job.seconds.values()):.1f} s")

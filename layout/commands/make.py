@@ -16,6 +16,7 @@ from layout.certify import MadeRows, Survey, survey
 from layout.commands import page
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
+from layout.drc import check_plan, write_lyp, write_lyrdb
 from layout.files import MaskContent, doses, dxf, handover, verify
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
@@ -24,8 +25,6 @@ from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import LayerNumber
 from layout.process import process as processes
-from layout.rules import check as drc
-from layout.rules import markers
 from metalens import lens as lenses
 from metalens.ground import config, store, transaction
 from metalens.ground.arrays import Array
@@ -109,7 +108,7 @@ def _checked(drawing: Drawing, made: build.MadePlan) -> Job:
         split = fields.split(source.diameters, rules, drawn=made.cells)
         plan = stages.rows.watched(with_fields(made.plan, split, rules))
     with stages("check"):
-        found = drc.check(plan, rules.rules, foot_nm=_feet(plan, source, rules))
+        found = check_plan(plan, rules.rules, foot_nm=_feet(plan, source, rules))
     return Job(drawing.options, source, rules, made, split, plan, found, stages)
 
 
@@ -224,8 +223,8 @@ def _certified(
 
 def _accompany(job: Job, shots: dict[str, bytes], target: Path) -> None:
     """Layer properties, markers, report and its pictures."""
-    markers.write_lyp(job.plan, target / "mask.lyp")
-    markers.write_lyrdb(job.plan, job.drc, target / "mask.lyrdb")
+    write_lyp(job.plan, target / "mask.lyp")
+    write_lyrdb(job.drc, job.plan.name, target / "mask.lyrdb")
     store.write_text(target / "process.toml", config.dumps(job.process))
     handover.write_fields(job.fields, target / "fields.csv")
     store.write_text(target / "job.txt", job.sheet)
@@ -240,12 +239,13 @@ def values_of(job: Job) -> dict[str, Any]:
     return {
         "ok": job.ok,
         "failures": job.failures,
-        "pillars": found.pillars,
+        "pillars": found.shapes,
         "classes": len(job.plan.classes),
         "diameters": len(job.made.cells.diameters_nm),
         **found.sizes,
         "maximum_density": found.maximum_density,
         "violations": found.counts,
+        "worst": found.worst,
         "files": job.written,
         "exposure": {
             name: {

@@ -9,10 +9,10 @@ import numpy as np
 from layout.commands import pictures
 from layout.commands.job import Job
 from layout.dose.exposure import PointExposure
+from layout.drc import DrcReport, format_size
 from layout.files import Window, handover
 from layout.mask import MaskPlan
 from layout.process import Exposure
-from layout.rules import DrcReport, told
 from layout.shapes import polygon
 from metalens.ground import report
 from metalens.ground.report import Figure, KeyFigure, Section, Table
@@ -68,8 +68,8 @@ def _lead(job: Job) -> str:
     source, lattice = job.source, job.plan.lattices[0]
     own = sum(int(np.count_nonzero(block)) for _, block in lattice.blocks(_ROWS))
     die = (
-        f" ({job.drc.pillars:,} on the die, with its test arrays)"
-        if job.drc.pillars != own
+        f" ({job.drc.shapes:,} on the die, with its test arrays)"
+        if job.drc.shapes != own
         else ""
     )
     return (
@@ -84,16 +84,16 @@ def _key_figures(job: Job) -> list[KeyFigure]:
     broken = sum(found.counts.values())
     same = all(outcome.ok for outcome in job.compared.values())
     return [
-        KeyFigure("pillars", f"{found.pillars:,}"),
+        KeyFigure("pillars", f"{found.shapes:,}"),
         KeyFigure(
             "smallest gap",
-            told(found.minimum_gap_nm),
-            found.counts["gap"] + found.counts["overlap"] == 0,
+            format_size(found.minimum_space_nm),
+            found.counts["space"] + found.counts["overlap"] == 0,
         ),
         KeyFigure(
             "thinnest pillar",
-            told(found.minimum_feature_nm),
-            found.counts["feature"] == 0,
+            format_size(found.minimum_width_nm),
+            found.counts["width"] == 0,
         ),
         KeyFigure("violations", f"{broken:,}", broken == 0),
         KeyFigure("files read back", "as planned" if same else "DIFFERENT", same),
@@ -140,7 +140,13 @@ def _rules(job: Job, shots: dict[str, bytes]) -> Section:
             "Checked on the drawn polygons, all pillars.",
         ),
     ]
-    if found.violations:
+    if found.worst:
+        tallies = [
+            [e["rule"], e["layer"], e["cell"], e["count"], e["worst"], e["limit"]]
+            for e in found.worst[:50]
+        ]
+        head = ("rule", "layer", "cell", "violations", "worst", "limit")
+        items.append(Table(head, tallies, "Violations by rule, layer and cell."))
         places = [
             [
                 v.rule,

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from layout.certify import Survey
+from layout.drc import DrcReport
 from layout.files import Window, sites_in
 from layout.mask import Lattice, MaskPlan
-from layout.rules import DrcReport
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
@@ -129,8 +129,8 @@ def diameters(plan: MaskPlan) -> bytes:
 def margins(found: DrcReport) -> bytes:
     """Each rule: what was found beside what is allowed."""
     rows = [
-        ("gap / nm", found.minimum_gap_nm, found.limits["gap"], True),
-        ("feature / nm", found.minimum_feature_nm, found.limits["feature"], True),
+        ("space / nm", found.minimum_space_nm, found.limits["space"], True),
+        ("width / nm", found.minimum_width_nm, found.limits["width"], True),
         (
             "density / %",
             100 * found.maximum_density,

@@ -23,11 +23,11 @@ from layout.commands import make
 from layout.commands.check import read
 from layout.commands.job import Options
 from layout.commands.stages import Stages
-from layout.files import MaskContent, hierarchy, verify
+from layout.drc import DrcReport, Violation, check_library, check_plan
+from layout.files import MaskContent, hierarchy, placement_limit, verify
 from layout.mask import FieldPlan, build
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
-from layout.rules import DrcReport, Violation, check, foreign
 from metalens import lens as lenses
 from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
@@ -78,8 +78,10 @@ class Work:
     def broken(self, name: str, found: DrcReport) -> None:
         """Enter what was found of the rules of a part."""
         self.rules[name] = found
-        if found.broken:
-            self.failures.append(f"{name}: design rules broken: {found.broken}")
+        if not found.ok:
+            self.failures.append(
+                f"{name}: design rules violated: {found.violated or 'no shape to check'}"
+            )
 
     def beside(self, file: Path) -> Path:
         """A file that the arrangement names."""
@@ -130,11 +132,11 @@ def cell_part(work: Work, part: CellPart) -> parts.Part:
         with work.stages(f"{part.name}: check"):
             content = MaskContent("cell", parts.UNIT_NM, dict(made.cells))
             skip = (layers.outline[0], layers.fields[0])
-            found = foreign.check(
+            drawn = {number for number, _ in hierarchy.shapes(content)}
+            found = check_library(
                 content,
                 work.process.rules,
-                skip=skip,
-                most=foreign.most_of(work.beside(part.file)),
+                layers=[(number, None) for number in sorted(drawn.difference(skip))],
             )
         work.broken(part.name, found)
     else:
@@ -165,7 +167,7 @@ def _file_part(work: Work, record: CellPart) -> parts.Part:
         raise MaskFileError(
             f"{path}: {reading.absent(path)}; need a GDSII or OASIS mask"
         )
-    most = foreign.most_of(path)
+    most = placement_limit(path)
     content = read(path, most)
     hierarchy.refuse_beyond(content, most)
     made = parts.of_file(
@@ -222,7 +224,7 @@ def written_part(work: Work, made: build.MadePlan) -> parts.Part:
     plan, process = made.plan, work.process
     name = plan.name
     with work.stages(f"{name}: check"):
-        work.broken(name, check.check(plan, process.rules))
+        work.broken(name, check_plan(plan, process.rules))
     path = work.folder / f"{name}.oas"
     oasis_write.write(plan, path)
     content = read(path, make.MOST_READ)

@@ -8,9 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from layout.commands.check import read
-from layout.files import MaskContent, doses, flat, hierarchy
+from layout.files import MaskContent, doses, flat, hierarchy, placement_limit
 from layout.process import LayerNumber
-from layout.rules import foreign
 from layout.shapes import polygon
 from metalens.commands import MASKS
 from metalens.ground.errors import MaskFileError
@@ -32,7 +31,7 @@ def panels(path: Path) -> list[Panel]:
     found = mask_of(path) if path.is_dir() else path
     if found is None:
         raise MaskFileError(f"{path}: no mask file ({', '.join(MASKS)}) in it")
-    most = foreign.most_of(found)
+    most = placement_limit(found)
     content = read(found, most)
     hierarchy.refuse_beyond(content, most)
     table = found.with_name("doses.csv")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from layout.files.assembly import Copies as Copies
     from layout.files.assembly import Sites as Sites
     from layout.files.assembly import arrays as arrays
+    from layout.files.content import CONTEXT_CELL as CONTEXT_CELL
     from layout.files.content import NOTHING as NOTHING
     from layout.files.content import QUARTERS as QUARTERS
     from layout.files.content import CellContent as CellContent
@@ -24,8 +25,11 @@ if TYPE_CHECKING:
     from layout.files.content import MaskContent as MaskContent
     from layout.files.content import Placed as Placed
     from layout.files.content import Turn as Turn
+    from layout.files.content import decode_name as decode_name
     from layout.files.content import forget as forget
+    from layout.files.content import has_area as has_area
     from layout.files.content import mapped as mapped
+    from layout.files.content import placement_limit as placement_limit
     from layout.files.digest import Digest as Digest
     from layout.files.digest import Sums as Sums
     from layout.files.dxf import Window as Window
@@ -39,6 +43,7 @@ __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Assembly": "assembly",
+        "CONTEXT_CELL": "content",
         "CellContent": "content",
         "Copies": "assembly",
         "Digest": "digest",
@@ -53,15 +58,18 @@ __getattr__, __dir__, __all__ = attach(
         "Turn": "content",
         "Window": "dxf",
         "arrays": "assembly",
+        "decode_name": "content",
         "deltas": "read_loops",
         "doses": "",
         "dxf": "",
         "flat": "",
         "forget": "content",
         "handover": "",
+        "has_area": "content",
         "hierarchy": "",
         "mapped": "content",
         "paths": "",
+        "placement_limit": "content",
         "placements": "read_loops",
         "sites_in": "dxf",
         "squares": "",

@@ -2,9 +2,11 @@
 placements.
 """
 
+import dataclasses
 import math
 import mmap
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -123,6 +125,7 @@ class CellContent:
     """One cell: {(layer, datatype): polygons (n, 2)}, {(layer, datatype): circles (n,
     3) of x, y, radius}.
 
+    texts: number of texts. skipped: other elements of the file that draw nothing.
     sums: where the cell has more placements than are kept, their sums, one for each of
     ``placed.children``; ``placed``
     then holds none.
@@ -134,6 +137,7 @@ class CellContent:
     placed: Placed = NOTHING
     texts: int = 0
     sums: Sums | None = None
+    skipped: Counter[str] = field(default_factory=Counter)
 
     def kept(self) -> Placed:
         """The placements.
@@ -182,6 +186,36 @@ class MaskContent:
         """Cells that no other cell places."""
         used = {name for cell in self.cells.values() for name in cell.placed.children}
         return [name for name in self.cells if name not in used]
+
+    @property
+    def skipped(self) -> Counter[str]:
+        """Elements of the cells that draw nothing: {kind: number}, texts among them."""
+        found = sum((cell.skipped for cell in self.cells.values()), Counter())
+        texts = sum(cell.texts for cell in self.cells.values())
+        return found + Counter(text=texts)
+
+    def below(self, top: str) -> "MaskContent":
+        """The cells that one cell draws, itself as the only top cell.
+
+        Args:
+            top: name of the cell.
+
+        Raises:
+            MaskFileError: the mask has no such cell.
+        """
+        if top not in self.cells:
+            raise MaskFileError(
+                f"no cell {top!r} in the mask; top cells: {', '.join(self.tops[:8])}"
+            )
+        kept: set[str] = set()
+        waiting = [top]
+        while waiting:
+            name = waiting.pop()
+            if name in self.cells and name not in kept:
+                kept.add(name)
+                waiting += self.cells[name].placed.children
+        cells = {name: cell for name, cell in self.cells.items() if name in kept}
+        return dataclasses.replace(self, cells=cells)
 
     def leaves(self, top: str) -> Iterator[Placed]:
         """All placements below ``top`` of cells that place nothing themselves, at their
@@ -307,6 +341,36 @@ def mapped(path: str | Path) -> Array:
         return np.frombuffer(
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8
         )
+
+
+CONTEXT_CELL = "$$$CONTEXT_INFO$$$"  # KLayout's record of library cells: no drawing
+
+
+def decode_name(data: bytes) -> str:
+    """A name of a mask file: UTF-8, or Latin-1 where it is none; trailing NULs go."""
+    data = data.rstrip(b"\0")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def has_area(points: Array) -> bool:
+    """Whether the corners (n, 2) of a polygon do not all lie on one line."""
+    steps = points[1:] - points[0]
+    if not len(steps):
+        return False
+    longest = steps[np.abs(steps).sum(1).argmax()]
+    return bool((steps[:, 0] * longest[1] != steps[:, 1] * longest[0]).any())
+
+
+def placement_limit(path: Path) -> int:
+    """Placements and shapes that a mask file is expanded to by default.
+
+    4 million take less than 1 GB however small the file; 20 more for each byte admit
+    long lists (OASIS masks of this package have 4 to 17 pillars a byte).
+    """
+    return 4_000_000 + 20 * path.stat().st_size
 
 
 def forget(data: Array, end: int) -> None:

@@ -79,5 +79,5 @@ def refuse_beyond(content: MaskContent, most: int) -> None:
     if total > most:
         raise MaskFileError(
             f"the mask draws {total:,} shapes when its arrays are taken apart, at most {most:,} are taken "
-            "(metalens check --most-shapes sets another limit, at 25 to 150 bytes of memory for each)"
+            "(metalens check --max-shapes sets another limit, at 25 to 150 bytes of memory for each)"
         )

@@ -27,15 +27,17 @@ def outline(
     open.
 
     Args:
-        points: (m, 2), m >= 2 and not all alike. begin, end: lengths by which it goes
+        points: (m, 2), m >= 1; where all are equal, the path runs along x. begin, end: lengths by which it goes
             on beyond its ends.
         rounded: with half circles at the ends.
     """
     p = np.asarray(points, float)
     p = p[np.r_[True, (np.diff(p, axis=0) != 0).any(1)]]
     along = np.diff(p, axis=0)
+    if not len(along):
+        p, along = np.vstack([p, p]), np.array([[1.0, 0.0]])
     long = np.hypot(*along.T)
-    along /= long[:, None]
+    along = along / np.where(long > 0, long, 1.0)[:, None]
     if not rounded:
         p[0] -= begin * along[0]
         p[-1] += end * along[-1]
@@ -44,7 +46,8 @@ def outline(
     if rounded:
         left = [*left[1:-1], *_cap(p[-1], along[-1], half_width)]
         right = [*right[1:-1], *_cap(p[0], -along[0], half_width)]
-    return np.asarray(np.rint(np.array(left + right)), np.int64)
+    corners = np.array(left + right)
+    return np.asarray(np.copysign(np.floor(np.abs(corners) + 0.5), corners), np.int64)
 
 
 def _side(p: Array, along: Array, long: Array, half: float) -> list[Array]:

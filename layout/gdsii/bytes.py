@@ -18,7 +18,7 @@ COLROW, NODE, TEXTTYPE, PRESENTATION, STRING, STRANS, MAG, ANGLE = (
     0x1B,
     0x1C,
 )
-BGNEXTN, ENDEXTN = 0x30, 0x31
+BGNEXTN, ENDEXTN, STRCLASS, MBMSPATH = 0x30, 0x31, 0x34, 0x56
 PATHTYPE, ELFLAGS, NODETYPE, PROPATTR, PROPVALUE, BOX, BOXTYPE, PLEX = (
     0x21,
     0x26,
@@ -78,6 +78,8 @@ DATA |= {
     NODE: NO_DATA,
     NODETYPE: INT2,
     PLEX: INT4,
+    STRCLASS: BITS,
+    MBMSPATH: NO_DATA,
 }
 NAMES = {
     value: name
@@ -123,7 +125,7 @@ def record(kind: int, data: bytes = b"") -> bytes:
 
 def text(kind: int, value: str) -> bytes:
     """A record of text, filled to an even length with a zero."""
-    data = value.encode("ascii")
+    data = value.encode()
     return record(kind, data + bytes(len(data) % 2))
 
 

@@ -1,6 +1,7 @@
 """GDSII reader: every record is checked; what is wrong is named with its byte offset."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from layout.files import (
+    CONTEXT_CELL,
     FARTHEST,
     NOTHING,
     QUARTERS,
@@ -17,7 +19,9 @@ from layout.files import (
     Placed,
     Sums,
     Turn,
+    decode_name,
     forget,
+    has_area,
     mapped,
     paths,
     sref_run,
@@ -26,15 +30,10 @@ from layout.gdsii import bytes as gds
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
-_HEADS = {0x00, 0x05} | {
-    0x1F,
-    0x20,
-    0x22,
-    0x36,
-    0x23,
-    0x39,
-}  # header records that libraries may add
-_SHAPES = {gds.BOUNDARY, gds.BOX, gds.PATH, gds.TEXT, gds.NODE, gds.SREF, gds.AREF}
+# records that libraries may have before UNITS
+_HEADS = {0x00, 0x05, 0x1F, 0x20, 0x22, 0x23, 0x36, 0x37, 0x38, 0x39, 0x3A, 0x3B}
+_PATHS = (gds.PATH, gds.MBMSPATH)
+_SHAPES = {gds.BOUNDARY, gds.BOX, gds.TEXT, gds.NODE, gds.SREF, gds.AREF, *_PATHS}
 LIMIT = 2**29
 _AT_ONCE = 1 << 20  # copies of an array
 
@@ -44,7 +43,7 @@ class _Batch:
     """Placements of the structure that is being read."""
 
     held: Gathered
-    names: dict[bytes, int] = field(default_factory=dict)
+    names: dict[str, int] = field(default_factory=dict)
     turns: dict[Turn, int] = field(
         default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
     )
@@ -56,7 +55,7 @@ class _Batch:
             child.astype(np.int32), x.astype(np.int32), y.astype(np.int32), turned
         )
 
-    def number(self, name: bytes) -> int:
+    def number(self, name: str) -> int:
         return self.names.setdefault(name, len(self.names))
 
     def sums(self) -> Sums | None:
@@ -69,7 +68,7 @@ class _Batch:
     def placed(self) -> Placed:
         if not self.held.count:
             return NOTHING
-        names = tuple(name.decode("ascii") for name in self.names)
+        names = tuple(self.names)
         if self.held.digest is not None:
             return dataclasses.replace(NOTHING, children=names)
         return Placed(names, *self.held.columns(), tuple(self.turns))
@@ -171,36 +170,37 @@ class _Reader:
             cells[cell.name] = cell
         if self.data[self.at :].any():
             raise self.fail("data after ENDLIB", self.at)
+        cells.pop(CONTEXT_CELL, None)
         return MaskContent("GDSII", meters * 1e9, cells)
 
-    def name(self, data: bytes) -> bytes:
-        text = data[:-1] if data.endswith(b"\0") else data
-        if not text or any(c <= 32 or c > 126 for c in text):
-            raise self.fail(f"name {text[:40]!r}, need printable characters")
+    def name(self, data: bytes) -> str:
+        text = decode_name(data)
+        if not text:
+            raise self.fail("a structure or reference without a name")
         return text
 
     def structure(self) -> CellContent:
-        name = self.name(self.next(gds.STRNAME)[1]).decode("ascii")
-        batch, texts = _Batch(Gathered(self.keep)), 0
+        name = self.name(self.next(gds.STRNAME)[1])
+        batch, skipped = _Batch(Gathered(self.keep)), Counter[str]()
         polygons: dict[tuple[int, int], list[Array]] = {}
         while True:
             self.references(batch)
-            kind, _ = self.next(*_SHAPES, gds.ENDSTR)
+            kind, _ = self.next(*_SHAPES, gds.ENDSTR, gds.STRCLASS)
             if kind == gds.ENDSTR:
+                texts = skipped.pop(gds.NAMES[gds.TEXT], 0)
                 return CellContent(
-                    name, polygons, {}, batch.placed(), texts, batch.sums()
+                    name, polygons, {}, batch.placed(), texts, batch.sums(), skipped
                 )
             if kind in (gds.SREF, gds.AREF):
                 self.reference(batch, kind)
-            elif kind in (gds.BOUNDARY, gds.BOX, gds.PATH):
-                layer, points = self.line() if kind == gds.PATH else self.boundary(kind)
-                polygons.setdefault(layer, []).append(points)
-            elif kind == gds.NODE:
-                raise self.fail(
-                    "NODE, which marks a net and draws nothing, is not read; remove it from the file"
-                )
-            else:
-                texts += 1
+            elif kind in (gds.BOUNDARY, gds.BOX, *_PATHS):
+                layer, points = self.line() if kind in _PATHS else self.boundary(kind)
+                if has_area(points):
+                    polygons.setdefault(layer, []).append(points)
+                else:
+                    skipped[f"{gds.NAMES[kind]} without area"] += 1
+            elif kind != gds.STRCLASS:  # TEXT, NODE
+                skipped[gds.NAMES[kind]] += 1
                 while self.next()[0] != gds.ENDEL:
                     self.refuse_outside_element()
 
@@ -225,7 +225,7 @@ class _Reader:
         self.placed += more
         if self.placed > self.limit:
             raise self.fail(
-                f"{self.placed:,} placements up to here, at most {self.limit:,} are read (metalens check --most-shapes "
+                f"{self.placed:,} placements up to here, at most {self.limit:,} are read (metalens check --max-shapes "
                 "sets another limit)"
             )
 
@@ -237,14 +237,12 @@ class _Reader:
             if kind == gds.ENDEL:
                 return found
             self.refuse_outside_element()
+            if kind == gds.XY:  # writers split long outlines over several records
+                found[kind] = found.get(kind, b"") + data
+                continue
             if kind in found and kind not in (gds.PROPATTR, gds.PROPVALUE):
-                more = (
-                    "; an outline over several records is no GDSII"
-                    if kind == gds.XY
-                    else ""
-                )
                 raise self.fail(
-                    f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice{more}"
+                    f"element with {gds.NAMES.get(kind, f'record 0x{kind:02x}')} twice"
                 )
             found[kind] = data
 
@@ -261,7 +259,7 @@ class _Reader:
         return np.frombuffer(data, f">i{size}").astype(np.int64)
 
     def boundary(self, kind: int) -> tuple[tuple[int, int], Array]:
-        start = self.begin
+        """Layer and corners of an outline, closed where the file leaves it open."""
         found = self.fields()
         layer = int(self.numbers(found, gds.LAYER, 1)[0])
         datatype = int(
@@ -269,16 +267,16 @@ class _Reader:
                 found, gds.DATATYPE if kind == gds.BOUNDARY else gds.BOXTYPE, 1
             )[0]
         )
-        points = self.numbers(found, gds.XY, None)
-        if len(points) % 2 or len(points) < 8:
-            raise self.fail(
-                f"boundary of {len(points) // 2} points, need at least 4 (first and last alike)",
-                start,
-            )
-        points = points.reshape(-1, 2)
-        if (points[0] != points[-1]).any():
-            raise self.fail("boundary that is not closed", start)
-        return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1]
+        points = self.points(found)
+        closed = len(points) > 1 and (points[0] == points[-1]).all()
+        return (layer & 0xFFFF, datatype & 0xFFFF), points[:-1] if closed else points
+
+    def points(self, found: dict[int, bytes]) -> Array:
+        """(n, 2) points of an element, n >= 1."""
+        numbers = self.numbers(found, gds.XY, None)
+        if len(numbers) % 2 or not len(numbers):
+            raise self.fail(f"element with {len(numbers)} coordinates, need pairs")
+        return numbers.reshape(-1, 2)
 
     def reference(self, batch: _Batch, kind: int) -> None:
         start = self.begin
@@ -336,59 +334,32 @@ class _Reader:
                 f"reference scaled by {size}, or with broken STRANS; need a scale above 0",
                 start,
             )
-        if flags[1] & 6:
-            raise self.fail(
-                "reference of absolute angle or size, which the format allows and writers ignore",
-                start,
-            )
+        # absolute angle and size (bits 13, 14) are ignored, as other readers do
         return Turn(angle % 360, bool(flags[0] & 128), size)
 
     def line(self) -> tuple[tuple[int, int], Array]:
-        start = self.begin
+        """Layer and outline of a path; a negative width does not scale with references,
+        which is ignored as other readers do.
+        """
         found = self.fields()
         layer, datatype = (
             int(self.numbers(found, k, 1)[0]) for k in (gds.LAYER, gds.DATATYPE)
         )
-        points = self.numbers(found, gds.XY, None)
+        points = self.points(found)
         width, begin, end = (
             self.whole(found, k) for k in (gds.WIDTH, gds.BGNEXTN, gds.ENDEXTN)
         )
         ends = (
             int(self.numbers(found, gds.PATHTYPE, 1)[0]) if gds.PATHTYPE in found else 0
         )
-        if (
-            len(points) % 2
-            or len(points) < 4
-            or (points.reshape(-1, 2) == points[:2]).all()
-        ):
-            raise self.fail(
-                f"path of {len(points) // 2} points, need 2 that differ", start
-            )
-        if width <= 0 or ends not in (0, 1, 2, 4):
-            absolute = (
-                ", which no magnification changes and readers take differently"
-                if width < 0
-                else ""
-            )
-            raise self.fail(
-                f"path of width {width}{absolute}, and type {ends}: need a width above 0, and type 0, 1, 2 or 4",
-                start,
-            )
-        half = width / 2
-        longer = {
-            0: (0.0, 0.0),
-            1: (0.0, 0.0),
-            2: (half, half),
-            4: (float(begin), float(end)),
-        }[ends]
-        made = paths.outline(
-            points.reshape(-1, 2),
-            half,
-            begin=longer[0],
-            end=longer[1],
-            rounded=ends == 1,
+        half = abs(width) / 2
+        if not half:
+            return (layer & 0xFFFF, datatype & 0xFFFF), points[:1]
+        begin, end = {1: (half, half), 2: (half, half), 4: (begin, end)}.get(
+            ends, (0, 0)
         )
-        return (layer & 0xFFFF, datatype & 0xFFFF), made
+        outline = paths.outline(points, half, begin=begin, end=end, rounded=ends == 1)
+        return (layer & 0xFFFF, datatype & 0xFFFF), outline
 
     def whole(self, found: dict[int, bytes], kind: int) -> int:
         """A 32-bit number that an element may have; 0 without."""

@@ -70,7 +70,7 @@ def signed(value: int) -> bytes:
 
 def string(text: str) -> bytes:
     """Length and characters."""
-    data = text.encode("ascii")
+    data = text.encode()
     return unsigned(len(data)) + data
 
 

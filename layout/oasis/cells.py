@@ -3,6 +3,7 @@ texts, with modal values.
 """
 
 import dataclasses
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -15,6 +16,7 @@ from layout.files import (
     Gathered,
     Placed,
     Turn,
+    has_area,
     paths,
     placements,
 )
@@ -64,7 +66,8 @@ class Modal:
     points: Array | None = None
     half_width: int | None = None
     path_points: Array | None = None
-    path_ends: tuple[int, int] | None = None
+    path_begin: int | None = None
+    path_end: int | None = None
     kind: int | None = None
     repetition: Repetition | None = None
 
@@ -86,13 +89,20 @@ class OpenCell:
         default_factory=lambda: {turn: k for k, turn in enumerate(QUARTERS)}
     )
     texts: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
 
     def close(self, name: str, table: dict[int, str]) -> CellContent:
         """The finished cell; KeyError names a reference number without a name."""
         digest = self.held.digest
         sums = None if digest is None else digest.of(digest.children)
         return CellContent(
-            name, self.polygons, self.circles, self._placed(table), self.texts, sums
+            name,
+            self.polygons,
+            self.circles,
+            self._placed(table),
+            self.texts,
+            sums,
+            self.skipped,
         )
 
     def _placed(self, table: dict[int, str]) -> Placed:
@@ -159,6 +169,12 @@ class CellReader:
             self._trapezoid(c, kind)
         elif kind == oasis.CTRAPEZOID:
             self._compact(c)
+        elif kind == oasis.XELEMENT:
+            c.unsigned()
+            c.string()
+            self.cell.skipped["XELEMENT"] += 1
+        elif kind == oasis.XGEOMETRY:
+            self._extension(c)
         else:
             return False
         return True
@@ -202,7 +218,7 @@ class CellReader:
         if self.budget.used > self.budget.limit:
             raise c.fail(
                 f"{self.budget.used:,} placements and copies up to here (a drawn copy counts as {_DRAWN} and its "
-                f"corners), at most {self.budget.limit:,} are read (metalens check --most-shapes sets another limit)"
+                f"corners), at most {self.budget.limit:,} are read (metalens check --max-shapes sets another limit)"
             )
 
     def _need(self, c: Cursor, value: Value | None, what: str) -> Value:
@@ -290,8 +306,12 @@ class CellReader:
             y,
         )
 
-    def _polygons(self, c: Cursor, info: int, points: Array) -> None:
+    def _polygons(self, c: Cursor, info: int, points: Array, what: str) -> None:
+        """Copies of a polygon; ``what`` names its kind where it draws nothing."""
         layer, x, y = self._place(c, info, len(points))
+        if not has_area(points):
+            self.cell.skipped[f"{what} without area"] += len(x)
+            return
         c.within(int(np.abs(points).max()) + max(abs(self.modal.x), abs(self.modal.y)))
         shapes = self.cell.polygons.setdefault(layer, [])
         shapes.extend(
@@ -309,16 +329,14 @@ class CellReader:
         elif info & 0x20:
             m.height = c.within(c.unsigned())
         w, h = self._need(c, m.width, "width"), self._need(c, m.height, "height")
-        self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]))
+        self._polygons(c, info, np.array([[0, 0], [w, 0], [w, h], [0, h]]), "RECTANGLE")
 
     def _polygon(self, c: Cursor) -> None:
         info, m = c.byte(), self.modal
         self._layer(c, info)
         if info & 0x20:
             m.points = c.points()
-            if len(m.points) < 3:
-                raise c.fail(f"polygon of {len(m.points)} vertices, need 3")
-        self._polygons(c, info, self._need(c, m.points, "point list"))
+        self._polygons(c, info, self._need(c, m.points, "point list"), "POLYGON")
 
     def _path(self, c: Cursor) -> None:
         info, m = c.byte(), self.modal
@@ -326,27 +344,27 @@ class CellReader:
         if info & 0x40:
             m.half_width = c.within(c.unsigned())
         if info & 0x80:
-            m.path_ends = self._ends(c, c.unsigned())
+            scheme = c.unsigned()
+            m.path_begin = self._extent(c, scheme >> 2 & 3, m.path_begin)
+            m.path_end = self._extent(c, scheme & 3, m.path_end)
         if info & 0x20:
             m.path_points = c.points(closed=False)
         points, half = (
             self._need(c, m.path_points, "point list"),
             self._need(c, m.half_width, "width"),
         )
-        begin, end = self._need(c, m.path_ends, "ends")
-        if half == 0 or (points == points[0]).all():
-            raise c.fail("path without width or length")
-        self._polygons(c, info, paths.outline(points, half, begin=begin, end=end))
+        begin = self._need(c, m.path_begin, "extension at its start")
+        end = self._need(c, m.path_end, "extension at its end")
+        outline = paths.outline(points, half, begin=begin, end=end)
+        self._polygons(c, info, outline if half else points[:1], "PATH")
 
-    def _ends(self, c: Cursor, scheme: int) -> tuple[int, int]:
-        """By how much a path goes on at its begin and end: as before, not, by its half
-        width, or as told.
-        """
-        old, half = self.modal.path_ends or (0, 0), self.modal.half_width or 0
-        made = []
-        for n, form in enumerate((scheme >> 2 & 3, scheme & 3)):
-            made.append((old[n], 0, half)[form] if form < 3 else c.coordinate())
-        return made[0], made[1]
+    def _extent(self, c: Cursor, form: int, last: int | None) -> int | None:
+        """Extension of a path: as before (0), none, its half width, or stated (3)."""
+        if form < 2:
+            return 0 if form else last
+        if form == 2:
+            return self._need(c, self.modal.half_width, "width")
+        return c.coordinate()
 
     def _trapezoid(self, c: Cursor, kind: int) -> None:
         info, m = c.byte(), self.modal
@@ -360,7 +378,10 @@ class CellReader:
                 f"trapezoid of {w} x {h} whose sides lean by {a} and {b} and cross"
             )
         self._polygons(
-            c, info, trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80))
+            c,
+            info,
+            trapezoids.sloped(w, h, a, b, upright=bool(info & 0x80)),
+            "TRAPEZOID",
         )
 
     def _size(self, c: Cursor, info: int) -> None:
@@ -383,7 +404,9 @@ class CellReader:
         wide, high = trapezoids.needs(kind)
         w = self._need(c, m.width, "width") if wide else 0
         h = self._need(c, m.height, "height") if high else 0
-        self._polygons(c, info, trapezoids.compact(kind, w, h))
+        size = trapezoids.dependent_size(kind, w, h)
+        m.width, m.height = size
+        self._polygons(c, info, trapezoids.compact(kind, w, h), "CTRAPEZOID")
 
     def _circle(self, c: Cursor) -> None:
         info, m = c.byte(), self.modal
@@ -392,10 +415,22 @@ class CellReader:
             m.radius = c.within(c.unsigned())
         radius = self._need(c, m.radius, "radius")
         layer, x, y = self._place(c, info, 1)
+        if not radius:
+            self.cell.skipped["CIRCLE without area"] += len(x)
+            return
         shapes = self.cell.circles.setdefault(layer, [])
         shapes.extend(
             (px, py, radius) for px, py in zip(x.tolist(), y.tolist(), strict=True)
         )
+
+    def _extension(self, c: Cursor) -> None:
+        """XGEOMETRY, geometry of an extension of the format, is counted, no more."""
+        info = c.byte()
+        c.unsigned()
+        self._layer(c, info)
+        c.string()
+        _, x, _ = self._place(c, info, 1)
+        self.cell.skipped["XGEOMETRY"] += len(x)
 
     def _text(self, c: Cursor) -> None:
         """Texts are counted, no more."""

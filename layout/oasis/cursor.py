@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.files import FARTHEST, deltas
+from layout.files import FARTHEST, decode_name, deltas
 from metalens.ground.arrays import Array
 from metalens.ground.errors import MaskFileError
 
@@ -120,13 +120,11 @@ class Cursor:
         raise self.fail(f"real number of form {form}, need 0 to 7")
 
     def string(self, *, name: bool = False) -> str:
-        """Characters; a ``name`` is not empty and holds printable characters without
-        blanks.
-        """
-        data = self.take(self.unsigned())
-        if name and (not data or any(c <= 32 or c > 126 for c in data)):
-            raise self.fail(f"name {data[:40]!r}, need printable characters")
-        return data.decode("latin-1")
+        """Characters; a ``name`` is not empty."""
+        text = decode_name(self.take(self.unsigned()))
+        if name and not text:
+            raise self.fail("an empty name")
+        return text
 
     def delta(self) -> tuple[int, int]:
         """A g-delta."""

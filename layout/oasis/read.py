@@ -1,7 +1,5 @@
 """OASIS reader for mask files: names, cells, compressed blocks, checksum; what is wrong
 is named with its byte.
-
-Extension records (XELEMENT, XGEOMETRY) are refused by their number.
 """
 
 import struct
@@ -10,13 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from layout.files import CellContent, Gathered, MaskContent, mapped
+from layout.files import CONTEXT_CELL, CellContent, Gathered, MaskContent, mapped
 from layout.oasis import bytes as oasis
 from layout.oasis.cells import Budget, CellReader, Child, OpenCell
 from layout.oasis.cursor import Cursor
 from metalens.ground.arrays import Array
 
 LIMIT = 2**29
+_NUMBERED_NAMES = (
+    oasis.TEXTSTRING_REF,
+    oasis.PROPNAME_REF,
+    oasis.PROPSTRING_REF,
+    oasis.XNAME_REF,
+)
 _BYTES_EACH = 16  # of a compressed block, for each placement that may be read
 _LARGEST_RATIO = 1100  # deflate packs at most 1032 to 1
 
@@ -125,6 +129,12 @@ class _Reader:
             self._layer_name(c, kind)
         elif oasis.TEXTSTRING <= kind <= oasis.PROPSTRING_REF:
             self._other_name(c, kind)
+        elif kind in (oasis.XNAME, oasis.XNAME_REF):
+            c.unsigned()
+            self._other_name(c, kind)
+        elif kind == oasis.XELEMENT and self.cell is None:
+            c.unsigned()
+            c.string()
         elif kind == oasis.END and c is self.file:
             self.end_at = c.begin
         elif kind != oasis.PAD:
@@ -190,7 +200,7 @@ class _Reader:
 
     def _other_name(self, c: Cursor, kind: int) -> None:
         c.string()
-        if kind in (oasis.TEXTSTRING_REF, oasis.PROPNAME_REF, oasis.PROPSTRING_REF):
+        if kind in _NUMBERED_NAMES:
             c.unsigned()
         self.cell = None
 
@@ -255,4 +265,5 @@ class _Reader:
             if name in made:
                 raise self.file.fail(f"cell {name!r} comes twice")
             made[name] = content
+        made.pop(CONTEXT_CELL, None)
         return made

@@ -42,6 +42,21 @@ def needs(kind: int) -> tuple[bool, bool]:
     return "w" in text, "h" in text
 
 
+def dependent_size(kind: int, w: int, h: int) -> tuple[int, int]:
+    """Width and height, of which a compact trapezoid of one size sets the other.
+
+    Args:
+        kind: 0 to 25. w, h: sizes; of kinds 16 to 23 and 25 one of them does not count.
+    """
+    if kind in (16, 17, 18, 19, 25):
+        return w, w
+    if kind in (20, 21):
+        return 2 * h, h
+    if kind in (22, 23):
+        return w, 2 * w
+    return w, h
+
+
 def sloped(w: int, h: int, a: int, b: int, *, upright: bool) -> Array:
     """(4, 2) corners within a box of w by h; a, b: by how much each slanted side leans."""
     if upright:

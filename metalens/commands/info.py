@@ -18,6 +18,7 @@ from metalens.ground.errors import StoreError
 
 _SHADES = " .:-=+*#%@"
 NETWORK = ".safetensors"
+_DRAWINGS = {*MASKS, ".dxf", ".cif"}  # the latter two are refused by name
 _HDF5 = b"\x89HDF"  # first bytes
 # kind of file: module of a package above with ``told`` and ``text``, filled by the
 # command line
@@ -32,9 +33,11 @@ class Options(Common):
         file: an artefact of this toolchain: HDF5, a mask (GDSII or OASIS), a network or
             checkpoint (safetensors), a
             folder with a manifest, or any file of one.
+        top: cell of a mask to count with all below it; omitted: all top cells.
     """
 
     file: tyro.conf.Positional[Path]
+    top: str | None = None
 
 
 def run(options: Options) -> int:
@@ -47,9 +50,9 @@ def run(options: Options) -> int:
         told = network(options.file)
         options.console.result(told, _network_text(told))
         return 0
-    if options.file.suffix.lower() in MASKS and "mask" in TOLD:
+    if _is_drawing(options.file) and "mask" in TOLD:
         module = importlib.import_module(TOLD["mask"])
-        told = module.told(options.file)
+        told = module.told(options.file, options.top)
         options.console.result(told, module.text(told))
         return 0
     if (listed := member(options.file)) is not None:
@@ -59,6 +62,11 @@ def run(options: Options) -> int:
     about = _about(options.file.name, stored)
     options.console.result(about, _text(stored, about["arrays"]))
     return 0
+
+
+def _is_drawing(path: Path) -> bool:
+    """Whether a file is named as a mask, also a compressed one (chip.gds.gz)."""
+    return not _DRAWINGS.isdisjoint(suffix.lower() for suffix in path.suffixes)
 
 
 def _about(name: str, stored: store.Stored) -> dict[str, Any]:

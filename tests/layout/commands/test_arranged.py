@@ -210,11 +210,11 @@ def test_parts_that_meet_and_rules_that_break_end_with_one_and_are_named(
     pads = '[[cell]]\nfile = "pads.gds"\nname = "PADS"\nchecked = true\n'
     assert run(folder, pads, tmp_path / "m", "--gds") == 1  # 45 by 55 nm on 20/3
     told = capsys.readouterr().out
-    assert "  FAILED: PADS: design rules broken: 1 feature" in told.splitlines()
+    assert "  FAILED: PADS: design rules violated: 1 width" in told.splitlines()
     assert "passes its own checks" not in told
     page = (tmp_path / "m" / "report.html").read_text()
     assert (
-        "FAILS: PADS: design rules broken: 1 feature"
+        "FAILS: PADS: design rules violated: 1 width"
         in page[page.index("<h1") : page.index("<h2")]
     )
     assert run(folder, pads.replace("true", "false"), tmp_path / "m", "--gds") == 0

@@ -13,10 +13,9 @@ import pytest
 import layout
 from layout.commands import make, page
 from layout.dose.exposure import point_exposure
+from layout.drc import check_plan, write_lyp, write_lyrdb
 from layout.files import dxf
 from layout.process.process import Exposure, Rules
-from layout.rules import check as drc
-from layout.rules import markers
 from layout.shapes import polygon
 from layout.study import page as study_page
 from metalens import cli, lens
@@ -217,16 +216,16 @@ def test_a_broken_rule_ends_with_one_and_is_marked(lens_file, tmp_path, capsys):
     assert run(lens_file, "--process", process, "-o", target, "--oasis", "--json") == 1
     values = json.loads(capsys.readouterr().out)
     assert not values["ok"]
-    assert values["violations"]["gap"] > 0
+    assert values["violations"]["space"] > 0
     assert values["failures"] == [
-        f"design rules broken: {values['violations']['gap']:,} gap"
+        f"design rules violated: {values['violations']['space']:,} space"
     ]
     rdb = pytest.importorskip("klayout.rdb")
     database = rdb.ReportDatabase()
     database.load(str(target / "mask.lyrdb"))
     shown = sum(1 for _ in database.each_item())
-    assert shown == min(values["violations"]["gap"], 500)
-    assert {c.name() for c in database.each_category() if c.num_items()} == {"gap"}
+    assert shown == min(values["violations"]["space"], 500)
+    assert {c.name() for c in database.each_category() if c.num_items()} == {"space"}
 
 
 @pytest.mark.parametrize(
@@ -333,7 +332,7 @@ def test_dxf_beyond_its_limit_is_refused(plan, tmp_path, monkeypatch):
 
 
 def test_layer_properties_name_every_layer(plan, tmp_path):
-    markers.write_lyp(plan, tmp_path / "m.lyp")
+    write_lyp(plan, tmp_path / "m.lyp")
     text = (tmp_path / "m.lyp").read_text()
     for source, name in (("1/0@1", "pillar"), ("3/0@1", "marks")):
         assert f"<source>{source}</source>" in text
@@ -343,8 +342,8 @@ def test_layer_properties_name_every_layer(plan, tmp_path):
 def test_markers_stand_where_the_violations_are(make_plan, tmp_path):
     rdb = pytest.importorskip("klayout.rdb")
     plan = make_plan(np.array([[7, 7]], np.uint8))
-    found = drc.check(plan, Rules(minimum_gap_nm=300, minimum_feature_nm=1))
-    markers.write_lyrdb(plan, found, tmp_path / "m.lyrdb")
+    found = check_plan(plan, Rules(minimum_gap_nm=300, minimum_feature_nm=1))
+    write_lyrdb(found, plan.name, tmp_path / "m.lyrdb")
     database = rdb.ReportDatabase()
     database.load(str(tmp_path / "m.lyrdb"))
     (item,) = database.each_item()

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from layout.commands import view
+from layout.drc import DrcReport, Violation, write_lyrdb
 from layout.gdsii import write as gdsii_write
 from layout.oasis import write as oasis_write
 from layout.process.process import Rules
-from layout.rules import markers
-from layout.rules.report import DrcReport, Violation
 from metalens import cli
 from metalens.ground.errors import MaskFileError
 from metalens.view.page import html
@@ -69,13 +68,13 @@ def test_every_shape_is_in_the_page_where_the_file_has_it(make_plan, tmp_path, e
 def test_doses_and_broken_rules_beside_the_mask_are_shown(plan, tmp_path):
     oasis_write.write(plan, tmp_path / "mask.oas")
     (tmp_path / "doses.csv").write_text("layer,datatype,relative_dose\n1,0,1.37\n")
-    broken = Violation("gap", (-5000, 4300, -4700, 4500), 55.0, 70.0, "two pillars")
-    report = DrcReport.empty(markers.Top("TOP", 1.0), Rules())
-    report.counts["gap"], report.violations = 1, [broken]
-    markers.write_lyrdb(markers.Top("TOP", 1.0), report, tmp_path / "mask.lyrdb")
+    broken = Violation("space", (-5000, 4300, -4700, 4500), 55.0, 70.0, "two pillars")
+    report = DrcReport.empty(1.0, Rules())
+    report.add("space", 1, layer=1, cell="TOP", worst=55.0, examples=[broken])
+    write_lyrdb(report, "TOP", tmp_path / "mask.lyrdb")
     drawn, layers = view.panels(tmp_path)
     ((x, y, rule),) = drawn.marks
-    assert (x, y, rule) == (pytest.approx(-4.85), pytest.approx(4.4), "gap")
+    assert (x, y, rule) == (pytest.approx(-4.85), pytest.approx(4.4), "space")
     assert {
         o.notes["relative dose"] for o in drawn.outlines if o.layer == "1 pillar"
     } == {1.37}

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from layout.drc import check_plan
 from layout.files import verify
 from layout.gdsii import read as gdsii_read
 from layout.gdsii import write as gdsii_write
@@ -16,7 +17,6 @@ from layout.mask import build, shaped
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
-from layout.rules import check as drc
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import (
     Circle,
@@ -267,7 +267,7 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
                 least = min(
                     least, float(np.hypot(*(to - along[..., None] * edge).T).min())
                 )
-        found = drc.check(
+        found = check_plan(
             plan,
             PROCESS.rules,
             foot_nm=np.array([c.diameter_nm + 20.0 for c in plan.classes]),
@@ -276,7 +276,7 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
         assert found.minimum_foot_gap_nm == pytest.approx(
             least - 20, abs=1.1
         )  # round ones by circles
-        assert found.pillars == len(rows)
+        assert found.shapes == len(rows)
 
 
 @pytest.mark.parametrize(
@@ -417,7 +417,7 @@ def test_openings_of_a_film_are_drawn_as_pillars_of_their_size_would_be(
         assert shoelace == pytest.approx(area, rel=0.01)
     assert plan.layer_names[1, 0] == "opening"
     assert (
-        drc.check(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok
+        check_plan(plan, dataclasses.replace(PROCESS.rules, minimum_gap_nm=250)).ok
         is False
     )  # walls of 160 to 240 nm
 
@@ -605,7 +605,7 @@ def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
     plan = build.plan(made, PROCESS, furnished=False)
     gdsii_write.write(plan, tmp_path / "m.gds")
     drawn = region(tmp_path / "m.gds", "LENS")
-    found = drc.check(plan, PROCESS.rules)
+    found = check_plan(plan, PROCESS.rules)
     # of curves chords at an angle are no widths; edges that share a corner count for
     # neither
     how = (
@@ -632,12 +632,12 @@ def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
     rules = dataclasses.replace(
         PROCESS.rules, minimum_feature_nm=65, minimum_gap_nm=105
     )
-    found = drc.check(build.plan(made, PROCESS, furnished=False), rules)
+    found = check_plan(build.plan(made, PROCESS, furnished=False), rules)
     few = int(
         (made.diameters.diameter_um == 0.22).sum()
     )  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
-    assert found.counts["feature"] == few
-    assert found.counts["gap"] == few
+    assert found.counts["width"] == few
+    assert found.counts["space"] == few
     assert {round(v.value) for v in found.violations} == {
         60,
         98,
@@ -655,7 +655,7 @@ def test_an_exclusion_zone_in_the_middle_of_a_ring_meets_no_pillar():
     for side, pillars in ((0.06, 0), (0.14, 1)):
         zone = processes.Zone(x - side / 2, y - side / 2, side, side)
         rules = dataclasses.replace(PROCESS.rules, exclusion=(zone,))
-        assert drc.check(plan, rules).counts["exclusion"] == pillars
+        assert check_plan(plan, rules).counts["exclusion"] == pillars
 
 
 @pytest.mark.parametrize("kind", ["rectangular", "hexagonal"])
@@ -728,7 +728,7 @@ def test_both_tones_of_any_shape_and_lattice_are_the_die_and_share_nothing(
         p.area2() for p in drawn.each()
     )  # nothing is drawn (and exposed) twice
     assert (
-        drc.check(plan, PROCESS.rules).pillars > (made.diameters.diameter_um > 0).sum()
+        check_plan(plan, PROCESS.rules).shapes > (made.diameters.diameter_um > 0).sum()
     )
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import layout
+from layout.drc import check_plan
 from layout.files import flat
 from layout.mask import tone
 from layout.mask.plan import Figure, Lattice, MaskPlan, pillar_classes
 from layout.process.process import Die, Exposure, Process, Rules
-from layout.rules import check as drc
 from layout.shapes import rectilinear
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap
@@ -89,7 +89,7 @@ def test_both_tones_together_are_the_die_and_share_nothing(
     assert ((drawn + stays) ^ die).is_empty()
     assert (die ^ same_die).is_empty()
     assert area == drawn.area()  # nothing is drawn (and exposed) twice
-    assert drc.check(plan, dataclasses.replace(process.rules, maximum_density=1.0)).ok
+    assert check_plan(plan, dataclasses.replace(process.rules, maximum_density=1.0)).ok
     content = layout.read_gdsii(negative)
     assert layout.compare(plan, content).ok
 
@@ -155,7 +155,7 @@ def bare(figures=(), pitch=400, diameter=200):
 
 
 @pytest.mark.parametrize(
-    ("arm", "gap", "broken"), [(81, 71, {}), (20, 71, {"feature"}), (81, 30, {"gap"})]
+    ("arm", "gap", "broken"), [(81, 71, {}), (20, 71, {"width"}), (81, 30, {"space"})]
 )
 def test_thin_marks_and_narrow_gaps_of_a_negative_mask_are_seen(arm, gap, broken):
     bars = [
@@ -166,7 +166,7 @@ def test_thin_marks_and_narrow_gaps_of_a_negative_mask_are_seen(arm, gap, broken
     negative = tone.inverted(
         bare([marks]), Process(tone="negative", exposure=Exposure())
     )
-    found = drc.check(negative, Rules())
+    found = check_plan(negative, Rules())
     assert {rule for rule, count in found.counts.items() if count} == set(broken)
 
 

@@ -2,20 +2,17 @@
 
 import json
 import math
-import re
 
 import numpy as np
 import pytest
 
 import layout
-from layout.commands import check as checking
 from layout.commands.check import read
+from layout.drc import check_library, check_plan
 from layout.files import CellContent, MaskContent
 from layout.mask import build
 from layout.process import process as processes
 from layout.process.process import Rules
-from layout.rules import check as drc
-from layout.rules import foreign
 from metalens import cli
 from metalens.lens import DiameterMap
 
@@ -79,9 +76,10 @@ def test_turned_convex_pillars_anywhere_agree_with_klayout(tmp_path, suffix):
         for b in shapes[i + 1 : i + 40]
         if a.bbox().touches(b.bbox()) and a.touches(b)
     )
-    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=1))
-    assert report.pillars == len(shapes)
-    own = {v.box for v in report.violations if v.rule == "gap" and " to " in v.text}
+    rules = Rules(minimum_gap_nm=70, minimum_feature_nm=1)
+    report = check_library(read(path), rules, metric="euclidean")
+    assert report.shapes == len(shapes)
+    own = {v.box for v in report.violations if v.rule == "space"}
     theirs = pairs_of_klayout(shapes, 70)
     assert touching == 0 or own <= theirs
     assert own == theirs or touching
@@ -145,16 +143,18 @@ def test_thin_arms_and_notches_are_found_and_abutting_pieces_are_one(tmp_path, c
     values = json.loads(capsys.readouterr().out)
     found = values["violations"]
     assert (
-        found["feature"]
+        found["width"]
         == region.width_check(80, False, db.Region.Euclidian).count()
         == 1
     )
     assert (
-        found["gap"] == region.notch_check(70, False, db.Region.Euclidian).count() == 1
+        found["notch"]
+        == region.notch_check(70, False, db.Region.Euclidian).count()
+        == 1
     )
-    assert values["minimum_feature_nm"] == 20
-    assert values["minimum_gap_nm"] == 45
-    assert values["failures"] == ["design rules broken: 1 gap, 1 feature"]
+    assert values["minimum_width_nm"] == 20
+    assert values["minimum_space_nm"] == 45
+    assert values["failures"] == ["design rules violated: 1 width, 1 notch"]
     rdb = pytest.importorskip("klayout.rdb")
     database = rdb.ReportDatabase()
     database.load(str(tmp_path / "m.lyrdb"))
@@ -175,12 +175,12 @@ def test_a_shape_that_stands_alone_has_no_gap_and_says_so(tmp_path, capsys):
     made.write(str(tmp_path / "one.gds"))
     assert cli.main(["check", str(tmp_path / "one.gds")]) == 0
     told = capsys.readouterr().out
-    assert "no gap below 70 nm, thinnest 170.0 nm" in told
+    assert "no space below 70 nm, minimum width 170.0 nm" in told
     assert cli.main(["check", str(tmp_path / "one.gds"), "--json"]) == 0
     values = json.loads(
         capsys.readouterr().out, parse_constant=pytest.fail
     )  # no Infinity, which JSON does not know
-    assert (values["minimum_gap_nm"], values["minimum_feature_nm"]) == (None, 170.0)
+    assert (values["minimum_space_nm"], values["minimum_width_nm"]) == (None, 170.0)
 
 
 def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
@@ -218,13 +218,13 @@ def test_pillars_within_the_hull_of_a_mark_keep_their_own_width(tmp_path):
     path = tmp_path / "m.gds"
     made.write(str(path))
     region = db.Region(top.begin_shapes_rec(layer))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=45, minimum_feature_nm=95))
+    report = check_library(read(path), Rules(minimum_gap_nm=45, minimum_feature_nm=95))
     assert report.ok
     assert region.width_check(95, False, db.Region.Projection).is_empty()
-    thin = foreign.check(read(path), Rules(minimum_gap_nm=50, minimum_feature_nm=102))
-    assert thin.counts["feature"] == 20
+    thin = check_library(read(path), Rules(minimum_gap_nm=50, minimum_feature_nm=102))
+    assert thin.counts["width"] == 20
     assert (
-        thin.minimum_gap_nm == 49
+        thin.minimum_space_nm == 49
     )  # of the first row and column to the bar: 100 less 51
     assert not region.space_check(50, False, db.Region.Euclidian).is_empty()
     assert region.space_check(49, False, db.Region.Euclidian).is_empty()
@@ -252,158 +252,6 @@ def fork(rng):
     return [(0, 0), (w, 0), (w, h), (c, h), (c, b), (a, b), (a, h), (0, h)]
 
 
-def klayout_least(check, most):
-    """Smallest whole limit that a check of KLayout finds broken, less one: what it
-    measures, rounded down.
-    """
-    return next(
-        (
-            d - 1
-            for d in range(1, most + 1)
-            if check(d, True, db.Region.Euclidian).count()
-        ),
-        most,
-    )
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_least_gap_and_feature_of_any_upright_polygons_are_those_of_klayout(
-    tmp_path, seed
-):
-    """Overlapping, touching, nested, holes, arrays: exact, since upright edges have
-    whole distances or corners.
-    """
-    rng, most = np.random.default_rng(seed), 110
-    made = db.Layout()
-    top, sub, layer = made.create_cell("TOP"), made.create_cell("SUB"), made.layer(3, 1)
-    for n in range(int(rng.integers(2, 16))):
-        points = (staircase, ell, fork)[n % 3](rng)
-        x, y = rng.integers(-2200, 2200, 2).tolist()
-        turned = db.Trans(int(rng.integers(0, 8)), x, y)
-        (sub if n == 1 else top).shapes(layer).insert(
-            db.Polygon([db.Point(*p) for p in points]).transformed(turned)
-        )
-    steps = (
-        db.Vector(int(rng.integers(700, 1300)), 40),
-        db.Vector(-30, int(rng.integers(700, 1300))),
-    )
-    top.insert(
-        db.CellInstArray(sub.cell_index(), db.Trans(seed % 8, 50, -70), *steps, 2, 3)
-    )
-    path = tmp_path / f"m.{('gds', 'oas')[seed % 2]}"
-    made.write(str(path))
-    region = db.Region(top.begin_shapes_rec(layer))
-    report = foreign.check(
-        read(path), Rules(minimum_gap_nm=most, minimum_feature_nm=most)
-    )
-    own = [
-        min(np.floor(v + 1e-9), most)
-        for v in (report.minimum_gap_nm, report.minimum_feature_nm)
-    ]
-    assert own == [
-        klayout_least(region.space_check, most),
-        klayout_least(region.width_check, most),
-    ]
-
-
-def test_two_convex_shapes_beside_a_mark_are_one_pair(tmp_path):
-    """Two pillars 33 nm apart, both 51 nm beside an angle: three gaps, as KLayout finds
-    pairs of shapes.
-    """
-    made = db.Layout()
-    top, layer = made.create_cell("TOP"), made.layer(1, 0)
-    shapes = [
-        db.Polygon(
-            [
-                db.Point(*p)
-                for p in [
-                    (0, 0),
-                    (2000, 0),
-                    (2000, 300),
-                    (300, 300),
-                    (300, 900),
-                    (0, 900),
-                ]
-            ]
-        ),
-        db.Polygon(db.Box(500, 351, 700, 551)),
-        db.Polygon(db.Box(733, 351, 940, 561)),
-    ]
-    for shape in shapes:
-        top.shapes(layer).insert(shape)
-    path = tmp_path / "m.gds"
-    made.write(str(path))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
-    theirs = [
-        pairs_of_klayout([shapes[i], shapes[j]], 70)
-        for i, j in ((0, 1), (0, 2), (1, 2))
-    ]
-    assert report.counts["gap"] == sum(map(len, theirs)) == 3
-    assert sorted(round(v.value, 6) for v in report.violations) == [33, 51, 51]
-
-
-def test_pillars_within_the_hull_of_an_angle_are_one_gap_each_as_far_as_polygons_are(
-    tmp_path,
-):
-    """Round pillars 31 and 58 nm from an angle, one 40 nm from another, a square on it:
-    pairs as KLayout finds them.
-    """
-    made = db.Layout()
-    top, layer = made.create_cell("TOP"), made.layer(1, 0)
-    angle = 2 * np.pi * (np.arange(32) + 0.5) / 32
-    disc = np.rint(73 * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
-    r = int(disc.max())
-    angled = db.Polygon(
-        [
-            db.Point(*p)
-            for p in [
-                (0, 0),
-                (4000, 0),
-                (4000, 300),
-                (300, 300),
-                (300, 3000),
-                (0, 3000),
-            ]
-        ]
-    )
-    places = [
-        (900, 300 + r + 31),
-        (300 + r + 58, 900),
-        (900 + 2 * r + 40, 300 + r + 31),
-    ]
-    shapes = [
-        angled,
-        db.Polygon(db.Box(2500, 300, 2700, 500)),
-        *(
-            db.Polygon([db.Point(int(p), int(q)) for p, q in disc + at])
-            for at in places
-        ),
-    ]
-    for shape in shapes:
-        top.shapes(layer).insert(shape)
-    path = tmp_path / "m.gds"
-    made.write(str(path))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=90))
-    assert sorted(round(v.value, 6) for v in report.violations if v.rule == "gap") == [
-        31,
-        31,
-        40,
-        58,
-    ]
-    theirs = [
-        pairs_of_klayout([shapes[i], shapes[j]], 70)
-        for i, j in ((0, 2), (0, 3), (0, 4), (2, 4))
-    ]
-    assert report.counts["gap"] == sum(map(len, theirs)) == 4
-    boxes = {v.value: v.box for v in report.violations if "angle" not in v.text}
-    assert boxes[58] == (
-        300,
-        900 - r - 58,
-        300 + 2 * r + 2 * 58,
-        900 + r + 58,
-    )  # the pillar and as far around
-
-
 def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
     """Not as its chords: KLayout's projection of edges that face each other says the
     same.
@@ -420,14 +268,14 @@ def test_a_round_hole_is_a_gap_as_wide_as_itself(tmp_path):
     top.shapes(layer).insert(plate)
     path = tmp_path / "m.gds"
     made.write(str(path))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=90, minimum_feature_nm=90))
-    assert report.counts["gap"] == 1
-    assert report.counts["feature"] == 0
+    report = check_library(read(path), Rules(minimum_gap_nm=90, minimum_feature_nm=90))
+    assert report.counts["notch"] == 1
+    assert report.counts["width"] == 0
     assert plate.notch_check(
-        int(report.minimum_gap_nm), False, db.Region.Projection, 2.0
+        int(report.minimum_space_nm), False, db.Region.Projection, 2.0
     ).is_empty()
     assert not plate.notch_check(
-        int(report.minimum_gap_nm) + 2, False, db.Region.Projection, 2.0
+        int(report.minimum_space_nm) + 2, False, db.Region.Projection, 2.0
     ).is_empty()
     assert report.violations[0].box == (459, 559, 541, 641)
 
@@ -448,7 +296,7 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
     rules = processes.load(process)
     plan = build.prepare(DiameterMap(size, 0.3), rules, furniture="none").plan
     layout.write_oasis(plan, tmp_path / "m.oas")
-    planned = drc.check(plan, rules.rules)
+    planned = check_plan(plan, rules.rules)
     assert (
         cli.main(
             ["check", str(tmp_path / "m.oas"), "--process", str(process), "--json"]
@@ -456,9 +304,9 @@ def test_a_negative_mask_is_held_to_the_rules_of_what_stays_as_its_plan_is(
         == 1
     )
     found = json.loads(capsys.readouterr().out)
-    assert found["violations"]["feature"] == planned.counts["feature"] > 20
-    assert found["violations"]["gap"] == planned.counts["gap"] == 0
-    assert found["minimum_feature_nm"] == pytest.approx(planned.minimum_feature_nm)
+    assert found["violations"]["width"] == planned.counts["width"] > 20
+    assert found["violations"]["space"] == planned.counts["space"] == 0
+    assert found["minimum_width_nm"] == pytest.approx(planned.minimum_width_nm)
 
 
 def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
@@ -474,14 +322,14 @@ def test_walls_at_the_rim_of_a_negative_lens_alone_are_whole(tmp_path, capsys):
     rules = processes.load(process)
     plan = build.prepare(DiameterMap(size, 0.33), rules, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
-    assert drc.check(plan, rules.rules).ok
+    assert check_plan(plan, rules.rules).ok
     assert (
         cli.main(
             ["check", str(tmp_path / "m.gds"), "--process", str(process), "--json"]
         )
         == 0
     )
-    assert json.loads(capsys.readouterr().out)["violations"]["gap"] == 0
+    assert json.loads(capsys.readouterr().out)["violations"]["space"] == 0
     read_back = db.Layout()
     read_back.read(str(tmp_path / "m.gds"))
     drawn = db.Region(read_back.top_cell().begin_shapes_rec(read_back.find_layer(1, 0)))
@@ -509,13 +357,13 @@ def test_small_circles_and_turned_pillars_are_as_wide_as_they_are(tmp_path):
         )
     path = tmp_path / "m.gds"
     made.write(str(path))
-    report = foreign.check(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=119))
+    report = check_library(read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=119))
     assert report.ok
-    assert 119 < report.minimum_feature_nm < 123
+    assert 119 < report.minimum_width_nm < 123
     assert (
-        foreign.check(
+        check_library(
             read(path), Rules(minimum_gap_nm=70, minimum_feature_nm=124)
-        ).counts["feature"]
+        ).counts["width"]
         == 3
     )
 
@@ -538,22 +386,6 @@ def test_a_polygon_without_area_draws_nothing(flat):
     box = np.array([[0, 0], [500, 0], [500, 400], [0, 400]])
     for drawn in ([box], []):
         cell = CellContent("T", {(1, 0): [*drawn, np.array(flat)]})
-        report = foreign.check(MaskContent("GDSII", 1.0, {"T": cell}), Rules())
-        assert report.ok
-        assert report.minimum_feature_nm == (400 if drawn else math.inf)
-
-
-@pytest.mark.parametrize("size", [0, 1_700_000])
-def test_a_file_is_taken_apart_to_what_the_help_says(tmp_path, size):
-    """So many million shapes, and so many more for each byte of the file: a promise to
-    who sets no limit of his own.
-    """
-    (tmp_path / "m.oas").write_bytes(bytes(size))
-    said = " ".join(checking.Options.__doc__.split())
-    millions, each = map(
-        int,
-        re.search(
-            r"(\d+) million, and (\d+) more for each byte of the file", said
-        ).groups(),
-    )
-    assert foreign.most_of(tmp_path / "m.oas") == 1_000_000 * millions + each * size
+        report = check_library(MaskContent("GDSII", 1.0, {"T": cell}), Rules())
+        assert report.ok == bool(drawn)  # nothing checked is not passed
+        assert report.minimum_width_nm == (400 if drawn else math.inf)

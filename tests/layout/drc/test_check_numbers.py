@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from layout.drc import check_plan
+from layout.drc.report import Violation
 from layout.mask.plan import Lattice, MaskPlan, PillarClass
 from layout.process import Rules
-from layout.rules import check as drc
-from layout.rules.report import Violation
 
 UNIT_NM = 0.5
 LOOSE = Rules(minimum_feature_nm=1, minimum_gap_nm=1, maximum_density=1)
@@ -46,26 +46,26 @@ def test_a_gap_is_told_in_nanometres_with_the_box_of_both():
     side.
     """
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=70, minimum_feature_nm=50)
-    found = drc.check(plan_of(A, B), rules)
-    assert [v for v in found.violations if v.rule == "gap"] == [
-        Violation("gap", (-790, 840, -300, 960), 55.0, 70, "A to B in L")
+    found = check_plan(plan_of(A, B), rules)
+    assert [v for v in found.violations if v.rule == "space"] == [
+        Violation("space", (-790, 840, -300, 960), 55.0, 70, "A to B in L")
     ]
-    assert [v for v in found.violations if v.rule == "feature"] == [
-        Violation("feature", (-500, 860, -300, 940), 40.0, 50, "B")
+    assert [v for v in found.violations if v.rule == "width"] == [
+        Violation("width", (-500, 860, -300, 940), 40.0, 50, "B")
     ]
-    assert (found.counts["gap"], found.counts["feature"], found.pillars) == (1, 1, 2)
-    assert (found.minimum_gap_nm, found.minimum_feature_nm) == (55.0, 40.0)
+    assert (found.counts["space"], found.counts["width"], found.shapes) == (1, 1, 2)
+    assert (found.minimum_space_nm, found.minimum_width_nm) == (55.0, 40.0)
 
 
 def test_a_gap_from_row_to_row_and_an_overlap():
     """500 - 60 - 40 units downwards; 300 - 90 - 260 across."""
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=201)
-    found = drc.check(plan_of(A, B, classes=((1, 0), (2, 0))), rules)
+    found = check_plan(plan_of(A, B, classes=((1, 0), (2, 0))), rules)
     assert found.violations == [
-        Violation("gap", (-800, 360, -600, 960), 200.0, 201, "B to A in L")
+        Violation("space", (-800, 360, -600, 960), 200.0, 201, "B to A in L")
     ]
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=8)
-    found = drc.check(plan_of(A, rectangle("C", 260, 30)), rules)
+    found = check_plan(plan_of(A, rectangle("C", 260, 30)), rules)
     assert found.violations == [
         Violation("overlap", (-790, 840, -140, 960), 0.0, 8, "A to C in L")
     ]
@@ -73,7 +73,7 @@ def test_a_gap_from_row_to_row_and_an_overlap():
 
 def test_no_gap_is_told_where_it_is_the_rule():
     rules = dataclasses.replace(LOOSE, minimum_gap_nm=55, minimum_feature_nm=40)
-    assert drc.check(plan_of(A, B), rules).ok
+    assert check_plan(plan_of(A, B), rules).ok
 
 
 @pytest.mark.parametrize(
@@ -81,13 +81,13 @@ def test_no_gap_is_told_where_it_is_the_rule():
 )
 def test_lattices_off_the_grid_are_told_at_their_first_pillar(off):
     place = {"pitch": 300, "down": 500, "x0": -700, "y0": 900} | off
-    found = drc.check(plan_of(A, B, grid=10, **place), LOOSE)
+    found = check_plan(plan_of(A, B, grid=10, **place), LOOSE)
     x, y = place["x0"], place["y0"]
     assert found.violations == [Violation("off-grid", (x, y, x, y), 0.0, 10.0, "L")]
 
 
 def test_shapes_off_the_grid_are_told_about_their_middle():
-    found = drc.check(plan_of(A, rectangle("B", 100, 45), grid=10), LOOSE)
+    found = check_plan(plan_of(A, rectangle("B", 100, 45), grid=10), LOOSE)
     assert found.violations == [
         Violation("off-grid", (-100, -45, 100, 45), 0.0, 10.0, "B")
     ]
@@ -102,7 +102,7 @@ def test_dense_windows_step_by_half_their_size_both_ways():
     plan = plan_of(rectangle("C", 160, 100), classes=classes, pitch=400, down=300)
     share = 20 * 27 * 320 * 200 / (16_000 * 16_200)
     rules = dataclasses.replace(LOOSE, maximum_density=0.9 * share, density_window_um=8)
-    found = drc.check(plan, rules)
+    found = check_plan(plan, rules)
     boxes = {
         (
             -700 + 8000 * j,
@@ -118,7 +118,7 @@ def test_dense_windows_step_by_half_their_size_both_ways():
         ("density", share, 0.9 * share, "L")
     }
     assert (found.maximum_density, found.counts["density"]) == (share, 4)
-    assert drc.check(plan, dataclasses.replace(rules, maximum_density=share)).ok
+    assert check_plan(plan, dataclasses.replace(rules, maximum_density=share)).ok
 
 
 def test_windows_reach_over_the_last_rows_and_columns():
@@ -131,7 +131,7 @@ def test_windows_reach_over_the_last_rows_and_columns():
         pitch=400,
         down=300,
     )
-    found = drc.check(
+    found = check_plan(
         plan, dataclasses.replace(LOOSE, maximum_density=1e-6, density_window_um=8)
     )
     one = 320 * 200 / (16_000 * 16_200)
@@ -143,7 +143,7 @@ def test_windows_reach_over_the_last_rows_and_columns():
             (7300, -7200): 15 * one,
         }
     )
-    small = drc.check(
+    small = check_plan(
         plan, dataclasses.replace(LOOSE, maximum_density=0.1, density_window_um=0.1)
     )
     assert small.maximum_density == pytest.approx(
@@ -157,21 +157,21 @@ def test_feet_are_told_once_a_lattice():
     """
     rules = dataclasses.replace(LOOSE, minimum_foot_gap_nm=75)
     feet = np.array([61.0, 95.0])
-    found = drc.check(plan_of(A, B), rules, foot_nm=feet)
+    found = check_plan(plan_of(A, B), rules, foot_nm=feet)
     box = (-700, -100, -100, 900)
     assert found.violations == [
         Violation("foot", box, 72.0, 75, "feet of etched pillars in L")
     ]
     assert found.counts["foot"] == 1
-    assert drc.check(
+    assert check_plan(
         plan_of(A, B), dataclasses.replace(rules, minimum_foot_gap_nm=72), foot_nm=feet
     ).ok
     bars = (rectangle("A", 90, 60, round=False), rectangle("B", 100, 40, round=False))
-    found = drc.check(plan_of(*bars), rules, foot_nm=np.array([94.0, 107.0]))
+    found = check_plan(plan_of(*bars), rules, foot_nm=np.array([94.0, 107.0]))
     assert found.violations == [
         Violation("foot", box, 55.0 - 7.0, 75, "feet of etched pillars in L")
     ]
-    assert drc.check(
+    assert check_plan(
         plan_of(*bars),
         dataclasses.replace(rules, minimum_foot_gap_nm=48),
         foot_nm=np.array([94, 107]),

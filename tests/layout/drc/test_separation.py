@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from layout.rules.apart import apart
+from layout.drc.geometry import contour_edges, measure_separation
 from layout.shapes import convex
 
 ANGLE = np.array([(0, 0), (900, 0), (900, 100), (120, 100), (120, 700), (0, 700)])
@@ -25,11 +25,10 @@ RING = np.array(
 TURNED = np.array([(-30, -40), (70, 0), (0, 60)])
 
 
-def distance(first, second, dx, dy, most=math.inf):
-    one, two = np.array([0]), np.array([1])
-    return apart(
-        [first, second], (one, two), (np.array([dx]), np.array([dy])), most=most
-    )[0]
+def distance(first, second, dx, dy):
+    edges = [contour_edges([first]), contour_edges([second])]
+    zero = np.zeros(1, np.int64)
+    return measure_separation(edges, zero, zero + 1, np.array([[dx, dy]]))[0][0]
 
 
 @pytest.mark.parametrize(
@@ -65,12 +64,6 @@ def test_what_lies_in_a_hole_that_is_cut_in_is_apart_and_what_lies_on_the_ring_i
     assert distance(big, RING, 3, -7) == 0
 
 
-def test_no_farther_than_asked_for():
-    assert distance(ANGLE, TURNED, 300, 500, most=150.0) == 150
-    assert distance(ANGLE, TURNED, 300, 500, most=70.0) == 70
-    assert distance(ANGLE, TURNED, 300, 500, most=151.0) == 150
-
-
 def test_convex_ones_are_as_far_apart_as_lines_between_them_say():
     rng = np.random.default_rng(8)
     shapes = []
@@ -82,7 +75,8 @@ def test_convex_ones_are_as_far_apart_as_lines_between_them_say():
         shapes.append(shape[(shape != np.roll(shape, 1, axis=0)).any(1)])
     one, two = rng.integers(0, 12, (2, 600))
     dx, dy = rng.integers(-210, 210, (2, 600))
-    found = apart(shapes, (one, two), (dx, dy))
+    edges = [contour_edges([shape]) for shape in shapes]
+    found, _ = measure_separation(edges, one, two, np.column_stack([dx, dy]))
     some = zip(one.tolist(), two.tolist(), dx.tolist(), dy.tolist(), strict=True)
     wanted = [max(convex.gap(shapes[a], shapes[b], x, y), 0.0) for a, b, x, y in some]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)

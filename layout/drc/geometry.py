@@ -1,0 +1,425 @@
+"""Plane sweep, and distances between edges, polygons and boxes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from layout.process import compiled
+from layout.shapes import convex
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+# degrees; a sharper wedge is narrower than the limit as far from its tip
+SHARPEST_CORNER = 60.0
+MAX_PAIRS = 40_000_000  # of close boxes, 16 bytes each
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A width, notch or sharp corner of one polygon.
+
+    rule: "width", "notch" or "corner".
+    value: distance in database units, or angle in degrees.
+    box: left, bottom, right, top of the two edges (of the contour where it is convex).
+    """
+
+    rule: str
+    value: float
+    box: tuple[int, int, int, int]
+
+
+def clean_contour(points: Array) -> Array:
+    """Remove repeated and collinear corners, and dents shallower than one database unit.
+
+    Such dents come from rounding a convex outline to the grid; its convex hull replaces it.
+
+    Args:
+        points: (n, 2) corners in whole database units.
+
+    Returns:
+        (m, 2) corners, m < 3 for a contour without area.
+    """
+    points = np.asarray(points, np.int64)
+    points = points[(points != np.roll(points, 1, axis=0)).any(1)]
+    before = points - np.roll(points, 1, axis=0)
+    after = np.roll(before, -1, axis=0)
+    points = points[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]]
+    if len(points) < 4 or is_convex(points) or is_convex(points[::-1]):
+        return points
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    depth = -(points @ hull.equations[:, :2].T + hull.equations[:, 2]).max(1)
+    if depth.max() >= 1:
+        return points
+    x, y = points.T
+    is_hole = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() < 0
+    return points[hull.vertices[::-1] if is_hole else hull.vertices]
+
+
+def is_convex(points: Array) -> bool:
+    """Whether a contour without collinear corners turns left at every corner, once around."""
+    before = points - np.roll(points, 1, axis=0)
+    after = np.roll(before, -1, axis=0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    if cross.min(initial=1) <= 0:
+        return False
+    direction = np.unwrap(np.arctan2(after[:, 1], after[:, 0]))
+    return bool(direction[-1] - direction[0] < 2 * np.pi)
+
+
+def contour_edges(contours: Sequence[Array]) -> Array:
+    """(m, 4) edges x1, y1, x2, y2 of closed contours; the interior is on the left of each edge."""
+    edges = [np.hstack([points, np.roll(points, -1, axis=0)]) for points in contours]
+    return np.concatenate([np.empty((0, 4)), *edges])
+
+
+def contour_box(contours: Sequence[Array]) -> tuple[int, int, int, int]:
+    """Left, bottom, right, top of some contours."""
+    points = np.concatenate(contours)
+    left, bottom = points.min(0).tolist()
+    right, top = points.max(0).tolist()
+    return left, bottom, right, top
+
+
+def measure_polygon(
+    contours: Sequence[Array], width_limit: float, space_limit: float
+) -> list[Measurement]:
+    """Widths, notches and sharp corners of one polygon in the projection metric.
+
+    A convex contour is as wide as its two nearest parallel supporting lines (calipers); a convex hole is a notch of
+    that size. All other edges are measured in pairs (see :func:`projected_distance`); edges that share a corner are
+    no pair (see :func:`find_sharp_corners`). Pairs hidden behind a nearer edge are counted, too.
+
+    Args:
+        contours: cleaned contours, outer ones counter-clockwise, holes clockwise.
+        width_limit: pairs facing through the interior are reported below it, database units.
+        space_limit: pairs facing through the exterior are reported below it, database units.
+
+    Returns:
+        Pairs below the limits, and the caliper width of each convex contour whatever it is.
+    """
+    found = find_sharp_corners(contours)
+    convex_contour = []
+    for number, points in enumerate(contours):
+        outer, hole = is_convex(points), is_convex(points[::-1])
+        convex_contour.append(np.full(len(points), number if outer or hole else -1))
+        if outer:
+            found.append(
+                Measurement("width", convex.width(points), contour_box([points]))
+            )
+        elif hole:
+            found.append(
+                Measurement("notch", convex.width(points[::-1]), contour_box([points]))
+            )
+    if len(contours) == 1 and convex_contour[0][0] == 0:
+        return found
+    edges = contour_edges(contours)
+    pairs = find_close_boxes(edge_boxes(edges), max(width_limit, space_limit))
+    of = np.concatenate(convex_contour)
+    pairs = pairs[(of[pairs[:, 0]] != of[pairs[:, 1]]) | (of[pairs[:, 0]] < 0)]
+    for rule, side, limit in (
+        ("width", 1.0, width_limit),
+        ("notch", -1.0, space_limit),
+    ):
+        distances = projected_distances(edges, pairs, side)
+        for (i, j), value in zip(
+            pairs[distances < limit - 1e-9],
+            distances[distances < limit - 1e-9],
+            strict=True,
+        ):
+            corners = edges[[i, j]].reshape(4, 2).astype(np.int64)
+            found.append(Measurement(rule, float(value), contour_box([corners])))
+    return found
+
+
+def find_sharp_corners(contours: Sequence[Array]) -> list[Measurement]:
+    """Corners of less than 60 degrees, of the interior or the exterior.
+
+    Args:
+        contours: cleaned contours in database units.
+
+    Accuracy:
+        A corner counts where rounding its ends to whole units cannot explain it.
+    """
+    found = []
+    for points in contours:
+        before = np.roll(points, 1, axis=0) - points
+        after = np.roll(points, -1, axis=0) - points
+        lengths = np.hypot(*before.T), np.hypot(*after.T)
+        scalar, product = (before * after).sum(1), lengths[0] * lengths[1]
+        rounding = 2**0.5 * (lengths[0] + lengths[1])
+        for n in np.flatnonzero(scalar > product / 2 + rounding).tolist():
+            angle = np.degrees(np.arccos(min(scalar[n] / product[n], 1.0)))
+            x, y = points[n].tolist()
+            box = (x - 1, y - 1, x + 1, y + 1)
+            found.append(Measurement("corner", float(angle), box))
+    return found
+
+
+def edge_boxes(edges: Array) -> Array:
+    """(m, 4) left, bottom, right, top of edges (m, 4)."""
+    start, end = edges[:, :2], edges[:, 2:]
+    return np.hstack([np.minimum(start, end), np.maximum(start, end)])
+
+
+def find_close_boxes(boxes: Array, distance: float) -> Array:
+    """Plane sweep along x in horizontal bands: pairs of boxes closer than a distance along x and along y.
+
+    Args:
+        boxes: (n, 4) left, bottom, right, top.
+        distance: database units.
+
+    Returns:
+        (m, 2) indices, each pair once.
+
+    Raises:
+        MaskFileError: more than 40 million pairs.
+    """
+    if len(boxes) < 2:
+        return np.empty((0, 2), np.int64)
+    order = np.argsort(boxes[:, 0], kind="stable")
+    boxes = np.asarray(boxes[order], float)
+    bottom = boxes[:, 1].min()
+    extent = boxes[:, 3].max() + distance - bottom
+    height = max(np.median(boxes[:, 3] - boxes[:, 1]) + distance, extent / len(boxes))
+    first = ((boxes[:, 1] - bottom) // height).astype(np.int64)
+    last = ((boxes[:, 3] + distance - bottom) // height).astype(np.int64)
+    start, member = _fill_bands(first, last)
+    pairs = np.empty((len(boxes), 2), np.int64)
+    count = _sweep_bands(boxes, first, start, member, distance, pairs)
+    if count > MAX_PAIRS:
+        raise MaskFileError(
+            f"{count:,} pairs of shapes closer than {distance:g} units, at most "
+            f"{MAX_PAIRS:,} are measured; do shapes lie on each other?"
+        )
+    if count > len(pairs):
+        pairs = np.empty((count, 2), np.int64)
+        _sweep_bands(boxes, first, start, member, distance, pairs)
+    return order[pairs[:count]]
+
+
+@compiled
+def _fill_bands(first: Array, last: Array) -> tuple[Array, Array]:
+    """Offsets of the bands, and the boxes of each band in the given order."""
+    start = np.zeros(last.max() + 2, np.int64)
+    for n in range(len(first)):
+        for band in range(first[n], last[n] + 1):
+            start[band + 1] += 1
+    start = np.cumsum(start)
+    member = np.empty(start[-1], np.int64)
+    place = start.copy()
+    for n in range(len(first)):
+        for band in range(first[n], last[n] + 1):
+            member[place[band]] = n
+            place[band] += 1
+    return start, member
+
+
+@compiled
+def _sweep_bands(
+    boxes: Array,
+    first: Array,
+    start: Array,
+    member: Array,
+    distance: float,
+    pairs: Array,
+) -> int:
+    """Count the close pairs, and store as many as ``pairs`` holds; a pair belongs to its lowest common band."""
+    count = 0
+    for band in range(len(start) - 1):
+        for k in range(start[band], start[band + 1]):
+            i = member[k]
+            right = boxes[i, 2] + distance
+            for other in range(k + 1, start[band + 1]):
+                j = member[other]
+                if boxes[j, 0] >= right:
+                    break
+                if max(first[i], first[j]) != band:
+                    continue
+                if (
+                    boxes[j, 1] - boxes[i, 3] >= distance
+                    or boxes[i, 1] - boxes[j, 3] >= distance
+                ):
+                    continue
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return count
+
+
+def measure_separation(
+    polygons: Sequence[Array], first: Array, second: Array, offset: Array
+) -> tuple[Array, Array]:
+    """Distances between pairs of polygons, edge to edge.
+
+    Args:
+        polygons: edges (m, 4) of each distinct polygon.
+        first: (n,) polygon of each pair.
+        second: (n,) the other polygon of each pair.
+        offset: (n, 2) displacement of the second polygon of each pair.
+
+    Returns:
+        (n,) Euclidean distance, 0 where the polygons touch, overlap or contain each other; and (n,) distance in the
+        projection metric, inf where no edges face each other.
+
+    Accuracy:
+        Intersections are exact for extents below 2^26 database units; distances are rounded as float64.
+    """
+    start = np.cumsum([0, *(len(edges) for edges in polygons)])
+    edges = np.concatenate([np.empty((0, 4)), *polygons]).astype(float)
+    euclidean, projected = np.empty(len(first)), np.empty(len(first))
+    _measure_separation(
+        edges, start, first, second, offset.astype(float), euclidean, projected
+    )
+    return euclidean, projected
+
+
+@compiled
+def _measure_separation(
+    edges: Array,
+    start: Array,
+    first: Array,
+    second: Array,
+    offset: Array,
+    euclidean: Array,
+    projected: Array,
+) -> None:
+    for n in range(len(first)):
+        one = edges[start[first[n]] : start[first[n] + 1]]
+        two = edges[start[second[n]] : start[second[n] + 1]].copy()
+        two[:, 0::2] += offset[n, 0]
+        two[:, 1::2] += offset[n, 1]
+        nearest, facing = np.inf, np.inf
+        for i in range(len(one)):
+            for j in range(len(two)):
+                square = edge_distance_squared(one[i], two[j])
+                nearest = min(nearest, square)
+                if square < facing * facing:
+                    facing = min(facing, projected_distance(one[i], two[j], -1.0))
+        if nearest > 0 and (
+            encloses(one, two[0, 0], two[0, 1]) or encloses(two, one[0, 0], one[0, 1])
+        ):
+            nearest = 0.0
+        euclidean[n] = nearest**0.5
+        projected[n] = facing
+
+
+@compiled
+def edge_distance_squared(e: Array, f: Array) -> float:
+    """Squared distance of two edges, 0 where they cross or touch."""
+    if _on_both_sides(e, f) and _on_both_sides(f, e) and _overlap_on_axes(e, f):
+        return 0.0
+    ends = min(
+        _point_distance_squared(e[0], e[1], f), _point_distance_squared(e[2], e[3], f)
+    )
+    return min(
+        ends,
+        _point_distance_squared(f[0], f[1], e),
+        _point_distance_squared(f[2], f[3], e),
+    )
+
+
+@compiled
+def _on_both_sides(e: Array, f: Array) -> bool:
+    """Whether the ends of f lie on different sides of the line through e, or on it."""
+    dx, dy = e[2] - e[0], e[3] - e[1]
+    start = dx * (f[1] - e[1]) - dy * (f[0] - e[0])
+    end = dx * (f[3] - e[1]) - dy * (f[2] - e[0])
+    return (start <= 0 <= end) or (end <= 0 <= start)
+
+
+@compiled
+def _overlap_on_axes(e: Array, f: Array) -> bool:
+    """Whether the bounding boxes of two edges meet."""
+    for axis in range(2):
+        if max(e[axis], e[axis + 2]) < min(f[axis], f[axis + 2]):
+            return False
+        if max(f[axis], f[axis + 2]) < min(e[axis], e[axis + 2]):
+            return False
+    return True
+
+
+@compiled
+def _point_distance_squared(x: float, y: float, e: Array) -> float:
+    """Squared distance of a point from an edge."""
+    dx, dy = e[2] - e[0], e[3] - e[1]
+    along = ((x - e[0]) * dx + (y - e[1]) * dy) / (dx * dx + dy * dy)
+    along = min(max(along, 0.0), 1.0)
+    return (x - e[0] - along * dx) ** 2 + (y - e[1] - along * dy) ** 2
+
+
+@compiled
+def encloses(edges: Array, x: float, y: float) -> bool:
+    """Whether the winding number of a polygon about a point off its edges is not 0."""
+    winding = 0
+    for n in range(len(edges)):
+        x1, y1, x2, y2 = edges[n]
+        if (y1 <= y) != (y2 <= y):
+            side = (x2 - x1) * (y - y1) - (x - x1) * (y2 - y1)
+            if (side > 0) == (y2 > y1):
+                winding += 1 if y2 > y1 else -1
+    return winding != 0
+
+
+@compiled
+def projected_distances(edges: Array, pairs: Array, side: float) -> Array:
+    """(n,) :func:`projected_distance` of pairs (n, 2) of edges."""
+    out = np.empty(len(pairs))
+    for n in range(len(pairs)):
+        out[n] = projected_distance(edges[pairs[n, 0]], edges[pairs[n, 1]], side)
+    return out
+
+
+@compiled
+def projected_distance(e: Array, f: Array, side: float) -> float:
+    """Distance of two edges in the projection metric, as KLayout measures it.
+
+    Edges face each other where their directions are opposed by more than 90 degrees, each lies on the wanted side of
+    the other, and the perpendicular projection of each onto the other has a length.
+
+    Args:
+        e: x1, y1, x2, y2 with the interior on the left.
+        f: the other edge.
+        side: 1 through the interior (width), -1 through the exterior (space, notch).
+
+    Returns:
+        The larger of the two perpendicular distances; inf where the edges do not face, or share a corner.
+    """
+    if (e[2] - e[0]) * (f[2] - f[0]) + (e[3] - e[1]) * (f[3] - f[1]) >= 0:
+        return np.inf
+    if (e[0] == f[2] and e[1] == f[3]) or (e[2] == f[0] and e[3] == f[1]):
+        return np.inf
+    return max(_perpendicular_distance(e, f, side), _perpendicular_distance(f, e, side))
+
+
+@compiled
+def _perpendicular_distance(e: Array, f: Array, side: float) -> float:
+    """Least distance from the line of e of that part of f which projects onto e and lies on one side of it."""
+    length = ((e[2] - e[0]) ** 2 + (e[3] - e[1]) ** 2) ** 0.5
+    ux, uy = (e[2] - e[0]) / length, (e[3] - e[1]) / length
+    along_start = (f[0] - e[0]) * ux + (f[1] - e[1]) * uy
+    along_end = (f[2] - e[0]) * ux + (f[3] - e[1]) * uy
+    away_start = side * (ux * (f[1] - e[1]) - uy * (f[0] - e[0]))
+    away_end = side * (ux * (f[3] - e[1]) - uy * (f[2] - e[0]))
+    if max(away_start, away_end) <= 0:
+        return np.inf
+    low, high = _clip_to_range(along_start, along_end, 0.0, length)
+    low_side, high_side = _clip_to_range(away_start, away_end, 0.0, np.inf)
+    low, high = max(low, low_side), min(high, high_side)
+    if (high - low) * abs(along_end - along_start) <= 1e-9:
+        return np.inf
+    slope = away_end - away_start
+    return max(min(away_start + low * slope, away_start + high * slope), 0.0)
+
+
+@compiled
+def _clip_to_range(
+    start: float, end: float, low: float, high: float
+) -> tuple[float, float]:
+    """Part (0 to 1) of the way from start to end that lies between two values; empty where the second is smaller."""
+    if start == end:
+        return (0.0, 1.0) if low <= start <= high else (1.0, 0.0)
+    first, last = (low - start) / (end - start), (high - start) / (end - start)
+    return max(min(first, last), 0.0), min(max(first, last), 1.0)

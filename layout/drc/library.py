@@ -1,0 +1,645 @@
+"""Hierarchical design-rule check of any mask file: width, space, notch and grid."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from typing import Literal
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from layout.drc.geometry import (
+    Measurement,
+    clean_contour,
+    contour_box,
+    contour_edges,
+    find_close_boxes,
+    is_convex,
+    measure_polygon,
+    measure_separation,
+)
+from layout.drc.report import MAX_LISTED, DrcReport, LayerCoverage, Violation
+from layout.files import QUARTERS, MaskContent, Turn, flat, hierarchy
+from layout.process import LayerNumber, Rules
+from layout.shapes import region
+from metalens.ground.arrays import Array
+from metalens.ground.errors import MaskFileError
+
+# database units: two corners, each rounded by up to half a unit along x and along y
+GRID_TOLERANCE = 2**0.5
+UPRIGHT = QUARTERS[0]
+Metric = Literal["projection", "euclidean"]
+LayerChoice = tuple[int, int | None]  # layer number; datatype, None: all together
+
+
+def check_library(
+    content: MaskContent,
+    rules: Rules,
+    *,
+    layers: Collection[LayerChoice] | None = None,
+    negative: Collection[int] = (),
+    metric: Metric = "projection",
+    max_elements: int = 50_000_000,
+) -> DrcReport:
+    """Check width, space, notch, corners and grid of all shapes below the top cells.
+
+    The datatypes of a layer number are checked together; shapes that touch are merged.
+    A cell reference whose bounding box keeps the minimum space from everything around
+    it is checked once for all its instances; any other is expanded where it stands.
+
+    Args:
+        content: cells of a GDSII or OASIS file.
+        rules: limits; minimum feature is the width, minimum gap the space and the
+            notch.
+        layers: (layer, datatype) to check, each by itself; datatype None: all datatypes
+            together. None: all layer numbers of the file.
+        negative: layer numbers exposed together whose clear areas remain: their spaces
+            are checked as widths.
+        metric: of the space between shapes; widths and notches are always measured in
+            projection.
+        max_elements: shapes and references expanded at once, some 100 bytes of memory
+            each.
+
+    Returns:
+        Report with the coverage of every layer.
+
+    Raises:
+        MaskFileError: no top cell, a reference without its cell, a recursive hierarchy,
+            too many elements.
+
+    Accuracy:
+        Exact for shapes in whole database units, references at multiples of 90 degrees.
+        Shapes rotated otherwise are rounded to database units: their widths are
+        measured before rotation, their spaces have ``GRID_TOLERANCE``.
+    """
+    if not content.tops:
+        raise MaskFileError(
+            "the mask has no top cell: its cells reference each other in a circle"
+        )
+    report = DrcReport.empty(content.unit_nm, rules)
+    shapes = hierarchy.shapes(content)
+    if layers is None:
+        layers = [(number, None) for number in sorted({number for number, _ in shapes})]
+    groups = [_select_layers(choice, shapes) for choice in layers]
+    checked = set().union(*groups)
+    report.layers = {
+        layer: LayerCoverage(layer in checked, shapes[layer])
+        for layer in sorted(shapes)
+    }
+    clear = {layer for layer in checked if layer[0] in negative}
+    for group in groups:
+        if group - clear:
+            _LayerCheck(content, group - clear, rules, metric, max_elements).run(report)
+    if clear:
+        limits = replace(
+            rules,
+            minimum_gap_nm=rules.minimum_feature_nm,
+            minimum_feature_nm=rules.minimum_gap_nm,
+        )
+        names = {"width": "space", "space": "width", "notch": "width"}
+        _LayerCheck(content, clear, limits, metric, max_elements, names).run(report)
+    return report
+
+
+def _select_layers(
+    choice: LayerChoice, shapes: Collection[LayerNumber]
+) -> set[LayerNumber]:
+    """Layers of a file that a choice names."""
+    number, datatype = choice
+    return {
+        layer for layer in shapes if layer[0] == number and datatype in (None, layer[1])
+    }
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Element:
+    """A distinct polygon, or a distinct cell reference of one orientation.
+
+    cell: that holds the polygon, or is referenced.
+    turn: orientation of the reference, None for a polygon.
+    contours: of the merged polygon; the bounding box of a reference.
+    designed: contours before a rotation that rounds them.
+    rounded: whether the corners were rounded.
+    """
+
+    cell: str
+    turn: Turn | None
+    contours: tuple[Array, ...]
+    designed: tuple[Array, ...]
+    rounded: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Placements:
+    """(n,) number of the element, and (n, 2) place of each."""
+
+    element: Array
+    xy: Array
+
+    def select(self, members: Array) -> "_Placements":
+        return _Placements(self.element[members], self.xy[members])
+
+
+def _concatenate(parts: Sequence[_Placements]) -> _Placements:
+    element = np.concatenate([np.empty(0, np.int64), *(part.element for part in parts)])
+    return _Placements(
+        element,
+        np.concatenate([np.empty((0, 2), np.int64), *(part.xy for part in parts)]),
+    )
+
+
+class _LayerCheck:
+    """Check of some layer numbers taken as one layer."""
+
+    def __init__(
+        self,
+        content: MaskContent,
+        layers: set[LayerNumber],
+        rules: Rules,
+        metric: Metric,
+        max_elements: int,
+        rule_names: dict[str, str] | None = None,
+    ) -> None:
+        self.content, self.layers, self.rules = content, layers, rules
+        self.metric, self.max_elements = metric, max_elements
+        self.rule_names = rule_names or {}
+        self.layer = min(layers)[0]
+        self.width = rules.minimum_feature_nm / content.unit_nm
+        self.space = rules.minimum_gap_nm / content.unit_nm
+        self.elements: list[_Element] = []
+        self.numbers: dict[tuple[str, object, Turn], int] = {}
+        self.polygons = cache(self._polygons)
+        self.references = cache(self._references)
+        self.bounding_box = cache(self._bounding_box)
+        self.check_cell = cache(self._check_cell)
+        self.measure_element = cache(self._measure_element)
+
+    def run(self, report: DrcReport) -> None:
+        """Enter the findings of all top cells together into a report."""
+        tops = [
+            self._reference(name, UPRIGHT)
+            for name in self.content.tops
+            if self.bounding_box(name) is not None
+        ]
+        place = _Placements(
+            np.array(tops, np.int32), np.zeros((len(tops), 2), np.int64)
+        )
+        found = self._check_placements(self.content.tops[0], place)
+        report.shapes += found.shapes
+        for rule in ("width", "space"):
+            report.measured(
+                self.rule_names.get(rule, rule), getattr(found, f"minimum_{rule}_nm")
+            )
+        self._copy_findings(
+            found, report, UPRIGHT, np.zeros((1, 2), np.int64), names=self.rule_names
+        )
+        self._check_grid(report)
+
+    # hierarchy
+
+    def _polygons(self, cell: str) -> list[tuple[Array, Array]]:
+        """Distinct polygons of a cell from their lowest corners, and (n, 2) places of each."""
+        held = self.content.cells[cell]
+        drawn = [
+            p
+            for layer, some in held.polygons.items()
+            if layer in self.layers
+            for p in some
+        ]
+        circles = [
+            c
+            for layer, some in held.circles.items()
+            if layer in self.layers
+            for c in some
+        ]
+        drawn += [flat.circle(*c) for c in circles]
+        by_corners: dict[int, list[Array]] = {}
+        for points in drawn:
+            by_corners.setdefault(len(points), []).append(points)
+        found = []
+        for same in by_corners.values():
+            points = np.stack(same).astype(np.int64)
+            places = points.min(1)
+            outlines = (points - places[:, None]).reshape(len(points), -1)
+            distinct, which = np.unique(outlines, axis=0, return_inverse=True)
+            order = np.argsort(which.ravel(), kind="stable")
+            starts = np.cumsum(np.bincount(which.ravel()))[:-1]
+            for outline, members in zip(distinct, np.split(order, starts), strict=True):
+                found.append((outline.reshape(-1, 2), places[members]))
+        return found
+
+    def _references(self, cell: str) -> list[tuple[str, Turn, Array]]:
+        """(referenced cell, orientation, (n, 2) places) of all references that draw on the layer."""
+        placed = self.content.cells[cell].kept()
+        key = placed.child.astype(np.int64) * len(placed.turns) + placed.turn
+        found = []
+        for kind, members in _group(key):
+            child, turn = divmod(kind, len(placed.turns))
+            name = placed.children[child]
+            if self.bounding_box(name) is not None:
+                found.append(
+                    (
+                        name,
+                        placed.turns[turn],
+                        np.column_stack([placed.x[members], placed.y[members]]),
+                    )
+                )
+        return found
+
+    def _bounding_box(self, cell: str) -> tuple[int, int, int, int] | None:
+        """Box around all that a cell draws on the layer; None for nothing."""
+        corners = []
+        for outline, places in self.polygons(cell):
+            corners += [outline.min(0) + places.min(0), outline.max(0) + places.max(0)]
+        for child, turn, places in self.references(cell):
+            left, bottom, right, top = _turned_box(self.bounding_box(child), turn)
+            low, high = np.array([left, bottom]), np.array([right, top])
+            corners += [places.min(0) + low, places.max(0) + high]
+        return contour_box([np.array(corners)]) if corners else None
+
+    def _contents(self, cell: str, turn: Turn) -> _Placements:
+        """Polygons and references directly in a cell of some orientation."""
+        parts = []
+        for outline, places in self.polygons(cell):
+            number = self._polygon(cell, outline, turn)
+            if number >= 0:
+                parts.append((number, places))
+        parts += [
+            (self._reference(child, turn.after(own)), places)
+            for child, own, places in self.references(cell)
+        ]
+        placed = []
+        for number, places in parts:
+            xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
+            placed.append(
+                _Placements(np.full(len(xy), number, np.int64), xy.astype(np.int64))
+            )
+        return _concatenate(placed)
+
+    def _polygon(self, cell: str, outline: Array, turn: Turn) -> int:
+        """Number of the element of a polygon; -1 where it has no area."""
+        key = (cell, outline.tobytes(), turn)
+        if key not in self.numbers:
+            contours = _merged_contours([np.column_stack(turn.apply(*outline.T))])
+            designed = (
+                contours
+                if turn.quarter or turn.scale != 1
+                else _merged_contours([outline])
+            )
+            element = _Element(cell, None, contours, designed, not turn.quarter)
+            self.numbers[key] = self._add_element(element) if contours else -1
+        return self.numbers[key]
+
+    def _reference(self, cell: str, turn: Turn) -> int:
+        """Number of the element of a cell reference."""
+        key = (cell, None, turn)
+        if key not in self.numbers:
+            left, bottom, right, top = _turned_box(self.bounding_box(cell), turn)
+            box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+            self.numbers[key] = self._add_element(
+                _Element(cell, turn, (box,), (), False)
+            )
+        return self.numbers[key]
+
+    def _add_element(self, element: _Element) -> int:
+        self.elements.append(element)
+        return len(self.elements) - 1
+
+    def _expand(self, placed: _Placements) -> _Placements:
+        """References replaced by what their cells hold."""
+        parts = []
+        total = 0
+        for number, members in _group(placed.element):
+            element = self.elements[number]
+            contents = self._contents(element.cell, element.turn)
+            places = placed.xy[members]
+            total += len(places) * len(contents.element)
+            if total > self.max_elements:
+                raise MaskFileError(
+                    f"instances of cell {element.cell!r} are closer than the minimum "
+                    "space to other shapes; expanding them takes more than "
+                    f"{self.max_elements:,} elements (metalens check --max-shapes)"
+                )
+            xy = (places[:, None] + contents.xy).reshape(-1, 2)
+            parts.append(_Placements(np.tile(contents.element, len(places)), xy))
+        return _concatenate(parts)
+
+    # sweep
+
+    def _check_cell(self, cell: str) -> DrcReport:
+        """Findings of one instance of a cell, in its own coordinates."""
+        return self._check_placements(cell, self._contents(cell, UPRIGHT))
+
+    def _check_placements(self, cell: str, placed: _Placements) -> DrcReport:
+        """Findings of elements; references that stay isolated count as their cells."""
+        report = DrcReport.empty(self.content.unit_nm, self.rules)
+        isolated = []
+        while True:
+            pairs, distance, _ = self._close_pairs(placed)
+            close = np.zeros(len(placed.element), bool)
+            close[pairs[distance < max(self.space, 1.0)]] = True
+            turns = [element.turn for element in self.elements]
+            reference = np.array([turn is not None for turn in turns], bool)[
+                placed.element
+            ]
+            scaled = np.array(
+                [turn is not None and turn.scale != 1 for turn in turns], bool
+            )[placed.element]
+            expanded = reference & (close | scaled)
+            isolated.append(placed.select(~close & ~expanded))
+            if not expanded.any():
+                break
+            placed = _concatenate(
+                [
+                    placed.select(close & ~reference),
+                    self._expand(placed.select(expanded)),
+                ]
+            )
+        self._check_isolated(_concatenate(isolated), report)
+        self._check_close(cell, placed.select(close), report)
+        return report
+
+    def _close_pairs(self, placed: _Placements) -> tuple[Array, Array, Array]:
+        """(n, 2) pairs with boxes closer than the minimum space; their Euclidean and projected distances."""
+        used, element = np.unique(placed.element, return_inverse=True)
+        elements = [self.elements[number] for number in used.tolist()]
+        boxes = [contour_box(element.contours) for element in elements]
+        boxes = np.array(boxes, np.int64).reshape(-1, 4)
+        boxes = boxes[element] + np.hstack([placed.xy, placed.xy])
+        pairs = find_close_boxes(boxes, max(self.space, 1.0))
+        first, second = element[pairs].T
+        offset = placed.xy[pairs[:, 1]].astype(np.int64) - placed.xy[pairs[:, 0]]
+        _, example, which = _distinct_rows(np.column_stack([first, second, offset]))
+        edges = [contour_edges(element.contours) for element in elements]
+        euclidean, projected = measure_separation(
+            edges, first[example], second[example], offset[example]
+        )
+        return pairs, euclidean[which], projected[which]
+
+    def _check_isolated(self, placed: _Placements, report: DrcReport) -> None:
+        """Widths and notches of isolated polygons, and the findings of isolated references."""
+        for number, members in _group(placed.element):
+            element, places = self.elements[number], placed.xy[members]
+            if element.turn is None:
+                report.shapes += len(members)
+                self._check_polygon(number, places, report)
+                continue
+            found = self.check_cell(element.cell)
+            report.shapes += found.shapes * len(members)
+            report.measured("width", found.minimum_width_nm)
+            report.measured("space", found.minimum_space_nm)
+            self._copy_findings(found, report, element.turn, places)
+
+    def _copy_findings(
+        self,
+        found: DrcReport,
+        report: DrcReport,
+        turn: Turn,
+        places: Array,
+        names: dict[str, str] | None = None,
+    ) -> None:
+        """Count the findings of a cell for all its instances; list those of the first."""
+        names = names or {}
+        for (rule, layer, cell), tally in found.tallies.items():
+            rule = names.get(rule, rule)
+            report.add(
+                rule,
+                tally.count * len(places),
+                layer=layer,
+                cell=cell,
+                worst=tally.worst,
+            )
+        copies = f"; in each of {len(places):,} instances" if len(places) > 1 else ""
+        shown: dict[str, list[Violation]] = {}
+        for violation in found.violations:
+            shown.setdefault(names.get(violation.rule, violation.rule), []).append(
+                violation
+            )
+        for rule, violations in shown.items():
+            report.list_violations(
+                rule, _instance_violations(rule, violations, turn, places, copies)
+            )
+
+    def _measure_element(self, number: int) -> list[Measurement]:
+        return measure_polygon(self.elements[number].designed, self.width, self.space)
+
+    def _check_polygon(self, number: int, places: Array, report: DrcReport) -> None:
+        """Widths and notches of one polygon at (n, 2) places."""
+        element, unit = self.elements[number], self.content.unit_nm
+        tolerance = (
+            GRID_TOLERANCE * unit
+            if element.rounded and element.designed is element.contours
+            else 0.0
+        )
+        for found in self.measure_element(number):
+            limit = report.limits[found.rule]
+            value = found.value * report.scale(found.rule)
+            if found.rule == "width" or value < limit - tolerance - 1e-9:
+                report.measured(found.rule, value)
+            if value >= limit - tolerance - 1e-9:
+                continue
+            box = np.array(
+                contour_box(element.contours) if element.rounded else found.box
+            )
+            boxes = (
+                tuple((box + np.array([x, y, x, y])).tolist())
+                for x, y in places.tolist()
+            )
+            shown = (
+                Violation(found.rule, box, value, limit, element.cell) for box in boxes
+            )
+            report.add(
+                found.rule,
+                len(places),
+                layer=self.layer,
+                cell=element.cell,
+                worst=value,
+                examples=shown,
+            )
+
+    def _check_close(self, cell: str, placed: _Placements, report: DrcReport) -> None:
+        """Merge polygons that touch; then widths and notches of each, and the space of each close pair."""
+        report.shapes += len(placed.element)
+        pairs, distance, projected = self._close_pairs(placed)
+        if (distance == 0).any():
+            placed = self._merge_touching(cell, placed, pairs[distance == 0])
+            pairs, distance, projected = self._close_pairs(placed)
+        for number, members in _group(placed.element):
+            self._check_polygon(number, placed.xy[members], report)
+        unit, limit = self.content.unit_nm, report.limits["space"]
+        rounded = np.array([element.rounded for element in self.elements], bool)[
+            placed.element
+        ]
+        tolerance = GRID_TOLERANCE * unit * rounded[pairs].any(1)
+        value = unit * (distance if self.metric == "euclidean" else projected)
+        bad = (value < limit - tolerance - 1e-9) & (distance > 0)
+        worst = float(value[bad].min(initial=np.inf))
+        report.measured("space", worst)
+        shown = self._space_violations(placed, pairs[bad], value[bad], limit)
+        report.add(
+            "space",
+            int(bad.sum()),
+            layer=self.layer,
+            cell=cell,
+            worst=worst,
+            examples=shown,
+        )
+
+    def _space_violations(
+        self, placed: _Placements, pairs: Array, values: Array, limit: float
+    ) -> Iterator[Violation]:
+        """Boxes around pairs of polygons."""
+        for pair, value in zip(pairs, values.tolist(), strict=True):
+            elements = [
+                self.elements[number] for number in placed.element[pair].tolist()
+            ]
+            moved = [
+                e.contours[0] + xy
+                for e, xy in zip(elements, placed.xy[pair], strict=True)
+            ]
+            text = f"{elements[0].cell} to {elements[1].cell}, layer {self.layer}"
+            yield Violation("space", contour_box(moved), value, limit, text)
+
+    def _merge_touching(
+        self, cell: str, placed: _Placements, pairs: Array
+    ) -> _Placements:
+        """Replace polygons that touch by their union."""
+        count = len(placed.element)
+        graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (count, count))
+        label = connected_components(graph, directed=False)[1]
+        single = np.bincount(label)[label] == 1
+        order = np.argsort(label, kind="stable")
+        order = order[~single[order]]
+        merged = []
+        for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+            elements = [
+                self.elements[number] for number in placed.element[members].tolist()
+            ]
+            moved = [
+                c + xy
+                for e, xy in zip(elements, placed.xy[members], strict=True)
+                for c in e.contours
+            ]
+            contours = _merged_contours(moved)
+            rounded = any(element.rounded for element in elements)
+            merged.append(
+                self._add_element(_Element(cell, None, contours, contours, rounded))
+            )
+        union = _Placements(
+            np.array(merged, np.int64), np.zeros((len(merged), 2), np.int64)
+        )
+        return _concatenate([placed.select(single), union])
+
+    # grid
+
+    def _check_grid(self, report: DrcReport) -> None:
+        """Polygons with corners off the grid, counted for each cell by the positions of its instances on the grid."""
+        step = self.rules.grid_nm / self.content.unit_nm
+        if step == 1:
+            return
+        instances: dict[str, dict[tuple[Turn, float, float], list[int]]] = {
+            name: {} for name in self.content.cells
+        }
+        for name in self.content.tops:
+            instances[name][UPRIGHT, 0.0, 0.0] = [1, 0, 0]
+        for name in hierarchy.ordered(self.content):
+            for (turn, *phase), (times, x, y) in instances[name].items():
+                for child, own, places in self.references(name):
+                    xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
+                    phases = np.round(np.mod(xy + phase, step), 6) % step
+                    distinct, example, which = _distinct_rows(phases)
+                    for row, first, count in zip(
+                        distinct, xy[example], np.bincount(which), strict=True
+                    ):
+                        key = (turn.after(own), *row.tolist())
+                        entry = instances[child].setdefault(
+                            key, [0, x + int(first[0]), y + int(first[1])]
+                        )
+                        entry[0] += times * int(count)
+                self._check_grid_of_cell(
+                    name, turn, (step, *phase), (times, x, y), report
+                )
+
+    def _check_grid_of_cell(
+        self,
+        cell: str,
+        turn: Turn,
+        grid: tuple[float, float, float],
+        instances: tuple[int, int, int],
+        report: DrcReport,
+    ) -> None:
+        """Polygons off the grid (step, x, y) in one of several alike instances (number, x and y of the first)."""
+        step, *phase = grid
+        times, x, y = instances
+        limit = float(self.rules.grid_nm)
+        for outline, places in self.polygons(cell):
+            corners = np.column_stack(turn.apply(*outline.T)) + phase
+            xy = np.column_stack(turn.apply(*places.T.astype(np.int64)))
+            residue = np.mod(xy[:, None] + corners, step)
+            off = (np.minimum(residue, step - residue) > 1e-6).any((1, 2))
+            box = np.array(
+                contour_box([np.column_stack(turn.apply(*outline.T)).astype(np.int64)])
+            )
+            boxes = (
+                tuple((box + (u + x, v + y) * 2).tolist()) for u, v in xy[off].tolist()
+            )
+            shown = (Violation("off-grid", found, 0.0, limit, cell) for found in boxes)
+            report.add(
+                "off-grid",
+                times * int(off.sum()),
+                layer=self.layer,
+                cell=cell,
+                worst=0.0,
+                examples=shown,
+            )
+
+
+def _group(numbers: Array) -> Iterator[tuple[int, Array]]:
+    """Each distinct number, and the indices where it stands."""
+    order = np.argsort(numbers, kind="stable")
+    distinct, starts = np.unique(numbers[order], return_index=True)
+    if len(distinct):
+        parts = np.split(order, starts[1:])
+        yield from zip(distinct.tolist(), parts, strict=True)
+
+
+def _merged_contours(polygons: Sequence[Array]) -> tuple[Array, ...]:
+    """Cleaned contours of the union: outer ones counter-clockwise, holes clockwise."""
+    if len(polygons) == 1:
+        points = clean_contour(polygons[0])
+        for one in (points, points[::-1]):
+            if len(one) > 2 and is_convex(one):
+                return (one,)
+    cleaned = (clean_contour(contour) for contour in region.union(polygons))
+    return tuple(contour for contour in cleaned if len(contour) > 2)
+
+
+def _instance_violations(
+    rule: str, violations: list[Violation], turn: Turn, places: Array, text: str
+) -> Iterator[Violation]:
+    """Violations of a cell where its instances draw them."""
+    for (x, y), violation in product(places[:MAX_LISTED].tolist(), violations):
+        left, bottom, right, top = _turned_box(violation.box, turn)
+        box = (left + x, bottom + y, right + x, top + y)
+        yield replace(violation, rule=rule, box=box, text=violation.text + text)
+
+
+def _turned_box(
+    box: tuple[int, int, int, int] | None, turn: Turn
+) -> tuple[int, int, int, int]:
+    """Box around a box in some orientation."""
+    left, bottom, right, top = box
+    corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    return contour_box([np.column_stack(turn.apply(*corners.T))])
+
+
+def _distinct_rows(rows: Array) -> tuple[Array, Array, Array]:
+    """Distinct rows, an index of each, and (n,) which of them each row is."""
+    which = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        values, rank = np.unique(column, return_inverse=True)
+        which = np.unique(which * len(values) + rank, return_inverse=True)[1]
+    _, example = np.unique(which, return_index=True)
+    return rows[example], example, which
