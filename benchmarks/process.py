@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import Row, fastest
+from layout import solids
 from layout.dose import correct as dose
 from layout.mask import cells, fields
 from layout.process.process import Etch, Exposure, Process
-from layout.solid import verbs as solid
 from layout.study import focus, stitching, tolerance, tolerant
 from layout.study.sensitivity import Sensitivities
 from metalens.cell.record import Cell
@@ -228,30 +228,19 @@ def _focus_error() -> tuple[float, float]:
 
 
 def _solid_rows() -> list[Row]:
-    hundred = solid.tile(lens(), PROCESS, side_um=126.0)
-    ten = solid.tile(lens(), PROCESS, side_um=39.6)
-    cones = (
-        np.pi
-        / 12
-        * hundred.height_um
-        * (hundred.foot_um**2 + hundred.foot_um * hundred.top_um + hundred.top_um**2)
-    )
+    hundred = solids.cut_tile(lens(), PROCESS, side_um=126.0)
+    ten = solids.cut_tile(lens(), PROCESS, side_um=39.6)
+    areas = [
+        (a.foot.area_um2, a.top.area_um2, math.sqrt(a.foot.area_um2 * a.top.area_um2))
+        for a in hundred.sections
+    ]
+    cones = hundred.height_um / 3 * np.array(areas).sum(1)
     want = float(cones[hundred.kind].sum())
     with tempfile.TemporaryDirectory() as folder:
-        stl, step, threemf, gltf = (
-            Path(folder) / f"tile.{end}" for end in ("stl", "step", "3mf", "glb")
-        )
+        stl, step = (Path(folder) / f"tile.{end}" for end in ("stl", "step"))
         times = [
-            fastest(lambda: solid.write_stl(stl, hundred)),
-            fastest(lambda: solid.write_step(step, ten), repeats=1),
-            fastest(lambda: solid.write_3mf(threemf, hundred), repeats=1),
-            fastest(lambda: solid.write_gltf(gltf, ten), repeats=1),
-            fastest(
-                lambda: solid.write_module(
-                    Path(folder) / "module.step", solid.Module()
-                ),
-                repeats=1,
-            ),
+            fastest(lambda: solids.write_stl(stl, hundred)),
+            fastest(lambda: solids.write_step(step, ten), repeats=1),
         ]
         corners = (
             np.frombuffer(stl.read_bytes()[84:], "V50")
@@ -261,10 +250,7 @@ def _solid_rows() -> list[Row]:
         )
         a, b, c = corners.view("<f4").reshape(-1, 3, 3).astype(float).transpose(1, 0, 2)
         error = abs(float((a * np.cross(b, c)).sum()) / 6 / want - 1)
-        sizes = {
-            path.suffix: os.path.getsize(path) / 1e6
-            for path in (stl, step, threemf, gltf)
-        }
+        sizes = {path.suffix: os.path.getsize(path) / 1e6 for path in (stl, step)}
     count = f"{len(hundred.kind)} tapered pillars"
     met = [
         "met" if t <= g else "missed" for t, g in zip(times[:2], (2, 5), strict=True)
@@ -286,20 +272,5 @@ def _solid_rows() -> list[Row]:
             blank,
             "none: places are tested on re-import",
             goal=f"<= 5 s: {met[1]}",
-        ),
-        Row(count, f"3MF, {sizes['.3mf']:.1f} MB", times[2], blank, "none"),
-        Row(
-            f"{len(ten.kind)} instances",
-            f"glTF, {sizes['.glb']:.1f} MB",
-            times[3],
-            blank,
-            "none",
-        ),
-        Row(
-            "module",
-            "STEP with clearances",
-            times[4],
-            blank,
-            "none: sizes are tested on re-import",
         ),
     ]

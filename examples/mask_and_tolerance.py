@@ -18,9 +18,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Image, display
 from scipy.signal import resample
 
+from layout import solids
 from layout.dose import correct as dose
 from layout.drc import check_plan
 from layout.files import verify
@@ -28,7 +28,6 @@ from layout.mask import build, fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import process
-from layout.solid import verbs as solid
 from layout.study import sensitivity, stitching, tolerance, tolerant
 from metalens import design, library
 from metalens.design.profiles import Focus
@@ -226,19 +225,13 @@ for allowed in (0.1, 0.2, 0.3):
     )
 
 # %% [markdown]
-# ## The module around it
+# ## Solids
 #
-# Filter, die, mount, sensor and flex as the paper stacks them, 3.5 mm in all, written as STEP with labels, colours and clearances
-# checked; and a tile of the pillars themselves.
+# A tile of the pillars as they are fabricated, for CAD.
 
 # %%
-clearances = solid.write_module(folder / "module.step", solid.Module())
-gaps = [c for c in clearances if 0 < c.distance_mm < 0.3 - 1e-9]
-for c in gaps:
-    print(f"{c.first} to {c.second}: {1e3 * c.distance_mm:.2f} µm")
-tile = solid.tile(lens, rules, side_um=6.0)
-solid.write_step(folder / "tile.step", tile)
+tile = solids.cut_tile(lens, rules, side_um=6.0)
+solids.write_step(folder / "tile.step", tile)
 print(
     f"{len(tile.kind)} pillars in {(folder / 'tile.step').stat().st_size / 1e3:.0f} kB of STEP"
 )
-display(Image(solid.picture(solid.Module()), width=360))

@@ -143,7 +143,7 @@ def read(
     start = mapped(path)[:64].tobytes()
     other = reading.foreign(path) or _text_format(start)
     if other:
-        raise MaskFileError(f"{path}: {other}; need GDSII or OASIS")
+        raise MaskFileError(f"{path}: {other}, need GDSII or OASIS")
     is_oasis = start.startswith(oasis_bytes.MAGIC)
     reader = oasis_read.read if is_oasis else gdsii_read.read
     return reader(

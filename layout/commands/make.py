@@ -160,25 +160,25 @@ def _write_masks(job: Job, target: Path) -> None:
 
 
 def _write_solids(job: Job, target: Path) -> None:
-    from layout.solid import files as solid_files
+    """STL and STEP of the pillars in the window."""
+    from layout import solids
 
-    options, made = job.options, []
-    if options.stl:
-        with job.stages("write STL"):
-            made += solid_files.write_stl(
-                job.source, job.process, target, options.window
-            )
-    if options.step:
-        with job.stages("write STEP"):
-            made += solid_files.write_step(
-                job.source, job.process, target, options.window
-            )
-    job.written |= {path.name: path.stat().st_size for path in made}
-    with job.stages("read back solids"):
-        found = solid_files.differences(job.source, job.process, target, options.window)
-    job.compared |= {
-        name: verify.Comparison(count, wrong) for name, (count, wrong) in found.items()
-    }
+    options, window = job.options, job.options.window
+    tile = solids.cut_tile(
+        job.source,
+        job.process,
+        side_um=window.size_um,
+        centre_um=(window.x_um, window.y_um),
+    )
+    for is_wanted, form, write in (
+        (options.stl, "STL", solids.write_stl),
+        (options.step, "STEP", solids.write_step),
+    ):
+        if is_wanted:
+            path = target / f"pillars.{form.lower()}"
+            with job.stages(f"write {form}"):
+                write(path, tile)
+            job.written[path.name] = path.stat().st_size
 
 
 def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:

@@ -1,0 +1,455 @@
+"""Solids of the pillars in a window of a lens: STL and STEP."""
+
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from layout.process import Process
+from layout.shapes import region
+from metalens.cell import Cell
+from metalens.cell.shapes import Conic, Loop, Outline
+from metalens.ground import store
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError, ProcessError
+from metalens.ground.units import nm
+from metalens.lens import Lens
+from metalens.pillars.axes import sized
+
+# pillars that viewers and CAD kernels still open
+MAX_PILLARS = {"STEP": 10_000, "STL": 500_000}
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+_PILLARS_PER_BLOCK = 4096
+_UPRIGHT_UM = 1e-6
+_STEP_TIME = "2000-01-01T00:00:00"  # in the header: the same bytes for the same solids
+_SUBSTRATE_COLOUR, _PILLAR_COLOUR = (0.75, 0.85, 0.95), (0.25, 0.35, 0.75)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Section:
+    """Outlines of a class of pillars at foot and top, with corresponding parts.
+
+    name: label, by its size at half height in nm; "105_9" is 105.9.
+    """
+
+    name: str
+    foot: Outline
+    top: Outline
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether foot and top are equal, to 1e-6 um."""
+        return abs(self.foot.radius_um - self.top.radius_um) < _UPRIGHT_UM
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tile:
+    """Pillars of a part of a lens as fabricated: axis at (0, 0), feet on z = 0.
+
+    sections: of each class.
+    x_um, y_um: (pillars,) centres, +y up.
+    kind: (pillars,) class of each.
+    height_um: of all pillars.
+    pitch_um: of the lattice.
+    site_um2: area of the unit cell of one pillar.
+    """
+
+    sections: tuple[Section, ...]
+    x_um: Array
+    y_um: Array
+    kind: Array
+    height_um: float
+    pitch_um: float
+    site_um2: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Mesh:
+    """A closed surface.
+
+    vertices_um: (n, 3) corners.
+    triangles: (m, 3) numbers of corners, counter-clockwise from outside.
+    """
+
+    vertices_um: Array
+    triangles: Array
+
+
+def cut_tile(
+    lens: Lens,
+    process: Process,
+    *,
+    side_um: float | None = None,
+    centre_um: tuple[float, float] = (0.0, 0.0),
+) -> Tile:
+    """The pillars of a square of a lens as fabricated: bias, corner rounding, sidewalls.
+
+    Args:
+        lens: pillars that stand, of any shape.
+        process: steps of the drawn sizes, bias and sidewall angle.
+        side_um: side of the square; None: the whole lens.
+        centre_um: x and y of its centre.
+
+    Raises:
+        ProcessError: no pillar in the square, sidewalls that leave no top or make the
+            feet touch, openings of a film.
+    """
+    grid = lens.diameters
+    x, y = abs(grid.x_um - centre_um[0]), abs(grid.y_um - centre_um[1])
+    reach = np.inf if side_um is None else side_um / 2 + 1e-9
+    columns, rows = np.flatnonzero(x <= reach), np.flatnonzero(y <= reach)
+    part = np.zeros((0, 0))
+    if len(rows) and len(columns):
+        part = grid.diameter_um[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    row, column = np.nonzero(part)
+    if not len(row):
+        raise ProcessError(
+            f"no pillar within {side_um} um around {centre_um}; move or enlarge the square"
+        )
+    row, column = rows[row], columns[column]
+    if lens.cell.shape.hole:
+        raise ProcessError(
+            f"solids of {lens.cell.described}: only pillars that stand are written, "
+            "not openings of a film"
+        )
+    is_disc = grid.plain and lens.cell.shape.kind == "circle"
+    classify = _discs if is_disc else _shapes
+    sections, kind = classify(lens, process, row, column)
+    return Tile(
+        sections,
+        grid.x_um[column],
+        grid.y_um[row],
+        kind,
+        lens.cell.height_um,
+        grid.pitch_um,
+        grid.site_um2,
+    )
+
+
+def _discs(
+    lens: Lens, process: Process, row: Array, column: Array
+) -> tuple[tuple[Section, ...], Array]:
+    """Sections of round pillars at sites, and which of them each is."""
+    step, height = process.rules.diameter_step_nm, lens.cell.height_um
+    design_nm = lens.diameters.diameter_um[row, column] / nm
+    drawn = np.rint(process.written_diameter_nm(design_nm) / step).astype(np.int64)
+    sizes, kind = np.unique(drawn, return_inverse=True)
+    made_nm = process.made_diameter_nm(sizes * step)
+    top, foot = process.top_foot_nm(made_nm, height / nm)
+    pitch_nm = lens.diameters.pitch_um / nm
+    smallest, largest = min(top.min(), foot.min()), max(top.max(), foot.max())
+    if smallest <= 0 or largest >= pitch_nm:
+        raise ProcessError(
+            f"walls of {process.etch.sidewall_deg} degrees over {height} um make "
+            f"diameters from {smallest:.0f} to {largest:.0f} nm on a pitch of "
+            f"{pitch_nm:.0f} nm; need above 0 and below the pitch"
+        )
+    sections = tuple(
+        Section(_label(middle), _circle(low * nm), _circle(high * nm))
+        for middle, low, high in zip((top + foot) / 2, foot, top, strict=True)
+    )
+    return sections, kind
+
+
+def _circle(diameter_um: float) -> Outline:
+    return Outline((Conic(diameter_um / 2, diameter_um / 2),))
+
+
+def _label(width_nm: float, length_nm: float = 0.0, turn_deg: float = 0.0) -> str:
+    """Name of a class without points, which CAD does not take."""
+    sizes = [f"{s:.1f}".removesuffix(".0") for s in (width_nm, length_nm) if s]
+    turn = f"_{turn_deg:g}deg" if turn_deg else ""
+    return f"pillar_{'x'.join(sizes)}nm{turn}".replace(".", "_")
+
+
+def _shapes(
+    lens: Lens, process: Process, row: Array, column: Array
+) -> tuple[tuple[Section, ...], Array]:
+    """Sections of pillars of any shape and rotation at sites, and which each is."""
+    grid, step = lens.diameters, process.rules.diameter_step_nm
+
+    def drawn_steps(size_um: Array) -> Array:
+        drawn = process.bias.drawn_nm(np.asarray(size_um[row, column], float) / nm)
+        return np.rint(drawn / step).astype(np.int64) * step
+
+    keys = np.zeros((len(row), 3), np.int64)
+    keys[:, 0] = drawn_steps(grid.diameter_um)
+    if grid.length_um is not None:
+        keys[:, 1] = drawn_steps(grid.length_um)
+    if grid.angle_rad is not None:
+        angle = np.degrees(grid.angle_rad[row, column]) / process.rules.angle_step_deg
+        turns = round(360 / process.rules.angle_step_deg)
+        keys[:, 2] = np.rint(angle).astype(int) % turns
+    used, kind = np.unique(keys, axis=0, return_inverse=True)
+    sections = tuple(_section(lens.cell, process, *key) for key in used.tolist())
+    return sections, kind.reshape(-1)
+
+
+def _section(
+    cell: Cell, process: Process, drawn_nm: int, length_nm: int, turn: int
+) -> Section:
+    """Section of a drawn size, length (0: set by the shape) and rotation (in steps)."""
+    bias, angle = process.bias, turn * process.rules.angle_step_deg
+    width = float(bias.made_nm(np.array(float(drawn_nm))))
+    length = float(bias.made_nm(np.array(float(length_nm)))) if length_nm else 0.0
+    shape = sized(cell, width, length) if length else cell
+    lean_um = cell.height_um * math.tan(math.radians(process.etch.sidewall_deg))
+    is_closed = True
+    try:
+        foot, middle, top = (
+            shape.outline(width * nm, grow_um=grow).turned(math.radians(angle))
+            for grow in (lean_um, 0, -lean_um)
+        )
+        is_closed = not len(foot.parts) == len(middle.parts) == len(top.parts)
+    except CellError:
+        pass
+    if not is_closed:
+        largest = max(foot, top, key=lambda outline: outline.radius_um)
+        is_closed = largest.gap_um(cell.lattice.steps_um(cell.pitch_um)) <= 0
+    if is_closed:
+        raise ProcessError(
+            f"walls of {process.etch.sidewall_deg} degrees over {cell.height_um} um "
+            "leave nothing of the top, close a hole or make the feet touch, of a "
+            f"{cell.shape.name} {width:.0f} nm wide on a pitch of "
+            f"{cell.pitch_um / nm:.0f} nm"
+        )
+    return Section(_label(width, length, angle), foot, top)
+
+
+def check_count(pillars: Tile, form: str) -> None:
+    """Refuse more pillars than a file can hold.
+
+    Args:
+        pillars: to be written.
+        form: "STEP" or "STL".
+
+    Raises:
+        ProcessError: with the side of a square that would do.
+    """
+    limit, found = MAX_PILLARS[form], len(pillars.kind)
+    if found > limit:
+        side = (math.isqrt(limit) - 2) * math.sqrt(pillars.site_um2)
+        raise ProcessError(
+            f"{found:,} pillars are too many for {form} (at most {limit:,}); take a "
+            f"square of the lens with side_um = {side:.1f} or less, or use the mask "
+            "(OASIS) for the whole lens"
+        )
+
+
+def mesh_section(section: Section, height_um: float, *, sides: int = 8) -> Mesh:
+    """Triangulated surface of a pillar; volume between sections is linear in z.
+
+    Args:
+        section: outlines at foot and top.
+        height_um: of the pillar.
+        sides: edges of each curved part, of its area.
+    """
+    contours = [
+        tuple(part.vertices(sides)[:: part.sign] for part in (low, high))
+        for low, high in zip(section.foot.parts, section.top.parts, strict=True)
+    ]
+    foot, top = (np.concatenate([pair[end] for pair in contours]) for end in (0, 1))
+    total, start, faces = len(foot), 0, []
+    for low, _ in contours:
+        here = start + np.arange(len(low))
+        after = start + (np.arange(len(low)) + 1) % len(low)
+        faces.append(np.stack([here, after, after + total], -1))
+        faces.append(np.stack([here, after + total, here + total], -1))
+        start += len(low)
+    for end, order in ((0, -1), (1, 1)):
+        filled = region.triangles([pair[end] / nm for pair in contours])
+        faces.append(filled[:, ::order] + end * total)
+    rings = [
+        np.column_stack([ring, np.full(total, z)])
+        for ring, z in ((foot, 0.0), (top, height_um))
+    ]
+    return Mesh(np.concatenate(rings), np.concatenate(faces))
+
+
+def write_stl(path: str | Path, pillars: Tile, *, sides: int = 8) -> int:
+    """Write binary STL in um, one closed surface a pillar.
+
+    Args:
+        path: of the file.
+        pillars: of a window.
+        sides: edges of a round pillar.
+
+    Returns:
+        Number of triangles.
+
+    Raises:
+        ProcessError: too many pillars. OSError: the target cannot be written.
+    """
+    check_count(pillars, "STL")
+    meshes = [
+        mesh_section(section, pillars.height_um, sides=sides)
+        for section in pillars.sections
+    ]
+    facets = np.stack([_facets(mesh) for mesh in meshes])
+    total = facets.shape[1] * len(pillars.kind)
+    head = b"tapered pillars, um, metalens-toolchain".ljust(80)
+    places = np.column_stack([pillars.x_um, pillars.y_um]).astype(np.float32)
+    with store.replacing(path) as part, open(part, "wb") as file:
+        file.write(head + struct.pack("<I", total))
+        for start in range(0, len(places), _PILLARS_PER_BLOCK):
+            block = slice(start, start + _PILLARS_PER_BLOCK)
+            placed = facets[pillars.kind[block]]
+            placed["corners"][..., :2] += places[block, None, None]
+            file.write(placed.data)
+    return total
+
+
+def _facets(mesh: Mesh) -> Array:
+    corners = mesh.vertices_um[mesh.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facets = np.zeros(len(corners), _FACET)
+    facets["normal"] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    facets["corners"] = corners
+    return facets
+
+
+def write_step(path: str | Path, pillars: Tile) -> None:
+    """Write STEP (AP214): an assembly of tapered pillars on a slab of substrate.
+
+    Each class of pillars is stored once and placed. Modelled in um, where the tolerance
+    of the kernel (1e-7) is far below a pillar, and written in mm.
+
+    Args:
+        path: of the file.
+        pillars: of a window.
+
+    Raises:
+        ProcessError: too many pillars, or the kernel cannot write. OSError: the target
+            cannot be written.
+    """
+    check_count(pillars, "STEP")
+    from build123d import Solid
+    from OCP.TDocStd import TDocStd_Document
+    from OCP.XCAFApp import XCAFApp_Application
+    from OCP.XCAFDoc import XCAFDoc_DocumentTool
+
+    document = TDocStd_Document(_text("XmlOcaf"))
+    XCAFApp_Application.GetApplication_s().NewDocument(_text("MDTV-XCAF"), document)
+    XCAFDoc_DocumentTool.SetLengthUnit_s(document, 1e-6)
+    shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
+    shapes.SetAutoNaming_s(False)
+    colours = XCAFDoc_DocumentTool.ColorTool_s(document.Main())
+    root = shapes.NewShape()
+    _set_name(root, "metalens tile")
+    x, y, margin = pillars.x_um, pillars.y_um, pillars.pitch_um
+    size = float(np.ptp(x)) + margin, float(np.ptp(y)) + margin, 1.0
+    corner = float(x.min()) - margin / 2, float(y.min()) - margin / 2, -1.0
+    slab = Solid.make_box(*size).wrapped
+    parts = [("substrate", slab, _SUBSTRATE_COLOUR, [corner])]
+    for kind, section in enumerate(pillars.sections):
+        here = pillars.kind == kind
+        places = [(*p, 0.0) for p in np.column_stack([x[here], y[here]]).tolist()]
+        body = _body(section, pillars.height_um)
+        parts.append((section.name, body, _PILLAR_COLOUR, places))
+    for part in parts:
+        _add_part(shapes, colours, root, *part)
+    shapes.UpdateAssemblies()
+    with store.replacing(path) as file:
+        if not _write_document(document, file):
+            raise ProcessError(
+                f"{path}: the CAD kernel could not write the STEP file; is the disk full?"
+            )
+
+
+def _add_part(
+    shapes: Any,
+    colours: Any,
+    root: Any,
+    label: str,
+    body: Any,
+    colour: tuple[float, float, float],
+    places: Sequence[tuple[float, float, float]],
+) -> None:
+    """Store a solid with label and colour, and place it below the root."""
+    from OCP.gp import gp_Trsf, gp_Vec
+    from OCP.Quantity import Quantity_Color, Quantity_TypeOfColor
+    from OCP.TopLoc import TopLoc_Location
+    from OCP.XCAFDoc import XCAFDoc_ColorType
+
+    stored = shapes.AddShape(body, False)
+    _set_name(stored, label)
+    shade = Quantity_Color(*colour, Quantity_TypeOfColor.Quantity_TOC_sRGB)
+    colours.SetColor(stored, shade, XCAFDoc_ColorType.XCAFDoc_ColorGen)
+    for place in places:
+        move = gp_Trsf()
+        move.SetTranslation(gp_Vec(*place))
+        shapes.AddComponent(root, stored, TopLoc_Location(move))
+
+
+def _body(section: Section, height_um: float) -> Any:
+    """Solid of a pillar: each part of its section, the holes cut out of the first."""
+    pairs = zip(section.foot.parts, section.top.parts, strict=True)
+    whole, *holes = (
+        _loft(foot, top, height_um, is_upright=section.is_upright)
+        for foot, top in pairs
+    )
+    for hole in holes:
+        whole = (whole - hole).solid()
+    return whole.wrapped
+
+
+def _loft(
+    foot: Conic | Loop, top: Conic | Loop, height_um: float, *, is_upright: bool
+) -> Any:
+    from build123d import Face, Solid
+
+    is_round = isinstance(foot, Conic) and foot.half_x_um == foot.half_y_um
+    if is_round and is_upright:
+        return Solid.make_cylinder(foot.half_x_um, height_um)
+    if is_round:
+        return Solid.make_cone(foot.half_x_um, top.half_x_um, height_um)
+    if is_upright:
+        return Solid.extrude(Face(_wire(foot, 0.0)), (0, 0, height_um))
+    return Solid.make_loft([_wire(foot, 0.0), _wire(top, height_um)], ruled=True)
+
+
+def _wire(part: Conic | Loop, z_um: float) -> Any:
+    from build123d import Location, Wire
+
+    if isinstance(part, Conic):
+        ellipse = Wire.make_ellipse(part.half_x_um, part.half_y_um)
+        turn = (0, 0, math.degrees(part.angle_rad))
+        return ellipse.moved(Location((0, 0, z_um), turn))
+    corners = [(x, y, z_um) for x, y in part.vertices(0).tolist()]
+    return Wire.make_polygon(corners, close=True)
+
+
+def _text(text: str) -> Any:
+    from OCP.TCollection import TCollection_ExtendedString
+
+    return TCollection_ExtendedString(text)
+
+
+def _set_name(label: Any, name: str) -> None:
+    from OCP.TDataStd import TDataStd_Name
+
+    TDataStd_Name.Set_s(label, _text(name))
+
+
+def _write_document(document: Any, path: Path) -> bool:
+    """Whether the kernel could write the document as STEP."""
+    from OCP.APIHeaderSection import APIHeaderSection_MakeHeader
+    from OCP.IFSelect import IFSelect_ReturnStatus
+    from OCP.Message import Message, Message_Gravity
+    from OCP.STEPCAFControl import STEPCAFControl_Writer
+    from OCP.STEPControl import STEPControl_StepModelType
+    from OCP.TCollection import TCollection_HAsciiString
+
+    for printer in Message.DefaultMessenger_s().Printers():
+        printer.SetTraceLevel(Message_Gravity.Message_Fail)  # else it prints statistics
+    writer = STEPCAFControl_Writer()
+    writer.SetNameMode(True)
+    writer.SetColorMode(True)
+    writer.Transfer(document, STEPControl_StepModelType.STEPControl_AsIs)
+    header = APIHeaderSection_MakeHeader(writer.Writer().Model())
+    header.SetTimeStamp(TCollection_HAsciiString(_STEP_TIME))
+    return bool(writer.Write(str(path)) == IFSelect_ReturnStatus.IFSelect_RetDone)
