@@ -114,7 +114,7 @@ def test_verniers_keep_the_rules_and_the_grid(grid):
         exposure=Exposure(correct=False),
     )
     plan = layout.plan(lens_map(), made)
-    assert layout.check(plan, made.rules).ok
+    assert layout.check_plan(plan, made.rules).ok
     (drawn, opened), _, _ = parts(plan, made)
     assert len(middles(opened, 0)) == 21
     assert set(np.diff(middles(opened, 0)) - np.diff(middles(drawn, 0))) == {35.0}

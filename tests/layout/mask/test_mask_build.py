@@ -139,7 +139,7 @@ def test_a_coarse_grid_holds_for_everything():
     )
     plan = layout.plan(disc_map(31), process)
     assert plan.grid == 5
-    assert layout.check(plan, process.rules).counts["off-grid"] == 0
+    assert layout.check_plan(plan, process.rules).counts["off-grid"] == 0
 
 
 BEAM = {"alpha_um": 0.012, "beta_um": 27.0, "eta": 0.65}
@@ -227,7 +227,7 @@ def test_the_die_holds_everything_within_its_street_and_apart():
         "DOSETEST",
         "WITNESS",
     }
-    assert layout.check(plan, process.rules).ok
+    assert layout.check_plan(plan, process.rules).ok
     outline = next(f for f in plan.figures if f.name == "OUTLINE").polygons[
         process.layers.outline
     ][0]

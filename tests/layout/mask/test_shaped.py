@@ -272,8 +272,8 @@ def test_the_gaps_between_turned_and_hexagonal_pillars_are_measured():
             PROCESS.rules,
             foot_nm=np.array([c.diameter_nm + 20.0 for c in plan.classes]),
         )
-        assert found.minimum_gap_nm == pytest.approx(least)
-        assert found.minimum_foot_gap_nm == pytest.approx(
+        assert found.minimum_space_nm == pytest.approx(least)
+        assert found.minimum_foot_space_nm == pytest.approx(
             least - 20, abs=1.1
         )  # round ones by circles
         assert found.shapes == len(rows)
@@ -614,17 +614,17 @@ def test_widths_and_spaces_of_hollow_shapes_are_those_that_klayout_finds(
         else (db.Region.Euclidian, 45)
     )
     for value, check in (
-        (found.minimum_feature_nm, drawn.width_check),
-        (found.minimum_gap_nm, drawn.space_check),
+        (found.minimum_width_nm, drawn.width_check),
+        (found.minimum_space_nm, drawn.space_check),
     ):
         assert check(math.floor(value), False, *how).is_empty()
         assert not check(math.floor(value) + 1, False, *how).is_empty()
     outline = made.cell.outline(0.22)
     solid, space = (1e3 * v for v in outline.spans_um)
-    assert found.minimum_feature_nm == pytest.approx(
+    assert found.minimum_width_nm == pytest.approx(
         solid, abs=1.5
     )  # corners on a grid of 1 nm
-    assert found.minimum_gap_nm <= space + 1.5
+    assert found.minimum_space_nm <= space + 1.5
 
 
 def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
@@ -637,7 +637,7 @@ def test_a_hole_or_wall_below_the_rules_is_found_in_every_pillar():
         (made.diameters.diameter_um == 0.22).sum()
     )  # walls of 60.5, holes of 99 nm; of 260: 71.5, 117
     assert found.counts["width"] == few
-    assert found.counts["space"] == few
+    assert found.counts["notch"] == few
     assert {round(v.value) for v in found.violations} == {
         60,
         98,

@@ -27,14 +27,14 @@ def test_designs_at_the_limits_are_drawn_within_the_rules(tmp_path, text):
     rules = process.load(path)
     sizes = np.random.default_rng(1).uniform(least, 400 - gap, (30, 30)) * 1e-3
     sizes[0, :3] = np.array([least, 400 - gap, 400 - gap]) * 1e-3
-    found = layout.check(
+    found = layout.check_plan(
         layout.plan(DiameterMap(sizes, 0.4), rules, furnished=False), rules.rules
     )
     assert found.ok, found.summary
     assert (
-        found.minimum_gap_nm < 90 + 10
+        found.minimum_space_nm < 90 + 10
     )  # and they give away no more than a step or two
-    assert found.minimum_feature_nm < 100 + 10
+    assert found.minimum_width_nm < 100 + 10
 
 
 def drawn_well(diameter_nm, rules, *, alone):
@@ -48,7 +48,7 @@ def drawn_well(diameter_nm, rules, *, alone):
         rules,
         furnished=False,
     )
-    return layout.check(planned, rules.rules).ok
+    return layout.check_plan(planned, rules.rules).ok
 
 
 @pytest.mark.parametrize(
