@@ -8,7 +8,7 @@ OUT    ?= demo
 # Without byte code on the disk every worker and every command that a test starts would compile all modules again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow mutants check bench peers bench-peers test-peers notebooks site clean
+.PHONY: setup demo test test-arithmetic test-arithmetic-all test-slow check bench peers bench-peers test-peers notebooks site wheel-check clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -22,8 +22,10 @@ demo: setup
 	$(BIN)/metalens demo $(OUT) --force
 
 # Threads of a worker that wait do not spin: two of them beside another worker took four times their processor time.
+# Loops are compiled once, before the workers begin.
 test: setup
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not peers'
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.warm
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m 'not slow and not peers'
 
 # The numeric tests under the arithmetic of other processors, and compiled loops as they are written; -all: the whole default suite under each of them.
 test-arithmetic: setup
@@ -31,10 +33,6 @@ test-arithmetic: setup
 
 test-arithmetic-all: setup
 	$(BIN)/python tests/arithmetic.py all
-
-# One-line mutants of the numeric code: which of them no test sees.
-mutants: setup
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.mutation --count 300
 
 test-slow: setup
 	$(BIN)/python -m pytest -m 'slow and not peers'
@@ -67,14 +65,16 @@ notebooks: setup
 site: setup
 	$(BIN)/mkdocs build --strict --quiet
 
-# The wheel, installed where nothing of this folder can be seen, runs the demo.
+# The wheel holds every file of the packages and, installed where nothing of this folder can be seen, runs the chain of a small lens.
 wheel-check: setup
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m pip wheel --quiet --no-deps -w build/wheel .
+	$(BIN)/python .ci/wheel.py build/wheel/*.whl
+	$(BIN)/python -m tests.small build/wheel/chain
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt torch numpy
 	build/wheel/venv/bin/python -m pip install --quiet -c constraints.txt build/wheel/*.whl
-	cd build/wheel && venv/bin/metalens demo demo
+	cd build/wheel && venv/bin/metalens demo demo --config chain/chain.toml
 
 clean:
 	rm -rf $(VENV) .venv-peers build *.egg-info $(OUT)

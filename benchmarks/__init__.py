@@ -8,12 +8,9 @@ come), and, where it compares with other projects, ``peer_rows() -> list[Row]`` 
 environment of their own).
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,20 +45,3 @@ def fastest(work: Callable[[], object], *, repeats: int = 3) -> float:
         work()
         best = min(best, time.perf_counter() - start)
     return best
-
-
-def kept_lines(path: Path) -> list[dict[str, Any]]:
-    """Lines of a study that goes on where it stopped: one JSON object a run; none where
-    it has not begun.
-    """
-    return (
-        [json.loads(text) for text in path.read_text("utf-8").splitlines()]
-        if path.exists()
-        else []
-    )
-
-
-def keep_line(path: Path, line: dict[str, Any]) -> None:
-    """Add a run's line, after what the run left beside it is written."""
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")

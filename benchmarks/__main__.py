@@ -21,9 +21,13 @@ from benchmarks import Row, figures
 from benchmarks._stored import compared, machine
 
 LONG = (
-    "closure", "engines", "gpu", "gpu_training", "install", "hardness", "hard_cells", "limits", "plan", "scene_referee",
-    "shaped_cells", "shaped_seen",
-)  # fmt: skip
+    "engines",
+    "gpu",
+    "hard_cells",
+    "limits",
+    "scene_referee",
+    "shaped_cells",
+)
 HEAD = (
     "case",
     "method",

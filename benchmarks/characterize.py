@@ -12,7 +12,6 @@ import torch
 
 from benchmarks import Row, fastest
 from benchmarks import _millimetre as millimetre
-from benchmarks import _phases as phases
 from benchmarks import characterize_referee as referee
 from characterize.bench import bench
 from characterize.captures import capture
@@ -155,8 +154,7 @@ def _fit() -> list[Row]:
     start = time.perf_counter()
     referee.prepared("whole")
     solved = time.perf_counter() - start
-    with phases.timed() as spent, phases.counted() as made:
-        run = referee.study("whole", 0)
+    run = referee.study("whole", 0)
     case, threads = (
         "1 mm lens, 11 depths of 32 x 32 pixels, 23 parameters, 3 starts",
         torch.get_num_threads(),
@@ -204,23 +202,7 @@ def _fit() -> list[Row]:
             threads,
             goal="0.95 to 1.05",
         ),
-        *(
-            Row(
-                case,
-                f"of the fit: {phase}",
-                wall,
-                float("nan"),
-                _work(work, made.get(phase, [0, 0])),
-                threads,
-            )
-            for phase, (wall, work) in spent.items()
-        ),
     ]
-
-
-def _work(seconds: float, made: list[int]) -> str:
-    """Of a phase, in words: its images and Jacobians are the same on any machine."""
-    return f"{seconds:.1f} s of processor time, {made[0]} images, {made[1]} Jacobians"
 
 
 def _reduced() -> list[Row]:

@@ -136,14 +136,9 @@ def measured(work: Callable[[], object], *, repeats: int = 3) -> tuple[float, fl
 
 
 def rows() -> Iterator[Row]:
-    """All rows, one by one; build and write beside gdstk and KLayout where these are
-    installed.
-    """
-    from benchmarks import _layout_fresh
-
+    """All rows, one by one."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder)
-        yield from _layout_fresh.rows(target)
         for some in (
             _file_rows,
             _streaming_rows,

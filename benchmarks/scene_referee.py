@@ -3,7 +3,6 @@ errors beside times.
 """
 
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,16 +18,12 @@ NONE = float("nan")
 
 
 def rows() -> list[Row]:
-    """Rows of this topic, and results/scene_referee.png; two to five minutes."""
+    """Rows of this topic; two to five minutes."""
     states = dataset.states_at(torch.tensor(STATES), 1)
     made = [
         pathtraced.compare(states[k : k + 1], samples=SAMPLES)
         for k in range(len(STATES))
     ]
-    for k, one in enumerate(made):
-        pathtraced.picture(
-            one, Path(__file__).parent / "results" / f"scene_referee_{k}.png"
-        )
     against = f"{SAMPLES} paths a pixel, relative L2 without their noise"
     ours = min(one.seconds[0] for one in made)
     out = [

@@ -1,9 +1,6 @@
-"""Fixtures shared by all tests, the one hypothesis profile, and the order of files that
-several workers share.
-"""
+"""Fixtures shared by all tests, the one hypothesis profile, and the seed of a run."""
 
 import os
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,38 +23,6 @@ hypothesis.settings.register_profile(
     ],
 )
 hypothesis.settings.load_profile("house")
-
-
-DEAR = (
-    Path(__file__).parent / "dear.txt"
-)  # files of about ten seconds of processor time or more, the dearest first
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Workers take files in the order of :func:`pytest_collection_modifyitems`, not by
-    their number of tests.
-    """
-    config.option.loadscopereorder = False
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of several workers: dear files first, then by number of tests, so that none has a
-    long one alone at the end.
-    """
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        tests = Path(__file__).parent
-        places = {
-            tests / line: place
-            for place, line in enumerate(DEAR.read_text(encoding="utf-8").split())
-        }
-        count = Counter(item.path for item in items)
-        items.sort(
-            key=lambda item: (
-                places.get(item.path, len(places)),
-                -count[item.path],
-                str(item.path),
-            )
-        )
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -3,6 +3,7 @@ that a user types; tests share its files through the session fixtures of conftes
 """
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,15 @@ SETTINGS = {
         resolution = [0.5, 0.5]
     """,
 }
+SETTINGS["chain.toml"] = """
+    cell = "cell.toml"
+    design = "design.toml"
+    process = "process.toml"
+    psf = "psf.toml"
+    run = "run.toml"
+    bench_truth = "truth.toml"
+    budget = false
+"""
 STAGES = {  # the file or folder that a command leaves, and its words
     "library.h5": ("library", "cell.toml"),
     "lens.h5": ("design", "design.toml"),
@@ -177,3 +187,9 @@ class Chain:
                 raise RuntimeError(f"{words}: {done.stderr or done.stdout}")
             self.said[target] = json.loads(done.stdout)
         return self.folder / target
+
+
+if __name__ == "__main__":  # the settings, for ``metalens demo --config``
+    target = Path(sys.argv[1])
+    target.mkdir(parents=True)
+    write_settings(target)

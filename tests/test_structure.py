@@ -393,12 +393,6 @@ def test_test_files_have_unique_names():
     assert len(names) == len(set(names))
 
 
-def test_dear_test_files_are_there():
-    names = (ROOT / "tests" / "dear.txt").read_text(encoding="utf-8").split()
-    assert [name for name in names if not (ROOT / "tests" / name).is_file()] == []
-    assert len(names) == len(set(names))
-
-
 def test_the_demo_and_the_examples_show_the_same_process():
     example, shipped = (
         ROOT / "examples" / "process.toml",
