@@ -1,9 +1,12 @@
 """A virtual bench: frames of a hidden as-built lens by the sum over every pillar, with
 the noise of a real sensor.
 
-Nothing of the fit's reduced model is used: pillars are changed one by one, the field
-comes from
+Independent of the fit: pillars are changed one by one, the field comes from
 :func:`metalens.psf.psf_stack`, blur and pixels are applied in real space.
+Shared with the fit, and so not tested by it: the pillars' response (proxy, slopes by
+height, index and sidewall), the paths through films and a plate of glass (``Films``,
+``extra_path``), the map of uneven light, and the colours of a spectrum. The referee of
+the tests (``tests/referees/pillar_bench.py``) shares none of these.
 """
 
 import math
@@ -320,9 +323,6 @@ def _frames(
         )
         t = t * np.exp(2j * math.pi / wavelength_um * path)
     side = camera.pixels + 2 * _MARGIN
-    middle = (
-        0.0 if camera.pixels % 2 else -camera.pixel_um / 2
-    )  # the chief ray meets pixel (n // 2, n // 2)
     stack = psf.psf_stack(
         np.angle(t),
         np.abs(t),
@@ -334,7 +334,7 @@ def _frames(
         window_um=side * camera.pixel_um,
         samples=side * FINE,
         tolerance=1e-5,
-        offset_um=(way.shift_um[0] + middle, way.shift_um[1] + middle),
+        offset_um=way.shift_um,
         layers=lens.layers,
     )
     step, out = camera.pixel_um / FINE, []
@@ -382,7 +382,7 @@ def background(truth: Truth) -> Array:
     """(y, x) electrons of the background plane."""
     x, camera = truth.vector(), truth.camera
     n = camera.pixels
-    edge = (np.arange(n) - n // 2) / (n / 2)
+    edge = (np.arange(n) - (n - 1) / 2) / (n / 2)
     plane = (
         x[PLACE["background_e"]]
         + x[PLACE["background_x_e"]] * edge

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from characterize.captures.alike import Spectra as Spectra
     from characterize.captures.alike import above_rim as above_rim
     from characterize.captures.alike import likeness as likeness
+    from characterize.captures.alike import shifted as shifted
     from characterize.captures.capture import Capture as Capture
     from characterize.captures.electrons import Frames as Frames
     from characterize.captures.electrons import Gain as Gain
@@ -35,6 +36,7 @@ __getattr__, __dir__, __all__ = attach(
         "clean": "electrons",
         "likeness": "alike",
         "merge_brackets": "electrons",
+        "shifted": "alike",
         "told": "rounding",
         "turn": "turns",
     },

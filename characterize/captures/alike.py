@@ -49,6 +49,17 @@ def likeness(a: Array, b: Array, noise: float) -> tuple[float, tuple[float, floa
     return min(float(cross.max()) / norm, 1.0), (float(shift[0]), float(shift[1]))
 
 
+def shifted(light: Array, shift: tuple[int, int]) -> Array:
+    """(..., y, x) moved by whole pixels (y, x); nothing comes in from outside."""
+    out = np.zeros_like(light)
+    rows, columns = light.shape[-2:]
+    dy, dx = shift
+    out[..., max(dy, 0) : rows + min(dy, 0), max(dx, 0) : columns + min(dx, 0)] = light[
+        ..., max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)
+    ]
+    return out
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Spectra:
     """Frames as :func:`likeness` correlates them: spectra (n, u, v) of twice the side,

@@ -19,6 +19,8 @@ _HIDES = 0.3
 # their level lies
 _ROUGH = 0.35
 _SURE = 3.0  # standard errors from which on noise is taken to grow with light
+# of a camera that nobody describes, where no two dark frames tell
+_ASSUMED_READ_NOISE_E = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,31 +333,42 @@ def _merge(frames: Frames, index: Array, exposure_s: Array) -> list[Array]:
 
 
 def _gain(capture: Capture, notes: list[str]) -> Gain:
-    stated = capture.about
+    """Gain and read noise as stated, else as measured, else assumed; notes say which.
+
+    Read noise comes from the description, else from two dark frames or more, else from
+    the photon-transfer line of the flats.
+    """
+    stated, dark = capture.about, capture.dark
+    flats = 0 if capture.flat is None else len(capture.flat)
+    measured = None
     if "gain_e" in stated:
-        notes.append(f"gain {stated['gain_e']} e/count as stated")
-        read_known = "read_noise_e" in stated
-        return Gain(
-            float(stated["gain_e"]),
-            0.0,
-            float(stated.get("read_noise_e", 2.0)),
-            read_known=read_known,
-        )
-    if capture.flat is not None and len(capture.flat) > 1:
-        gain = photon_transfer(capture.flat, capture.dark)
+        gain, sigma, known = float(stated["gain_e"]), 0.0, True
+        notes.append(f"gain {gain:g} e/count as stated")
+    elif capture.flat is not None and flats > 1:
+        measured = photon_transfer(capture.flat, dark)
+        gain, sigma, known = measured.gain_e, measured.gain_sigma_e, True
         notes.append(
-            f"gain {gain.gain_e:.3g} +- {gain.gain_sigma_e:.1g} e/count, read noise {gain.read_noise_e:.2g} e"
+            f"gain {gain:.3g} +- {sigma:.1g} e/count, measured in {flats} flat frames"
         )
-        return gain
-    notes.append(
-        "no flats, no stated gain: 1 e/count assumed, chi-square has no absolute meaning"
-    )
-    noise = (
-        _pair_variance(capture.dark)
-        if capture.dark is not None and len(capture.dark) > 1
-        else 4.0
-    )
-    return Gain(1.0, math.inf, math.sqrt(noise), known=False)
+    else:
+        gain, sigma, known = 1.0, math.inf, False
+        notes.append(
+            "no flats, no stated gain: 1 e/count assumed, chi-square has no absolute "
+            "meaning"
+        )
+    read_known = True
+    if "read_noise_e" in stated:
+        read, origin = float(stated["read_noise_e"]), "as stated"
+    elif dark is not None and len(dark) > 1:
+        read = gain * math.sqrt(max(_floor(dark) - 1 / 12, 0.0))
+        origin = f"measured in {len(dark)} dark frames"
+    elif measured is not None:
+        read, origin = measured.read_noise_e, "from the flats' photon-transfer line"
+        read_known = False
+    else:
+        read, origin, read_known = _ASSUMED_READ_NOISE_E, "assumed", False
+    notes.append(f"read noise {read:.2g} e, {origin}")
+    return Gain(gain, sigma, read, known=known, read_known=read_known)
 
 
 def _dark_level(
@@ -365,10 +378,13 @@ def _dark_level(
     frames.
     """
     if capture.dark is None and "offset" in capture.about:
-        notes.append(f"offset of {capture.about['offset']} counts subtracted as stated")
+        notes.append(f"offset {capture.about['offset']:g} counts as stated, subtracted")
         return float(capture.about["offset"]), 0.0
     if capture.dark is None:
-        notes.append("no dark frame: the offset is left to the fit's background")
+        notes.append(
+            "no dark frame and no stated offset: counts without light are left to the "
+            "fit's background and weigh as light; add dark.tif or state offset"
+        )
         return 0.0, 0.0
     level, error = (
         np.mean(capture.dark, axis=0),
@@ -379,7 +395,8 @@ def _dark_level(
         rounded = Dark.of(capture.dark)
         told, errors = rounded.level, rounded.error
     notes.append(
-        f"dark of {len(capture.dark)} frames subtracted, mean {np.mean(told):.4g} counts"
+        f"offset {np.mean(told):.4g} counts on average, measured pixel by pixel in "
+        f"{len(capture.dark)} dark frames, subtracted"
     )
     return np.asarray(told), errors
 

@@ -24,11 +24,14 @@ from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError, nearest
 
 _LENGTHS = {"um": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
-_BARE = ("depth", "z", "position")
+_BARE = ("depth", "z", "position", "exposure")
 _POSITIONS = {
-    f"{name}_{unit}": scale for name in _BARE for unit, scale in _LENGTHS.items()
+    f"{name}_{unit}": scale for name in _BARE[:3] for unit, scale in _LENGTHS.items()
 }
 _ANGLES = {"angle_deg": math.pi / 180, "angle_rad": 1.0}
+_EXPOSURES = {"exposure_s": 1.0, "exposure_ms": 1e-3, "exposure_us": 1e-6}
+# of a plan (metalens capture --protocol): in proportion, no times
+_PLANNED = "relative_exposure"
 _ANGLES_Y = ("angle_y_deg", "angle_y_rad")
 _ALIASES = {
     f"{name}_{unit}": (entry, scale)
@@ -67,7 +70,7 @@ _NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 _KNOWN = (*_NUMBERS, *_ALIASES, "voxel_um", "channel", "mosaic", "axes", "window")
 _MICRO = str.maketrans("\u00b5\u03bc", "uu")
 _MISSPELT = 0.75  # likeness from which on another name is taken for a misspelt one
-_COLUMNS = {"file", "page", "exposure_s", *_ANGLES_Y} | set(_POSITIONS) | set(_ANGLES)
+_COLUMNS = {"file", "page", *_EXPOSURES, *_ANGLES_Y, *_POSITIONS, *_ANGLES}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -117,7 +120,7 @@ def read_stage(folder: Path) -> Rows | None:
     Columns: ``file``, ``page`` (from 0; without it a stack has a row for each page in
     turn), one of depth/z/position
     with unit, nm to m (``depth_um``, ``z_nm``, ``position_mm``), ``angle_deg``,
-    ``angle_y_deg``, ``exposure_s``.
+    ``angle_y_deg``, ``exposure_s`` (or ``_ms``, ``_us``).
     JSON: a list of such objects.
 
     Raises:
@@ -290,8 +293,18 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
     for row, entries in enumerate(table, 2):
         for key in entries:
             if key in _BARE:
+                units = (
+                    "_s (or _ms, _us)"
+                    if key == "exposure"
+                    else "_um (or _nm, _mm, _cm, _m)"
+                )
                 raise CaptureError(
-                    f"{path}: column {key!r} without a unit; name it {key}_um (or _nm, _mm, _cm, _m)"
+                    f"{path}: column {key!r} without a unit; name it {key}{units}"
+                )
+            if key == _PLANNED:
+                raise CaptureError(
+                    f"{path}: {_PLANNED} is what a plan asks for, no time; write the "
+                    "exposure that each frame had as exposure_s (or _ms, _us)"
                 )
             if key not in _COLUMNS:
                 raise CaptureError(
@@ -302,12 +315,13 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
                 f"{path}, row {row}: no 'file'; name the image of every row"
             )
     head = table[0].keys()
-    for kind in (_POSITIONS, _ANGLES, _ANGLES_Y):
+    for kind in (_POSITIONS, _ANGLES, _ANGLES_Y, _EXPOSURES):
         if len(stated := [key for key in kind if key in head]) > 1:
             raise CaptureError(
                 f"{path}: columns {' and '.join(stated)} say the same; leave the one that holds"
             )
     place = next((key for key in _POSITIONS if key in head), None)
+    timed = next((key for key in _EXPOSURES if key in head), None)
     angle = [
         next((k for k in names if k in head), None) for names in (_ANGLES, _ANGLES_Y)
     ]
@@ -321,9 +335,9 @@ def _rows(table: list[dict[str, Any]], path: Path) -> Rows:
         position_um=_column(table, place, path, np.nan)
         * _POSITIONS.get(place or "", 1.0),
         angle_rad=np.stack(columns, 1),
-        exposure_s=_exposures(table, path)
-        if "exposure_s" in head
-        else np.full(len(table), np.nan),
+        exposure_s=np.full(len(table), np.nan)
+        if timed is None
+        else _exposures(table, timed, path) * _EXPOSURES[timed],
         source=str(path),
     )
 
@@ -400,12 +414,12 @@ def _pages(table: list[dict[str, Any]], path: Path) -> tuple[int, ...]:
     return tuple(int(page) for page in pages)
 
 
-def _exposures(table: list[dict[str, Any]], path: Path) -> Array:
-    times = _column(table, "exposure_s", path)
+def _exposures(table: list[dict[str, Any]], key: str, path: Path) -> Array:
+    times = _column(table, key, path)
     for row, time in enumerate(times, 2):
         if time <= 0:
             raise CaptureError(
-                f"{path}, row {row}: exposure_s is {time:g}, need above 0; leave the column out if unknown"
+                f"{path}, row {row}: {key} is {time:g}, need above 0; leave the column out if unknown"
             )
     return times
 

@@ -52,7 +52,7 @@ def _plan(options: Options, path: Path) -> int:
         "untold_sigma": dict(zip(found.names, found.untold.tolist(), strict=True))
     }
     told = [
-        f"  {z:10.5g} um  {angle:6.3g} deg  exposure {time:g}"
+        f"  {z:10.5g} um  {angle:6.3g} deg  relative exposure {time:g}"
         for z, angle, time in rows
     ]
     whole = np.hypot(found.sigma, found.untold)
@@ -86,8 +86,10 @@ def _rows(found: Plan) -> list[tuple[float, float, float]]:
 
 
 def _listed(found: Plan) -> str:
-    """The frames to take as a stage.csv."""
-    lines = ["file,depth_um,angle_deg,exposure_s"]
+    """The frames to take, as rows of a stage.csv but for the times, which the bench
+    sets in proportion to ``relative_exposure``.
+    """
+    lines = ["file,depth_um,angle_deg,relative_exposure"]
     lines += [
         f"frame_{i:03d}.tif,{z:.6g},{angle:.6g},{time:.6g}"
         for i, (z, angle, time) in enumerate(_rows(found))

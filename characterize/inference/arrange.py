@@ -16,6 +16,7 @@ from characterize.captures import (
     above_rim,
     between,
     likeness,
+    shifted,
     turn,
 )
 from characterize.inference.leastsquares import Data
@@ -306,10 +307,7 @@ def _apart(k: int, expected: Both, light: Array, noise: Array) -> float:
     """Chi-square between the nominal images, as bright as the light, and these turned
     about the chief ray.
     """
-    odd = [
-        one[:, 1 - one.shape[1] % 2 :, 1 - one.shape[2] % 2 :] for one in expected
-    ]  # pixel n // 2 is its middle
-    unlike = ((turn(odd[0], k) - odd[k % 2]) ** 2).sum((1, 2)) * _brightness(
+    unlike = ((turn(expected[0], k) - expected[k % 2]) ** 2).sum((1, 2)) * _brightness(
         light, expected[0], noise
     ) ** 2
     return float((unlike * light[0].size / np.maximum(noise, 1e-300) ** 2).sum())
@@ -395,7 +393,7 @@ def _brightness(light: Array, expected: Array, noise: Array) -> float:
 def _distance(a: Array, b: Array) -> float:
     """Squared difference of two images after the shift that makes them most alike."""
     _, (dy, dx) = likeness(a, b, 0.0)
-    return float(((a - np.roll(b, (int(dy), int(dx)), (0, 1))) ** 2).sum())
+    return float(((a - shifted(b, (int(dy), int(dx)))) ** 2).sum())
 
 
 def _plainest(

@@ -3,6 +3,7 @@ likelihood, checked, explained.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from characterize.inference.arrange import Arrangement, arrange, laid_words, rea
 from characterize.inference.asbuilt import AsBuilt, WithinModel, spread
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Solution
-from characterize.inference.missing import Lean, Looked, Unstated
+from characterize.inference.missing import Finding, Lean, Looked, Unstated
 from characterize.inference.prepare import (
     check_depths,
     check_enough,
@@ -52,8 +53,11 @@ MORE = (
     "bias_o_nm",
     "tilt_x_deg",
     "tilt_y_deg",
+    "pixel_percent",
 )
-_CAUSES = 2  # that are found in the residuals, one after the other
+_CAUSES = 4  # that are found in the residuals, one after the other
+# fall of -2 ln L by which a cause must free a parameter that ran to its bound
+_OUT_OF_BOUNDS = 10.0
 _ROUNDS, _STAYS = (
     5,
     0.1,
@@ -167,7 +171,7 @@ def _fit(
     posterior = explore.explore(task, ends)
     if looked is None or posterior.best is not looked[0]:
         looked = posterior.best, missing.look(task, posterior.best)
-    cautions += verdict.quiet(posterior.best, frames.gain, whole=frames.count_e > 0)
+    cautions += verdict.rounding(frames.gain, whole=frames.count_e > 0)
     result = _result(capture, task, posterior, cautions, frames.gain, looked[1])
     _refuse(result.problems, options, leans)
     return result
@@ -187,7 +191,10 @@ def _refuse(problems: Sequence[str], options: Options, leans: list[Lean]) -> Non
     """
     if problems and not options.insist:
         raise FitRefused(
-            "fit refused: " + "; ".join([*problems, *missing.words(leans)])
+            "fit refused: "
+            + "; ".join(
+                dict.fromkeys([*problems, *(one.words for one in missing.words(leans))])
+            )
         )
 
 
@@ -242,22 +249,36 @@ def _with_what_is_there(
         return task, ends, None
     looked = missing.look(task, ends[0])
     for _ in range(_CAUSES):
-        first = missing.to_fit(looked.leans)
-        if first is None or not ends[0].converged:
+        if not ends[0].converged:
             break
-        more = dataclasses.replace(task, free=(*task.free, *first.frees))
+        cause = _best_cause(task, ends[0], looked.leans)
+        if cause is None:
+            break
+        more = dataclasses.replace(task, free=(*task.free, *cause.frees))
         wide = search.wider(more, task.all_of(ends[0].value))
-        if wide is None or wide[1][0].merit > ends[0].merit - first.chi2 / 2:
+        if wide is None or wide[1][0].merit > ends[0].merit:
             break
-        seen = (
-            "shows in the residuals"
-            if first.chance < missing.CHANCE
-            else f"is likely there ({first.odds:.0f} to 1)"
+        fall = ends[0].merit - wide[1][0].merit
+        cautions.append(
+            f"{cause.cause} explains the frames better (chi-square falls by "
+            f"{fall:.0f}): {', '.join(cause.frees)} fitted too"
         )
-        cautions.append(f"{first.cause} {seen}: {', '.join(first.frees)} fitted too")
         task, ends = wide
         looked = missing.look(task, ends[0])
     return task, ends, (ends[0], looked)
+
+
+def _best_cause(task: Task, best: Solution, leans: list[Lean]) -> Lean | None:
+    """The cause whose parameters lower the misfit most; None where none lowers it by
+    half of what the residuals promise.
+    """
+    stuck = bool(verdict.at_bounds(task.names, best, task.prior))
+    falls: list[tuple[float, Lean]] = []
+    for cause in missing.to_fit(leans, stuck=stuck):
+        fall = best.merit - search.merit_with(task, best, cause.frees)
+        if fall > (_OUT_OF_BOUNDS if stuck else cause.chi2 / 2):
+            falls.append((fall, cause))
+    return max(falls, key=lambda pair: pair[0])[1] if falls else None
 
 
 def _spoken_of(options: Options) -> set[str]:
@@ -304,6 +325,7 @@ def _result(
     covariance = _with_gain(names, found, gain)
     unstated = looked.reckoned()
     within = _within(found, covariance, names)
+    findings = _findings(task, solution, looked)
     more, value = explore.REACH * unstated.sigma, solution.value
     return AsBuilt(
         design=model.lens,
@@ -332,11 +354,13 @@ def _result(
         degeneracies=_open(task, found, covariance, looked if gain.known else None),
         cautions=(
             *cautions,
-            *(_seen(task, solution, looked, unseen) if gain.known else ()),
+            *(one.words for one in findings),
+            *(_extrapolation(unseen) if gain.known else ()),
         ),
         problems=(
             *_problems(task, solution, gain, looked.leans),
             *verdict.held_back(names, solution, task.prior),
+            *missing.decisive(findings),
         ),
         low=value - np.hypot(value - within.low, more),
         high=value + np.hypot(within.high - value, more),
@@ -396,21 +420,27 @@ def _verdicts(
     return _psf_verdict(*errors, unseen, len(task.model.groups)), known
 
 
-def _seen(task: Task, solution: Solution, looked: Looked, unseen: float) -> list[str]:
-    """What is in the frames and in no parameter: structure of the residuals, causes,
-    frames left out.
+def _findings(task: Task, solution: Solution, looked: Looked) -> list[Finding]:
+    """What is in the frames and in no parameter: structure of the residuals, effects.
+
+    Residuals are taken over the noise that they have where more than the noise model
+    gives is left, and where no gain says how much that is.
     """
-    noise = np.sqrt(task.data.variance(solution.image))
-    shared = task.data.shared(solution.image) / noise
-    words = [
-        *verdict.structure(solution.residual_sigma, shared),
-        *missing.words(looked.leans),
+    data, r = task.data, solution.residual_sigma / math.sqrt(solution.chi2_per_dof)
+    noise = np.sqrt(data.variance(solution.image))
+    shared = data.shared(solution.image) / noise
+    structure = verdict.structure(np.where(data.saturated, 0.0, r), shared)
+    return [*structure, *missing.words(looked.leans)]
+
+
+def _extrapolation(unseen: float) -> list[str]:
+    """That frames left out are not predicted within their noise, in words."""
+    if not unseen > _LEFT_OUT:
+        return []
+    return [
+        f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do "
+        "not extrapolate"
     ]
-    if unseen > _LEFT_OUT:
-        words.append(
-            f"frames left out are predicted with chi-square {unseen:.2f} a pixel, not 1: do not extrapolate"
-        )
-    return words
 
 
 def _open(
@@ -459,6 +489,7 @@ def _problems(
 ) -> list[str]:
     problems = [
         *verdict.problems(task.names, solution, gain),
+        *verdict.too_quiet(solution, gain),
         *(missing.misplaced(leans) if gain.known else ()),
     ]
     clipped = float(task.data.saturated.mean())

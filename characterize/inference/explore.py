@@ -251,14 +251,18 @@ def _drawn(
     """
     if not walks:
         return posterior.draws(valleys)
-    rng, least = np.random.default_rng(0), modes[0].merit
+    rng = np.random.default_rng(0)
     beside = [
         k
         for k, mode in enumerate(modes)
         if not any(one.passes(mode.value) for one in walks)
     ]
     one = max(walks, key=Walk.log_mass)
-    log = [one.log_mass(), *(_log_mass(modes[k], valleys[k], least) for k in beside)]
+    one_axis = np.log(2 * np.pi) / 2  # which a walk's mass holds and evidence does not
+    log = [
+        one.log_mass(),
+        *(posterior.log_evidence(valleys[k]) + one_axis for k in beside),
+    ]
     share = np.exp(np.array(log) - max(log))
     count = rng.multinomial(posterior.DRAWS, share / share.sum())
     parts = [one.draws(int(count[0]), widened=spread, rng=rng)]
@@ -268,13 +272,6 @@ def _drawn(
         if n
     ]
     return np.asarray(rng.permutation(np.concatenate(parts)))
-
-
-def _log_mass(mode: Solution, valley: Valley, least: float) -> float:
-    """As :meth:`Walk.log_mass`, of a parabola."""
-    return float(
-        posterior.half_volume(valley) - (mode.merit - least) / 2 + np.log(2 * np.pi) / 2
-    )
 
 
 def _widened(one: Profile, best: Array, wider: Array, i: int) -> Profile:

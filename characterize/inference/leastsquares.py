@@ -141,7 +141,8 @@ class Solution:
     information: (p, p) Fisher information of the data alone.
     image, residual_sigma: (n, y, x) model, and (data - model) / sigma, 0 where masked
     or silent.
-    chi2_per_dof: of the pixels that count. merit: robust chi-square with priors, to
+    chi2_per_dof: reduced chi-square of the pixels within ``huber``, over its expectation.
+    merit: robust chi-square with priors, to
     compare starts.
     converged, reason: why it stopped.
     beyond: (p,) sigma from each value to where the parabola has its least: 0 but for
@@ -451,7 +452,7 @@ def _solution(
     counted = data.usable & ~data.saturated
     shown = state.residual * data.usable
     inlier = counted & (np.abs(state.residual) <= settings.huber)
-    dof = max(int(inlier.sum()) - len(state.x), 1)
+    dof = max(int(inlier.sum()) * _inlier_variance(settings.huber) - len(state.x), 1.0)
     chi2 = float((state.residual[inlier] ** 2).sum()) / dof
     log_noise = float(2 * np.log(state.noise[counted]).sum())
     merit = _merit(data, state.image, state.x, state.noise, prior, settings) + log_noise
@@ -468,6 +469,18 @@ def _solution(
         beyond=-covariance @ state.gradient / np.sqrt(np.diag(covariance)),
         slopes=state.jacobian,
     )
+
+
+def _inlier_variance(huber: float) -> float:
+    """Variance of a standard normal variable that is known to lie within +-huber.
+
+    1 - 2 h phi(h) / (2 Phi(h) - 1): what a pixel adds to chi-square on average where
+    residuals beyond ``huber`` are left out.
+    """
+    if not math.isfinite(huber):
+        return 1.0
+    density = math.exp(-(huber**2) / 2) / math.sqrt(2 * math.pi)
+    return 1 - 2 * huber * density / math.erf(huber / math.sqrt(2))
 
 
 def invert(matrix: Array) -> Array:

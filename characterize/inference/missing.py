@@ -19,11 +19,13 @@ and no more.
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
+from characterize.captures import shifted
 from characterize.inference import causes
 from characterize.inference.leastsquares import Solution
 from characterize.inference.search import Task
@@ -36,12 +38,31 @@ CHANCE = 1e-4
 # for a cause of plausible size from which on it is fitted: by chance in one fit of 100
 # or fewer
 ODDS = 10.0
+_TRIED = 5  # causes that are fitted in turn to see which explains most
 _SEEN = 4.0  # sigma of what the fit leaves of a cause, above which it would be found
 _SHIFTS, _NEAREST_PX, _FARTHEST_PX = 400, 3, 14  # of a ghost
 _PATCHY, _SPOT = (
     3.0,
     0.2,
 )  # sigma of chi-square from which on dark spots are looked for; their distance over the radius
+
+
+# sigma from which on something beside the parameters is no chance: the fit is not
+# trusted
+DECISIVE = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What the residuals hold beside noise, in words, and its significance in sigma."""
+
+    words: str
+    sigma: float
+
+
+def decisive(found: Sequence[Finding]) -> list[str]:
+    """Findings beyond ``DECISIVE`` sigma, in words: no fit with one passes its checks."""
+    return [one.words for one in found if one.sigma > DECISIVE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,25 +242,26 @@ def expected(task: Task) -> Unstated:
     return look(task, mode).reckoned()
 
 
-def to_fit(found: list[Lean]) -> Lean | None:
-    """The cause to fit next: what the residuals lean to beyond chance, or else what is
-    likelier there than not.
+def to_fit(found: list[Lean], *, stuck: bool = False) -> list[Lean]:
+    """Causes that free parameters describe and that may be fitted next, likeliest first.
 
-    None where no free parameters describe the first, or nothing is likely.
+    Those that the residuals lean to beyond chance; else those that are likelier there
+    than not.
+
+    Args:
+        stuck: a parameter ran to its bound, so that any cause may stand behind it.
     """
-    told = [one for one in found if one.chance < CHANCE]
-    if told:
-        return told[0] if told[0].frees else None
-    return max(
-        (one for one in found if one.frees and one.odds > ODDS),
-        key=lambda one: one.odds,
-        default=None,
-    )
+    some = [one for one in found if one.frees]
+    told = [one for one in some if one.chance < CHANCE]
+    likely = sorted((one for one in some if one.odds > ODDS), key=lambda one: -one.odds)
+    return (some if stuck else told or likely)[:_TRIED]
 
 
-def words(found: list[Lean]) -> list[str]:
-    """The cause that the residuals lean to most, with those that are as likely; nothing
-    where all is chance.
+def words(found: list[Lean]) -> list[Finding]:
+    """The cause that the residuals lean to most, with those that are as likely.
+
+    Nothing where all is chance. Its significance is that of a normal variable which is
+    as improbable.
     """
     told = [one for one in found if one.chance < CHANCE]
     if not told:
@@ -249,11 +271,16 @@ def words(found: list[Lean]) -> list[str]:
     more = f"; {', '.join(alike)} would explain much of it too" if alike else ""
     cure = "state it, free it, or mend the bench"
     if first.cause == causes.LAMP:
-        cure = "state the light of every frame, by a monitor diode, in proportion as exposure_s of stage.csv"
-    return [
-        f"residuals lean towards {first.cause}, which is not fitted (chi-square {first.chi2:.0f} with {first.degrees} "
-        f"of them){more}: intervals hold only if it is absent; {cure}"
-    ]
+        cure = (
+            "state the light of every frame, by a monitor diode, in proportion as "
+            "exposure_s of stage.csv"
+        )
+    said = (
+        f"residuals lean towards {first.cause}, which is not fitted (chi-square "
+        f"{first.chi2:.0f} with {first.degrees} degrees of freedom){more}: intervals "
+        f"hold only if it is absent; {cure}"
+    )
+    return [Finding(said, float(stats.norm.isf(max(first.chance, 1e-300) / 2)))]
 
 
 def misplaced(found: list[Lean]) -> list[str]:
@@ -419,7 +446,7 @@ def _ghost(task: Task, x: Array, image: Array, root: Array, fit: Fitted) -> Lean
     places = places[:: math.ceil(len(places) / _SHIFTS)] if places else []
     best = 0.0
     for shift in places:
-        copy = (_moved(light, shift) * root).reshape(1, -1)
+        copy = (shifted(light, shift) * root).reshape(1, -1)
         left, score = fit.left(copy)
         seen = float((copy * left).sum())
         if seen > 1e-3 * float((copy**2).sum()) and score[0] > 0:
@@ -480,14 +507,3 @@ def _spots(u: Array, v: Array, count: int) -> Array:
             for a, b in places
         ][:count]
     )
-
-
-def _moved(light: Array, shift: tuple[int, int]) -> Array:
-    """Shifted by whole pixels, nothing coming in from outside."""
-    out = np.zeros_like(light)
-    rows, columns = light.shape[1:]
-    dy, dx = shift
-    out[:, max(dy, 0) : rows + min(dy, 0), max(dx, 0) : columns + min(dx, 0)] = light[
-        :, max(-dy, 0) : rows - max(dy, 0), max(-dx, 0) : columns - max(dx, 0)
-    ]
-    return out

@@ -246,18 +246,21 @@ def draws(valleys: Sequence[Valley], count: int = DRAWS, *, seed: int = 0) -> Ar
 
 
 def shares(valleys: Sequence[Valley]) -> Array:
-    """(k,) probability of every mode by Laplace's rule: exp(-misfit / 2) times the
-    volume of its parabola.
-    """
-    half = [-v.least / 2 + half_volume(v) for v in valleys]
-    weight = np.exp(np.array(half) - max(half))
+    """(k,) probability of every mode by Laplace's rule, see :func:`log_evidence`."""
+    log = np.array([log_evidence(valley) for valley in valleys])
+    weight = np.exp(log - log.max())
     return np.asarray(weight / weight.sum())
 
 
-def half_volume(valley: Valley) -> float:
-    """Half the log determinant of a parabola's covariance."""
+def log_evidence(valley: Valley) -> float:
+    """ln of a mode's evidence over that of the best, but for a constant (Laplace).
+
+    -rise / 2 + ln det(C) / 2 with the rise of -2 ln posterior, which holds the
+    normalisation of the noise at each mode, and the covariance C of its parabola.
+    """
     unit = valley.covariance / np.outer(valley.sigma, valley.sigma)
-    return float(np.linalg.slogdet(unit)[1] / 2 + np.log(valley.sigma).sum())
+    volume = float(np.linalg.slogdet(unit)[1] / 2 + np.log(valley.sigma).sum())
+    return volume - valley.above / 2
 
 
 def secant(slopes: Array, step: Array, missed: Array) -> Array:

@@ -310,6 +310,25 @@ def wider(task: Task, begin: Array) -> tuple[Task, list[Solution]] | None:
         return None
 
 
+def merit_with(task: Task, best: Solution, frees: Sequence[str]) -> float:
+    """-2 ln posterior of a short fit with further parameters, from where the best is;
+    infinite where they lead out of the model's range.
+    """
+    more = dataclasses.replace(task, free=(*task.free, *frees), left_out=None)
+    x = task.all_of(best.value)
+    begin = with_values(x, _opened(more, x))[[PLACE[name] for name in more.names]]
+    settings = Settings(
+        iterations=12, step_tolerance=0.3, secant=True, near=1.0, finish=False
+    )
+    try:
+        found = leastsquares.fit(
+            more.problem(), more.data, begin, prior=more.prior, settings=settings
+        )
+    except FitError:
+        return math.inf
+    return found.merit
+
+
 def distinct(ends: Sequence[Solution]) -> list[Solution]:
     """Ends that are not the same, best first, within ``MODES_WITHIN`` of the best."""
     kept: list[Solution] = []
@@ -392,7 +411,7 @@ def _nearer(task: Task, value: Array) -> Solution:
 
 def _opened(task: Task, x: Array) -> dict[str, float]:
     """Sizes that have no slope at 0 start off it."""
-    off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5}
+    off = {"pinhole_um": 5.0, "bandwidth_nm": 0.5, "glass_um": 50.0}
     return {
         name: size
         for name, size in off.items()

@@ -15,7 +15,7 @@ from characterize.captures import Gain
 from characterize.inference import residual
 from characterize.inference.explore import Posterior
 from characterize.inference.leastsquares import Prior, Solution
-from characterize.inference.missing import Unstated
+from characterize.inference.missing import Finding, Unstated
 from characterize.inference.posterior import Valley
 from characterize.inference.search import WAVES_RAD, Task
 from characterize.model import ForwardModel, Known, Parameter, thinplate
@@ -42,12 +42,8 @@ def explained(solution: Solution, gain: Gain) -> bool:
     return solution.chi2_per_dof <= 1 + _allowed(solution, gain)
 
 
-def quiet(solution: Solution, gain: Gain, *, whole: bool) -> list[str]:
-    """What to say of frames with less noise than stated: chi-square as far below 1 as
-    it may not be above.
-
-    Of counts too coarse for their noise how they were fitted: in the middle of a count
-    most pixels tell nothing.
+def rounding(gain: Gain, *, whole: bool) -> list[str]:
+    """How counts too coarse for their noise were fitted, in words; empty for others.
 
     Args:
         whole: the frames are counts and no means of them: fitted as rounded.
@@ -60,11 +56,24 @@ def quiet(solution: Solution, gain: Gain, *, whole: bool) -> list[str]:
         exact = "they are fitted as rounded counts; more bits, or a higher gain of the camera, tell more"
         rough = "of merged exposures intervals within the model are too narrow; save more bits, or raise the camera's gain"
         return [said + (exact if whole else rough)]
-    if not gain.known or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
+    return []
+
+
+def too_quiet(solution: Solution, gain: Gain) -> list[str]:
+    """Whether frames have less noise than the noise model says, in words.
+
+    Chi-square may be as far below 1 as above; half of it where no gain is known.
+    Counts too coarse for their noise are not judged: in the middle of a count most
+    pixels tell nothing.
+    """
+    if gain.coarse or solution.chi2_per_dof >= 1 - _allowed(solution, gain):
         return []
     return [
-        f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, below 1: less noise than stated, so that "
-        "intervals are too wide; averaged or smoothed frames, dark frames of a longer exposure, a gain of other counts"
+        f"chi-square per degree of freedom is {solution.chi2_per_dof:.2f}, far below 1: "
+        "the frames have less noise than the noise model says, so intervals and tests do "
+        "not hold; averaged or smoothed frames, an offset that weighs as light (no dark "
+        "frame), dark frames of a longer exposure, or a gain of other counts: state "
+        "gain_e, read_noise_e and offset of these frames, or add dark.tif and flat.tif"
     ]
 
 
@@ -176,15 +185,16 @@ def colours(lens: Lens, known: Mapping[str, Known]) -> list[str]:
     ]
 
 
-def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
-    """What chi-square does not see, in words: residuals that go together from pixel to
-    pixel or from frame to frame.
+def structure(residual_sigma: Array, shared: Array | None = None) -> list[Finding]:
+    """Correlations between residuals that chi-square does not show.
 
-    Of noise, the mean product of neighbours scatters about 0 by one over the root of
-    their number. Errors of dark and
-    flat are the same in every frame: their part of the products is expected.
+    For noise, the mean product of neighbours scatters about 0 by one over the root of
+    their number. Errors of dark and flat are the same in every frame: their part of the
+    products is expected.
 
     Args:
+        residual_sigma: (n, y, x) residuals over their noise; 0 where a pixel is masked
+            or saturated.
         shared: (2, n, y, x) standard deviations of such errors over the noise, by dark
             and by flat, see
             :meth:`characterize.inference.leastsquares.Data.shared`.
@@ -192,31 +202,37 @@ def structure(residual_sigma: Array, shared: Array | None = None) -> list[str]:
     r = np.clip(residual_sigma, -6, 6)
     dark, flat = np.zeros((2, *r.shape)) if shared is None else shared * (r != 0)
     r = r / np.sqrt(1 + flat**2)
-    words = []
+    found = []
     sides = np.array(
         [_together(r[:, :, 1:], r[:, :, :-1]), _together(r[:, 1:], r[:, :-1])]
     )
     worst = int(np.argmax(sides.max(0)))
     if sides.max() > _STRUCTURE:
-        words.append(
-            f"residuals of frame {worst} go together from pixel to pixel ({sides[:, worst].max():.1f} sigma): more "
-            "is there than the parameters describe; see the residual map"
+        words = (
+            f"residuals of frame {worst} go together from pixel to pixel "
+            f"({sides.max():.1f} sigma): more is there than the parameters describe; "
+            "see the residual map"
         )
+        found.append(Finding(words, float(sides.max())))
     if len(r) > 1:
         frames = _from_frame_to_frame(
             r, dark / np.sqrt(1 + flat**2), flat / np.sqrt(1 + flat**2)
         )
         if frames > _STRUCTURE:
-            words.append(
-                f"residuals go together from frame to frame ({frames:.1f} sigma): the same is missed in each"
+            words = (
+                f"residuals go together from frame to frame ({frames:.1f} sigma): the "
+                "same is missed in each"
             )
-    levels = r.mean((1, 2)) * math.sqrt(max(r[0].size, 1))
-    if np.abs(levels).max() > _STRUCTURE + 0.5:
-        at = int(np.argmax(np.abs(levels)))
-        words.append(
-            f"frame {at} is brighter or darker than the model by {abs(levels[at]):.1f} sigma: exposure or lamp"
+            found.append(Finding(words, frames))
+    levels = r.sum((1, 2)) / np.sqrt(np.maximum((r != 0).sum((1, 2)), 1))
+    at = int(np.argmax(np.abs(levels)))
+    if abs(levels[at]) > _STRUCTURE + 0.5:
+        words = (
+            f"frame {at} is brighter or darker than the model by "
+            f"{abs(levels[at]):.1f} sigma: exposure or lamp"
         )
-    return words
+        found.append(Finding(words, float(abs(levels[at]))))
+    return found
 
 
 def _from_frame_to_frame(r: Array, dark: Array, flat: Array) -> float:

@@ -55,7 +55,7 @@ class Grid:
     margin: int = 2
     middle_um: tuple[float, float] = (0.0, 0.0)
     fill: float = 1.0
-    aside: tuple[int, int] = (0, 0)
+    aside: tuple[float, float] = (0.0, 0.0)
 
     @property
     def fine_um(self) -> float:
@@ -68,8 +68,8 @@ class Grid:
         return self.fill * self.pixel_um
 
     def axes_um(self) -> tuple[Array, Array]:
-        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel (rows
-        // 2, columns // 2).
+        """(y, x) of the fine samples from the chief ray; ``middle_um`` at pixel
+        ((rows - 1) / 2, (columns - 1) / 2).
         """
         y, x = self._centre_um()
         return self._axis(self.rows) + y, self._axis(self.columns) + x
@@ -77,7 +77,7 @@ class Grid:
     def ends_um(self) -> tuple[Array, Array]:
         """(y, x) of the first and last pixels from the chief ray."""
         ends = [
-            (np.array([0, n - 1]) - n // 2) * self.pixel_um
+            np.array([-1, 1]) * (n - 1) / 2 * self.pixel_um
             for n in (self.rows, self.columns)
         ]
         y, x = self._centre_um()
@@ -98,7 +98,7 @@ class Grid:
         """Of neighbouring rows and columns, with so many pixels at most around them."""
         some = range(self.rows)[rows], range(self.columns)[columns]
         moved = (
-            one[len(one) // 2] - n // 2
+            (one[0] + one[-1] - (n - 1)) / 2
             for one, n in zip(some, (self.rows, self.columns), strict=True)
         )
         y, x = (off + by for off, by in zip(self.aside, moved, strict=True))
@@ -108,15 +108,13 @@ class Grid:
         )
 
     def _centre_um(self) -> tuple[float, float]:
-        """(y, x) of the middle pixel from the chief ray."""
+        """(y, x) of the middle of the window from the chief ray."""
         x, y = self.middle_um
         return y + self.aside[0] * self.pixel_um, x + self.aside[1] * self.pixel_um
 
     def _axis(self, pixels: int) -> Array:
         fine = np.arange((pixels + 2 * self.margin) * self.oversample)
-        first = (
-            -(pixels // 2 + self.margin) * self.oversample - (self.oversample - 1) / 2
-        )
+        first = 0.5 - (pixels / 2 + self.margin) * self.oversample
         return (fine + first) * self.fine_um
 
     def frequencies(self) -> tuple[Array, Array]:

@@ -53,6 +53,7 @@ _WINDOW = {
     "wavelength_nm": ("wave", 1e-3),
 }  # what moves the window, um in its unit
 _WAVE_STEP_NM, _WIDER_NM = 0.01, 0.02
+_PITCH, _PITCH_STEP = PLACE["pixel_percent"], 0.3
 # off the chief ray, within which windows need no more directions than those of the
 # middle
 _NEAR_UM = 5.0
@@ -226,6 +227,13 @@ class ForwardModel:
         """
         return dataclasses.replace(self.grid, oversample=self._over)
 
+    def with_pixel_pitch(self, ratio: float) -> "ForwardModel":
+        """The same model with pixels ``ratio`` times as far apart and as wide."""
+        part, pixel_um = copy.copy(self), self.setting.pixel_um * ratio
+        part.setting = dataclasses.replace(self.setting, pixel_um=pixel_um)
+        part.grid = dataclasses.replace(self.grid, pixel_um=pixel_um)
+        return part
+
     def with_walls(self, angle_rad: float) -> "ForwardModel":
         """The same lens with side walls that lean by an angle about half height; its
         derivatives are those without.
@@ -267,6 +275,8 @@ class ForwardModel:
         """Frames, and with ``wanted`` their derivatives by those parameters
         (len(wanted), n, rows, columns).
         """
+        if x[_PITCH]:
+            return self._off_pitch(x, wanted)
         light, slopes = self._light(x, wanted)
         s, films, about = self.setting, self.films, {"centre_um": self.stage_centre_um}
         scale = (
@@ -280,6 +290,8 @@ class ForwardModel:
             return sampled + background(x, s), None
         out = np.zeros((len(wanted), *light.shape))
         plain: dict[str, Any] = {"background_e": s.glow, "log_gain": sampled}
+        if "pixel_percent" in wanted:
+            plain["pixel_percent"] = self._pitch_slope(x)
         plain |= {
             name: s.glow * edge
             for name, edge in zip(
@@ -292,6 +304,28 @@ class ForwardModel:
             if name in wanted:
                 out[list(wanted).index(name)] += rate[:, None, None] * sampled
         return sampled + background(x, s), out
+
+    def _off_pitch(
+        self, x: Array, wanted: Sequence[str] | None
+    ) -> tuple[Array, Array | None]:
+        """:meth:`images` where the pixel pitch is not the stated one."""
+        ratio = 1 + float(x[_PITCH]) / 100
+        stated = x.copy()
+        stated[_PITCH] = 0.0
+        frames, slopes = self.with_pixel_pitch(ratio).images(stated, wanted)
+        if slopes is not None and wanted is not None and "pixel_percent" in wanted:
+            slopes[list(wanted).index("pixel_percent")] /= ratio
+        return frames, slopes
+
+    def _pitch_slope(self, x: Array) -> Array:
+        """(n, rows, columns) derivative by the pixel pitch per percent: central
+        difference.
+        """
+        up, down = (
+            self.with_pixel_pitch(1 + sign * _PITCH_STEP / 100).images(x)[0]
+            for sign in (1, -1)
+        )
+        return np.asarray((up - down) / (2 * _PITCH_STEP))
 
     def _light(
         self, x: Array, wanted: Sequence[str] | None, like_nm: float | None = None
@@ -455,6 +489,7 @@ class ForwardModel:
         the wavelength per nm."""
         bias = np.tensordot([x[PLACE[name]] for name in WIDENING], group.widening, 1)
         reach = group.pillars.span.bias_um
+        inside = np.abs(bias) < reach
         bias = np.clip(bias, -reach, reach).astype(real_of(group.reduced.kind))
         weight = group.pillars.weights(bias)
         values = group.pillars.coefficients(change(x), self._lean_um)
@@ -469,7 +504,7 @@ class ForwardModel:
         by_wave = (
             group.pillars.coefficients(change(up), self._lean_um) - values
         ) / _WAVE_STEP_NM
-        rate = group.pillars.rates(bias, weight)
+        rate = group.pillars.rates(bias, weight) * inside
         return (
             pupil,
             group.reduced.combined(rate, values),

@@ -90,7 +90,9 @@ _OF_LENS = {row.name: _of(row) for row in CAUSES}
 PARAMETERS: tuple[Parameter, ...] = (
     *(_OF_LENS[name] for name in (*named(Widens), *named(Answers))),
     Parameter("wavelength_nm", "wavelength minus stated", 0.3, 0.5, -5.0, 5.0),
-    Parameter("bandwidth_nm", "standard deviation of the spectrum", 0.5, 1.0, 0.0, 8.0, free=False),
+    Parameter(
+        "bandwidth_nm", "standard deviation of the spectrum", 0.5, math.inf, 0.0, 30.0, free=False, plausible=1.0
+    ),
     Parameter("distance_um", "lens to sensor, minus design", 2.0, 100.0, -400.0, 400.0),
     Parameter("decentre_x_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
     Parameter("decentre_y_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
@@ -112,6 +114,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     _light("light_r", "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2"),
     Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False, plausible=5.0),
     Parameter("crosstalk_px", "standard deviation of pixel crosstalk and vibration", 0.1, 0.3, 0.02, 3.0, start=0.2),
+    Parameter("pixel_percent", "true pixel pitch over the stated one, less 1", 0.3, 1.0, -8.0, 8.0, free=False),
     Parameter("log_gain", "logarithm of the electrons through the aperture in a frame at the reference depth", 0.02),
     Parameter("background_e", "background at the window's centre, in the longest exposure", 2.0),
     Parameter("background_x_e", "background at the right edge less that at the centre", 2.0),
@@ -123,7 +126,6 @@ UNFITTED: tuple[Unfitted, ...] = (
         "shift of each write field of the mask, four across the lens",
         60.0,
     ),
-    Unfitted("pixel_percent", "true pixel pitch over the stated one, less 1", 1.0),
     Unfitted(
         "camera_turn_deg", "turn of the camera against the lens, from +x to +y", 1.0
     ),

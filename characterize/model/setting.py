@@ -60,10 +60,10 @@ class Setting:
 
     @property
     def edges(self) -> tuple[Array, Array]:
-        """(rows, 1) and (1, columns) of the pixels, -1 to 1 from edge to edge about the
-        middle one.
-        """
-        y, x = ((np.arange(n) - n // 2) / (n / 2) for n in (self.rows, self.columns))
+        """(rows, 1) and (1, columns) of the pixels, -1 to 1 from edge to edge."""
+        y, x = (
+            (np.arange(n) - (n - 1) / 2) / (n / 2) for n in (self.rows, self.columns)
+        )
         return y[:, None], x[None]
 
     @property

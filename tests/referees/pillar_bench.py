@@ -343,22 +343,22 @@ def _pixels(fine, pitch_um, session, frame):
     """Light in the pixels: a box convolved with a Gaussian is a difference of error
     functions, along each axis.
 
-    The axis of the lens meets the middle of pixel (n // 2, n // 2).
+    The axis of the lens meets pixel ((n - 1) / 2, (n - 1) / 2).
     """
     pixel = session.pixel_um * (1 + session.faults.pixel_error)
     blur = session.values.get("crosstalk_px", 0.2)
     blur = math.hypot(blur, session.faults.vibration_px * (frame % 2))
     at = (np.arange(len(fine)) - (len(fine) - 1) / 2) * pitch_um / pixel
-    apart = (at[None] - (np.arange(session.pixels) - session.pixels // 2)[:, None]) / (
-        math.sqrt(2) * blur
-    )
+    apart = (
+        at[None] - (np.arange(session.pixels) - (session.pixels - 1) / 2)[:, None]
+    ) / (math.sqrt(2) * blur)
     half = 0.5 / (math.sqrt(2) * blur)
     weight = (special.erf(apart + half) - special.erf(apart - half)) / 2
     return weight @ fine @ weight.T
 
 
 def _background(session):
-    edge = (np.arange(session.pixels) - session.pixels // 2) / (session.pixels / 2)
+    edge = (np.arange(session.pixels) - (session.pixels - 1) / 2) / (session.pixels / 2)
     level = session.of("background_e") + session.of("background_x_e") * edge[None]
     return level + session.of("background_y_e") * edge[:, None]
 

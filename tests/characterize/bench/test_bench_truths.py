@@ -52,7 +52,7 @@ def test_the_background_is_a_plane_that_is_never_below_nothing():
     for i in range(6):
         for j in range(6):
             assert made[i, j] == pytest.approx(
-                max(4 + 3 * (j - 3) / 3 - 6 * (i - 3) / 3, 0.0)
+                max(4 + 3 * (j - 2.5) / 3 - 6 * (i - 2.5) / 3, 0.0)
             )
 
 

@@ -128,7 +128,7 @@ def test_protocol_on_the_command_line(tmp_path, capsys):
         values["untold_sigma"]["bias_nm"] > 0.5
     )  # glass, walls, write fields, that nobody stated
     lines = (tmp_path / "stage.csv").read_text().splitlines()
-    assert lines[0] == "file,depth_um,angle_deg,exposure_s"
+    assert lines[0] == "file,depth_um,angle_deg,relative_exposure"
     assert len(lines) == 3
     assert (
         main([*words, "--truth", str(tmp_path / "p.toml"), "-o", str(tmp_path / "x")])

@@ -200,61 +200,6 @@ def fake(sigma, rho, least, common=0.0):
     )
 
 
-def test_modes_far_up_are_weighed_without_leaving_the_range_of_numbers():
-    valleys = [
-        fake((0.7, 2.1), 0.6, 4000.0),
-        fake((0.7, 2.1), 0.6, 4003.0),
-        fake((0.7, 2.1), 0.6, 9e4),
-    ]
-    ratio = math.exp(-1.5)
-    assert posterior.shares(valleys) == pytest.approx(
-        [1 / (1 + ratio), ratio / (1 + ratio), 0], rel=1e-9
-    )
-
-
-def test_of_two_lenses_the_covariance_has_the_intervals_and_the_correlation_of_the_draws(
-    monkeypatch,
-):
-    """Sigma is the whole interval over 2 x 1.96; correlations of the draws, a fifth of
-    the best parabola's.
-    """
-    best = SimpleNamespace(value=np.array([1.0, 2.0]), merit=50.0, chi2_per_dof=0.8)
-    other = SimpleNamespace(value=np.array([1.6, -9.0]), merit=50.9, chi2_per_dof=0.8)
-    valleys = [fake((0.7, 2.1), 0.6, 50.0), fake((0.9, 0.5), -0.2, 50.9)]
-    prior = SimpleNamespace(low=np.array([-50.0, -9.3]), high=np.array([99.0, 99.0]))
-    about = SimpleNamespace(names=("bias_nm", "background_e"), prior=prior)
-    drawn = RNG.normal(0, 1, (posterior.DRAWS, 2)) @ np.array([[1.0, 0.5], [0, 3.0]])
-    monkeypatch.setattr(
-        posterior, "draws", lambda given: drawn if given == valleys else None
-    )
-    found = explore._joined(about, [best, other], valleys, {}, {})
-    clipped = np.clip(drawn, prior.low, prior.high)
-    assert found.draws == pytest.approx(clipped)
-    sigma = (found.high - found.low) / (2 * 1.959964)
-    correlation = 0.8 * np.corrcoef(clipped.T)[0, 1] + 0.2 * 0.6
-    want = np.array(
-        [
-            [sigma[0] ** 2, correlation * sigma.prod()],
-            [correlation * sigma.prod(), sigma[1] ** 2],
-        ]
-    )
-    assert found.covariance == pytest.approx(want, rel=1e-6)
-    assert found.share == pytest.approx(posterior.shares(valleys))
-    shared = [fake((0.7, 2.1), 0.6, 50.0, common=0.5), valleys[1]]
-    monkeypatch.setattr(
-        posterior, "draws", lambda given: np.zeros((posterior.DRAWS, 2))
-    )
-    spread = explore._joined(
-        about, [best, other], shared, {}, {}
-    ).draws  # of the calibration alone
-    assert np.cov(spread.T)[0, 0] == pytest.approx(
-        0.5 * 0.49, rel=6 * math.sqrt(2 / posterior.DRAWS)
-    )
-    assert np.corrcoef(spread.T)[0, 1] == pytest.approx(
-        0.6, abs=4 / math.sqrt(posterior.DRAWS)
-    )
-
-
 def test_a_parameter_that_no_draw_moves_leaves_a_regular_covariance():
     drawn = np.column_stack([RNG.normal(0, 2.0, 50), np.full(50, 3.0)])
     got = explore._covariance(drawn, fake((0.7, 2.1), 0.6, 0.0), np.array([0.31, 5.3]))

@@ -79,17 +79,6 @@ def valley(sigma, rho, least, common=0.0):
     )
 
 
-def test_a_mode_is_as_probable_as_its_depth_and_its_volume():
-    """Laplace: exp(-misfit / 2) sqrt(det covariance)."""
-    first, second = valley((0.7, 2.1), 0.6, 10.3), valley((1.9, 0.4), -0.3, 11.7)
-    ratio = np.exp(1.4 / 2) * np.sqrt(
-        np.linalg.det(first.covariance) / np.linalg.det(second.covariance)
-    )
-    assert posterior.shares([first, second]) == pytest.approx(
-        [ratio / (1 + ratio), 1 / (1 + ratio)], rel=1e-12
-    )
-
-
 def test_draws_give_the_correlation_and_intervals_the_sigma():
     drawn = RNG.multivariate_normal([3.0, -1.0], [[4.0, -1.2], [-1.2, 0.9]], 70)
     rho = np.corrcoef(drawn.T)[0, 1]
@@ -101,41 +90,6 @@ def test_draws_give_the_correlation_and_intervals_the_sigma():
         np.array([[0.31**2, 0.31 * 5.3 * mixed], [0.31 * 5.3 * mixed, 5.3**2]]),
         rel=1e-6,
     )
-
-
-def test_a_second_valley_widens_the_intervals_by_what_its_misfit_leaves():
-    """chi² of 1.44 a degree widens all; a mode 1.7 above the best reaches 1 - 1.7 /
-    (1.96² 1.44) of its own, rooted.
-    """
-    best = SimpleNamespace(value=np.array([1.0, 2.0]), merit=50.0, chi2_per_dof=1.44)
-    other = SimpleNamespace(value=np.array([1.6, -9.0]), merit=51.7, chi2_per_dof=1.44)
-    valleys = [valley((0.7, 2.1), 0.6, 0.0), valley((0.9, 0.5), 0.2, 30.0)]
-    prior = SimpleNamespace(low=np.array([-50.0, -99.0]), high=np.array([99.0, 99.0]))
-    about = SimpleNamespace(names=("bias_nm", "background_e"), prior=prior)
-    found = explore._joined(about, [best, other], valleys, {}, {})
-    wide = REACH * 1.2 * np.array([0.7, 2.1])
-    reach = np.sqrt(1 - 1.7 / (REACH**2 * 1.44)) * REACH * 1.2 * np.array([0.9, 0.5])
-    assert found.low == pytest.approx(
-        np.minimum(best.value - wide, other.value - reach), rel=1e-12
-    )
-    assert found.high == pytest.approx(
-        np.maximum(best.value + wide, other.value + reach), rel=1e-12
-    )
-    assert found.covariance == pytest.approx(1.44 * valleys[0].covariance, rel=1e-12)
-    profile = ends.Profile(-0.4, 3.1, np.zeros(1), np.zeros(1), parabolic=True)
-    found = explore._joined(about, [best], valleys[:1], {"bias_nm": profile}, {})
-    assert (found.low[0], found.high[0]) == pytest.approx((-0.4, 3.1))
-    assert found.low[1] == pytest.approx(2.0 - wide[1])
-    assert not len(found.draws)
-    shared = valley(
-        (0.7, 2.1), 0.6, 0.0, common=0.81
-    )  # of dark and flat, beside the 1.44 of each frame: 1.25 as wide
-    found = explore._joined(about, [best], [shared], {"bias_nm": profile}, {})
-    assert (found.low[0], found.high[0]) == pytest.approx(
-        (1.0 - 1.25 * 1.4, 1.0 + 1.25 * 2.1)
-    )
-    assert found.high[1] == pytest.approx(2.0 + 1.25 * wide[1])
-    assert found.covariance == pytest.approx(2.25 * shared.covariance)
 
 
 def test_predicted_error_is_the_sine_between_the_images():

@@ -29,7 +29,7 @@ PLANE = {"background_e": 60.0, "background_x_e": 9.0, "background_y_e": -14.0}
 def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_subtracted(
     dark_known, glow
 ):
-    """Pixel (3, 11) lies 3/8 of the way to the right edge, 5/8 to the upper one. Slopes
+    """Pixel (3, 11) lies 7/16 of the way to the right edge, 9/16 to the upper one. Slopes
     by finite differences, which
     are exact of what is linear: to rounding of float64 differences of 60 electrons."""
     setting = dataclasses.replace(SETTING, dark_known=dark_known)
@@ -38,7 +38,7 @@ def test_the_background_is_a_plane_times_the_exposure_where_the_dark_level_is_su
         vector(PLANE | {"log_gain": 12.0}),
     )
     assert background(x, setting)[:, 3, 11] == pytest.approx(
-        glow * (60 + 9 * 3 / 8 + 14 * 5 / 8)
+        glow * (60 + 9 * 7 / 16 + 14 * 9 / 16)
     )
     slopes = model.images(x, list(PLANE))[1]
     for name, slope in zip(PLANE, slopes, strict=True):
@@ -58,7 +58,7 @@ def shot(model):
         x, longest
     )
     scale = 6000 / light.max()
-    y, across = ((np.arange(16) - 8) / 8 for _ in range(2))
+    y, across = ((np.arange(16) - 7.5) / 8 for _ in range(2))
     electrons = EXPOSURE[:, None, None] * (
         scale * light + 60 + 9 * across - 14 * y[:, None]
     )

@@ -91,35 +91,6 @@ def test_a_fit_whose_windows_were_held_off_its_decentre_is_put_there_and_finds_n
     assert same is ends
 
 
-def test_a_search_holds_its_windows_before_its_long_fits_and_takes_short_ones_by_the_quick_model(
-    monkeypatch,
-):
-    """Short fits of four steps know the place to a third of a pixel: all terms of the
-    model are asked with windows held
-    there only, never where frames were seen to lie, 0.7 and 0.8 pixels off. (Long fits
-    first and windows after them
-    took a sixth more time.)"""
-    order, long, problem = [], search._long, search.residual.problem
-
-    def followed(task, value, *more):
-        order.append(("long", *task.model.grid.middle_um, task.model.cut))
-        return long(task, value, *more)
-
-    def asked(model, *about):
-        order.append(("asked", *model.grid.middle_um, model.cut))
-        return problem(model, *about)
-
-    monkeypatch.setattr(search, "_long", followed)
-    monkeypatch.setattr(search.residual, "problem", asked)
-    there, _ = search.search(task())
-    whole = [k for k, one in enumerate(order) if one[3] == 0.0]
-    assert {cut for *_, cut in order[: whole[0]]} == {there.model.quick().cut}
-    assert {one[0] for one in order} == {"asked", "long"}
-    for k in whole:
-        assert order[k][1:3] == pytest.approx(PLACE_UM, abs=0.5)
-    assert there.model.grid.middle_um == order[whole[0]][1:3]
-
-
 def test_most_of_the_way_to_the_best_is_gone_by_the_quick_model():
     """From several sigma off to within one of the lowest place, which the whole model
     has to find alone.

@@ -15,7 +15,7 @@ import bench_lens as b
 from characterize.bench import bench
 from characterize.inference.leastsquares import Data
 from characterize.inference.prepare import LeftOut, lit_part
-from characterize.model import PLACE, ForwardModel, Setting, detector, vector
+from characterize.model import PLACE, ForwardModel, Setting, vector
 
 ROWS, COLUMNS = slice(9, 22), slice(6, 20)
 ANGLES = np.array([[0.0, 0.0], [0.11, -0.07]])
@@ -36,28 +36,6 @@ def model():
 @pytest.fixture(scope="module")
 def part(model):
     return model.quick(ROWS, COLUMNS)
-
-
-def test_a_part_of_the_window_has_the_light_of_the_whole_model_there_and_background_alone_beside(
-    model, part
-):
-    """Fewer nodes hold what reaches the part: light to the percent of the brightest
-    that few terms leave out.
-    """
-    x = vector(HIDDEN)
-    want, got = model.images(x)[0], part.images(x)[0]
-    assert all(
-        few.reduced.nodes < one.reduced.nodes
-        for few, one in zip(part.groups, model.groups, strict=True)
-    )
-    assert np.abs(got - want)[:, ROWS, COLUMNS].max() < 0.01 * want.max()
-    beside = np.ones(want.shape[1:], bool)
-    beside[ROWS, COLUMNS] = False
-    edge = (np.arange(28) - 14) / 14
-    plane = SETTING.exposure[:, None, None] * np.broadcast_to(
-        7.0 + 3.0 * edge, want.shape
-    )
-    assert got[:, beside] == pytest.approx(plane[:, beside], abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -96,41 +74,6 @@ def test_derivatives_of_a_part_are_differences_of_its_own_images(part):
         assert np.linalg.norm(got - want) < 0.06 * np.linalg.norm(want), (
             name
         )  # slopes of a quick model: 5 %
-
-
-def test_a_residual_phase_goes_along_to_fewer_nodes(model, part):
-    def bumps(u, v, count):
-        return np.stack([u**2 - 0.3 * v, u * v**2][:count])
-
-    modes = np.array([0.31, -0.22])
-    whole, few = model.with_residual(modes, bumps), part.with_residual(modes, bumps)
-    after = whole.quick(ROWS, COLUMNS)
-    x = vector(HIDDEN)
-    want = few.images(x)[0]
-    assert after.images(x)[0] == pytest.approx(want, abs=1e-4 * want.max())
-    assert np.abs(want - part.images(x)[0]).max() > 0.05 * want.max()
-
-
-def test_places_of_a_part_are_those_of_the_same_pixels_in_the_whole():
-    """Two samples a pixel; of 3 to 7 of 11 rows, 2 to 5 of 8 columns, and a part of
-    that.
-    """
-    whole = detector.Grid(11, 8, 1.5, 2, 4, (0.7, -1.1))
-    one = whole.part(slice(3, 8), slice(2, 6), 1)
-    two = one.part(slice(1, 4), slice(1, 4), 3)
-    for grid, rows, columns in ((one, (3, 8), (2, 6)), (two, (4, 7), (3, 6))):
-        assert grid.margin == 1
-        for axis, every, (first, last) in zip(
-            grid.axes_um(), whole.axes_um(), (rows, columns), strict=True
-        ):
-            assert axis == pytest.approx(
-                every[2 * (first + 4 - 1) : 2 * (last + 4 + 1)], abs=1e-12
-            )
-        y, x = grid.ends_um()
-        assert y == pytest.approx((np.array([rows[0], rows[1] - 1]) - 5) * 1.5 - 1.1)
-        assert x == pytest.approx(
-            (np.array([columns[0], columns[1] - 1]) - 4) * 1.5 + 0.7
-        )
 
 
 def test_the_lit_part_is_what_light_tells_over_its_noise_but_for_thirty_parts_in_a_million(

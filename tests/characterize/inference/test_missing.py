@@ -93,26 +93,6 @@ def test_errors_that_are_one_in_all_frames_are_not_taken_for_a_cause():
     assert np.mean(plain) == pytest.approx(3.09, abs=0.5)
 
 
-def test_what_is_there_is_found_whatever_the_fit_takes_of_it():
-    """Its own part that the slopes cannot make up: 0.3 sigma a pixel of 900 pixels, so
-    81 for each of three.
-    """
-    own = CHANGES - CHANGES @ np.linalg.pinv(SLOPES) @ SLOPES
-    seen = fit_of(rng.normal(size=900) + 0.3 * CHANGES[1] + 5 * SLOPES[2]).lean(
-        "second", CHANGES[1:2]
-    )
-    want = 0.09 * float(own[1] @ own[1])
-    assert seen.chi2 == pytest.approx(
-        want, abs=5 * 2 * np.sqrt(want)
-    )  # variance of chi² is 4 times its offset
-    assert seen.degrees == 1
-    assert seen.chance < CHANCE
-    assert words([seen, Lean("other", 30.0, 1, 0.1)])[0].startswith(
-        "residuals lean towards second"
-    )
-    assert not words([Lean("other", 3.0, 1, 0.1)])
-
-
 def test_what_the_fit_makes_up_for_is_not_seen_but_said():
     fit = fit_of(rng.normal(size=900))
     change = 2.3 * SLOPES[0] - 0.41 * SLOPES[2]
@@ -377,20 +357,3 @@ def test_a_clean_bench_is_called_clean_and_glass_is_declared():
     assert wall.chi2 < 16
     glass = next(one for one in untold(found) if "plate of glass" in one)
     assert "distance_um" in glass or "stage_zero_um" in glass
-
-
-def test_pixels_of_another_pitch_see_other_places():
-    """Against a model made for that pitch, whose nodes are its own: fields to 5e-4."""
-    setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
-    model, x = (
-        ForwardModel(b.lens(), setting, b.RESPONSE),
-        vector(b.VALUES | {"log_gain": 10.0}),
-    )
-    here = model.images(x)[0]
-    found = causes.on_pixels(model, 1.03).images(x)[0]
-    want = ForwardModel(
-        b.lens(), dataclasses.replace(setting, pixel_um=1.545), b.RESPONSE
-    ).images(x)[0]
-    assert np.abs(found - want).max() < 2e-3 * want.max()
-    assert np.abs(found - here).max() > 2e-2 * want.max()
-    assert np.array_equal(model.images(x)[0], here)

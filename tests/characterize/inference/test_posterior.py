@@ -10,7 +10,7 @@ import pytest
 
 from characterize.inference.knowable import density
 from characterize.inference.leastsquares import Data, Prior
-from characterize.inference.posterior import REACH, Valley, draws, half_volume, shares
+from characterize.inference.posterior import REACH, Valley, draws, log_evidence, shares
 from tests.referees.one_profile import profile
 
 NOISE = 0.7
@@ -85,7 +85,7 @@ def test_half_the_volume_of_a_valley_is_that_of_its_covariance():
         for one, other in ((alike[0],) * 2, (alike[1],) * 2, alike)
     )
     assert both**2 / (a * b) > 0.5
-    assert half_volume(valley) == pytest.approx(
+    assert log_evidence(valley) == pytest.approx(
         -math.log(a * b - both**2) / 2, rel=1e-9
     )
 

@@ -2,7 +2,6 @@
 much of it is likely.
 """
 
-import math
 import re
 import sys
 from dataclasses import dataclass, field, replace
@@ -105,62 +104,6 @@ def found(names=("bias_nm",), known=None, unfitted=None):
     image = task.model.images(x)[0]
     slopes = {name: SLOPES[PLACE[name]] for name in ("stage_zero_um", *named(Bends))}
     return {one.cause: one for one in causes.changes(task, x, slopes)}, image
-
-
-def test_every_cause_changes_the_images_by_its_amount_and_is_as_likely_as_its_size():
-    """Sizes that nobody stated: a source of 5 um, a spectrum of 1 nm (both squared),
-    saddles of 10 nm, a wall of 2
-    degrees, an index of 0.02, tilts of 1 degree, a plate of 100 um and its tilts of 5
-    degrees."""
-    every, _ = found()
-    known = {
-        "a source of finite size": ("pinhole_um", 6, (5 / 6) ** 2),
-        "a spectrum of finite width": ("bandwidth_nm", 2, 1 / 4),
-        "a tilt of the lens about y": ("tilt_x_deg", 0.3, 1 / 0.3),
-        "a tilt of the lens about x": ("tilt_y_deg", 0.3, 1 / 0.3),
-        "a saddle of the diameters": ("bias_a_nm", 3, 10 / 3),
-        "an oblique saddle of the diameters": ("bias_o_nm", 3, 10 / 3),
-        "a tilted side wall": ("sidewall_deg", 0.5, 2 / 0.5),
-        "another refractive index": ("index", 0.01, 0.02 / 0.01),
-        "a plate of glass in the beam": ("glass_um", 100, 1.0),
-        "a tilt of 100 um of glass about y": ("glass_tilt_x_deg", 5, 1.0),
-        "a tilt of 100 um of glass about x": ("glass_tilt_y_deg", 5, 1.0),
-    }
-    for cause, (name, amount, sigma) in known.items():
-        one = every[cause]
-        assert one.images == pytest.approx(
-            amount * SLOPES[None, PLACE[name]], abs=1e-9
-        ), cause
-        assert one.amount == amount
-        assert one.sigma == pytest.approx(sigma), cause
-        assert one.frees == (() if "of glass" in cause and "tilt" in cause else (name,))
-        assert one.of_mask == (
-            name in ("bias_a_nm", "bias_o_nm", "sidewall_deg", "index")
-        )
-
-
-def test_walls_pixels_and_uneven_light_have_units_of_their_own():
-    every, image = found()
-    leaning = every["a side wall that leans about half height"]
-    assert leaning.images == pytest.approx(math.radians(1.5) * LEANING[None])
-    assert (leaning.amount, leaning.sigma) == (
-        pytest.approx(2.25),
-        pytest.approx((2 / 1.5) ** 2),
-    )
-    assert leaning.roughly
-    assert leaning.of_mask
-    pitch = every["a wrong pixel pitch"]  # 1 % of it, of which 1 % is likely
-    assert pitch.images == pytest.approx(0.05 * image[None], rel=1e-9)
-    assert (pitch.amount, pitch.sigma) == (1.0, 1.0)
-    uneven = every["uneven illumination"]
-    assert uneven.images == pytest.approx(
-        0.2 * SLOPES[[PLACE[n] for n in ("light_x", "light_y", "light_r")]]
-    )
-    assert uneven.amount == 0.2
-    assert uneven.sigma == pytest.approx([1.0, 1.0, 1.0])
-    assert uneven.frees == ("light_x", "light_y", "light_r")
-    some, _ = found(names=("light_y",), known={"light_r": Known("light_r", 0.0, 0.05)})
-    assert some["uneven illumination"].sigma == pytest.approx([1.0, 0.25])
 
 
 def test_a_stated_wall_is_reckoned_with_by_the_mean_square_of_its_angle():

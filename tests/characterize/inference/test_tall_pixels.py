@@ -27,7 +27,7 @@ _PLACE = {
 
 
 def at_rows(share: float) -> np.ndarray:
-    """(5, 16, 16) light of pixels that lie ``share`` times as far apart each way, as
+    """(5, 17, 17) light of pixels that lie ``share`` times as far apart each way, as
     wide as ever.
     """
     setting = Setting(
@@ -35,8 +35,8 @@ def at_rows(share: float) -> np.ndarray:
         np.zeros((5, 2)),
         np.ones(5),
         share * _WIDE_UM,
-        16,
-        16,
+        17,
+        17,
         fill=1 / share,
     )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
@@ -50,7 +50,7 @@ def test_they_lie_farther_apart_along_one_axis_alone():
     Models of their own for each pitch: fields to 5e-4, light to twice that.
     """
     setting = Setting(
-        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), _WIDE_UM, 16, 16
+        np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), _WIDE_UM, 17, 17
     )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25})
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
@@ -72,7 +72,7 @@ def summed(rows: int) -> np.ndarray:
     )
     x = vector(_PLACE | {"log_gain": 10.0, "crosstalk_px": 0.25 * _FINE})
     light = ForwardModel(b.lens(), setting, b.RESPONSE).images(x)[0]
-    y, x0 = (count // 2 - 8 * side - side // 2 for side in (rows, _FINE))
+    y, x0 = ((count - 16 * side) // 2 for side in (rows, _FINE))
     part = light[:, y : y + 16 * rows, x0 : x0 + 16 * _FINE]
     return np.asarray(part.reshape(3, 16, rows, 16, _FINE).sum((2, 4)))
 
