@@ -68,7 +68,7 @@ def test_fine_samples_share_each_pixel_evenly(over):
         assert len(axis) == (pixels + 6) * over
         centre = axis.reshape(-1, over).mean(1)
         assert centre == pytest.approx(
-            (np.arange(pixels + 6) - pixels // 2 - 3) * 2.4, abs=1e-12
+            (np.arange(pixels + 6) - (pixels - 1) / 2 - 3) * 2.4, abs=1e-12
         )
         assert np.diff(axis) == pytest.approx(np.full(len(axis) - 1, 2.4 / over))
     assert grid.fine_um == pytest.approx(2.4 / over)
@@ -89,7 +89,7 @@ def test_waves_arrive_at_pixel_centres_with_the_transfer_of_their_frequency(over
         -2j * math.pi * (gx * 0.31 - gy * 0.17)
     )
     seen = grid.sample(np.stack([light, 2 * light]), transfer)
-    rows, columns = (np.arange(6) - 3) * 1.7, (np.arange(9) - 4) * 1.7
+    rows, columns = (np.arange(6) - 2.5) * 1.7, (np.arange(9) - 4) * 1.7
     moved = 2 * math.pi * (fx * (columns - 0.31) + fy * (rows[:, None] + 0.17)) + 0.4
     want = 5 + math.exp(-2 * (fy**2 + 3 * fx**2)) * np.cos(moved)
     assert seen[0] == pytest.approx(want, abs=1e-9)

@@ -56,7 +56,7 @@ def test_a_part_of_a_window_sees_the_same_places():
         2,
     )  # no more room than there was
     rows, columns = (
-        (np.arange(n) - n // 2) * 2.4 + at for n, at in ((7, -31.0), (10, 5.5))
+        (np.arange(n) - (n - 1) / 2) * 2.4 + at for n, at in ((7, -31.0), (10, 5.5))
     )
     for one, r, c in (
         (part, slice(2, 6), slice(2, 9)),
@@ -74,9 +74,9 @@ def test_a_part_of_a_window_sees_the_same_places():
 
 
 def y_centre(part):
-    """Of the pixel at half the number of rows, um."""
+    """Of the middle of the rows, um."""
     y, _ = part.ends_um()
-    return y[0] + part.rows // 2 * 2.4
+    return y[0] + (part.rows - 1) / 2 * 2.4
 
 
 def test_sums_times_a_factor_are_theirs_once():

@@ -286,7 +286,7 @@ def test_windows_far_off_along_one_axis_alone_have_directions_of_their_own(small
 def test_a_background_rises_from_minus_one_to_one_across_the_frame(small):
     """In electrons of exposure 1, 1.7 times as many in the second frame: its level, and
     its slopes along x and y by
-    (column - 8) / 8 and (row - 6) / 6."""
+    (column - 7.5) / 8 and (row - 5.5) / 6."""
     dark = b.VALUES | {"background_e": 0.0, "background_x_e": 0.0}
     light = small.images(vector(dark))[0]
     seen = small.images(
@@ -294,7 +294,7 @@ def test_a_background_rises_from_minus_one_to_one_across_the_frame(small):
             dark | {"background_e": 7.0, "background_x_e": 3.0, "background_y_e": -5.0}
         )
     )[0]
-    y, x = (np.arange(12)[:, None] - 6) / 6, (np.arange(16) - 8) / 8
+    y, x = (np.arange(12)[:, None] - 5.5) / 6, (np.arange(16) - 7.5) / 8
     grown = np.array([1.0, 1.7])[:, None, None]
     assert seen - light == pytest.approx(grown * (7 + 3 * x - 5 * y), abs=1e-9)
 

@@ -87,7 +87,7 @@ def summed(lens, sites, sign):
     )
     t = size * np.exp(1j * (phase + sign * 2 * turn))
     gauss, weight = np.polynomial.legendre.leggauss(3)
-    at = ((np.arange(PIXELS) - PIXELS // 2)[:, None] + gauss / 2).ravel() * PIXEL
+    at = ((np.arange(PIXELS) - (PIXELS - 1) / 2)[:, None] + gauss / 2).ravel() * PIXEL
     out = []
     for depth in DEPTHS:
         z = depth + VALUES["stage_zero_um"]

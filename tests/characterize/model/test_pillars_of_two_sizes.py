@@ -190,7 +190,7 @@ def summed(lens, setting):
                 + away**2
             )
             field[i] = (np.exp(1j * k * r) * (away / r**2) * (1 / r - 1j * k)) @ lit
-        apart = (fine[None] / pixel - (np.arange(n) - n // 2)[:, None]) / (
+        apart = (fine[None] / pixel - (np.arange(n) - (n - 1) / 2)[:, None]) / (
             math.sqrt(2) * BENCH["crosstalk_px"]
         )
         half = 0.5 / (math.sqrt(2) * BENCH["crosstalk_px"])

@@ -260,10 +260,13 @@ def test_between_wavelengths_pillars_are_those_of_the_proxy():
 
 def test_what_nobody_states_is_reckoned_with_as_plausible_or_as_its_prior_has_it():
     """A plate of glass is free in its prior and 0.1 mm where nobody speaks of it; a
-    bandwidth has its prior alone.
+    tilt has its prior alone.
     """
     told = {p.name: p for p in parameters.PARAMETERS}
     assert (told["glass_um"].sigma, told["glass_um"].unstated) == (math.inf, 100.0)
     assert (told["light_x"].sigma, told["light_x"].unstated) == (0.3, 0.2)
-    assert told["bandwidth_nm"].plausible == 0.0
-    assert told["bandwidth_nm"].unstated == told["bandwidth_nm"].sigma == 1.0
+    assert (told["bandwidth_nm"].sigma, told["bandwidth_nm"].unstated) == (
+        math.inf,
+        1.0,
+    )
+    assert told["tilt_x_deg"].unstated == told["tilt_x_deg"].sigma == 1.0
