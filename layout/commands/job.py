@@ -7,7 +7,7 @@ from typing import Literal
 
 import tyro
 
-from layout.certify import MadeRows, Survey
+from layout.certify import LensRows, Survey
 from layout.commands.stages import Stages
 from layout.drc import DrcReport
 from layout.files import Window, handover, verify
@@ -110,7 +110,7 @@ class Job:
     compared: dict[str, verify.Comparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
     certified: dict[str, Survey] = field(default_factory=dict)
-    made_rows: MadeRows | None = None
+    made_rows: LensRows | None = None
     answers_error: float = 0.0
 
     @property

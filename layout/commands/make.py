@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.certify import MadeRows, Survey, survey
+from layout.certify import LensRows, Survey, survey
 from layout.commands import page
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
@@ -209,7 +209,7 @@ def _certified(
         return next(iter(job.certified.values()))
     lattice = job.plan.lattices[0]
     small = not job.certified and lattice.rows * lattice.columns <= MOST_MADE
-    job.made_rows = MadeRows(job.plan) if small else job.made_rows
+    job.made_rows = LensRows(job.plan) if small else job.made_rows
     keep = job.made_rows.take if small and job.made_rows else None
     return survey(
         content,

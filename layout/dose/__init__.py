@@ -5,8 +5,11 @@ from typing import TYPE_CHECKING
 from metalens.ground.lazy import attach
 
 if TYPE_CHECKING:
+    from layout.dose import bodies as bodies
     from layout.dose import correct as correct
     from layout.dose import exposure as exposure
+    from layout.dose import nodes as nodes
+    from layout.dose import sampled as sampled
     from layout.dose.assign import Ladder as Ladder
     from layout.dose.assign import dose_ladder as dose_ladder
     from layout.dose.bodies import Body as Body
@@ -30,8 +33,11 @@ __getattr__, __dir__, __all__ = attach(
         "Rects": "bodies",
         "Solution": "correct",
         "Uniformity": "uniformity",
+        "bodies": "",
         "correct": "",
         "dose_ladder": "assign",
         "exposure": "",
+        "nodes": "",
+        "sampled": "",
     },
 )

@@ -16,7 +16,7 @@ NONE = 255  # dose class of a site without pillar
 _BLOCK_SITES = 1 << 20
 _FAINT = 0.02  # least exposure of its own edge at which a pillar can be corrected
 _NEGLIGIBLE = 5e-4  # exposure by the four nearest pillars that is left out
-_COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
+COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at each site
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -188,7 +188,7 @@ def split(point: PointExposure, drawn: Drawn, number: Array, body: Body) -> Rang
     reach = np.array(
         [_given(drawn, number > 0, body.steps_um, width) for width in point.widths_um]
     )
-    far = point.widths_um >= _COARSE * body.apart_um
+    far = point.widths_um >= COARSE * body.apart_um
     middle = ~far & (
         (reach * point.weights > _NEGLIGIBLE) | (point.widths_um > body.apart_um)
     )

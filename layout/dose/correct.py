@@ -21,12 +21,12 @@ import numpy as np
 
 from layout.dose import assign, bodies, exposure, rects
 from layout.dose.assign import Ladder
-from layout.dose.bodies import Body, Ranges, Rects, Table
+from layout.dose.bodies import NONE, Body, Ranges, Rects, Table
 from layout.dose.drawn import Discs, Drawn
 from layout.dose.exposure import CLEARS, PointExposure
 from layout.dose.nodes import Convolution, Grid, convolution, gather, spread
 from layout.dose.pieces import cut as cut_pieces
-from layout.dose.sampled import sampled_error
+from layout.dose.sampled import Exposed, exact_edges
 from layout.dose.uniformity import Uniformity
 from layout.process import Exposure, Process
 from metalens.ground.arrays import Array
@@ -146,7 +146,7 @@ def round_doses(
     """
     fields, point = wanted.fields, wanted.point
     pairs, rect_class, after = assign.assign(fields, ladder)
-    error = sampled_error(fields, ladder, after, point=point, samples=samples)
+    error = _sampled_error(wanted, ladder, after, samples)
     return Solution(
         ladder,
         needed,
@@ -160,6 +160,39 @@ def round_doses(
         point,
         fields,
     )
+
+
+def _sampled_error(
+    wanted: Wanted, ladder: Ladder, found: assign.Assigned, samples: int
+) -> float:
+    """Largest |fast - exact| / wanted exposure at sample pillars of the first body."""
+    fields, table = wanted.fields, wanted.fields.table
+    dose = np.zeros(NONE + 1)
+    dose[: len(ladder.factors)] = ladder.factors
+    points, areas, of = fields.spots
+    needed = (CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
+    scene = Exposed(
+        fields.bodies,
+        table.drawn,
+        table.own + table.area_um2 * float(fields.ranges.far.density(np.array(0.0))),
+        fields.ranges,
+        wanted.point,
+        (points, areas * dose[ladder.nearest(needed)][of]),
+        lambda number, first, block: dose.take(
+            assign.classes(fields, number, first, block, ladder)
+        ),
+    )
+    rows, columns, exact = exact_edges(scene, samples)
+    worst = 0.0
+    for row, column, edge in zip(
+        rows.tolist(), columns.tolist(), exact.tolist(), strict=True
+    ):
+        block = np.ascontiguousarray(fields.bodies[0].source(row, row + 1))
+        entry = int(block[0, column])
+        near = fields.at(found.far, 0, row, 1, found.near)[0, column]
+        fast = scene.dose_of(0, row, block)[0, column] * table.own[entry] + near
+        worst = max(worst, abs(fast - edge) / (CLEARS * table.goal[entry]))
+    return float(worst)
 
 
 def correct(written: DiameterMap, process: Process, *, samples: int = 8) -> DoseResult:
@@ -274,7 +307,7 @@ def _fields(
         hollow=False,
     )
     middles = (
-        [_middle(body, ranges) for body in parts]
+        [middle_convolution(body, ranges) for body in parts]
         if len(ranges.middle.widths_um)
         else []
     )
@@ -357,7 +390,7 @@ def _masses(
     return out[0], out[1], out[2]
 
 
-def _middle(body: Body, ranges: Ranges) -> Convolution:
+def middle_convolution(body: Body, ranges: Ranges) -> Convolution:
     """Convolution on the sites of a lattice with the Gaussians that reach neighbours
     only.
     """

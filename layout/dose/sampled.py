@@ -1,56 +1,61 @@
-"""How far the fast sum is from exact shapes, at sample pillars."""
+"""Exposure of sample pillars by the direct sum over exact shapes."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.assign import Assigned, Fields, Ladder, classes
-from layout.dose.bodies import NONE, Body
+from layout.dose.bodies import COARSE, Body, Ranges
 from layout.dose.drawn import Drawn
-from layout.dose.exposure import CLEARS, PointExposure
+from layout.dose.exposure import PointExposure
 from metalens.ground.arrays import Array
 
 _NEIGHBOURS = 5  # sites on each side whose shapes are taken exactly
 
 
-def sampled_error(
-    fields: Fields,
-    steps: Ladder,
-    found: Assigned,
-    *,
-    point: PointExposure,
-    samples: int,
-) -> float:
-    """Largest |fast - exact| / wanted exposure at pillars of the first body, evenly
-    drawn.
+@dataclass(frozen=True, eq=False, slots=True)
+class Exposed:
+    """Doses on lattices, as the exact sum takes them.
+
+    bodies: the samples are pillars of the first. drawn: their kinds, by entry. own:
+    (entries,) exposure of an edge by its own pillar, at unit dose.
+    ranges: Gaussians widened by the mean pillar. spots: x and y (n, 2), and area times
+    dose of what is no pillar.
+    dose_of: (body, first row, entries of a block) -> (rows, columns) relative doses.
+    """
+
+    bodies: Sequence[Body]
+    drawn: Drawn
+    own: Array
+    ranges: Ranges
+    point: PointExposure
+    spots: tuple[Array, Array]
+    dose_of: Callable[[int, int, Array], Array]
+
+
+def exact_edges(scene: Exposed, samples: int) -> tuple[Array, Array, Array]:
+    """Rows and columns of pillars, evenly drawn, and the exposure of their edges.
 
     Exact: whole shapes of all pillars within 5 sites, seen along the edges, and the
-    direct sum over every other
-    pillar (and piece of a rectangle) of Gaussians whose second moment is that of its
-    shape.
+    direct sum over every other pillar (and piece of a mark) of Gaussians whose second
+    moment is that of its shape.
     """
-    lens = fields.bodies[0]
+    lens = scene.bodies[0]
     rows, columns = _some(lens, samples)
-    dose = np.zeros(NONE + 1)
-    dose[: len(steps.factors)] = steps.factors
-    distant = _distant(fields, steps, dose, (rows, columns))
-    own = _own(lens, (rows, columns), fields.table.drawn, point)
-    worst = 0.0
+    exposure = _distant(scene, (rows, columns))
     for n, (row, column) in enumerate(
         zip(rows.tolist(), columns.tolist(), strict=True)
     ):
         block, first = _around(lens, row)
-        chosen = classes(fields, 0, first, block, steps)
-        entry = int(block[row - first, column])
-        near = fields.at(found.far, 0, row, 1, found.near)[0, column]
-        fast = dose[chosen[row - first, column]] * fields.table.own[entry] + near
+        given = scene.dose_of(0, first, block)
         left = max(column - _NEIGHBOURS, 0)
         here = slice(left, column + _NEIGHBOURS + 1)
-        given = dose[chosen[:, here]]
-        beside = _close(
-            fields, (block[:, here], given), (row - first, column - left), point
+        entry = int(block[row - first, column])
+        exposure[n] += given[row - first, column] * scene.own[entry]
+        exposure[n] += _close(
+            scene, (block[:, here], given[:, here]), (row - first, column - left)
         )
-        exact = distant[n] + given[row - first, column - left] * own[entry] + beside
-        worst = max(worst, abs(fast - exact) / (CLEARS * fields.table.goal[entry]))
-    return float(worst)
+    return rows, columns, exposure
 
 
 def _some(body: Body, samples: int) -> tuple[Array, Array]:
@@ -78,18 +83,6 @@ def _some(body: Body, samples: int) -> tuple[Array, Array]:
     return every[0][pick], every[1][pick]
 
 
-def _own(
-    body: Body, sites: tuple[Array, Array], drawn: Drawn, point: PointExposure
-) -> Array:
-    """(entries,) exposure of the edges of the pillars on these sites by themselves, at
-    unit dose; each shape once.
-    """
-    used = np.zeros(len(drawn.area_um2), bool)
-    for row in np.unique(sites[0]).tolist():
-        used[body.source(row, row + 1)[0][sites[1][sites[0] == row]]] = True
-    return drawn.edges(used, point)[0]
-
-
 def _around(body: Body, row: int) -> tuple[Array, int]:
     first = max(row - _NEIGHBOURS, 0)
     return np.ascontiguousarray(
@@ -97,44 +90,30 @@ def _around(body: Body, row: int) -> tuple[Array, int]:
     ), first
 
 
-def _distant(
-    fields: Fields, steps: Ladder, dose: Array, sites: tuple[Array, Array]
-) -> Array:
+def _distant(scene: Exposed, sites: tuple[Array, Array]) -> Array:
     """(samples,) background from all that is more than 5 sites away, by the direct sum
     of Gaussians.
     """
-    lens, area = fields.bodies[0], fields.table.area_um2
+    lens, area = scene.bodies[0], scene.drawn.area_um2
     at_x, at_y = lens.columns_um[sites[1]], lens.rows_um(0, lens.rows)[sites[0]]
-    ranges = [*_terms(fields.ranges.far), *_terms(fields.ranges.middle)]
+    ranges = [*_terms(scene.ranges.far), *_terms(scene.ranges.middle)]
     total = np.zeros(len(at_x))
-    for number, body in enumerate(fields.bodies):
+    for number, body in enumerate(scene.bodies):
         for first, block in body.blocks():
-            mass = (
-                area.take(block)
-                * dose.take(classes(fields, number, first, block, steps))
-            ).astype(np.float32)
+            dose = scene.dose_of(number, first, block)
+            mass = (area.take(block) * dose).astype(np.float32)
             y = body.rows_um(first, len(block))
             for width, weight in ranges:
+                scale = weight / (np.pi * width**2)
                 wx, wy = _bell(body.columns_um, at_x, width), _bell(y, at_y, width)
-                total += (
-                    weight / (np.pi * width**2) * ((mass @ wx) * wy).sum(0, dtype=float)
-                )
+                total += scale * ((mass @ wx) * wy).sum(0, dtype=float)
                 if not number:
-                    total -= (
-                        weight
-                        / (np.pi * width**2)
-                        * _own_block(mass, first, sites, wx, wy)
-                    )
-    points, areas, of = fields.spots
-    given = dose[
-        steps.nearest(
-            (CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
-        )
-    ]
-    for width, weight in _terms(fields.ranges.far):
+                    total -= scale * _own_block(mass, first, sites, wx, wy)
+    points, mass = scene.spots
+    for width, weight in _terms(scene.ranges.far):
         if len(points):
             bell = _bell(points[:, 0], at_x, width) * _bell(points[:, 1], at_y, width)
-            total += weight / (np.pi * width**2) * ((areas * given[of]) @ bell)
+            total += weight / (np.pi * width**2) * (mass @ bell)
     return total
 
 
@@ -164,30 +143,40 @@ def _own_block(
     return found
 
 
-def _close(
-    fields: Fields,
-    block: tuple[Array, Array],
-    site: tuple[int, int],
-    point: PointExposure,
-) -> float:
-    """Exposure of the edges of one pillar by the shapes within 5 sites, exact."""
-    (index, given), (row, column), body, drawn = (
-        block,
-        site,
-        fields.bodies[0],
-        fields.table.drawn,
-    )
-    y = (row - np.arange(index.shape[0])) * body.down_um  # rows run towards -y
-    x = (np.arange(index.shape[1]) - column) * body.pitch_um
-    mine = int(index[row, column])
-    edge, others = drawn.edge_um(mine), index > 0
+def _close(scene: Exposed, block: tuple[Array, Array], site: tuple[int, int]) -> float:
+    """Exposure of the edges of one pillar by those within 5 sites: of exact shapes, or
+    Gaussians of their second moments where the point exposure is far wider than these.
+    """
+    (index, given), (row, column) = block, site
+    body, drawn, point = scene.bodies[0], scene.drawn, scene.point
+    others = index > 0
     others[row, column] = False
+    i, j = np.nonzero(others)
+    entry, dose = index[i, j], given[i, j]
+    # rows run towards -y
+    place = np.column_stack([(j - column) * body.pitch_um, (row - i) * body.down_um])
+    away = np.hypot(*place.T)
+    mine = int(index[row, column])
+    edge = drawn.edge_um(mine)
     total = 0.0
-    for entry in np.unique(index[others]).tolist():
-        i, j = np.nonzero(others & (index == entry))
-        at = edge[:, None] - np.stack([x[j], y[i]], -1)
-        for width, weight in zip(point.widths_um, point.weights, strict=True):
-            total += weight * float(
-                (drawn.given(entry, at, float(width)) * given[i, j]).sum(-1).mean()
-            )
+    for width, weight in zip(
+        point.widths_um.tolist(), point.weights.tolist(), strict=True
+    ):
+        if width >= COARSE * body.apart_um:
+            wider = (2 * drawn.wider_um2[mine] + drawn.wider_um2[entry]) / 3
+            square = width**2 + wider  # of discs R^2 of the edge, R^2 / 2 of the area
+            bell = np.exp(-(away**2) / square) / (np.pi * square)
+            total += weight * float((dose * drawn.area_um2[entry] * bell).sum())
+            continue
+        for kind in np.unique(entry[away < _reach(drawn, edge, width)]).tolist():
+            same = entry == kind
+            at = edge[:, None] - place[same]
+            seen = drawn.given(kind, at, width) * dose[same]
+            total += weight * float(seen.sum(-1).mean())
     return total
+
+
+def _reach(drawn: Drawn, edge: Array, width: float) -> float:
+    """From middle to middle, where pillars expose each other's edges (exp(-36))."""
+    widest = float(np.sqrt(drawn.wider_um2.max()))
+    return float(np.hypot(*edge.T).max()) + widest + 6 * width

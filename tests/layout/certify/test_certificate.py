@@ -11,8 +11,8 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.certify import MadeRows, exposed, outlines, places, survey
-from layout.certify.gathered import Polygons
+from layout.certify import LensRows, polygon_edges, survey
+from layout.certify.polygon_edges import Polygons
 from layout.dose import exposure
 from layout.files import doses
 from layout.mask import build
@@ -23,7 +23,7 @@ from metalens.lens.record import DiameterMap, Lens
 from metalens.made import Bias
 from metalens.pillars import Proxy
 from tests.referees import rims
-from tests.referees.listed_certificate import certify
+from tests.referees.verified import verify
 
 BEAM = {"alpha_um": 0.013, "beta_um": 24.0, "eta": 0.7}
 
@@ -62,22 +62,24 @@ def written(process, furnished=True):
 )
 def test_exposures_are_those_of_the_direct_sum(third):
     process = Process(exposure=Exposure(**{**BEAM, **third}, correct=False))
-    _, content, table = written(process, furnished=False)
-    found = certify(content, table, process)
+    plan, content, table = written(process, furnished=False)
+    found = verify(plan, content, table, process)
     centres = np.stack([found.x_um, found.y_um], -1)
     which = np.linspace(0, len(centres) - 1, 12).astype(int)
     point = exposure.point_exposure(process.exposure)
     wide, dose = found.drawn_nm * 1e-3, np.full(len(centres), table[1, 0])
     exact = rims.at_edges(centres, wide, dose, point, which=which)
-    assert found.exposure[which] * 0.5 == pytest.approx(
-        exact, rel=2e-3
-    )  # neighbours as Gaussians of their moment
+    # interpolation on nodes and Gaussians of second moments: 5e-4; where a Gaussian is
+    # about as wide as pillars, the error that the survey measures at its own samples
+    error = np.abs(found.exposure[which] * 0.5 - exact).max()
+    assert error < 5e-4 + 0.5 * found.survey.error
+    assert found.survey.error < (0.015 if third.get("nu", 0) > 0.2 else 2e-3)
 
 
 def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
     process = Process(exposure=Exposure(**BEAM, tolerance=0.008))
     plan, content, table = written(process)
-    found = certify(content, table, process)
+    found = verify(plan, content, table, process)
     assert len(found.drawn_nm) == plan.counts()[1:].sum()
     assert np.abs(found.exposure[found.judged] - 1).max() < 0.008 + 2e-3
     assert found.survey.worst_nm < 1.0
@@ -91,16 +93,16 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
 
 def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     plain = Process(exposure=Exposure(**BEAM, correct=False))
-    _, content, table = written(plain)
-    assert not certify(content, table, plain).survey.ok
+    plan, content, table = written(plain)
+    assert not verify(plan, content, table, plain).survey.ok
     process = Process(exposure=Exposure(**BEAM))
-    _, content, table = written(process)
+    plan, content, table = written(process)
     layer = max(k for k in table if k[0] == 1)
-    more = certify(content, {**table, layer: 1.05 * table[layer]}, process).survey
+    more = verify(plan, content, {**table, layer: 1.05 * table[layer]}, process).survey
     assert not more.ok
     assert more.worst_exposure > 0.03
-    less = certify(
-        content, {k: v for k, v in table.items() if k != layer}, process
+    less = verify(
+        plan, content, {k: v for k, v in table.items() if k != layer}, process
     ).survey
     assert less.undosed == (layer,)
     assert not less.ok
@@ -111,13 +113,13 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
 )
 def test_the_edges_of_marks_and_labels_are_judged(third):
     process = Process(exposure=Exposure(**BEAM, **third))
-    _, content, table = written(process)
-    found = certify(content, table, process).survey
+    plan, content, table = written(process)
+    found = verify(plan, content, table, process).survey
     assert found.ok  # the tolerance of the correction is what a certificate wants
     assert set(found.edges.layer.tolist()) == {3, 4}
     labels = sorted(k for k in table if k[0] == 4)
     label = labels[len(labels) // 2]
-    wrong = certify(content, {**table, label: 0.9 * table[label]}, process).survey
+    wrong = verify(plan, content, {**table, label: 0.9 * table[label]}, process).survey
     assert not wrong.ok
     assert wrong.edges.exposure[wrong.edges.layer == 4].min() < 0.95
     assert wrong.edges.shift_nm[wrong.edges.layer == 4].min() < -0.3
@@ -152,34 +154,10 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     )
 
 
-@pytest.mark.parametrize(
-    "third", [{}, pytest.param({"gamma_um": 0.45, "nu": 0.03}, marks=pytest.mark.slow)]
-)
-def test_a_survey_of_the_planned_places_says_what_the_certificate_of_all_says(
-    third, monkeypatch
-):
-    process = Process(exposure=Exposure(**BEAM, **third), bias=Bias(isolated_nm=-9.0))
-    plan, content, table = written(process)
-    whole = certify(content, table, process, height_um=0.7).survey
-    monkeypatch.setattr(
-        exposed, "_MOST_PIXELS", 0
-    )  # bands of pixels, as a large mask needs
-    monkeypatch.setattr(exposed, "_BAND", 700)
-    monkeypatch.setattr(places, "_SITES", 100)
-    bands = survey(content, plan, table, process, height_um=0.7)
-    assert bands.pillars == whole.pillars
-    assert bands.tally.ends == pytest.approx(whole.tally.ends, rel=1e-5)  # float32
-    assert bands.edges.exposure == pytest.approx(whole.edges.exposure, rel=1e-5)
-    assert bands.tally.bins.sum() == whole.tally.bins.sum()
-    assert bands.worst_nm == pytest.approx(whole.worst_nm, rel=1e-4)
-    off = np.abs(bands.map_nm - whole.map_nm)[np.isfinite(whole.map_nm)]
-    assert off.max() < 1e-3  # nm: float32 diameters of 300 nm, and 1e-5 of the exposure
-
-
 def test_without_a_point_exposure_nothing_is_certified():
-    _, content, table = written(Process(), furnished=False)
+    plan, content, table = written(Process(), furnished=False)
     with pytest.raises(ProcessError, match="alpha_um, beta_um, eta"):
-        certify(content, table, Process())
+        verify(plan, content, table, Process())
 
 
 def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
@@ -206,13 +184,15 @@ def test_edges_of_a_polygon_are_those_of_products_of_error_functions():
                 * (erf((t - points[:, 1]) / a) - erf((b - points[:, 1]) / a))
                 / 2
             )
-    assert outlines.exposure(points, polygons, terms) == pytest.approx(want, abs=1e-9)
+    assert polygon_edges.exposure(points, polygons, terms) == pytest.approx(
+        want, abs=1e-9
+    )
 
 
 def test_samples_lie_on_the_outline_of_the_union_away_from_corners():
     boxes = [[0.0, 0.0, 3.0, 0.8], [3.0, 0.0, 3.7, 2.9]]
     corners = [np.array([[l, b], [r, b], [r, t], [l, t]]) for l, b, r, t in boxes]
-    found = outlines.samples(Polygons(corners, np.ones(2), np.array([3, 3])), 0.1)
+    found = polygon_edges.samples(Polygons(corners, np.ones(2), np.array([3, 3])), 0.1)
     x, y = found.at_um.T
     inner = (np.abs(x - 3.0) < 1e-9) & (y < 0.8)
     assert not inner.any()  # the shared side is no edge
@@ -233,7 +213,9 @@ def test_the_raster_of_a_large_polygon_carries_its_mass():
     shape = np.array(
         [[0.0, 0.0], [9.0, 0.0], [9.0, 2.0], [1.0, 2.0], [1.0, 7.0], [0.0, 7.0]]
     )
-    x, y, mass = outlines.spots(Polygons([shape], np.array([1.7]), np.array([3])), 0.5)
+    x, y, mass = polygon_edges.spots(
+        Polygons([shape], np.array([1.7]), np.array([3])), 0.5
+    )
     assert mass.sum() == pytest.approx(1.7 * 23.0, rel=1e-12)
     assert (mass * x).sum() / mass.sum() == pytest.approx(
         (18 * 4.5 + 5 * 0.5) / 23, rel=0.02
@@ -250,8 +232,8 @@ def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
         etch=Etch(sidewall_deg=1.0),
     )
     source = lens_map()
-    _, content, table = written(process)
-    found = certify(content, table, process, height_um=0.7)
+    plan, content, table = written(process)
+    found = verify(plan, content, table, process, height_um=0.7)
     lens = found.layer == 1
     made = found.made_nm[lens]
     size = source.diameter_um.shape[0]
@@ -283,8 +265,8 @@ def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
     designed = Lens(
         lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
     )
-    found, rows = certify(content, table, process), MadeRows(plan)
-    rows.place(found.x_um, found.y_um, found.made_nm, found.layer)
+    rows = LensRows(plan)
+    survey(content, plan, table, process, keep=rows.take)
     made = rows.lens(designed)
     d, want = made.diameters.diameter_um, designed.diameters.diameter_um
     assert np.array_equal(d > 0, want > 0)

@@ -7,14 +7,14 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.certify import outlines
-from layout.certify.gathered import Polygons
+from layout.certify import polygon_edges
+from layout.certify.polygon_edges import Polygons
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
-from tests.referees.listed_certificate import certify
+from tests.referees.verified import verify
 
 pytest.importorskip("klayout.db")
 
@@ -113,7 +113,8 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
     resist = plain_exposure.Resist(
         drawn, [(beam["alpha_um"], 1.0), (beam["beta_um"], beam["eta"])]
     )
-    found = certify(
+    found = verify(
+        plan,
         layout.read_gdsii(tmp_path / "m.gds"),
         doses.read(tmp_path / "doses.csv"),
         process,
@@ -169,14 +170,14 @@ def test_the_slope_across_an_edge_is_that_of_an_error_function(alpha_um):
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     drawn = Polygons((square,), np.array([1.3]), np.array([4]))
     middle = np.array([[1.0, 0.07], [-0.11, -1.0]])
-    points = outlines.Samples(
+    points = polygon_edges.Samples(
         middle, np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([4, 4])
     )
     outside, inside = (
-        outlines.exposure(at, drawn, [(alpha_um, 1.0)])
-        for at in outlines.slope_aside(points)
+        polygon_edges.exposure(at, drawn, [(alpha_um, 1.0)])
+        for at in polygon_edges.slope_aside(points)
     )
     want = 1.3 / (alpha_um * np.sqrt(np.pi))
-    assert (inside - outside) / outlines.aside_um() == pytest.approx(
+    assert (inside - outside) / polygon_edges.aside_um() == pytest.approx(
         [want] * 2, rel=0.016
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import layout
-from layout.certify import MadeRows, survey
+from layout.certify import LensRows, survey
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
@@ -18,6 +18,7 @@ from metalens.lens import DiameterMap, Lens
 from metalens.made import Bias
 from metalens.pillars import Proxy
 from tests.referees import plain_exposure
+from tests.referees.verified import verify
 
 pytest.importorskip("klayout.db")
 
@@ -132,7 +133,7 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     plan = build.prepare(source, process, furniture="none").plan
     layout.write_oasis(plan, tmp_path / "m.oas")
     doses.write(plan, process, tmp_path / "doses.csv")
-    rows = MadeRows(plan)
+    rows = LensRows(plan)
     survey(
         layout.read_oasis(tmp_path / "m.oas"),
         plan,
@@ -151,14 +152,10 @@ def certified(content, plan, table, process):
     """(n, 3) x, y and size in the resist of every pillar by the certificate, which
     holds.
     """
-    bands = []
-    outcome = survey(
-        content, plan, table, process, keep=lambda band, _: bands.append(band)
-    )
+    found = verify(plan, content, table, process)
+    outcome = found.survey
     assert outcome.ok, (outcome.worst_exposure, outcome.worst_nm)
-    return np.concatenate(
-        [np.column_stack([band.x_um, band.y_um, band.resist_nm]) for band in bands]
-    )
+    return np.column_stack([found.x_um, found.y_um, found.resist_nm])
 
 
 def places(plan):
@@ -189,17 +186,12 @@ def test_lone_pillars_of_any_shape_and_lattice_come_out_as_designed(tmp_path, ca
     plan = build.prepare(source, process, furniture="none").plan
     layout.write_gdsii(plan, tmp_path / "m.gds")
     doses.write(plan, process, tmp_path / "doses.csv")
-    bands = []
     content, table = (
         layout.read_gdsii(tmp_path / "m.gds"),
         doses.read(tmp_path / "doses.csv"),
     )
-    survey(content, plan, table, process, keep=lambda band, _: bands.append(band))
-    d = source.diameters
-    x, y, size = (
-        np.concatenate([getattr(band, name) for band in bands])
-        for name in ("x_um", "y_um", "made_nm")
-    )
+    found, d = verify(plan, content, table, process), source.diameters
+    x, y, size = found.x_um, found.y_um, found.made_nm
     row, column = (
         np.rint(y / d.steps_um[1] + (len(d.y_um) - 1) / 2),
         np.rint(x / d.steps_um[0] + (len(d.x_um) - 1) / 2),

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.certify.gathered import Polygons
 from layout.shapes import region
 from metalens.ground.arrays import Array
 from metalens.ground.units import nm
@@ -26,6 +25,17 @@ from metalens.ground.units import nm
 _STEP_UM = 1.0  # between the samples along an edge
 _FAR = 5.0  # ranges at which a polygon no longer counts: exp(-25)
 _ASIDE_UM = 2 * nm  # for the slope across an edge
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Polygons:
+    """Shapes that are no pillars: corners (counter-clockwise, um), relative doses and
+    layer numbers, one each.
+    """
+
+    corners: Sequence[Array]
+    dose: Array
+    layer: Array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
