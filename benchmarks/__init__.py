@@ -1,11 +1,11 @@
 """Benchmarks: every row prints a time beside an error, and what the error is measured
 against.
 
-A topic is a module ``benchmarks/<topic>.py`` with ``rows() -> list[Row]`` (or an
-iterator, whose rows are shown as they
-come), and, where it compares with other projects, ``peer_rows() -> list[Row]`` (run by
-``make bench-peers`` in an
-environment of their own).
+A topic is a module of ``speed`` (what every release must keep), ``peers`` (other
+people's methods and projects) or ``studies`` (are error bars honest, what is the model
+worth) with ``rows() -> list[Row]`` (or an iterator, whose rows are shown as they come),
+and, where it compares with other projects, ``peer_rows() -> list[Row]`` (run by
+``make bench-peers`` in an environment of their own).
 """
 
 import time

@@ -22,7 +22,6 @@ from benchmarks._stored import compared, machine
 
 LONG = (
     "engines",
-    "gpu",
     "hard_cells",
     "limits",
     "scene_referee",
@@ -50,7 +49,7 @@ def main(words: list[str]) -> int:
     asked = _parser().parse_args(words)
     failed = [
         topic
-        for topic in asked.topics or sorted(set(_topics()) - set(LONG))
+        for topic in asked.topics or sorted(_topics().keys() - set(LONG))
         if not _done(topic, asked.peers)
     ]
     figures.write()
@@ -65,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
         "topics",
         nargs="*",
         metavar="TOPIC",
-        choices=_topics(),
+        choices=list(_topics()),
         help=", ".join(_topics()),
     )
     parser.add_argument(
@@ -76,20 +75,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _topics() -> list[str]:
-    """Modules with ``rows`` or ``peer_rows``, found without importing them."""
+def _topics() -> dict[str, str]:
+    """{topic: module} of those with ``rows`` or ``peer_rows``, not imported for it."""
     folder = Path(__file__).parent
     made = re.compile(r"^def (peer_)?rows\(", re.M)
-    return [
-        p.stem
-        for p in sorted(folder.glob("[!_]*.py"))
-        if made.search(p.read_text(encoding="utf-8"))
-    ]
+    return {
+        path.stem: f"benchmarks.{path.parent.name}.{path.stem}"
+        for path in sorted(folder.glob("*/[!_]*.py"))
+        if made.search(path.read_text(encoding="utf-8"))
+    }
 
 
 def _done(topic: str, peers: bool) -> bool:
     """Run a topic and keep its rows; one without rows of this sort is passed over."""
-    module = importlib.import_module(f"benchmarks.{topic}")
+    module = importlib.import_module(_topics()[topic])
     make = getattr(module, "peer_rows" if peers else "rows", None)
     if make is None:
         return True

@@ -29,8 +29,8 @@ sys.path.insert(
     0, ".."
 )  # the rivals that this page measures lie beside the folder of examples
 
-from benchmarks.rivals import lowrank
-from benchmarks.rivals.radial import Radial, field_radial
+from benchmarks.peers import lowrank
+from benchmarks.peers.radial import Radial, field_radial
 from metalens import propagate, psf
 from metalens.psf import metrics as psf_metrics
 

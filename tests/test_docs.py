@@ -190,9 +190,9 @@ def test_files_modules_and_benchmarks_that_a_page_names_exist(page):
         re.findall(rf"`((?:{OURS}|benchmarks|tests|docs|examples)/[\w/.\-]+)`", text)
     )
     assert not [name for name in files if not (ROOT / name).exists()]
-    parts = set(re.findall(r"python -m benchmarks(?:\.| )([a-z]\w*)", text))
+    parts = set(re.findall(r"python -m benchmarks(?:\.\w+\.| )([a-z]\w*)", text))
     assert not [
-        name for name in parts if not list((ROOT / "benchmarks").glob(f"{name}*"))
+        name for name in parts if not list((ROOT / "benchmarks").rglob(f"{name}.py"))
     ]
     assert not [
         name for name in re.findall(rf"`({OURS}(?:\.\w+)+)", text) if not _there(name)

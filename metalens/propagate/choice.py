@@ -42,7 +42,7 @@ def choose(
 
     The angular spectrum is never chosen: its error (lattice, padding) has no bound.
     Radial lenses known by their
-    radial profile have a faster way of their own, :mod:`benchmarks.rivals.radial`.
+    radial profile have a faster way of their own, :mod:`benchmarks.peers.radial`.
     """
     pillars = case.shape[0] * case.shape[1]
     exact = exact_seconds(case)

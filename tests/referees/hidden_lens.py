@@ -6,12 +6,12 @@ import functools
 import math
 
 import numpy as np
-import pillar_table
-from pillar_bench import Session
 
 from metalens import design
 from metalens.design import profiles
 from metalens.pillars.record import DEFAULT_CELL
+from tests.referees import pillar_table
+from tests.referees.pillar_bench import Session
 
 DEPTHS = (380.0, 470.0, 590.0, 640.0, 800.0, 1150.0)
 # (middle, standard deviation) of the truths; the fit assumes 0 and 15, 10 nm ..., 0.5

@@ -19,10 +19,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-import pillar_table
 from scipy import fft, special
 
 from characterize.captures.capture import Capture
+from tests.referees import pillar_table
 
 MARGIN_UM = 6.0  # around the window that blur may reach in from
 ZERNIKE = {

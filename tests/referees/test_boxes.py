@@ -2,18 +2,13 @@
 both lights and all of Jones.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import boxes as referee
 
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import Polygon, Rectangle, Square
+from tests.referees import boxes as referee
 
 AIR = Index(1.0)
 HOOK = Polygon(

@@ -3,15 +3,9 @@ electrons that it counted.
 """
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import hidden_lens as hidden
-import pillar_bench as bench
 
 from characterize.captures import clean
 from characterize.inference import leastsquares
@@ -19,6 +13,8 @@ from characterize.inference.leastsquares import Settings
 from characterize.inference.prepare import data_of
 from characterize.inference.search import Task
 from characterize.model import PARAMETERS, PLACE, ForwardModel, Setting, slopes, vector
+from tests.referees import hidden_lens as hidden
+from tests.referees import pillar_bench as bench
 
 STEPS = {
     "bias_nm": 0.3,

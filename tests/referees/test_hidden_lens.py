@@ -3,16 +3,9 @@ says of errors unknown to it.
 """
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import hidden_lens as hidden
-import pillar_bench as bench
-import pillar_table
 
 import characterize
 from characterize.inference.estimate import Options
@@ -20,6 +13,9 @@ from characterize.model import NAMES, UNFITTED, slopes
 from metalens import modal
 from metalens.ground.errors import CaptureError, FitError
 from metalens.pillars.record import DEFAULT_CELL
+from tests.referees import hidden_lens as hidden
+from tests.referees import pillar_bench as bench
+from tests.referees import pillar_table
 
 USUAL = Options(scan_um=60.0)
 
@@ -216,7 +212,7 @@ def test_what_cannot_be_told_lies_within_the_interval(response, fault):
 
 @pytest.mark.slow
 def test_a_ghost_is_refused_or_spoken_of(response):
-    """The other faults have their rows in ``benchmarks.characterize_referee``: not all
+    """The other faults have their rows in ``benchmarks.studies.characterize_referee``: not all
     are found.
     """
     session = bench.with_faults(hidden.session(0), ghost=0.08)

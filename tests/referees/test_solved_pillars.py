@@ -3,15 +3,9 @@ past the proxy, wavelength.
 """
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import hidden_lens as hidden
-import pillar_table
 
 from characterize.model import slopes
 from characterize.model.pillars import Change, Pillars
@@ -19,6 +13,8 @@ from metalens import modal
 from metalens.cell import Index
 from metalens.made import Answers, answer, named, transmission
 from metalens.pillars.record import DEFAULT_CELL
+from tests.referees import hidden_lens as hidden
+from tests.referees import pillar_table
 
 D = np.array([0.0837, 0.1121, 0.1493, 0.1772, 0.1994])
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.rivals import mobilenet_v3
+from benchmarks.peers import mobilenet_v3
 from codesign.network import cost, windows
 from codesign.network.architecture import Space, largest, sample, smallest
 from codesign.network.supernet import Supernet

@@ -5,7 +5,7 @@ against the layer-by-layer one.
 import pytest
 import torch
 
-from benchmarks.rivals import layered
+from benchmarks.peers import layered
 from metalens.ground.errors import SceneError
 from metalens.image import scene
 from metalens.image.scene import Frames, Layers

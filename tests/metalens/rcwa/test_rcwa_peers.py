@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import rcwa as bench
+from benchmarks.speed import rcwa as bench
 from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle

@@ -1,7 +1,7 @@
 """A hundred hidden lenses, drawn anew with every seed: errors against the Cramér-Rao
 bound, coverage, prediction.
 
-``python -m benchmarks.characterize_study 8000 200 --minutes 9`` fits the seeds that are
+``python -m benchmarks.studies.characterize_study 8000 200 --minutes 9`` fits the seeds that are
 still missing at these peak
 electrons and keeps each at once in ``benchmarks/results/characterize_study``; what is
 there is printed by
@@ -34,8 +34,7 @@ from characterize.model.forward import ForwardModel, Setting
 from characterize.model.parameters import PLACE, Known
 from metalens.ground import store
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "characterize"))
-FOLDER = Path(__file__).parent / "results" / "characterize_study"
+FOLDER = Path(__file__).parents[1] / "results" / "characterize_study"
 SEEDS, PEAKS, GOALS = 100, (8000, 200), {8000: 1.10, 200: 1.25}
 DEPTHS, NEW_DEPTHS, NEW_ANGLE_DEG = (
     (380.0, 480.0, 600.0, 800.0, 1150.0),
@@ -80,7 +79,7 @@ def study(seed: int, peak_e: int) -> dict[str, Any]:
     """Capture a hidden lens, fit it, compare with the truth and at places that the fit
     never saw.
     """
-    import bench_lens as b
+    from tests.characterize import bench_lens as b
 
     values = hidden(seed)
     told = tuple(
@@ -194,7 +193,7 @@ def _truth(
 
 
 def _read(electrons: np.ndarray, seed: int) -> Capture:
-    import bench_lens as b
+    from tests.characterize import bench_lens as b
 
     return b.capture(electrons, seed=seed)
 
@@ -208,7 +207,7 @@ def _predicted(
     """NRMSE at places never captured; the stated depths pass through the fitted and the
     true stage alike.
     """
-    import bench_lens as b
+    from tests.characterize import bench_lens as b
 
     middle = float(np.mean(DEPTHS))
     moved = values["stage_zero_um"] + values["stage_scale"] * (np.mean(depths) - middle)

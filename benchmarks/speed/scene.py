@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks.rivals import layered
+from benchmarks.peers import layered
 from codesign.eye import dataset, renderer
 from codesign.eye.population import Rig, parameters
 from codesign.eye.renderer import Camera

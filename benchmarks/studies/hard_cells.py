@@ -2,7 +2,7 @@
 the bars are.
 
 ``python -m benchmarks hard_cells`` draws 1000 cells (an hour or two); ``python -m
-benchmarks.hard_cells
+benchmarks.studies.hard_cells
 N [SEED [SECONDS]]`` fewer, without RCWA, at most that long for each kind and tolerance.
 Two referees: finer meshes of
 the modal engine, until their own estimate is a fifth of the bar that they judge (cases

@@ -5,12 +5,12 @@ Lenses, pupils and screens of any pitch, wavelength and numerical aperture; wind
 their light, beside it, tiny,
 wider than the lens, and as wide as Fourier transforms take them; sources from the side.
 The referee is the plain sum
-over pillars (:mod:`benchmarks.rivals.plain_sum`), which shares no code with the engine,
+over pillars (:mod:`benchmarks.peers.plain_sum`), which shares no code with the engine,
 of the very maps that the
 engine got: at every sample of a window, or at ``POINTS`` of them drawn by their light,
 its root and evenly.
 
-``python -m benchmarks psf_float32`` draws 500 cases; ``python -m benchmarks.psf_float32
+``python -m benchmarks psf_float32`` draws 500 cases; ``python -m benchmarks.studies.psf_float32
 N [SEED]`` so many.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from benchmarks import Row
-from benchmarks.rivals import plain_sum
+from benchmarks.peers import plain_sum
 from metalens import psf
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError

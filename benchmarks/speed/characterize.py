@@ -2,7 +2,6 @@
 reduced model, micrographs.
 """
 
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +10,8 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks import _millimetre as millimetre
-from benchmarks import characterize_referee as referee
+from benchmarks.speed import _millimetre as millimetre
+from benchmarks.studies import characterize_referee as referee
 from characterize.bench import bench
 from characterize.captures import capture
 from characterize.measure import sem
@@ -21,7 +20,7 @@ from characterize.model.parameters import vector
 from characterize.pupil.fit import fit_pupil
 from characterize.pupil.record import PupilSpec
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 BEADS = (
     ROOT.parent
     / "shared"
@@ -29,7 +28,6 @@ BEADS = (
     / "bead_stack"
     / "psf_wl520nm_z300nm_x130nm_na0.85_n1.0.tif"
 )
-sys.path.insert(0, str(ROOT / "tests" / "characterize" / "measure"))
 
 
 def rows() -> Iterator[Row]:
@@ -149,7 +147,7 @@ def _fit() -> list[Row]:
     earlier run left them, and solved.
 
     Its truth shares no pillar, camera or prior with the fit
-    (:mod:`benchmarks.characterize_referee`).
+    (:mod:`benchmarks.studies.characterize_referee`).
     """
     start = time.perf_counter()
     referee.prepared("whole")
@@ -206,7 +204,7 @@ def _fit() -> list[Row]:
 
 
 def _reduced() -> list[Row]:
-    import bench_lens as b
+    from tests.characterize import bench_lens as b
 
     setting = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)
     model = ForwardModel(b.lens(), setting, b.RESPONSE)
@@ -239,7 +237,7 @@ def _reduced() -> list[Row]:
 
 
 def _micrographs() -> list[Row]:
-    import test_sem
+    from tests.characterize.measure import test_sem
 
     truth = np.random.default_rng(1).uniform(140, 300, (4, 4))
     start = time.perf_counter()

@@ -1,8 +1,6 @@
 """A lens of 1 mm and its light at 11 depths, by the sum over every pillar."""
 
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +11,7 @@ from characterize.model.parameters import Known
 from metalens import design, profiles
 from metalens.cell.record import Cell
 from metalens.lens.record import Lens
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "characterize"))
-import bench_lens
+from tests.characterize import bench_lens
 
 RESPONSE, PIXEL_UM, PIXELS, PEAK_E = bench_lens.RESPONSE, 3.0, 32, 8000.0
 DEPTHS = tuple((1 / np.linspace(1 / 15e3, 1 / 28e3, 11)).tolist())

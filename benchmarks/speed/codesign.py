@@ -13,7 +13,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks import Row, fastest
-from benchmarks.rivals import mobilenet_v3
+from benchmarks.peers import mobilenet_v3
 from codesign.batches import pool
 from codesign.batches.flat import depth_um, flattened, irradiance
 from codesign.batches.pool import PoolScenes

@@ -22,7 +22,7 @@ from metalens.modal.ladder import RUNGS
 
 WAVELENGTH_UM = 0.85
 CELL = Cell(0.40, 0.7, Index(3.6), Index(1.4525), Index(1.0), Index(1.0))
-REFERENCES = Path(__file__).parent / "results" / "reference_pillars.json"
+REFERENCES = Path(__file__).parents[1] / "results" / "reference_pillars.json"
 DIAMETERS = np.unique(
     np.round(
         np.concatenate([np.linspace(0.08, 0.32, 25), [0.1925, 0.1937, 0.301, 0.3035]]),

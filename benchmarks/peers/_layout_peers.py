@@ -10,7 +10,7 @@ import numpy as np
 
 import layout
 from benchmarks import Row, fastest
-from benchmarks.layout import NAN, PITCH, RULES, lens_of, plan
+from benchmarks.speed.layout import NAN, PITCH, RULES, lens_of, plan
 from layout.drc import check_plan
 from layout.mask.plan import Lattice, MaskPlan
 

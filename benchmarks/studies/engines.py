@@ -2,7 +2,7 @@
 do they agree within their bars?
 
 ``python -m benchmarks engines`` draws 200 round pillars of each kind (an hour);
-``python -m benchmarks.engines N
+``python -m benchmarks.studies.engines N
 [KIND ...]`` prints the table of fewer. t and r are compared, phases included. RCWA
 takes few orders, fixed: its bars
 are then wide, but the orders that a tolerance asks of strange cells take minutes. No
@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from benchmarks import Row
-from benchmarks.hard_cells import KINDS as HARD
-from benchmarks.hard_cells import Drawn
+from benchmarks.studies.hard_cells import KINDS as HARD
+from benchmarks.studies.hard_cells import Drawn
 from metalens import modal, rcwa
 from metalens.cell import Cell, Index
 from metalens.ground.errors import CellError

@@ -315,7 +315,7 @@ def _streaming_rows(target: Path) -> list[Row]:
 
 def _command_rows(target: Path) -> list[Row]:
     """The whole command on a lens file."""
-    from benchmarks.process import lens
+    from benchmarks.speed.process import lens
     from layout.commands import layout as command
     from metalens import lens as lenses
 
@@ -531,7 +531,7 @@ def _large_command_rows(target: Path) -> Iterator[Row]:
 
 def peer_rows() -> list[Row]:
     """gdstk and KLayout on the same pillars."""
-    from benchmarks import _layout_peers
+    from benchmarks.peers import _layout_peers
 
     with tempfile.TemporaryDirectory() as folder:
         return _layout_peers.measured(Path(folder))

@@ -1,4 +1,4 @@
-"""Reference values of hard pillars: ``python -m benchmarks.modal_reference [FILE]`` (an
+"""Reference values of hard pillars: ``python -m benchmarks.studies.modal_reference [FILE]`` (an
 hour on one core).
 
 Each value is the mean of both forms on the finer of two unrelated meshes, its
@@ -24,7 +24,7 @@ from metalens.modal.engine import evaluate
 from metalens.modal.mesh import MeshPlan, build
 from metalens.modal.spaces import select
 
-FILE = Path(__file__).parent / "results" / "reference_pillars.json"
+FILE = Path(__file__).parents[1] / "results" / "reference_pillars.json"
 FINEST = MeshPlan(7, 7, 7, (0.7,), (0.75, 0.96, 1.0), (0.05, 0.3, 1.0), core=0.55)
 FINE = MeshPlan(6, 7, 6, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0), core=0.55)
 BOTH = MeshPlan(5, 6, 5, (0.7, 1.3), (0.85, 1.0), (0.15, 1.0))
@@ -154,7 +154,7 @@ def main(file: Path) -> None:
         "about": "Zero-order t and r of round pillars, power-normalised, exp(-iwt), phases from foot to top, light "
         "from the substrate; angles in vacuum. Mean of the electric and magnetic forms of metalens.modal on the finer "
         "of two meshes; uncertainty: largest distance of the scattering matrices of the two meshes.",
-        "made_by": "python -m benchmarks.modal_reference",
+        "made_by": "python -m benchmarks.studies.modal_reference",
         "entries": [],
     }
     if file.exists():

@@ -2,7 +2,7 @@
 million pillars, a bench, a run.
 
     python -m benchmarks limits                              # all of them, some fifteen minutes on two quiet cores
-    python -m benchmarks.limits library info --work DIR      # these alone, on what DIR already holds
+    python -m benchmarks.speed.limits library info --work DIR      # these alone, on what DIR already holds
 
 Library, design, PSF, mask, budget, plan and scene are at full size; bench and networks
 are those of the demo.

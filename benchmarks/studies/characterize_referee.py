@@ -1,7 +1,7 @@
 """Hidden lenses of the referee bench, fitted with default priors: coverage by
 parameter, and faults that no fit knows.
 
-``python -m benchmarks.characterize_referee small 200 --minutes 60`` fits the seeds that
+``python -m benchmarks.studies.characterize_referee small 200 --minutes 60`` fits the seeds that
 are still missing of a case
 (small: 40 um; fifth: 0.2 mm; whole: 1 mm; drawn: the small one with one kind of what
 nobody states in turn, as large
@@ -33,8 +33,7 @@ from characterize.model import Known, slopes
 from metalens.ground import store
 from metalens.ground.errors import CaptureError, FitError
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "referees"))
-FOLDER = Path(__file__).parent / "results" / "characterize_referee"
+FOLDER = Path(__file__).parents[1] / "results" / "characterize_referee"
 CASES: dict[str, dict[str, Any]] = {
     "small": {"lens": (40.0, 110.0, 600.0), "scale": 1.0, "session": {}},
     "fifth": {
@@ -88,7 +87,7 @@ FAULTS: dict[str, dict[str, float]] = {
 @functools.cache
 def prepared(case: str) -> tuple[Any, Any]:
     """The design of a case, and its pillars under change."""
-    import hidden_lens
+    from tests.referees import hidden_lens
 
     lens = hidden_lens.lens(*CASES[case]["lens"])
     return lens, slopes(lens)
@@ -98,8 +97,7 @@ def study(
     case: str, seed: int, faults: dict[str, float] | None = None
 ) -> dict[str, Any]:
     """One hidden lens: capture, fit, compare."""
-    import hidden_lens
-    import pillar_bench
+    from tests.referees import hidden_lens, pillar_bench
 
     lens, response = prepared(case)
     about = CASES[case]

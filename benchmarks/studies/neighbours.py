@@ -30,7 +30,7 @@ from metalens.ground.arrays import Array
 from metalens.lens import Lens, Neighbours
 from metalens.psf import among
 
-FILE = Path(__file__).parents[1] / "examples" / "cells" / "tio2_532.toml"
+FILE = Path(__file__).parents[2] / "examples" / "cells" / "tio2_532.toml"
 WAVELENGTH_UM, APERTURE_UM = 0.532, 20.0
 LENSES = (
     (0.8, 7.5, (2, 3, 4)),

@@ -2,7 +2,7 @@
 random: do any lie below the error?
 
 ``python -m benchmarks shaped_cells`` draws 16 cells of each kind (an hour); ``python -m
-benchmarks.shaped_cells N [SEED
+benchmarks.studies.shaped_cells N [SEED
 [KIND ...]]`` another number. The referee is the same Fourier method at truncations that
 no bar has seen (orders within
 ``FINEST``), the mean of the last three with their spread as its doubt; ``make

@@ -12,19 +12,17 @@ its own PSF. Errors are relative L2 of PSFs of sum 1 unless the row says otherwi
 
 import functools
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks import Row
-from benchmarks import neighbours as rows_of_unlike
-from benchmarks.image import pillar_lens
+from benchmarks.speed.image import pillar_lens
+from benchmarks.studies import neighbours as rows_of_unlike
 from metalens import design, library, rcwa
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
@@ -35,7 +33,6 @@ from metalens.image import Frames, UniformImager, basis, image, uniform_imager
 from metalens.lens import Lens
 from metalens.psf import PsfStack, Source, View, from_lens, spectrum
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 PITCH, COUNT, WAVELENGTH = 0.4, 3600, 0.85
 # um from the rim to a window, and its diffraction: the referee of films fades what
 # falls further aside

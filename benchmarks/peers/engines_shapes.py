@@ -3,7 +3,7 @@ agree within their bars?
 
 ``python -m benchmarks engines_shapes --peers`` (in the environment of ``make
 bench-peers``) draws 200 cells of each
-kind (half an hour); ``python -m benchmarks.engines_shapes N [SEED [KIND ...]]`` prints
+kind (half an hour); ``python -m benchmarks.peers.engines_shapes N [SEED [KIND ...]]`` prints
 the table of fewer. All four
 numbers of t and of r are compared, phases included. Ours: few orders, fixed. fmmax has
 no bars: it is given ``FACTOR``
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import Row
-from benchmarks.shaped_cells import Drawn, fitting
+from benchmarks.studies.shaped_cells import Drawn, fitting
 from metalens import rcwa
 from metalens.cell import Cell, Film, Index, Lattice, Layer
 from metalens.cell.shapes import (

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks._psf_case import (
+from benchmarks.speed._psf_case import (
     DEPTHS,
     GEOMETRY,
     WINDOW,

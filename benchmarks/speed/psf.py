@@ -1,5 +1,5 @@
 """PSF engine: time beside error for a 1 mm lens of 2500 x 2500 pillars; see
-:mod:`benchmarks._psf_case`.
+:mod:`benchmarks.speed._psf_case`.
 """
 
 import functools
@@ -13,7 +13,9 @@ import numpy as np
 import torch
 
 from benchmarks import Row, fastest
-from benchmarks._psf_case import (
+from benchmarks.peers import lowrank
+from benchmarks.peers.radial import Radial, field_radial
+from benchmarks.speed._psf_case import (
     DEPTHS,
     GEOMETRY,
     PITCH,
@@ -32,8 +34,6 @@ from benchmarks._psf_case import (
     peak_mb,
     textbook,
 )
-from benchmarks.rivals import lowrank
-from benchmarks.rivals.radial import Radial, field_radial
 from metalens import propagate, psf
 from metalens.propagate.direct import transfer
 from metalens.propagate.estimate import draw, scan, square_error
