@@ -10,6 +10,7 @@ from scipy import fft, ndimage, optimize
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
+from metalens.psf import brightest, encircled_power, fwhm
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -151,7 +152,7 @@ def spot(psf: Array, *, step_um: float) -> Spot:
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     widths, (cx, cy) = _second_moments(light, x, y)
     return Spot(
-        _fwhm(light) * step_um,
+        fwhm(light, step_um),
         _encircled(light, x - cx, y - cy, 0.8) * step_um,
         (widths[0] * step_um, widths[1] * step_um),
         (cx * step_um, cy * step_um),
@@ -182,8 +183,8 @@ def focusing_efficiency(
     aperture_um: float,
     exposure_ratio: float = 1.0,
 ) -> float:
-    """Light within a stated circle about the centroid over the light through an open
-    aperture of the lens's size.
+    """Light within a stated circle about the peak over the light through an open
+    aperture of the lens's size: as :class:`metalens.psf.FocusMetrics`, measured.
 
     Args:
         image_e, reference_e: electrons, background taken off; the reference is a frame
@@ -193,10 +194,10 @@ def focusing_efficiency(
             it with the number.
         exposure_ratio: exposure of the image over that of the reference.
     """
-    share = encircled_energy(
-        image_e, step_um=step_um, radius_um=np.array([aperture_um / 2])
-    )[0]
-    return float(share * np.sum(image_e) / np.sum(reference_e) / exposure_ratio)
+    light = np.asarray(image_e, float)
+    row, column, _ = brightest(light)
+    power = encircled_power(light, (row, column), aperture_um / 2 / step_um)
+    return float(power / np.sum(reference_e) / exposure_ratio)
 
 
 def _second_moments(
@@ -228,33 +229,6 @@ def _second_moments(
             break
         width = max(major, 1.0)
     return (major, minor), (cx, cy)
-
-
-def _fwhm(light: Array) -> float:
-    row, column = np.unravel_index(int(light.argmax()), light.shape)
-    peak, (dy, dx) = _parabola(light, int(row), int(column))
-    y, x = np.indices(light.shape)
-    radius = np.hypot(y - row - dy, x - column - dx)
-    spline = ndimage.spline_filter(light, 3)
-    angle = np.linspace(0, 2 * math.pi, 72, endpoint=False)
-
-    def mean_at(r: float) -> float:
-        points = row + dy + r * np.sin(angle), column + dx + r * np.cos(angle)
-        return float(
-            ndimage.map_coordinates(
-                spline, points, prefilter=False, mode="nearest"
-            ).mean()
-        )
-
-    radii = np.linspace(0, radius.max() / 2, 400)
-    below = next((r for r in radii if mean_at(float(r)) < peak / 2), None)
-    if below is None:
-        return math.nan
-    return 2 * float(
-        optimize.brentq(
-            lambda r: mean_at(r) - peak / 2, max(below - radii[1], 0), below
-        )
-    )
 
 
 def _encircled(light: Array, x: Array, y: Array, share: float) -> float:

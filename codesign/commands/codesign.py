@@ -2,19 +2,22 @@
 under compute budgets.
 """
 
+import contextlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.batches import parallel
 from codesign.commands import onnx_file
 from codesign.commands.options.codesign import Options
 from codesign.network import Baseline, Subnet
-from codesign.optics import formed
+from codesign.optics import OpticsConfig, formed
 from codesign.optics import stack as trained
 from codesign.train import (
     End,
@@ -35,7 +38,7 @@ from codesign.train import run as runs
 from metalens import design, lens, library
 from metalens.ground import config, report, store, transaction
 from metalens.ground.console import Console
-from metalens.ground.errors import ConfigError
+from metalens.ground.errors import ConfigError, LensError
 
 CHECKPOINT, LOG, SETTINGS = "checkpoint.safetensors", "log.jsonl", "run.toml"
 RESULT, ANSWERS = "result.json", "answers.h5"
@@ -237,7 +240,9 @@ def _log(folder: Path, entry: dict[str, Any]) -> None:
 def _keep(folder: Path, going: Run, ends: list[End], said: dict[str, Any]) -> None:
     """lens.h5, the networks, result.json, answers.h5 and the plot of the Pareto set."""
     settings = going.settings
-    _lens(folder / "lens.h5", going)
+    about = store.Provenance(config=config.dumps(settings), seed=settings.inner.seed)
+    phase = runs.coefficients(going)
+    lens.save(folder / "lens.h5", trained_lens(settings.optics, phase, about))
     _weights(folder, going, ends)
     pitch = float(going.trainer.model.pitch_um.detach())
     rows = [end.row for end in ends]
@@ -285,24 +290,43 @@ def _named(budget_mmacs: float | None) -> str:
     )
 
 
-def _lens(path: Path, going: Run) -> None:
-    settings = going.settings.optics
-    made = library.sweep(
-        library.DEFAULT_CELL, wavelengths_um=(settings.focus.wavelength_um,)
-    )
-    phase = trained.phase_of(settings, runs.coefficients(going).numpy())
-    result, _ = design.make(
-        phase,
-        settings.focus,
-        aperture_um=settings.aperture_mm * 1e3,
-        cell=made.cell,
-        proxy=library.proxy_of(made),
-        profile="codesign",
-        provenance=store.Provenance(
-            config=config.dumps(going.settings), seed=going.settings.inner.seed
-        ),
-    )
-    lens.save(path, result)
+SPECTRAL_NODES = 5  # wavelengths of the pillars' library over the light of training
+
+
+def trained_lens(
+    settings: OpticsConfig, coefficients_rad: Tensor, provenance: store.Provenance
+) -> lens.Lens:
+    """The lens of a trained phase, its pillars known over the light of training.
+
+    Over 1.25 of the width of a line to either side (0.3 % of a Gaussian lies beyond),
+    over half of that where pillars would cover less than a turn of phase, else at the
+    middle alone.
+
+    Args:
+        coefficients_rad: (polynomials,) of the phase.
+    """
+    middle_um, light = settings.focus.wavelength_um, formed.source_of(settings)
+    width_um = 0.0 if light is None else light.fwhm_nm * 1e-3
+
+    def over(half_um: float) -> lens.Lens:
+        waves = np.linspace(-half_um, half_um, SPECTRAL_NODES if half_um else 1)
+        waves_um = tuple((waves + middle_um).tolist())
+        made = library.sweep(library.DEFAULT_CELL, wavelengths_um=waves_um)
+        result, _ = design.make(
+            trained.phase_of(settings, coefficients_rad.numpy()),
+            settings.focus,
+            aperture_um=settings.aperture_mm * 1e3,
+            cell=made.cell,
+            proxy=library.proxy_of(made),
+            profile="codesign",
+            provenance=provenance,
+        )
+        return result
+
+    for half_um in (1.25 * width_um, 0.625 * width_um) if width_um else ():
+        with contextlib.suppress(LensError):
+            return over(half_um)
+    return over(0.0)
 
 
 def _plot(going: Run) -> bytes:

@@ -38,12 +38,11 @@ from metalens.ground.store import write_bytes
 from metalens.lens import Layers, Lens, check_gaps
 from metalens.lens import picture as lens_plot
 from metalens.pillars import PillarLibrary, axes
+from metalens.psf import FocusMetrics
 
 if TYPE_CHECKING:
     from metalens.image import Pupil
 
-# pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
-MOST_SUMMED = 60_000_000
 _WAVELENGTH_NM = 850.0  # where neither the design nor its library says one
 OBJECTIVES: dict[str, str] = {}  # module by name, filled by the command line
 Profile = Literal["hyperbolic", "double-helix", "cubic", "fisher", "map"]
@@ -181,13 +180,10 @@ def run(options: Options) -> int:
         _head(made.wanted, target, made.quality) + words.held(made.lens) + lost,
         made.wanted.layers,
     )
-    values = words.values(made.quality, made.check, made.unlike) | several.numbers(
-        made.beside
-    )
+    about_focus = made.quality, made.check, made.unlike, made.figures
+    values = words.values(*about_focus) | several.numbers(made.beside)
     values |= words.curve(made.lens.proxy) | {"loss": made.loss}
-    text = words.text(
-        head, layers, made.quality, made.check, made.unlike, several=bool(made.beside)
-    )
+    text = words.text(head, layers, *about_focus, several=bool(made.beside))
     text += several.lines(made.beside, layers)
     if made.quality.turns < 1 and not made.beside:
         about = made.lens.proxy, made.lens.cell, made.wanted.limits
@@ -254,12 +250,14 @@ def _paired(wanted: Design, options: Options, read: list[Path]) -> int:
         )
         profiles = wanted.profile, (wanted.along_y or wanted).profile
         checks = paired.checks(made, profiles, skip=options.skip_focus_check)
+        figures = paired.figures(made, split)
         lens.save(draft.path, made)
         write_bytes(draft.path.with_suffix(".png"), lens_plot.picture(made))
     head = _head(wanted, options.output, split.x)
     head += describe_order_loss(made_of.cell, wanted.focus.wavelength_um)
-    told = paired.values(split, checks), paired.text(head, wanted.layers, split, checks)
-    return options.console.judged(*told, words.unfocused(checks))
+    values = paired.values(split, checks, figures)
+    text = paired.text(head, wanted.layers, split, checks, figures)
+    return options.console.judged(values, text, words.unfocused(checks))
 
 
 def _read(wanted: Design, where: Path) -> list[Path]:
@@ -336,26 +334,37 @@ def _make(wanted: Design, options: Options, path: Path) -> "Outcome":
         else None
     )
     beside = several.judged(made, wanted.wavelengths, lights[1:], others, check=checked)
+    figures = words.focus_figures(made, quality)
     lens.save(path, made)
     write_bytes(path.with_suffix(".png"), lens_plot.picture(made))
     if judged is not None:
         write_bytes(path.with_name(f"{path.stem}_fisher.png"), judged.picture)
     lost = made_of.mean_loss(made.diameters.diameter_um, wanted.focus.wavelength_um)
     return Outcome(
-        wanted, quality, check, judged, conversion, found, made, beside, lost
+        wanted,
+        quality,
+        check,
+        figures,
+        judged,
+        conversion,
+        found,
+        made,
+        beside,
+        lost,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a design is worth. wanted: as it was filled in; check: of its focus; judged:
-    of a free form; conversion: of
+    """What a design is worth. wanted: as it was filled in; check: of its focus; figures:
+    of its PSF; judged: of a free form; conversion: of
     circular light; unlike: what neighbours leave of the efficiency; beside: of the
     other wavelengths; loss: mean share that is absorbed or in other orders."""
 
     wanted: Design
     quality: Quality
     check: FocusCheck | None
+    figures: FocusMetrics | None
     judged: "_Judged | None"
     conversion: Conversion | None
     unlike: design.Unlike | None
@@ -370,11 +379,11 @@ def _checkable(wanted: Design, options: Options, quality: Quality) -> bool:
     """
     if wanted.profile != "hyperbolic" or options.skip_focus_check:
         return False
-    if quality.pillars > MOST_SUMMED:
+    if quality.pillars > words.MOST_SUMMED:
         options.console.say(
-            f"the exact sum around the focus is left out: more than {MOST_SUMMED:,} pillars"
+            f"the exact sum around the focus is left out: more than {words.MOST_SUMMED:,} pillars"
         )
-    return quality.pillars <= MOST_SUMMED
+    return quality.pillars <= words.MOST_SUMMED
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from metalens.ground.console import Console
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens
 from metalens.pillars import Proxy
+from metalens.psf import FocusMetrics
 
 
 def meets(
@@ -22,12 +23,17 @@ def meets(
     elsewhere = design.meeting_um(
         phase, focus, radius_um=radius_um, pitch_um=cell.pitch_um
     )
-    if elsewhere is not None and abs(elsewhere / focus.sensor_distance_um - 1) > 0.01:
-        told = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {focus.sensor_distance_um / 1e3:g} mm"
-        console.say(
-            f"the rays of the map come together {elsewhere * 1e-3:.4g} mm behind the lens; {told}"
-        )
+    distance = focus.sensor_distance_um
+    if elsewhere is not None and abs(elsewhere[2] / distance - 1) > 0.01:
+        stated = f"source at {focus.source_distance_um / 1e3:g} mm, sensor at {distance / 1e3:g} mm"
+        console.say(f"the rays of the map meet {place(elsewhere)}; {stated}")
     return False
+
+
+def place(at_um: tuple[float, float, float]) -> str:
+    """A place behind the lens, for a person."""
+    x, y, z = (round(value, 3) + 0.0 for value in at_um)
+    return f"at ({x:+.4g}, {y:+.4g}) um, {z * 1e-3:.4g} mm behind the lens"
 
 
 def neighbours(
@@ -62,22 +68,42 @@ def neighbours(
     return made, design.unlike(made, radius_um=radius_um)
 
 
+# pillars of a focus check: 2.6 mm at a pitch of 0.3 um, half a minute on two cores
+MOST_SUMMED = 60_000_000
+
+
+def focus_figures(made: Lens, quality: Quality) -> FocusMetrics | None:
+    """Of the PSF of the design source; None of a phase without a focus, of a lens of
+    more pillars than fit in memory at once, and where torch is not installed.
+    """
+    if not quality.focuses or quality.pillars > MOST_SUMMED:
+        return None
+    try:
+        return design.focus_figures(made)
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        return None
+
+
 def values(
-    quality: Quality, check: FocusCheck | None, unlike: Unlike | None = None
+    quality: Quality,
+    check: FocusCheck | None,
+    unlike: Unlike | None = None,
+    figures: FocusMetrics | None = None,
 ) -> dict[str, object]:
-    """Numbers of a lens, of the check of its focus and of its neighbours; None for what
-    JSON does not know.
+    """Numbers of a lens, of the check of its focus, of its neighbours and of its PSF;
+    None for what JSON does not know.
     """
     values: dict[str, object] = {"pillars": quality.pillars, "focuses": quality.focuses}
     if quality.focuses:
         values |= {
             "numerical_aperture": quality.numerical_aperture,
             "field_of_view_deg": math.degrees(quality.field_of_view_rad),
-            "efficiency": quality.efficiency,
+            **_of_psf(figures),
         }
-    else:
-        values["wave_efficiency"] = quality.efficiency
     values |= {
+        "wavefront_efficiency": quality.wavefront_efficiency,
         "sampled_aperture": quality.sampled_aperture,
         "steepest": quality.steepest,
         "transmission": quality.transmission,
@@ -97,6 +123,22 @@ def values(
     if unlike is not None:
         values["neighbours"] = asdict(unlike)
     return values
+
+
+def _of_psf(figures: FocusMetrics | None) -> dict[str, object]:
+    """Focusing efficiency and widths of the PSF of the design source; none computed:
+    none.
+    """
+    if figures is None:
+        return {"efficiency": None}
+    names = "efficiency", "efficiency_error", "fwhm_um", "fwhm_error_um", "mtf50_per_um"
+    found = {name: getattr(figures, name) for name in names}
+    found |= {"psf_strehl": figures.strehl, "psf_strehl_error": figures.strehl_error}
+    found = {
+        name: None if isinstance(v, float) and math.isnan(v) else v
+        for name, v in found.items()
+    }
+    return found | {"diffraction_limit": asdict(figures.limit)}
 
 
 def unfocused(checks: Sequence[FocusCheck | None]) -> list[str]:
@@ -132,20 +174,32 @@ def converted(found: Conversion, quality: Quality, hand: str) -> str:
     )
 
 
-def _neighbours(found: Unlike, quality: Quality) -> str:
-    """What neighbours leave of the efficiency, in words."""
-    left = quality.efficiency * found.share
+def _neighbours(found: Unlike) -> str:
+    """What neighbours leave of the power in the focus, in words."""
     if found.pillars:
         rows = ", ".join(map(str, found.pillars))
         return (
-            f"  with pillars among unlike neighbours {left:.3f} +- {quality.efficiency * found.error:.2g} "
-            f"(rows of {rows} of its own pillars solved)"
+            f"  unlike neighbours leave {found.share:.3f} +- {found.error:.2g} of the power of pillars one by one, "
+            f"counted in the PSF (rows of {rows} of its own pillars solved)"
         )
     most = min(1.0, max(1 - found.share, 0.0) + found.error)
     return (
         f"  that is of pillars one by one: unlike neighbours may cost as much as {most:.1%} of it "
         "(rough, of another cell; --own-cell solves rows of these pillars, and PSFs and images then hold them)"
     )
+
+
+def _psf(figures: FocusMetrics | None, quality: Quality) -> list[str]:
+    """FWHM, Strehl ratio and focusing efficiency of the PSF, in words."""
+    if figures is None:
+        why = "more pillars than fit in memory, or torch is not installed"
+        return [f"  no focusing efficiency: {why}"] if quality.focuses else []
+    return [
+        f"  PSF of the design source: focusing efficiency {figures.efficiency:.3f} +- {figures.efficiency_error:.2g} "
+        f"(power within three FWHM over power on the aperture; {figures.limit.efficiency:.3f} without losses and "
+        f"aberrations),\n  FWHM {figures.fwhm_um:.4g} +- {figures.fwhm_error_um:.2g} um (diffraction limit "
+        f"{figures.limit.fwhm_um:.4g}), Strehl ratio {figures.strehl:.3f} +- {figures.strehl_error:.2g}"
+    ]
 
 
 def _films(layers: Layers) -> list[str]:
@@ -203,19 +257,20 @@ def text(
     quality: Quality,
     check: FocusCheck | None,
     unlike: Unlike | None = None,
+    figures: FocusMetrics | None = None,
     *,
     several: bool = False,
 ) -> str:
     """Lines about a lens below a head; layers: films that its phase is corrected for;
-    several: whether its pillars are
+    figures: of its PSF; several: whether its pillars are
     a compromise between wavelengths."""
     lines = [
         head,
         *_cone(quality),
-        f"  {'focusing' if quality.focuses else 'wave-front'} efficiency {quality.efficiency:.3f}, "
-        f"mean |T|² {quality.transmission:.3f}, "
+        *_psf(figures, quality),
+        f"  wave-front efficiency {quality.wavefront_efficiency:.3f}, mean |T|² {quality.transmission:.3f}, "
         f"Strehl ratio of the pillars {quality.strehl:.4f}, largest phase error {quality.max_phase_error_rad:.2g} rad",
-        *([] if unlike is None else [_neighbours(unlike, quality)]),
+        *([] if unlike is None else [_neighbours(unlike)]),
         *_films(layers),
     ]
     if quality.steepest > quality.sampled_aperture:

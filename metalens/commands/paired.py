@@ -21,8 +21,8 @@ from metalens.ground import store
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens, check_gaps
 from metalens.pillars import axes
+from metalens.psf import FocusMetrics
 
-MOST_SUMMED = 60_000_000  # pillars of a focus check
 BOTH: tuple[Literal["x", "y"], ...] = ("x", "y")
 
 
@@ -81,7 +81,7 @@ def checks(
     """The exact sum about the focus of either light; None where a profile has no focus,
     or it is not asked for.
     """
-    skip = skip or made.diameters.diameter_um.size > MOST_SUMMED
+    skip = skip or made.diameters.diameter_um.size > words.MOST_SUMMED
     return [
         None
         if skip or profile != "hyperbolic"
@@ -90,7 +90,19 @@ def checks(
     ]
 
 
-def values(split: Split, found: list[FocusCheck | None]) -> dict[str, object]:
+def figures(made: Lens, split: Split) -> list[FocusMetrics | None]:
+    """Of the PSF of either light."""
+    return [
+        words.focus_figures(made.seen(light), quality)
+        for light, quality in zip(BOTH, (split.x, split.y), strict=True)
+    ]
+
+
+def values(
+    split: Split,
+    found: list[FocusCheck | None],
+    of_psf: list[FocusMetrics | None],
+) -> dict[str, object]:
     """Of both lights, for programs."""
     told: dict[str, object] = {
         "pillars": split.x.pillars,
@@ -101,9 +113,9 @@ def values(split: Split, found: list[FocusCheck | None]) -> dict[str, object]:
     for place, (light, quality) in enumerate(
         zip(BOTH, (split.x, split.y), strict=True)
     ):
-        own = words.values(quality, found[place])
+        own = words.values(quality, found[place], None, of_psf[place])
         own |= {
-            "efficiency_error": split.efficiency_error[place],
+            "wavefront_efficiency_error": split.wavefront_efficiency_error[place],
             "leaked": split.leaked[place],
         }
         del own["turns"]  # of a single diameter
@@ -112,7 +124,11 @@ def values(split: Split, found: list[FocusCheck | None]) -> dict[str, object]:
 
 
 def text(
-    head: str, layers: Layers, split: Split, found: list[FocusCheck | None]
+    head: str,
+    layers: Layers,
+    split: Split,
+    found: list[FocusCheck | None],
+    of_psf: list[FocusMetrics | None],
 ) -> str:
     """Of both lights, for people."""
     what = "two phases" if split.multiplexed else "one phase for both polarisations"
@@ -124,11 +140,16 @@ def text(
         zip(BOTH, (split.x, split.y), strict=True)
     ):
         lines += words.text(
-            f"  light polarised along {light}:", layers, quality, found[place]
+            f"  light polarised along {light}:",
+            layers,
+            quality,
+            found[place],
+            None,
+            of_psf[place],
         ).splitlines()
         lines.append(
-            f"  efficiency within {split.efficiency_error[place]:.2g} (error bars of the pillars); phase error "
-            f"{quality.rms_phase_error_rad:.2g} rad rms costs {1 - quality.strehl:.1%} of the peak; "
+            f"  wave-front efficiency within {split.wavefront_efficiency_error[place]:.2g} (error bars of the pillars); "
+            f"phase error {quality.rms_phase_error_rad:.2g} rad rms costs {1 - quality.strehl:.1%} of the peak; "
             f"{split.leaked[place]:.2g} of the light leaves with the other polarisation"
         )
     return "\n".join(lines)

@@ -6,7 +6,7 @@ An interruption leaves what stood at the output; the same command begins anew.
 
 import importlib
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -16,11 +16,13 @@ import tyro
 from metalens import design, lens, psf
 from metalens.cell import describe_order_loss
 from metalens.commands import far_field
+from metalens.commands import psf_words as words
 from metalens.commands.common import Common, MaybeOutput
 from metalens.commands.psf_settings import Settings, read
 from metalens.ground import config, reading, store, transaction
+from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
-from metalens.ground.report import Figure, KeyFigure, Section, Table, write
+from metalens.ground.report import write
 from metalens.ground.store import Provenance, write_bytes
 from metalens.psf import export as psf_export
 
@@ -30,13 +32,12 @@ SOURCES: dict[str, str] = {}
 CAPTIONS = {
     "xz": "Slice through the PSF along depth, centre row of the window, each depth at its own full scale.",
     "montage": "PSFs over depth (across) and field angle (down); square root of intensity.",
-    "mtf": "Modulation transfer along x (thick) and y (thin), and the share of the window's light inside a circle.",
+    "mtf": "Modulation transfer along x (thick) and y (thin) up to the cut-off, that of an ideal round aperture dotted, "
+    "and the share of the window's light inside a circle.",
+    "zscan": "Irradiance along x on planes behind the lens for light along the axis, and its peak and width over the "
+    "plane's shift from the sensor.",
     "information": "I(z) of Eq. 11 under two normalisations and three binnings; the normalisation decides the ranking.",
 }
-BUDGET_WORDS = (
-    "What computation and model are wrong by, each alone, the worst over angles: the terms of the model are those "
-    "of a perfect lens of the same aperture."
-)
 
 
 @dataclass(frozen=True)
@@ -54,10 +55,13 @@ class Options(Common):
             stands in place of the file's.
         depths_mm: nearest and farthest source, and the largest step between depths;
             left out: 21 depths about the
-            focus of this lens, to 1.75 waves out of focus.
+            focus of this lens, to 1.75 waves out of focus; of a lens for collimated
+            light infinity, with a scan along z behind the lens (NAME_zscan.png).
         sources_mm: the depth of every source, in place of depths_mm; inf for a plane
             wave.
-        angles_deg: field angles along x; the image of a positive angle lies at +x.
+        angles_deg: field angles along x; the image of a positive angle lies at +x. Left
+            out: 0 and the half field over which a hyperbolic lens of this focus is
+            diffraction-limited; of asbuilt.h5 the angles of the captures.
         angles_y_deg: field angles along y (down), one for each of angles_deg.
         window_um: full width along x of the window about the chief ray; left out: what
             the blur of this lens needs.
@@ -125,8 +129,8 @@ class Options(Common):
 
 
 def run(options: Options) -> int:
-    """Compute, write, draw; exit 1 where the error estimate stays above the tolerance
-    or pillars are hardly known.
+    """Compute, write, draw; exit 1 where the error estimate stays above the tolerance,
+    pillars are hardly known, or a window holds hardly any of the light.
     """
     if options.far_field:
         return _far(options)
@@ -134,7 +138,7 @@ def run(options: Options) -> int:
     psf_export.check(target)
     made, built = _read(options.lens)
     made = made if settings.layers is None else replace(made, layers=settings.layers)
-    settings = settings.about(made)
+    settings = settings.about(made, None if built is None else built.angle_rad)
     view = settings.view
     pixels = (
         len(view.depths_um)
@@ -146,22 +150,13 @@ def run(options: Options) -> int:
     with options.claim(
         target, beside=ends, room=transaction.ROOM + 4 * pixels
     ) as draft:
-        stack = _make(options, settings, made, built, draft.path)
-    counts = (
-        ("angle", stack.angles_rad),
-        ("depth", stack.depths_um),
-        ("wavelength", stack.weights),
-    )
-    shape = " x ".join(
-        f"{len(all_of)} {name}{'s' * (len(all_of) != 1)}" for name, all_of in counts
-    )
-    text = f"{target}: {shape}, relative error {stack.error:.2g} ({stack.reason})\n  {_budget(stack).text}"
-    text += describe_order_loss(made.cell, float(stack.wavelengths_um.min()))
-    above = f"the relative error {stack.error:.2g} is above the tolerance {stack.tolerance:g}: {_budget(stack).cure}"
-    failures = ["" if stack.converged else above, made.proxy.doubt]
-    return options.console.judged(
-        _summary(stack) | {"doubt": made.proxy.doubt}, text, failures
-    )
+        found = _compute(options.lens, settings, made, built)
+        _write(draft.path, found, page=options.report)
+    failures = [words.above(found.stack), made.proxy.doubt, words.dark(found)]
+    values = words.numbers(found) | {"doubt": made.proxy.doubt}
+    text = words.text(target, found)
+    text += describe_order_loss(made.cell, float(found.stack.wavelengths_um.min()))
+    return options.console.judged(values, text, failures)
 
 
 def _far(options: Options) -> int:
@@ -199,8 +194,15 @@ class Built(Protocol):
     def design(self) -> lens.Lens:
         """What was to be made."""
 
-    def psf_stack(self, view: "psf.View", *, tolerance: float) -> psf.PsfStack:
+    @property
+    def angle_rad(self) -> Array:
+        """(n, 2) field angles of the captures."""
+
+    def psf_stack(self, view: "psf.View", *, tolerance: float) -> "psf.PsfStack":
         """PSFs (angle, depth, y, x)."""
+
+    def psf_posterior(self, view: "psf.View") -> float:
+        """Relative L2 error of the PSFs by what the captures leave open."""
 
 
 def _read(path: Path) -> tuple[lens.Lens, Built | None]:
@@ -214,32 +216,60 @@ def _read(path: Path) -> tuple[lens.Lens, Built | None]:
     return found.design, found
 
 
-def _make(
-    options: Options,
-    settings: Settings,
-    made: lens.Lens,
-    built: Built | None,
-    path: Path,
-) -> psf.PsfStack:
-    """Compute, write, draw."""
+def _compute(
+    path: Path, settings: Settings, made: lens.Lens, built: Built | None
+) -> words.Computed:
+    """PSFs, the figures of the sharpest of every angle, and a scan behind a lens for
+    collimated light.
+    """
+    if built is not None:
+        stack = _of_built(path, settings, built)
+        figures = psf.focus_metrics(stack, made)
+        return words.Computed(stack, figures, design.lens_meeting_um(made))
+    made = _in_light(path, made, settings)
+    known = _own_cell(made, settings) if settings.own_cell else None
+    if known is not None and isinstance(known.neighbours, lens.Neighbours):
+        made = replace(made, neighbours=known.neighbours)
+    stack = _of_design(made, settings, known, _provenance(path, settings))
+    figures = psf.focus_metrics(stack, made, power_error=design.power_error(made))
+    lit = figures[0].window_share >= words.DARK
+    scan = _scan(made, settings, stack) if lit else None
+    return words.Computed(stack, figures, design.lens_meeting_um(made), scan)
+
+
+def _scan(
+    made: lens.Lens, settings: Settings, stack: psf.PsfStack
+) -> "psf.FocusScan | None":
+    """Behind a lens for collimated light, unless its sources were stated."""
+    if not math.isinf(made.source_distance_um) or settings.sources_mm != (math.inf,):
+        return None
+    nodes = psf.Nodes(stack.wavelengths_um, stack.weights, 0.0)
+    return psf.focus_scan(made, offset_um=settings.offset_um, nodes=nodes)
+
+
+def _write(path: Path, found: words.Computed, *, page: bool) -> None:
+    """The file of PSFs, its pictures, and with ``page`` its report."""
     from metalens.psf import plots as psf_plots
 
-    stack = (
-        _of_design(options.lens, settings, made)
-        if built is None
-        else _of_made(options.lens, settings, built)
-    )
-    psf_export.write(path, stack)
-    pictures = psf_plots.pictures(stack)
+    psf_export.write(path, found.stack)
+    limit = max((one.limit for one in found.figures), key=lambda one: one.cutoff_per_um)
+    pictures = psf_plots.pictures(found.stack, limit=limit, scan=found.scan)
     for name, image in pictures.items():
         write_bytes(path.with_name(f"{path.stem}_{name}.png"), image)
-    if options.report:
-        _report(path.with_suffix(".html"), stack, pictures)
-    return stack
+    if page:
+        sections = words.sections(found, {CAPTIONS[n]: i for n, i in pictures.items()})
+        write(
+            path.with_suffix(".html"),
+            "Point spread functions",
+            sections,
+            key_figures=words.key_figures(found),
+        )
 
 
-def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
-    """PSFs of a kind of file that the command line knows a source for."""
+def _of_built(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
+    """PSFs of a kind of file that the command line knows a source for, the posterior of
+    its fit in their error.
+    """
     for name in ("led_fwhm_nm", "spectrum", "wavelengths_nm", "layers", "own_cell"):
         if getattr(settings, name):
             raise ConfigError(
@@ -247,31 +277,55 @@ def _of_made(path: Path, settings: Settings, given: Built) -> psf.PsfStack:
                 "were fitted"
             )
     if settings.polarisation in ("flux", "vector"):
-        words = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
-        raise ConfigError(f"{path}: {words}")
+        stated = f"polarisation = {settings.polarisation!r} is for a design; a {store.kind_of(path)} file is one scalar"
+        raise ConfigError(f"{path}: {stated}")
     found = given.psf_stack(settings.view, tolerance=settings.tolerance)
-    return replace(found, provenance=_provenance(path, settings))
+    posterior = given.psf_posterior(settings.view)
+    budget = replace(found.budget or psf.Budget(found.error), posterior=posterior)
+    return replace(
+        found,
+        error=math.hypot(found.error, posterior),
+        budget=budget,
+        provenance=_provenance(path, settings),
+    )
 
 
-def _of_design(path: Path, settings: Settings, made: lens.Lens) -> psf.PsfStack:
-    """PSFs of a lens file, for the polarisation that is asked for."""
-    if (
-        settings.light != "both"
-        and made.pairs is None
-        and made.one_light != f"light along {settings.light}"
+def _in_light(path: Path, made: lens.Lens, settings: Settings) -> lens.Lens:
+    """The lens for the polarisation that is asked for."""
+    if settings.light == "both" or (
+        made.pairs is None and made.one_light == f"light along {settings.light}"
     ):
-        known = (
-            f"know {made.one_light} alone" if made.one_light else "treat x and y alike"
+        return made
+    if made.pairs is not None:
+        return made.seen(settings.light)
+    known = f"know {made.one_light} alone" if made.one_light else "treat x and y alike"
+    known = "are turned, for circular light" if made.hand else known
+    raise ConfigError(
+        f"{path}: light = {settings.light!r} is for pillars of two sizes; these {known}"
+    )
+
+
+def _of_design(
+    made: lens.Lens,
+    settings: Settings,
+    known: psf.LeftOut | None,
+    provenance: Provenance,
+) -> psf.PsfStack:
+    """PSFs of a lens file; of pillars of two sizes the mean of light along x and y."""
+
+    def of(one: lens.Lens) -> psf.PsfStack:
+        return psf.from_lens(
+            one,
+            settings.view,
+            tolerance=settings.tolerance,
+            spectrum=settings.spectrum_of(one),
+            provenance=provenance,
+            polarisation=settings.polarisation,
+            left_out=known,
         )
-        known = "are turned, for circular light" if made.hand else known
-        raise ConfigError(
-            f"{path}: light = {settings.light!r} is for pillars of two sizes; these {known}"
-        )
-    provenance = _provenance(path, settings)
-    if made.pairs is None:
-        return _from_lens(made, settings, provenance)
-    if settings.light != "both":
-        return _from_lens(made.seen(settings.light), settings, provenance)
+
+    if made.pairs is None or settings.light != "both":
+        return of(made)
     x, y = made.seen("x"), made.seen("y")
     if (x.sensor_distance_um, x.source_distance_um) != (
         y.sensor_distance_um,
@@ -280,24 +334,7 @@ def _of_design(path: Path, settings: Settings, made: lens.Lens) -> psf.PsfStack:
         raise ConfigError(
             "light along x and y is focused at other distances by this lens: give light = 'x' or 'y'"
         )
-    return psf.unpolarised(*(_from_lens(one, settings, provenance) for one in (x, y)))
-
-
-def _from_lens(
-    made: lens.Lens, settings: Settings, provenance: Provenance
-) -> psf.PsfStack:
-    found = _own_cell(made, settings) if settings.own_cell else None
-    if found is not None and isinstance(found.neighbours, lens.Neighbours):
-        made = replace(made, neighbours=found.neighbours)
-    return psf.from_lens(
-        made,
-        settings.view,
-        tolerance=settings.tolerance,
-        spectrum=settings.spectrum_of(made),
-        provenance=provenance,
-        polarisation=settings.polarisation,
-        left_out=found,
-    )
+    return psf.unpolarised(of(x), of(y))
 
 
 def _provenance(path: Path, settings: Settings) -> Provenance:
@@ -316,91 +353,3 @@ def _own_cell(made: lens.Lens, settings: Settings) -> psf.LeftOut:
         float(np.arctan(np.hypot(*np.tan(angle)))) for angle in settings.view.angles_rad
     )
     return design.left_out(made, aperture=max(apertures), incidence_rad=incidence)
-
-
-def _summary(stack: psf.PsfStack) -> dict[str, object]:
-    return {
-        "error": stack.error,
-        "budget": {
-            name: None if math.isnan(v) else v
-            for name, v in asdict(_budget(stack)).items()
-        },
-        "tolerance": stack.tolerance,
-        "converged": stack.converged,
-        "reason": stack.reason,
-        "depths_um": [
-            None if math.isinf(depth) else depth for depth in stack.depths_um.tolist()
-        ],
-        "angles_rad": stack.angles_rad.tolist(),
-        "wavelengths_um": stack.wavelengths_um.tolist(),
-    }
-
-
-def _budget(stack: psf.PsfStack) -> psf.Budget:
-    return stack.budget or psf.Budget(stack.error)
-
-
-def _budget_table(stack: psf.PsfStack) -> Table:
-    found = _budget(stack)
-    rows = [
-        [name, "not known" if math.isnan(v) else f"{v:.2g}"]
-        for name, v in asdict(found).items()
-    ]
-    rows += [
-        ["computed", f"{found.computed:.2g}"],
-        ["of the device", f"{found.total:.2g}"],
-    ]
-    return Table(
-        ("cause", "relative L2"),
-        rows,
-        "The tolerance is about what is computed; outside is a share of light.",
-    )
-
-
-def _key_figures(stack: psf.PsfStack) -> list[KeyFigure]:
-    """What was computed, how well, and what the model leaves out of it."""
-    found, shape = (
-        _budget(stack),
-        (len(stack.angles_rad), len(stack.depths_um), len(stack.wavelengths_um)),
-    )
-    counted = " × ".join(map(str, shape))
-    figures = [
-        KeyFigure("field angles × depths × wavelengths", counted),
-        KeyFigure(
-            "relative error of what is computed", f"{stack.error:.2g}", stack.converged
-        ),
-        KeyFigure("with what the model leaves out", f"{found.total:.2g}"),
-    ]
-    known = not math.isnan(found.outside)
-    return figures + (
-        [KeyFigure("of the light falls beside the window", f"{found.outside:.2g}")]
-        if known
-        else []
-    )
-
-
-def _report(path: Path, stack: psf.PsfStack, pictures: dict[str, bytes]) -> None:
-    """One page with all pictures and the energies."""
-    energy = np.asarray(stack.energy_um2)
-    rows = [
-        [f"{x:.3g}", f"{y:.3g}", float(e.min()), float(e.max())]
-        for (x, y), e in zip(np.rad2deg(stack.angles_rad), energy, strict=True)
-    ]
-    table = Table(
-        ("x / deg", "y / deg", "least", "most"),
-        rows,
-        "Light in the window for unit irradiance, µm², over depth.",
-    )
-    figures = [
-        Figure(image, CAPTIONS[name], wide=True) for name, image in pictures.items()
-    ]
-    write(
-        path,
-        "Point spread functions",
-        [
-            Section("Pictures", items=figures),
-            Section("Error by cause", BUDGET_WORDS, [_budget_table(stack)]),
-            Section("Energy", f"Method: {stack.reason}.", [table]),
-        ],
-        key_figures=_key_figures(stack),
-    )

@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from metalens import lens, propagate, psf
+from metalens import design, lens, propagate, psf
 from metalens.ground import config
+from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, reach
 from metalens.psf import spectrum as spectra
@@ -24,13 +25,15 @@ class Settings:
     """What is computed; kept in the file.
 
     depths_mm: nearest and farthest source, and the largest step between depths; left
-    out: 21 depths over which the rim
+    out: infinity for a lens for collimated light, else 21 depths over which the rim
         of this lens goes from 1.75 waves out of focus on one side to as many on the
         other.
     sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
     angles_deg: field angles along x, arctangents of the light's slope dx/dz in air: the
     image of a positive angle lies
-        at +x. angles_y_deg: along y (down), one for each or none for 0.
+        at +x; left out: 0 and the half field over which a hyperbolic lens of this focus
+        is diffraction-limited (Strehl ratio 0.8), or the angles that a lens was
+        measured at. angles_y_deg: along y (down), one for each or none for 0.
     window_um, samples: full width along x of the window that follows the chief ray, and
     samples along it; without a
         width 28 wavelength / NA, or 8 blur radii at the worst depth where that is more.
@@ -67,7 +70,7 @@ class Settings:
 
     depths_mm: tuple[float, float, float] | None = None
     sources_mm: tuple[float, ...] = field(default=(), metadata={"may_be_inf": True})
-    angles_deg: tuple[float, ...] = (0.0, 10.0, 20.0)
+    angles_deg: tuple[float, ...] | None = None
     angles_y_deg: tuple[float, ...] = ()
     window_um: float | None = None
     samples: int = 192
@@ -103,17 +106,16 @@ class Settings:
                 f"sources_mm = {self.sources_mm}: need depths above 0, inf for a plane wave"
             )
         if (far - near) / step > MOST_DEPTHS or max(
-            map(abs, (*self.angles_deg, *self.angles_y_deg, 0.0))
+            map(abs, (*(self.angles_deg or ()), *self.angles_y_deg, 0.0))
         ) >= 90:
             raise ConfigError(
                 f"depths_mm = {self.depths_mm}, angles_deg = {self.angles_deg}: need at most {MOST_DEPTHS} depths, "
                 "angles within 90 degrees"
             )
-        if not self.angles_deg or (
-            self.angles_y_deg and len(self.angles_y_deg) != len(self.angles_deg)
-        ):
+        along_x = len(self.angles_deg or ())
+        if self.angles_deg == () or len(self.angles_y_deg) not in (0, along_x):
             raise ConfigError(
-                f"{len(self.angles_deg)} angles along x, {len(self.angles_y_deg)} along y: need one for each"
+                f"{along_x} angles along x, {len(self.angles_y_deg)} along y: need one for each"
             )
         if (self.source_um and self.source_deg) or not (
             self.source_um >= 0 and 0 <= self.source_deg < 90
@@ -189,18 +191,27 @@ class Settings:
             raise ConfigError("window_um is left to the lens, and there is none")
         return self.window_um
 
-    def about(self, made: lens.Lens) -> "Settings":
-        """These with the depths and the window of this lens where they were left out."""
-        near, far = (depth * 1e-3 for depth in reach.depth_range_um(made))
-        depths_mm = self.depths_mm or (near, far, (far - near) / 20)
+    def about(self, made: lens.Lens, angles_rad: Array | None = None) -> "Settings":
+        """These with depths, angles and window of this lens where they were left out.
+
+        angles_rad: (n, 2) angles that it was measured at, in place of its field's.
+        """
+        filled = self
+        if self.angles_deg is None:
+            x, y = _angles_deg(made, angles_rad)
+            filled = replace(filled, angles_deg=x, angles_y_deg=y)
+        collimated = math.isinf(made.source_distance_um)
+        if not self.sources_mm and self.depths_mm is None:
+            if collimated:
+                filled = replace(filled, sources_mm=(math.inf,))
+            else:
+                near, far = (depth * 1e-3 for depth in reach.depth_range_um(made))
+                filled = replace(filled, depths_mm=(near, far, (far - near) / 20))
         if self.window_um is not None:
-            return replace(self, depths_mm=depths_mm)
-        ends = [z * 1e3 for z in self.sources_mm or depths_mm[:2]]
-        return replace(
-            self,
-            depths_mm=depths_mm,
-            window_um=reach.window_um(made, tuple(ends), airy=AIRY),
-        )
+            return filled
+        ends = filled.sources_mm or (filled.depths_mm or ())[:2]
+        ends_um = tuple(z * 1e3 for z in ends)
+        return replace(filled, window_um=reach.window_um(made, ends_um, airy=AIRY))
 
     @property
     def view(self) -> "psf.View":
@@ -220,6 +231,8 @@ class Settings:
                 np.linspace(near, far, int(np.ceil((far - near) / step - 1e-9)) + 1)
                 * 1e3
             )
+        if self.angles_deg is None:
+            raise ConfigError("angles_deg are left to the lens, and there is none")
         along_y = self.angles_y_deg or (0.0,) * len(self.angles_deg)
         pairs = [
             tuple(np.deg2rad([x, y]).tolist())
@@ -265,6 +278,20 @@ class Settings:
             if self.led_fwhm_nm
             else None
         )
+
+
+def _angles_deg(
+    made: lens.Lens, angles_rad: Array | None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """(x, y) field angles that a lens was measured at, or of its field."""
+    if angles_rad is not None and len(angles_rad):
+        x, y = np.rad2deg(np.unique(angles_rad, axis=0)).T
+        return tuple(x.tolist()), tuple(y.tolist())
+    distances = made.sensor_distance_um, made.source_distance_um
+    focus = design.Focus(made.wavelength_um, *distances, made.layers)
+    radius_um = made.diameters.radius_um + made.diameters.pitch_um / 2
+    half = math.degrees(design.field_angle(focus, radius_um))
+    return (0.0, float(f"{half:.2g}")), (0.0, 0.0)
 
 
 def read(path: Path | None, over: dict[str, Any]) -> Settings:

@@ -12,6 +12,7 @@ from metalens.design import FocusCheck, Quality, Wanted
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers, Lens
 from metalens.pillars import PillarLibrary
+from metalens.psf import FocusMetrics
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,7 @@ class Judged:
     light: Beside
     quality: Quality
     check: FocusCheck | None
+    figures: FocusMetrics | None
 
 
 def check(wavelengths: tuple[Beside, ...], profile: str) -> None:
@@ -100,6 +102,7 @@ def judged(
                 light,
                 quality,
                 design.check_focus(seen, expected=quality.strehl) if check else None,
+                words.focus_figures(seen, quality),
             )
         )
     return tuple(out)
@@ -111,7 +114,7 @@ def numbers(beside: Sequence[Judged]) -> dict[str, object]:
         {
             "wavelength_nm": one.light.wavelength_nm,
             "weight": one.light.weight,
-            **words.values(one.quality, one.check),
+            **words.values(one.quality, one.check, None, one.figures),
         }
         for one in beside
     ]
@@ -126,6 +129,8 @@ def lines(beside: Sequence[Judged], layers: Layers) -> str:
     ]
     found = zip(heads, beside, strict=True)
     return "".join(
-        words.text(head, layers, one.quality, one.check, several=True)
+        words.text(
+            head, layers, one.quality, one.check, None, one.figures, several=True
+        )
         for head, one in found
     )

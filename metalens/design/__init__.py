@@ -9,16 +9,20 @@ if TYPE_CHECKING:
     from metalens.design import profiles as profiles
     from metalens.design.focus_check import FocusCheck as FocusCheck
     from metalens.design.focus_check import check_focus as check_focus
+    from metalens.design.focus_check import focus_figures as focus_figures
     from metalens.design.focusing import focused as focused
     from metalens.design.focusing import focuses as focuses
+    from metalens.design.focusing import lens_meeting_um as lens_meeting_um
     from metalens.design.focusing import meeting_um as meeting_um
     from metalens.design.of_phase import Limits as Limits
     from metalens.design.of_phase import Quality as Quality
     from metalens.design.of_phase import cure as cure
+    from metalens.design.of_phase import field_angle as field_angle
     from metalens.design.of_phase import make as make
     from metalens.design.of_phase import phase_of as phase_of
     from metalens.design.own_cell import Unlike as Unlike
     from metalens.design.own_cell import left_out as left_out
+    from metalens.design.own_cell import power_error as power_error
     from metalens.design.own_cell import rough_unlike as rough_unlike
     from metalens.design.own_cell import rows as rows
     from metalens.design.own_cell import unlike as unlike
@@ -52,8 +56,11 @@ __getattr__, __dir__, __all__ = attach(
         "Wanted": "several",
         "check_focus": "focus_check",
         "cure": "of_phase",
+        "field_angle": "of_phase",
+        "focus_figures": "focus_check",
         "focused": "focusing",
         "focuses": "focusing",
+        "lens_meeting_um": "focusing",
         "meeting_um": "focusing",
         "hyperbolic": "profiles",
         "left_out": "own_cell",
@@ -64,6 +71,7 @@ __getattr__, __dir__, __all__ = attach(
         "neighbours": "",
         "phase_of": "of_phase",
         "profiles": "",
+        "power_error": "own_cell",
         "rough_unlike": "own_cell",
         "rows": "own_cell",
         "unlike": "own_cell",

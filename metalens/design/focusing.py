@@ -56,60 +56,77 @@ def focused(lens: Lens) -> bool:
     """As :func:`focuses`, of the pillars of a lens: every place has the phase of the
     pillar next to it.
     """
-    d, phase = lens.diameters, lens.phase_rad()
+    phase, focus, radius_um = _nearest(lens)
+    pitch_um = lens.diameters.pitch_um
+    return focuses(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
+
+
+def lens_meeting_um(lens: Lens) -> tuple[float, float, float] | None:
+    """As :func:`meeting_um`, of the pillars of a lens."""
+    phase, focus, radius_um = _nearest(lens)
+    pitch_um = lens.diameters.pitch_um
+    return meeting_um(phase, focus, radius_um=radius_um, pitch_um=pitch_um)
+
+
+def _nearest(lens: Lens) -> tuple[PhaseOf, Focus, float]:
+    """The phase of the pillar next to every place, what the lens images onto what, and
+    its radius in um.
+    """
+    d = lens.diameters
 
     def nearest(x_um: Array, y_um: Array) -> Array:
         rows, columns = (
             np.clip(np.rint(at / step + (n - 1) / 2).astype(int), 0, n - 1)
             for at, step, n in zip(
-                (y_um, x_um), d.steps_um[::-1], phase.shape, strict=True
+                (y_um, x_um), d.steps_um[::-1], d.diameter_um.shape, strict=True
             )
         )
-        return np.asarray(phase[np.ix_(rows, columns)])
+        found = [lens.rows_phase_rad(slice(row, row + 1))[0] for row in rows.tolist()]
+        return np.stack([row[columns] for row in found])
 
-    focus = Focus(
-        lens.wavelength_um,
-        lens.sensor_distance_um,
-        lens.source_distance_um,
-        lens.layers,
-    )
-    return focuses(
-        nearest, focus, radius_um=d.radius_um + d.pitch_um / 2, pitch_um=d.pitch_um
-    )
+    distances = lens.sensor_distance_um, lens.source_distance_um
+    focus = Focus(lens.wavelength_um, *distances, lens.layers)
+    return nearest, focus, d.radius_um + d.pitch_um / 2
 
 
 def meeting_um(
     phase: PhaseOf, focus: Focus, *, radius_um: float, pitch_um: float
-) -> float | None:
-    """Distance behind the lens, through air, where rays from the design source pass
-    closest to one another.
+) -> tuple[float, float, float] | None:
+    """Place (x, y, z) behind the lens where rays from the design source pass closest to
+    one another.
 
     Rays go from (x, y) along (p, q, sqrt(1 - p² - q²)); the sum of squared distances
     from their middle is least at
     z = -sum(x u + y v) / sum(u² + v²), u = p / sqrt(1 - p² - q²), v alike, all less
-    their means. None where they
-    spread there as widely as on the lens (:data:`SPREAD`), never meet in front of the
-    lens, or films stand behind it.
+    their means. Behind films: their middle on the sensor. None where they
+    spread there as widely as on the lens (:data:`SPREAD`), or never meet in front of
+    the lens.
     """
     axis, x, y, inside = _grid(radius_um, pitch_um)
-    if not focus.layers.plain or inside.sum() < RAYS:
-        return None
-    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
-    inside &= px**2 + py**2 < 1
     if inside.sum() < RAYS:
         return None
-    along = np.sqrt(1 - (px**2 + py**2)[inside])
-    places, slopes = (
-        np.stack([x[inside], y[inside]]),
-        np.stack([px[inside], py[inside]]) / along,
-    )
-    places, slopes = (a - a.mean(axis=1, keepdims=True) for a in (places, slopes))
-    power = float((slopes**2).sum())
-    if power < 1e-18 * slopes.size:  # parallel to rounding
+    px, py = _leaving(phase, focus, pitch_um, (axis, x, y))
+    after = focus.layers.after(focus.sensor_distance_um, focus.wavelength_um)
+    w = px**2 + py**2
+    inside &= w < 0.999 * after.layers[0][0] ** 2
+    if inside.sum() < RAYS:
         return None
-    distance_um = float(-(places * slopes).sum() / power)
-    spread = np.linalg.norm(places + distance_um * slopes) / np.linalg.norm(places)
-    return distance_um if distance_um > 0 and spread <= SPREAD else None
+    # sideways way to the sensor over p; through air that of the slope u times z
+    bend = media.bend(after.layers, np.where(inside, w, 0.0))[inside]
+    z_um = focus.sensor_distance_um
+    places = np.stack([x[inside], y[inside]])
+    slopes = np.stack([px[inside], py[inside]]) * bend / z_um
+    centred, turned = (a - a.mean(axis=1, keepdims=True) for a in (places, slopes))
+    if len(after.layers) == 1:
+        power = float((turned**2).sum())
+        if power < 1e-18 * turned.size:  # parallel to rounding
+            return None
+        z_um = float(-(centred * turned).sum() / power)
+    spread = np.linalg.norm(centred + z_um * turned) / np.linalg.norm(centred)
+    if z_um <= 0 or spread > SPREAD:
+        return None
+    middle = (places + z_um * slopes).mean(axis=1)
+    return float(middle[0]), float(middle[1]), z_um
 
 
 def _grid(radius_um: float, pitch_um: float) -> tuple[Array, Array, Array, Array]:

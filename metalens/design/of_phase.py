@@ -32,8 +32,9 @@ class Quality:
 
     pillars: count.
     numerical_aperture: of the cone that leaves the lens towards the sensor.
-    efficiency: |sum T exp(i error)|² / N²: power in the ideal spot, against a perfect
-    lens without loss.
+    wavefront_efficiency: |sum T exp(i error)|² / N²: power on the aperture that leaves
+    in the wanted wave front. The focusing efficiency is that of the PSF
+    (:func:`metalens.design.focus_figures`).
     transmission: mean |T|², the light that passes.
     strehl: |sum T exp(i error)|² / (sum T)²: what the phase errors of the pillars leave
     of the peak.
@@ -46,8 +47,7 @@ class Quality:
     phases that none has.
     focuses: whether rays of the design source meet in one spot
     (:func:`metalens.design.focuses`); where they do not,
-        aperture and field have no meaning, and the efficiency is that of the wanted
-        wave front.
+        aperture and field have no meaning.
     steepest: slope of the phase at the rim over the wave number, the bend in sines that
     it asks for (of the focus).
     sampled_aperture: bend that the lattice carries without aliases, wavelength / (2
@@ -56,7 +56,7 @@ class Quality:
 
     pillars: int
     numerical_aperture: float
-    efficiency: float
+    wavefront_efficiency: float
     transmission: float
     strehl: float
     field_of_view_rad: float
@@ -303,7 +303,7 @@ class Sums:
         return Quality(
             pillars=self.count,
             numerical_aperture=focus.aperture(lit_um),
-            efficiency=peak / self.count**2,
+            wavefront_efficiency=peak / self.count**2,
             transmission=self.power / self.count,
             strehl=peak / self.level**2,
             field_of_view_rad=2 * field_angle(focus, radius_um),

@@ -132,6 +132,20 @@ def rough_unlike(lens: Lens, *, radius_um: float) -> Unlike:
     return Unlike(share, abs(1 - share))
 
 
+def power_error(lens: Lens) -> float:
+    """Relative error of the power behind the pillars: that of |T|² by their curve, and
+    what neighbours take beyond the solved rows (rough where none is solved).
+    """
+    pillars = (
+        lens.proxy.error(lens.wavelength_um)
+        if lens.pairs is None
+        else lens.pairs.entry_error
+    )
+    radius_um = lens.diameters.radius_um + lens.diameters.pitch_um / 2
+    known = rough_unlike if lens.neighbours is None else unlike
+    return math.hypot(2 * pillars, known(lens, radius_um=radius_um).error)
+
+
 def _rings(lens: Lens, radius_um: float) -> tuple[Array, Array]:
     """(m,) sines by which rings of a lens turn light, and their shares of the area."""
     node, weight = np.polynomial.legendre.leggauss(RINGS)

@@ -41,8 +41,8 @@ _GAPS = 12  # sizes along each axis at which the gap to the neighbours is worked
 class Split:
     """What a lens of two sizes makes of light along x and along y.
 
-    x, y: quality for either; their ``efficiency`` is the share of that light in its
-    focus. efficiency_error: bar of
+    x, y: quality for either; their ``wavefront_efficiency`` is the share of that light in its
+    focus. wavefront_efficiency_error: bar of
     each, from the error bars of the pillars. leaked: mean power that leaves with the
     other polarisation, for x and y.
     covered: share of pairs of phases (of single phases, where both are one) that a
@@ -53,7 +53,7 @@ class Split:
 
     x: Quality
     y: Quality
-    efficiency_error: tuple[float, float]
+    wavefront_efficiency_error: tuple[float, float]
     leaked: tuple[float, float]
     covered: float
     multiplexed: bool
@@ -250,7 +250,7 @@ def _split(
     mean = float(
         (used * stock.error).sum() / used.sum()
     )  # of t: the peak's amplitude is off by no more
-    errors = [2 * math.sqrt(q.efficiency) * mean + mean**2 for q in qualities]
+    errors = [2 * math.sqrt(q.wavefront_efficiency) * mean + mean**2 for q in qualities]
     leaked = (used[:, None] * stock.leaked).sum(axis=0) / used.sum()
     return Split(
         qualities[0],

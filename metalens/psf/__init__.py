@@ -24,7 +24,14 @@ if TYPE_CHECKING:
     from metalens.psf.directions import FarField as FarField
     from metalens.psf.directions import far_field as far_field
     from metalens.psf.extended import Extent as Extent
+    from metalens.psf.focus import focus_metrics as focus_metrics
+    from metalens.psf.metrics import DiffractionLimit as DiffractionLimit
+    from metalens.psf.metrics import FocusMetrics as FocusMetrics
     from metalens.psf.metrics import blur_um as blur_um
+    from metalens.psf.metrics import brightest as brightest
+    from metalens.psf.metrics import diffraction_limit as diffraction_limit
+    from metalens.psf.metrics import encircled_power as encircled_power
+    from metalens.psf.metrics import fwhm as fwhm
     from metalens.psf.of_lens import View as View
     from metalens.psf.of_lens import all_maps as all_maps
     from metalens.psf.of_lens import from_lens as from_lens
@@ -44,13 +51,18 @@ if TYPE_CHECKING:
     from metalens.psf.vector import of_flux as of_flux
     from metalens.psf.vector import strongest as strongest
     from metalens.psf.vector import turned as turned
+    from metalens.psf.z_scan import FocusScan as FocusScan
+    from metalens.psf.z_scan import focus_scan as focus_scan
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
         "Budget": "budget",
+        "DiffractionLimit": "metrics",
         "Extent": "extended",
         "FarField": "directions",
+        "FocusMetrics": "metrics",
+        "FocusScan": "z_scan",
         "LeftOut": "budget",
         "Mixed": "vector",
         "NEIGHBOURS": "budget",
@@ -65,9 +77,15 @@ __getattr__, __dir__, __all__ = attach(
         "aperture": "budget",
         "beyond_faces": "vector",
         "blur_um": "metrics",
+        "brightest": "metrics",
+        "diffraction_limit": "metrics",
+        "encircled_power": "metrics",
         "export": "",
         "far_field": "directions",
+        "focus_metrics": "focus",
+        "focus_scan": "z_scan",
         "from_lens": "of_lens",
+        "fwhm": "metrics",
         "incidence": "of_lens",
         "unpolarised": "of_lens",
         "load": "record",

@@ -92,7 +92,8 @@ class Budget:
         light that goes twice between
         two faces. proxy: of pillars that answer by a curve, which follows those of
         their library to some error, and of
-        what their solver knows of them; of two sizes that alone.
+        what their solver knows of them; of two sizes that alone. posterior: of a lens that
+    was fitted to captures, what its parameters leave open.
     outside: share of the light that falls beside the window, worst over angles and
     depths; a PSF of sum 1 does not
         show it, so it is in no total.
@@ -108,6 +109,7 @@ class Budget:
     glass: float = math.nan
     stop: float = math.nan
     proxy: float = math.nan
+    posterior: float = math.nan
     outside: float = math.nan
 
     @property
@@ -132,6 +134,7 @@ class Budget:
             self.glass,
             self.stop,
             self.proxy,
+            self.posterior,
         )
 
     @property

@@ -4,15 +4,24 @@ information (paper Eq. 11).
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy import ndimage, optimize, special
 
 from metalens.ground.arrays import Array
 from metalens.ground.errors import PropagationError
 from metalens.psf.record import PsfStack
 
 Normalisation = Literal["sum", "l2", "none"]
+Point = tuple[float, float]
+
+# Airy pattern (2 J1(v)/v)², v = 2 pi NA r / wavelength: half maximum at v = 1.61634
+AIRY_FWHM = 2 * 1.6163399561 / (2 * math.pi)
+# MTF of a round aperture without aberrations is 1/2 at this part of its cut-off
+AIRY_MTF50 = 0.4039728
+SPOT_FWHM = 3.0  # diameter of the circle that counts as the focus, in FWHM
 
 
 def mtf(stack: PsfStack, *, frequencies_per_um: Array) -> Array:
@@ -144,3 +153,155 @@ def information_by_name(
 ) -> dict[str, Array]:
     """I(z) under several normalisations, by name."""
     return {name: axial_information(stack, normalisation=name)[1] for name in names}
+
+
+@dataclass(frozen=True, slots=True)
+class DiffractionLimit:
+    """Airy pattern of a round aperture without aberrations or losses.
+
+    fwhm_um: 1.029 wavelength / (2 NA). mtf50_per_um: frequency of half modulation.
+    cutoff_per_um: 2 NA / wavelength, beyond which the MTF is 0.
+    efficiency: share of the pattern within a circle of three FWHM, 0.855.
+    """
+
+    fwhm_um: float
+    mtf50_per_um: float
+    cutoff_per_um: float
+    efficiency: float
+
+
+@dataclass(frozen=True, slots=True)
+class FocusMetrics:
+    """Figures of one PSF. Errors are standard errors of the device, one sigma.
+
+    angle_rad: (x, y) of the field. depth_um: of the source, inf for a plane wave.
+    fwhm_um: full width at half maximum of the mean over directions about the peak.
+    strehl: peak irradiance over that of the same light with all pillars in phase.
+    mtf50_per_um: (x, y) lowest frequency at which the modulation is 1/2.
+    efficiency: power within a circle of three FWHM about the peak over the power that
+    falls on the aperture (focusing efficiency).
+    window_share: share of the light behind the pillars that falls in the window.
+    """
+
+    angle_rad: Point
+    depth_um: float
+    fwhm_um: float
+    fwhm_error_um: float
+    strehl: float
+    strehl_error: float
+    mtf50_per_um: Point
+    mtf50_error_per_um: Point
+    efficiency: float
+    efficiency_error: float
+    window_share: float
+    limit: DiffractionLimit
+
+
+def diffraction_limit(
+    numerical_aperture: float, wavelength_um: float
+) -> DiffractionLimit:
+    """Airy pattern of a numerical aperture (Born and Wolf, Principles of Optics, 8.5.2).
+
+    Args:
+        numerical_aperture: n sin θ of the image side.
+        wavelength_um: in vacuum.
+    """
+    v = math.pi * AIRY_FWHM * SPOT_FWHM
+    cutoff = 2 * numerical_aperture / wavelength_um
+    return DiffractionLimit(
+        AIRY_FWHM * wavelength_um / numerical_aperture,
+        AIRY_MTF50 * cutoff,
+        cutoff,
+        float(1 - special.j0(v) ** 2 - special.j1(v) ** 2),
+    )
+
+
+def brightest(light: Array) -> tuple[float, float, float]:
+    """(row, column, value) of the peak of (y, x) samples, by a quintic spline."""
+    spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
+    start = np.array(np.unravel_index(int(light.argmax()), light.shape), float)
+    bounds = [
+        (max(c - 1, 0), min(c + 1, n - 1))
+        for c, n in zip(start, light.shape, strict=True)
+    ]
+    scale = float(light.max())
+    found = optimize.minimize(
+        lambda at: -_at(spline, at[0], at[1]).item() / scale, start, bounds=bounds
+    )
+    row, column = (float(c) for c in found.x)
+    return row, column, float(-found.fun) * scale
+
+
+def fwhm(light: Array, step_um: float) -> float:
+    """Full width at half maximum of (y, x) samples about their peak, um.
+
+    Of the mean over all directions about the peak; nan where it does not fall to one
+    half within the window.
+    """
+    return half_maximum(light, brightest(light))[0] * step_um
+
+
+def half_maximum(light: Array, peak: tuple[float, float, float]) -> tuple[float, float]:
+    """FWHM in samples of the azimuthal mean, and its fall at half maximum: part of the
+    peak a sample.
+    """
+    row, column, top = peak
+    spline = ndimage.spline_filter(np.asarray(light, float), 5, mode="mirror")
+    turn = 2 * np.pi * np.arange(72) / 72
+
+    def above(radius: float) -> float:
+        ring = _at(spline, row + radius * np.sin(turn), column + radius * np.cos(turn))
+        return float(ring.mean()) / top - 0.5
+
+    widest = min(row, column, light.shape[0] - 1 - row, light.shape[1] - 1 - column)
+    radii = np.arange(0.0, max(widest, 0.0), 0.25)
+    below = next((float(r) for r in radii if above(float(r)) < 0), None)
+    if below is None:
+        return math.nan, math.nan
+    half = float(optimize.brentq(above, max(below - 0.25, 0.0), below))
+    return 2 * half, (above(0.95 * half) - above(1.05 * half)) / (0.1 * half)
+
+
+def _at(spline: Array, row: Array | float, column: Array | float) -> Array:
+    """Values of a quintic spline at rows and columns."""
+    at = np.stack(np.broadcast_arrays(np.atleast_1d(row), np.atleast_1d(column)))
+    return np.asarray(
+        ndimage.map_coordinates(spline, at, order=5, prefilter=False, mode="mirror")
+    )
+
+
+def encircled_power(light: Array, at: Sequence[float], radius: float) -> float:
+    """Light of (y, x) samples within a circle about (row, column), in samples.
+
+    Samples are even over their cells; those that the rim crosses count by their part
+    (16 x 16 points a cell: to 1e-3 of a cell).
+    """
+    if not math.isfinite(radius):
+        return math.nan
+    rows, columns = (np.arange(n) - c for n, c in zip(light.shape, at, strict=False))
+    distance = np.hypot(rows[:, None], columns)
+    inside = distance <= radius - math.sqrt(0.5)
+    total = float(np.asarray(light, float)[inside].sum())
+    fine = (np.arange(16) + 0.5) / 16 - 0.5
+    for i, j in np.argwhere(~inside & (distance < radius + math.sqrt(0.5))).tolist():
+        part = np.hypot((rows[i] + fine)[:, None], columns[j] + fine) <= radius
+        total += float(light[i, j]) * float(part.mean())
+    return total
+
+
+def mtf50(line: Array, step_um: float, cutoff_per_um: float) -> tuple[float, float]:
+    """Lowest frequency at which a line spread of samples has a modulation of 1/2, and
+    its change a unit of modulation; both per um, nan where it stays above.
+    """
+    total = float(line.sum())
+    x = np.arange(len(line)) * step_um
+
+    def above(frequency: float) -> float:
+        return abs(complex(line @ np.exp(-2j * np.pi * frequency * x))) / total - 0.5
+
+    steps = np.linspace(0, min(cutoff_per_um, 0.5 / step_um), 201)
+    below = next((i for i, f in enumerate(steps) if above(float(f)) < 0), None)
+    if below is None:
+        return math.nan, math.nan
+    found = float(optimize.brentq(above, steps[below - 1], steps[below]))
+    return found, 0.1 * found / (above(0.95 * found) - above(1.05 * found))

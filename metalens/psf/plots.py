@@ -2,25 +2,40 @@
 encircled energy, I(z).
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from metalens.ground.arrays import Array
 from metalens.ground.report import canvas, png
 from metalens.psf import metrics as psf_metrics
+from metalens.psf.metrics import DiffractionLimit
 from metalens.psf.pixels import on_pixels
 from metalens.psf.record import PsfStack
+
+if TYPE_CHECKING:
+    from metalens.psf.z_scan import FocusScan
 
 PIXEL_UM = 3.0
 
 
-def pictures(stack: PsfStack) -> dict[str, bytes]:
-    """{name: PNG}: ``xz``, ``montage``, ``mtf``, and ``information`` where neighbours
-    of two depths or more differ.
+def pictures(
+    stack: PsfStack,
+    *,
+    limit: DiffractionLimit | None = None,
+    scan: "FocusScan | None" = None,
+) -> dict[str, bytes]:
+    """{name: PNG}: ``montage`` and ``mtf``; ``xz`` of two depths or more, and
+    ``information`` where neighbours of them differ; ``zscan`` of a scan.
+
+    limit: of the aperture, for the ideal MTF and its cut-off.
     """
     plain = stack.numpy()
-    found = {"xz": slices(plain), "montage": montage(plain), "mtf": transfer(plain)}
+    found = {"montage": montage(plain), "mtf": transfer(plain, limit=limit)}
+    if scan is not None:
+        found["zscan"] = along_z(scan)
+    if len(plain.depths_um) > 1:
+        found["xz"] = slices(plain)
     if (
         len(plain.depths_um) > 1
         and np.isfinite(plain.depths_um).all()
@@ -108,12 +123,14 @@ def montage(stack: PsfStack, *, most: int = 7) -> bytes:
     return png(figure)
 
 
-def transfer(stack: PsfStack) -> bytes:
-    """MTF along x and y, and encircled energy, of three depths at the first and last
-    angle.
+def transfer(stack: PsfStack, *, limit: DiffractionLimit | None = None) -> bytes:
+    """MTF along x and y up to its cut-off (where samples show it), and encircled
+    energy, of three depths at the first and last angle.
     """
     depths = np.unique([0, len(stack.depths_um) // 2, len(stack.depths_um) - 1])
-    cut = min(0.5 / stack.step_um, 0.4)
+    cut = 0.5 / stack.step_um
+    if limit is not None:
+        cut = min(cut, limit.cutoff_per_um)
     frequency, radius = (
         np.linspace(0, cut, 81),
         np.linspace(0, stack.step_um * len(stack.x_um) / 2, 61),
@@ -145,6 +162,10 @@ def transfer(stack: PsfStack) -> bytes:
             axes[1].plot(
                 radius, energy[angle, i], style, color=f"C{colour}", label=name
             )
+    if limit is not None:
+        s = np.minimum(frequency / limit.cutoff_per_um, 1.0)
+        ideal = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+        axes[0].plot(frequency * 1e3, ideal, ":", color="0.4")
     axes[0].set(
         title="MTF (thick along x, thin along y)",
         xlabel="cycles per mm",
@@ -156,6 +177,31 @@ def transfer(stack: PsfStack) -> bytes:
         xlabel="radius / µm",
         ylabel="share",
         ylim=(0, 1.02),
+    )
+    axes[1].legend(fontsize=7)
+    return png(figure)
+
+
+def along_z(scan: "FocusScan") -> bytes:
+    """Irradiance along x against the shift of the plane, and its peak and FWHM."""
+    figure, axes = canvas(1, 2, size=(9.5, 3.4))
+    axes[0].pcolormesh(
+        scan.shift_um,
+        scan.x_um,
+        np.sqrt(scan.slices.T),
+        shading="nearest",
+        rasterized=True,
+    )
+    axes[0].grid(False)
+    axes[0].set(
+        title="√irradiance along x behind the lens",
+        xlabel="shift from the sensor / µm",
+        ylabel="x / µm",
+    )
+    axes[1].plot(scan.shift_um, scan.peak / scan.peak.max(), label="peak irradiance")
+    axes[1].plot(scan.shift_um, scan.fwhm_um / np.nanmax(scan.fwhm_um), label="FWHM")
+    axes[1].set(
+        xlabel="shift from the sensor / µm", ylabel="of the largest", ylim=(0, None)
     )
     axes[1].legend(fontsize=7)
     return png(figure)

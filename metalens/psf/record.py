@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -40,10 +41,10 @@ class PsfStack:
     step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a
     row per angle.
     sensor_distance_um: lens to sensor. tolerance: that was asked for.
-    error: estimated relative L2 error of the intensity as computed, the worst over
-    angles and lenses, which the
-        tolerance is about. budget: the same by cause, with what the model leaves out.
-        reason: method, and why.
+    error: estimated relative L2 error of the intensity, the worst over angles and
+        lenses: of what is computed, and for a lens that was fitted of its posterior.
+    budget: the same by cause, with what the model leaves out.
+    reason: method, and why.
     """
 
     intensity: Any
@@ -88,8 +89,11 @@ class PsfStack:
 
     @property
     def converged(self) -> bool:
-        """Whether the error estimate is within the tolerance."""
-        return self.error <= self.tolerance
+        """Whether the error of what is computed is within the tolerance."""
+        fit = _budget(self).posterior
+        return (
+            math.sqrt(max(self.error**2 - np.nan_to_num(fit) ** 2, 0)) <= self.tolerance
+        )
 
     def numpy(self) -> "PsfStack":
         """The same record with numpy arrays, detached from any graph."""

@@ -3,6 +3,7 @@ a hidden lens.
 """
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from characterize.model.pillars import Pillars
 from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
+from metalens.cli import main
 from metalens.ground.errors import CaptureError, ConfigError, FitError
 from metalens.made import Solved, sensitivity
 from metalens.psf.of_lens import View
@@ -457,3 +459,43 @@ def test_effective_index_slopes_scale_as_a_waveguide():
     assert (index.imag > 0).all()
     assert (np.diff(index.imag) > 0).all()  # wider pillars hold more of the light
     assert not wall.any()  # straight walls: second order
+
+
+def test_psfs_of_a_fitted_lens_hold_its_posterior_in_their_error(
+    fitted, tmp_path, capsys
+):
+    """A lens known but for 3 um of its distance: its PSFs are off by 3 um times their
+    slope, relative L2, to the scatter of 8 draws (a quarter, at 2.5 sigma 0.6). The
+    command takes the angles of the captures.
+    """
+    i = fitted.names.index("distance_um")
+    covariance = np.zeros_like(fitted.covariance)
+    covariance[i, i] = 3.0**2
+    within = dataclasses.replace(
+        fitted.within, covariance=covariance, draws=np.empty((0, 0))
+    )
+    bench = np.zeros_like(covariance)
+    known = dataclasses.replace(
+        fitted,
+        covariance=covariance,
+        draws=np.empty((0, 0)),
+        within=within,
+        bench=bench,
+    )
+    known.save(tmp_path / "asbuilt.h5")
+    words = ["psf", str(tmp_path / "asbuilt.h5"), "-o", str(tmp_path / "psf.h5")]
+    more = ["--sources-mm", "2", "--window-um", "24", "--samples", "48", "--json"]
+    assert main([*words, *more]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["angles_rad"] == pytest.approx(np.unique(fitted.angle_rad, axis=0))
+    view = View((2e3,), ((0.0, 0.0),), window_um=24.0, samples=48)
+    ends = []
+    for step in (-1.0, 1.0):
+        value = fitted.value.copy()
+        value[i] += step
+        ends.append(fitted.psf_stack(view, value).intensity)
+    slope = (ends[1] - ends[0]) / 2
+    want = 3 * np.linalg.norm(slope) / np.linalg.norm(ends[0] + ends[1]) * 2
+    assert said["error"] == pytest.approx(want, rel=0.6)
+    assert said["budget"]["posterior"] == pytest.approx(said["error"], rel=0.01)
+    assert said["computed_error"] < 1e-4

@@ -123,7 +123,7 @@ def test_silicon_on_sapphire_from_toml_to_mask(tmp_path, capsys):
     assert found["numerical_aperture"] == pytest.approx(
         math.sin(math.atan(15 / 50)), rel=0.01
     )
-    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+    assert 0.8 < found["wavefront_efficiency"] <= found["transmission"] <= 1
     assert found["focus_passed"]
 
 
@@ -131,7 +131,7 @@ def test_silicon_on_sapphire_from_toml_to_mask(tmp_path, capsys):
 def test_titania_lens_from_toml_to_mask(tmp_path, capsys):
     found = chained(tmp_path, "tio2_532", "tio2.h5", capsys, **COARSE)
     assert found["numerical_aperture"] == pytest.approx(0.8, abs=0.01)
-    assert 0.7 < found["efficiency"] <= found["transmission"] <= 1
+    assert 0.7 < found["wavefront_efficiency"] <= found["transmission"] <= 1
     assert found["turns"] < 1
 
 
@@ -170,7 +170,7 @@ def test_a_hexagonal_lens_from_toml_to_mask(tmp_path, capsys):
     )
     assert found["focus_passed"]
     assert found["steepest"] < found["sampled_aperture"]
-    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+    assert 0.8 < found["wavefront_efficiency"] <= found["transmission"] <= 1
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_two_phases_by_width_and_length_from_toml_to_mask(tmp_path, capsys):
             math.sin(math.atan(20 / distance)), rel=0.01
         )
         assert own["focus_passed"]
-        assert 0.6 < own["efficiency"] <= own["transmission"] <= 1
+        assert 0.6 < own["wavefront_efficiency"] <= own["transmission"] <= 1
         assert own["leaked"] < 1e-20  # mirrors
     assert found["multiplexed"]
     view = "depths_mm = [1e3, 1e3, 1.0]\nangles_deg = [0.0]\nsamples = 40\nwindow_um = 16.0\ntolerance = 1e-3\n"
@@ -217,7 +217,7 @@ def test_lenses_of_other_shapes_from_toml_to_mask(tmp_path, capsys, name, librar
     )
     assert found["turns"] > 1
     assert found["focus_passed"]
-    assert 0.8 < found["efficiency"] <= found["transmission"] <= 1
+    assert 0.8 < found["wavefront_efficiency"] <= found["transmission"] <= 1
 
 
 @pytest.mark.parametrize(("turned", "least", "most"), [(0, 0.5, 1), (1, 0, 1e-20)])

@@ -326,7 +326,7 @@ def test_settings_that_wait_for_a_lens_say_so():
     with pytest.raises(ConfigError, match="depths_mm"):
         _ = Settings(window_um=10.0).view
     with pytest.raises(ConfigError, match="window_um"):
-        _ = Settings(depths_mm=(1.0, 2.0, 1.0)).view
+        _ = Settings(depths_mm=(1.0, 2.0, 1.0), angles_deg=(0.0,)).view
     with pytest.raises(ConfigError, match="need window_um"):
         Settings(height_um=10.0)
 

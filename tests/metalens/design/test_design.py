@@ -100,7 +100,7 @@ def test_every_pillar_makes_the_wanted_phase(proxy):
         made.transmission()[d.diameter_um > 0].mean() ** 2
         / made.transmission()[d.diameter_um > 0].mean() ** 2
     )
-    assert quality.efficiency == pytest.approx(
+    assert quality.wavefront_efficiency == pytest.approx(
         made.transmission()[d.diameter_um > 0].mean() ** 2, rel=1e-6
     )
 
@@ -232,7 +232,9 @@ def test_blocks_of_rows_do_not_show(proxy, monkeypatch):
     np.testing.assert_allclose(
         whole.diameters.diameter_um, parts.diameters.diameter_um, rtol=0, atol=6e-8
     )
-    assert one.efficiency == pytest.approx(other.efficiency, rel=1e-12)
+    assert one.wavefront_efficiency == pytest.approx(
+        other.wavefront_efficiency, rel=1e-12
+    )
 
 
 def test_field_is_limited_by_coma_as_in_third_order_theory():

@@ -44,7 +44,8 @@ def test_rays_of_an_ideal_lens_meet_in_its_focus(
     )
     # the difference over one pitch p misses the slope by p² / 24 of its second
     # derivative: 0.015 um² / (900 um)²
-    assert found == pytest.approx(focal_um, rel=1e-6)
+    assert found is not None
+    assert found == pytest.approx((aside_um, 0.0, focal_um), rel=1e-6, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +71,20 @@ def test_no_meeting_of_rays_that_spread_or_part():
     axicon = lambda x, y: -0.1 * K * np.hypot(x, y[:, None])  # noqa: E731
     for phase in (diverging, axicon, lambda x, y: 0.03 * K * x + 0 * y[:, None]):
         assert meeting_um(phase, focus, **ABOUT) is None
-    behind = Focus(1.31, 800.0, layers=Layers(behind=(Film(Index(1.5), 201.0),)))
-    assert meeting_um(lens(900.0, np.inf), behind, **ABOUT) is None
+
+
+def test_rays_through_a_film_meet_in_the_middle_of_the_sensor_s_spot():
+    """A film of index n and thickness t sets the focus back by t (1 - 1/n) and moves
+    nothing aside.
+    """
+    film = Layers(behind=(Film(Index(1.5), 60.0),))
+    behind = Focus(1.31, 920.0, np.inf, film)
+    found = meeting_um(lens(900.0, np.inf, 23.0), behind, **ABOUT)
+    assert found is not None
+    assert found[0] == pytest.approx(23.0, abs=0.05)  # third order: 60 um (r/f)^3 / 2
+    assert found[1:] == pytest.approx((0.0, 920.0), abs=1e-3)
+    spread = Focus(1.31, 500.0, np.inf, film)
+    assert meeting_um(lens(900.0, np.inf), spread, **ABOUT) is None
 
 
 TURNS = Proxy(

@@ -75,7 +75,7 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
         found = design.check_focus(seen)
         assert found.passed
         assert found.strehl == pytest.approx(1, abs=3e-3)
-        assert quality.efficiency == pytest.approx(level**2, rel=3e-3)
+        assert quality.wavefront_efficiency == pytest.approx(level**2, rel=3e-3)
         assert quality.rms_phase_error_rad < 0.05
     wrong = dataclasses.replace(
         made_lens.seen("y"), sensor_distance_um=NEAR.sensor_distance_um
@@ -83,8 +83,8 @@ def test_each_polarisation_has_its_own_focus_with_the_light_of_its_pillars(two):
     assert design.check_focus(wrong, axial=False).strehl < 0.7  # a depth of focus away
     assert split.multiplexed
     assert split.leaked == pytest.approx((LEAK**2, LEAK**2 / 4))
-    assert split.efficiency_error[0] == pytest.approx(
-        2 * math.sqrt(split.x.efficiency) * 0.01 + 1e-4
+    assert split.wavefront_efficiency_error[0] == pytest.approx(
+        2 * math.sqrt(split.x.wavefront_efficiency) * 0.01 + 1e-4
     )
     assert split.covered > 0.98
 

@@ -263,10 +263,10 @@ def test_what_a_lens_makes_of_either_light_is_of_its_own_focus():
         assert one.numerical_aperture == pytest.approx(
             21 / math.hypot(21, distance), rel=1e-12
         )
-        assert one.efficiency == pytest.approx(level**2, rel=1e-12)
+        assert one.wavefront_efficiency == pytest.approx(level**2, rel=1e-12)
         assert one.turns == 1.0
         assert one.sampled_aperture == pytest.approx(0.94 / 0.8, rel=1e-12)
-    assert found.efficiency_error == pytest.approx(
+    assert found.wavefront_efficiency_error == pytest.approx(
         (1.8 * 0.0125 + 0.0125**2, 1.6 * 0.0125 + 0.0125**2), rel=1e-12
     )
     assert (found.multiplexed, found.pairs) == (False, 2)

@@ -33,7 +33,7 @@ def test_quality_is_that_of_the_sum_of_all_pillars():
     assert made.pillars == 40
     assert made.turns == 2.5
     assert made.transmission == pytest.approx(np.mean(level**2), rel=1e-12)
-    assert made.efficiency == pytest.approx(abs(field / 40) ** 2, rel=1e-12)
+    assert made.wavefront_efficiency == pytest.approx(abs(field / 40) ** 2, rel=1e-12)
     assert made.strehl == pytest.approx(abs(field / level.sum()) ** 2, rel=1e-12)
     assert made.rms_phase_error_rad == pytest.approx(
         math.sqrt(np.mean(error**2)), rel=1e-12

@@ -120,7 +120,9 @@ def test_quality_at_each_wavelength_is_that_of_its_light_in_the_focus(three):
             ** 2
         )
         assert quality.strehl == pytest.approx(peak / np.abs(t).sum() ** 2, rel=1e-5)
-        assert quality.efficiency == pytest.approx(peak / len(t) ** 2, rel=1e-5)
+        assert quality.wavefront_efficiency == pytest.approx(
+            peak / len(t) ** 2, rel=1e-5
+        )
 
 
 def test_what_serves_all_serves_the_others_better_than_a_lens_for_one():
@@ -151,7 +153,7 @@ def test_one_wavelength_and_even_transmission_make_the_wanted_phase():
         wanted(ACHROMATIC[1]), proxy(level=((0.93, 0.0), (0.0, 0.0)))
     )
     assert quality.max_phase_error_rad < 3e-4
-    assert quality.efficiency == pytest.approx(0.93**2, rel=1e-6)
+    assert quality.wavefront_efficiency == pytest.approx(0.93**2, rel=1e-6)
     assert (
         lens.diameters.diameter_um[lens.diameters.diameter_um > 0].min()
         >= SPAN[0] - 1e-7

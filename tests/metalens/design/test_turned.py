@@ -77,7 +77,9 @@ def test_every_pillar_gives_the_light_of_its_hand_the_wanted_phase(hand, sign):
     assert np.allclose(
         leave, (lens.transmission() * np.exp(1j * lens.phase_rad()))[there], atol=2e-6
     )
-    assert quality.efficiency == pytest.approx(abs(T_X - T_Y) ** 2 / 4, abs=1e-6)
+    assert quality.wavefront_efficiency == pytest.approx(
+        abs(T_X - T_Y) ** 2 / 4, abs=1e-6
+    )
     assert found.converted == pytest.approx(abs(T_X - T_Y) ** 2 / 4)
     assert found.unconverted == pytest.approx(abs(T_X + T_Y) ** 2 / 4)
     assert found.converted_error == pytest.approx(
