@@ -292,8 +292,6 @@ def test_no_command_begins_where_its_workers_cannot_be_had(
     asked = {
         "--workers 0": "0 workers: need 1 to 1024",
         "--workers 4611686018427387904": "4611686018427387904 workers: need 1 to 1024",
-        "--workers 2 --scheduler tcp://127.0.0.1:9": "ask for one",
-        "--scheduler nowhere://": "no dask scheduler at 'nowhere://'",
     }
     before = tree(inputs)
     for more, told in asked.items():

@@ -348,7 +348,6 @@ EXTRAS = {  # what only some commands need
         "ezdxf",
         "OCP",
         "astropy",
-        "distributed",
     ),
     *("mitsuba", "onnx", "onnxruntime"),
 }

@@ -31,7 +31,7 @@ def run(options: Options) -> int:
 def _plan(options: Options, path: Path) -> int:
     if options.spread:
         raise ConfigError(
-            "--workers and --scheduler share out the frames of --truth; a plan takes none"
+            "--workers shares out the frames of --truth; a plan takes none"
         )
     target, wanted, design = (
         options.output,

@@ -70,7 +70,7 @@ class Options(Distributed):
         """
         if self.spread and not self.study:
             raise ConfigError(
-                "--workers and --scheduler share out the work of --study: ask for it too, or leave them"
+                "--workers shares out the work of --study: ask for it too, or leave it"
             )
         return super().shared()
 

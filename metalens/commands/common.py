@@ -115,17 +115,14 @@ class Distributed(Common):
     Attributes:
         workers: processes of this machine that do the work; left out: as many as it has
             cores.
-        scheduler: address of a dask scheduler (tcp://host:8786) whose workers do the
-            work in their place.
     """
 
     workers: int | None = None
-    scheduler: str | None = None
 
     @property
     def spread(self) -> bool:
         """Whether workers were asked for."""
-        return self.workers is not None or self.scheduler is not None
+        return self.workers is not None
 
     def shared(self) -> contextlib.AbstractContextManager[None]:
         """Where the work of the block is done.
@@ -133,4 +130,4 @@ class Distributed(Common):
         Raises:
             ConfigError, WorkerError: see :func:`metalens.ground.executor.on`.
         """
-        return executor.on(self.scheduler, processes=self.workers)
+        return executor.on(self.workers)

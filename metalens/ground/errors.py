@@ -39,7 +39,7 @@ class OutputError(MetalensError):
 
 
 class WorkerError(MetalensError):
-    """A worker process died or a cluster cannot be reached."""
+    """A worker process died."""
 
 
 class MaterialError(MetalensError):

@@ -1,5 +1,4 @@
-"""Many tasks at once: on the cores of this machine (loky), or on a cluster named by its
-address (dask.distributed).
+"""Parallel tasks in worker processes of this machine (loky).
 
 loky, since its workers start without running the caller's script again; a process pool
 of the standard library does,
@@ -10,11 +9,9 @@ done by one process with one BLAS thread, and knows nothing of the others.
 
 import contextlib
 import functools
-import importlib
 import os
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any, TypeVar
@@ -41,7 +38,7 @@ _ENVIRONMENT = {"PYTHONSAFEPATH": "1"} | dict.fromkeys(_VARIABLES, "1")
 _ENVIRONMENT["LOKY_MAX_MEMORY_LEAK_SIZE"] = (
     "1e15"  # what a large lens takes is no leak to end a worker for
 )
-_CONNECT_S, _MOST = 10, 1024  # seconds; processes of one machine
+_MOST = 1024  # processes of one machine
 
 
 def cores() -> int:
@@ -54,36 +51,27 @@ def cores() -> int:
 
 
 @contextlib.contextmanager
-def on(scheduler: str | None = None, *, processes: int | None = None) -> Iterator[None]:
-    """Do the tasks of the block on the dask cluster of this address, or on so many
-    processes of this machine.
+def on(processes: int | None = None) -> Iterator[None]:
+    """Do the tasks of the block in so many processes of this machine.
 
-    With neither, each verb has its own way: :func:`run` a process a core,
-    :func:`gather` threads of this process.
+    Args:
+        processes: None: each verb has its own way, :func:`run` a process a core,
+            :func:`gather` threads of this process.
 
     Raises:
-        ConfigError: both are asked for, or no such number of processes. WorkerError: no
-            cluster at the address.
+        ConfigError: no such number of processes.
     """
-    if processes is not None and not 1 <= processes <= _MOST:
-        raise ConfigError(
-            f"{processes} workers: need 1 to {_MOST}; more machines are reached by a scheduler"
-        )
-    if processes is not None and scheduler is not None:
-        raise ConfigError(
-            "workers are processes of this machine, the cluster of a scheduler has its own: ask for one"
-        )
-    with contextlib.ExitStack() as held:
-        place: Place | None = None
-        if scheduler is not None:
-            place = functools.partial(
-                _cluster, held.enter_context(_client(scheduler)), scheduler
-            )
-        elif processes is not None:
-            place = functools.partial(_here, held.enter_context(_pool(processes)))
-        token = _PLACE.set(place)
-        held.callback(_PLACE.reset, token)
+    if processes is None:
         yield
+        return
+    if not 1 <= processes <= _MOST:
+        raise ConfigError(f"{processes} workers: need 1 to {_MOST}")
+    with _pool(processes) as pool:
+        token = _PLACE.set(functools.partial(_here, pool))
+        try:
+            yield
+        finally:
+            _PLACE.reset(token)
 
 
 def run(
@@ -201,65 +189,3 @@ def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
-
-
-@contextlib.contextmanager
-def _client(address: str) -> Iterator[Any]:
-    """The cluster of an address."""
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError:
-        raise WorkerError(
-            "--scheduler needs the extra [cluster]: pip install 'metalens-toolchain[cluster]'"
-        ) from None
-    try:
-        client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise WorkerError(
-            f"no dask scheduler at {address!r} ({error}); start one with `dask scheduler`"
-        ) from None
-    with client:
-        yield client
-
-
-def _cluster(
-    client: Any,
-    address: str,
-    work: Callable[[Any, Any], Any],
-    common: Any,
-    tasks: Sequence[Any],
-) -> Done:
-    """A task of a lost worker is done again by another; so is the fetching of what all
-    tasks need.
-    """
-    distributed: Any = importlib.import_module("distributed")
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Sending large graph"
-        )  # it is sent once
-        held = client.submit(_itself, common, pure=False)
-        waiting = {
-            client.submit(_alone, work, held, task, pure=False): i
-            for i, task in enumerate(tasks)
-        }
-    try:
-        for future in distributed.as_completed(waiting, loop=client.loop):
-            yield waiting[future], future.result()
-    except distributed.KilledWorker as error:
-        raise WorkerError(
-            f"workers of the cluster died again and again on one task ({error})"
-        ) from None
-    except distributed.CancelledError as error:
-        raise WorkerError(f"the cluster at {address} was lost ({error})") from None
-    finally:
-        client.cancel([held, *waiting])
-
-
-def _itself(common: Common) -> Common:
-    return common
-
-
-def _alone(work: Callable[[Any, Any], Result], common: Any, task: Any) -> Result:
-    """A task on one BLAS thread."""
-    with threads.one_blas_thread():
-        return work(common, task)

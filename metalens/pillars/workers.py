@@ -160,7 +160,7 @@ def _both_polarizations(cell: Cell, size_um: float, light: Light, reach: int) ->
 def run(
     tasks: list[Task], *, processes: int | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """(index, result) of every task as it is done, on all cores or a cluster.
+    """(index, result) of every task as it is done, on all cores.
 
     Raises:
         MetalensError: what a task raised, of the same class; WorkerError: a worker

@@ -11,7 +11,6 @@ from layout.study import sensitivity, tolerance
 from metalens.cell.record import Index
 from metalens.ground import executor
 from tests.layout.study.test_tolerance import SENS, hyperbolic
-from tests.lost_worker import losing_one
 
 
 def content(lens):
@@ -28,13 +27,6 @@ def content(lens):
 def plain():
     lens = hyperbolic(31)
     return lens, content(lens)
-
-
-@pytest.mark.slow  # in small: metalens/pillars/test_workers.py
-def test_draws_are_the_same_from_a_cluster_that_loses_a_worker(plain, tmp_path):
-    lens, here = plain
-    with losing_one(tmp_path) as address, executor.on(address):
-        assert content(lens) == here
 
 
 def unlike(cell, diameter_um, wavelength_um, finer):

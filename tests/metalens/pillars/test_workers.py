@@ -18,7 +18,6 @@ from metalens.cell.record import Cell, Index
 from metalens.ground import executor
 from metalens.ground.errors import MaterialError, WorkerError
 from metalens.pillars import engines, workers
-from tests.lost_worker import losing_one
 
 CELL = Cell(0.30, 0.7, Index(3.6))
 TASK = workers.points_task(
@@ -122,34 +121,6 @@ def test_nothing_is_imported_from_the_current_folder_and_prints_are_no_results(
     assert told.returncode == 2
     assert "no such file" in told.stderr
     assert not (tmp_path / "executed").exists()
-
-
-def test_a_cluster_that_loses_a_worker_gives_the_same(tmp_path):
-    tasks = [
-        workers.points_task(
-            CELL, Light(0.85), [0.05 + 0.02 * i], tolerance=0.1, engine="rcwa"
-        )
-        for i in range(6)
-    ]
-    with losing_one(tmp_path) as address, executor.on(address):
-        found = dict(workers.run(tasks))
-        assert executor.gather(divmod, 47, [5, 9, 3]) == [
-            (9, 2),
-            (5, 2),
-            (15, 2),
-        ]  # in the order of the tasks
-    assert found == dict(workers.run(tasks, processes=1))
-
-
-def test_no_cluster_at_the_address_is_told(monkeypatch):
-    """Within the seconds that it waits for one: fewer here, that nobody else has to."""
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(executor, "_CONNECT_S", 0.5)
-    with (
-        pytest.raises(WorkerError, match="no dask scheduler at"),
-        executor.on("tcp://127.0.0.1:9"),
-    ):
-        list(executor.run(abs, [1]))
 
 
 def test_the_solves_that_choose_a_mesh_are_nodes_of_the_curve(monkeypatch):
