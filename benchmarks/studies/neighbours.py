@@ -24,11 +24,12 @@ from benchmarks import Row
 from metalens import design, library
 from metalens.cell import Cell
 from metalens.commands.library import CellFile
-from metalens.design.neighbours import neighbours, printed, solve_row
+from metalens.design.neighbours import neighbours, printed
 from metalens.ground import config
 from metalens.ground.arrays import Array
 from metalens.lens import Lens, Neighbours
 from metalens.psf import among
+from metalens.rcwa import solve_row
 
 FILE = Path(__file__).parents[2] / "examples" / "cells" / "tio2_532.toml"
 WAVELENGTH_UM, APERTURE_UM = 0.532, 20.0

@@ -3,7 +3,8 @@
 ``solve_textbook_rcwa`` is the plain reference: a page of formulae without symmetries.
 ``jones`` gives both polarisations of a cell of any shape, lattice and layers,
 ``jones_derivatives`` also their exact
-derivatives by every number of it, ``near_field`` the fields in it.
+derivatives by every number of it, ``near_field`` the fields in it, ``solve_row`` the
+orders of a row of different pillars.
 ``solve`` gives the zero-order response with an error estimate, ``solve_many`` shares
 the work over diameters. Light comes from the substrate.
 """
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from metalens.rcwa.rates.verb import jones_derivatives as jones_derivatives
     from metalens.rcwa.reference import OrderResponse as OrderResponse
     from metalens.rcwa.reference import solve_textbook_rcwa as solve_textbook_rcwa
+    from metalens.rcwa.supercell import Row as Row
+    from metalens.rcwa.supercell import block_of as block_of
+    from metalens.rcwa.supercell import solve_row as solve_row
     from metalens.rcwa.verbs import solve as solve
     from metalens.rcwa.verbs import solve_many as solve_many
 
@@ -57,11 +61,14 @@ __getattr__, __dir__, __all__ = attach(
         "Rate": "metalens.rcwa.rates.verb",
         "NearField": "near",
         "most_harmonics": "any_shape",
+        "Row": "supercell",
+        "block_of": "supercell",
         "near_field": "near",
         "near_fields": "near",
         "OrderResponse": "reference",
         "solve_textbook_rcwa": "reference",
         "solve": "verbs",
         "solve_many": "verbs",
+        "solve_row": "supercell",
     },
 )

@@ -121,10 +121,16 @@ def tables(this: Slab, cell: Cell, reach: tuple[int, int]) -> tuple[Array, Array
 
 
 def normal_tables(
-    outlines: tuple[Outline, ...], cell: Cell, reach: tuple[int, int]
+    outlines: tuple[Outline, ...],
+    cell: Cell,
+    reach: tuple[int, int],
+    flips: tuple[tuple[int, int], ...] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Fourier coefficients of w nx nx, w ny ny, w nx ny over m, n from -2 reach to 2
     reach.
+
+    flips: mirrors (sx, sy) that outlines and lattice share; None: those that the
+        outlines have.
     """
     most = (
         _HELD * math.ceil(2 * reach[0] / _HELD),
@@ -134,19 +140,22 @@ def normal_tables(
         slice(m - 2 * r, m + 2 * r + 1) for m, r in zip(most, reach, strict=True)
     )
     first, second, third = (
-        whole[rows, columns] for whole in _normals(outlines, cell, most)
+        whole[rows, columns] for whole in _normals(outlines, cell, most, flips)
     )
     return real(first), real(second), real(third)
 
 
 @lru_cache(maxsize=64)
 def _normals(
-    outlines: tuple[Outline, ...], cell: Cell, most: tuple[int, int]
+    outlines: tuple[Outline, ...],
+    cell: Cell,
+    most: tuple[int, int],
+    flips: tuple[tuple[int, int], ...] | None,
 ) -> tuple[Array, Array, Array]:
     """As ``normal_tables``, over m, n from -most to most, for all truncations at once."""
     x, y = cell.lattice.periods_um(cell.pitch_um)
     counts = [
-        max(2 * m + 2, math.ceil(_GRID * edge / cell.pitch_um))
+        max(2 * m + 2, math.ceil(_GRID * edge / min(x, y) - 1e-6))
         for m, edge in zip(most, (x, y), strict=True)
     ]
     counts = [count + count % 2 for count in counts]
@@ -159,8 +168,8 @@ def _normals(
     n, distance = _nearest(outlines, cell, px, py)
     far = _FAR * distance.max()
     weight = 1 / (1 + (distance / far) ** 4)
-    kept = [
-        flips for flips in FLIPS if all(outline.keeps(*flips) for outline in outlines)
+    kept = flips or [
+        flip for flip in FLIPS if all(outline.keeps(*flip) for outline in outlines)
     ]
 
     def table(values: Array, *, odd: bool = False) -> Array:
@@ -187,7 +196,8 @@ def _nearest(
     """
     from scipy.spatial import cKDTree
 
-    found = [outline.boundary(cell.pitch_um / 200) for outline in outlines]
+    step_um = min(cell.lattice.periods_um(cell.pitch_um)) / 200
+    found = [outline.boundary(step_um) for outline in outlines]
     points, normals = (np.concatenate(part) for part in zip(*found, strict=True))
     near = _sites(cell)
     copies = (points[None] + near[:, None]).reshape(-1, 2)
@@ -221,7 +231,7 @@ def normals_at(
     """(..., 2) n and (...) w of the normal field at any points."""
     edges = cell.lattice.periods_um(cell.pitch_um)
     axes = (
-        np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / cell.pitch_um))
+        np.linspace(-edge / 2, edge / 2, 1 + math.ceil(_GRID * edge / min(edges)))
         for edge in edges
     )
     far = _FAR * _nearest(outlines, cell, *np.meshgrid(*axes, indexing="ij"))[1].max()
@@ -251,11 +261,17 @@ def real(values: Array) -> Array:
 
 
 def operators(
-    space: Orders, ways: Waves, this: Slab, cell: Cell
+    space: Orders,
+    ways: Waves,
+    this: Slab,
+    cell: Cell,
+    flips: tuple[tuple[int, int], ...] | None = None,
 ) -> tuple[Array, Array]:
-    """P and Q of :mod:`metalens.rcwa.orders.waves` in these orders."""
+    """P and Q of :mod:`metalens.rcwa.orders.waves` in these orders; flips: as in
+    :func:`normal_tables`.
+    """
     direct, inverse = tables(this, cell, space.reach)
-    xx, yy, xy = normal_tables(this.outlines, cell, space.reach)
+    xx, yy, xy = normal_tables(this.outlines, cell, space.reach, flips)
     laurent = [mirrors.product(space, direct, link) for link in (0, 1)]
     delta = [
         part - np.linalg.inv(mirrors.product(space, inverse, link))

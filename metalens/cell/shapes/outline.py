@@ -28,14 +28,16 @@ _DIRECTIONS = np.stack(
 
 @dataclass(frozen=True, slots=True)
 class Conic:
-    """An ellipse about the origin with half axes a (along x before the turn) and b;
-    sign -1 cuts it out.
+    """An ellipse with half axes a (along x before the turn) and b; sign -1 cuts it out.
+
+    centre_um: (x, y), the site of the pillar but in rows of several.
     """
 
     half_x_um: float
     half_y_um: float
     angle_rad: float = 0.0
     sign: int = 1
+    centre_um: Point = (0.0, 0.0)
 
     @property
     def area_um2(self) -> float:
@@ -55,10 +57,11 @@ class Conic:
         )
         x = np.hypot(along, across)
         safe = np.where(x < 1e-6, 1.0, x)
-        return np.asarray(
-            self.area_um2 * np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe),
-            complex,
-        )
+        shape = np.where(x < 1e-6, 1 - x * x / 8, 2 * j1(safe) / safe)
+        if self.centre_um == (0.0, 0.0):
+            return np.asarray(self.area_um2 * shape, complex)
+        shift = self.centre_um[0] * gx + self.centre_um[1] * gy
+        return np.asarray(self.area_um2 * shape * np.exp(-1j * shift))
 
     def vertices(self, count: int) -> Array:
         """(count, 2) points, anticlockwise, of the inscribed polygon with the area of
@@ -71,7 +74,7 @@ class Conic:
             swell * self.half_y_um * np.sin(turn),
         )
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
-        return np.stack([c * x - s * y, s * x + c * y], axis=1)
+        return np.stack([c * x - s * y, s * x + c * y], axis=1) + self.centre_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +156,9 @@ class Outline:
         made: list[Conic | Loop] = []
         for part in self.parts:
             if isinstance(part, Conic):
-                made.append(replace(part, angle_rad=part.angle_rad + angle_rad))
+                x, y = turned(np.array([part.centre_um]), angle_rad)[0].tolist()
+                angle = part.angle_rad + angle_rad
+                made.append(replace(part, angle_rad=angle, centre_um=(x, y)))
             else:
                 corners = turned(np.array(part.corners_um), angle_rad).tolist()
                 made.append(replace(part, corners_um=tuple((x, y) for x, y in corners)))
@@ -181,11 +186,10 @@ class Outline:
         """
         points, normals = [], []
         for part in self.parts:
-            count = (
-                max(32, math.ceil(2 * math.pi * self.radius_um / step_um))
-                if isinstance(part, Conic)
-                else 0
-            )
+            count = 0
+            if isinstance(part, Conic):
+                radius_um = max(part.half_x_um, part.half_y_um)
+                count = max(32, math.ceil(2 * math.pi * radius_um / step_um))
             corners = part.vertices(count)
             edge = np.roll(corners, -1, axis=0) - corners
             for start, d in zip(corners, edge, strict=True):

@@ -73,14 +73,15 @@ class Orders:
 
 
 @lru_cache(maxsize=24)
-def orders(harmonics: int, frame: Frame) -> Orders:
+def orders(harmonics: float, frame: Frame) -> Orders:
     """All orders within the circle of radius ``harmonics`` orders of a square lattice
     of this cell's area.
     """
     radius = harmonics / np.sqrt(
         frame.along * frame.across / (2 if frame.centred else 1)
     )
-    reach = (int(radius * frame.along), int(radius * frame.across))
+    most = radius * (1 + 1e-9)
+    reach = (int(most * frame.along), int(most * frame.across))
     m, n = (
         a.ravel()
         for a in np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij")

@@ -47,8 +47,9 @@ def test_equal_pillars_in_a_row_are_one_pillar(polarization):
     four = supercell.solve_row(
         CELL, [0.14] * 4, WAVE, polarization=polarization, harmonics=2
     )
-    assert four.order(0) == pytest.approx(one.order(0), abs=1e-9)
-    assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 1e-9
+    # the field of normals is sampled along the rims
+    assert four.order(0) == pytest.approx(one.order(0), abs=2e-4)
+    assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 2e-4
 
 
 @pytest.mark.parametrize("polarization", ["x", "y"])
@@ -59,7 +60,7 @@ def test_energy_holds_and_a_mirrored_row_mirrors_its_orders(polarization):
         CELL, row[::-1], WAVE, polarization=polarization, harmonics=2
     )
     assert there.energy == pytest.approx(1, abs=1e-9)
-    assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
+    assert back.t[::-1] == pytest.approx(there.t, abs=2e-4)
     assert (
         abs(there.order(1) - there.order(-1)) > 0.05
     )  # the row is not its own mirror image
@@ -75,14 +76,14 @@ def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_ano
     lattice, 1e-2 of t."""
     about = dict(polarization=polarization, harmonics=2, diagonal=True)
     four = supercell.solve_row(CELL, [0.14] * 4, WAVE, **about)
-    assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 1e-9
+    assert np.abs(four.t[np.abs(four.orders) % 4 != 0]).max() < 2e-4
     two = [
         supercell.solve_row(
             CELL, [0.14] * 2, WAVE, **about | dict(polarization=p)
         ).order(0)
         for p in ("x", "y")
     ]
-    assert two == pytest.approx([four.order(0)] * 2, abs=1e-9)
+    assert two == pytest.approx([four.order(0)] * 2, abs=2e-4)
     fine = supercell.solve_row(
         CELL, [0.14], WAVE, polarization=polarization, harmonics=5
     ).order(0)
@@ -98,7 +99,7 @@ def test_rows_along_the_diagonal_hold_energy_mirror_and_know_one_pillar_from_ano
     there = supercell.solve_row(CELL, [0.1, 0.12, 0.17, 0.2], WAVE, **about)
     back = supercell.solve_row(CELL, [0.2, 0.17, 0.12, 0.1], WAVE, **about)
     assert there.energy == pytest.approx(1, abs=1e-9)
-    assert back.t[::-1] == pytest.approx(there.t, abs=1e-9)
+    assert back.t[::-1] == pytest.approx(there.t, abs=2e-4)
     with pytest.raises(CellError, match="diagonal: need an even number"):
         supercell.solve_row(CELL, [0.14] * 3, WAVE, **about)
 
@@ -235,7 +236,7 @@ def steep():
     """A lens of NA 0.8 of pillars as the rows' own solver has them, one by one."""
     sizes = np.linspace(NARROW, WIDE, 25)
     alone = [
-        supercell.solve_row(TITANIA, [d], GREEN, polarization="x", harmonics=2).order(0)
+        supercell.solve_row(TITANIA, [d], GREEN, polarization="x", harmonics=4).order(0)
         for d in sizes
     ]
     phase = np.polynomial.Chebyshev.fit(
@@ -353,9 +354,9 @@ def test_the_factor_on_a_lens_s_maps_is_that_of_rows_it_has_not_seen(
     Rows of 2, 3 and 4 pillars (2, 4 and 6 along the diagonal) are known. Apart: rows
     whose phases begin elsewhere.
     """
-    rows = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=2)
+    rows = supercell.neighbours(steep, counts=(2, 3, 4), harmonics=3)
     block = supercell.block_of(TITANIA.pitch_um, diagonal)
-    solved = supercell._mean(steep, count, diagonal, 2)[0]
+    solved = supercell._mean(steep, count, diagonal, 3)[0]
     sine = GREEN / (count * block.spacing_um)
     want = solved * np.array([(1 - sine**2) ** -0.25, (1 - sine**2) ** 0.25])
     along, down = np.indices((24, 24))[::-1]
