@@ -39,8 +39,9 @@ class Table:
         self.diameter_um = np.array(stored["diameter_um"])
         t = np.array(stored["real"]) + 1j * np.array(stored["imaginary"])
         self._spline = CubicSpline(self.diameter_um, np.moveaxis(t, -1, 0))
+        arrays = {name: np.array(value) for name, value in stored["proxy"].items()}
         self.proxy = Proxy.from_arrays(
-            {name: np.array(value) for name, value in stored["proxy"].items()}
+            {"entry_error": np.array(0.0), "gaps_um": np.empty((0, 2))} | arrays
         )
 
     def at(self, diameter_um, height_um, wavelength_um):
