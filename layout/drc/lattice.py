@@ -85,29 +85,44 @@ class _LatticeCheck:
             return
         outlines, kind = _distinct_outlines(self.plan.classes, used)
         self._check_widths(outlines, kind, used)
-        foot = np.zeros(len(outlines) + 1)
-        if foot_nm is not None:
-            np.maximum.at(foot, kind[used], foot_nm[used - 1])
+        foot, growth = np.zeros((2, len(outlines) + 1))
         limit = self.rules.minimum_gap_nm / self.plan.unit_nm
+        measured = limit
+        if foot_nm is not None:
+            drawn = np.array([self.plan.classes[k - 1].diameter_nm for k in used])
+            np.maximum.at(foot, kind[used], foot_nm[used - 1])
+            np.maximum.at(growth, kind[used], foot_nm[used - 1] - drawn)
+            if not all(self.plan.classes[k - 1].round for k in used):
+                widest = self.rules.minimum_foot_gap_nm + growth.max()
+                measured = max(limit, widest / self.plan.unit_nm)
         radius = np.array(
             [0.0, *(np.hypot(*outline[0].T).max() for outline in outlines)]
         )
         foot_reach = (foot.max() + self.rules.minimum_foot_gap_nm) / self.plan.unit_nm
         vectors = lattice_vectors(
-            self.lattice, max(2 * radius.max() + limit, foot_reach)
+            self.lattice, max(2 * radius.max() + measured, foot_reach)
         )
         table = np.zeros((len(vectors), len(radius), len(radius)), np.int64)
         for block, new, _ in self._blocks(vectors):
             count_pairs(block, new, kind, vectors, table)
         steps = vectors * (self.lattice.pitch, self.lattice.down)
-        spaces = self._measure_pairs(table, steps, outlines, radius, limit)
+        spaces = self._measure_pairs(table, steps, outlines, radius, measured)
         nearest = min(spaces.values(), default=math.inf)
         self.report.measured("space", nearest * self.plan.unit_nm)
         close = {key: space for key, space in spaces.items() if space < limit - 1e-9}
         if close:
             self._report_pairs(kind, vectors, table, close)
         if foot_nm is not None:
-            self._check_feet(table, steps, foot, foot_nm, nearest * self.plan.unit_nm)
+            if all(self.plan.classes[k - 1].round for k in used):
+                self._check_feet(*self._foot_spaces(table, steps, foot))
+            else:
+                pairs = np.array(list(spaces), np.int64).reshape(-1, 3)
+                _, first, second = pairs.T
+                drawn_nm = np.array(list(spaces.values())) * self.plan.unit_nm
+                self._check_feet(
+                    drawn_nm - (growth[first] + growth[second]) / 2,
+                    table[tuple(pairs.T)],
+                )
 
     def _check_widths(
         self, outlines: list[tuple[Array, ...]], kind: Array, used: Array
@@ -239,33 +254,31 @@ class _LatticeCheck:
                 value = values[vector, int(kind[one]), int(kind[two])]
                 yield Violation(rule, contour_box(both), value, limit, text)
 
-    def _check_feet(
-        self, table: Array, steps: Array, foot: Array, foot_nm: Array, nearest_nm: float
-    ) -> None:
-        """Spaces between feet: of discs by their diameters, of other shapes by the nearest pair and the widest foot."""
+    def _foot_spaces(
+        self, table: Array, steps: Array, foot: Array
+    ) -> tuple[Array, Array]:
+        """Spaces between the feet of discs for each kind of pair, nm, and the number of
+        such pairs.
+        """
+        vector, first, second = np.nonzero(table)
+        filled = (first > 0) & (second > 0)
+        vector, first, second = vector[filled], first[filled], second[filled]
+        away = np.hypot(*steps[vector].T) * self.plan.unit_nm
+        return away - (foot[first] + foot[second]) / 2, table[vector, first, second]
+
+    def _check_feet(self, spaces_nm: Array, pairs: Array) -> None:
+        """Enter the pairs of feet that are nearer than the rule.
+
+        Args:
+            spaces_nm: (n,) between feet, of all pairs that can be too near, and of the
+                nearest: of discs by their diameters, of other shapes between the drawn
+                polygons less what both walls lean out.
+            pairs: (n,) how many there are of each.
+        """
         lattice, limit = self.lattice, self.rules.minimum_foot_gap_nm
-        shapes = [
-            (k, self.plan.classes[k - 1])
-            for k in (np.flatnonzero(self.counts[1:]) + 1).tolist()
-        ]
-        growth = [
-            float(foot_nm[k - 1]) - shape.diameter_nm
-            for k, shape in shapes
-            if not shape.round
-        ]
-        if growth:
-            least = nearest_nm - max(growth)
-            count = int(least < limit - 1e-9)
-        else:
-            vector, first, second = np.nonzero(table)
-            space = (
-                np.hypot(*steps[vector].T) * self.plan.unit_nm
-                - (foot[first] + foot[second]) / 2
-            )
-            filled = (first > 0) & (second > 0)
-            least = float(space[filled].min(initial=math.inf))
-            close = filled & (space < limit - 1e-9)
-            count = int(table[vector[close], first[close], second[close]].sum())
+        least = float(spaces_nm.min(initial=math.inf))
+        count = int(pairs[spaces_nm < limit - 1e-9].sum())
+        layer = self.plan.classes[int(np.flatnonzero(self.counts[1:])[0])].layer[0]
         self.report.minimum_foot_space_nm = min(
             self.report.minimum_foot_space_nm, least
         )
@@ -282,7 +295,7 @@ class _LatticeCheck:
         self.report.add(
             "foot",
             count,
-            layer=shapes[0][1].layer[0],
+            layer=layer,
             cell=lattice.name,
             worst=least,
             examples=[shown],

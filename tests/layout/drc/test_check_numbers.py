@@ -153,7 +153,7 @@ def test_windows_reach_over_the_last_rows_and_columns():
 
 def test_feet_are_told_once_a_lattice():
     """Round: 150 nm from axis to axis, less half of 61 and 95 nm; else 55 nm drawn,
-    less what the widest leans out.
+    less what both walls lean out, 4 and 7 nm in diameter.
     """
     rules = dataclasses.replace(LOOSE, minimum_foot_gap_nm=75)
     feet = np.array([61.0, 95.0])
@@ -169,10 +169,10 @@ def test_feet_are_told_once_a_lattice():
     bars = (rectangle("A", 90, 60, round=False), rectangle("B", 100, 40, round=False))
     found = check_plan(plan_of(*bars), rules, foot_nm=np.array([94.0, 107.0]))
     assert found.violations == [
-        Violation("foot", box, 55.0 - 7.0, 75, "feet of etched pillars in L")
+        Violation("foot", box, 55.0 - (4 + 7) / 2, 75, "feet of etched pillars in L")
     ]
     assert check_plan(
         plan_of(*bars),
-        dataclasses.replace(rules, minimum_foot_gap_nm=48),
+        dataclasses.replace(rules, minimum_foot_gap_nm=49),
         foot_nm=np.array([94, 107]),
     ).ok
