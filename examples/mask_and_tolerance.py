@@ -28,11 +28,10 @@ from layout.mask import build, fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import process
-from layout.study import sensitivity, stitching, tolerance, tolerant
+from layout.study import sensitivity, stitching, tolerance
 from metalens import design, library
 from metalens.design.profiles import Focus
 from metalens.lens.record import DiameterMap
-from metalens.made import Spread
 
 rules = process.load("process.toml")
 focus = Focus(wavelength_um=0.85, sensor_distance_um=600.0, source_distance_um=20_000.0)
@@ -200,29 +199,6 @@ axes[2].set(
     title="axial information (Eq. 11)",
 )
 plt.show()
-
-# %% [markdown]
-# ## The tolerant choice
-#
-# Several diameters often do for one phase. Choosing those whose light answers most alike to the bias costs a little phase and buys
-# tolerance:
-
-# %%
-bias_only = process.Process(spread=Spread.only(bias_nm=8.0))
-plain = tolerance.analyse(lens, bias_only, sens=answers, draws=10).effects[0]
-print(
-    "phase tolerance   phase error   |T|     spread per nm    phase at ±8 nm   PSF change"
-)
-print(
-    f"{'as designed':>15s}   {0:8.3f} rad  {quality.transmission:.3f}   {'':14s} {plain.phase_rad:8.3f} rad   {100 * plain.psf:8.2f} %"
-)
-for allowed in (0.1, 0.2, 0.3):
-    choice = tolerant.choose(lens, rules, tolerance_rad=allowed)
-    after = tolerance.analyse(choice.lens, bias_only, sens=answers, draws=10).effects[0]
-    print(
-        f"{allowed:11.1f} rad   {choice.phase_error_rad:8.3f} rad  {choice.transmission:.3f}   {choice.before:.4f} → {choice.after:.4f} "
-        f"{after.phase_rad:8.3f} rad   {100 * after.psf:8.2f} %"
-    )
 
 # %% [markdown]
 # ## Solids

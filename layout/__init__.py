@@ -1,4 +1,4 @@
-"""Diameter map to fabrication-tolerant mask: process, cells, polygons, writers,
+"""Diameter map to mask: process, cells, polygons, writers,
 readers, checks, solids.
 
 Names load when first used: ``import layout; layout.write_oasis(layout.plan(lens,

@@ -26,7 +26,6 @@ from layout.gdsii import write as gdsii_write
 from layout.mask.plan import Lattice, MaskPlan, pillar_classes
 from layout.oasis import write as oasis_write
 from layout.process.process import Rules
-from layout.shapes import polygon
 from metalens.ground import store
 from metalens.ground.arrays import Array
 
@@ -148,7 +147,6 @@ def rows() -> Iterator[Row]:
         ):
             yield from some(target)
         yield from _check_rows()
-        yield from _polygon_rows()
         yield from _large_command_rows(target)
 
 
@@ -254,29 +252,6 @@ def _check_rows() -> list[Row]:
             goal,
         )
     ]
-
-
-def _polygon_rows() -> list[Row]:
-    made = []
-    for grid in (1, 2, 5):
-        for point in polygon.frontier(
-            range(100, 302, 10), grid_nm=grid, vertices=(8, 16, 24, 32, 48, 64)
-        ):
-            text = f"area; edge {point.edge_error_nm:.2f} nm, {point.corners:.0f} vertices, {point.shots:.0f} shots"
-            start = time.perf_counter()
-            polygon._pillar.cache_clear()
-            list(polygon.frontier([200], grid_nm=grid, vertices=(point.vertices,)))
-            seconds = time.perf_counter() - start
-            made.append(
-                Row(
-                    f"grid {grid} nm",
-                    f"{point.shape} {point.vertices}",
-                    seconds,
-                    point.area_error,
-                    text,
-                )
-            )
-    return made
 
 
 def _streaming_rows(target: Path) -> list[Row]:

@@ -16,7 +16,7 @@ from layout import solids
 from layout.dose import correct as dose
 from layout.mask import cells, fields
 from layout.process.process import Etch, Exposure, Process
-from layout.study import focus, stitching, tolerance, tolerant
+from layout.study import focus, stitching, tolerance
 from layout.study.sensitivity import Sensitivities
 from metalens.cell.record import Cell
 from metalens.lens.record import DiameterMap, Lens
@@ -157,12 +157,8 @@ def _optics_rows() -> list[Row]:
     plan = fields.split(source.diameters, PROCESS)
     report = stitching.stitching(source, plan, PROCESS)
     study = tolerance.analyse(source, PROCESS, sens=SENS)
-    choice = tolerant.choose(source, PROCESS, tolerance_rad=0.15)
     seconds = fastest(lambda: stitching.stitching(source, plan, PROCESS), repeats=1)
     amount = fastest(lambda: tolerance.analyse(source, PROCESS, sens=SENS), repeats=1)
-    choosing = fastest(
-        lambda: tolerant.choose(source, PROCESS, tolerance_rad=0.15), repeats=1
-    )
     case = "4.9 M pillars"
     return [
         Row(
@@ -191,13 +187,6 @@ def _optics_rows() -> list[Row]:
             amount,
             study.error,
             "t of the pillars, rms relative",
-        ),
-        Row(
-            case,
-            "tolerant choice within 0.15 rad",
-            choosing,
-            choice.after / choice.before,
-            "spread of d ln t/dD after / before",
         ),
     ]
 

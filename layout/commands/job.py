@@ -42,8 +42,7 @@ class Options(Distributed):
         window: of DXF and STL.
         name: of the top cell.
         dose: proximity correction, where the process asks for it.
-        study: add stitching, tolerance (Monte Carlo) and the tolerant choice to the
-            report.
+        study: add stitching and tolerance (Monte Carlo) to the report.
     """
 
     lens: tyro.conf.Positional[Path]

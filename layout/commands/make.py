@@ -250,6 +250,7 @@ def values_of(job: Job) -> dict[str, Any]:
         "exposure": {
             name: {
                 "worst_relative": c.worst_exposure,
+                "field_error": c.error,
                 "worst_diameter_nm": c.worst_nm,
                 "pillars": c.pillars,
                 "edges": len(c.edges.x_um),

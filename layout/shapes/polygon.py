@@ -8,7 +8,6 @@ vertices carry the area. Widths and areas therefore rise with the diameter.
 
 import functools
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -236,40 +235,3 @@ def edge_error(points: Array, radius: float) -> float:
     return float(
         max(vertex.max() - radius, radius - foot.min())
     )  # feet lie nearer to the origin than vertices
-
-
-@dataclass(frozen=True, slots=True)
-class FrontierPoint:
-    """What a number of vertices costs and gives, worst over a range of diameters.
-
-    area_error: relative; edge_error_nm; corners, shots: mean counts of one pillar.
-    """
-
-    vertices: int
-    shape: str
-    area_error: float
-    edge_error_nm: float
-    corners: float
-    shots: float
-
-
-def frontier(
-    diameters_nm: Iterable[float],
-    *,
-    grid_nm: float = 1.0,
-    vertices: Iterable[int] = (8, 12, 16, 24, 32, 48, 64),
-) -> Iterator[FrontierPoint]:
-    """Area error, edge error and cost for each number of vertices, and for the
-    shot-friendly octagon.
-    """
-    sizes = [d / grid_nm for d in diameters_nm]
-    for shape, n in [("shot", 8), *(("round", n) for n in vertices)]:
-        made = [pillar(s, vertices=n, shape=shape) for s in sizes]
-        yield FrontierPoint(
-            vertices=n,
-            shape=shape,
-            area_error=max(abs(m.area_error) for m in made),
-            edge_error_nm=max(m.edge_error for m in made) * grid_nm,
-            corners=sum(len(m.points) for m in made) / len(made),
-            shots=sum(m.shots for m in made) / len(made),
-        )

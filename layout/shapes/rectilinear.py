@@ -1,6 +1,5 @@
 """Polygons of horizontal and vertical edges, taken apart into rectangles, exactly."""
 
-import itertools
 import math
 
 import numpy as np
@@ -71,30 +70,6 @@ def covering(shape: Array) -> Array:
             ]
         )
     return np.array(made, np.int64)
-
-
-def cut(boxes: Array, side: float, grid: int) -> tuple[Array, Array]:
-    """Boxes (n, 4) cut on the grid to sides of some ``side`` at most: (m, 4), and (m,)
-    the box of each.
-    """
-    pieces: list[tuple[int, int, int, int]] = []
-    of: list[int] = []
-    for n, (left, bottom, right, top) in enumerate(np.asarray(boxes).tolist()):
-        xs, ys = _steps(left, right, side, grid), _steps(bottom, top, side, grid)
-        pieces += [
-            (a, c, b, d)
-            for a, b in itertools.pairwise(xs)
-            for c, d in itertools.pairwise(ys)
-        ]
-        of += [n] * (len(pieces) - len(of))
-    return np.array(pieces, np.int64).reshape(-1, 4), np.array(of, np.int64)
-
-
-def _steps(low: int, high: int, side: float, grid: int) -> list[int]:
-    count = max(1, int(np.ceil((high - low) / side)))
-    offsets = np.rint(np.linspace(0, high - low, count + 1) / grid).astype(np.int64)
-    steps: list[int] = np.unique(low + offsets * grid).tolist()
-    return steps
 
 
 def corners(box: Array) -> Array:

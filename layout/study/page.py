@@ -1,5 +1,5 @@
 """Sections of a mask's report on what the process does to the light: stitching,
-tolerance, tolerant choice.
+tolerance.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import numpy as np
 
 from layout.mask import FieldPlan
 from layout.process import Process
-from layout.study import stitching, tolerance, tolerant
+from layout.study import stitching, tolerance
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
@@ -18,9 +18,8 @@ from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, Section, Table
 from metalens.ground.units import deg
 from metalens.lens import Lens
-from metalens.made import PairSensitivities, Spread, pair_sensitivities
+from metalens.made import PairSensitivities, pair_sensitivities
 
-CHOICE_RAD = (0.1, 0.2, 0.3)
 Answers = Mapping[
     str, Sensitivities | PairSensitivities
 ]  # of light along "x" and "y"; of pillars of one size under ""
@@ -38,31 +37,22 @@ def answers_of(lens: Lens) -> Answers:
 def sections(
     lens: Lens, process: Process, plan: FieldPlan, answers: Answers
 ) -> list[Section]:
-    """The three sections; half a minute for a 1 mm lens, most of it for the solver and
-    the Monte Carlo.
+    """Stitching and tolerance; half a minute for a 1 mm lens, most of it for the solver
+    and the Monte Carlo.
 
-    Pillars that are turned one by one have no choice of sizes: their turn gives any
-    phase at the size that is best.
-    Those of two sizes have none either, and two sections for light along x and two for
-    light along y.
+    Of pillars of two sizes two sections for light along x and two for light along y.
 
     answers: :func:`answers_of` the lens.
     """
-    if lens.pairs is not None:
-        return [
-            replace(section, title=f"{section.title}, light along {light}")
-            for light, answer in answers.items()
-            for section in _of_light(
-                lens.seen("x" if light == "x" else "y"), process, plan, answer
-            )
-        ]
-    answer = answers[""]
-    found = _of_light(lens, process, plan, answer)
-    return (
-        found
-        if lens.hand or isinstance(answer, PairSensitivities)
-        else [*found, _choice(lens, process, answer)]
-    )
+    if lens.pairs is None:
+        return _of_light(lens, process, plan, answers[""])
+    return [
+        replace(section, title=f"{section.title}, light along {light}")
+        for light, answer in answers.items()
+        for section in _of_light(
+            lens.seen("x" if light == "x" else "y"), process, plan, answer
+        )
+    ]
 
 
 def _of_light(
@@ -237,37 +227,3 @@ def _bands(study: ToleranceReport) -> bytes:
 def _finer(samples: Array, interpolated: Array) -> Array:
     """Intensity between samples; interpolation may dip below zero by its ripple."""
     return np.asarray(np.clip(interpolated, 0, 1.05 * samples.max()))
-
-
-def _choice(lens: Lens, process: Process, answers: Sensitivities) -> Section:
-    sigma = max(process.spread.bias_nm, 1.0)
-    only = replace(process, spread=Spread.only(bias_nm=sigma))
-    before = tolerance.analyse(lens, only, sens=answers, draws=10).effects[0]
-    rows: list[list[float | str]] = [
-        ["as designed", 0.0, "-", before.phase_rad, 100 * before.psf]
-    ]
-    for allowed in CHOICE_RAD:
-        chosen = tolerant.choose(lens, process, tolerance_rad=allowed)
-        after = tolerance.analyse(chosen.lens, only, sens=answers, draws=10).effects[0]
-        spread = f"{chosen.before:.4f} → {chosen.after:.4f}"
-        rows.append(
-            [
-                f"within {allowed} rad",
-                chosen.phase_error_rad,
-                spread,
-                after.phase_rad,
-                100 * after.psf,
-            ]
-        )
-    head = (
-        "choice",
-        "phase error / rad",
-        "spread of d ln t/dD per nm",
-        "phase / rad",
-        "PSF / %",
-    )
-    text = (
-        "Several diameters often do for one phase. Taking those whose light answers most alike to the bias costs some "
-        f"phase and buys tolerance; effect of a bias of ±{sigma:g} nm."
-    )
-    return Section("Tolerant choice", text, [Table(head, rows, digits=3)])

@@ -12,7 +12,6 @@ from scipy.special import erf
 from layout.dose import rects
 from layout.dose.bodies import Rects
 from layout.dose.exposure import PointExposure
-from layout.shapes import rectilinear
 
 ALPHA_UM = 0.05
 PIXEL_UM = 0.005
@@ -27,7 +26,15 @@ ROWS = [
 
 
 def test_edges_of_letters_are_even_where_rows_end_over_a_piece():
-    boxes, _ = rectilinear.cut(np.array(ROWS), 1200, 1)
+    boxes = np.array(
+        [
+            [left, bottom, right, top]
+            for low, bottom, high, top in ROWS
+            for left, right in itertools.pairwise(
+                np.linspace(low, high, -(-(high - low) // 1200) + 1).astype(int)
+            )
+        ]
+    )
     cut = Rects(boxes * 1e-3, np.zeros(len(boxes), int), np.ones(len(boxes)))
     own, points, piece = rects.own(
         cut, PointExposure(np.array([ALPHA_UM]), np.array([1.0]))

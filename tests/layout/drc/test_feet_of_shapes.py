@@ -17,7 +17,9 @@ def test_every_pair_of_feet_that_is_too_near_is_counted(lean_nm, least):
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     half = np.array([WIDE // 2, LONG // 2])
-    made = PillarClass("D000324", float(WIDE), WIDE, (1, 0), corners * half, round=False)
+    made = PillarClass(
+        "D000324", float(WIDE), WIDE, (1, 0), corners * half, round=False
+    )
     sites = np.ones((ROWS, COLUMNS), np.uint8)
     sites[2, 3] = 0
     lens = Lattice.of("LENS", sites, pitch=PITCH, x0=0, y0=0)

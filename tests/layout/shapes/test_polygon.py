@@ -52,15 +52,6 @@ def test_area_of_32_vertices_is_the_circle_within_a_thousandth(diameter):
     assert centroid == (0.0, 0.0)  # odd diameters too: no half grid step
 
 
-def test_frontier_improves_with_vertices_and_costs_shots():
-    points = list(polygon.frontier(range(100, 300, 20), vertices=(8, 16, 32)))
-    shot, coarse, middle, fine = points
-    assert shot.shots == coarse.shots == 3  # an octagon: rectangle and two trapezoids
-    assert fine.area_error < 1e-3
-    assert fine.edge_error_nm < middle.edge_error_nm < coarse.edge_error_nm
-    assert fine.shots > middle.shots > coarse.shots
-
-
 def test_edge_error_of_an_equal_area_polygon_follows_the_closed_form():
     # n = 16: vertices stand out by R (sqrt(pi / (n/2 sin(2 pi/n))) - 1); grid rounding
     # adds 0.7 steps at most

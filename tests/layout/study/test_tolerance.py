@@ -1,6 +1,4 @@
-"""Tolerance: the reduced model against the plain sum with every pillar changed, limits,
-and the tolerant choice.
-"""
+"""Tolerance: the reduced model against the plain sum with every pillar changed, limits."""
 
 import dataclasses
 import functools
@@ -10,8 +8,8 @@ import numpy as np
 import pytest
 
 from layout.mask import fields
-from layout.process.process import Etch, Process, Rules, WriteField
-from layout.study import focus, stitching, tolerance, tolerant
+from layout.process.process import Etch, Process, WriteField
+from layout.study import focus, stitching, tolerance
 from layout.study import page as study_page
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import missed, reduce
@@ -263,53 +261,6 @@ def test_too_few_draws_are_refused():
         tolerance.analyse(hyperbolic(), Process(), sens=SENS, draws=5)
 
 
-def test_the_tolerant_choice_keeps_the_phase_and_lowers_the_spread():
-    lens = hyperbolic()
-    result = tolerant.choose(lens, Process(), tolerance_rad=0.1, loss=0.05)
-    d, made = lens.diameters.diameter_um, result.lens.diameters.diameter_um
-    here = d > 0
-    assert ((made > 0) == here).all()
-    away = np.angle(
-        np.exp(
-            1j * (PROXY.phase_rad(made[here], 0.85) - PROXY.phase_rad(d[here], 0.85))
-        )
-    )
-    assert abs(away).max() < 0.1 + 2 * np.pi / 2048
-    assert result.after < 0.95 * result.before
-    assert result.moved > 0.02
-    assert result.transmission > result.transmission_before - 0.05
-
-
-def test_the_tolerant_choice_loses_less_to_a_bias():
-    lens = hyperbolic()
-    result = tolerant.choose(lens, Process(), tolerance_rad=0.1)
-    only_bias = Process(spread=Spread.only(bias_nm=8.0))
-    lost = [
-        tolerance.analyse(each, only_bias, sens=SENS, depths_um=(1200.0,), draws=10)
-        .effects[0]
-        .phase_rad
-        for each in (lens, result.lens)
-    ]
-    assert lost[1] < 0.9 * lost[0]
-
-
-def test_chosen_diameters_are_printable():
-    result = tolerant.choose(hyperbolic(), Process())
-    made = result.lens.diameters.diameter_um
-    sizes = np.unique(made[made > 0]) * 1e3
-    assert np.allclose(sizes % 2, 0, atol=1e-6) or np.allclose(
-        2 - sizes % 2, 0, atol=1e-6
-    )
-    assert sizes.min() >= 100
-    assert sizes.max() <= 400 - 70
-
-
-@pytest.mark.parametrize("bad", [0.0, 4.0, -1.0])
-def test_an_impossible_phase_tolerance_is_refused(bad):
-    with pytest.raises(ProcessError, match="between 0 and pi"):
-        tolerant.choose(hyperbolic(41), Process(), tolerance_rad=bad)
-
-
 def _drawn(study, most, *given, **more):
     """A study of few draws."""
     return study(*given, **more | {"draws": most})
@@ -323,7 +274,6 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
         monkeypatch.setattr(
             module, name, functools.partial(_drawn, getattr(module, name), most)
         )
-    monkeypatch.setattr(study_page, "CHOICE_RAD", (0.1, 0.3))
     lens = hyperbolic(31)
     process = Process(write_field=WriteField(size_um=6.0))
     made = study_page.sections(
@@ -332,17 +282,11 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     assert [section.title for section in made] == [
         "Stitching",
         "Tolerance",
-        "Tolerant choice",
     ]
     tables = [
         item for section in made for item in section.items if isinstance(item, Table)
     ]
     assert [row[0] for row in tables[1].rows] == list(Spread().stated)
-    assert [row[0] for row in tables[-1].rows] == [
-        "as designed",
-        "within 0.1 rad",
-        "within 0.3 rad",
-    ]
     assert all(
         np.isfinite(value)
         for table in tables
@@ -356,7 +300,7 @@ def test_the_report_sections_say_what_was_found(monkeypatch):
     assert all(picture.png.startswith(b"\x89PNG") for picture in pictures)
 
 
-def test_a_turned_lens_has_its_study_without_a_choice_of_sizes(monkeypatch):
+def test_a_turned_lens_has_its_study(monkeypatch):
     for module, name, most in (
         (tolerance, "analyse", 10),
         (stitching, "stitching", 20),
@@ -421,19 +365,6 @@ def test_fields_of_a_turned_lens_add_up_to_its_light():
         abs(ready.light(moments.sum(0)[None])[0] - exact).max()
         < 1e-4 * abs(exact).max()
     )  # float32 sums
-
-
-def test_the_tolerant_choice_keeps_the_lattice_and_what_a_shape_may_be():
-    """Squares on a hexagonal lattice of 440 nm: neighbours along a row are 440 nm less
-    the side apart.
-    """
-    lens = hexagonal()
-    rules = Rules(minimum_gap_nm=201.0, minimum_feature_nm=121.0)
-    made = tolerant.choose(lens, Process(rules=rules), tolerance_rad=0.4).lens
-    d = made.diameters.diameter_um
-    assert made.diameters.lattice == lens.diameters.lattice
-    assert ((d > 0) == (lens.diameters.diameter_um > 0)).all()
-    assert 0.121 <= d[d > 0].min() <= d.max() <= 0.239
 
 
 def test_sensitivities_agree_with_an_independent_solver():
