@@ -1,35 +1,28 @@
-"""Phases for light polarised along x and along y, made of pillars of two sizes: one
-lens, or two in one place.
+"""Assignment of two-size pillars for light polarised along x and along y: one lens, or
+two in one place (:mod:`metalens.design.candidates`).
 
-At every site that pair of sizes of the library is taken whose t_x, t_y lie nearest to
-the wanted
-
-    |t_x - exp(i (φ_x + a))|² + |t_y - exp(i (φ_y + b))|²   least over the printable pairs within their bars,      (1)
-
-which for the peak of a focus, |sum t exp(-iφ)|², is the best choice site by site. The
-pistons a and b, which no focus
-knows, are those of the largest sum over a sample of sites; where both phases are one, a
-= b, so that any polarisation
-of the light stays as it is.
+Where both phases are one, they share a piston: any polarisation stays as it is.
 """
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from metalens.design.candidates import (
+    make_candidates,
+    sample_phases,
+    wanted_blocks,
+)
 from metalens.design.of_phase import Limits, Quality, Sums
 from metalens.design.profiles import Focus
-from metalens.design.sites import PhaseOf, Sites, least_period_um, sites
+from metalens.design.sites import PhaseOf, least_period_um, sites
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.ground.store import Provenance
 from metalens.lens import Lens, Pairs
 from metalens.pillars.axes import AxesLibrary, sized
 
-_PISTONS = 24  # tried for each polarisation
-_SAMPLE = 1500  # sites that choose them
 _COVERED_RAD = (
     0.2  # a wanted pair of phases is covered where a pillar gives both within this, and
 )
@@ -88,30 +81,28 @@ def make_paired(
     stock = _stock(library, at, limits)
     place = sites(library.cell, aperture_um, grid_nm=limits.grid_nm)
     wanted = phases[0], phases[1] or phases[0]
-    pistons = stock.pistons(_sampled(place, wanted), alike=phases[1] is None)
+    table = make_candidates(stock.t.T, np.ones(2), common_piston=phases[1] is None)
+    pistons = table.pistons(sample_phases(place, wanted))
     size, length = np.zeros(place.shape, np.float32), np.zeros(place.shape, np.float32)
     sums, chosen = (Sums(), Sums()), []
-    for (rows, inside, x), (_, _, y) in zip(
-        place.blocks(wanted[0]), place.blocks(wanted[1]), strict=True
-    ):
-        x, y = x + pistons[0], y + pistons[1]
-        pick = stock.nearest(x, y)
+    for rows, inside, block in wanted_blocks(place, wanted, pistons):
+        pick = table.nearest(block)
         size[rows][inside], length[rows][inside] = stock.sizes[pick].T
-        for one, phase, k in zip(sums, (x, y), (0, 1), strict=True):
+        for one, phase, k in zip(sums, block, (0, 1), strict=True):
             one.add(phase, np.angle(stock.t[pick, k]), np.abs(stock.t[pick, k]))
         chosen.append(np.bincount(pick, minlength=len(stock.t)))
     used = np.sum(chosen, axis=0)
     made = Lens(
         place.map(size, length_um=length),
         library.cell,
-        (table := _table(library, focuses[1], stock.entry_error(used))).proxy,
+        (pairs := _pairs(library, focuses[1], stock.entry_error(used))).proxy,
         focuses[0].wavelength_um,
         focuses[0].sensor_distance_um,
         focuses[0].source_distance_um,
         profile,
         provenance or Provenance(),
         focuses[0].layers,
-        pairs=table,
+        pairs=pairs,
     )
     return made, _split(
         stock, sums, used, focuses, aperture_um, library, alike=phases[1] is None
@@ -128,14 +119,6 @@ class _Stock:
     t: Array
     error: Array
     leaked: Array
-    tree: cKDTree
-
-    def nearest(self, x_rad: Array, y_rad: Array) -> Array:
-        """Places of the pairs by (1)."""
-        wanted = np.stack(
-            [np.cos(x_rad), np.sin(x_rad), np.cos(y_rad), np.sin(y_rad)], axis=-1
-        )
-        return np.asarray(self.tree.query(wanted)[1])
 
     def entry_error(self, used: Array) -> float:
         """Root mean square over the pillars of the bars relative to |t|, of the light
@@ -143,29 +126,6 @@ class _Stock:
         often each pair stands in the lens."""
         relative = self.error / np.abs(self.t).min(axis=1).clip(1e-6)
         return math.sqrt(float((used * relative**2).sum() / used.sum()))
-
-    def pistons(
-        self, wanted: tuple[Array, Array], *, alike: bool
-    ) -> tuple[float, float]:
-        """(a, b) of (1)."""
-        tried = 2 * np.pi * np.arange(_PISTONS) / _PISTONS
-        pairs = (
-            [(a, a) for a in tried] if alike else [(a, b) for a in tried for b in tried]
-        )
-        best = max(
-            pairs, key=lambda pair: self._peak(wanted[0] + pair[0], wanted[1] + pair[1])
-        )
-        return float(best[0]), float(best[1])
-
-    def _peak(self, x_rad: Array, y_rad: Array) -> float:
-        """The sum of both peaks."""
-        t = self.t[self.nearest(x_rad, y_rad)]
-        return float(
-            sum(
-                abs((t[:, k] * np.exp(-1j * phase)).mean()) ** 2
-                for k, phase in enumerate((x_rad, y_rad))
-            )
-        )
 
 
 def _stock(library: AxesLibrary, at: int, limits: Limits) -> _Stock:
@@ -180,11 +140,8 @@ def _stock(library: AxesLibrary, at: int, limits: Limits) -> _Stock:
     jones = library.t[at, row, column]
     t = np.stack([jones[:, 0, 0], jones[:, 1, 1]], axis=1)
     leaked = np.abs(np.stack([jones[:, 1, 0], jones[:, 0, 1]], axis=1)) ** 2
-    tree = cKDTree(
-        np.stack([t[:, 0].real, t[:, 0].imag, t[:, 1].real, t[:, 1].imag], axis=1)
-    )
     sizes = np.stack([library.x_um[row], library.y_um[column]], axis=1)
-    return _Stock(sizes, t, library.t_error[at, row, column], leaked, tree)
+    return _Stock(sizes, t, library.t_error[at, row, column], leaked)
 
 
 def _printable(library: AxesLibrary, limits: Limits) -> Array:
@@ -214,16 +171,7 @@ def _printable(library: AxesLibrary, limits: Limits) -> Array:
     )  # of the next larger pair
 
 
-def _sampled(place: Sites, wanted: tuple[PhaseOf, PhaseOf]) -> tuple[Array, Array]:
-    """Both phases at some of the sites, evenly picked."""
-    x, y = (
-        np.concatenate([phase for *_, phase in place.blocks(one)]) for one in wanted
-    )
-    pick = np.unique(np.linspace(0, len(x) - 1, _SAMPLE).astype(int))
-    return x[pick], y[pick]
-
-
-def _table(library: AxesLibrary, focus_y: Focus, entry_error: float) -> Pairs:
+def _pairs(library: AxesLibrary, focus_y: Focus, entry_error: float) -> Pairs:
     t = np.stack([library.t[..., 0, 0], library.t[..., 1, 1]], axis=-1)
     distances = focus_y.sensor_distance_um, focus_y.source_distance_um
     return Pairs(
@@ -267,7 +215,7 @@ def _covered(stock: _Stock, alike: bool) -> float:
     """Share of the phases, or of pairs of them, that a pillar gives."""
     turn = 2 * np.pi * np.arange(72 if alike else 36) / (72 if alike else 36)
     x, y = (turn, turn) if alike else (v.ravel() for v in np.meshgrid(turn, turn))
-    pick = stock.nearest(x, y)
+    pick = make_candidates(stock.t.T, np.ones(2)).nearest(np.stack([x, y]))
     off = np.abs(np.angle(stock.t[pick] * np.exp(-1j * np.stack([x, y], axis=1)))).max(
         axis=1
     )

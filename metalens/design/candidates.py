@@ -1,0 +1,169 @@
+"""Choice of pillars for several channels at once: wavelengths, or polarisations.
+
+At every site the pillar j is taken whose transmissions lie nearest to what all channels
+c want,
+
+    sum_c w_c |t_cj - exp(i (phi_c + p_c))|²   least over the candidates j.        (1)
+
+No intensity depends on the pistons p, so they are part of the search. For given pillars
+the best pistons are the phases of sum t exp(-i phi), the amplitudes in the foci. For
+given pistons the best pillars are those of (1). Both in turn never raise the sum over
+the sites, and end where neither lowers it, from several starts.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from metalens.design.sites import PhaseOf, Sites
+from metalens.ground.arrays import Array
+from metalens.ground.threads import split
+
+_STARTS, _ROUNDS, _SAMPLE = (
+    16,
+    40,
+    1500,
+)  # of the pistons: starts, rounds of each at most, sites that choose them
+_CONVERGED_RAD = 1e-3  # pistons that move less have converged
+_ROWS = 256  # sites whose sums (1) stay in a processor's cache
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CandidateTable:
+    """Pillars to choose from.
+
+    t: (channels, n) complex transmission of each candidate.
+    weights: (channels,) w of (1), above 0.
+    common_piston: whether all channels share one piston.
+    factors: (2 channels, n) float32 by which cosines and sines of the wanted phases
+    enter (1). power: (n,) the part of (1) that no phase changes.
+    """
+
+    t: Array
+    weights: Array
+    common_piston: bool
+    factors: Array
+    power: Array
+
+    def sums(self, phases_rad: Array) -> Array:
+        """Sums (1) less the sum of the weights.
+
+        Args:
+            phases_rad: (channels, sites) wanted phases, pistons included.
+
+        Returns:
+            (sites, n) float32.
+        """
+        phasors = np.concatenate([np.cos(phases_rad), np.sin(phases_rad)])
+        return np.asarray(self.power + phasors.astype(np.float32).T @ self.factors)
+
+    def nearest(self, phases_rad: Array) -> Array:
+        """(sites,) candidates of the least sums (1)."""
+        return self._over_sites(phases_rad, lambda sums: sums.argmin(1)).astype(int)
+
+    def between(self, phases_rad: Array) -> Array:
+        """(sites,) places of the least sums in a table of one size, in steps of it.
+
+        Vertices of the parabolas through the least sums and their two neighbours; the
+        ends of the table as they are.
+        """
+        return self._over_sites(phases_rad, _vertices)
+
+    def _over_sites(self, phases_rad: Array, choose: Callable[[Array], Array]) -> Array:
+        out = np.empty(phases_rad.shape[1])
+
+        def work(start: int, stop: int) -> None:
+            for a in range(start, stop, _ROWS):
+                some = slice(a, min(a + _ROWS, stop))
+                out[some] = choose(self.sums(phases_rad[:, some]))
+
+        split(len(out), work)
+        return out
+
+    def pistons(self, phases_rad: Array) -> Array:
+        """(channels,) pistons of the least sum over sites, the best of 16 starts.
+
+        Args:
+            phases_rad: (channels, sites) wanted phases of a sample of sites.
+        """
+        count = 1 if self.common_piston else len(self.t)
+        found = [self._converged(phases_rad, start) for start in _starts(count)]
+        return min(found, key=lambda one: one[0])[1]
+
+    def _converged(self, phases: Array, start: Array) -> tuple[float, Array]:
+        """The sum over the sites and its pistons, by pillars and pistons in turn."""
+        pistons = np.broadcast_to(start, len(self.t))
+        for _ in range(_ROUNDS):
+            pick = self.sums(phases + pistons[:, None]).argmin(1)
+            peaks = self.weights * (self.t[:, pick] * np.exp(-1j * phases)).sum(1)
+            peaks = peaks.sum(keepdims=True) if self.common_piston else peaks
+            before, pistons = pistons, np.broadcast_to(np.angle(peaks), len(self.t))
+            moved = np.angle(np.exp(1j * (pistons - before)))
+            if np.abs(moved).max() < _CONVERGED_RAD:
+                break
+        least = self.sums(phases + pistons[:, None]).min(1)
+        return float(least.sum(dtype=float)), pistons
+
+
+def make_candidates(
+    t: Array, weights: Array, *, common_piston: bool = False
+) -> CandidateTable:
+    """The table of candidates with these transmissions.
+
+    Args:
+        t: (channels, n) complex transmission of each candidate.
+        weights: (channels,) w of (1), above 0.
+        common_piston: whether all channels share one piston.
+    """
+    weighted = -2 * weights[:, None] * t
+    factors = np.concatenate([weighted.real, weighted.imag]).astype(np.float32)
+    power = (weights @ np.abs(t) ** 2).astype(np.float32)
+    return CandidateTable(t, weights, common_piston, factors, power)
+
+
+def sample_phases(place: Sites, phases: Sequence[PhaseOf]) -> Array:
+    """(channels, sites) wanted phases at some of the sites, evenly picked."""
+    wanted = [
+        np.concatenate([block for *_, block in place.blocks(phase)]) for phase in phases
+    ]
+    pick = np.unique(np.linspace(0, len(wanted[0]) - 1, _SAMPLE).astype(int))
+    return np.stack([one[pick] for one in wanted])
+
+
+def wanted_blocks(
+    place: Sites, phases: Sequence[PhaseOf], pistons: Array
+) -> Iterator[tuple[slice, Array, Array]]:
+    """Blocks of rows: which sites hold a pillar, and (channels, sites) wanted phases.
+
+    Args:
+        place: the sites of the lens.
+        phases: wanted by each channel.
+        pistons: (channels,) in rad, added to the phases.
+    """
+    for blocks in zip(*map(place.blocks, phases), strict=True):
+        rows, inside, _ = blocks[0]
+        yield rows, inside, np.stack([b[2] for b in blocks]) + pistons[:, None]
+
+
+def _vertices(sums: Array) -> Array:
+    """(sites,) vertices of parabolas through the least of each row of sums."""
+    last, row = sums.shape[1] - 1, np.arange(len(sums))
+    best = sums.argmin(1)
+    inner = best.clip(1, last - 1)
+    before, here, after = (sums[row, inner + i].astype(float) for i in (-1, 0, 1))
+    bend = before - 2 * here + after
+    off = (before - after) / (2 * np.maximum(bend, 1e-30))
+    return np.asarray(inner + np.where((best == inner) & (bend > 0), off, best - inner))
+
+
+def _starts(count: int) -> Array:
+    """(starts, count) pistons spread evenly over all turns.
+
+    Additive recurrence of the roots of x^(n+1) = x + 1 (M. Roberts, 2018).
+    """
+    root = 2.0
+    for _ in range(50):
+        root = (1 + root) ** (1 / (count + 1))
+    steps = root ** -np.arange(1.0, count + 1)
+    return np.asarray(2 * np.pi * (np.arange(_STARTS)[:, None] * steps % 1))
