@@ -31,6 +31,7 @@ from layout.process import process
 from layout.study import sensitivity, stitching, tolerance
 from metalens import design, library
 from metalens.design.profiles import Focus
+from metalens.fabrication import Spread
 from metalens.lens.record import DiameterMap
 
 rules = process.load("process.toml")

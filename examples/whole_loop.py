@@ -32,7 +32,7 @@ from codesign.adapt.settings import RetrainConfig
 from codesign.optics import built
 from metalens import lens as lenses
 from metalens.cli import main
-from metalens.made import sensitivity
+from metalens.fabrication import sensitivity
 
 work = Path(tempfile.mkdtemp())
 

@@ -24,18 +24,18 @@ from layout.process import Process
 from layout.study import tolerance
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Circle, Rectangle
-from metalens.ground.errors import ConfigError, FitError, ProcessError
-from metalens.lens import DiameterMap, Lens
-from metalens.made import (
-    Answers,
+from metalens.fabrication import (
     Bias,
     Printed,
+    ResponseError,
     Spread,
     State,
     lacking,
     named,
     sensitivity,
 )
+from metalens.ground.errors import ConfigError, FitError, ProcessError
+from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 from metalens.rcwa import jones
 from tests.codesign.process_entry import process_entry
@@ -134,7 +134,7 @@ def test_a_turn_of_a_rectangle_whose_mirrors_lie_along_the_lattice_is_of_second_
         lens, cell=dataclasses.replace(CELL, shape=Rectangle(RATIO, 0.5))
     )
     found = sensitivity(oblique)
-    rate = found.at(np.array([0.19]))[named(Answers).index("turn_deg"), 0]
+    rate = found.at(np.array([0.19]))[named(ResponseError).index("turn_deg"), 0]
     up, down = (solved(0.19, RATIO * 0.19, 0.5 + step) for step in (0.02, -0.02))
     # derivatives hold the field of normals that a truncation samples, differences move
     # it: what truncations differ by
@@ -251,5 +251,5 @@ def test_what_a_shape_cannot_have_is_refused_by_name_in_every_reader(lens):
     with pytest.raises(ProcessError, match=r"spread\.width_nm"):
         list(links.process(about))
     assert State.of({"width_nm": 3.0}).answers()[
-        named(Answers).index("width_nm")
+        named(ResponseError).index("width_nm")
     ] == pytest.approx(3e-3)

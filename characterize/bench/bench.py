@@ -29,11 +29,11 @@ from characterize.model import (
     vector,
 )
 from metalens import psf
+from metalens.fabrication import Sensitivity
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
-from metalens.made import Sensitivity
 
 FINE = 9
 _SPECTRUM = 1e-5  # of a mean over it: a fiftieth of what the fit allows itself

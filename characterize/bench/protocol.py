@@ -28,10 +28,10 @@ from characterize.model import (
     usual,
     vector,
 )
+from metalens.fabrication import Sensitivity
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError, nearest
 from metalens.lens import Lens
-from metalens.made import Sensitivity
 
 REACH = posterior.REACH
 # depths and angles, from which on a fit is tested on frames left out; one frame is

@@ -39,12 +39,12 @@ from characterize.model import (
 )
 from metalens import lens as lenses
 from metalens import psf as psfs
+from metalens.fabrication import PairSensitivities, Sensitivity, Solved
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.reading import reader
 from metalens.ground.store import Provenance
 from metalens.lens import DiameterMap, Lens
-from metalens.made import PairSensitivities, Sensitivity, Solved
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -17,6 +17,7 @@ from characterize.inference.search import Task
 from characterize.model import (
     LIGHT,
     MODES,
+    PARAMETERS,
     PLACE,
     ForwardModel,
     background,
@@ -24,10 +25,10 @@ from characterize.model import (
     prior_rad,
     unstated,
 )
+from metalens.fabrication import CDError, ResponseError, WavefrontError, maps, named
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens, Stop
-from metalens.made import Bends, maps, named
 
 _STITCH_UM = 0.05
 _STOP_UM = 3.0
@@ -44,26 +45,8 @@ _ROUND = (
 _GRID = 41  # places across the lens where write fields are told apart
 
 _TILTED = {"glass_um": 100.0, "glass_tilt_x_deg": 0.0, "glass_tilt_y_deg": 0.0}
-_OF_MODEL: tuple[
-    tuple[str, str, float], ...
-] = (  # cause, name and amount that is added
-    ("a source of finite size", "pinhole_um", 6),
-    ("a spectrum of finite width", "bandwidth_nm", 2),
-    ("a source off the stage's axis along x", "source_x_um", 5),
-    ("a source off the stage's axis along y", "source_y_um", 5),
-    ("a tilt of the lens about y", "tilt_x_deg", 0.3),
-    ("a tilt of the lens about x", "tilt_y_deg", 0.3),
-    ("a saddle of the diameters", "bias_a_nm", 3),
-    ("an oblique saddle of the diameters", "bias_o_nm", 3),
-    ("a tilted side wall", "sidewall_deg", 0.5),
-    ("another refractive index", "index", 0.01),
-    ("a wrong pixel pitch", "pixel_percent", 1.0),
-    ("a plate of glass in the beam", "glass_um", 100),
-    ("a tilt of {:g} um of glass about y", "glass_tilt_x_deg", 5),
-    ("a tilt of {:g} um of glass about x", "glass_tilt_y_deg", 5),
-)
 _SQUARE = ("pinhole_um", "bandwidth_nm")  # blur acts as the square of its size
-_OF_MASK = ("bias_a_nm", "bias_o_nm", "sidewall_deg", "index")
+_OF_MASK = {*named(CDError), *named(ResponseError)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,7 +129,8 @@ def changes(task: Task, x: Array, slopes: dict[str, Array]) -> Iterator[Change]:
 
 def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
     """Parameters of the model that are held."""
-    for cause, name, amount in _OF_MODEL:
+    for row in (row for row in PARAMETERS if row.effect):
+        name, amount = row.name, row.probe
         base: dict[str, float] = {}
         if name.startswith("glass_tilt") and x[PLACE["glass_um"]] == 0:
             if "glass_um" in task.known:
@@ -164,7 +148,7 @@ def _of_model(task: Task, x: Array, image: Array) -> Iterator[Change]:
             first = task.model.images(before)[0] if base else image
             change = (task.model.images(after)[0] - first)[None]
             sigma = (_size(task, name) / amount) ** (2 if name in _SQUARE else 1)
-            words = cause.format(before[PLACE["glass_um"]])
+            words = row.effect.format(before[PLACE["glass_um"]])
             needs = ("glass_um",) if base else ()
             frees = () if _exactly(task, name) else (*needs, name)
             yield Change(
@@ -291,7 +275,7 @@ def _of_phase(
     )
     sized = bent[:MODES] * prior_rad()[:, None, None, None]
     yield Change("a smooth phase that no parameter describes", sized)
-    known = [slopes.get(name, np.zeros_like(image)) for name in named(Bends)]
+    known = [slopes.get(name, np.zeros_like(image)) for name in named(WavefrontError)]
     every = np.concatenate([bent, np.stack(known)])
     fields = np.tensordot(write_fields(model.lens), every, 1)
     sigma = _size(task, "stitching_nm") * 1e-3
@@ -365,7 +349,7 @@ def write_fields(lens: Lens) -> Array:
     t = np.linspace(-1, 1, _GRID)
     u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 1] for part in np.meshgrid(t, t))
     shapes = np.concatenate(
-        [smooth(u, v, MODES + 3), maps(Bends, u, v), np.ones((1, len(u)))]
+        [smooth(u, v, MODES + 3), maps(WavefrontError, u, v), np.ones((1, len(u)))]
     )
     field = (
         np.minimum(np.floor(2 * (v + 1)), 3) * 4 + np.minimum(np.floor(2 * (u + 1)), 3)

@@ -30,6 +30,7 @@ from characterize.inference.prepare import (
 from characterize.inference.search import Task, with_values
 from characterize.model import (
     NAMES,
+    PARAMETERS,
     PLACE,
     ForwardModel,
     Known,
@@ -39,22 +40,15 @@ from characterize.model import (
     usual,
     vector,
 )
+from metalens.fabrication import Sensitivity
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitRefused
 from metalens.lens import Lens
-from metalens.made import Sensitivity
 
 LIKENESS = 0.45
-MORE = (
-    "pinhole_um",
-    "bandwidth_nm",
-    "bias_a_nm",
-    "bias_o_nm",
-    "tilt_x_deg",
-    "tilt_y_deg",
-    "pixel_percent",
-)
+# fitted too where the usual parameters do not explain the frames
+EXTRA = tuple(row.name for row in PARAMETERS if row.extra)
 _CAUSES = 4  # that are found in the residuals, one after the other
 # fall of -2 ln L by which a cause must free a parameter that ran to its bound
 _OUT_OF_BOUNDS = 10.0
@@ -203,14 +197,14 @@ def _ends(task: Task, gain: Gain, cautions: list[str]) -> tuple[Task, list[Solut
     frames.
     """
     task, ends = search.search(task)
-    if verdict.explained(ends[0], gain) or set(MORE) <= set(task.names):
+    if verdict.explained(ends[0], gain) or set(EXTRA) <= set(task.names):
         return task, ends
-    more = dataclasses.replace(task, free=(*task.free, *MORE))
+    more = dataclasses.replace(task, free=(*task.free, *EXTRA))
     wide = search.wider(more, task.all_of(ends[0].value))
     if wide is None or wide[1][0].chi2_per_dof >= 0.97 * ends[0].chi2_per_dof:
         return task, ends
     cautions.append(
-        f"the usual parameters did not explain the frames: {', '.join(MORE)} fitted too"
+        f"the usual parameters did not explain the frames: {', '.join(EXTRA)} fitted too"
     )
     return wide
 

@@ -7,56 +7,6 @@ import numpy as np
 from characterize.model import PARAMETERS, PLACE
 from metalens.ground.arrays import Array
 
-_SIDE = (
-    "light that falls off to one side and a gradient of the bias look alike; "
-    "measure the lamp's profile without the lens"
-)
-_WHY = {
-    frozenset(
-        {"wavelength_nm", "distance_um"}
-    ): "a longer wavelength and a longer distance refocus alike; "
-    "measure the wavelength with a spectrometer",
-    frozenset(
-        {"wavelength_nm", "stage_zero_um"}
-    ): "chromatic and geometric defocus look alike; measure the wavelength",
-    frozenset(
-        {"distance_um", "stage_zero_um"}
-    ): "moving the sensor and moving the source refocus alike; widen the depth range",
-    frozenset(
-        {"distance_um", "stage_scale"}
-    ): "both change how fast the image goes out of focus; calibrate the stage",
-    frozenset(
-        {"height_nm", "log_gain"}
-    ): "height acts mainly through efficiency; measure the power or the height (AFM)",
-    frozenset(
-        {"height_nm", "bias_nm"}
-    ): "both shift the phase and efficiency of all pillars; measure CDs (SEM) or height (AFM)",
-    frozenset({"bias_x_nm", "light_x"}): _SIDE,
-    frozenset({"bias_y_nm", "light_y"}): _SIDE,
-    frozenset(
-        {"bias_x_nm", "decentre_x_um"}
-    ): "a gradient of the bias tilts the wave front; measure CDs at both rims",
-    frozenset(
-        {"bias_y_nm", "decentre_y_um"}
-    ): "a gradient of the bias tilts the wave front; measure CDs at both rims",
-    frozenset(
-        {"pinhole_um", "crosstalk_px"}
-    ): "both blur; measure the pinhole, or take frames at more distant depths",
-    frozenset(
-        {"bias_r_nm", "spherical_rad"}
-    ): "a radial bias is nearly a spherical wave-front error; measure CDs along a radius",
-    frozenset(
-        {"bias_r_nm", "distance_um"}
-    ): "a radial bias adds power to the lens; measure CDs along a radius",
-    frozenset(
-        {"tilt_x_deg", "coma_x_rad"}
-    ): "tilt makes coma; take frames at opposite field angles",
-    frozenset(
-        {"tilt_y_deg", "coma_y_rad"}
-    ): "tilt makes coma; take frames at opposite field angles",
-    frozenset({"bandwidth_nm", "crosstalk_px"}): "both blur; measure the spectrum",
-}
-
 
 def degeneracies(
     names: tuple[str, ...], covariance: Array, sigma_prior: Array
@@ -75,10 +25,11 @@ def degeneracies(
     ]
     for size, i, j in sorted(pairs, reverse=True):
         if size > 0.9:
-            why = _WHY.get(
-                frozenset({names[i], names[j]}),
-                "an independent measurement of either settles both",
+            either = dict.fromkeys(
+                PARAMETERS[PLACE[names[k]]].measured_by for k in (j, i)
             )
+            known = " or ".join(one for one in either if one)
+            why = f"measure {known or 'either'}, which settles both"
             words.append(
                 f"{names[j]} and {names[i]} go together (correlation {correlation[i, j]:+.3f}): {why}"
             )

@@ -12,10 +12,10 @@ import numpy as np
 from characterize.captures import Capture, Frames, merge_brackets, told
 from characterize.inference.leastsquares import Data, Model
 from characterize.model import ForwardModel, Known, Setting, background, usual
+from metalens.fabrication import Kinds, Sensitivity
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CaptureError
 from metalens.lens import Lens
-from metalens.made import Kinds, Sensitivity
 
 MOST_OF_ONE_FRAME = 8
 # share of what light tells that may lie where a quick model knows nothing of it

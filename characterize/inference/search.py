@@ -24,11 +24,11 @@ from characterize.model import (
     usual,
     vector,
 )
+from metalens.fabrication import coarser
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
-from metalens.made import coarser
 
 WAVES_RAD = 0.9
 MODES_WITHIN = 10.0  # rise of -2 ln L up to which another valley is reported
@@ -37,7 +37,6 @@ _ALONG_NM, _ASIDE_UM = (
     9.0,
     50.0,
 )  # bias by which starts are moved along the valley; where windows begin at most
-_REVERSED = ("bias_x_nm", "bias_y_nm", "bias_r_nm")
 _PROMISING, _MOST, _AGAIN = 40.0, 2, 3
 _HELD_PX = 0.1  # off the decentre that windows may be held
 _ONWARD = Settings(
@@ -243,8 +242,9 @@ def reversals(task: Task, best: Solution) -> list[Array]:
     that does, and these together.
     """
     value, covariance = best.value, best.covariance
-    places = [task.names.index(name) for name in _REVERSED if name in task.names]
-    whole = [i for i, name in enumerate(task.names) if name == "bias_nm"] + places
+    rows = usual(task.names, task.model.lens)
+    whole = [i for i, row in enumerate(rows) if row.reversible]
+    places = [i for i in whole if task.names[i] != "bias_nm"]
     off = (
         float(
             value[whole]

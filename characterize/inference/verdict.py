@@ -19,10 +19,10 @@ from characterize.inference.missing import Finding, Unstated
 from characterize.inference.posterior import Valley
 from characterize.inference.search import WAVES_RAD, Task
 from characterize.model import ForwardModel, Known, Parameter, thinplate
+from metalens.fabrication import coarser
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import coarser
 
 MISFIT, LEAST_PEAK_E = 1.15, 100.0
 _BEYOND = 2.0  # sigma beyond a bound at which a value inside it is no longer believed

@@ -31,17 +31,17 @@ from characterize.model.setting import (
     true_depth,
 )
 from characterize.model.window import Operators
+from metalens.fabrication import CDError, ResponseError, Sensitivity, named, of_kind
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Sensitivity, Widens, named, of_kind
 
 GEOMETRY = (
     "distance_um", "wavelength_nm", "decentre_x_um", "decentre_y_um", "tilt_x_deg", "tilt_y_deg", "source_x_um",
     "source_y_um", "stage_zero_um", "stage_scale", "glass_um", "glass_tilt_x_deg", "glass_tilt_y_deg",
 )  # fmt: skip
 WIDENING, ANSWERING = (
-    {name: n for n, name in enumerate(named(kind))} for kind in (Widens, Answers)
+    {name: n for n, name in enumerate(named(kind))} for kind in (CDError, ResponseError)
 )
 EVERY = slice(None)
 Light = tuple[Array, dict[str, Array]]  # and its derivatives by name
@@ -496,7 +496,7 @@ class ForwardModel:
         pupil = group.reduced.combined(weight, values)
         if not slopes:
             return pupil, pupil, pupil, pupil
-        rows = (row for _, row in of_kind(Answers))
+        rows = (row for _, row in of_kind(ResponseError))
         slopes_of = zip(group.pillars.slopes(change(x)), rows, strict=True)
         by = [group.reduced.combined(weight, c * row.unit) for c, row in slopes_of]
         up = x.copy()

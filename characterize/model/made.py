@@ -11,23 +11,25 @@ import numpy as np
 from characterize.model import thinplate
 from characterize.model.parameters import PLACE, state
 from characterize.model.pillars import incidence_rad
+from metalens.fabrication import (
+    CDError,
+    Kinds,
+    PairTable,
+    Sensitivity,
+    WavefrontError,
+    biased,
+    perturbations,
+    transmission,
+)
 from metalens.ground import legendre
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import (
-    Bends,
-    Kinds,
-    PairTable,
-    Sensitivity,
-    Widens,
-    biased,
-    causes,
-    transmission,
-)
 
 _TABLE = 1 << 16
-_NODES = max(causes.polynomials(kind).shape[-1] for kind in (Widens, Bends))
+_NODES = max(
+    perturbations.polynomials(kind).shape[-1] for kind in (CDError, WavefrontError)
+)
 
 if TYPE_CHECKING:
     from metalens.psf import PsfStack, View

@@ -1,7 +1,7 @@
 """The parameters of an as-built lens and its bench: what each means, in which unit, and
 what is known beforehand.
 
-Those of the lens are the table of :mod:`metalens.made.causes`; those of the bench stand
+Those of the lens are the table of :mod:`metalens.fabrication.perturbations`; those of the bench stand
 here.
 """
 
@@ -12,20 +12,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from metalens.ground.arrays import Array
-from metalens.ground.errors import ConfigError, nearest
-from metalens.lens import Lens
-from metalens.made import (
-    CAUSES,
-    Answers,
-    Bends,
-    Cause,
+from metalens.fabrication import (
+    PERTURBATIONS,
+    CDError,
+    Perturbation,
+    ResponseError,
     State,
-    Widens,
+    WavefrontError,
     coarser,
     larger,
     named,
 )
+from metalens.ground.arrays import Array
+from metalens.ground.errors import ConfigError, nearest
+from metalens.lens import Lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,10 @@ class Parameter:
     any metrology (inf: none).
     low, high: bounds. free: fitted unless told otherwise. plausible: standard deviation
     that is reckoned with where
-    it is neither fitted nor stated; sigma where 0.
+    it is neither fitted nor stated; sigma where 0. effect: as a cause in words, where it
+    is looked for while it is held; probe: so much of it is tried then. extra: fitted too
+    where the usual ones do not explain the frames. reversible: near focus the opposite
+    sign looks alike. measured_by: what settles it beside the frames.
     """
 
     name: str
@@ -48,6 +51,11 @@ class Parameter:
     start: float = 0.0
     free: bool = True
     plausible: float = 0.0
+    effect: str = ""
+    probe: float = 0.0
+    extra: bool = False
+    reversible: bool = False
+    measured_by: str = ""
 
     @property
     def unstated(self) -> float:
@@ -69,57 +77,245 @@ class Unfitted:
     sigma: float
 
 
-def _of(row: Cause) -> Parameter:
-    bounds = row.low, row.high
-    return Parameter(
-        row.name,
-        row.meaning,
-        row.scale,
-        row.sigma,
-        *bounds,
-        free=row.free,
-        plausible=row.plausible,
-    )
+def _of(row: Perturbation) -> Parameter:
+    shared = (field.name for field in dataclasses.fields(Parameter))
+    entries = {name: getattr(row, name) for name in shared if name != "start"}
+    return Parameter(**entries)
 
 
 def _light(name: str, meaning: str) -> Parameter:
-    return Parameter(name, meaning, 0.1, 0.3, -2.0, 2.0, free=False, plausible=0.2)
+    return Parameter(
+        name,
+        meaning,
+        0.1,
+        0.3,
+        -2.0,
+        2.0,
+        free=False,
+        plausible=0.2,
+        measured_by="the profile of the lamp without the lens",
+    )
 
 
-_OF_LENS = {row.name: _of(row) for row in CAUSES}
+_OF_LENS = {row.name: _of(row) for row in PERTURBATIONS}
 PARAMETERS: tuple[Parameter, ...] = (
-    *(_OF_LENS[name] for name in (*named(Widens), *named(Answers))),
-    Parameter("wavelength_nm", "wavelength minus stated", 0.3, 0.5, -5.0, 5.0),
+    *(_OF_LENS[name] for name in (*named(CDError), *named(ResponseError))),
     Parameter(
-        "bandwidth_nm", "standard deviation of the spectrum", 0.5, math.inf, 0.0, 30.0, free=False, plausible=1.0
+        "wavelength_nm",
+        "wavelength minus stated",
+        0.3,
+        0.5,
+        -5.0,
+        5.0,
+        measured_by="the wavelength (spectrometer)",
     ),
-    Parameter("distance_um", "lens to sensor, minus design", 2.0, 100.0, -400.0, 400.0),
-    Parameter("decentre_x_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
-    Parameter("decentre_y_um", "window centre minus chief ray on the sensor", 1.0, 30.0, -60.0, 60.0),
-    Parameter("tilt_x_deg", "tilt of the lens about the y axis", 0.2, 1.0, -3.0, 3.0, free=False),
-    Parameter("tilt_y_deg", "tilt of the lens about the x axis", 0.2, 1.0, -3.0, 3.0, free=False),
-    Parameter("source_x_um", "source off the stage's axis", 5.0, 50.0, -300.0, 300.0, free=False),
-    Parameter("source_y_um", "source off the stage's axis", 5.0, 50.0, -300.0, 300.0, free=False),
-    Parameter("stage_zero_um", "true source depth minus stated (with the substrate's plate shift)", 50.0, 1000.0),
-    Parameter("stage_scale", "true stage step over stated, minus 1", 1e-3, 0.01, -0.05, 0.05),
     Parameter(
-        "glass_um", "plane glass of index 1.51 between source and lens", 20.0, math.inf, 0.0, 3000.0, free=False,
+        "bandwidth_nm",
+        "standard deviation of the spectrum",
+        0.5,
+        math.inf,
+        0.0,
+        30.0,
+        free=False,
+        plausible=1.0,
+        effect="a spectrum of finite width",
+        probe=2.0,
+        extra=True,
+        measured_by="the spectrum",
+    ),
+    Parameter(
+        "distance_um",
+        "lens to sensor, minus design",
+        2.0,
+        100.0,
+        -400.0,
+        400.0,
+        measured_by="a wider range of depths",
+    ),
+    Parameter(
+        "decentre_x_um",
+        "window centre minus chief ray on the sensor",
+        1.0,
+        30.0,
+        -60.0,
+        60.0,
+        measured_by="the place of the axis on the sensor",
+    ),
+    Parameter(
+        "decentre_y_um",
+        "window centre minus chief ray on the sensor",
+        1.0,
+        30.0,
+        -60.0,
+        60.0,
+        measured_by="the place of the axis on the sensor",
+    ),
+    Parameter(
+        "tilt_x_deg",
+        "tilt of the lens about the y axis",
+        0.2,
+        1.0,
+        -3.0,
+        3.0,
+        free=False,
+        effect="a tilt of the lens about y",
+        probe=0.3,
+        extra=True,
+        measured_by="frames at opposite field angles",
+    ),
+    Parameter(
+        "tilt_y_deg",
+        "tilt of the lens about the x axis",
+        0.2,
+        1.0,
+        -3.0,
+        3.0,
+        free=False,
+        effect="a tilt of the lens about x",
+        probe=0.3,
+        extra=True,
+        measured_by="frames at opposite field angles",
+    ),
+    Parameter(
+        "source_x_um",
+        "source off the stage's axis",
+        5.0,
+        50.0,
+        -300.0,
+        300.0,
+        free=False,
+        effect="a source off the axis of the stage along x",
+        probe=5.0,
+    ),
+    Parameter(
+        "source_y_um",
+        "source off the stage's axis",
+        5.0,
+        50.0,
+        -300.0,
+        300.0,
+        free=False,
+        effect="a source off the axis of the stage along y",
+        probe=5.0,
+    ),
+    Parameter(
+        "stage_zero_um",
+        "true source depth minus stated (with the substrate's plate shift)",
+        50.0,
+        1000.0,
+        measured_by="the zero of the stage, or a wider range of depths",
+    ),
+    Parameter(
+        "stage_scale",
+        "true stage step over stated, minus 1",
+        1e-3,
+        0.01,
+        -0.05,
+        0.05,
+        measured_by="the stage against a gauge",
+    ),
+    Parameter(
+        "glass_um",
+        "plane glass of index 1.51 between source and lens",
+        20.0,
+        math.inf,
+        0.0,
+        3000.0,
+        free=False,
         plausible=100.0,
+        effect="a plate of glass in the beam",
+        probe=100.0,
+        measured_by="the thickness of the glass",
     ),
-    Parameter("glass_tilt_x_deg", "tilt of that glass about the y axis", 1.0, 5.0, -45.0, 45.0, free=False),
-    Parameter("glass_tilt_y_deg", "tilt of that glass about the x axis", 1.0, 5.0, -45.0, 45.0, free=False),
-    *(_OF_LENS[name] for name in named(Bends)),
-    _light("light_x", "ln of the irradiance at the +x rim of the lens over that at its axis"),
-    _light("light_y", "ln of the irradiance at the +y rim of the lens over that at its axis"),
-    _light("light_r", "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2"),
-    Parameter("pinhole_um", "diameter of the source", 1.0, math.inf, 0.0, 2000.0, free=False, plausible=5.0),
-    Parameter("crosstalk_px", "standard deviation of pixel crosstalk and vibration", 0.1, 0.3, 0.02, 3.0, start=0.2),
-    Parameter("pixel_percent", "true pixel pitch over the stated one, less 1", 0.3, 1.0, -8.0, 8.0, free=False),
-    Parameter("log_gain", "logarithm of the electrons through the aperture in a frame at the reference depth", 0.02),
-    Parameter("background_e", "background at the window's centre, in the longest exposure", 2.0),
-    Parameter("background_x_e", "background at the right edge less that at the centre", 2.0),
-    Parameter("background_y_e", "background at the lower edge less that at the centre", 2.0),
-)  # fmt: skip
+    Parameter(
+        "glass_tilt_x_deg",
+        "tilt of that glass about the y axis",
+        1.0,
+        5.0,
+        -45.0,
+        45.0,
+        free=False,
+        effect="a tilt of {:g} um of glass about y",
+        probe=5.0,
+    ),
+    Parameter(
+        "glass_tilt_y_deg",
+        "tilt of that glass about the x axis",
+        1.0,
+        5.0,
+        -45.0,
+        45.0,
+        free=False,
+        effect="a tilt of {:g} um of glass about x",
+        probe=5.0,
+    ),
+    *(_OF_LENS[name] for name in named(WavefrontError)),
+    _light(
+        "light_x",
+        "ln of the irradiance at the +x rim of the lens over that at its axis",
+    ),
+    _light(
+        "light_y",
+        "ln of the irradiance at the +y rim of the lens over that at its axis",
+    ),
+    _light(
+        "light_r",
+        "ln of the irradiance at the rim all round over that at the axis, times rho² - 1/2",
+    ),
+    Parameter(
+        "pinhole_um",
+        "diameter of the source",
+        1.0,
+        math.inf,
+        0.0,
+        2000.0,
+        free=False,
+        plausible=5.0,
+        effect="a source of finite size",
+        probe=6.0,
+        extra=True,
+        measured_by="the pinhole, or frames at more distant depths",
+    ),
+    Parameter(
+        "crosstalk_px",
+        "standard deviation of pixel crosstalk and vibration",
+        0.1,
+        0.3,
+        0.02,
+        3.0,
+        start=0.2,
+    ),
+    Parameter(
+        "pixel_percent",
+        "true pixel pitch over the stated one, less 1",
+        0.3,
+        1.0,
+        -8.0,
+        8.0,
+        free=False,
+        effect="a wrong pixel pitch",
+        probe=1.0,
+        extra=True,
+        measured_by="the pixel pitch",
+    ),
+    Parameter(
+        "log_gain",
+        "logarithm of the electrons through the aperture in a frame at the reference depth",
+        0.02,
+        measured_by="the power",
+    ),
+    Parameter(
+        "background_e",
+        "background at the window's centre, in the longest exposure",
+        2.0,
+    ),
+    Parameter(
+        "background_x_e", "background at the right edge less that at the centre", 2.0
+    ),
+    Parameter(
+        "background_y_e", "background at the lower edge less that at the centre", 2.0
+    ),
+)
 UNFITTED: tuple[Unfitted, ...] = (
     Unfitted(
         "stitching_nm",
@@ -147,7 +343,7 @@ _IN_PIXELS = (
     "decentre_y_um",
 )  # which are as wide as the blur, and that as the wave is long
 _UNFITTED = tuple(row.name for row in UNFITTED)
-_CAUSES = [PLACE[row.name] for row in CAUSES]
+_CAUSES = [PLACE[row.name] for row in PERTURBATIONS]
 
 
 @dataclass(frozen=True, slots=True)

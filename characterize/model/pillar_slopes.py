@@ -9,14 +9,11 @@ from numpy.polynomial import chebyshev
 
 from characterize.model import kept, solving
 from metalens.cell import Cell, index
-from metalens.ground.arrays import Array
-from metalens.ground.errors import CellError, FitError, MaterialError
-from metalens.lens import Lens
-from metalens.made import (
-    Answers,
-    Cause,
+from metalens.fabrication import (
     Kinds,
     PairSensitivities,
+    Perturbation,
+    ResponseError,
     Sensitivity,
     Solved,
     lacking,
@@ -25,6 +22,9 @@ from metalens.made import (
     pair_sensitivities,
     sensitivity,
 )
+from metalens.ground.arrays import Array
+from metalens.ground.errors import CellError, FitError, MaterialError
+from metalens.lens import Lens
 
 _NODES, _MOST = 25, 14
 _SOURCES = (
@@ -32,7 +32,7 @@ _SOURCES = (
         "metalens.cell",
         "metalens.modal",
         "metalens.rcwa",
-        "metalens.made",
+        "metalens.fabrication",
         "metalens.pillars",
     ),
     *("characterize.model.solving", "characterize.model.pillar_slopes"),
@@ -42,19 +42,19 @@ _SOURCES = (
 def slopes(
     lens: Lens, *, tolerance: float = 0.02, wanted: Container[str] = ()
 ) -> Sensitivity:
-    """d ln t by the answering causes of :mod:`metalens.made.causes` over the diameters
+    """d ln t by the answering causes of :mod:`metalens.fabrication.perturbations` over the diameters
     of a lens, or t itself.
 
     Upright round pillars whose proxy is that of the cell: t by the modal method at
     every diameter that a bias can lead to and at five heights and seven indices within
-    the bounds of the fit (:class:`metalens.made.Solved`), to 3e-3 there and up to 0.03
+    the bounds of the fit (:class:`metalens.fabrication.Solved`), to 3e-3 there and up to 0.03
     between them where a resonance moves by. The slopes beside the table are polynomials
     of the least degree below 15 that meets ``tolerance`` at held-out diameters.
 
     Other round ones: derivatives by RCWA at a fixed truncation
-    (:func:`metalens.made.own_rates`) as such polynomials; ``error`` adds what the
+    (:func:`metalens.fabrication.own_rates`) as such polynomials; ``error`` adds what the
     truncation leaves. Cells that no solver takes get the effective-index slopes of
-    :func:`metalens.made.sensitivity`, pillars that are not round those of their own
+    :func:`metalens.fabrication.sensitivity`, pillars that are not round those of their own
     shape. Pillars of two sizes: those of up to 24 pairs of them, for the light of the
     lens.
 
@@ -217,20 +217,20 @@ def _table_slopes(
     rows = np.zeros((len(series), len(diameter_um)), complex)
     unknown = [row.name for row in _unknown() if row.name in wanted]
     rates = own_rates(lens, diameter_um).rates if unknown else rows
-    for n, (_, row) in enumerate(of_kind(Answers)):
-        if isinstance(row.acts, Answers) and row.acts.exact:
+    for n, (_, row) in enumerate(of_kind(ResponseError)):
+        if isinstance(row.acts, ResponseError) and row.acts.exact:
             rows[n] = series[n, 1] / series[n, 0]
         elif row.name in unknown:
             rows[n] = rates[n]
     return rows
 
 
-def _unknown() -> list[Cause]:
+def _unknown() -> list[Perturbation]:
     """Answering causes that a table of the modal method lacks."""
     return [
         row
-        for _, row in of_kind(Answers)
-        if isinstance(row.acts, Answers) and not row.acts.exact
+        for _, row in of_kind(ResponseError)
+        if isinstance(row.acts, ResponseError) and not row.acts.exact
     ]
 
 

@@ -17,15 +17,11 @@ from numpy.polynomial import chebyshev
 
 from characterize.model.parameters import PLACE, state
 from metalens.cell import Cell
-from metalens.ground import legendre
-from metalens.ground.arrays import Array
-from metalens.ground.errors import FitError
-from metalens.lens import DiameterMap, Lens
-from metalens.made import (
+from metalens.fabrication import (
     Answer,
-    Answers,
     Kinds,
     PairTable,
+    ResponseError,
     Sensitivity,
     answer,
     biased,
@@ -36,6 +32,10 @@ from metalens.made import (
     of_kind,
     transmission,
 )
+from metalens.ground import legendre
+from metalens.ground.arrays import Array
+from metalens.ground.errors import FitError
+from metalens.lens import DiameterMap, Lens
 from metalens.pillars import Proxy
 
 _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
@@ -44,7 +44,7 @@ _ENTRIES = 20001  # half a step is 2e-4 rad of phase at most
 _COLOURS = 12
 _MISSED = 2e-3  # of t, at random changes: more bias nodes are laid above it
 _ROOM = 1.07  # by which the basis reaches beyond the bounds of a fit
-_ROWS = [row for _, row in of_kind(Answers)]
+_ROWS = [row for _, row in of_kind(ResponseError)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from characterize.model.glass import AIR, Films
 from characterize.model.parameters import PLACE
 from characterize.model.pillars import Pillars
 from characterize.model.reduced import Reduced
+from metalens.fabrication import CDError, WavefrontError, maps, named
 from metalens.ground.arrays import Array
 from metalens.ground.errors import FitError
 from metalens.lens import Lens
-from metalens.made import Bends, Widens, maps, named
 
 LEAST_NM = (
     0.02  # of a spectrum that colours are chosen for: none has no slope by its width
@@ -122,7 +122,7 @@ def background(x: Array, setting: Setting) -> Array:
     return np.asarray(setting.glow * (x[PLACE["background_e"]] + along))
 
 
-BENDING = {name: n for n, name in enumerate(named(Bends))}
+BENDING = {name: n for n, name in enumerate(named(WavefrontError))}
 LIGHT = ("light_x", "light_y", "light_r")
 
 
@@ -160,7 +160,7 @@ class Group:
     def of(cls, index: Array, pillars: Pillars, reduced: Reduced) -> "Group":
         """Without a residual phase."""
         bending, widening = (
-            maps(kind, reduced.u, reduced.v) for kind in (Bends, Widens)
+            maps(kind, reduced.u, reduced.v) for kind in (WavefrontError, CDError)
         )
         return cls(
             index, pillars, reduced, bending, widening, np.empty((0, *reduced.u.shape))

@@ -11,10 +11,18 @@ from numpy.polynomial import polynomial
 
 from metalens import modal
 from metalens.cell import Cell, Light
+from metalens.fabrication import (
+    Perturbation,
+    ResponseError,
+    Solved,
+    coarser,
+    designed,
+    larger,
+    of_kind,
+)
 from metalens.ground import threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, Cause, Solved, coarser, designed, larger, of_kind
 from metalens.pillars import curve, engines
 
 # of a bias beyond the designed diameters: that of the fit, for 0.85 um and shorter
@@ -77,7 +85,7 @@ def _solved(cell: Cell, wavelength_um: float, low_um: float, high_um: float) -> 
     changes = _changes(wavelength_um)
     cells = [
         row.acts.changed(cell, amount, wavelength_um)
-        if isinstance(row.acts, Answers) and row.acts.changed and amount
+        if isinstance(row.acts, ResponseError) and row.acts.changed and amount
         else cell
         for _, row, amounts in changes
         for amount in amounts
@@ -112,11 +120,11 @@ def _along(cell: Cell, wavelength_um: float, diameters: Array) -> Array:
     )
 
 
-def _changes(wavelength_um: float) -> list[tuple[int, Cause, tuple[float, ...]]]:
+def _changes(wavelength_um: float) -> list[tuple[int, Perturbation, tuple[float, ...]]]:
     """(place, row, amounts in base units) of the causes that the solver knows."""
     out = []
-    for n, (_, row) in enumerate(of_kind(Answers)):
-        if isinstance(row.acts, Answers) and row.acts.exact:
+    for n, (_, row) in enumerate(of_kind(ResponseError)):
+        if isinstance(row.acts, ResponseError) and row.acts.exact:
             most = _ROOM * row.high * row.unit * larger(row.name, wavelength_um)
             out.append(
                 (n, row, tuple(most * share for share in _AMOUNTS[row.acts.exact]))
@@ -125,11 +133,11 @@ def _changes(wavelength_um: float) -> list[tuple[int, Cause, tuple[float, ...]]]
 
 
 def _powers(
-    columns: Array, changes: Sequence[tuple[int, Cause, tuple[float, ...]]]
+    columns: Array, changes: Sequence[tuple[int, Perturbation, tuple[float, ...]]]
 ) -> Array:
     """(causes, orders, diameters) power series through the amounts of each cause."""
     orders = max(len(amounts) for *_, amounts in changes)
-    out = np.zeros((len(list(of_kind(Answers))), orders, len(columns)), complex)
+    out = np.zeros((len(list(of_kind(ResponseError))), orders, len(columns)), complex)
     first = 0
     for n, _, amounts in changes:
         values = columns[:, first : first + len(amounts)].T

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import BSpline, RectBivariateSpline
 
+from metalens.fabrication import WavefrontError, maps
 from metalens.ground.arrays import Array
-from metalens.made import Bends, maps
 
 MODES, KNOTS, EXPECTED_RAD = 24, 9, 0.3
 _GRID = 61
@@ -70,7 +70,7 @@ def _known(u: Array, v: Array) -> Array:
     defocus, aberrations.
     """
     return np.concatenate(
-        [np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(Bends, u, v)]
+        [np.stack([np.ones_like(u), u, v, u * u + v * v]), maps(WavefrontError, u, v)]
     )
 
 

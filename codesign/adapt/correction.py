@@ -18,11 +18,18 @@ import numpy as np
 
 from characterize.model import PLACE, state
 from codesign.optics import MadeLens, Stack
+from metalens.fabrication import (
+    STEEPEST,
+    Bias,
+    Sensitivity,
+    State,
+    of_process,
+    transmission,
+)
 from metalens.ground import store
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
 from metalens.lens import DiameterMap, Lens
-from metalens.made import STEEPEST, Bias, Sensitivity, State, of_process, transmission
 
 _RAYS = 8  # of the places where the corrected map is judged
 
@@ -201,7 +208,7 @@ def present_bias(path: Path | None) -> Bias:
     """The bias that a mask was drawn with, from its PROCESS.toml; none without a file.
 
     Raises:
-        ConfigError, ProcessError: as :func:`metalens.made.of_process`.
+        ConfigError, ProcessError: as :func:`metalens.fabrication.of_process`.
     """
     return Bias() if path is None else of_process(path).bias
 

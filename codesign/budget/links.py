@@ -28,10 +28,10 @@ from codesign.evaluate import AXIAL
 from codesign.optics import psf_difference
 from metalens.cell import Light
 from metalens.design import neighbours as supercell
+from metalens.fabrication import State, biased, draws, sensitivity, transmission
 from metalens.ground.arrays import Array
 from metalens.ground.errors import CellError, LensError
 from metalens.lens import Neighbours
-from metalens.made import State, biased, draws, sensitivity, transmission
 from metalens.pillars import PillarLibrary, engines
 
 SOLVED = 12  # diameters at which the pillar model is solved again

@@ -25,10 +25,10 @@ from codesign.optics import (
     image_difference,
     kernels,
 )
+from metalens.fabrication import Printed
 from metalens.ground.errors import LensError
 from metalens.image import Grid, Imager, PsfBasis
 from metalens.lens import Lens
-from metalens.made import Printed
 from metalens.pillars import PillarLibrary
 from metalens.psf import Source
 

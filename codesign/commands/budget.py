@@ -20,10 +20,10 @@ from codesign.budget import page as budget_page
 from codesign.commands.options.budget import Options
 from codesign.optics import Numerics
 from metalens import __version__, lens, library
+from metalens.fabrication import of_process
 from metalens.ground import config, reading, store
 from metalens.ground.errors import ConfigError
 from metalens.ground.reading import reader
-from metalens.made import of_process
 from metalens.psf import Source, spectrum
 
 

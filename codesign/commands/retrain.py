@@ -20,10 +20,10 @@ from codesign.network import Subnet
 from codesign.optics import MadeLens, posterior, psf_error
 from codesign.train import Record, Trainer, checkpoint, device_of, place
 from metalens import __version__, lens
+from metalens.fabrication import Bias
 from metalens.ground import config, reading, store
 from metalens.ground.errors import TrainingError
 from metalens.ground.transaction import Draft
-from metalens.made import Bias
 
 LOG = "log.jsonl"
 

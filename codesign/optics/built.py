@@ -21,15 +21,21 @@ from characterize.model import PLACE, state, vector
 from codesign.optics.stack import OpticsConfig, Stack
 from codesign.optics.true_lens import PillarCells
 from metalens.design import Focus, profiles
+from metalens.fabrication import (
+    PERTURBATIONS,
+    Sensitivity,
+    State,
+    sensitivity,
+    transmission,
+)
 from metalens.field import Optics, cell_um
 from metalens.ground.arrays import Array
 from metalens.ground.errors import TrainingError
 from metalens.ground.paths import path_difference
 from metalens.image import Pupil, amplitude, aperture_light, coordinates
 from metalens.lens import Lens
-from metalens.made import CAUSES, Sensitivity, State, sensitivity, transmission
 
-OF_LENS = (*(row.name for row in CAUSES), "distance_um")
+OF_LENS = (*(row.name for row in PERTURBATIONS), "distance_um")
 TABLE_STEP_UM = 1e-5  # of the table of t over the diameter
 SPARE = 4  # samples around the window, so that what wraps around does not reach it
 

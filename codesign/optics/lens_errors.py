@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from metalens.fabrication import DRAWN, Draw, ResponseError, State, guide, of_kind
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError
-from metalens.made import DRAWN, Answers, Draw, State, guide, of_kind
 from metalens.pillars import DEFAULT_CELL, Proxy
 
 ASSEMBLY = ("focus_um", "tilt_waves", "astigmatism_waves")
@@ -54,7 +54,7 @@ class LensErrors(_Entries):  # type: ignore[misc]
     lens, waves at the rim.
     astigmatism_waves: of stress and stage errors, waves at the rim. Then what a process
     spreads, in the names of
-    :class:`metalens.made.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k,
+    :class:`metalens.fabrication.Spread`, ``bias_nm`` and ``height_nm`` first. correlation: (k,
     k) between the first k of them,
     rows one after the other; empty for none.
     bias_nm: mean of the diameters. height_nm: of the pillars. gradient_nm, bow_nm: of
@@ -202,8 +202,8 @@ def _answers() -> tuple[Array, Array]:
     seen = guide(DEFAULT_CELL, TURN, WAVELENGTH_UM, diameter)
     quick = [
         row.acts.quick(seen).imag
-        for _, row in of_kind(Answers)
-        if isinstance(row.acts, Answers)
+        for _, row in of_kind(ResponseError)
+        if isinstance(row.acts, ResponseError)
     ]
     rates = np.stack([TURN.dphase_ddiameter(diameter, WAVELENGTH_UM), *quick])
     return rates.mean(1), np.cov(rates)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from layout.process import Exposure
+from metalens.fabrication import read_csv
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
-from metalens.made import read_csv
 
 CLEARS = 0.5  # exposure at the edge of a wide area of dose 1
 

@@ -134,7 +134,7 @@ def _steps(
     size_nm: Array, design_nm: Array, process: Process, alone: Array | float
 ) -> Array:
     """Sizes as they are drawn, in whole steps; ``alone``: as
-    :meth:`metalens.made.Bias.drawn_nm` takes it.
+    :meth:`metalens.fabrication.Bias.drawn_nm` takes it.
     """
     step = process.rules.diameter_step_nm
     drawn = (

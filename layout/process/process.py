@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from metalens.fabrication import Bias, Spread, with_table
 from metalens.ground import config
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ConfigError, ProcessError
 from metalens.ground.units import deg
-from metalens.made import Bias, Spread, with_table
 
 LayerNumber = tuple[int, int]  # layer, datatype
 

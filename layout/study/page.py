@@ -13,12 +13,12 @@ from layout.study import stitching, tolerance
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
+from metalens.fabrication import PairSensitivities, Spread, pair_sensitivities
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, Section, Table
 from metalens.ground.units import deg
 from metalens.lens import Lens
-from metalens.made import PairSensitivities, pair_sensitivities
 
 Answers = Mapping[
     str, Sensitivities | PairSensitivities

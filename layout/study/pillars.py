@@ -8,9 +8,15 @@ from typing import Protocol
 import numpy as np
 
 from layout.study.sensitivity import Sensitivities
+from metalens.fabrication import (
+    Kinds,
+    PairSensitivities,
+    PairTable,
+    State,
+    transmission,
+)
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Kinds, PairSensitivities, PairTable, State, transmission
 from metalens.pillars import Proxy
 
 

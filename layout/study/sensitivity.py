@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.fabrication import ResponseError, of_kind, own_rates, with_missing
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Answers, of_kind, own_rates, with_missing
 
 Solver = Callable[[Cell, Array, float, bool], Array]
 _Solve = tuple[Cell, Array, bool]  # cell, diameters, whether at the finer truncation
@@ -103,8 +103,12 @@ def _differences(lens: Lens, diameters: Array, solver: Solver) -> Sensitivities:
     return Sensitivities(diameters, np.array(found), worst)
 
 
-def _answering() -> list[Answers]:
-    return [row.acts for _, row in of_kind(Answers) if isinstance(row.acts, Answers)]
+def _answering() -> list[ResponseError]:
+    return [
+        row.acts
+        for _, row in of_kind(ResponseError)
+        if isinstance(row.acts, ResponseError)
+    ]
 
 
 def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
@@ -122,7 +126,7 @@ def _tasks(lens: Lens, diameter_um: Array) -> Iterator[_Solve]:
         yield from ((end, some, finer) for finer in (False, True) for end in ends)
 
 
-def _some(lens: Lens, acts: Answers, diameter_um: Array) -> Array:
+def _some(lens: Lens, acts: ResponseError, diameter_um: Array) -> Array:
     """Diameters that a cause is solved at: every other one where walls tilt."""
     tilted = (
         acts.changed

@@ -22,10 +22,10 @@ import numpy as np
 from layout.study.focus import Focus
 from layout.study.pillars import Pillars, kinds
 from layout.study.sensitivity import Sensitivities
+from metalens.fabrication import Draw, PairSensitivities, Spread, State, draws
 from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import Draw, PairSensitivities, Spread, State, draws
 
 _BAND, _PARTS = (
     16,

@@ -14,9 +14,9 @@ import numpy as np
 from layout.mask import FieldPlan
 from layout.process import Process
 from layout.study.focus import Focus, Window, peak, prepare, window
+from metalens.fabrication import designed
 from metalens.ground.arrays import Array
 from metalens.lens import Lens
-from metalens.made import designed
 
 _BAND = 64
 

@@ -10,11 +10,17 @@ from layout.process import Process
 from layout.study.focus import Window, peak, prepare, window
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.spread_model import Model, missed, reduce
+from metalens.fabrication import (
+    Draw,
+    PairSensitivities,
+    State,
+    pair_sensitivities,
+    spread,
+)
 from metalens.ground import executor, threads
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.lens import Lens, reach
-from metalens.made import Draw, PairSensitivities, State, pair_sensitivities, spread
 
 # of the finite difference in the paper's Eq. 11 in the range of depths: 0.2 mm from 16
 # to 26 mm

@@ -20,9 +20,9 @@ from characterize.model.parameters import Known
 from characterize.model.setting import Setting
 from metalens import design, profiles
 from metalens.cell.record import Cell, Film, Index
+from metalens.fabrication import Sensitivity
 from metalens.lens import Layers
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import Sensitivity
 from metalens.pillars.proxy import Proxy
 
 DEPTHS = (380.0, 480.0, 600.0, 800.0, 1150.0)

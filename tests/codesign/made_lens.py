@@ -18,8 +18,8 @@ from codesign.train.evolution import Candidate, Search
 from metalens import design, lens
 from metalens.cell.record import Cell, Index
 from metalens.design.profiles import Focus
+from metalens.fabrication import sensitivity
 from metalens.ground.store import Provenance
-from metalens.made import sensitivity
 from metalens.pillars.proxy import Proxy
 
 # phase of 3 turns over the domain, with a wavelength so that a change of it is felt;

@@ -8,7 +8,7 @@ from codesign.budget import links
 from codesign.budget.entry import Entry
 from codesign.budget.prepared import Given
 from codesign.optics import Aperture
-from metalens.made import Printed
+from metalens.fabrication import Printed
 
 
 def process_entry(lens, spread, draws):

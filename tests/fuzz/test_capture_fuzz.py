@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from characterize.captures import capture
 from layout.dose import exposure
 from layout.process.process import Exposure
+from metalens.fabrication import bias
 from metalens.ground.errors import MetalensError
-from metalens.made import bias
 
 LIMITS = dict(max_examples=60)
 FRAMES = (np.arange(2 * 6 * 5).reshape(2, 6, 5) * 37 % 1000).astype(np.uint16)

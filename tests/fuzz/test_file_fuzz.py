@@ -21,10 +21,10 @@ from codesign.gaze import people_file
 from codesign.gaze.shared import Mixed, People
 from metalens import lens, library, psf
 from metalens.cell.record import Cell, Index
+from metalens.fabrication import Sensitivity
 from metalens.ground import store
 from metalens.ground.errors import MetalensError
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import Sensitivity
 from metalens.pillars.proxy import Proxy
 from metalens.pillars.record import PillarLibrary, Sweep
 from metalens.psf import PsfStack

@@ -12,9 +12,9 @@ from layout import solids
 from layout.process.process import Etch, Process
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
+from metalens.fabrication import Bias
 from metalens.ground.errors import ProcessError
 from metalens.lens import DiameterMap, Lens, Pairs
-from metalens.made import Bias
 from metalens.pillars import Proxy
 
 PROXY = Proxy(

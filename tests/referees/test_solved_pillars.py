@@ -11,7 +11,7 @@ from characterize.model import slopes
 from characterize.model.pillars import Change, Pillars
 from metalens import modal
 from metalens.cell import Index
-from metalens.made import Answers, answer, named, transmission
+from metalens.fabrication import ResponseError, answer, named, transmission
 from metalens.pillars.record import DEFAULT_CELL
 from tests.referees import hidden_lens as hidden
 from tests.referees import pillar_table
@@ -28,7 +28,7 @@ def amounts(height_um=0.0, index=0.0, sidewall_rad=0.0):
     """Of the causes that pillars answer, in the order of the table; of a round one no
     others.
     """
-    names, found = named(Answers), np.zeros(len(named(Answers)))
+    names, found = named(ResponseError), np.zeros(len(named(ResponseError)))
     for name, amount in (
         ("height_nm", height_um),
         ("index", index),
@@ -91,7 +91,7 @@ def test_rates_are_derivatives_of_the_factor(response):
 
 def test_few_functions_hold_every_change(response):
     pillars = Pillars(hidden.lens(), response)
-    change = Change((0.0163, *[0.0] * (len(named(Answers)) - 1)), 0.0007)
+    change = Change((0.0163, *[0.0] * (len(named(ResponseError)) - 1)), 0.0007)
     for bias_um in (-0.0117, 0.0, 0.0193):
         weight = pillars.weights(np.array(bias_um))
         rate = pillars.rates(np.array(bias_um), weight)

@@ -27,8 +27,8 @@ from metalens import psf
 from metalens.cell import Cell
 from metalens.cell.shapes import Rectangle
 from metalens.cli import main
+from metalens.fabrication import Solved, sensitivity
 from metalens.ground.errors import CaptureError, ConfigError, FitError
-from metalens.made import Solved, sensitivity
 from metalens.psf.of_lens import View
 
 SETTING = Setting(np.array(b.DEPTHS), np.zeros((5, 2)), np.ones(5), 1.5, 16, 16)

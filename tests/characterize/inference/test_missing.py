@@ -31,9 +31,9 @@ from characterize.inference.missing import (
 from characterize.inference.prepare import data_of
 from characterize.inference.search import Task, refine
 from characterize.model import PLACE, ForwardModel, Setting, vector
+from metalens.fabrication import WavefrontError, maps
 from metalens.ground.errors import FitError
 from metalens.lens import DiameterMap
-from metalens.made import Bends, maps
 
 rng = np.random.default_rng(20)
 SLOPES = rng.normal(size=(4, 900)) * np.array([[3.1], [0.7], [11.0], [2.3]])
@@ -254,7 +254,7 @@ def test_write_fields_moved_alike_are_a_lean_and_single_ones_are_not():
     fields = causes.write_fields(lens)
     t = np.linspace(-1, 1, 33)
     u, v = (part[np.hypot(*np.meshgrid(t, t)) <= 0.97] for part in np.meshgrid(t, t))
-    every = np.concatenate([causes.smooth(u, v, 27), maps(Bends, u, v)])
+    every = np.concatenate([causes.smooth(u, v, 27), maps(WavefrontError, u, v)])
     found = fields[:16].sum(0) @ every
     r = 20.0 * np.hypot(u, v)
     want = (

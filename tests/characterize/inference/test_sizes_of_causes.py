@@ -16,8 +16,8 @@ import bench_lens as b
 
 from characterize.inference import causes
 from characterize.model import MODES, PLACE, Known, Setting, prior_rad, unstated, vector
+from metalens.fabrication import WavefrontError, named
 from metalens.lens import Lens
-from metalens.made import Bends, named
 
 SHAPE = (4, 5, 7)
 RNG = np.random.default_rng(41)
@@ -102,7 +102,9 @@ def found(names=("bias_nm",), known=None, unfitted=None):
     x = vector({"bias_nm": 2.0, "background_e": 1.5, "index": 0.004})
     task = Asked(Model(), names, known or {}, unfitted or {})
     image = task.model.images(x)[0]
-    slopes = {name: SLOPES[PLACE[name]] for name in ("stage_zero_um", *named(Bends))}
+    slopes = {
+        name: SLOPES[PLACE[name]] for name in ("stage_zero_um", *named(WavefrontError))
+    }
     return {one.cause: one for one in causes.changes(task, x, slopes)}, image
 
 
@@ -140,7 +142,7 @@ def test_windows_of_every_angle_but_the_first_move_alone(unfitted, sigma):
         SimpleNamespace(index=np.array(index)) for index in ([0, 2], [1], [3])
     )
     task = Asked(Model(groups=groups), ("bias_nm",), {}, unfitted)
-    every |= {name: SLOPES[PLACE[name]] for name in named(Bends)}
+    every |= {name: SLOPES[PLACE[name]] for name in named(WavefrontError)}
     (found,) = [
         one for one in causes.changes(task, x, every) if one.cause == causes.WINDOWS
     ]
@@ -166,7 +168,7 @@ def test_write_fields_are_as_far_out_of_place_as_stated_and_smooth_phases_as_the
         assert fields.sigma == pytest.approx(sigma)
         assert fields.roughly
         assert not fields.sought
-    shapes = np.concatenate([MOVED, SLOPES[[PLACE[n] for n in named(Bends)]]])
+    shapes = np.concatenate([MOVED, SLOPES[[PLACE[n] for n in named(WavefrontError)]]])
     assert fields.images == pytest.approx(
         np.tensordot(causes.write_fields(LENS), shapes, 1), abs=1e-9
     )

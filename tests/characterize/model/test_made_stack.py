@@ -14,7 +14,7 @@ import bench_lens as b
 
 from characterize.model import made, state, thinplate, vector
 from metalens import psf
-from metalens.made import transmission
+from metalens.fabrication import transmission
 
 
 def test_psfs_are_those_of_the_wavelength_in_nm_and_the_distance_in_um_beside_the_design(

@@ -15,16 +15,22 @@ from characterize.model import ForwardModel, Setting, made, pillar_slopes, vecto
 from characterize.model.pillars import Change, change, of_lens
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Rectangle
+from metalens.fabrication import (
+    Kinds,
+    PairSensitivities,
+    ResponseError,
+    Sensitivity,
+    named,
+)
 from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap, Lens, Pairs
-from metalens.made import Answers, Kinds, PairSensitivities, Sensitivity, named
 
 X_UM, Y_UM = (
     np.linspace(0.06, 0.34, 71),
     np.linspace(0.08, 0.32, 61),
 )  # steps of 4 nm, room for a bias on all sides
 WAVE_UM, SENSOR_UM, DEPTH_UM = 0.85, 60.0, np.array([210.0, 330.0])
-CAUSES = named(Answers)
+CAUSES = named(ResponseError)
 MADE = {
     "bias_nm": 5.0,
     "bias_x_nm": -3.0,

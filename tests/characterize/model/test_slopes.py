@@ -15,7 +15,7 @@ from characterize.model import pillar_slopes
 from characterize.model.pillar_slopes import slopes
 from metalens import rcwa
 from metalens.cell.record import Cell, Film, Index
-from metalens.made import sensitivity
+from metalens.fabrication import sensitivity
 
 CELL = Cell(pitch_um=0.3, height_um=0.7, pillar=Index(3.6), substrate="SiO2")
 

@@ -8,14 +8,14 @@ import pytest
 from characterize.model import solving, thinplate
 from metalens import modal
 from metalens.cell import Cell, Index
-from metalens.made import Answers, Bends, maps, named, of_kind
+from metalens.fabrication import ResponseError, WavefrontError, maps, named, of_kind
 
 RNG = np.random.default_rng(29)
 
 
 def test_amounts_reach_beyond_the_bounds_of_a_fit():
     changes = solving._changes(0.85)
-    rows = [row for _, row in of_kind(Answers)]
+    rows = [row for _, row in of_kind(ResponseError)]
     assert [row.name for _, row, _ in changes] == ["height_nm", "index"]
     assert [n for n, _, _ in changes] == [rows.index(row) for _, row, _ in changes]
     assert changes[0][2] == pytest.approx(
@@ -39,7 +39,7 @@ def test_series_go_through_what_was_solved():
         t + sum(dense[p] * a ** (p + 1) for p in range(6)) for a in changes[1][2]
     ]
     out = solving._powers(np.array(columns).T, changes)
-    assert out.shape == (len(named(Answers)), 7, 7)
+    assert out.shape == (len(named(ResponseError)), 7, 7)
     assert out[:, 0] == pytest.approx(np.tile(t, (len(out), 1)), rel=1e-9)
     assert out[0, 1:5] == pytest.approx(tall, rel=1e-6)
     assert not out[0, 5:].any()
@@ -94,7 +94,7 @@ def test_modes_leave_out_what_parameters_already_do():
     inside = np.hypot(u, v) <= 1
     modes = thinplate.basis(u, v)[:, inside]
     u, v = u[inside], v[inside]
-    for shape in (np.ones_like(u), u, v, u**2 + v**2, *maps(Bends, u, v)):
+    for shape in (np.ones_like(u), u, v, u**2 + v**2, *maps(WavefrontError, u, v)):
         assert np.abs(modes @ shape).max() < 1e-6 * len(u)
     assert (modes @ modes.T) / len(u) == pytest.approx(np.eye(len(modes)), abs=1e-6)
 

@@ -15,8 +15,8 @@ import bench_lens as b
 from characterize.inference.search import prior_of
 from characterize.model import NAMES, PARAMETERS, Known, solving, unstated, usual
 from characterize.model.pillars import Change, Pillars, Range
+from metalens.fabrication import Sensitivity, coarser
 from metalens.lens import DiameterMap
-from metalens.made import Sensitivity, coarser
 
 LARGER = 12.0  # of 0.85 um: 10.2 um
 

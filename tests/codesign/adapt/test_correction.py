@@ -15,8 +15,8 @@ from characterize.model.parameters import state, vector
 from codesign.adapt import correction
 from codesign.optics import built
 from layout.process import process as processes
+from metalens.fabrication import sensitivity, transmission
 from metalens.ground.errors import ConfigError
-from metalens.made import sensitivity, transmission
 
 OLD = """
 [bias]

@@ -14,8 +14,8 @@ from codesign.optics import Numerics
 from metalens import design
 from metalens.cell import Cell, Film, Index
 from metalens.design import Focus
+from metalens.fabrication import Printed, Spread
 from metalens.lens import Layers, Lens, Neighbours
-from metalens.made import Printed, Spread
 from metalens.pillars.proxy import Proxy
 
 SLOPE = 55.0  # rad a um: phase of a pillar over its diameter, a straight line

@@ -16,8 +16,8 @@ from metalens import design
 from metalens.cell.record import Cell, Index
 from metalens.cell.shapes import Rectangle
 from metalens.design.profiles import Focus
+from metalens.fabrication import Printed, Spread, of_process
 from metalens.ground.errors import ConfigError, LensError, StoreError
-from metalens.made import Printed, Spread, of_process
 from metalens.pillars.proxy import Proxy
 
 CELL = Cell(pitch_um=0.30, height_um=0.7, pillar=Index(3.6))

@@ -24,8 +24,8 @@ from codesign.budget.journal import Journal
 from codesign.budget.links import Made
 from codesign.optics import Aperture, Window, image_difference, kernels, psf_difference
 from metalens.cell import Light
+from metalens.fabrication import Printed, Spread, State, draws, sensitivity
 from metalens.ground.errors import LensError
-from metalens.made import Printed, Spread, State, draws, sensitivity
 from metalens.pillars import PillarLibrary, Sweep, engines
 
 RNG = np.random.default_rng(31)

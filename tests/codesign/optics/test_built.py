@@ -19,7 +19,7 @@ from codesign.optics import built
 from codesign.optics import stack as optics
 from codesign.optics.stack import Stack
 from metalens import psf
-from metalens.made import sensitivity
+from metalens.fabrication import sensitivity
 
 X = vector(m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e": 9.0})
 

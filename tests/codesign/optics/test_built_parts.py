@@ -18,9 +18,9 @@ import made_lens as m
 from characterize.model import state
 from characterize.model.parameters import NAMES, vector
 from codesign.optics import built
+from metalens.fabrication import Sensitivity, transmission
 from metalens.image import Pupil, amplitude, coordinates
 from metalens.lens import DiameterMap
-from metalens.made import Sensitivity, transmission
 
 GATHER = getattr(
     built._gather, "py_func", built._gather

@@ -18,9 +18,9 @@ from layout.files import doses
 from layout.mask import build
 from layout.process.process import Etch, Exposure, Process
 from metalens.cell import Cell
+from metalens.fabrication import Bias
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import Bias
 from metalens.pillars import Proxy
 from tests.referees import rims
 from tests.referees.verified import verify

@@ -14,8 +14,8 @@ from layout.mask import build
 from layout.process.process import Die, Exposure, Process
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
+from metalens.fabrication import Bias
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Bias
 from metalens.pillars import Proxy
 from tests.referees import plain_exposure
 from tests.referees.verified import verify

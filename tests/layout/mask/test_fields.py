@@ -13,9 +13,9 @@ from layout.mask import fields
 from layout.process.process import Process, WriteField
 from layout.study import stitching
 from metalens.cell.record import Cell
+from metalens.fabrication import Bias
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import Bias
 from metalens.pillars.proxy import Proxy
 
 PROXY = Proxy(

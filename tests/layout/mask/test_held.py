@@ -12,10 +12,10 @@ from layout.mask import build, fields, held
 from layout.process.process import Exposure, Process, WriteField
 from metalens import lens as lenses
 from metalens.cell import Cell
+from metalens.fabrication import Bias
 from metalens.lens import record
 from metalens.lens.record import DiameterMap, Lens
 from metalens.lens.rows import RowsOnDisk
-from metalens.made import Bias
 from metalens.pillars import Proxy
 
 BEAM = Exposure(alpha_um=0.01, beta_um=8.0, eta=0.7)

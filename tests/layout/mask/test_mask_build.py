@@ -15,9 +15,9 @@ from layout.dose import exposure
 from layout.mask import Lattice, build, cells, die, font, marks
 from layout.process.process import Die, Exposure, Layers, Process, Rules
 from layout.shapes import polygon
+from metalens.fabrication import Bias
 from metalens.ground.errors import LensError, ProcessError
 from metalens.lens.record import DiameterMap
-from metalens.made import Bias
 from tests.referees import rims
 
 PLAIN = Process(exposure=Exposure(correct=False))

@@ -27,9 +27,9 @@ from metalens.cell.shapes import (
     Ring,
     Square,
 )
+from metalens.fabrication import Bias
 from metalens.ground.errors import ProcessError
 from metalens.lens import DiameterMap, Lens, Pairs
-from metalens.made import Bias
 from metalens.pillars import Proxy
 
 PROXY = Proxy(

@@ -18,9 +18,9 @@ from layout.process.process import (
     Rules,
     WriteField,
 )
+from metalens.fabrication import Spread
 from metalens.ground import config
 from metalens.ground.errors import ConfigError, ProcessError
-from metalens.made import Spread
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "process.toml"
 DESIGN = np.arange(80, 340, 2.0)

@@ -10,7 +10,7 @@ import pytest
 
 from layout.process import process
 from layout.process.process import Etch, Exposure, Process, Rules
-from metalens.made import Bias
+from metalens.fabrication import Bias
 
 
 def octagon(corner_nm, **more):

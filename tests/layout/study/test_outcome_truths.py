@@ -13,7 +13,7 @@ from layout.study import focus, stitching, tolerance
 from layout.study.focus import Window, peak
 from layout.study.spread_model import reduce
 from layout.study.tolerance import Outcome
-from metalens.made import Answers, Draw, Spread, draws, named, transmission
+from metalens.fabrication import Draw, ResponseError, Spread, draws, named, transmission
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 from tests.referees import plain_sum
 
@@ -79,7 +79,7 @@ def test_an_effect_is_the_worse_of_both_signs_against_the_nominal_lens(model):
     every = hyperbolic(61, 60.0, 500.0).diameters.diameter_um
     before, *after = (
         transmission(
-            PROXY, SENS, every[every > 0] + b, 0.85, np.zeros(len(named(Answers)))
+            PROXY, SENS, every[every > 0] + b, 0.85, np.zeros(len(named(ResponseError)))
         )
         for b in (0, -0.031, 0.031)
     )

@@ -9,10 +9,10 @@ import pytest
 
 from layout.study.sensitivity import Sensitivities, sensitivities
 from metalens.cell.record import Cell, Index
-from metalens.made import Answers, named
+from metalens.fabrication import ResponseError, named
 from tests.layout.study.test_tolerance import hyperbolic
 
-ROWS = named(Answers)
+ROWS = named(ResponseError)
 SLOPES = {"height_nm": 3.1j, "index": -0.02 + 0.4j, "sidewall_deg": 0.3 + 0.1j}
 FINER = {
     "height_nm": 1.03,

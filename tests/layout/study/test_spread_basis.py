@@ -12,7 +12,15 @@ from scipy import stats
 
 from layout.study import focus, spread_model
 from layout.study.spread_model import Model, _summed, missed, reduce
-from metalens.made import Answers, Draw, Spread, State, draws, named, transmission
+from metalens.fabrication import (
+    Draw,
+    ResponseError,
+    Spread,
+    State,
+    draws,
+    named,
+    transmission,
+)
 from tests.layout.study.test_tolerance import PROXY, SENS, hyperbolic
 
 # of the variation of t, in amplitude: lenses drawn anew then miss 2e-3 of theirs
@@ -43,7 +51,7 @@ def overlaps(lens, spread, seed):
             + wall * np.deg2rad(a["sidewall_deg"])
         )
         curves.append(
-            transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(Answers))))
+            transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(ResponseError))))
             * np.exp(change)
         )
     return (np.array(curves) * count) @ np.conj(curves).T
@@ -234,7 +242,7 @@ def test_curves_of_a_basis_are_of_places_anywhere_in_the_lens(monkeypatch):
         return np.zeros(1)
 
     made = SimpleNamespace(
-        bias_um=bias_um, answers=lambda: np.zeros(len(named(Answers)))
+        bias_um=bias_um, answers=lambda: np.zeros(len(named(ResponseError)))
     )
     one = SimpleNamespace(state=lambda: made)
     monkeypatch.setattr(

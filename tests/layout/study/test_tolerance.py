@@ -17,10 +17,10 @@ from metalens import modal
 from metalens.cell.lattice import Lattice
 from metalens.cell.record import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Cross, Rectangle, Square
+from metalens.fabrication import ResponseError, Spread, draws, named, transmission
 from metalens.ground.errors import ProcessError
 from metalens.ground.report import Figure, Table
 from metalens.lens.record import DiameterMap, Lens
-from metalens.made import Answers, Spread, draws, named, transmission
 from metalens.pillars.proxy import Proxy
 from tests.referees import plain_sum
 
@@ -130,7 +130,7 @@ def test_a_drawn_lens_sends_the_light_of_pillars_changed_one_by_one(made):
             + wall * np.deg2rad(a["sidewall_deg"])
         )
         t = transmission(
-            PROXY, SENS, made, 0.85, np.zeros(len(named(Answers)))
+            PROXY, SENS, made, 0.85, np.zeros(len(named(ResponseError)))
         ) * np.exp(change)
         exact = plain_sum.field(lens, np.where(d > 0, t * swung, 0), where)
         assert abs(light - exact).max() < 2e-3 * abs(exact).max()
@@ -204,7 +204,9 @@ def test_axial_information_is_equation_11_of_the_direct_psf():
 def test_beyond_the_domain_the_phase_goes_on_straight():
     d = np.array([0.3, 0.31, 0.32])
     phase = np.unwrap(
-        np.angle(transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(Answers)))))
+        np.angle(
+            transmission(PROXY, SENS, d, 0.85, np.zeros(len(named(ResponseError))))
+        )
     )
     assert np.diff(phase) == pytest.approx(
         0.01 * PROXY.dphase_ddiameter(np.full(2, 0.3), 0.85), rel=1e-9

@@ -16,12 +16,10 @@ from layout.study import focus, page, pillars, stitching, tolerance
 from layout.study.spread_model import missed, reduce
 from metalens.cell import Cell, Index
 from metalens.cell.shapes import Ellipse, Rectangle
-from metalens.ground.report import Table
-from metalens.lens import DiameterMap, Lens, Pairs
-from metalens.made import (
-    Answers,
+from metalens.fabrication import (
     PairSensitivities,
     PairTable,
+    ResponseError,
     Spread,
     State,
     draws,
@@ -30,9 +28,11 @@ from metalens.made import (
     pair_rates,
     pair_sensitivities,
 )
-from metalens.made import (
+from metalens.fabrication import (
     two_sizes as by_pairs,
 )
+from metalens.ground.report import Table
+from metalens.lens import DiameterMap, Lens, Pairs
 from metalens.rcwa import jones, pattern
 from tests.referees import plain_sum
 
@@ -41,7 +41,7 @@ LIGHTS = {
     "x": (19.0, 9.0, 0.93),
     "y": (8.0, 21.0, 0.97),
 }  # rad per um of width and of length, |t| of the thinnest
-CAUSES = named(Answers)
+CAUSES = named(ResponseError)
 
 
 def formula(width_um, length_um, light):

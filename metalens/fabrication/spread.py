@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.fabrication.perturbations import PERTURBATIONS, Drawn, lacking
+from metalens.fabrication.state import State
 from metalens.ground.errors import ProcessError
-from metalens.made.causes import CAUSES, Drawn, lacking
-from metalens.made.state import State
 
 DRAWN: dict[str, Drawn] = {
-    row.drawn.name: row.drawn for row in CAUSES if row.drawn
+    row.drawn.name: row.drawn for row in PERTURBATIONS if row.drawn
 }  # by entry, in the table's order
 _Entries: Any = dataclasses.make_dataclass(
     "_Entries",
@@ -62,7 +62,7 @@ class Spread(_Entries):  # type: ignore[misc]
         Raises:
             ProcessError: naming the entry.
         """
-        apart = {row.drawn.name: row.name for row in CAUSES if row.drawn}
+        apart = {row.drawn.name: row.name for row in PERTURBATIONS if row.drawn}
         for name, value in self.stated.items():
             if value and apart[name] in lacking(cell):
                 raise ProcessError(
@@ -87,7 +87,7 @@ class Draw:
     def state(self) -> State:
         """The causes that these amounts mean."""
         found: dict[str, float] = {}
-        for row in CAUSES:
+        for row in PERTURBATIONS:
             if row.drawn and row.drawn.name in self.amounts:
                 found[row.name] = (
                     self.amounts[row.drawn.name]
@@ -101,9 +101,11 @@ class Draw:
         entry.
         """
         entry = next(
-            row.drawn.name for row in CAUSES if row.name == cause and row.drawn
+            row.drawn.name for row in PERTURBATIONS if row.name == cause and row.drawn
         )
-        together = [row.name for row in CAUSES if row.drawn and row.drawn.name == entry]
+        together = [
+            row.name for row in PERTURBATIONS if row.drawn and row.drawn.name == entry
+        ]
         return (
             1.0
             if len(together) == 1

@@ -10,13 +10,18 @@ import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
 from metalens.cell import Cell, Index
+from metalens.fabrication.own import own_rates
+from metalens.fabrication.perturbations import (
+    Guide,
+    ResponseError,
+    of_kind,
+    with_missing,
+)
+from metalens.fabrication.solved import Solved
+from metalens.fabrication.two_sizes import PairSensitivities
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.lens import Lens
-from metalens.made.causes import Answers, Guide, of_kind, with_missing
-from metalens.made.own import own_rates
-from metalens.made.solved import Solved
-from metalens.made.two_sizes import PairSensitivities
 from metalens.pillars import Proxy
 
 # steps in the wavelengths of a proxy, of which the last one gives the tangent at its
@@ -141,7 +146,7 @@ class Answer:
 
 
 class Slopes(Protocol):
-    """Anything that knows d ln t by the answering causes."""
+    """Anything that knows d ln t by the answering perturbations."""
 
     def at(self, diameter_um: Array) -> Array:
         """(answering causes, *shape) derivatives of ln t by the base unit of each."""
@@ -184,14 +189,14 @@ def sensitivity(lens: Lens, *, degree: int = 5) -> Sensitivity:
     center = float(seen.diameter_um.mean())
     rows = [
         polynomial.polyfit(seen.diameter_um - center, row.acts.quick(seen), degree)
-        for _, row in of_kind(Answers)
-        if isinstance(row.acts, Answers)
+        for _, row in of_kind(ResponseError)
+        if isinstance(row.acts, ResponseError)
     ]
     return Sensitivity(np.array(rows), center, 0.5, low, high)
 
 
 def _of_its_own(lens: Lens) -> Sensitivity:
-    """From :func:`metalens.made.own.own_rates` at Chebyshev sizes, as polynomials of
+    """From :func:`metalens.fabrication.own.own_rates` at Chebyshev sizes, as polynomials of
     degree 5.
     """
     low, high = lens.proxy.domain_um

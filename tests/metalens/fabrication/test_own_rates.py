@@ -10,8 +10,16 @@ import pytest
 
 from metalens.cell import Cell, Index, Layer
 from metalens.cell.shapes import Circle, Ellipse, Rectangle
+from metalens.fabrication import (
+    ResponseError,
+    lacking,
+    named,
+    own,
+    own_rates,
+    perturbations,
+    response,
+)
 from metalens.lens import DiameterMap, Lens
-from metalens.made import Answers, causes, lacking, named, own, own_rates, response
 from metalens.pillars import Proxy
 from metalens.rcwa import jones, pattern
 
@@ -25,7 +33,7 @@ CELL = Cell(
     Index(1.05),
     shape=Rectangle(RATIO, ANGLE),
 )
-ROWS = named(Answers)
+ROWS = named(ResponseError)
 
 
 def lens(cell=CELL, *, hand="", tilted_light=False):
@@ -197,9 +205,9 @@ def test_a_cause_of_which_no_number_tells_goes_by_differences(few_orders, monkey
     exact = own_rates(lens(**about), sizes)
     untold = tuple(
         dataclasses.replace(row, acts=dataclasses.replace(row.acts, numbers=None))
-        if isinstance(row.acts, Answers) else row for row in causes.CAUSES
+        if isinstance(row.acts, ResponseError) else row for row in perturbations.PERTURBATIONS
     )  # fmt: skip
-    monkeypatch.setattr(causes, "CAUSES", untold)
+    monkeypatch.setattr(perturbations, "PERTURBATIONS", untold)
     found = own_rates(lens(**about), sizes)
     for name in ("height_nm", "index"):
         assert found.rates[ROWS.index(name)] == pytest.approx(

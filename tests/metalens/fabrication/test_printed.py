@@ -1,7 +1,7 @@
 """What is known of a mask without drawing one is what its maker's rules say."""
 
 from layout.process import Rules
-from metalens.made import Printed, of_process
+from metalens.fabrication import Printed, of_process
 
 
 def test_pillars_of_no_stated_mask_come_in_the_steps_of_the_default_rules(tmp_path):

@@ -1,13 +1,13 @@
-"""What can be wrong with a made lens: one table of causes, each with its unit, prior,
-bounds and derivative.
+"""Fabrication perturbations of a lens: one table with unit, prior, bounds, derivative,
+symmetry and measurement of each.
 
 Fit, tolerance study, error budget, training spread and mask correction read this table
 and nothing else: a new cause is
 a new row. Three kinds of derivative hold all of them:
 
-    Widens    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
-    Answers   t of every pillar alike, by its diameter                          t exp(sum a_c s_c(D))
-    Bends     phase of the wave front at (u, v)                                 t exp(i sum a_c z_c(u, v))
+    CDError    diameter of the pillar at (u, v), lens places over the radius     D + sum a_c w_c(u, v)
+    ResponseError   t of every pillar alike, by its diameter                          t exp(sum a_c s_c(D))
+    WavefrontError     phase of the wave front at (u, v)                                 t exp(i sum a_c z_c(u, v))
 """
 
 import dataclasses
@@ -49,21 +49,21 @@ class Guide:
 
 
 @dataclass(frozen=True, slots=True)
-class Widens:
+class CDError:
     """Derivative of the diameter: um a unit of the cause, a polynomial in (u, v)."""
 
     terms: Terms
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class ResponseError:
     """Derivative of ln t of every pillar alike, by ``unit`` of the row.
 
     quick: from the effective index, (n,) complex for the diameters of a guide. changed:
     the cell with so much more of
     the cause; None where a pillar of the same size has no more of it. step: of
     differences through a solver. exact: the number of the cell that tables of t follow
-    by powers (:class:`metalens.made.Solved`), empty where none does.
+    by powers (:class:`metalens.fabrication.Solved`), empty where none does.
     numbers: weight of each number of a cell, as :func:`metalens.rcwa.jones_derivatives`
     names them, by cell and size of
     the pillar; {} where such a pillar cannot have the cause. None: by differences, step
@@ -78,7 +78,7 @@ class Answers:
 
 
 @dataclass(frozen=True, slots=True)
-class Bends:
+class WavefrontError:
     """Derivative of the wave front's phase: rad a unit of the cause, a polynomial in
     (u, v).
     """
@@ -101,7 +101,7 @@ class Drawn:
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class Perturbation:
     """One row: a number that says how a made lens differs from its design; 0 is the
     design.
 
@@ -111,7 +111,11 @@ class Cause:
     free: fitted unless told
     otherwise. drawn: how the process spreads it, where it does. plausible: standard
     deviation that is reckoned with
-    where it is neither fitted nor stated; sigma where 0.
+    where it is neither fitted nor stated; sigma where 0. effect: as a cause in words,
+    where it is looked for while it is not fitted; probe: so much of it is tried then.
+    extra: fitted too where the usual ones do not explain the frames. reversible: near
+    focus the images of a lens with the opposite sign look alike. measured_by: what
+    settles it beside the frames.
     """
 
     name: str
@@ -120,11 +124,16 @@ class Cause:
     sigma: float
     low: float
     high: float
-    acts: Widens | Answers | Bends
+    acts: CDError | ResponseError | WavefrontError
     unit: float = 1.0
     free: bool = True
     drawn: Drawn | None = None
     plausible: float = 0.0
+    effect: str = ""
+    probe: float = 0.0
+    extra: bool = False
+    reversible: bool = False
+    measured_by: str = ""
 
 
 def _by_height(g: Guide) -> Array:
@@ -235,30 +244,32 @@ def _leaning(cell: Cell, amount: float, wavelength_um: float) -> Cell:
 
 def _widens(
     name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: object
-) -> Cause:
+) -> Perturbation:
     nm = tuple((c * 1e-3, i, j) for c, i, j in terms)
-    return Cause(name, meaning, 1.0, sigma, -bound, bound, Widens(nm), 1e-3, **more)  # type: ignore[arg-type]
+    return Perturbation(
+        name, meaning, 1.0, sigma, -bound, bound, CDError(nm), 1e-3, **more
+    )  # type: ignore[arg-type]
 
 
-def _bends(name: str, norm: float, terms: Terms) -> Cause:
+def _bends(name: str, norm: float, terms: Terms) -> Perturbation:
     """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
     rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
-    return Cause(
+    return Perturbation(
         f"{name}_rad",
         f"Zernike {name} of the wave front, rms",
         0.05,
         1.0,
         -6.0,
         6.0,
-        Bends(rad),
+        WavefrontError(rad),
     )
 
 
 def _side(
     name: str, meaning: str, numbers: Callable[[Cell, float], dict[str, float]]
-) -> Cause:
-    acts = Answers(_by_side, None, 2e-3, numbers=numbers)
-    return Cause(
+) -> Perturbation:
+    acts = ResponseError(_by_side, None, 2e-3, numbers=numbers)
+    return Perturbation(
         name,
         meaning,
         1.0,
@@ -272,11 +283,11 @@ def _side(
     )
 
 
-def _film(name: str, meaning: str, *, under: bool) -> Cause:
-    acts = Answers(
+def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
+    acts = ResponseError(
         _by_none, None, 1e-2, numbers=lambda cell, size_um: _films(cell, under=under)
     )
-    return Cause(
+    return Perturbation(
         name,
         meaning,
         2.0,
@@ -292,55 +303,157 @@ def _film(name: str, meaning: str, *, under: bool) -> Cause:
 
 DEG = math.pi / 180
 USUAL_UM = 0.85  # wavelength of the lenses that the sizes in nm below are of
-CAUSES: tuple[Cause, ...] = (
+PERTURBATIONS: tuple[Perturbation, ...] = (
     _widens(
-        "bias_nm", "diameter minus design, mean over the lens", 15.0, 26.0, ((1, 0, 0),), drawn=Drawn("bias_nm", 4.0)
+        "bias_nm",
+        "diameter minus design, mean over the lens",
+        15.0,
+        26.0,
+        ((1, 0, 0),),
+        drawn=Drawn("bias_nm", 4.0),
+        reversible=True,
+        measured_by="CDs at the centre (SEM)",
     ),
     _widens(
-        "bias_x_nm", "diameter bias at the +x rim less that at the axis", 10.0, 15.0, ((1, 1, 0),),
+        "bias_x_nm",
+        "diameter bias at the +x rim less that at the axis",
+        10.0,
+        15.0,
+        ((1, 1, 0),),
         drawn=Drawn("gradient_nm", 3.0, 0.5),
+        reversible=True,
+        measured_by="CDs at both rims (SEM)",
     ),
     _widens(
-        "bias_y_nm", "diameter bias at the +y rim less that at the axis", 10.0, 15.0, ((1, 0, 1),),
+        "bias_y_nm",
+        "diameter bias at the +y rim less that at the axis",
+        10.0,
+        15.0,
+        ((1, 0, 1),),
         drawn=Drawn("gradient_nm", 3.0, 0.5),
+        reversible=True,
+        measured_by="CDs at both rims (SEM)",
     ),
     _widens(
-        "bias_r_nm", "diameter bias at the rim less that at the axis, times 1/2 (2 rho² - 1)", 10.0, 15.0,
-        ((1, 2, 0), (1, 0, 2), (-0.5, 0, 0)), drawn=Drawn("bow_nm", 2.0),
+        "bias_r_nm",
+        "diameter bias at the rim less that at the axis, times 1/2 (2 rho² - 1)",
+        10.0,
+        15.0,
+        ((1, 2, 0), (1, 0, 2), (-0.5, 0, 0)),
+        drawn=Drawn("bow_nm", 2.0),
+        reversible=True,
+        measured_by="CDs along a radius (SEM)",
     ),
     _widens(
-        "bias_a_nm", "saddle of the diameter bias, x² - y² over R²", 10.0, 15.0, ((1, 2, 0), (-1, 0, 2)), free=False
+        "bias_a_nm",
+        "saddle of the diameter bias, x² - y² over R²",
+        10.0,
+        15.0,
+        ((1, 2, 0), (-1, 0, 2)),
+        free=False,
+        effect="a saddle of the diameters",
+        probe=3.0,
+        extra=True,
+        measured_by="CDs at four rims (SEM)",
     ),
-    _widens("bias_o_nm", "oblique saddle of the diameter bias, 2xy over R²", 10.0, 15.0, ((2, 1, 1),), free=False),
-    Cause(
-        "height_nm", "pillar height minus design", 5.0, 10.0, -28.0, 28.0,
-        Answers(_by_height, _taller, 0.01, "height_um", _heights), 1e-3, drawn=Drawn("height_nm", 7.0),
+    _widens(
+        "bias_o_nm",
+        "oblique saddle of the diameter bias, 2xy over R²",
+        10.0,
+        15.0,
+        ((2, 1, 1),),
+        free=False,
+        effect="an oblique saddle of the diameters",
+        probe=3.0,
+        extra=True,
+        measured_by="CDs at four rims (SEM)",
     ),
-    Cause(
-        "index", "refractive index of the pillars minus design", 0.02, 0.02, -0.075, 0.075,
-        Answers(_by_index, _denser, 0.02, "n", _number("pillar.n")), free=False, drawn=Drawn("index", 0.02),
+    Perturbation(
+        "height_nm",
+        "pillar height minus design",
+        5.0,
+        10.0,
+        -28.0,
+        28.0,
+        ResponseError(_by_height, _taller, 0.01, "height_um", _heights),
+        1e-3,
+        drawn=Drawn("height_nm", 7.0),
+        measured_by="the height (AFM) or the power",
     ),
-    Cause(
-        "sidewall_deg", "sidewall angle minus design", 0.3, 0.5, -1.6, 1.6,
-        Answers(_by_sidewall, _leaning, DEG / 2, numbers=_number("sidewall_rad")), DEG, free=False,
-        drawn=Drawn("sidewall_deg", 0.5), plausible=2.0,
+    Perturbation(
+        "index",
+        "refractive index of the pillars minus design",
+        0.02,
+        0.02,
+        -0.075,
+        0.075,
+        ResponseError(_by_index, _denser, 0.02, "n", _number("pillar.n")),
+        free=False,
+        drawn=Drawn("index", 0.02),
+        effect="another refractive index",
+        probe=0.01,
+        measured_by="the index (ellipsometer)",
     ),
-    _side("width_nm", "side of a rectangle or ellipse along its x, minus design and bias", _width),
-    _side("length_nm", "side of a rectangle or ellipse along its y, minus design and bias", _length),
-    Cause(
-        "turn_deg", "turn of every pillar in the plane, from +x to +y, minus design", 0.2, 0.3, -3.0, 3.0,
-        Answers(_by_none, None, DEG / 2, numbers=_turn), DEG, free=False, drawn=Drawn("turn_deg", 0.0),
+    Perturbation(
+        "sidewall_deg",
+        "sidewall angle minus design",
+        0.3,
+        0.5,
+        -1.6,
+        1.6,
+        ResponseError(_by_sidewall, _leaning, DEG / 2, numbers=_number("sidewall_rad")),
+        DEG,
+        free=False,
+        drawn=Drawn("sidewall_deg", 0.5),
+        plausible=2.0,
+        effect="a tilted side wall",
+        probe=0.5,
+        measured_by="a cross-section (SEM)",
     ),
-    _film("pedestal_nm", "height of the films under a layered pillar's own material, minus design", under=True),
-    _film("cap_nm", "height of the films on it (a residual mask), minus design", under=False),
+    _side(
+        "width_nm",
+        "side of a rectangle or ellipse along its x, minus design and bias",
+        _width,
+    ),
+    _side(
+        "length_nm",
+        "side of a rectangle or ellipse along its y, minus design and bias",
+        _length,
+    ),
+    Perturbation(
+        "turn_deg",
+        "turn of every pillar in the plane, from +x to +y, minus design",
+        0.2,
+        0.3,
+        -3.0,
+        3.0,
+        ResponseError(_by_none, None, DEG / 2, numbers=_turn),
+        DEG,
+        free=False,
+        drawn=Drawn("turn_deg", 0.0),
+    ),
+    _film(
+        "pedestal_nm",
+        "height of the films under a layered pillar's own material, minus design",
+        under=True,
+    ),
+    _film(
+        "cap_nm",
+        "height of the films on it (a residual mask), minus design",
+        under=False,
+    ),
     _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
     _bends("oblique_astigmatism", 6, ((2, 1, 1),)),
     _bends("coma_x", 8, ((3, 3, 0), (3, 1, 2), (-2, 1, 0))),
     _bends("coma_y", 8, ((3, 0, 3), (3, 2, 1), (-2, 0, 1))),
     _bends("trefoil_x", 8, ((1, 3, 0), (-3, 1, 2))),
     _bends("trefoil_y", 8, ((3, 2, 1), (-1, 0, 3))),
-    _bends("spherical", 5, ((6, 4, 0), (12, 2, 2), (6, 0, 4), (-6, 2, 0), (-6, 0, 2), (1, 0, 0))),
-)  # fmt: skip
+    _bends(
+        "spherical",
+        5,
+        ((6, 4, 0), (12, 2, 2), (6, 0, 4), (-6, 2, 0), (-6, 0, 2), (1, 0, 0)),
+    ),
+)
 
 
 def coarser(wavelength_um: float) -> float:
@@ -363,13 +476,17 @@ def larger(name: str, wavelength_um: float) -> float:
 
 
 def of_kind(
-    kind: type[Widens] | type[Answers] | type[Bends],
-) -> Iterator[tuple[int, Cause]]:
+    kind: type[CDError] | type[ResponseError] | type[WavefrontError],
+) -> Iterator[tuple[int, Perturbation]]:
     """(place in the table, row) of the causes that act in one way, in order."""
-    return ((n, row) for n, row in enumerate(CAUSES) if isinstance(row.acts, kind))
+    return (
+        (n, row) for n, row in enumerate(PERTURBATIONS) if isinstance(row.acts, kind)
+    )
 
 
-def named(kind: type[Widens] | type[Answers] | type[Bends]) -> tuple[str, ...]:
+def named(
+    kind: type[CDError] | type[ResponseError] | type[WavefrontError],
+) -> tuple[str, ...]:
     """Names of the causes that act in one way, in order."""
     return tuple(row.name for _, row in of_kind(kind))
 
@@ -379,7 +496,7 @@ def with_missing(rows: Sequence[Array]) -> Array:
     there are 0.
     """
     return np.stack(
-        [*rows, *[np.zeros_like(rows[0])] * (len(named(Answers)) - len(rows))]
+        [*rows, *[np.zeros_like(rows[0])] * (len(named(ResponseError)) - len(rows))]
     )
 
 
@@ -390,13 +507,13 @@ def lacking(cell: Cell) -> tuple[str, ...]:
     size = cell.pitch_um / 2
     rows = [
         row
-        for _, row in of_kind(Answers)
-        if isinstance(row.acts, Answers) and row.acts.numbers
+        for _, row in of_kind(ResponseError)
+        if isinstance(row.acts, ResponseError) and row.acts.numbers
     ]
     return tuple(row.name for row in rows if not row.acts.numbers(cell, size))  # type: ignore[union-attr, misc]
 
 
-def polynomials(kind: type[Widens] | type[Bends]) -> Array:
+def polynomials(kind: type[CDError] | type[WavefrontError]) -> Array:
     """(rows of the kind, i, j) coefficients of u^i v^j: um or rad a unit of each cause."""
     return _polynomials(kind.__name__)
 
@@ -405,8 +522,8 @@ def polynomials(kind: type[Widens] | type[Bends]) -> Array:
 def _polynomials(kind: str) -> Array:
     found = [
         row.acts.terms
-        for row in CAUSES
-        if type(row.acts).__name__ == kind and not isinstance(row.acts, Answers)
+        for row in PERTURBATIONS
+        if type(row.acts).__name__ == kind and not isinstance(row.acts, ResponseError)
     ]
     size = 1 + max((max(i, j) for terms in found for _, i, j in terms), default=0)
     out = np.zeros((len(found), size, size))
@@ -416,7 +533,7 @@ def _polynomials(kind: str) -> Array:
     return out
 
 
-def maps(kind: type[Widens] | type[Bends], u: Array, v: Array) -> Array:
+def maps(kind: type[CDError] | type[WavefrontError], u: Array, v: Array) -> Array:
     """(rows of the kind, *shape) derivative maps at lens places (u, v) over the radius."""
     return np.stack(
         [np.polynomial.polynomial.polyval2d(u, v, each) for each in polynomials(kind)]

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from layout.process.isolation import isolation
+from metalens.fabrication.bias import Bias, read_csv
 from metalens.ground.errors import ProcessError
-from metalens.made.bias import Bias, read_csv
 
 DESIGN = np.linspace(60, 360, 301)
 TABLE = ((80.0, -6.0), (120.0, -3.5), (180.0, -1.0), (340.0, 1.0))

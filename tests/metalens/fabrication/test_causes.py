@@ -9,15 +9,21 @@ import numpy as np
 import pytest
 
 from metalens.cell import Cell, Index, Layer
-from metalens.made import causes, response
-from metalens.made.causes import CAUSES, Answers, Bends, Guide, Widens
-from metalens.made.response import Answer, Sensitivity
-from metalens.made.solved import Solved
-from metalens.made.state import State
+from metalens.fabrication import perturbations, response
+from metalens.fabrication.perturbations import (
+    PERTURBATIONS,
+    CDError,
+    Guide,
+    ResponseError,
+    WavefrontError,
+)
+from metalens.fabrication.response import Answer, Sensitivity
+from metalens.fabrication.solved import Solved
+from metalens.fabrication.state import State
 
 RNG = np.random.default_rng(17)
 U, V = np.array([0.37, -0.8, 0.1]), np.array([-0.52, 0.31, 0.66])
-COUNT = len(causes.named(Answers))
+COUNT = len(perturbations.named(ResponseError))
 
 
 def answering(*first):
@@ -37,8 +43,8 @@ def test_biases_over_the_lens_by_hand():
     assert made["bias_y_nm"] == 7.0
     assert not made.bends()
     assert not made.phase_rad(U, V).any()
-    assert causes.maps(Widens, U, V)[1] == pytest.approx(1e-3 * U, rel=1e-12)
-    assert causes.named(Widens) == names
+    assert perturbations.maps(CDError, U, V)[1] == pytest.approx(1e-3 * U, rel=1e-12)
+    assert perturbations.named(CDError) == names
 
 
 def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
@@ -55,12 +61,17 @@ def test_wave_fronts_are_zernike_polynomials_of_unit_mean_square():
         math.sqrt(8) * radius**3 * np.sin(3 * angle),
         math.sqrt(5) * (6 * radius**4 - 6 * radius**2 + 1),
     ]
-    assert causes.maps(Bends, U, V) == pytest.approx(np.array(want), rel=1e-9)
+    assert perturbations.maps(WavefrontError, U, V) == pytest.approx(
+        np.array(want), rel=1e-9
+    )
     x, w = np.polynomial.legendre.leggauss(8)
     r, turn = np.sqrt((x + 1) / 2)[:, None], np.arange(16) * math.pi / 8 + 0.1
     u, v, weight = r * np.cos(turn), r * np.sin(turn), np.repeat(w / 2 / 16, 16)
     basis = np.concatenate(
-        [np.stack([np.ones_like(u), 2 * u, 2 * v]), causes.maps(Bends, u, v)]
+        [
+            np.stack([np.ones_like(u), 2 * u, 2 * v]),
+            perturbations.maps(WavefrontError, u, v),
+        ]
     ).reshape(10, -1)
     assert basis * weight @ basis.T == pytest.approx(np.eye(10), abs=1e-9)
     made = State.of({"coma_y_rad": 0.3, "trefoil_x_rad": -0.2})
@@ -91,7 +102,7 @@ def test_answers_travel_in_micrometres_radians_and_one():
     ]
     assert made.answers() == pytest.approx(want, rel=1e-12)
     assert not State.of().amounts.any()
-    assert len(State.of().amounts) == len(CAUSES)
+    assert len(State.of().amounts) == len(PERTURBATIONS)
 
 
 def effective(d, n, around=1.3, k=2 * math.pi / 0.85):
@@ -129,7 +140,10 @@ def test_quick_derivatives_are_those_of_guides_of_one_mode():
         h,
         wall,
     )
-    rows = {row.name: row.acts.quick(guide) for _, row in causes.of_kind(Answers)}
+    rows = {
+        row.name: row.acts.quick(guide)
+        for _, row in perturbations.of_kind(ResponseError)
+    }
     assert rows["height_nm"] == pytest.approx(1j * k * here, rel=1e-9)
     by_index = (effective(d, n + 1e-5) - effective(d, n - 1e-5)) / 2e-5
     assert rows["index"] == pytest.approx(1j * k * h * by_index, rel=1e-5)
@@ -160,7 +174,7 @@ def test_changed_cells_have_so_much_more_of_the_cause():
     cell = Cell(0.4, 0.6, Index(3.1, 0.02), sidewall_rad=0.03)
     rows = {
         row.name: row.acts.changed(cell, 0.011, 0.85)
-        for _, row in causes.of_kind(Answers)
+        for _, row in perturbations.of_kind(ResponseError)
         if row.acts.changed
     }
     assert len(rows) == 3
@@ -186,7 +200,9 @@ def test_a_taller_layered_pillar_is_taller_in_its_own_material(films, heights):
         Layer(h, material=film) for h, film in zip((0.1, 0.2, 0.3), films, strict=True)
     )
     acts = next(
-        row.acts for _, row in causes.of_kind(Answers) if row.name == "height_nm"
+        row.acts
+        for _, row in perturbations.of_kind(ResponseError)
+        if row.name == "height_nm"
     )
     made = acts.changed(Cell(0.4, 0.6, layers=layers), 0.012, 0.85)
     assert [layer.height_um for layer in made.layers] == pytest.approx(heights)
@@ -368,7 +384,7 @@ def test_slopes_of_a_lens_are_polynomials_through_the_guides_own():
     )  # of the lens, within the proxy's
     d = np.linspace(0.12, 0.3, 61)
     guide = response.guide(lens.cell, lens.proxy, 0.85, d)
-    for n, (_, row) in enumerate(causes.of_kind(Answers)):
+    for n, (_, row) in enumerate(perturbations.of_kind(ResponseError)):
         assert made.at(d)[n] == pytest.approx(row.acts.quick(guide), rel=1e-3, abs=1e-6)
 
 
@@ -376,7 +392,7 @@ def test_the_table_says_what_the_documents_say():
     """Prior, bound and unit of the rows that a fit opens by default."""
     rows = {
         row.name: (row.scale, row.sigma, row.low, row.high, row.unit, row.free)
-        for row in CAUSES
+        for row in PERTURBATIONS
     }
     assert rows["bias_nm"] == (1.0, 15.0, -26.0, 26.0, 1e-3, True)
     for name in ("bias_x_nm", "bias_y_nm", "bias_r_nm"):

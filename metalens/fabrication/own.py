@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from metalens.cell import Cell
+from metalens.fabrication.perturbations import Perturbation, ResponseError, of_kind
 from metalens.ground import executor
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
-from metalens.made.causes import Answers, Cause, of_kind
 from metalens.pillars.axes import sized
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _derived(
     from metalens.rcwa import jones_derivatives
 
     (wavelength_um, edges, weights), (cell, size_um, harmonics) = about, task
-    causes = [row for _, row in of_kind(Answers)]
+    causes = [row for _, row in of_kind(ResponseError)]
     wanted = [_numbers(row, cell, size_um) for row in causes]
     names = dict.fromkeys(name for some in (*wanted, edges) for name in some or {})
     found = jones_derivatives(
@@ -148,11 +148,11 @@ def _derived(
     return [list(each) for each in zip(*differ, strict=True)]
 
 
-def _numbers(row: Cause, cell: Cell, size_um: float) -> dict[str, float] | None:
+def _numbers(row: Perturbation, cell: Cell, size_um: float) -> dict[str, float] | None:
     acts = row.acts
     return (
         acts.numbers(cell, size_um)
-        if isinstance(acts, Answers) and acts.numbers
+        if isinstance(acts, ResponseError) and acts.numbers
         else None
     )
 
@@ -162,7 +162,7 @@ def _of(found: "JonesDerivatives", name: str, weight: Array) -> complex:
 
 
 def _difference(
-    row: Cause,
+    row: Perturbation,
     wavelength_um: float,
     weights: tuple[Array, ...],
     task: tuple[Cell, float, int],
@@ -173,7 +173,7 @@ def _difference(
     from metalens.rcwa import jones
 
     (cell, size_um, harmonics), acts = task, row.acts
-    if not isinstance(acts, Answers) or acts.changed is None:
+    if not isinstance(acts, ResponseError) or acts.changed is None:
         return [0j] * len(weights)
     ends = (acts.changed(cell, sign * acts.step, wavelength_um) for sign in (-1, 1))
     less, more = (

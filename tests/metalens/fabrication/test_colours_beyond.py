@@ -5,7 +5,7 @@ a while, then held.
 import numpy as np
 import pytest
 
-from metalens.made import designed
+from metalens.fabrication import designed
 from metalens.pillars.proxy import Proxy
 
 D = np.array([0.12, 0.17, 0.23])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from metalens.made.spread import DRAWN, Draw, Spread, draws
+from metalens.fabrication.spread import DRAWN, Draw, Spread, draws
 
 
 def test_a_drawn_gradient_points_in_its_own_direction():

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
+from metalens.fabrication.own import pair_rates
+from metalens.fabrication.perturbations import with_missing
 from metalens.ground.arrays import Array
 from metalens.ground.errors import LensError
 from metalens.lens import DiameterMap, Lens
-from metalens.made.causes import with_missing
-from metalens.made.own import pair_rates
 
 _PAIRS = 24  # that are solved
 _DARKEST = 1e-3  # |t| that a tangent beyond a table falls to at most
