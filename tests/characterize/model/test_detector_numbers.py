@@ -14,22 +14,6 @@ from characterize.model.detector import Grid, Sums
 GRID = Grid(7, 10, 2.4, 3, margin=4, middle_um=(5.5, -31.0), fill=0.7)
 
 
-def test_pixels_count_from_the_chief_ray_with_the_middle_one_at_half_their_number():
-    """Rows 0 to 6 about the fourth, columns 0 to 9 about the sixth; three samples a
-    pixel.
-    """
-    y, x = GRID.ends_um()
-    assert y == pytest.approx([-31.0 - 3 * 2.4, -31.0 + 3 * 2.4])
-    assert x == pytest.approx([5.5 - 5 * 2.4, 5.5 + 4 * 2.4])
-    fine_y, fine_x = GRID.axes_um()
-    assert (len(fine_y), len(fine_x)) == ((7 + 8) * 3, (10 + 8) * 3)
-    assert fine_y[[0, -1]] == pytest.approx(
-        [-31.0 - 7 * 2.4 - 0.8, -31.0 + 7 * 2.4 + 0.8]
-    )
-    assert fine_x[[0, -1]] == pytest.approx([5.5 - 9 * 2.4 - 0.8, 5.5 + 8 * 2.4 + 0.8])
-    assert (GRID.fine_um, GRID.wide_um) == pytest.approx((0.8, 0.7 * 2.4))
-
-
 @pytest.mark.parametrize(("near", "off"), [(12.0, 19.0), (40.0, 0.0)])
 def test_the_square_that_holds_all_light_grows_by_twice_what_lies_far_off(near, off):
     assert GRID.across_um(near) == pytest.approx((10 + 4) * 2.4 + 20.0 + 2 * off)
