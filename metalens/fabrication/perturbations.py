@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -242,16 +242,16 @@ def _leaning(cell: Cell, amount: float, wavelength_um: float) -> Cell:
     return dataclasses.replace(cell, sidewall_rad=cell.sidewall_rad + amount)
 
 
-def _widens(
-    name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: object
+def _cd_error(
+    name: str, meaning: str, sigma: float, bound: float, terms: Terms, **more: Any
 ) -> Perturbation:
     nm = tuple((c * 1e-3, i, j) for c, i, j in terms)
     return Perturbation(
         name, meaning, 1.0, sigma, -bound, bound, CDError(nm), 1e-3, **more
-    )  # type: ignore[arg-type]
+    )
 
 
-def _bends(name: str, norm: float, terms: Terms) -> Perturbation:
+def _zernike(name: str, norm: float, terms: Terms) -> Perturbation:
     """A Zernike polynomial (Noll 1976) of unit root mean square on the disc."""
     rad = tuple((math.sqrt(norm) * c, i, j) for c, i, j in terms)
     return Perturbation(
@@ -304,7 +304,7 @@ def _film(name: str, meaning: str, *, under: bool) -> Perturbation:
 DEG = math.pi / 180
 USUAL_UM = 0.85  # wavelength of the lenses that the sizes in nm below are of
 PERTURBATIONS: tuple[Perturbation, ...] = (
-    _widens(
+    _cd_error(
         "bias_nm",
         "diameter minus design, mean over the lens",
         15.0,
@@ -314,7 +314,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         reversible=True,
         measured_by="CDs at the centre (SEM)",
     ),
-    _widens(
+    _cd_error(
         "bias_x_nm",
         "diameter bias at the +x rim less that at the axis",
         10.0,
@@ -324,7 +324,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         reversible=True,
         measured_by="CDs at both rims (SEM)",
     ),
-    _widens(
+    _cd_error(
         "bias_y_nm",
         "diameter bias at the +y rim less that at the axis",
         10.0,
@@ -334,7 +334,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         reversible=True,
         measured_by="CDs at both rims (SEM)",
     ),
-    _widens(
+    _cd_error(
         "bias_r_nm",
         "diameter bias at the rim less that at the axis, times 1/2 (2 rho² - 1)",
         10.0,
@@ -344,7 +344,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         reversible=True,
         measured_by="CDs along a radius (SEM)",
     ),
-    _widens(
+    _cd_error(
         "bias_a_nm",
         "saddle of the diameter bias, x² - y² over R²",
         10.0,
@@ -356,7 +356,7 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         extra=True,
         measured_by="CDs at four rims (SEM)",
     ),
-    _widens(
+    _cd_error(
         "bias_o_nm",
         "oblique saddle of the diameter bias, 2xy over R²",
         10.0,
@@ -442,13 +442,13 @@ PERTURBATIONS: tuple[Perturbation, ...] = (
         "height of the films on it (a residual mask), minus design",
         under=False,
     ),
-    _bends("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
-    _bends("oblique_astigmatism", 6, ((2, 1, 1),)),
-    _bends("coma_x", 8, ((3, 3, 0), (3, 1, 2), (-2, 1, 0))),
-    _bends("coma_y", 8, ((3, 0, 3), (3, 2, 1), (-2, 0, 1))),
-    _bends("trefoil_x", 8, ((1, 3, 0), (-3, 1, 2))),
-    _bends("trefoil_y", 8, ((3, 2, 1), (-1, 0, 3))),
-    _bends(
+    _zernike("astigmatism", 6, ((1, 2, 0), (-1, 0, 2))),
+    _zernike("oblique_astigmatism", 6, ((2, 1, 1),)),
+    _zernike("coma_x", 8, ((3, 3, 0), (3, 1, 2), (-2, 1, 0))),
+    _zernike("coma_y", 8, ((3, 0, 3), (3, 2, 1), (-2, 0, 1))),
+    _zernike("trefoil_x", 8, ((1, 3, 0), (-3, 1, 2))),
+    _zernike("trefoil_y", 8, ((3, 2, 1), (-1, 0, 3))),
+    _zernike(
         "spherical",
         5,
         ((6, 4, 0), (12, 2, 2), (6, 0, 4), (-6, 2, 0), (-6, 0, 2), (1, 0, 0)),
@@ -492,7 +492,7 @@ def named(
 
 
 def with_missing(rows: Sequence[Array]) -> Array:
-    """(answering causes, *shape) of the first rows of the table: those that are not
+    """(pillar-response errors, *shape) of the first rows of the table: those that are not
     there are 0.
     """
     return np.stack(

@@ -1,4 +1,4 @@
-"""What the answering causes do to every pillar: derivatives of ln t over the diameter,
+"""What the pillar-response errors do to every pillar: derivatives of ln t over the diameter,
 and t itself under a change.
 """
 
@@ -38,10 +38,10 @@ _NODES, _DEGREE = (
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensitivity:
-    """First-order change of ln t with the answering causes, as polynomials of the
+    """First-order change of ln t with the pillar-response errors, as polynomials of the
     diameter.
 
-    coefficients: (answering causes, degree + 1) complex power series in (D - center_um)
+    coefficients: (pillar-response errors, degree + 1) complex power series in (D - center_um)
     of d ln t by the base unit
         (um, rad, 1) of each; a row of zeros switches a cause off, and so does a row
         that is not there.
@@ -72,7 +72,7 @@ class Sensitivity:
         return cls(np.zeros((0, 1)), 0.0, pairs.error, pairs=pairs)
 
     def at(self, diameter_um: Array) -> Array:
-        """(answering causes, *shape) derivatives of ln t.
+        """(pillar-response errors, *shape) derivatives of ln t.
 
         Raises:
             LensError: of pillars of two sizes.
@@ -107,7 +107,7 @@ class Sensitivity:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """Pillars of given diameters under the answering causes: t over that of the proxy
+    """Pillars of given diameters under the pillar-response errors: t over that of the proxy
     at the design's wavelength.
 
     slopes: (causes, *shape) d ln t by the causes that act linearly. series: (causes,
@@ -149,7 +149,7 @@ class Slopes(Protocol):
     """Anything that knows d ln t by the answering perturbations."""
 
     def at(self, diameter_um: Array) -> Array:
-        """(answering causes, *shape) derivatives of ln t by the base unit of each."""
+        """(pillar-response errors, *shape) derivatives of ln t by the base unit of each."""
         ...
 
     def by_edges(self, diameter_um: Array) -> Array | None:
@@ -356,7 +356,7 @@ def transmission(
     as the solver has it.
 
     Args:
-        answers: (answering causes,) amounts in base units: :meth:`State.answers`.
+        answers: (pillar-response errors,) amounts in base units: :meth:`State.answers`.
             bias_um: what of the diameters is
             bias, of all edges alike, and no size of the design (:func:`biased`).
     """

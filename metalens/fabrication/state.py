@@ -67,7 +67,7 @@ class State:
         return bool(self._of(WavefrontError).any())
 
     def answers(self) -> Array:
-        """(answering causes,) amounts in um, rad and 1, as the pillars' derivatives
+        """(pillar-response errors,) amounts in um, rad and 1, as the pillars' derivatives
         take them.
         """
         return self._of(ResponseError) * [row.unit for _, row in of_kind(ResponseError)]

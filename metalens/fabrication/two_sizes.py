@@ -137,10 +137,10 @@ def _keys(diameters: DiameterMap, rows: slice, columns: slice) -> Array:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairSensitivities:
-    """Logarithmic derivatives of t by the answering causes, of pillars of two sizes and
+    """Logarithmic derivatives of t by the pillar-response errors, of pillars of two sizes and
     one polarisation.
 
-    width_um, length_um: (n,) pairs that were solved. rates: (answering causes, n)
+    width_um, length_um: (n,) pairs that were solved. rates: (pillar-response errors, n)
     complex, by the base unit of
         each (um, rad, 1). error: largest relative change of one of them from a coarser
         truncation, and what the rates
@@ -154,7 +154,7 @@ class PairSensitivities:
     error: float
 
     def at(self, width_um: Array, length_um: Array) -> Array:
-        """(answering causes, n) derivatives of ln t."""
+        """(pillar-response errors, n) derivatives of ln t."""
         found = _carried(
             (self.width_um, self.length_um), self.rates, (width_um, length_um)
         )
