@@ -31,7 +31,6 @@ from layout.process import process
 from layout.study import sensitivity, stitching, tolerance
 from metalens import design, library
 from metalens.design.profiles import Focus
-from metalens.fabrication import Spread
 from metalens.lens.record import DiameterMap
 
 rules = process.load("process.toml")

@@ -13,7 +13,7 @@ from layout.study import stitching, tolerance
 from layout.study.sensitivity import Sensitivities, sensitivities
 from layout.study.stitching import StitchReport
 from layout.study.tolerance import ToleranceReport
-from metalens.fabrication import PairSensitivities, Spread, pair_sensitivities
+from metalens.fabrication import PairSensitivities, pair_sensitivities
 from metalens.ground import report
 from metalens.ground.arrays import Array
 from metalens.ground.report import Figure, Section, Table
