@@ -21,12 +21,12 @@ import numpy as np
 from scipy.signal import resample
 
 from layout import solids
-from layout.dose import correct as dose
 from layout.drc import check_plan
 from layout.files import verify
 from layout.mask import build, fields
 from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
+from layout.pec import correct as dose
 from layout.process import process
 from layout.study import sensitivity, stitching, tolerance
 from metalens import design, library

@@ -56,7 +56,7 @@ QUICK = (
     "tests/metalens/rcwa/test_rcwa.py",
     "tests/characterize/model",
     "tests/characterize/measure",
-    "tests/layout/dose",
+    "tests/layout/pec",
     "tests/layout/study/test_focus.py",
     "tests/codesign/gaze",
     "tests/codesign/optics",
@@ -70,12 +70,12 @@ INTERPRETED = (
     "tests/codesign/eye/test_shading.py",
     "tests/codesign/optics/test_built.py",
     *(
-        f"tests/layout/dose/test_{name}.py"
+        f"tests/layout/pec/test_{name}.py"
         for name in ("constants_of_doses", "dose", "exposure")
     ),
     *(
-        f"tests/layout/dose/test_{name}.py"
-        for name in ("exposure_core", "nodes", "pieces", "rects")
+        f"tests/layout/pec/test_{name}.py"
+        for name in ("exposure_core", "nodes", "fracture", "rects")
     ),
     "tests/layout/files/test_gdsii_numbers.py",
     "tests/layout/oasis",

@@ -317,19 +317,19 @@ def _command_rows(target: Path) -> list[Row]:
 
 def _certificate_rows(target: Path) -> list[Row]:
     """8.7 million pillars with corrected doses, written, read back and exposed again."""
-    from layout.certify import survey
     from layout.files import doses
     from layout.mask import build
     from layout.process.process import Exposure, Process
+    from layout.verify import verify_exposure
 
     process = Process(exposure=Exposure(alpha_um=0.012, beta_um=30.0, eta=0.7))
     made = build.prepare(_lens(1.0, 0.3).diameters, process, furniture="none")
     layout.write_gdsii(made.plan, target / "c.gds")
     doses.write(made.plan, process, target / "c.csv")
     content, table = layout.read_gdsii(target / "c.gds"), doses.read(target / "c.csv")
-    found = survey(content, made.plan, table, process)
+    found = verify_exposure(content, made.plan, table, process)
     seconds, peak = measured(
-        lambda: survey(content, made.plan, table, process), repeats=1
+        lambda: verify_exposure(content, made.plan, table, process), repeats=1
     )
     text = f"worst exposure of {found.pillars:,} pillars less 1; worst diameter {found.worst_nm:.2f} nm"
     return [

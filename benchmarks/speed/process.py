@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks import Row, fastest
 from layout import solids
-from layout.dose import correct as dose
 from layout.mask import cells, fields
+from layout.pec import correct as dose
 from layout.process.process import Etch, Exposure, Process
 from layout.study import focus, stitching, tolerance
 from layout.study.sensitivity import Sensitivities

@@ -10,9 +10,9 @@ import numpy as np
 
 from layout.arrange.joined import PER_UM, Placing
 from layout.arrange.parts import APERTURE, Part
-from layout.dose import exposure
 from layout.drc import Violation
 from layout.files import Copies, Turn
+from layout.pec import psf
 from layout.process import Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -58,8 +58,8 @@ def reach_um(process: Process) -> float:
     """
     if not process.exposure.corrected:
         return 0.0
-    point = exposure.point_exposure(process.exposure)
-    most = exposure.CLEARS * process.exposure.tolerance
+    point = psf.point_exposure(process.exposure)
+    most = psf.THRESHOLD * process.exposure.tolerance
 
     def added(away_um: float) -> float:
         pairs = zip(point.weights.tolist(), point.widths_um.tolist(), strict=True)

@@ -243,7 +243,7 @@ def _lens_row(name: str, values: dict[str, Any]) -> list[Any]:
     ]
     found = [
         sum(values["violations"].values()),
-        exposed[0] if exposed else "not certified",
+        exposed[0] if exposed else "not verified",
         same,
     ]
     return [name, *sizes, *found, "passes" if values["ok"] else "FAILS"]

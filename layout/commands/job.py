@@ -7,13 +7,13 @@ from typing import Literal
 
 import tyro
 
-from layout.certify import LensRows, Survey
 from layout.commands.stages import Stages
 from layout.drc import DrcReport
 from layout.files import Window, handover, verify
 from layout.mask import FieldPlan, MaskPlan, build
 from layout.process import LayerNumber
 from layout.process import process as processes
+from layout.verify import ExposureReport, LensRows
 from metalens.commands import Distributed, Output
 from metalens.ground.errors import ConfigError
 from metalens.lens import Lens
@@ -90,7 +90,7 @@ class Job:
 
     stages: what the time went to. written: {file name: bytes}. compared: {file name:
     outcome of reading it back}.
-    certified: {file name: what the file and the dose table make, by the simulator}.
+    verified: {file name: what the file and the dose table make, by the simulator}.
     made_rows: the lens that comes out.
     answers_error: of --study, by how much the solver may miss how pillars answer to the
     process, relative.
@@ -108,7 +108,7 @@ class Job:
     written: dict[str, int] = field(default_factory=dict)
     compared: dict[str, verify.Comparison] = field(default_factory=dict)
     undosed: dict[str, tuple[LayerNumber, ...]] = field(default_factory=dict)
-    certified: dict[str, Survey] = field(default_factory=dict)
+    verified: dict[str, ExposureReport] = field(default_factory=dict)
     made_rows: LensRows | None = None
     answers_error: float = 0.0
 
@@ -135,7 +135,7 @@ class Job:
         if self.process.exposure.corrected and self.options.dose:
             found += [
                 f"{name}: exposure off by {100 * c.worst_exposure:.2g} % and {c.worst_nm:.2g} nm{self._too_few}"
-                for name, c in self.certified.items()
+                for name, c in self.verified.items()
                 if not c.ok
             ]
         return found + (

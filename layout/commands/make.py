@@ -1,5 +1,5 @@
 """One lens to its mask in a folder: quantised, dosed, checked, written, read back,
-certified, with its companions.
+verified, with its companions.
 """
 
 import json
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from layout.certify import LensRows, Survey, survey
 from layout.commands import page
 from layout.commands.job import Job, Options
 from layout.commands.stages import Stages
@@ -25,6 +24,7 @@ from layout.oasis import read as oasis_read
 from layout.oasis import write as oasis_write
 from layout.process import LayerNumber
 from layout.process import process as processes
+from layout.verify import ExposureReport, LensRows, verify_exposure
 from metalens import lens as lenses
 from metalens.ground import config, store, transaction
 from metalens.ground.arrays import Array
@@ -187,31 +187,31 @@ def _read_back(job: Job, path: Path, read: Callable[..., MaskContent]) -> None:
         job.compared[path.name] = verify.compare(job.plan, content)
         table = doses.read(path.with_name("doses.csv"))
         job.undosed[path.name] = doses.missing(content, table, job.process)
-    if _certifiable(job) and job.compared[path.name].ok:
-        with job.stages(f"certify {path.suffix[1:]}"):
-            job.certified[path.name] = _certified(job, content, table)
+    if _is_verifiable(job) and job.compared[path.name].ok:
+        with job.stages(f"verify exposure {path.suffix[1:]}"):
+            job.verified[path.name] = _verified(job, content, table)
     job.written[path.name] = path.stat().st_size
 
 
-def _certifiable(job: Job) -> bool:
+def _is_verifiable(job: Job) -> bool:
     """Whether the simulator knows the point exposure (Gaussians) and the tone."""
     exposure = job.process.exposure
     return exposure.known and exposure.csv is None and job.process.tone == "positive"
 
 
-def _certified(
+def _verified(
     job: Job, content: MaskContent, table: Mapping[LayerNumber, float]
-) -> Survey:
+) -> ExposureReport:
     """What a file makes that holds the plan's places; two files of the same polygons
     make the same.
     """
-    if job.certified and not job.options.circles:
-        return next(iter(job.certified.values()))
+    if job.verified and not job.options.circles:
+        return next(iter(job.verified.values()))
     lattice = job.plan.lattices[0]
-    small = not job.certified and lattice.rows * lattice.columns <= MOST_MADE
+    small = not job.verified and lattice.rows * lattice.columns <= MOST_MADE
     job.made_rows = LensRows(job.plan) if small else job.made_rows
     keep = job.made_rows.take if small and job.made_rows else None
-    return survey(
+    return verify_exposure(
         content,
         job.plan,
         table,
@@ -255,7 +255,7 @@ def values_of(job: Job) -> dict[str, Any]:
                 "pillars": c.pillars,
                 "edges": len(c.edges.x_um),
             }
-            for name, c in job.certified.items()
+            for name, c in job.verified.items()
         },
         "differences": {
             name: list(outcome.differences) for name, outcome in job.compared.items()

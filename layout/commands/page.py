@@ -8,10 +8,10 @@ import numpy as np
 
 from layout.commands import pictures
 from layout.commands.job import Job
-from layout.dose.exposure import PointExposure
 from layout.drc import DrcReport, format_size
 from layout.files import Window, handover
 from layout.mask import MaskPlan
+from layout.pec.psf import PointExposure
 from layout.process import Exposure
 from layout.shapes import polygon
 from metalens.ground import report
@@ -43,7 +43,7 @@ def write(job: Job, shots: dict[str, bytes], target: Path) -> None:
         _rules(job, shots),
         _classes(job, shots),
         _doses(job),
-        _certified(job),
+        _verified(job),
         _fields(job),
         _files(job),
     ]
@@ -301,9 +301,9 @@ def _table_said(exposure: Exposure, point: PointExposure) -> str:
     )
 
 
-def _certified(job: Job) -> Section | None:
+def _verified(job: Job) -> Section | None:
     """What the written files and their dose table make."""
-    if not job.certified:
+    if not job.verified:
         return None
     rows = [
         [
@@ -316,7 +316,7 @@ def _certified(job: Job) -> Section | None:
             f"{c.thinnest_top_nm:.0f} to {c.widest_foot_nm:.0f}",
             "yes" if c.ok else "NO",
         ]
-        for name, c in job.certified.items()
+        for name, c in job.verified.items()
     ]
     head = (
         "file",
@@ -328,7 +328,7 @@ def _certified(job: Job) -> Section | None:
         "thinnest top to widest foot / nm",
         f"within {100 * job.process.exposure.tolerance:g} % and 1 nm",
     )
-    picture = pictures.certified(next(iter(job.certified.values())))
+    picture = pictures.verified(next(iter(job.verified.values())))
     text = (
         "The files and doses.csv, read back and exposed again. Shared with the correction: the Gaussians of the process "
         "file, the threshold (half of what a wide area receives) and the method of the field on nodes. That field is "

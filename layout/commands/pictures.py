@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from layout.certify import Survey
 from layout.drc import DrcReport
 from layout.files import Window, sites_in
 from layout.mask import Lattice, MaskPlan
+from layout.verify import ExposureReport
 from metalens.ground import report
 from metalens.ground.arrays import Array
 
@@ -156,7 +156,7 @@ def margins(found: DrcReport) -> bytes:
     return report.png(figure)
 
 
-def certified(found: Survey) -> bytes:
+def verified(found: ExposureReport) -> bytes:
     """Where the diameters in the resist differ from the drawn ones, and how often by
     how much.
     """

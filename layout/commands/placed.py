@@ -18,7 +18,6 @@ from layout.arrange import (
     parts,
     wafer,
 )
-from layout.certify import survey
 from layout.commands import make
 from layout.commands.check import read
 from layout.commands.job import Options
@@ -28,6 +27,7 @@ from layout.files import MaskContent, hierarchy, placement_limit, verify
 from layout.mask import FieldPlan, build
 from layout.oasis import write as oasis_write
 from layout.process import process as processes
+from layout.verify import verify_exposure
 from metalens import lens as lenses
 from metalens.ground import reading
 from metalens.ground.errors import MaskFileError
@@ -218,7 +218,7 @@ def _source(work: Work) -> Lens:
 
 
 def written_part(work: Work, made: build.MadePlan) -> parts.Part:
-    """What stands beside the lenses: checked, written, read back and certified as they
+    """What stands beside the lenses: checked, written, read back and verified as they
     are.
     """
     plan, process = made.plan, work.process
@@ -233,8 +233,8 @@ def written_part(work: Work, made: build.MadePlan) -> parts.Part:
         f"{name}: {text}" for text in verify.compare(plan, content).differences
     ]
     if made.dose is not None and process.exposure.csv is None:
-        with work.stages(f"{name}: certify"):
-            seen = survey(content, plan, plan.doses, process)
+        with work.stages(f"{name}: verify exposure"):
+            seen = verify_exposure(content, plan, plan.doses, process)
         if not seen.ok:
             work.failures.append(
                 f"{name}: exposure off by {100 * seen.worst_exposure:.2g} % and {seen.worst_nm:.2g} nm"

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from layout.dose import Solution, dose_ladder
 from layout.mask import cells, die, dosed, shaped, tone
 from layout.mask.plan import MaskPlan, PillarClass, pillar_classes
+from layout.pec import Solution, dose_ladder
 from layout.process import LayerNumber, Process, names
 from metalens.cell.shapes import Circle
 from metalens.ground.arrays import Array

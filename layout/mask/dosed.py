@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose import Body, Discs, Drawn, Ladder, Outlines, Rects, Solution
-from layout.dose import correct as dose
 from layout.mask.held import hold
 from layout.mask.plan import EXPOSED, Figure, Lattice, MaskPlan, PillarClass
+from layout.pec import Discs, DoseLadder, Drawn, Outlines, PillarArray, Rects, Solution
+from layout.pec import correct as dose
 from layout.process import LayerNumber, Process
 from layout.shapes import rectilinear
 from metalens.ground.arrays import Array
@@ -37,7 +37,7 @@ def want(plan: MaskPlan, process: Process) -> Wanted:
     """The doses that everything on a plan needs, before they are rounded to classes.
 
     Raises:
-        ProcessError: as :func:`layout.dose.correct.correct`.
+        ProcessError: as :func:`layout.pec.correct.correct`.
     """
     dose.refuse_negative(process)
     unit = plan.unit_nm * nm
@@ -50,7 +50,7 @@ def want(plan: MaskPlan, process: Process) -> Wanted:
 
 
 def corrected(
-    wanted: Wanted, process: Process, ladder: Ladder, needed: int
+    wanted: Wanted, process: Process, ladder: DoseLadder, needed: int
 ) -> tuple[MaskPlan, Solution]:
     """The plan with corrected doses: classes of diameter and dose, marks and labels in
     pieces of one dose each.
@@ -85,11 +85,11 @@ def corrected(
     )
 
 
-def _body(lattice: Lattice, unit: float) -> Body:
+def _body(lattice: Lattice, unit: float) -> PillarArray:
     """Sites in um."""
     place = lattice.pitch * unit, lattice.x0 * unit, lattice.y0 * unit
     rows = lattice.row_pitch * unit, lattice.centred
-    return Body(lattice.rows, lattice.columns, *place, lattice.source, *rows)
+    return PillarArray(lattice.rows, lattice.columns, *place, lattice.source, *rows)
 
 
 def _drawn(plan: MaskPlan, unit: float) -> Drawn:
@@ -130,7 +130,7 @@ def title(kind: str, level: float) -> str:
 
 
 def _pieces(
-    plan: MaskPlan, parts: Sequence[Body], process: Process
+    plan: MaskPlan, parts: Sequence[PillarArray], process: Process
 ) -> tuple[Array, Array, Array]:
     """Rectangles of all exposed figures, cut: (n, 4) boxes, (n, 2) figure and layer
     number, (n,) shape.

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from characterize.captures import capture
-from layout.dose import exposure
+from layout.pec import exposure
 from layout.process.process import Exposure
 from metalens.fabrication import bias
 from metalens.ground.errors import MetalensError

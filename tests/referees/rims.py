@@ -4,7 +4,7 @@ way is judged by.
 
 import numpy as np
 
-from layout.dose.exposure import PointExposure, disc, rim_of_own_disc
+from layout.pec.psf import PointExposure, disc, rim_of_own_disc
 from metalens.ground.arrays import Array
 
 

@@ -4,12 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from layout.certify import survey
+from layout.verify import verify_exposure
 from metalens.ground.units import nm
 
 
 def verify(plan, content, doses, process, *, height_um=0.0):
-    """The survey of a mask that was read back, and (n,) arrays, a pillar each: x_um,
+    """The report on a mask that was read back, and (n,) arrays, a pillar each: x_um,
     y_um; drawn_nm, resist_nm, made_nm; exposure of the drawn edge, relative to dose to
     size; layer number; judged (not of the dose test, which is wrong on purpose).
     """
@@ -32,8 +32,10 @@ def verify(plan, content, doses, process, *, height_um=0.0):
         found["drawn_nm"].append(np.array(drawn))
         found["layer"].append(np.array([k.layer[0] for k in kinds]))
 
-    result = survey(content, plan, doses, process, height_um=height_um, keep=keep)
+    result = verify_exposure(
+        content, plan, doses, process, height_um=height_um, keep=keep
+    )
     out = SimpleNamespace(**{n: np.concatenate(found[n]) for n in names})
     out.judged = out.layer != process.layers.dose[0]
-    out.survey = result
+    out.report = result
     return out

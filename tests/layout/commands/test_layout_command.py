@@ -12,9 +12,9 @@ import pytest
 
 import layout
 from layout.commands import make, page
-from layout.dose.exposure import point_exposure
 from layout.drc import check_plan, write_lyp, write_lyrdb
 from layout.files import dxf
+from layout.pec.psf import point_exposure
 from layout.process.process import Exposure, Rules
 from layout.shapes import polygon
 from layout.study import page as study_page

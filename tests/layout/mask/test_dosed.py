@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.dose.assign import dose_ladder
 from layout.mask import MaskPlan, dosed
 from layout.mask.plan import Figure, Lattice, pillar_classes
+from layout.pec.assign import dose_ladder
 from layout.process import Exposure, Process
 
 RNG = np.random.default_rng(41)

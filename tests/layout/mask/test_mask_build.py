@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import layout
-from layout.dose import exposure
 from layout.mask import Lattice, build, cells, die, font, marks
+from layout.pec import psf
 from layout.process.process import Die, Exposure, Layers, Process, Rules
 from layout.shapes import polygon
 from metalens.fabrication import Bias
@@ -176,7 +176,7 @@ def test_everything_on_the_die_is_exposed_right_by_the_exact_sum():
     """
     settings = Exposure(**BEAM, tolerance=0.01)
     plan = build.prepare(disc_map(41), Process(exposure=settings)).plan
-    point = exposure.point_exposure(settings)
+    point = psf.point_exposure(settings)
     centres, wide, dose, goal = [], [], [], []
     for lattice in plan.lattices:
         rows, columns = np.nonzero(lattice.whole())

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import layout
-from layout.certify import LensRows, survey
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
+from layout.verify import LensRows, verify_exposure
 from metalens.cell import Cell, Lattice
 from metalens.cell.shapes import Circle, Cross, Ellipse, Polygon, Rectangle, Ring
 from metalens.fabrication import Bias
@@ -134,7 +134,7 @@ def test_the_lens_as_made_holds_shapes_whose_middle_lies_beside_their_site(
     layout.write_oasis(plan, tmp_path / "m.oas")
     doses.write(plan, process, tmp_path / "doses.csv")
     rows = LensRows(plan)
-    survey(
+    verify_exposure(
         layout.read_oasis(tmp_path / "m.oas"),
         plan,
         doses.read(tmp_path / "doses.csv"),
@@ -153,7 +153,7 @@ def certified(content, plan, table, process):
     holds.
     """
     found = verify(plan, content, table, process)
-    outcome = found.survey
+    outcome = found.report
     assert outcome.ok, (outcome.worst_exposure, outcome.worst_nm)
     return np.column_stack([found.x_um, found.y_um, found.resist_nm])
 

@@ -7,11 +7,11 @@ import pytest
 from matplotlib.path import Path as Outline
 
 import layout
-from layout.certify import polygon_edges
-from layout.certify.polygon_edges import Polygons
 from layout.files import doses
 from layout.mask import build
 from layout.process.process import Die, Exposure, Process
+from layout.verify import polygon_edges
+from layout.verify.polygon_edges import Polygons
 from metalens.lens.record import DiameterMap
 from tests.referees import plain_exposure
 from tests.referees.verified import verify
@@ -118,7 +118,7 @@ def test_edges_of_marks_verniers_and_labels_are_exposed_as_the_certificate_says(
         layout.read_gdsii(tmp_path / "m.gds"),
         doses.read(tmp_path / "doses.csv"),
         process,
-    ).survey.edges
+    ).report.edges
     assert set(found.layer.tolist()) == {
         process.layers.marks[0],
         process.layers.labels[0],

@@ -5,10 +5,10 @@ the plain sum over pillars.
 import numpy as np
 import pytest
 
-from layout.dose import nodes
-from layout.dose.bodies import Body
-from layout.dose.exposure import PointExposure
-from layout.dose.nodes import Axis, Grid, convolution, gather, spread
+from layout.pec import nodes
+from layout.pec.bodies import PillarArray
+from layout.pec.nodes import Axis, Grid, convolution, gather, spread
+from layout.pec.psf import PointExposure
 
 RNG = np.random.default_rng(0)
 GRID = Grid(Axis.over(-7.3, 21.9, 1.7), Axis.over(3.1, 26.5, 1.7))
@@ -52,7 +52,7 @@ WIDE = Grid(Axis.over(-7.3, 21.9, 1.7), Axis.over(-9.9, 46.5, 1.7))
 @pytest.mark.parametrize("grid", [GRID, WIDE])
 def test_rows_of_a_lattice_are_deposits_at_its_sites(grid):
     index = RNG.integers(0, 4, (13, 9)).astype(np.uint8)
-    body = Body(13, 9, 1.3, 4.0, 20.1, lambda first, end: index[first:end])
+    body = PillarArray(13, 9, 1.3, 4.0, 20.1, lambda first, end: index[first:end])
     value = np.array([[0.0, 1.7, 2.9, 0.4]])
     out, nodes = np.zeros((1, *grid.shape)), RNG.normal(size=grid.shape)
     lines = *grid.y.at(body.rows_um(0, 13)), *grid.x.at(body.columns_um)

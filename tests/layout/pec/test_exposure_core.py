@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.dose.exposure import PointExposure, fit
+from layout.pec.psf import PointExposure, fit
 
 
 def test_the_narrowest_gaussian_may_be_as_wide_as_the_first_radius():

@@ -12,15 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.certify import polygon_edges
-from layout.certify.polygon_edges import Polygons
-from layout.certify.verdict import Edges, Survey, Tally
-from layout.dose import Body, Discs, Drawn, Outlines, bodies, correct, nodes, sampled
-from layout.dose.exposure import CLEARS, PointExposure, point_exposure
 from layout.files import NOTHING, MaskContent, flat
 from layout.mask import Lattice, MaskPlan
+from layout.pec import (
+    Discs,
+    Drawn,
+    Outlines,
+    PillarArray,
+    bodies,
+    correct,
+    nodes,
+    sampled,
+)
+from layout.pec.psf import THRESHOLD, PointExposure, point_exposure
 from layout.process import LayerNumber, Process, isolation
 from layout.shapes import polygon, region
+from layout.verify import polygon_edges
+from layout.verify.polygon_edges import Polygons
+from layout.verify.report import Edges, ExposureReport, Tally
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm
@@ -39,7 +48,7 @@ class Scene:
     others: all other shapes. undosed: layers with shapes and no dose.
     """
 
-    bodies: Sequence[Body]
+    bodies: Sequence[PillarArray]
     kinds: Drawn
     dose: Array
     layer: Array
@@ -65,7 +74,7 @@ class Rows:
     made_nm: Array
 
 
-def survey(
+def verify_exposure(
     content: MaskContent,
     plan: MaskPlan,
     doses: Mapping[LayerNumber, float],
@@ -73,7 +82,7 @@ def survey(
     *,
     height_um: float = 0.0,
     keep: Callable[[Rows], None] | None = None,
-) -> Survey:
+) -> ExposureReport:
     """Expose and etch a mask that was read back, whose pillars stand where ``plan`` has
     them.
 
@@ -111,7 +120,7 @@ def survey(
         if keep is not None:
             keep(rows)
     top, foot = process.top_foot_nm(0.0, height_um / nm)
-    return Survey(
+    return ExposureReport(
         count,
         total,
         box,
@@ -205,9 +214,9 @@ def _one_outline(name: str, stacks: Sequence[flat.Stack]) -> list[Array]:
     return [np.asarray(c, float) for c in found]
 
 
-def _body(lattice: Lattice, unit_um: float) -> Body:
+def _body(lattice: Lattice, unit_um: float) -> PillarArray:
     """Sites in um."""
-    return Body(
+    return PillarArray(
         lattice.rows,
         lattice.columns,
         lattice.pitch * unit_um,
@@ -288,7 +297,7 @@ class _Field:
         )
         if self.near:
             out += self.near[number][first : first + len(block)]
-        return out + (scene.dose * self.own)[block]
+        return np.asarray(out + (scene.dose * self.own)[block])
 
 
 def _of_themselves(
@@ -312,7 +321,7 @@ def _of_themselves(
 
 
 def _box(
-    parts: Sequence[Body], corners: Sequence[Array]
+    parts: Sequence[PillarArray], corners: Sequence[Array]
 ) -> tuple[float, float, float, float]:
     """Left, bottom, right, top of sites and shapes."""
     ends = [np.array(body.box_um).reshape(2, 2) for body in parts]
@@ -334,7 +343,7 @@ def _develop(
             reach = isolation.halo(body.down_um, process.bias.range_um)
         for first, block in body.blocks():
             exposure = field.rows(scene, number, first, block)
-            shift = 2 * (exposure - CLEARS) / steep[block]
+            shift = 2 * (exposure - THRESHOLD) / steep[block]
             resist = (scene.size_um[block] + shift) / nm
             alone: Array | float = 0.0
             if reach:
@@ -348,7 +357,7 @@ def _develop(
                 )[first - low : first - low + len(block)]
             etch = process.made_diameter_nm if is_round else process.bias.made_nm
             made = np.where(block > 0, etch(np.maximum(resist, 0), alone), 0)
-            yield Rows(number, first, block, exposure / CLEARS, resist, made)
+            yield Rows(number, first, block, exposure / THRESHOLD, resist, made)
 
 
 def _edges(scene: Scene, field: _Field, point: PointExposure) -> Edges:
@@ -363,7 +372,7 @@ def _edges(scene: Scene, field: _Field, point: PointExposure) -> Edges:
     x, y = points.at_um.T
     here = here + field.grid.sample(field.far, x, y)
     slope = np.maximum(inside - outside, 1e-12) / polygon_edges.aside_um()
-    return Edges(x, y, here / CLEARS, (here - CLEARS) / slope / nm, points.layer)
+    return Edges(x, y, here / THRESHOLD, (here - THRESHOLD) / slope / nm, points.layer)
 
 
 def _sampled(scene: Scene, field: _Field, point: PointExposure) -> tuple[float, float]:
@@ -384,12 +393,12 @@ def _sampled(scene: Scene, field: _Field, point: PointExposure) -> tuple[float, 
     )
     rows, columns, exact = sampled.exact_edges(exposed, samples)
     worst, judged = 0.0, scene.dose[_entries(scene, rows, columns)] > 0
-    off = float(np.abs(exact / CLEARS - 1)[judged].max(initial=0.0))
+    off = float(np.abs(exact / THRESHOLD - 1)[judged].max(initial=0.0))
     for row in np.unique(rows).tolist():
         mine = rows == row
         block = np.ascontiguousarray(scene.bodies[0].source(row, row + 1))
         fast = field.rows(scene, 0, row, block)[0, columns[mine]]
-        worst = max(worst, float(np.abs(fast - exact[mine]).max()) / CLEARS)
+        worst = max(worst, float(np.abs(fast - exact[mine]).max()) / THRESHOLD)
     return off, worst
 
 

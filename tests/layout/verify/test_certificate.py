@@ -11,12 +11,12 @@ import pytest
 from scipy.special import erf
 
 import layout
-from layout.certify import LensRows, polygon_edges, survey
-from layout.certify.polygon_edges import Polygons
-from layout.dose import exposure
 from layout.files import doses
 from layout.mask import build
+from layout.pec import psf
 from layout.process.process import Etch, Exposure, Process
+from layout.verify import LensRows, polygon_edges, verify_exposure
+from layout.verify.polygon_edges import Polygons
 from metalens.cell import Cell
 from metalens.fabrication import Bias
 from metalens.ground.errors import ProcessError
@@ -66,14 +66,14 @@ def test_exposures_are_those_of_the_direct_sum(third):
     found = verify(plan, content, table, process)
     centres = np.stack([found.x_um, found.y_um], -1)
     which = np.linspace(0, len(centres) - 1, 12).astype(int)
-    point = exposure.point_exposure(process.exposure)
+    point = psf.point_exposure(process.exposure)
     wide, dose = found.drawn_nm * 1e-3, np.full(len(centres), table[1, 0])
     exact = rims.at_edges(centres, wide, dose, point, which=which)
     # interpolation on nodes and Gaussians of second moments: 5e-4; where a Gaussian is
-    # about as wide as pillars, the error that the survey measures at its own samples
+    # about as wide as pillars, the error that the report states at its own samples
     error = np.abs(found.exposure[which] * 0.5 - exact).max()
-    assert error < 5e-4 + 0.5 * found.survey.error
-    assert found.survey.error < (0.015 if third.get("nu", 0) > 0.2 else 2e-3)
+    assert error < 5e-4 + 0.5 * found.report.error
+    assert found.report.error < (0.015 if third.get("nu", 0) > 0.2 else 2e-3)
 
 
 def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
@@ -82,8 +82,8 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
     found = verify(plan, content, table, process)
     assert len(found.drawn_nm) == plan.counts()[1:].sum()
     assert np.abs(found.exposure[found.judged] - 1).max() < 0.008 + 2e-3
-    assert found.survey.worst_nm < 1.0
-    assert found.survey.ok
+    assert found.report.worst_nm < 1.0
+    assert found.report.ok
     test = found.exposure[~found.judged]
     assert (test.min(), test.max()) == (
         pytest.approx(0.8, abs=0.01),
@@ -94,16 +94,16 @@ def test_a_corrected_mask_keeps_its_dose_to_size_and_its_diameters():
 def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
     plain = Process(exposure=Exposure(**BEAM, correct=False))
     plan, content, table = written(plain)
-    assert not verify(plan, content, table, plain).survey.ok
+    assert not verify(plan, content, table, plain).report.ok
     process = Process(exposure=Exposure(**BEAM))
     plan, content, table = written(process)
     layer = max(k for k in table if k[0] == 1)
-    more = verify(plan, content, {**table, layer: 1.05 * table[layer]}, process).survey
+    more = verify(plan, content, {**table, layer: 1.05 * table[layer]}, process).report
     assert not more.ok
     assert more.worst_exposure > 0.03
     less = verify(
         plan, content, {k: v for k, v in table.items() if k != layer}, process
-    ).survey
+    ).report
     assert less.undosed == (layer,)
     assert not less.ok
 
@@ -114,12 +114,12 @@ def test_a_single_dose_a_wrong_dose_and_a_missing_dose_are_found():
 def test_the_edges_of_marks_and_labels_are_judged(third):
     process = Process(exposure=Exposure(**BEAM, **third))
     plan, content, table = written(process)
-    found = verify(plan, content, table, process).survey
+    found = verify(plan, content, table, process).report
     assert found.ok  # the tolerance of the correction is what a certificate wants
     assert set(found.edges.layer.tolist()) == {3, 4}
     labels = sorted(k for k in table if k[0] == 4)
     label = labels[len(labels) // 2]
-    wrong = verify(plan, content, {**table, label: 0.9 * table[label]}, process).survey
+    wrong = verify(plan, content, {**table, label: 0.9 * table[label]}, process).report
     assert not wrong.ok
     assert wrong.edges.exposure[wrong.edges.layer == 4].min() < 0.95
     assert wrong.edges.shift_nm[wrong.edges.layer == 4].min() < -0.3
@@ -146,7 +146,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
         )
     )
     plan, content, table = written(process)
-    found = survey(content, plan, table, process)
+    found = verify_exposure(content, plan, table, process)
     assert found.ok, (found.worst_exposure, found.worst_nm)
     assert (
         sum(len(p) for figure in plan.figures for p in figure.polygons.values())
@@ -154,7 +154,7 @@ def test_any_double_gaussian_gets_as_many_doses_and_pieces_as_its_certificate_ne
     )
 
 
-def test_without_a_point_exposure_nothing_is_certified():
+def test_without_a_point_exposure_nothing_is_verified():
     plan, content, table = written(Process(), furnished=False)
     with pytest.raises(ProcessError, match="alpha_um, beta_um, eta"):
         verify(plan, content, table, Process())
@@ -246,7 +246,7 @@ def test_bias_of_lone_pillars_and_tilted_walls_are_in_what_is_made():
     # sites
     assert np.abs(off).max() < 2.5
     assert np.abs(off).mean() < 0.8
-    assert found.survey.lean_nm == pytest.approx(
+    assert found.report.lean_nm == pytest.approx(
         700 * np.tan(np.deg2rad(1.0)), rel=1e-12
     )
 
@@ -266,7 +266,7 @@ def test_the_lens_as_made_is_the_designed_one_within_what_the_process_rounds():
         lens_map(), Cell(0.4), proxy, 0.85, 500.0, float("inf"), "hyperbolic"
     )
     rows = LensRows(plan)
-    survey(content, plan, table, process, keep=rows.take)
+    verify_exposure(content, plan, table, process, keep=rows.take)
     made = rows.lens(designed)
     d, want = made.diameters.diameter_um, designed.diameters.diameter_um
     assert np.array_equal(d > 0, want > 0)

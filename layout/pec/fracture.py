@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.exposure import CLEARS, PointExposure
-from layout.dose.rects import CORNER, pairs_near, sums_of_boxes
+from layout.pec.psf import THRESHOLD, PointExposure
+from layout.pec.rects import CORNER, pairs_near, sums_of_boxes
 from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -56,7 +56,7 @@ class _Pieces:
         return _joined([_Pieces(low, first, self.of), _Pieces(high, second, self.of)])
 
 
-def cut(
+def fracture_boxes(
     boxes: Array,
     lattices: Array,
     *,
@@ -89,7 +89,7 @@ def cut(
         )
         / step_um
     )
-    change = _SHARE * tolerance * CLEARS
+    change = _SHARE * tolerance * THRESHOLD
     usual, corners = _ranges(around, change)
     sides = (np.asarray(boxes)[:, 2:] - np.asarray(boxes)[:, :2]) * step_um
     for ranges in _LONGEST:

@@ -2,7 +2,7 @@
 that clears the resist.
 
 The exposure at the edge of pillar i is d_i s_i + B_i: by itself
-(:mod:`layout.dose.drawn`: s(D) of a disc), and the
+(:mod:`layout.pec.drawn`: s(D) of a disc), and the
 background B = K * (A d) of all other shapes of the die. Setting it to g_i / 2 (1/2: the
 edge of a wide area of dose 1;
 g: the goal, 1 but for a dose test) gives d = (g / 2 - B) / s, and for the background
@@ -19,15 +19,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose import assign, bodies, exposure, rects
-from layout.dose.assign import Ladder
-from layout.dose.bodies import NONE, Body, Ranges, Rects, Table
-from layout.dose.drawn import Discs, Drawn
-from layout.dose.exposure import CLEARS, PointExposure
-from layout.dose.nodes import Convolution, Grid, convolution, gather, spread
-from layout.dose.pieces import cut as cut_pieces
-from layout.dose.sampled import Exposed, exact_edges
-from layout.dose.uniformity import Uniformity
+from layout.pec import assign, bodies, psf, rects
+from layout.pec.assign import DoseLadder
+from layout.pec.bodies import NONE, PillarArray, Ranges, Rects, Table
+from layout.pec.drawn import Discs, Drawn
+from layout.pec.fracture import fracture_boxes
+from layout.pec.nodes import Convolution, Grid, convolution, gather, spread
+from layout.pec.psf import THRESHOLD, PointExposure
+from layout.pec.sampled import Exposed, exact_edges
+from layout.pec.uniformity import Uniformity
 from layout.process import Exposure, Process
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
@@ -75,7 +75,7 @@ class Solution:
     pieces.
     """
 
-    ladder: Ladder
+    ladder: DoseLadder
     needed: int
     pairs: Array
     rects: Rects
@@ -107,7 +107,7 @@ class Wanted:
 
 
 def solve(
-    parts: Sequence[Body],
+    parts: Sequence[PillarArray],
     kinds: Drawn,
     goal: Array,
     settings: Exposure,
@@ -125,7 +125,7 @@ def solve(
     Raises:
         ProcessError: as :func:`correct`.
     """
-    point = exposure.point_exposure(settings)
+    point = psf.point_exposure(settings)
     number = bodies.count(parts, len(goal))
     densest = min(parts, key=lambda body: body.apart_um)
     ranges = bodies.split(point, kinds, number, densest)
@@ -135,12 +135,12 @@ def solve(
 
 
 def round_doses(
-    wanted: Wanted, ladder: Ladder, needed: int, *, samples: int = 8
+    wanted: Wanted, ladder: DoseLadder, needed: int, *, samples: int = 8
 ) -> Solution:
     """Every wanted dose rounded to the nearest of a ladder.
 
     Args:
-        ladder, needed: of :func:`layout.dose.assign.dose_ladder`, over all that is
+        ladder, needed: of :func:`layout.pec.assign.dose_ladder`, over all that is
             written in one job.
         samples: pillars at which the exposure is summed exactly.
     """
@@ -163,14 +163,14 @@ def round_doses(
 
 
 def _sampled_error(
-    wanted: Wanted, ladder: Ladder, found: assign.Assigned, samples: int
+    wanted: Wanted, ladder: DoseLadder, found: assign.Assigned, samples: int
 ) -> float:
     """Largest |fast - exact| / wanted exposure at sample pillars of the first body."""
     fields, table = wanted.fields, wanted.fields.table
     dose = np.zeros(NONE + 1)
     dose[: len(ladder.factors)] = ladder.factors
     points, areas, of = fields.spots
-    needed = (CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
+    needed = (THRESHOLD * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
     scene = Exposed(
         fields.bodies,
         table.drawn,
@@ -191,7 +191,7 @@ def _sampled_error(
         entry = int(block[0, column])
         near = fields.at(found.far, 0, row, 1, found.near)[0, column]
         fast = scene.dose_of(0, row, block)[0, column] * table.own[entry] + near
-        worst = max(worst, abs(fast - edge) / (CLEARS * table.goal[entry]))
+        worst = max(worst, abs(fast - edge) / (THRESHOLD * table.goal[entry]))
     return float(worst)
 
 
@@ -232,7 +232,7 @@ def correct_table(
     diameters, entry 0 for none.
     """
     refuse_negative(process)
-    body = Body.of(index, pitch_um)
+    body = PillarArray.of(index, pitch_um)
     wanted = solve(
         [body], Discs(diameter_um), np.ones(len(diameter_um)), process.exposure
     )
@@ -267,7 +267,7 @@ def refuse_negative(process: Process) -> None:
 
 
 def pieces(
-    boxes: Array, parts: Sequence[Body], settings: Exposure, *, step_um: float
+    boxes: Array, parts: Sequence[PillarArray], settings: Exposure, *, step_um: float
 ) -> tuple[Array, Array]:
     """Boxes (n, 4) in steps of ``step_um`` cut to pieces of one dose each: (m, 4) and
     (m,) the box of each.
@@ -276,18 +276,18 @@ def pieces(
         ProcessError: too many pieces.
     """
     around = np.array([body.box_um for body in parts])
-    point = exposure.point_exposure(settings)
+    point = psf.point_exposure(settings)
     most = min(settings.tolerance, assign.straight_edge_error(point))
-    return cut_pieces(boxes, around, step_um=step_um, point=point, tolerance=most)
+    return fracture_boxes(boxes, around, step_um=step_um, point=point, tolerance=most)
 
 
-def _box(parts: Sequence[Body], cut: Rects) -> tuple[float, float, float, float]:
+def _box(parts: Sequence[PillarArray], cut: Rects) -> tuple[float, float, float, float]:
     boxes = np.array([*(body.box_um for body in parts), *cut.box_um])
     return *boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()
 
 
 def _fields(
-    parts: Sequence[Body], drawn: Table, ranges: Ranges, cut: Rects
+    parts: Sequence[PillarArray], drawn: Table, ranges: Ranges, cut: Rects
 ) -> assign.Fields:
     """Backgrounds that belong to the wanted doses, and to dose 1 everywhere."""
     width = float(ranges.far.widths_um.min()) if len(ranges.far.widths_um) else 1e3
@@ -368,11 +368,11 @@ class _Pads:
             )
             / number
         )
-        return self.deposited((CLEARS * self.rects.goal - around) / self.own)
+        return self.deposited((THRESHOLD * self.rects.goal - around) / self.own)
 
 
 def _masses(
-    parts: Sequence[Body], drawn: Table, grid: Grid
+    parts: Sequence[PillarArray], drawn: Table, grid: Grid
 ) -> tuple[Array, Array, Array]:
     """Node sums of area, area / own, and goal area / own."""
     per_own = np.divide(
@@ -390,7 +390,7 @@ def _masses(
     return out[0], out[1], out[2]
 
 
-def middle_convolution(body: Body, ranges: Ranges) -> Convolution:
+def middle_convolution(body: PillarArray, ranges: Ranges) -> Convolution:
     """Convolution on the sites of a lattice with the Gaussians that reach neighbours
     only.
     """
@@ -408,14 +408,14 @@ def middle_convolution(body: Body, ranges: Ranges) -> Convolution:
     )
 
 
-def _times(body: Body, value: Array, middle: Convolution) -> Array:
+def _times(body: PillarArray, value: Array, middle: Convolution) -> Array:
     """(rows, columns) what pillars that carry ``value`` (entries,) give to each other."""
     mass = np.concatenate([value.take(block) for _, block in body.blocks()])
     return middle(mass).astype(np.float32)
 
 
 def _backgrounds(
-    parts: Sequence[Body],
+    parts: Sequence[PillarArray],
     drawn: Table,
     grid: Grid,
     reach: Convolution,
@@ -427,7 +427,7 @@ def _backgrounds(
     doses, in turn until they rest.
     """
     wanted, goal = masses
-    field = _relaxed(reach, wanted, CLEARS * goal, pads=pads)
+    field = _relaxed(reach, wanted, THRESHOLD * goal, pads=pads)
     near: list[Array] = []
     per_own = np.divide(
         drawn.area_um2, drawn.own, out=np.zeros_like(drawn.own), where=drawn.used
@@ -444,14 +444,17 @@ def _backgrounds(
             own = _relaxed(
                 middle,
                 mass,
-                (CLEARS * drawn.goal.take(index) - far) * mass,
+                (THRESHOLD * drawn.goal.take(index) - far) * mass,
                 bound_below=0.9,
             )
             near.append(own.astype(np.float32))
             rows, columns = np.nonzero(index)
             x, y = body.columns_um[columns], body.rows_um(0, body.rows)[rows]
             taken += grid.deposit(x, y, (own * mass)[rows, columns])
-        before, field = field, _relaxed(reach, wanted, CLEARS * goal - taken, pads=pads)
+        before, field = (
+            field,
+            _relaxed(reach, wanted, THRESHOLD * goal - taken, pads=pads),
+        )
         if np.abs(field - before).max() < 1e-7:
             break
     return field, near

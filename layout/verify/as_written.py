@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from layout.certify.verify import Rows
 from layout.mask import MaskPlan
+from layout.verify.exposure import Rows
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 from metalens.ground.units import nm

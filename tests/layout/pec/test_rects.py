@@ -9,9 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from layout.dose import rects
-from layout.dose.bodies import Rects
-from layout.dose.exposure import PointExposure
+from layout.pec import rects
+from layout.pec.bodies import Rects
+from layout.pec.psf import PointExposure
 
 ALPHA_UM = 0.05
 PIXEL_UM = 0.005

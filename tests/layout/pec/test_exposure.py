@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from layout.dose.exposure import (
+from layout.pec.psf import (
     PointExposure,
     _fit_error,
     disc,

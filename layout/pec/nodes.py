@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.exposure import PointExposure
+from layout.pec.psf import PointExposure
 from layout.process import compiled
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError

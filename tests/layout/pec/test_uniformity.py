@@ -5,7 +5,7 @@ follows from the slope.
 import numpy as np
 import pytest
 
-from layout.dose.uniformity import Tally
+from layout.pec.uniformity import Tally
 
 
 def test_the_worst_error_may_lie_below():

@@ -9,8 +9,8 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import erf
 
-from layout.dose.drawn import Discs, Outlines
-from layout.dose.exposure import PointExposure
+from layout.pec.drawn import Discs, Outlines
+from layout.pec.psf import PointExposure
 
 POINT = PointExposure(np.array([0.014, 0.31, 9.0]), np.array([0.6, 0.1, 0.3]))
 D, ONE, OFF = 0.231, np.array([False, True]), np.array([0.3517, -0.2109])

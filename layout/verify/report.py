@@ -1,5 +1,5 @@
-"""What a certificate says of millions of pillars: extremes, a map and a histogram,
-gathered band by band.
+"""Report on the exposure of a written mask: extremes, a map and a histogram over
+millions of pillars.
 """
 
 from dataclasses import dataclass
@@ -79,7 +79,7 @@ class Tally:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Survey:
+class ExposureReport:
     """The verdict over everything that is written.
 
     pillars: the dose test too. tally: sums over those that are judged. box_um: left,

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from layout.dose.bodies import Rects
-from layout.dose.exposure import PointExposure
+from layout.pec.bodies import Rects
+from layout.pec.psf import PointExposure
 from layout.process import compiled
 from metalens.ground import threads
 from metalens.ground.arrays import Array

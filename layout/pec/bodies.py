@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.drawn import Drawn
-from layout.dose.exposure import PointExposure
+from layout.pec.drawn import Drawn
+from layout.pec.psf import PointExposure
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
@@ -20,7 +20,7 @@ COARSE = 6  # steps between neighbours: a Gaussian that wide needs no node at ea
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Body:
+class PillarArray:
     """A lattice of pillars.
 
     source: (first row, end row) -> (rows, columns) entries of the table, 0 for none.
@@ -40,7 +40,7 @@ class Body:
     centred: bool = False
 
     @classmethod
-    def of(cls, index: Array, pitch_um: float) -> "Body":
+    def of(cls, index: Array, pitch_um: float) -> "PillarArray":
         """A lattice in memory, its first site at (0, 0)."""
         return cls(
             index.shape[0],
@@ -170,7 +170,7 @@ class Ranges:
     near: PointExposure
 
 
-def count(bodies: Sequence[Body], entries: int) -> Array:
+def count(bodies: Sequence[PillarArray], entries: int) -> Array:
     """(entries,) pillars of each entry in all bodies."""
     total = np.zeros(entries, np.int64)
     for body in bodies:
@@ -180,7 +180,9 @@ def count(bodies: Sequence[Body], entries: int) -> Array:
     return total
 
 
-def split(point: PointExposure, drawn: Drawn, number: Array, body: Body) -> Ranges:
+def split(
+    point: PointExposure, drawn: Drawn, number: Array, body: PillarArray
+) -> Ranges:
     """Which Gaussians reach how far, for these pillars on the densest of the lattices."""
     mass = number * drawn.area_um2
     total = float(mass.sum())
@@ -219,7 +221,7 @@ def table(
     *,
     point: PointExposure,
     ranges: Ranges,
-    body: Body,
+    body: PillarArray,
 ) -> Table:
     """The table of a mask.
 
@@ -246,7 +248,7 @@ def table(
     return Table(drawn, area, goal, own, slope, number)
 
 
-def _beside(middle: PointExposure, body: Body) -> float:
+def _beside(middle: PointExposure, body: PillarArray) -> float:
     """Bound of the eigenvalues of what the sites of a lattice, unit masses, give to
     each other, per um^2.
 

@@ -5,10 +5,10 @@ a measured spread is fitted.
 import numpy as np
 import pytest
 
-from layout.dose import pieces
-from layout.dose.bodies import Body
-from layout.dose.exposure import PointExposure, fit
-from layout.dose.nodes import Axis, Grid, gather, spread
+from layout.pec import fracture
+from layout.pec.bodies import PillarArray
+from layout.pec.nodes import Axis, Grid, gather, spread
+from layout.pec.psf import PointExposure, fit
 
 RNG = np.random.default_rng(8)
 NOTHING = np.empty((0, 4))
@@ -23,7 +23,7 @@ def test_large_marks_are_cut_to_a_hundred_thousand_pieces_at_most(halvings, side
     of twice the length 131 072 are many, which are halved by going to whole ranges."""
     step = 0.1
     length = round(0.5 * BACK_UM / step) * 2**halvings
-    made, _ = pieces.cut(
+    made, _ = fracture.fracture_boxes(
         np.array([[0, 0, length, 3]]),
         NOTHING,
         step_um=step,
@@ -41,7 +41,7 @@ def test_pieces_next_to_a_lens_are_as_long_as_its_background_lets_them_be():
     by 2.6 %, and half of it to either side of the middle, of which a sixteenth would be
     a needless quarter of a million
     pieces a square millimetre of marks."""
-    made, _ = pieces.cut(np.array([[0, 0, 6400, 3200]]), np.array([[6.5, -50.0, 90.0, 50.0]]), step_um=1e-3,
+    made, _ = fracture.fracture_boxes(np.array([[0, 0, 6400, 3200]]), np.array([[6.5, -50.0, 90.0, 50.0]]), step_um=1e-3,
                          point=POINT, tolerance=0.2)  # fmt: skip
     sides = (made[:, 2:] - made[:, :2]).max(1) * 1e-3
     assert (sides <= BACK_UM / 8).all()
@@ -69,7 +69,9 @@ def test_nodes_wider_than_tall_and_taller_than_wide_serve_alike(tall):
     grid = Grid(long, short) if tall else Grid(short, long)
     index = RNG.integers(0, 3, (23, 4) if tall else (4, 23)).astype(np.uint8)
     left, bottom = (-1.2, 5.0) if tall else (5.0, -1.2)
-    body = Body(*index.shape, 1.3, left, bottom, lambda first, end: index[first:end])
+    body = PillarArray(
+        *index.shape, 1.3, left, bottom, lambda first, end: index[first:end]
+    )
     y, x = np.meshgrid(body.rows_um(0, len(index)), body.columns_um, indexing="ij")
     lines = *grid.y.at(body.rows_um(0, len(index))), *grid.x.at(body.columns_um)
     nodes, sites = RNG.normal(size=grid.shape), np.empty(index.shape, np.float32)

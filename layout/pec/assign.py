@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.bodies import NONE, Body, Ranges, Rects, Table
-from layout.dose.exposure import CLEARS, PointExposure
-from layout.dose.nodes import Convolution, Grid, spread
-from layout.dose.uniformity import Tally, Uniformity
+from layout.pec.bodies import NONE, PillarArray, Ranges, Rects, Table
+from layout.pec.nodes import Convolution, Grid, spread
+from layout.pec.psf import THRESHOLD, PointExposure
+from layout.pec.uniformity import Tally, Uniformity
 from layout.process import Exposure, compiled
 from metalens.ground.arrays import Array
 
@@ -26,12 +26,12 @@ class Fields:
     far: (y, x) on the nodes with the wanted doses; alone: with dose 1. near,
     near_alone: (rows, columns) for each
     body, the middle ranges; empty lists where there is none.
-    own: (pieces,) as in :func:`layout.dose.rects.own`; points, piece: outer edges of
+    own: (pieces,) as in :func:`layout.pec.rects.own`; points, piece: outer edges of
     the pieces and whose they are.
     spots: points, areas and pieces that stand for the rectangles on the nodes.
     """
 
-    bodies: Sequence[Body]
+    bodies: Sequence[PillarArray]
     table: Table
     ranges: Ranges
     grid: Grid
@@ -73,7 +73,7 @@ class Fields:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ladder:
+class DoseLadder:
     """(doses,) relative doses, rising, in equal steps of the logarithm."""
 
     factors: Array
@@ -133,13 +133,13 @@ def dose_range(fields: Fields, settings: Exposure) -> DoseRange:
                 block,
                 field,
                 t.own,
-                CLEARS * t.goal,
+                THRESHOLD * t.goal,
                 _SOFTEST_UM * t.slope / 2,
                 most,
                 span,
             )
     if len(fields.own):
-        goal = CLEARS * fields.rects.goal
+        goal = THRESHOLD * fields.rects.goal
         left = goal - fields.of_rects(fields.far)
         dose = left / fields.own
         rise = (
@@ -158,7 +158,9 @@ def dose_range(fields: Fields, settings: Exposure) -> DoseRange:
     return DoseRange(*span.tolist())
 
 
-def dose_ladder(ranges: Sequence[DoseRange], settings: Exposure) -> tuple[Ladder, int]:
+def dose_ladder(
+    ranges: Sequence[DoseRange], settings: Exposure
+) -> tuple[DoseLadder, int]:
     """The doses of a job (at most ``maximum_classes``), and how many its tolerance
     needs.
 
@@ -170,7 +172,7 @@ def dose_ladder(ranges: Sequence[DoseRange], settings: Exposure) -> tuple[Ladder
     step = 2 * np.log1p(_ROUNDED / max(one.share for one in ranges))
     needed = max(1, int(np.ceil(np.log(span) / step - 1e-9)))
     count = min(needed, settings.maximum_classes)
-    return Ladder(least * span ** ((np.arange(count) + 0.5) / count)), needed
+    return DoseLadder(least * span ** ((np.arange(count) + 0.5) / count)), needed
 
 
 def straight_edge_error(point: PointExposure) -> float:
@@ -178,7 +180,7 @@ def straight_edge_error(point: PointExposure) -> float:
     rounded doses may.
     """
     steep = float((point.weights / point.widths_um).sum()) / np.sqrt(np.pi)
-    return float(_SOFTEST_UM * steep / 2 / CLEARS)
+    return float(_SOFTEST_UM * steep / 2 / THRESHOLD)
 
 
 @compiled
@@ -205,7 +207,7 @@ def _span(
 
 
 def classes(
-    fields: Fields, number: int, first: int, block: Array, steps: Ladder
+    fields: Fields, number: int, first: int, block: Array, steps: DoseLadder
 ) -> Array:
     """(rows, columns) uint8 dose class of the pillars of a block, 255 where there is
     none.
@@ -217,7 +219,7 @@ def classes(
         block,
         field,
         shift,
-        CLEARS * t.goal,
+        THRESHOLD * t.goal,
         steps.per_log,
         len(steps.factors),
         out,
@@ -246,7 +248,7 @@ def _classes(
             out[row, column] = min(max(level, 0.0), count - 1.0)
 
 
-def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
+def assign(fields: Fields, steps: DoseLadder) -> tuple[Array, Array, Assigned]:
     """((entries, doses) pillars, (pieces,) class, outcome) of the nearest doses, over
     everything.
     """
@@ -277,7 +279,7 @@ def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
                 if not number
                 else _NOTHING
             )
-            tables = np.stack([t.own, t.area_um2, CLEARS * t.goal])
+            tables = np.stack([t.own, t.area_um2, THRESHOLD * t.goal])
             _take(
                 block,
                 chosen,
@@ -304,7 +306,7 @@ def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
             ):
                 tally.merge(row)
     own_class = steps.nearest(
-        (CLEARS * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
+        (THRESHOLD * fields.rects.goal - fields.of_rects(fields.far)) / fields.own
     )
     worst_rect = _rect_error(fields, own_class, dose, mass)
     after = fields.reach(mass)
@@ -318,10 +320,10 @@ def assign(fields: Fields, steps: Ladder) -> tuple[Array, Array, Assigned]:
         ),
         default=0,
     )
-    shift /= CLEARS * float(t.goal[t.used].min())
+    shift /= THRESHOLD * float(t.goal[t.used].min())
     gentle = float(t.slope[t.used].min())
     before = tallies[0].result(gentle / mean, 0.0)
-    found = tallies[1].result(gentle * float(steps.factors[0]) / CLEARS, shift)
+    found = tallies[1].result(gentle * float(steps.factors[0]) / THRESHOLD, shift)
     worst = max(found.worst, tallies[2].worst + shift, worst_rect + shift)
     return (
         pairs[:, : len(steps.factors)],
@@ -398,4 +400,4 @@ def _rect_error(fields: Fields, own_class: Array, dose: Array, mass: Array) -> f
     mass += fields.grid.deposit(spots[:, 0], spots[:, 1], area * dose[own_class[of]])
     background = fields.grid.sample(fields.far, *fields.points.T)
     edge = (dose[own_class] * fields.own)[fields.piece] + background
-    return float(np.abs(edge / (CLEARS * fields.rects.goal[fields.piece]) - 1).max())
+    return float(np.abs(edge / (THRESHOLD * fields.rects.goal[fields.piece]) - 1).max())

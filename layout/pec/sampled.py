@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from layout.dose.bodies import COARSE, Body, Ranges
-from layout.dose.drawn import Drawn
-from layout.dose.exposure import PointExposure
+from layout.pec.bodies import COARSE, PillarArray, Ranges
+from layout.pec.drawn import Drawn
+from layout.pec.psf import PointExposure
 from metalens.ground.arrays import Array
 
 _NEIGHBOURS = 5  # sites on each side whose shapes are taken exactly
@@ -24,7 +24,7 @@ class Exposed:
     dose_of: (body, first row, entries of a block) -> (rows, columns) relative doses.
     """
 
-    bodies: Sequence[Body]
+    bodies: Sequence[PillarArray]
     drawn: Drawn
     own: Array
     ranges: Ranges
@@ -58,7 +58,7 @@ def exact_edges(scene: Exposed, samples: int) -> tuple[Array, Array, Array]:
     return rows, columns, exposure
 
 
-def _some(body: Body, samples: int) -> tuple[Array, Array]:
+def _some(body: PillarArray, samples: int) -> tuple[Array, Array]:
     """Pillars of some rows spread over the lens, so that no list of all pillars is
     made.
     """
@@ -83,7 +83,7 @@ def _some(body: Body, samples: int) -> tuple[Array, Array]:
     return every[0][pick], every[1][pick]
 
 
-def _around(body: Body, row: int) -> tuple[Array, int]:
+def _around(body: PillarArray, row: int) -> tuple[Array, int]:
     first = max(row - _NEIGHBOURS, 0)
     return np.ascontiguousarray(
         body.source(first, min(row + _NEIGHBOURS + 1, body.rows))

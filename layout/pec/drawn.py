@@ -20,7 +20,7 @@ from typing import Protocol
 
 import numpy as np
 
-from layout.dose.exposure import PointExposure, disc, rim_of_own_disc, slope_at_rim
+from layout.pec.psf import PointExposure, disc, rim_of_own_disc, slope_at_rim
 from layout.process import compiled
 from layout.shapes.moments import Contours, along, moments, perimeter
 from metalens.ground.arrays import Array

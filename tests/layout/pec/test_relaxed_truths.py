@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from layout.dose import correct
-from layout.dose.exposure import CLEARS
-from layout.dose.uniformity import Tally
+from layout.pec import correct
+from layout.pec.psf import THRESHOLD
+from layout.pec.uniformity import Tally
 
 RNG = np.random.default_rng(13)
 SHAPE = (4, 5)
@@ -77,19 +77,19 @@ def test_pieces_of_marks_ask_for_their_own_dose_in_the_mean_of_their_edges():
     pads = correct._Pads(SimpleNamespace(goal=goal), own, edges, points, grid)
     field = RNG.uniform(0.1, 0.3, SHAPE)
     around = np.array([(field.ravel()[7] + field.ravel()[12]) / 2, field.ravel()[3]])
-    dose = (CLEARS * goal - around) / own
+    dose = (THRESHOLD * goal - around) / own
     assert pads.wanted(field).ravel() == pytest.approx(spots @ dose, rel=1e-12)
-    # in the background: (1 + K (M + S E / own)) B = K (drive + S CLEARS goal / own)
+    # in the background: (1 + K (M + S E / own)) B = K (drive + S THRESHOLD goal / own)
     mean = np.zeros((2, 20))
     mean[0, [7, 12]], mean[1, 3] = 0.5, 1.0
     system = np.eye(20) + KERNEL @ (np.diag(MASS) + spots @ (mean / own[:, None]))
-    want = np.linalg.solve(system, KERNEL @ (DRIVE + spots @ (CLEARS * goal / own)))
+    want = np.linalg.solve(system, KERNEL @ (DRIVE + spots @ (THRESHOLD * goal / own)))
     got = correct._relaxed(reach, MASS.reshape(SHAPE), DRIVE.reshape(SHAPE), pads=pads)
     assert got.ravel() == pytest.approx(want, rel=1e-6)
 
 
 def test_half_a_unit_of_exposure_clears_a_straight_edge():
-    assert CLEARS == 0.5
+    assert THRESHOLD == 0.5
 
 
 def test_worst_and_rms_are_over_all_that_was_taken_in_and_become_a_diameter_by_the_slope():

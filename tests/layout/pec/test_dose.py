@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from layout.dose import correct as dose
-from layout.dose.bodies import NONE
-from layout.dose.exposure import PointExposure, point_exposure, rim_of_own_disc
+from layout.pec import correct as dose
+from layout.pec.bodies import NONE
+from layout.pec.psf import PointExposure, point_exposure, rim_of_own_disc
 from layout.process.process import Exposure, Process
 from metalens.ground.errors import ProcessError
 from metalens.lens.record import DiameterMap

@@ -19,7 +19,7 @@ from metalens.fabrication import read_csv
 from metalens.ground.arrays import Array
 from metalens.ground.errors import ProcessError
 
-CLEARS = 0.5  # exposure at the edge of a wide area of dose 1
+THRESHOLD = 0.5  # exposure at the edge of a wide area of dose 1
 
 
 @dataclass(frozen=True, eq=False, slots=True)

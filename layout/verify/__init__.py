@@ -1,0 +1,21 @@
+"""Exposure and etch of the written files, by files and dose table alone."""
+
+from typing import TYPE_CHECKING
+
+from metalens.ground.lazy import attach
+
+if TYPE_CHECKING:
+    from layout.verify.as_written import LensRows as LensRows
+    from layout.verify.exposure import Rows as Rows
+    from layout.verify.exposure import verify_exposure as verify_exposure
+    from layout.verify.report import ExposureReport as ExposureReport
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "LensRows": "as_written",
+        "Rows": "exposure",
+        "ExposureReport": "report",
+        "verify_exposure": "exposure",
+    },
+)
