@@ -1,4 +1,4 @@
-"""Image metrics, registration, micrographs."""
+"""Image metrics, frame quality, micrographs."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from characterize.measure import metrics as metrics
     from characterize.measure import overlay as overlay
     from characterize.measure import picture as picture
-    from characterize.measure import register as register
     from characterize.measure import sem as sem
 
 __getattr__, __dir__, __all__ = attach(
@@ -19,7 +18,6 @@ __getattr__, __dir__, __all__ = attach(
         "metrics": "",
         "overlay": "",
         "picture": "",
-        "register": "",
         "sem": "",
     },
 )
