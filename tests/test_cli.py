@@ -6,17 +6,13 @@ import importlib
 import inspect
 import json
 import os
-import sys
 import textwrap
 from importlib import resources
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from command_line import process, run
-
 from metalens import cli
+from tests.command_line import process, run
 
 
 def test_help_lists_every_verb():

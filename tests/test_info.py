@@ -5,20 +5,17 @@ short.
 import ast
 import functools
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent / "fuzz"))
-import test_file_fuzz as artefacts
-
 from codesign.train import checkpoint
 from codesign.train.inner import InnerConfig
 from metalens.cli import BAD_INPUT, SUCCESS, main
 from metalens.ground import manifest, store
+from tests.fuzz import test_file_fuzz as artefacts
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("metalens", "layout", "characterize", "codesign")

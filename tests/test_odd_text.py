@@ -4,18 +4,15 @@ or refuses in one line.
 
 import importlib
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from test_before_the_work import NAMES, NEEDS, inputs, tree  # noqa: F401 (a fixture)
-
 from metalens.cli import BAD_INPUT, main
 from metalens.ground import reading, store
 from metalens.ground.errors import MetalensError
+from tests.test_before_the_work import NAMES, NEEDS, inputs, tree  # noqa: F401 (a fixture)
 
 CELL = "[cell]\npitch_um = 0.3\npillar = {n = 3.6}\n"
 PUPIL = "numerical_aperture = 0.5\nwavelength_um = 0.6\npixel_um = 0.1\nstep_um = 0.5\n"

@@ -3,14 +3,9 @@ other versions are named.
 """
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from command_line import run
 
 import layout
 from layout.process import Process
@@ -19,6 +14,7 @@ from metalens.cell.record import Cell, Index
 from metalens.ground import store
 from metalens.lens.record import DiameterMap, Lens
 from metalens.pillars.proxy import Proxy
+from tests.command_line import run
 
 # verb: words after it, and the target that already exists; %s is the folder of inputs
 CASES = {

@@ -2,15 +2,11 @@
 which judges, what is kept when.
 """
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from codesign.adapt import train as retraining
 from codesign.adapt.reading import Accuracy

@@ -2,14 +2,8 @@
 reading of the table, real gain.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from characterize.model.parameters import state, vector
 from codesign.adapt import correction
@@ -17,6 +11,7 @@ from codesign.optics import built
 from layout.process import process as processes
 from metalens.fabrication import sensitivity, transmission
 from metalens.ground.errors import ConfigError
+from tests.codesign import made_lens as m
 
 OLD = """
 [bias]

@@ -3,16 +3,11 @@ is judged on what.
 """
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 import codesign
 from characterize.bench.bench import Truth
@@ -28,6 +23,7 @@ from codesign.optics.stack import Stack
 from codesign.train import place
 from metalens.ground.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
+from tests.codesign import made_lens as m
 from tests.elsewhere import AWAY, elsewhere
 
 SHORT = RetrainConfig(steps=2, draws=2, judge=1, test_batches=1)

@@ -3,7 +3,6 @@ another lens may be off.
 """
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,14 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
-
 from codesign.adapt import source
 from codesign.adapt.settings import RetrainConfig
 from codesign.network import Space, smallest
 from metalens.ground.errors import ConfigError, FitError, TrainingError
 from metalens.lens.record import DiameterMap
+from tests.codesign import made_lens as m
 
 
 def written(folder, rows):

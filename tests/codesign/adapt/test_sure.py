@@ -1,19 +1,15 @@
 """A correction is made only where draws of the posterior agree on it."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from characterize.inference.asbuilt import WithinModel
 from characterize.model import PLACE
 from codesign.adapt import correction, sure
 from metalens.ground.errors import ConfigError
+from tests.codesign import made_lens as m
 
 KNOTS = np.array([0.7, 1.0, 1.6])
 

@@ -3,16 +3,11 @@ it is compared with.
 """
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent))
-import small_bench as small
 
 from codesign.budget import task
 from codesign.budget.prepared import finest_of, same_lens
@@ -21,6 +16,7 @@ from codesign.optics import Numerics, OpticsConfig, device, gathered, image_diff
 from metalens.ground.errors import LensError
 from metalens.image import Frames, Grid
 from metalens.psf import Source
+from tests.codesign.budget import small_bench as small
 
 RNG = np.random.default_rng(31)
 

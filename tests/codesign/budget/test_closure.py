@@ -3,16 +3,11 @@ experiment measures.
 """
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.adapt import train as retraining
 from codesign.budget import links, total
@@ -24,6 +19,7 @@ from codesign.evaluate import AXIAL, ExperimentConfig, experiment
 from codesign.optics import Numerics, formed, image_difference
 from metalens.cli import main
 from metalens.ground.errors import LensError
+from tests.codesign import made_lens as m
 
 FRAMES = ExperimentConfig(
     subjects=2,

@@ -4,18 +4,11 @@ what the device itself says.
 
 import functools
 import math
-import sys
 from dataclasses import astuple, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parent))
-import made_lens
-import small_bench as small
 
 from characterize.model import NAMES
 from codesign.budget import links, task
@@ -27,6 +20,8 @@ from metalens.cell import Light
 from metalens.fabrication import Printed, Spread, State, draws, sensitivity
 from metalens.ground.errors import LensError
 from metalens.pillars import PillarLibrary, Sweep, engines
+from tests.codesign import made_lens
+from tests.codesign.budget import small_bench as small
 
 RNG = np.random.default_rng(31)
 # the table of 8192 diameters, 2e-5 um apart: half of that at 55 rad a um, in every

@@ -7,17 +7,12 @@ The clock is typed in; everything that it times is run.
 import copy
 import itertools
 import math
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import small_bench as small
 
 from codesign.budget import chain as chains
 from codesign.budget import plan, task
@@ -28,6 +23,7 @@ from metalens.cell import Index
 from metalens.design import Focus
 from metalens.image import Grid
 from metalens.psf import Source
+from tests.codesign.budget import small_bench as small
 
 STACKS, FRAMES = 7, 110
 SAID: list[str] = []

@@ -12,9 +12,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
-
 from characterize.bench import Truth
 from characterize.inference import asbuilt
 from codesign.adapt import retrained
@@ -24,6 +21,7 @@ from layout.process import process
 from metalens import lens
 from metalens.cli import main
 from metalens.ground import config
+from tests.codesign import made_lens as m
 from tests.command_line import run
 
 DIES = """

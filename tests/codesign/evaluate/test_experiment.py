@@ -3,16 +3,11 @@ honestly, and its command.
 """
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.adapt import train as retraining
 from codesign.batches import EyeScenes, SceneConfig
@@ -27,6 +22,7 @@ from codesign.gaze import people_file, personal, regressor, shared
 from codesign.gaze.readings import Readings
 from metalens.cli import main
 from metalens.ground.errors import ConfigError, TrainingError
+from tests.codesign import made_lens as m
 from tests.referees.seen_pupil import pupil_of
 
 SMALL = ExperimentConfig(subjects=2, grid=(4, 3), share=0.3, fixation_deg=0.0, people=9)

@@ -2,15 +2,10 @@
 answers as the experiment.
 """
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.adapt import train as retraining
 from codesign.commands import onnx_file
@@ -18,6 +13,7 @@ from codesign.evaluate import gaze_experiment as experiment
 from codesign.evaluate.shown import ExperimentConfig
 from codesign.eye import render
 from codesign.gaze import Readings, angle_deg, people_file
+from tests.codesign import made_lens as m
 
 CONFIG = ExperimentConfig(
     subjects=2,

@@ -3,16 +3,11 @@ of the sensor's rim.
 """
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.commands import view
 from codesign.evaluate import imaged
@@ -23,6 +18,7 @@ from metalens.design import Focus
 from metalens.ground.errors import SceneError
 from metalens.ground.store import Provenance
 from metalens.lens import Layers
+from tests.codesign import made_lens as m
 
 CAMERA = Camera(24, 3.0)
 RIG = replace(Rig(), elevation_rad=0.6)

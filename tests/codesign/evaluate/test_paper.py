@@ -4,19 +4,15 @@ is said of what is missing.
 
 import json
 import re
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.commands import paper as command_paper
 from codesign.evaluate import paper
 from codesign.evaluate.paper import Measured
 from metalens.cli import main
 from metalens.ground.errors import StoreError
+from tests.codesign import made_lens as m
 
 RATIO = re.compile(r"^([\d.]+) / ([\d.]+)")
 

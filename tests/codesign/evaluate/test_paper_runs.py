@@ -4,14 +4,10 @@ answer, gaze of two networks.
 
 import functools
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.commands import paper as command_paper
 from codesign.commands.paper import GAZE
@@ -19,6 +15,7 @@ from codesign.evaluate import paper, paper_runs
 from codesign.train import run as runs
 from metalens.cli import main
 from metalens.ground.errors import TrainingError
+from tests.codesign import made_lens as m
 
 KEYS = ("population_floor_deg", "personal_deg", "personal_floor_deg", "anatomy_deg")
 

@@ -3,17 +3,12 @@ bootstrap, depths of windows.
 """
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from codesign.evaluate import reader
 from codesign.evaluate.reader import Frames, Read, ReaderConfig
@@ -23,6 +18,7 @@ from metalens.cell import Film, Index
 from metalens.design import Focus
 from metalens.ground.errors import ConfigError
 from metalens.lens import Layers
+from tests.codesign import made_lens as m
 
 
 def frames(count, seed):

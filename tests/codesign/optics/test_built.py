@@ -3,15 +3,10 @@ all symmetries broken.
 """
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from characterize.model import made
 from characterize.model.parameters import PLACE, vector
@@ -20,6 +15,7 @@ from codesign.optics import stack as optics
 from codesign.optics.stack import Stack
 from metalens import psf
 from metalens.fabrication import sensitivity
+from tests.codesign import made_lens as m
 
 X = vector(m.TRUE | {"wavelength_nm": 0.7, "stage_zero_um": 50.0, "background_e": 9.0})
 

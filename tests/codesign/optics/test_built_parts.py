@@ -4,16 +4,11 @@ harmonics on samples, waves.
 
 import dataclasses
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.signal import correlate
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import made_lens as m
 
 from characterize.model import state
 from characterize.model.parameters import NAMES, vector
@@ -21,6 +16,7 @@ from codesign.optics import built
 from metalens.fabrication import Sensitivity, transmission
 from metalens.image import Pupil, amplitude, coordinates
 from metalens.lens import DiameterMap
+from tests.codesign import made_lens as m
 
 GATHER = getattr(
     built._gather, "py_func", built._gather
