@@ -12,7 +12,7 @@ import numpy as np
 
 from layout.arrange.joined import PER_UM, Placing
 from layout.files import Assembly, CellContent, handover
-from layout.mask import FieldPlan
+from layout.mask import FieldPlan, Lattice
 from layout.process import LayerNumber
 from layout.shapes import polygon
 from metalens.ground import store
@@ -130,5 +130,14 @@ def _children(made: Assembly, name: str) -> Iterator[tuple[str, float]]:
     for copies in made.copies.get(name, ()):
         yield copies.child, copies.count * copies.turn.scale**2
     if name in made.sites:
-        for child, sums in made.sites[name].sums().items():
-            yield child, float(sums[0])
+        sites = made.sites[name]
+        number = np.zeros(len(sites.children) + 1, np.int64)
+        for _, block in sites.lattice.blocks(_rows_at_once(sites.lattice)):
+            number += np.bincount(block.ravel(), minlength=len(number))
+        for child, count in zip(sites.children, number[1:].tolist(), strict=True):
+            if count:
+                yield child, float(count)
+
+
+def _rows_at_once(lattice: Lattice) -> int:
+    return max(1, (1 << 20) // max(1, lattice.columns))

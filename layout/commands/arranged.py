@@ -195,6 +195,7 @@ def _one(
 
 def _accompany(work: Work, made: Assembly) -> None:
     """Dose table, layers, write fields, list of dies, job sheet, values, report."""
+    work.areas_um2 = job_file.areas_um2(made)
     fields = list(job_file.place_fields(work.placed, work.splits))
     job_file.write_fields(fields, work.folder / "fields.csv")
     turned = job_file.without_fields(work.placed, work.splits)
@@ -237,7 +238,7 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
         "failures": work.failures,
         "notes": work.notes,
         "unchecked": work.unchecked,
-        "charge_uC": _charges(work, made),
+        "charge_uC": handover.charge_uC(work.areas_um2, made.doses, work.process),
         "dies": 1 if work.dies is None else len(work.dies.index),
         "cells": len(made.cells),
         "doses": len(made.doses),
@@ -245,11 +246,6 @@ def _values(work: Work, made: Assembly) -> dict[str, Any]:
         "lenses": work.lenses,
         "seconds": work.stages.seconds,
     }
-
-
-def _charges(work: Work, made: Assembly) -> dict[str, float]:
-    """{step: charge} of the whole mask."""
-    return handover.charge_uC(job_file.areas_um2(made), made.doses, work.process)
 
 
 def _sheet(work: Work, made: Assembly, fields: int) -> list[str]:
@@ -293,7 +289,7 @@ def _sheet(work: Work, made: Assembly, fields: int) -> list[str]:
                 for mark in size.marks
             ),
         ]
-    areas = job_file.areas_um2(made)
+    areas = work.areas_um2
     charges = handover.charge_uC(areas, made.doses, process)
     many = "" if work.dies is None else f" of a die, {len(work.dies.index)} dies"
     return [

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from layout.arrange import apart, job_file, joined, seen
+from layout.arrange import apart, joined, seen
 from layout.commands.placed import Work
 from layout.drc import format_size
 from layout.files import Assembly, handover
@@ -256,7 +256,7 @@ def _doses(work: Work, made: Assembly) -> Section:
         for layer, dose in sorted(made.doses.items())
     ]
     head = ("layer", "datatype", "relative dose", "µC/cm²", "name")
-    charges = handover.charge_uC(job_file.areas_um2(made), made.doses, work.process)
+    charges = handover.charge_uC(work.areas_um2, made.doses, work.process)
     charge = Table(
         ("step", "charge / µC", "hours at 1 nA"),
         [[step, f"{q:.4g}", f"{q / 3.6:.3g}"] for step, q in charges.items()],

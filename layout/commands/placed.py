@@ -26,6 +26,7 @@ from layout.drc import DrcReport, Violation, check_library, check_plan
 from layout.files import MaskContent, hierarchy, placement_limit, verify
 from layout.mask import FieldPlan, build
 from layout.oasis import write as oasis_write
+from layout.process import LayerNumber
 from layout.process import process as processes
 from layout.verify import verify_exposure
 from metalens import lens as lenses
@@ -42,7 +43,8 @@ class Work:
     unchecked: parts whose design rules nobody checked here.
     placed: parts on the die. near: those that stand too near each other.
     rules: what was found of each part that is checked here. splits: write fields of
-    each lens. unlike: files that do not read back as planned.
+    each lens. areas_um2: of each layer, over the whole mask. unlike: files that do not
+    read back as planned.
     """
 
     options: Options
@@ -60,6 +62,7 @@ class Work:
     near: list[Violation] = field(default_factory=list)
     rules: dict[str, DrcReport] = field(default_factory=dict)
     splits: dict[str, FieldPlan] = field(default_factory=dict)
+    areas_um2: dict[LayerNumber, float] = field(default_factory=dict)
     unlike: set[str] = field(default_factory=set)
 
     @property

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from layout.shapes import polygon as polygon
     from layout.shapes import rectilinear as rectilinear
     from layout.shapes import region as region
-    from layout.shapes import squared as squared
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -19,7 +18,6 @@ __getattr__, __dir__, __all__ = attach(
         "moments": "",
         "rectilinear": "",
         "region": "",
-        "squared": "",
         "polygon": "",
     },
 )
