@@ -271,7 +271,8 @@ def _media(
         for name in (rest, *(film.material for film in films))
     ]
     for n, t in zip(indices, thicknesses, strict=True):
-        lost = -math.expm1(-4 * math.pi * n.imag * t / wavelength_um)
+        absorption = 4 * math.pi * n.imag / wavelength_um  # per um
+        lost = -math.expm1(-absorption * t) if absorption else 0.0
         if lost > MOST_ABSORBED:
             raise PropagationError(
                 f"layers: {t:g} um of index {n:.4g} from {where} absorb {lost:.1%} at {wavelength_um} um, which the "
