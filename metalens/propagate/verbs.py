@@ -235,18 +235,35 @@ def angles(angle_rad: Any) -> tuple[float, float]:
 
 
 def exact(phase_rad: Array, transmission: Array, **geometry: Any) -> Array:
-    """The referee: direct Rayleigh-Sommerfeld sum over all pillars in float64 (see
-    :func:`field_exact`).
+    """Field on a window by direct Rayleigh-Sommerfeld summation over all pillars.
+
+        U(X) = Σ p² T exp(iφ) U_in d / (2π r²) (1/r - ik) exp(ikr)
+
+    in float64, |U_in| = 1 with phase 0 at the lens centre (Goodman, Introduction to
+    Fourier Optics, eq. 3-43, time factor exp(-iωt)). Through films d/(2πr²)(1/r - ik)
+    exp(ikr) becomes the stationary phase of the plane waves along the refracted ray. The
+    reference for every faster method; its time grows as pillars times samples.
 
     Args:
-        phase_rad, transmission: (y, x) numpy arrays.
-        geometry: as :func:`case`.
+        phase_rad: (y, x) phase of every pillar.
+        transmission: (y, x) magnitude |T| of every pillar.
+        geometry: pitch, wavelength, distances, angle and window by name, as
+            :func:`case`.
 
     Returns:
-        (depth, y, x) complex128.
+        (depth, y, x) complex128 field; its square is the irradiance for unit irradiance
+        of the lens.
 
     Raises:
         PropagationError: empty aperture, NaN, or maps and geometry that do not fit.
+
+    Accuracy: rounding, 1e-12 of the sum of the pillars' magnitudes.
+
+    >>> one_pillar = np.ones((1, 1))
+    >>> u = exact(0 * one_pillar, one_pillar, pitch_um=0.4, wavelength_um=0.85,
+    ...           sensor_distance_um=50.0, depths_um=np.inf, window_um=1.0, samples=1)
+    >>> round(float(abs(u[0, 0, 0])), 6)  # p² / (wavelength d)
+    0.003765
     """
     phase, level = np.asarray(phase_rad), np.asarray(transmission)
     return field_exact(phase, level, case(phase.shape, **geometry))

@@ -52,14 +52,15 @@ AT_NORMAL = "pillars answer as at normal incidence: their library has no angles"
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where a lens is looked at.
+    """Sources and window for which PSFs are computed.
 
-    depths_um: source depths, inf for a plane wave; angles_rad: (x, y) pairs, as in
-    :func:`metalens.psf.psf_stack`.
-    window_um, samples: of the window that follows the chief ray; pairs (x, y) where it
-    is not square.
-    offset_um: (x, y) from the chief ray to the window's centre. source: size and shape
-    where it is no point.
+    Attributes:
+        depths_um: of the source from the lens, inf for a plane wave.
+        angles_rad: (x, y) field angles, as in :func:`metalens.psf.psf_stack`.
+        window_um: full width of the window about the chief ray, or a pair (x, y).
+        samples: along the window, or a pair (x, y).
+        offset_um: (x, y) from the chief ray to the window's centre.
+        source: size and shape of a source that is no point.
     """
 
     depths_um: tuple[float, ...]
@@ -88,38 +89,35 @@ def from_lens(
     polarisation: Polarisation = "scalar",
     left_out: LeftOut | None = None,
 ) -> PsfStack:
-    """PSFs of a lens, (angle, depth, y, x), float32 where the tolerance allows it.
+    """Point spread functions of a lens file, its pillars through their response table.
 
-    The proxy is asked at the angle of every direction where its library has angles,
-    else at normal incidence, which
-    ``reason`` and ``budget.angle`` then say. Light is unpolarised: at an angle the
-    proxy holds the mean of both
-    polarisations, at normal incidence they are alike. Where pillars of one size answer
-    x and y apart, the PSFs are
-    those of the light that the proxy is of (``lens.one_light``), which ``reason`` says.
-    The lens' films and cover are
-    gone through, and the factor of its own unlike neighbours where it holds their rows
-    (``lens.neighbours``).
+    As :func:`psf_stack` with the phase and transmission that the pillars have at each
+    wavelength and angle; films, stop and solved neighbours of the lens are in it. Light
+    is unpolarised: at an angle the table holds the mean of both polarisations. Where it
+    has no angles, pillars respond as at normal incidence, and ``budget.angle`` is the
+    error of that.
 
     Args:
-        spectrum: wavelengths and weights, or a diode or measured curves, which get as
-            few wavelengths as the tolerance
-            needs; by default the design wavelength alone. Its error, judged by the
-            paths to where the light falls in
-            the window, is in the budget.
-        polarisation: as for :func:`psf_stack`, or ``auto``: the scalar where its error
-            (:func:`metalens.psf.scalar_error`) is below the tolerance, else the flux.
-        left_out: what is known of the lens's own pillars
-            (:func:`metalens.design.left_out`), for the budget; else rough
-            numbers.
+        lens: diameters, response of the pillars, distances and films.
+        view: depths, angles and window.
+        tolerance: relative L2 error of the PSFs of one direction; float32 is returned
+            from 1e-6 on.
+        spectrum: wavelengths with weights, a diode, or measured curves, which get as
+            few wavelengths as the tolerance needs; None for the design wavelength.
+        provenance: settings and input files, kept in the record.
+        polarisation: as for :func:`psf_stack`, or ``"auto"``: the scalar where its
+            error is below the tolerance, else the flux.
+        left_out: what is known of neighbours and angles of the lens's own pillars
+            (:func:`metalens.design.left_out`); None for rough numbers of another cell.
+
+    Returns:
+        PsfStack: (angle, depth, y, x), with the error by cause.
 
     Raises:
-        DomainError: a wavelength outside the proxy; PropagationError: a spectrum of
-            which a wavelength that stands for
-            it is, as :func:`psf_stack`, no angle, and ``flux`` or
-            ``vector`` for turned pillars, those of two sizes and those that answer x
-            and y apart (``auto`` takes the
-            scalar there; its error is in the budget).
+        DomainError: a wavelength outside the response table.
+        PropagationError: as :func:`psf_stack`; no angle; a spectrum that reaches beyond
+            the table; ``"flux"`` or ``"vector"`` for pillars whose x and y responses
+            differ.
     """
     if not 0 < tolerance < 1:
         raise PropagationError(

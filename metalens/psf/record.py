@@ -27,24 +27,26 @@ def _made_here() -> Provenance:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PsfStack:
-    """PSFs over depth (and field angle, and lens), each of sum 1, with their energy
-    beside them.
+    """Point spread functions over depth, field angle and lens.
 
-    intensity: (…, depth, y, x), sum over (y, x) is 1 (paper: normalised PSF); numpy or
-    torch, as the lens came in.
-        With several field angles the axis before depth is the angle; axes before that
-        are a batch of lenses.
-    energy_um2: (…, depth) light in the window for unit incident irradiance:
-    Σ|U|²·step².
-    depths_um, angles_rad (n, 2), wavelengths_um, weights: what the axes are;
-    wavelengths are summed with the weights.
-    step_um: sample spacing; centres_um: (n, 2) window centres [x, y] on the sensor, a
-    row per angle.
-    sensor_distance_um: lens to sensor. tolerance: that was asked for.
-    error: estimated relative L2 error of the intensity, the worst over angles and
-        lenses: of what is computed, and for a lens that was fitted of its posterior.
-    budget: the same by cause, with what the model leaves out.
-    reason: method, and why.
+    Attributes:
+        intensity: (…, [angle,] depth, y, x) PSFs, the sum over (y, x) is 1; numpy or
+            torch, as the lens came in. Axes before the angle are a batch of lenses.
+        energy_um2: (…, [angle,] depth) power in the window for unit irradiance of the
+            lens: Σ |U|² step².
+        depths_um: (depth,) of the source from the lens, inf for a plane wave.
+        angles_rad: (angle, 2) field angles (x, y).
+        wavelengths_um: (wavelength,) whose irradiances are added.
+        weights: (wavelength,) of that sum, together 1.
+        step_um: distance of neighbouring samples.
+        centres_um: (angle, 2) window centres (x, y) on the sensor.
+        sensor_distance_um: from the lens to the sensor.
+        tolerance: relative L2 error that was asked for.
+        error: estimated relative L2 error of the intensity, the worst over angles and
+            lenses: of what is computed, and for a fitted lens of its posterior.
+        reason: method, and why it stopped.
+        provenance: settings and input files.
+        budget: the error by cause, with what the model leaves out.
     """
 
     intensity: Any
