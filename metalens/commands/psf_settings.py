@@ -25,7 +25,8 @@ class Settings:
     """What is computed; kept in the file.
 
     depths_mm: nearest and farthest source, and the largest step between depths; left
-    out: infinity for a lens for collimated light, else 21 depths over which the rim
+    out: infinity for a lens for collimated light, else 21 depths, its focus among them,
+    over which the rim
         of this lens goes from 1.75 waves out of focus on one side to as many on the
         other.
     sources_mm: in place of depths_mm, the depth of every source; inf for a plane wave.
@@ -206,10 +207,18 @@ class Settings:
                 filled = replace(filled, sources_mm=(math.inf,))
             else:
                 near, far = (depth * 1e-3 for depth in reach.depth_range_um(made))
-                filled = replace(filled, depths_mm=(near, far, (far - near) / 20))
+                depths = np.linspace(near, far, 21)
+                focus_mm = made.source_distance_um * 1e-3
+                if near < focus_mm < far:  # one of them lies in focus
+                    depths[np.abs(1 / depths - 1 / focus_mm).argmin()] = focus_mm
+                filled = replace(
+                    filled,
+                    depths_mm=(near, far, (far - near) / 20),
+                    sources_mm=tuple(depths.tolist()),
+                )
         if self.window_um is not None:
             return filled
-        ends = filled.sources_mm or (filled.depths_mm or ())[:2]
+        ends = self.sources_mm or (filled.depths_mm or filled.sources_mm)[:2]
         ends_um = tuple(z * 1e3 for z in ends)
         return replace(filled, window_um=reach.window_um(made, ends_um, airy=AIRY))
 

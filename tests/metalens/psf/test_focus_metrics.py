@@ -250,3 +250,15 @@ def test_design_psf_and_the_definition_agree_on_the_efficiency():
     area = PITCH**2 * np.count_nonzero(np.asarray(made.diameters.diameter_um))
     # cells that the rim cuts: 1 % of the light within
     assert found.efficiency == pytest.approx(power / area, rel=0.015)
+
+
+def test_depths_that_are_left_out_hold_the_focus(saved, capsys):
+    """A lens for 1.1 mm: its sharpest PSF is that of a perfect lens, at 1.1 mm."""
+    folder = saved(source_um=1100.0)
+    assert run(folder, "--json", "--angles-deg", "0") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert len(said["depths_um"]) == 21
+    focus = said["focus"][0]
+    assert focus["depth_um"] == pytest.approx(1100.0)
+    assert focus["strehl"] == pytest.approx(1, abs=5e-3)
+    assert "z_scan" not in said
