@@ -80,7 +80,7 @@ NEEDS = {
     "library": ("cell.toml", "metalens.pillars.sweep:sweep"),
     "field": ("cell.toml --diameter-um 0.12", "metalens.commands.field:near_fields"),
     "design": ("design.toml", "metalens.commands.design:_make"),
-    "psf": ("lens.h5", "metalens.commands.psf:_make"),
+    "psf": ("lens.h5", "metalens.commands.psf:_compute"),
     "export": ("lens.h5", "metalens.lens.export:write"),
     "scene": ("scene.toml", "codesign.commands.scene:_make"),
     "layout": ("lens.h5", "layout.commands.make:_prepare"),

@@ -185,7 +185,7 @@ def psf_stack(
                 sensor_distance_um=lens.sensor_distance_um + x[PLACE["distance_um"]],
                 angle_rad=[list(angle)],
                 tolerance=tolerance,
-                **view.seen
+                **view.arguments
                 | {"offset_um": tuple(np.add(offset_um, view.offset_um).tolist())},
                 layers=lens.layers,
             )

@@ -71,7 +71,7 @@ class View:
     source: Extent | None = None
 
     @property
-    def seen(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         """Depths, window and source as arguments of :func:`metalens.psf.psf_stack`."""
         names = ("window_um", "samples", "offset_um", "source")
         return {"depths_um": np.array(self.depths_um)} | {
@@ -128,12 +128,12 @@ def from_lens(
     how: dict[str, Any] = {
         "tolerance": tolerance,
         "polarisation": polarisation,
-        "own": left_out or _known(lens),
+        "own": left_out or _left_out_of(lens),
     }
     how["provenance"] = provenance or Provenance()
     if isinstance(spectrum, Source | Measured):
-        return _of_spectrum(lens, view, spectrum, **how)
-    return _of_nodes(
+        return _over_spectrum(lens, view, spectrum, **how)
+    return _at_wavelengths(
         lens,
         view,
         spectrum or Nodes(np.array([lens.wavelength_um]), np.ones(1), 0.0),
@@ -141,7 +141,7 @@ def from_lens(
     )
 
 
-def _of_spectrum(
+def _over_spectrum(
     lens: Lens, view: View, source: Source | Measured, *, tolerance: float, **how: Any
 ) -> PsfStack:
     """PSFs of a spectrum: wavelengths for the paths to where few of them say that its
@@ -150,7 +150,7 @@ def _of_spectrum(
     within = lens.proxy.wavelengths_um
 
     def psfs(nodes: Nodes, tolerance: float, **other: Any) -> PsfStack:
-        return _of_nodes(
+        return _at_wavelengths(
             lens,
             view,
             spectra.known(nodes, source, within),
@@ -166,7 +166,7 @@ def _of_spectrum(
     if len(nodes.weights) > 2 * PILOT:
         few = Nodes(*spectra.gauss(*spectra.points(source), PILOT), 0.0)
         pilot = psfs(few, max(tolerance, PILOT_ERROR), polarisation="scalar")
-        nodes = _asked(source, spans, pilot, tolerance / 2 * SPARE)
+        nodes = _nodes_for(source, spans, pilot, tolerance / 2 * SPARE)
     for last in range(TRIES):
         stack = psfs(nodes, tolerance)
         if (
@@ -175,13 +175,13 @@ def _of_spectrum(
             or stack.budget.spectrum <= tolerance / 2
         ):
             break
-        nodes = _asked(source, spans, stack, tolerance / 2)
+        nodes = _nodes_for(source, spans, stack, tolerance / 2)
     return dataclasses.replace(
         stack, reason=stack.reason + spectra.beyond(source, within)
     )
 
 
-def _asked(
+def _nodes_for(
     source: Source | Measured, spans: list[Array], stack: PsfStack, tolerance: float
 ) -> Nodes:
     """Wavelengths for the paths of every direction (:func:`paths_um`) to where the
@@ -191,7 +191,7 @@ def _asked(
         spectra.nodes(
             source,
             path_um=span.ravel(),
-            light=lit(light, span.shape[1:]).ravel(),
+            light=light_shares(light, span.shape[1:]).ravel(),
             tolerance=tolerance,
         )
         for span, light in zip(spans, stack.intensity, strict=True)
@@ -210,14 +210,16 @@ def paths_um(
     source of finite size blurs into is as much wider.
     """
     grid = lens.diameters.grid._asdict()
-    seen = {name: value for name, value in view.seen.items() if name != "source"} | grid
+    given = {
+        name: value for name, value in view.arguments.items() if name != "source"
+    } | grid
     about: dict[str, Any] = {
         "wavelength_um": lens.wavelength_um,
         "sensor_distance_um": lens.sensor_distance_um,
     }
     about["layers"] = lens.layers.open
     case = propagate.case(
-        lens.diameters.diameter_um.shape, angle_rad=angle_rad, **seen, **about
+        lens.diameters.diameter_um.shape, angle_rad=angle_rad, **given, **about
     )
     more = (0, 0) if view.source is None else reach(case, view.source)
     radius = lens.diameters.radius_um * np.linspace(0, 1, RINGS)[:, None]
@@ -273,7 +275,7 @@ def _delay_um(
     return float(max(found))
 
 
-def lit(light: Array, places: tuple[int, ...]) -> Array:
+def light_shares(light: Array, places: tuple[int, ...]) -> Array:
     """(depth, y, x) shares of the squared intensity (depth, y, x) that lie nearest to
     places as in :func:`paths_um`.
     """
@@ -286,7 +288,7 @@ def lit(light: Array, places: tuple[int, ...]) -> Array:
     return np.asarray(square / square.sum())
 
 
-def _spectral(
+def _quadrature_error(
     lens: Lens,
     view: View,
     angle_rad: tuple[float, float],
@@ -299,11 +301,11 @@ def _spectral(
     if nodes.source is None:
         return nodes.error
     span = paths_um(lens, view, angle_rad, nodes.source)
-    share = lit(stack.intensity[0], span.shape[1:])
+    share = light_shares(stack.intensity[0], span.shape[1:])
     return float(np.sqrt(share.ravel() @ spectra.missed(nodes, span.ravel()) ** 2))
 
 
-def _of_nodes(
+def _at_wavelengths(
     lens: Lens,
     view: View,
     nodes: Nodes,
@@ -317,15 +319,17 @@ def _of_nodes(
     dtype = torch.float32 if tolerance >= 1e-6 else torch.float64
     share = math.sqrt(max(tolerance**2 - nodes.error**2, tolerance**2 / 4))
     budgets, parts = [], []
-    seen: tuple[float, bool] | None = None
+    kept: tuple[float, bool] | None = None
     for angle in view.angles_rad:
-        counted = _counted(lens, angle, polarisation, tolerance)
-        alike = incidence(lens, angle), counted == "scalar"
-        if seen != alike:  # without angles in the library all directions share the maps
+        counted = _decided_polarisation(lens, angle, polarisation, tolerance)
+        response = incidence(lens, angle), counted == "scalar"
+        if (
+            kept != response
+        ):  # without angles in the library all directions share the maps
             (phase, level), fields = all_maps(
                 lens, nodes, angle, dtype, scalar=counted == "scalar"
             )
-            seen = alike
+            kept = response
         parts.append(
             psf_stack(
                 phase,
@@ -335,7 +339,7 @@ def _of_nodes(
                 weights=nodes.weights.tolist(),
                 sensor_distance_um=lens.sensor_distance_um,
                 angle_rad=[list(angle)],
-                **view.seen,
+                **view.arguments,
                 tolerance=share,
                 layers=lens.layers,
                 polarisation=counted,
@@ -343,7 +347,7 @@ def _of_nodes(
             ).numpy()
         )
         judged = dataclasses.replace(
-            nodes, error=_spectral(lens, view, angle, parts[-1], nodes)
+            nodes, error=_quadrature_error(lens, view, angle, parts[-1], nodes)
         )
         budgets.append(_budget(lens, angle, parts[-1], judged, counted, own))
     held = (
@@ -351,20 +355,22 @@ def _of_nodes(
         if lens.one_light
         else ""
     )
-    return _told(_joined(parts, provenance), worst(budgets), tolerance, held, own)
+    return _with_budget(
+        _concatenated(parts, provenance), worst(budgets), tolerance, held, own
+    )
 
 
-def _told(
+def _with_budget(
     stack: PsfStack, found: Budget, tolerance: float, held: str, own: LeftOut
 ) -> PsfStack:
     """With the budget of all directions, and in words what it is of; the stack's own
     tolerance is that of the sums.
     """
     above = [ABOVE] if found.computed > tolerance and stack.converged else []
-    told = [stack.reason, *above, held, AT_NORMAL if found.angle else "", own.words]
-    words = "; ".join(filter(None, told))
+    words = [stack.reason, *above, held, AT_NORMAL if found.angle else "", own.words]
+    reason = "; ".join(filter(None, words))
     return dataclasses.replace(
-        stack, tolerance=tolerance, error=found.computed, budget=found, reason=words
+        stack, tolerance=tolerance, error=found.computed, budget=found, reason=reason
     )
 
 
@@ -386,7 +392,7 @@ def unpolarised(x: PsfStack, y: PsfStack) -> PsfStack:
     )
 
 
-def _known(lens: Lens) -> LeftOut:
+def _left_out_of(lens: Lens) -> LeftOut:
     """Rough terms, but for neighbours that the lens holds."""
     return LeftOut() if lens.neighbours is None else LeftOut(lens.neighbours)
 
@@ -418,7 +424,7 @@ def _budget(
     )
 
 
-def _counted(
+def _decided_polarisation(
     lens: Lens, angle: tuple[float, float], polarisation: Polarisation, tolerance: float
 ) -> Polarisation:
     """``auto`` decided."""
@@ -510,7 +516,7 @@ def passed_um2(
     )
 
 
-def _joined(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
+def _concatenated(parts: list[PsfStack], provenance: Provenance) -> PsfStack:
     """Stacks of single directions (1, depth, y, x) as one."""
     join: Any = {
         n: np.concatenate([getattr(p, n) for p in parts])

@@ -114,7 +114,7 @@ def psf_stack(
     ((1, 21, 21), True)
     """
     maps, waves, share = _maps(phase_rad, transmission, wavelength_um, weights)
-    maps, wanted = _among(
+    maps, wanted = _coupled(
         maps, neighbours, pitch_um, Wanted(tolerance, polarisation, integrate, source)
     )
     about: dict[str, Any] = {
@@ -142,11 +142,13 @@ def psf_stack(
             for w in waves
         ]
         cases.append(seen[int(share.argmax())])  # all wavelengths share its window
-        moving = _moving(angle, depths_um, sensor_distance_um, offset_um, cases[-1])
+        moving = _geometry_with_gradients(
+            angle, depths_um, sensor_distance_um, offset_um, cases[-1]
+        )
         found.append(
-            _seen(
+            _one_direction(
                 maps,
-                (_centred(seen, cases[-1]), share.tolist(), wanted, moving),
+                (_with_window_of(seen, cases[-1]), share.tolist(), wanted, moving),
                 layers,
             )
         )
@@ -158,7 +160,7 @@ def psf_stack(
         light, cases, (about["depths_um"], np.array(waves), share), worst, tolerance
     )
     power = torch.stack([row[2] for row in found], dim=-2) if several else found[0][2]
-    stack = _budgeted(stack, worst, power * cases[0].area_um2, cases, layers)
+    stack = _with_budget(stack, worst, power * cases[0].area_um2, cases, layers)
     return stack if isinstance(phase_rad, torch.Tensor) else stack.numpy()
 
 
@@ -168,7 +170,7 @@ _Given = tuple[
 _Found = tuple[torch.Tensor, list[Result], torch.Tensor]
 
 
-def _seen(
+def _one_direction(
     maps: tuple[torch.Tensor, torch.Tensor], given: _Given, layers: Layers | None
 ) -> _Found:
     """:func:`direction`, the sum of squares (…, depth), of 1 where it is that of all;
@@ -210,12 +212,12 @@ def _directions(angle_rad: Any) -> tuple[bool, Any]:
     return len(shape) == 2, angle_rad if len(shape) == 2 else [angle_rad]
 
 
-def _centred(cases: list[Case], like: Case) -> list[Case]:
+def _with_window_of(cases: list[Case], like: Case) -> list[Case]:
     """The cases with the window of one of them."""
     return [dataclasses.replace(one, centre_um=like.centre_um) for one in cases]
 
 
-def _among(
+def _coupled(
     maps: tuple[torch.Tensor, torch.Tensor],
     neighbours: Neighbours | Jones | None,
     pitch_um: float,
@@ -239,7 +241,7 @@ def _among(
     )
 
 
-def _ripples(
+def _stop_error(
     stack: PsfStack, share: Array, cases: list[Case], layers: Layers | None
 ) -> float:
     """Error of the shadow of a stop, the worst over angles, depths and wavelengths; nan
@@ -269,7 +271,7 @@ def _ripples(
     return max(found)
 
 
-def _budgeted(
+def _with_budget(
     stack: PsfStack,
     worst: Result,
     whole: torch.Tensor,
@@ -282,7 +284,7 @@ def _budgeted(
     share = (stack.energy_um2.detach().cpu().double() / whole).numpy()
     outside, stop = (
         max(0.0, 1 - float(share.min())),
-        _ripples(stack, share, cases, layers),
+        _stop_error(stack, share, cases, layers),
     )
     parts = {
         "sampling": worst.sampling,
@@ -351,7 +353,7 @@ def _value(argument: Any) -> Any:
     return argument
 
 
-def _moving(
+def _geometry_with_gradients(
     angle: Any, depths: Any, distance: Any, offset: Any, case: Case
 ) -> Moving | None:
     """Geometry as tensors where any of it carries a gradient."""
@@ -404,7 +406,7 @@ def _maps(
     if phase.dtype not in KEPT:
         raise PropagationError(f"phase_rad is {phase.dtype}, need float32 or float64")
     level = torch.as_tensor(level).to(phase)
-    if phase.ndim < 2 or 0 in phase.shape[:-2] or not _serves(level, phase):
+    if phase.ndim < 2 or 0 in phase.shape[:-2] or not _broadcasts(level, phase):
         shapes = f"phase_rad of shape {tuple(phase.shape)}, transmission of {tuple(level.shape)}"
         raise PropagationError(f"{shapes}: need (…, y, x) of both, alike")
     level = level.expand(phase.shape)
@@ -417,7 +419,7 @@ def _maps(
     return (phase, level), waves, share / share.sum()
 
 
-def _serves(level: torch.Tensor, phase: torch.Tensor) -> bool:
+def _broadcasts(level: torch.Tensor, phase: torch.Tensor) -> bool:
     """Whether a transmission is one of these maps, or of all of them."""
     alike = zip(level.shape[::-1], phase.shape[::-1], strict=False)
     return level.ndim <= phase.ndim and all(n in (1, m) for n, m in alike)

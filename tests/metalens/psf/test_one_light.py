@@ -10,10 +10,10 @@ import pytest
 from metalens.cell import Cell, Index, Lattice
 from metalens.cell.shapes.round import Circle, Ellipse
 from metalens.cell.shapes.straight import Cross, Rectangle, RegularPolygon
-from metalens.commands import design_words, psf
-from metalens.commands.psf_settings import Settings
-from metalens.ground.errors import ConfigError, PropagationError
-from metalens.lens import DiameterMap, Lens
+from metalens.cli import main
+from metalens.commands import design_words
+from metalens.ground.errors import PropagationError
+from metalens.lens import DiameterMap, Lens, save
 from metalens.pillars import Proxy
 from metalens.psf import View, from_lens
 
@@ -90,23 +90,27 @@ def test_round_pillars_of_unlike_periods_are_of_one_light_too():
     )
 
 
-def test_the_light_that_is_asked_for_is_refused_for_its_own_reason(tmp_path):
+def test_the_light_that_is_asked_for_is_refused_for_its_own_reason(tmp_path, capsys):
     """x of a rectangle is what its library holds; y is not in it; of round pillars both
     are the same.
     """
-    oblong, disc = lens(Rectangle(ratio=0.6)), lens(Circle())
-    path = tmp_path / "lens.h5"
-    path.write_bytes(b"0")
-    asked = Settings(
-        sources_mm=(3.0,),
-        angles_deg=(2.0,),
-        window_um=9.0,
-        samples=16,
-        tolerance=1e-3,
-        light="x",
-    )
-    assert "light along x" in psf._of_design(path, asked, oblong).reason
-    with pytest.raises(ConfigError, match="these know light along x alone"):
-        psf._of_design(path, replace(asked, light="y"), oblong)
-    with pytest.raises(ConfigError, match="these treat x and y alike"):
-        psf._of_design(path, asked, disc)
+
+    def psfs(made, light):
+        save(tmp_path / "lens.h5", made)
+        words = f"psf {tmp_path}/lens.h5 -o {tmp_path}/psf.h5 --sources-mm 3 --angles-deg 2 --window-um 9 --samples 16"
+        code = main(
+            [*words.split(), "--tolerance", "1e-3", "--force", "--light", light]
+        )
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    oblong = lens(Rectangle(ratio=0.6))
+    code, said = psfs(oblong, "x")
+    assert code < 2  # its window holds what it holds
+    assert "light along x" in said
+    code, said = psfs(oblong, "y")
+    assert code == 2
+    assert "these know light along x alone" in said
+    code, said = psfs(lens(Circle()), "x")
+    assert code == 2
+    assert "these treat x and y alike" in said

@@ -17,7 +17,7 @@ from metalens.cell import Cell, Index
 from metalens.lens import DiameterMap, Lens, answers
 from metalens.pillars import Proxy
 from metalens.psf import Nodes, View, from_lens, spectrum
-from metalens.psf.of_lens import PILOT, lit, paths_um
+from metalens.psf.of_lens import PILOT, light_shares, paths_um
 
 PHASE = np.array(
     [[0.0, 1.15 * math.pi], [-0.4, -1.9]]
@@ -109,7 +109,7 @@ def test_given_wavelengths_are_judged_by_where_their_light_falls(source):
 def test_light_is_shared_out_to_the_nearest_places():
     light = np.zeros((2, 5, 9))
     light[0, 0, 3], light[1, 3, 8], light[1, 2, 4] = 1.0, 2.0, 3.0
-    found = lit(light, (3, 5)) * 14
+    found = light_shares(light, (3, 5)) * 14
     want = np.zeros((2, 3, 5))
     want[0, 0, 2], want[1, 2, 4], want[1, 1, 2] = (
         1.0,
@@ -117,7 +117,7 @@ def test_light_is_shared_out_to_the_nearest_places():
         9.0,
     )  # 3 lies half-way between 2 and 4
     assert found == pytest.approx(want)
-    assert lit(light[:, :1, :1] + 1, (1, 1)).sum() == pytest.approx(1.0)
+    assert light_shares(light[:, :1, :1] + 1, (1, 1)).sum() == pytest.approx(1.0)
 
 
 def test_a_whole_spectrum_costs_its_own_wavelengths_and_few_to_foresee_its_light(
